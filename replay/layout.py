@@ -30,7 +30,7 @@ from .draw.scene import body
 from .draw.scene import stage as trail
 from .draw.scene.body import body_title
 from .samples import content as entities
-from .samples.content import Content, Series, Start, Tab
+from .samples.content import AwaitedMap, Content, HeatMap, Series, Start, Tab
 from .samples.timeline import ENSEMBLE_CYCLE, GAIT_CYCLE, SESSION_TIME
 
 BEFORE_CURSOR_S = 4.0
@@ -57,15 +57,15 @@ class Views:
 
     scene: rrb.Spatial3DView | None
     mode: rrb.StateTimelineView | None
-    words: tuple[rrb.View, ...]
-    angles: tuple[rrb.View, ...]
-    effort: tuple[rrb.View, ...]
-    bars: tuple[rrb.View, ...]
-    maps: tuple[rrb.View, ...] = ()
-    steps: tuple[rrb.View, ...] = ()
-    mean_scene: rrb.Spatial3DView | None = None
-    mean_words: rrb.TextDocumentView | None = None
-    mean_plots: tuple[rrb.View, ...] = ()
+    words: Sequence[rrb.View]
+    angles: Sequence[rrb.View]
+    effort: Sequence[rrb.View]
+    bars: Sequence[rrb.View]
+    maps: Sequence[rrb.View]
+    steps: Sequence[rrb.View]
+    mean_scene: rrb.Spatial3DView | None
+    mean_words: rrb.TextDocumentView | None
+    mean_plots: Sequence[rrb.View]
 
     @property
     def all(self) -> tuple[rrb.View, ...]:
@@ -82,29 +82,33 @@ def build_views(content: Content) -> Views:
     if content.has_events:
         words.append(rrb.TextLogView(name="Events", contents=[f"{gait.EVENTS}/**"]))
     mode = rrb.StateTimelineView(name="Gait mode", contents=[gait.MODE])
+    about = rrb.TextDocumentView(name="About the mean cycle", contents=[mean_cycle.ABOUT])
     angles, effort = _angle_views(content), _effort_views(content)
     if content.live:  # nothing comes after the cursor
-        for plot in (*angles, *effort):
-            plot.properties["VisibleTimeRanges"] = _window(BEFORE_CURSOR_S + AFTER_CURSOR_S, 0.0)
+        for one in (*angles, *effort):
+            one.properties["VisibleTimeRanges"] = _window(BEFORE_CURSOR_S + AFTER_CURSOR_S, 0.0)
     return Views(
-        scene=None if content.start is None else _body_view(content, content.start),
+        scene=_body_view(content),
         mode=mode if content.modes else None,
-        words=tuple(words),
-        angles=tuple(angles),
-        effort=tuple(effort),
-        bars=tuple(_bar_views(content)),
-        maps=tuple(_map_views(content)),
-        steps=tuple(_step_views(content)),
+        words=words,
+        angles=angles,
+        effort=effort,
+        bars=[bar_chart(one.title, f"{SEGMENTS}/{one.key}/**") for one in content.charts],
+        maps=[_map_view(one) for one in content.maps],
+        steps=[
+            _whole_plot(f"{one.name} by cycle [{one.unit}]", [part.entity for part in series])
+            for one, series in content.cycles
+        ],
         mean_scene=_mean_scene(content),
-        mean_words=None
-        if content.mean is None
-        else rrb.TextDocumentView(name="About the mean cycle", contents=[mean_cycle.ABOUT]),
-        mean_plots=tuple(_mean_plots(content)),
+        mean_words=None if content.mean is None else about,
+        mean_plots=_mean_plots(content),
     )
 
 
-def _body_view(content: Content, start: Start) -> rrb.Spatial3DView:
-    robot = content.robot
+def _body_view(content: Content) -> rrb.Spatial3DView | None:
+    start, robot = content.start, content.robot
+    if start is None:
+        return None
     span = sum(link.length for link in robot.links) if robot is not None else 1.0
     # From behind its right shoulder and above, where the wave shows along the whole body.
     eye = rrb.EyeControls3D(
@@ -114,18 +118,13 @@ def _body_view(content: Content, start: Start) -> rrb.Spatial3DView:
         eye_up=(0.0, 0.0, 1.0),
         tracking_entity=body.MEASURED,
     )
-    tail_time = rrb.VisibleTimeRange(
-        SESSION_TIME,
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-trail.TRAIL_SECONDS),
-        end=rrb.TimeRangeBoundary.cursor_relative(),
-    )
     return rrb.Spatial3DView(
         name=body_title(content),
         origin="/world",
         eye_controls=eye,
         background=_BACKGROUND,
         line_grid=_grid(span),
-        overrides={trail.TRAIL: rrb.VisibleTimeRanges([tail_time])},
+        overrides={trail.TRAIL: trail_window()},
     )
 
 
@@ -175,7 +174,7 @@ def _grid_spacing(span: float) -> float:
 def _effort_views(content: Content) -> list[rrb.View]:
     found: list[rrb.View] = []
     if content.has_power:
-        found.append(_plot("Power [W]", [f"{entities.TOTAL}/**"]))
+        found.append(plot("Power [W]", [f"{entities.TOTAL}/**"]))
     if content.joint_power:
         found.append(_joint_plot("Joint power [W]", content.joint_power, None))
     found += [
@@ -185,33 +184,15 @@ def _effort_views(content: Content) -> list[rrb.View]:
     return found
 
 
-def _bar_views(content: Content) -> list[rrb.View]:
-    return [
-        rrb.BarChartView(
-            name=chart.title,
-            contents=[f"{SEGMENTS}/{chart.key}/**"],
-            plot_legend=rrb.PlotLegend(visible=False),
-        )
-        for chart in content.charts
-    ]
+def bar_chart(title: str, contents: str) -> rrb.BarChartView:
+    """A view of bars without a legend."""
+    legend = rrb.PlotLegend(visible=False)
+    return rrb.BarChartView(name=title, contents=[contents], plot_legend=legend)
 
 
-def _map_views(content: Content) -> list[rrb.View]:
-    return [
-        rrb.Spatial2DView(
-            name=shown.title,
-            origin=shown.entity,
-            visual_bounds=rrb.VisualBounds2D(x_range=VISIBLE[0], y_range=VISIBLE[1]),
-        )
-        for shown in content.maps
-    ]
-
-
-def _step_views(content: Content) -> list[rrb.View]:
-    return [
-        _whole_plot(f"{quantity.name} by cycle [{quantity.unit}]", [one.entity for one in series])
-        for quantity, series in content.cycles
-    ]
+def _map_view(shown: HeatMap | AwaitedMap) -> rrb.Spatial2DView:
+    bounds = rrb.VisualBounds2D(x_range=VISIBLE[0], y_range=VISIBLE[1])
+    return rrb.Spatial2DView(name=shown.title, origin=shown.entity, visual_bounds=bounds)
 
 
 def _mean_plots(content: Content) -> list[rrb.View]:
@@ -223,15 +204,13 @@ def _mean_plots(content: Content) -> list[rrb.View]:
         corner = rrb.Corner2D.LeftBottom  # where a sine isn't
         contents = [f"{mean_cycle.PLACES}/**"]
         found.append(_whole_plot("Mean angle [°]", contents, legend=corner))
-    plane = None if content.places is None else content.places.plane
-    names = None if plane is None else _names(content.robot, plane)
-    for title, series in (
-        ("Mean angle of all joints [°]", mean.measured),
-        ("Mean error [°]", mean.error),
-        ("Mean power [W]", mean.power),
+    names = _plane_of_places(content)
+    for title, series, shown in (
+        ("Mean angle of all joints [°]", mean.measured, names),
+        ("Mean error [°]", mean.error, names),
+        ("Mean power [W]", mean.power, None),
     ):
         if series:
-            shown = None if series is mean.power else names
             contents = [one.entity for one in series]
             found.append(_whole_plot(title, contents, overrides=_lines(series, shown)))
     return found
@@ -242,7 +221,7 @@ def _angle_views(content: Content) -> list[rrb.View]:
     if content.places is not None:
         three = len(content.places.names) == 3
         title = "Head, middle, tail [°]" if three else "Angle [°]"
-        views.append(_plot(title, [f"{joints.PLACES}/**"]))
+        views.append(plot(title, [f"{joints.PLACES}/**"]))
     for plane in Plane:
         names = _names(content.robot, plane)
         if names & {name for series in content.measured for name in series.names}:
@@ -250,9 +229,7 @@ def _angle_views(content: Content) -> list[rrb.View]:
     if content.robot is None and content.measured:
         views.append(_joint_plot("Measured [°]", content.measured, None))
     if content.errors:
-        plane = None if content.places is None else content.places.plane
-        names = None if plane is None else _names(content.robot, plane)
-        views.append(_joint_plot("Error [°]", content.errors, names))
+        views.append(_joint_plot("Error [°]", content.errors, _plane_of_places(content)))
     if not views and content.commanded:
         views.append(_joint_plot("Commanded [°]", content.commanded, None))
     return views
@@ -264,31 +241,32 @@ def _names(robot: Robot | None, plane: Plane) -> set[str]:
     return {joint.name for joint in robot.joints if joint.plane is plane}
 
 
+def _plane_of_places(content: Content) -> set[str] | None:
+    """Joints of the plane that head, middle and tail bend; None where it isn't known."""
+    plane = None if content.places is None else content.places.plane
+    return None if plane is None else _names(content.robot, plane)
+
+
 def _joint_plot(
     title: str, series: Sequence[Series], names: set[str] | None, *, legend: bool = False
 ) -> rrb.TimeSeriesView:
     """A line a joint; ``names`` chooses the lines that are visible at first."""
     contents = [one.entity for one in series]
-    return _plot(title, contents, overrides=_lines(series, names), legend=legend)
+    return plot(title, contents, overrides=_lines(series, names), legend=legend)
 
 
 def _lines(
     series: Sequence[Series], names: set[str] | None
 ) -> dict[EntityPathLike, rrb.Visualizer]:
-    return {
-        one.entity: rr.SeriesLines.from_fields(
-            visible_series=[names is None or name in names for name in one.names]
-        ).visualizer(
-            mappings=[
-                VisualizerComponentMapping(
-                    "Scalars:scalars",
-                    ComponentSourceKind.SourceComponent,
-                    source_component=one.component,
-                )
-            ]
+    found: dict[EntityPathLike, rrb.Visualizer] = {}
+    for one in series:
+        shown = [names is None or name in names for name in one.names]
+        source = VisualizerComponentMapping(
+            entities.SCALARS, ComponentSourceKind.SourceComponent, source_component=one.component
         )
-        for one in series
-    }
+        look = rr.SeriesLines.from_fields(visible_series=shown)
+        found[one.entity] = look.visualizer(mappings=[source])
+    return found
 
 
 def _whole_plot(
@@ -308,13 +286,14 @@ def _whole_plot(
     )
 
 
-def _plot(
+def plot(
     title: str,
     contents: list[str],
     *,
     overrides: Mapping[EntityPathLike, rrb.Visualizer] | None = None,
     legend: bool = True,
 ) -> rrb.TimeSeriesView:
+    """A plot about the time cursor."""
     return rrb.TimeSeriesView(
         name=title,
         contents=contents,
@@ -324,15 +303,19 @@ def _plot(
     )
 
 
-def _window(before_s: float, after_s: float) -> rrb.VisibleTimeRanges:
+def trail_window() -> rrb.VisibleTimeRanges:
+    """The part of the head's trail that is seen."""
+    return _window(trail.TRAIL_SECONDS, 0.0, SESSION_TIME)
+
+
+def _window(before_s: float, after_s: float, *timelines: str) -> rrb.VisibleTimeRanges:
+    """A stretch about the cursor; on the session's timelines where none is given."""
+    start = rrb.TimeRangeBoundary.cursor_relative(seconds=-before_s)
+    end = rrb.TimeRangeBoundary.cursor_relative(seconds=after_s)
     return rrb.VisibleTimeRanges(
         [
-            rrb.VisibleTimeRange(
-                timeline,
-                start=rrb.TimeRangeBoundary.cursor_relative(seconds=-before_s),
-                end=rrb.TimeRangeBoundary.cursor_relative(seconds=after_s),
-            )
-            for timeline in (SESSION_TIME, GAIT_CYCLE)
+            rrb.VisibleTimeRange(timeline, start=start, end=end)
+            for timeline in timelines or (SESSION_TIME, GAIT_CYCLE)
         ]
     )
 
@@ -349,23 +332,28 @@ def build_blueprint(content: Content, front: Tab = "session") -> rrb.Blueprint:
         following the end of what still grows.
     """
     views = build_views(content)
-    tabs: dict[Tab, rrb.Container] = {"session": _session(content, views)}
+    pages: dict[Tab, rrb.Container] = {"session": _session(content, views)}
     if views.maps or views.steps:
         rows = [rrb.Horizontal(*row) for row in (views.maps, views.steps) if row]
         shares = [1.35, 1.0][: len(rows)]
-        tabs["cycles"] = rrb.Vertical(*rows, row_shares=shares, name="Cycles")
+        pages["cycles"] = rrb.Vertical(*rows, row_shares=shares, name="Cycles")
     if views.mean_plots and views.mean_words is not None:
-        tabs["mean-cycle"] = _mean(views, views.mean_words)
-    shown: Tab = front if front in tabs else "session"
-    root = tabs[shown]
-    if len(tabs) > 1:
-        root = rrb.Tabs(*tabs.values(), active_tab=list(tabs).index(shown))
+        pages["mean-cycle"] = _mean(views, views.mean_words)
+    shown: Tab = front if front in pages else "session"
+    root = pages[shown]
+    if len(pages) > 1:
+        root = rrb.Tabs(*pages.values(), active_tab=list(pages).index(shown))
     timeline = ENSEMBLE_CYCLE if shown == "mean-cycle" else SESSION_TIME
+    return blueprint(root, _time_panel(content, timeline))
+
+
+def blueprint(root: rrb.View | rrb.Container, time_panel: rrb.TimePanel) -> rrb.Blueprint:
+    """A layout that is ours alone, the viewer's own panels folded away."""
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        _time_panel(content, timeline),
+        time_panel,
         auto_views=False,
         auto_layout=False,
     )
@@ -376,7 +364,7 @@ def _session(content: Content, views: Views) -> rrb.Container:
     lane = [views.mode] if views.mode is not None and content.modes > 1 else []
     words = [*views.words, *([views.mode] if views.mode is not None and not lane else [])]
     plots: list[rrb.View | rrb.Container] = [
-        _tabs(group) for group in (views.angles, views.effort) if group
+        tabs(group) for group in (views.angles, views.effort) if group
     ]
     heights = [3.0, 2.4][: len(plots)]
     if views.bars:
@@ -384,17 +372,16 @@ def _session(content: Content, views: Views) -> rrb.Container:
         heights.append(3.0)
     if views.scene is None:
         shares = [*heights, *[0.8] * len(lane), 2.0]
-        return rrb.Vertical(*plots, *lane, _tabs(words), row_shares=shares, name="Session")
+        return rrb.Vertical(*plots, *lane, tabs(words), row_shares=shares, name="Session")
     shares = [3.2, *[0.62] * len(lane), 1.1]
-    left = rrb.Vertical(views.scene, *lane, _tabs(words), row_shares=shares)
+    left = rrb.Vertical(views.scene, *lane, tabs(words), row_shares=shares)
     right = rrb.Vertical(*plots, row_shares=heights)
     return rrb.Horizontal(left, right, column_shares=[1.1, 1.0], name="Session")
 
 
 def _mean(views: Views, words: rrb.TextDocumentView) -> rrb.Container:
     first, *others = views.mean_plots
-    plots = [first, _tabs(others)] if others else [first]
-    right = rrb.Vertical(*plots)
+    right = rrb.Vertical(first, *([tabs(others)] if others else []))
     left = words
     if views.mean_scene is not None:
         left = rrb.Vertical(views.mean_scene, words, row_shares=[2.6, 1.0])
@@ -414,5 +401,8 @@ def _time_panel(content: Content, timeline: str) -> rrb.TimePanel:
     )
 
 
-def _tabs(views: Sequence[rrb.View]) -> rrb.View | rrb.Tabs:
+def tabs(
+    views: Sequence[rrb.View] | Sequence[rrb.Horizontal],
+) -> rrb.View | rrb.Horizontal | rrb.Tabs:
+    """Views behind each other; a single one as it is."""
     return views[0] if len(views) == 1 else rrb.Tabs(*views, active_tab=0)

@@ -133,6 +133,11 @@ class ReproducedRun:
     comparison: Comparison | None
     not_compared: str | None
 
+    @property
+    def exact(self) -> bool:
+        """Whether it is known to be the same to the last bit."""
+        return self.same is not None and self.same.exact
+
 
 def find_repetition(
     original: Path,

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,7 @@ from .parameters import (
     unknowns,
     with_values,
 )
-from .solve import Solution, derivatives, solve
+from .solve import Solution, derivatives, normal_of, slope_of, solve
 
 SIGNIFICANT = 0.05
 
@@ -87,17 +88,10 @@ def find_weak_module(
     gains: list[float] = []
     for joint in joints:
         wanted = (*shared.unknowns, module_unknown(answers.scenario, joint, spread))
-        column = derivatives(answers, wanted, np.append(shared.x, 0.0), [len(shared.x)])
-        normal = np.zeros((len(wanted), len(wanted)))
-        normal[:-1, :-1], normal[-1, -1] = shared.normal, spread**-2
-        slope = 0.0
-        for own, others, rest, s in zip(
-            column, shared.columns, shared.after, shared.sigma.tolist(), strict=True
-        ):
-            normal[-1, :-1] += own[:, 0] @ others / s**2
-            normal[-1, -1] += own[:, 0] @ own[:, 0] / s**2
-            slope += float(own[:, 0] @ rest) / s**2
-        normal[:-1, -1] = normal[-1, :-1]
+        own = derivatives(answers, wanted, np.append(shared.x, 0.0), [len(shared.x)])
+        columns = [np.hstack(pair) for pair in zip(shared.columns, own, strict=True)]
+        normal = normal_of(columns, shared.sigma, np.append(shared.precision, spread**-2))
+        slope = float(slope_of(own, shared.after, shared.sigma)[0])
         gains.append(slope**2 * float(np.linalg.inv(normal)[-1, -1]))
     best = joints[int(np.argmax(gains))]
     wanted = (*shared.unknowns, module_unknown(answers.scenario, best, spread))
@@ -139,16 +133,16 @@ class Fitted:
 
     Attributes:
         label: How it is called in text.
-        unit: SI.
         module: The joint whose own it is, or None.
+        unit: SI.
         ci95: 95 % interval; None where the twin doesn't fit, since it would hold for noise alone.
         determined: Whether the session tells it.
     """
 
     name: str
     label: str
-    unit: str
     module: str | None
+    unit: str
     start: float
     value: float
     ci95: tuple[float, float] | None
@@ -230,13 +224,8 @@ def calibrate(
         raise DataError(
             f"{path}: {count} settled samples are too few for {len(open_ones)} unknowns"
         )
-    answers = Answers(
-        scenario,
-        lambda: driven.make(scenario.robot, scenario),
-        measured,
-        kernels,
-        on_tick,
-    )
+    gait = partial(driven.make, scenario.robot, scenario)
+    answers = Answers(scenario, gait, measured, kernels, on_tick)
 
     def told(k: int, rms: float) -> None:
         on_iteration(k, rms, answers.speed)
@@ -277,15 +266,10 @@ def _calibration(
     lack: LackOfFit,
     within: float,
 ) -> Calibration:
-    low, high = _ends(solution, lack.alternatives)
+    rows = np.column_stack([solution.x, *_ends(solution, lack.alternatives)]).tolist()
     parameters = [
-        _fitted(one, x, ends, within, fits=not lack.found)
-        for one, x, ends in zip(
-            solution.unknowns,
-            solution.x.tolist(),
-            zip(low.tolist(), high.tolist(), strict=True),
-            strict=True,
-        )
+        _fitted(one, x, (low, high), within, fits=not lack.found)
+        for one, (x, low, high) in zip(solution.unknowns, rows, strict=True)
     ]
     return Calibration(
         session=str(path),

@@ -32,6 +32,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SimulationError
+from undulog.sim.scenario.scenario import Scenario
 from undulog.sim.scenario.world import FrictionLaw
 
 from .parameters import DELAY, Answers, Unknown, with_values
@@ -42,11 +43,13 @@ Z95 = 1.959963984540054
 _RIDGE = 0.5
 _MOVED = 0.01
 
+_FULL_VOLTAGE = (
+    "commands that bring the servos to full voltage: a larger amplitude, a higher frequency, or a "
+    "stronger load"
+)
 _TELLS = {
-    "stall_torque": "commands that bring the servos to full voltage: a larger amplitude, a higher "
-    "frequency, or a stronger load",
-    "proportional_gain": "commands that bring the servos to full voltage: a larger amplitude, a "
-    "higher frequency, or a stronger load",
+    "stall_torque": _FULL_VOLTAGE,
+    "proportional_gain": _FULL_VOLTAGE,
     "coulomb_friction": "slow motion without contact",
     "viscous_friction": "fast motion without contact, up to full voltage",
     "gear_stiffness": "a stronger load, or frequencies near the gear's resonance",
@@ -158,6 +161,11 @@ class Alternative:
     widens: bool
 
     @property
+    def ci95(self) -> tuple[float, float]:
+        """95 % interval of its size."""
+        return self.size - Z95 * self.error, self.size + Z95 * self.error
+
+    @property
     def could_be(self) -> bool:
         """Whether its interval (95 %) has the weight that the other law has."""
         return abs(self.size - 1.0) <= Z95 * self.error
@@ -180,9 +188,8 @@ def alternatives(answers: Answers, solution: Solution) -> tuple[Alternative, ...
         for law in (FrictionLaw.ELLIPSE, FrictionLaw.BOX, FrictionLaw.TRANSETH):
             if law is ground.law:
                 continue
-            world = dataclasses.replace(scenario.world, ground=dataclasses.replace(ground, law=law))
             try:
-                track = answers.run(dataclasses.replace(scenario, world=world))
+                track = answers.run(_under(scenario, law))
             except SimulationError:  # too stiff with these parameters
                 continue
             there = answers.sampled(track)
@@ -198,16 +205,18 @@ def alternatives(answers: Answers, solution: Solution) -> tuple[Alternative, ...
     return tuple(found)
 
 
+def _under(scenario: Scenario, law: FrictionLaw) -> Scenario:
+    """The scenario, which has a ground, under another law."""
+    assert scenario.world.ground is not None  # noqa: S101 - the caller looked at its law
+    ground = dataclasses.replace(scenario.world.ground, law=law)
+    return dataclasses.replace(scenario, world=dataclasses.replace(scenario.world, ground=ground))
+
+
 def _refitted(
     one: Alternative, law: FrictionLaw, answers: Answers, solution: Solution
 ) -> Alternative:
     """Shift and covariance from a fit under the other law itself."""
-    scenario = answers.scenario
-    if scenario.world.ground is None:
-        return one
-    ground = dataclasses.replace(scenario.world.ground, law=law)
-    world = dataclasses.replace(scenario.world, ground=ground)
-    others = dataclasses.replace(answers, scenario=dataclasses.replace(scenario, world=world))
+    others = dataclasses.replace(answers, scenario=_under(answers.scenario, law))
     try:
         there = solve(others, solution.unknowns, start=solution.x, most=_ITERATIONS)
     except SimulationError:

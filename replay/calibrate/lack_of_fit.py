@@ -38,7 +38,7 @@ from undulog.capture.common.arrays import FloatArray
 
 from .identifiability import Alternative
 from .parameters import Measured
-from .solve import deviations, score_covariance
+from .solve import deviations, normal_of, score_covariance, slope_of
 
 _STILL = 1e-3
 """A joint that moves less has no gain [rad, RMS]."""
@@ -277,7 +277,8 @@ def halves(
         The check; None where half of the session is too short for K parameters.
     """
     count = len(x)
-    parts = [slice(None, min(map(len, residuals)) // 2), slice(min(map(len, residuals)) // 2, None)]
+    middle = min(map(len, residuals)) // 2
+    parts = [slice(None, middle), slice(middle, None)]
     if sum(len(r[parts[0]]) for r in residuals) <= 4 * count or not count:
         return None
     sigma = deviations(residuals)
@@ -289,19 +290,12 @@ def halves(
         # Where an encoder has its zero is a half's own affair, too.
         J = [column[part] - column[part].mean(axis=0) for column in columns]
         rest = [r[part] - r[part].mean() for r in residuals]
-        normal = prior + sum(
-            (c.T @ c / s**2 for c, s in zip(J, sigma.tolist(), strict=True)),
-            start=np.zeros((count, count)),
-        )
-        slope = np.sum(
-            [c.T @ r / s**2 for c, r, s in zip(J, rest, sigma.tolist(), strict=True)], axis=0
-        )
+        normal = normal_of(J, sigma, precision)
         inverse: FloatArray = np.linalg.inv(normal).astype(np.float64)
         scores = score_covariance(J, rest, sigma, precision)
-        white = normal - prior
         # Never less than white noise has it, as in the fit itself.
-        covariance += inverse @ _larger(scores, white) @ inverse
-        steps.append(inverse @ (slope - precision * x))
+        covariance += inverse @ _larger(scores, normal - prior) @ inverse
+        steps.append(inverse @ (slope_of(J, rest, sigma) - precision * x))
         inverses.append(inverse)
     apart = inverses[0] - inverses[1]
     covariance += apart @ prior @ apart

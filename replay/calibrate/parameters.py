@@ -25,7 +25,7 @@ from undulog.sim.drive.motion import COMMANDS
 from undulog.sim.gait.contract import Gait
 from undulog.sim.scenario.scenario import Kernels, Scenario
 from undulog.sim.scenario.sensors import Noise, SensorModels
-from undulog.sim.scenario.world import FrictionLaw, Ground
+from undulog.sim.scenario.world import FrictionLaw
 from undulog.sim.twin.twin import Twin
 
 SERVO = {
@@ -99,22 +99,20 @@ def unknowns(
             "servo_of and the joints' own servos"
         )
     (servo,) = servos
-    found: dict[str, tuple[str, float]] = {
-        name: (unit, float(getattr(servo, name))) for name, unit in SERVO.items()
-    }
     ground = scenario.world.ground
-    if ground is not None:
-        of_law = _VISCOUS if ground.law is FrictionLaw.VISCOUS else _DRY
-        found |= {name: (unit, float(getattr(ground, name))) for name, unit in of_law.items()}
+    of_law = _VISCOUS if ground is not None and ground.law is FrictionLaw.VISCOUS else _DRY
+    found = {
+        name: Unknown(name, unit, float(getattr(owner, name)), spread)
+        for owner, units in ((servo, SERVO), (ground, of_law))
+        for name, unit in (units.items() if owner is not None else ())
+    }
     for name in only:
         if name not in found:
             raise UsageError(f"--only {name}: expected one of {', '.join(found)}")
-        if found[name][1] == 0.0:
+        if found[name].start == 0.0:
             raise UsageError(f"--only {name}: it is 0 in {scenario.name} and can't be scaled")
     chosen = tuple(
-        Unknown(name, unit, value, spread)
-        for name, (unit, value) in found.items()
-        if value > 0.0 and (not only or name in only)
+        one for name, one in found.items() if one.start > 0.0 and (not only or name in only)
     )
     return (*chosen, Unknown(DELAY, "s", 0.0, 1.0)) if delay else chosen
 
@@ -160,14 +158,11 @@ def with_values(scenario: Scenario, wanted: Sequence[Unknown], x: FloatArray) ->
         dataclasses.replace(joint, servo=_servo(joint.servo, shared, factor.get(joint.name, 1.0)))
         for joint in scenario.robot.joints
     )
-    ground: Ground | None = scenario.world.ground
-    if ground is not None:
-        ground = dataclasses.replace(ground, **of_ground)
-    return dataclasses.replace(
-        scenario,
-        robot=dataclasses.replace(scenario.robot, joints=joints),
-        world=dataclasses.replace(scenario.world, ground=ground),
-    )
+    robot, world = dataclasses.replace(scenario.robot, joints=joints), scenario.world
+    if world.ground is not None:
+        ground = dataclasses.replace(world.ground, **of_ground)
+        world = dataclasses.replace(world, ground=ground)
+    return dataclasses.replace(scenario, robot=robot, world=world)
 
 
 def _servo(servo: Servo, shared: dict[str, float], factor: float) -> Servo:
@@ -223,9 +218,8 @@ def read_measured(session: SessionView, settle_s: float, end_s: float) -> Measur
             f"{session.path}: no joint has {FEWEST} samples on {RESPONSE_TOPIC} between "
             f"{settle_s:g} s and {end_s:g} s; is --settle too long?"
         )
-    return Measured(
-        tuple(found), tuple(t for t, _ in found.values()), tuple(a for _, a in found.values())
-    )
+    times, values = zip(*found.values(), strict=True)
+    return Measured(tuple(found), times, values)
 
 
 @dataclass
@@ -267,10 +261,8 @@ class Answers:
         Raises:
             SimulationError: If the twin fails with these parameters.
         """
-        late_s = next(
-            (one.value(e) for one, e in zip(wanted, x.tolist(), strict=True) if one.name == DELAY),
-            0.0,
-        )
+        pairs = zip(wanted, x.tolist(), strict=True)
+        late_s = sum(one.value(entry) for one, entry in pairs if one.name == DELAY)
         return self.sampled(self.run(with_values(self.scenario, wanted, x)), late_s)
 
     def run(self, scenario: Scenario) -> CubicHermiteSpline:
@@ -284,18 +276,15 @@ class Answers:
         """
         begun = time.perf_counter()
         quiet = dataclasses.replace(scenario, noise=Noise(), sensing=SensorModels())
-        times: list[float] = []
-        angles: list[FloatArray] = []
-        rates: list[FloatArray] = []
+        rows: list[tuple[float, FloatArray, FloatArray]] = []
         with Twin(quiet, self.make_gait(), kernels=self.kernels) as twin:
             for sample in twin.samples():
                 self.on_tick()
-                times.append(sample.time_s)
-                angles.append(sample.step.body.angle)
-                rates.append(sample.step.body.rate)
+                rows.append((sample.time_s, sample.step.body.angle, sample.step.body.rate))
         self.runs += 1
         self.work_s += time.perf_counter() - begun
-        return CubicHermiteSpline(np.array(times), np.array(angles), np.array(rates))
+        times, angles, rates = (np.array(column) for column in zip(*rows, strict=True))
+        return CubicHermiteSpline(times, angles, rates)
 
     def sampled(self, track: CubicHermiteSpline, late_s: float = 0.0) -> tuple[FloatArray, ...]:
         """A run at the measured instants.

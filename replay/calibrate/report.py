@@ -25,7 +25,7 @@ from undulog.capture.robot.model import Robot
 from undulog.sim.scenario.scenario import Modules
 
 from .fit import Calibration, Fitted
-from .identifiability import Z95, Alternative, CorrelatedParameters
+from .identifiability import Alternative, CorrelatedParameters
 from .lack_of_fit import LEVEL, LackOfFit, Misfit
 from .parameters import DELAY
 
@@ -77,14 +77,11 @@ def scenario_text(calibration: Calibration, robot_file: Path, scenario_file: Pat
         scenario_file: Where the scenario will be.
     """
     scenario = calibration.scenario
+    modules = {one.module for one in calibration.parameters}
     own = {
-        one.module: {
-            "stall_torque": scenario.robot.joints[
-                scenario.robot.joint_names.index(one.module)
-            ].servo.stall_torque
-        }
-        for one in calibration.parameters
-        if one.module is not None
+        joint.name: {"stall_torque": joint.servo.stall_torque}
+        for joint in scenario.robot.joints
+        if joint.name in modules
     }
     named = dataclasses.replace(
         scenario,
@@ -116,11 +113,8 @@ def write_calibration(
 
 def _write_listed(robot: Robot, folder: Path) -> None:
     """The DBC files and meshes that a description lists lie beside it; those there are left."""
-    listed = {
-        **{name: text.encode() for name, text in robot.databases},
-        **dict(robot.meshes),
-    }
-    for name, content in listed.items():
+    databases = {name: text.encode() for name, text in robot.databases}
+    for name, content in (databases | dict(robot.meshes)).items():
         path = folder / name
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -173,55 +167,35 @@ def reported(calibration: Calibration) -> dict[str, Any]:
     Returns:
         SI units; ``within`` of intervals as pairs.
     """
-    search = calibration.search
+    search, lack = calibration.search, calibration.lack
     return {
         "session": calibration.session,
         "world": calibration.world,
         "parameters": [
-            {
-                "name": one.name,
-                "module": one.module,
-                "unit": one.unit,
-                "start": one.start,
-                "value": one.value,
-                "ci95": None if one.ci95 is None else list(one.ci95),
-                "determined": one.determined,
-            }
+            {key: value for key, value in vars(one).items() if key != "label"}
             for one in calibration.parameters
         ],
         "undetermined": [one.label for one in calibration.parameters if not one.determined],
-        "ridges": [{"left": one.left, "factors": one.factors} for one in calibration.ridges],
+        "ridges": [vars(one) for one in calibration.ridges],
         "would_tell": list(calibration.would_tell),
         "search": None
         if search is None
-        else {
-            "module": search.module,
-            "p": search.p,
-            "tried": search.tried,
-            "named": search.named and not calibration.lack.found,
-        },
+        else {**vars(search), "named": search.named and not lack.found},
         "misfit": {
             joint: {"before": vars(first), "after": vars(calibration.after[joint])}
             for joint, first in calibration.before.items()
         },
-        "fits": not calibration.lack.found,
+        "fits": not lack.found,
         "lack_of_fit": {
-            "p": calibration.lack.p,
-            "worst": calibration.lack.worst,
-            "gait_hz": calibration.lack.gait_hz,
-            "joints": {joint: vars(one) for joint, one in calibration.lack.joints.items()},
+            "p": lack.p,
+            "worst": lack.worst,
+            "gait_hz": lack.gait_hz,
+            "joints": {joint: vars(one) for joint, one in lack.joints.items()},
             "alternatives": [
-                {
-                    "label": one.label,
-                    "size": one.size,
-                    "ci95": [one.size - Z95 * one.error, one.size + Z95 * one.error],
-                    "p": one.p,
-                }
-                for one in calibration.lack.alternatives
+                {"label": one.label, "size": one.size, "ci95": one.ci95, "p": one.p}
+                for one in lack.alternatives
             ],
-            "unfitted": None
-            if calibration.lack.unfitted is None
-            else vars(calibration.lack.unfitted),
+            "unfitted": None if lack.unfitted is None else vars(lack.unfitted),
         },
         "rms_rad": {"before": _rms(calibration.before), "after": _rms(calibration.after)},
         "residual_memory_samples": calibration.memory,
@@ -262,7 +236,7 @@ def _lack(lack: LackOfFit) -> Iterator[str]:
 
 def _size(other: Alternative) -> str:
     """How much of another law, with its 95 % interval."""
-    low, high = other.size - Z95 * other.error, other.size + Z95 * other.error
+    low, high = other.ci95
     if other.widens:
         return f"weight {other.size:.2f} [{low:.2f}, {high:.2f}], 0 is the twin's law"
     return f"{other.size:.2g} rad [{low:.2g}, {high:.2g}]"

@@ -226,11 +226,6 @@ class Solution:
         """Diagonal of P^-1, shape (K,)."""
         return _precision(self.unknowns)
 
-    @property
-    def normal(self) -> FloatArray:
-        """A, shape (K, K)."""
-        return _normal(self.columns, self.sigma, self.precision)
-
 
 def solve(
     answers: Answers,
@@ -261,12 +256,12 @@ def solve(
         sigma = deviations(residuals)
         if not converged:  # the last step is too small to change them
             columns = derivatives(answers, wanted, x)
-        normal = _normal(columns, sigma, precision)
+        normal = normal_of(columns, sigma, precision)
         if converged or iterations >= most:
             break
         iterations += 1
         on_iteration(iterations, float(np.sqrt(np.mean(np.concatenate(residuals) ** 2))))
-        slope = _slope(columns, residuals, sigma) - precision * x
+        slope = slope_of(columns, residuals, sigma) - precision * x
         errors = np.sqrt(np.diag(np.linalg.inv(normal)))
         cost = _cost(residuals, sigma, precision, x)
         for _ in range(_TRIES):
@@ -277,14 +272,13 @@ def solve(
             except SimulationError:  # too far: too stiff or too soft for the physics step
                 damping = max(30.0 * damping, 1e-2)
                 continue
+            converged = bool(np.all(np.abs(step) <= _DONE * errors))
             if _cost(there, sigma, precision, x + step) <= cost:
                 x, residuals = x + step, there
                 # None where none is needed: it would stop the way along a ridge.
                 damping = damping / 10.0 if damping > 1e-4 else 0.0
-                converged = bool(np.all(np.abs(step) <= _DONE * errors))
                 break
-            if np.all(np.abs(step) <= _DONE * errors):  # nothing to gain but rounding
-                converged = True
+            if converged:  # nothing to gain but rounding
                 break
             damping *= 10.0
         else:
@@ -292,11 +286,7 @@ def solve(
     return Solution(
         unknowns=wanted,
         x=x,
-        covariance=_covariance(
-            score_covariance(columns, residuals, sigma, precision),
-            normal,
-            precision,
-        ),
+        covariance=_covariance(columns, residuals, sigma, precision),
         before=before,
         after=residuals,
         columns=columns,
@@ -349,11 +339,10 @@ def covariance_with(
     Returns:
         The step, shape (K,), and the covariance, shape (K, K).
     """
-    normal = _normal(columns, sigma, precision)
-    step = np.linalg.solve(normal, _slope(columns, residuals, sigma) - prior)
+    normal = normal_of(columns, sigma, precision)
+    step = np.linalg.solve(normal, slope_of(columns, residuals, sigma) - prior)
     left = [r - c @ step for c, r in zip(columns, residuals, strict=True)]
-    scores = score_covariance(columns, left, sigma, precision)
-    return np.asarray(step, dtype=np.float64), _covariance(scores, normal, precision)
+    return np.asarray(step, dtype=np.float64), _covariance(columns, left, sigma, precision)
 
 
 def _residuals(
@@ -368,16 +357,20 @@ def _precision(wanted: Sequence[Unknown]) -> FloatArray:
     return np.array([one.spread**-2 for one in wanted])
 
 
-def _normal(columns: Sequence[FloatArray], sigma: FloatArray, precision: FloatArray) -> FloatArray:
+def normal_of(
+    columns: Sequence[FloatArray], sigma: FloatArray, precision: FloatArray
+) -> FloatArray:
+    """A of J = ``columns``, shape (K, K)."""
     return np.diag(precision) + sum(
         (c.T @ c / s**2 for c, s in zip(columns, sigma.tolist(), strict=True)),
         start=np.zeros((precision.size, precision.size)),
     )
 
 
-def _slope(
+def slope_of(
     columns: Sequence[FloatArray], residuals: Sequence[FloatArray], sigma: FloatArray
 ) -> FloatArray:
+    """J' W r, shape (K,)."""
     parts = zip(columns, residuals, sigma.tolist(), strict=True)
     return np.sum([c.T @ r / s**2 for c, r, s in parts], axis=0)
 
@@ -389,9 +382,15 @@ def _cost(
     return misfit + float(precision @ x**2)
 
 
-def _covariance(scores: FloatArray, normal: FloatArray, precision: FloatArray) -> FloatArray:
-    """A^-1 (B + P^-1) A^-1 of B = ``scores``, no direction narrower than A^-1 has it."""
-    values, vectors = np.linalg.eigh(normal)
+def _covariance(
+    columns: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
+    sigma: FloatArray,
+    precision: FloatArray,
+) -> FloatArray:
+    """A^-1 (B + P^-1) A^-1, no direction narrower than A^-1 has it."""
+    scores = score_covariance(columns, residuals, sigma, precision)
+    values, vectors = np.linalg.eigh(normal_of(columns, sigma, precision))
     root = vectors / np.sqrt(values)  # columns: root' A root = 1
     share, turn = np.linalg.eigh(root.T @ (scores + np.diag(precision)) @ root)
     spread = root @ turn

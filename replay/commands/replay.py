@@ -115,11 +115,9 @@ def replay(
         emit_json(_reported(again, changes))
     else:
         echo(*_told(again))
-        comparison = again.comparison
-        if comparison is not None and not (again.same and again.same.exact):
-            _show(comparison)
-        comparable = comparison is not None
-        echo(*what_next(file, again.recording.path, comparable=comparable))
+        if again.comparison is not None and not again.exact:
+            _show(again.comparison)
+        echo(*what_next(file, again.recording.path, comparable=again.comparison is not None))
     return 0
 
 
@@ -142,7 +140,7 @@ def _told(again: ReproducedRun) -> Iterator[str]:
         yield f"stopped at rest at {recording.duration_s:g} s of {scenario.duration_s:g} s"
     if again.same is not None:
         yield from _same(again.same)
-    if again.not_compared is not None and not (again.same and again.same.exact):
+    if again.not_compared is not None and not again.exact:
         yield f"Not compared: {again.not_compared}"
 
 

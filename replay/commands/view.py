@@ -6,16 +6,15 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 
-from .view_film import ClipOptions, view_clip
-from .view_overlay import OverlayOptions
-from .view_single import SingleOptions
+from .view_film import view_clip
+from .view_options import ClipOptions, OverlayOptions, SingleOptions
 
 if TYPE_CHECKING:
     from ..feed.recording import Recording
@@ -123,13 +122,11 @@ def _view_file(
     file: Path, single: SingleOptions, *, save: Path | None, web: bool, json: bool
 ) -> None:
     if save is not None:
-        recording, duration_s = _convert(file, save, single)
-        _report(recording, duration_s, json=json)
-        return
+        _report(*_convert(file, save, single), json=json)
+    else:
+        from .view_viewer import view_session
 
-    from .view_viewer import view_session
-
-    view_session(file, single, web=web)
+        view_session(file, single, web=web)
 
 
 def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording, float]:
@@ -170,23 +167,17 @@ def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording
 def _report(recording: Recording, duration_s: float, *, json: bool) -> None:
     size = recording.path.stat().st_size
     if json:
-        emit_json(_facts(recording, duration_s, size))
+        facts = {
+            "path": str(recording.path),
+            "bytes": size,
+            "recording_id": recording.recording_id,
+            "duration_s": duration_s,
+            "body": recording.content.start is not None,
+            "joints": [name for series in recording.content.measured for name in series.names],
+            "warnings": list(recording.warnings),
+        }
+        emit_json(facts)
         return
-    echo(
-        f"{recording.path}: {duration_s:.1f} s, {size / 1e6:.1f} MB; open it with: rerun "
-        f"{recording.path}"
-    )
-    for warning in recording.warnings:
-        echo(f"note: {warning}")
-
-
-def _facts(recording: Recording, duration_s: float, size: int) -> dict[str, Any]:
-    return {
-        "path": str(recording.path),
-        "bytes": size,
-        "recording_id": recording.recording_id,
-        "duration_s": duration_s,
-        "body": recording.content.start is not None,
-        "joints": [name for series in recording.content.measured for name in series.names],
-        "warnings": list(recording.warnings),
-    }
+    path = recording.path
+    echo(f"{path}: {duration_s:.1f} s, {size / 1e6:.1f} MB; open it with: rerun {path}")
+    echo(*(f"note: {warning}" for warning in recording.warnings))

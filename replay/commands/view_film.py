@@ -4,48 +4,18 @@ from __future__ import annotations
 
 import re
 import tempfile
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any
 
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import MissingExtraError, UsageError
 from undulog.capture.common.process import interruptible
 
+from .view_options import ClipOptions
+
 if TYPE_CHECKING:
     from ..feed.film import Shot
     from ..feed.recording import Recording
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClipOptions:
-    """The command line's options of a clip; None for those not given.
-
-    Attributes:
-        start: With `--clip`: where it begins, in seconds of the session.
-        end: With `--clip`: where it ends.
-        fps: With `--clip`: frames a second; 25 by default.
-        speed: With `--clip`: seconds of the session in a second of the clip, e.g. 0.25.
-        size: With `--clip`: WIDTHxHEIGHT in pixels; 960x540 by default.
-    """
-
-    start: Annotated[float | None, Parameter(name="--from")] = None
-    end: Annotated[float | None, Parameter(name="--to")] = None
-    fps: Annotated[int | None, Parameter(name="--fps")] = None
-    speed: Annotated[float | None, Parameter(name="--speed")] = None
-    size: Annotated[str | None, Parameter(name="--size")] = None
-
-    @property
-    def given(self) -> list[str]:
-        """Names of the options that were given."""
-        named = {"from": self.start, "to": self.end, "fps": self.fps, "speed": self.speed}
-        return [
-            f"--{name}"
-            for name, value in (named | {"size": self.size}).items()
-            if value is not None
-        ]
 
 
 def view_clip(file: Path, clip: Path, options: ClipOptions, *, force: bool, json: bool) -> None:
@@ -99,14 +69,10 @@ def _shot(options: ClipOptions, duration_s: float, file: Path) -> Shot:
     end_s = duration_s if options.end is None else options.end
     if end_s > duration_s:
         raise UsageError(f"--to {end_s:g}: {file.name} ends at {duration_s:.3f} s")
-    shot = Shot(options.start or 0.0, end_s)
-    if options.fps is not None:
-        shot = replace(shot, fps=options.fps)
-    if options.speed is not None:
-        shot = replace(shot, speed=options.speed)
-    if options.size is not None:
-        shot = replace(shot, size=_size(options.size))
-    return shot
+    size = None if options.size is None else _size(options.size)
+    given = {"fps": options.fps, "speed": options.speed, "size": size}
+    chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    return Shot(options.start or 0.0, end_s, **chosen)
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -136,5 +102,4 @@ def _report(clip: Path, shot: Shot, frames: int, recording: Recording, *, json: 
         f"{clip}: {facts['duration_s']:.2f} s, {frames} frames of {shot.size[0]}x{shot.size[1]}, "
         f"{facts['bytes'] / 1e6:.2f} MB"
     )
-    for warning in recording.warnings:
-        echo(f"note: {warning}")
+    echo(*(f"note: {warning}" for warning in recording.warnings))

@@ -5,45 +5,18 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any
 
 from undulog.capture.common.console import echo, emit_json, progress
 from undulog.capture.common.process import interruptible
 
 from ..viewer import viewer
+from .view_options import OverlayOptions
 
 if TYPE_CHECKING:
     from ..overlay.alignment import Align
     from ..overlay.write import Overlay, Place
-
-
-@dataclass(frozen=True, kw_only=True)
-class OverlayOptions:
-    """The command line's options of sessions side by side; None for those not given.
-
-    Attributes:
-        align: With several sessions, what happens at once: the same `time` since each one's first
-            sample (the default), the same time since the start of its `gait`, or the
-            same `phase` of the gait.
-        names: With several sessions: what they are called, with commas, e.g. `robot,twin`; the
-            files' names by default.
-        place: With several sessions: whether bodies are laid on the first one at the `start`
-            (the default) or stay where each session's `world` has them.
-    """
-
-    align: Annotated[Literal["time", "gait", "phase"] | None, Parameter(name="--align")] = None
-    names: Annotated[str | None, Parameter(name="--names")] = None
-    place: Annotated[Literal["start", "world"] | None, Parameter(name="--place")] = None
-
-    @property
-    def given(self) -> list[str]:
-        """Names of the options that were given."""
-        named = {"align": self.align, "names": self.names, "place": self.place}
-        return [f"--{name}" for name, value in named.items() if value is not None]
 
 
 def view_overlay(
@@ -76,7 +49,10 @@ def view_overlay(
     if save is None and not web:
         viewer.require_display()
     with ExitStack() as stack:
-        path = save or _in_passing(stack)
+        path = save
+        if path is None:  # it is only looked at
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="undulog-view-"))
+            path = Path(folder) / "beside.rrd"
         with interruptible() as stop, progress("view", total=steps(len(files))) as bar:
             beside = combine_sessions(
                 files,
@@ -94,16 +70,19 @@ def view_overlay(
             viewer.show(path)
 
 
-def _in_passing(stack: ExitStack) -> Path:
-    """Where a recording goes that is only looked at."""
-    folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="undulog-view-"))
-    return Path(folder) / "beside.rrd"
-
-
 def _report(beside: Overlay, how: Align, place: Place, *, saved: bool, json: bool) -> None:
     size = beside.path.stat().st_size
     if json:
-        emit_json(_facts(beside, how, place, size))
+        facts = {
+            "path": str(beside.path),
+            "bytes": size,
+            "recording_id": beside.recording_id,
+            "align": str(how),
+            "place": str(place),
+            "sessions": [_session(beside, k) for k in range(len(beside.shown))],
+            "warnings": list(beside.warnings),
+        }
+        emit_json(facts)
         return
     from ..overlay import layout as words
 
@@ -112,20 +91,7 @@ def _report(beside: Overlay, how: Align, place: Place, *, saved: bool, json: boo
         echo(f"{words.answer(first, other, beside.found[other.name])}.")
     if saved:
         echo(f"{beside.path}: {size / 1e6:.1f} MB; open it with: rerun {beside.path}")
-    for warning in beside.warnings:
-        echo(f"note: {warning}")
-
-
-def _facts(beside: Overlay, how: Align, place: Place, size: int) -> dict[str, Any]:
-    return {
-        "path": str(beside.path),
-        "bytes": size,
-        "recording_id": beside.recording_id,
-        "align": str(how),
-        "place": str(place),
-        "sessions": [_session(beside, k) for k in range(len(beside.shown))],
-        "warnings": list(beside.warnings),
-    }
+    echo(*(f"note: {warning}" for warning in beside.warnings))
 
 
 def _session(beside: Overlay, place: int) -> dict[str, Any]:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
-from undulog.capture import Session, SessionView
+from undulog.capture import Session
 from undulog.capture.common.console import complain, echo, emit_json, progress
 from undulog.capture.common.process import interruptible
 
 from ..samples.content import Layer
 from ..viewer import viewer
-from .view_single import SingleOptions
+from .view_options import SingleOptions
 
 if TYPE_CHECKING:
     from ..live.relay import RelayReport
@@ -37,11 +38,10 @@ def view_live(path: Path, *, save: Path | None, web: bool, connect: str | None, 
         UndulogError: If the viewer or the drawing fails.
     """
     from ..live.relay import open_server, open_window, relay_to_file, relay_to_viewer
-    from ..viewer import viewer
 
     if not (web or connect or save):
         viewer.require_display()
-    os.nice(max(_LIVE_NICENESS - os.nice(0), 0))  # it never competes with the recorder
+    _be_nice(_LIVE_NICENESS)  # it never competes with the recorder
     if save is not None:
         report = relay_to_file(path, save)
     elif connect is not None:
@@ -57,13 +57,8 @@ def view_live(path: Path, *, save: Path | None, web: bool, connect: str | None, 
     else:
         _tell(report, save)
     if connect is not None and report.complaint:
-        _leave(report.complaint)
-
-
-def _leave(complaint: str) -> NoReturn:
-    """End the process at once: Rerun would wait at its end for a viewer that takes nothing."""
-    complain(f"error: {complaint}")
-    os._exit(1)
+        complain(f"error: {report.complaint}")
+        os._exit(1)  # at once: Rerun would wait at its end for a viewer that takes nothing
 
 
 def _tell(report: RelayReport, save: Path | None) -> None:
@@ -109,16 +104,18 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
     with ExitStack() as stack:
         stop = stack.enter_context(interruptible())
         session = single.view(stack.enter_context(Session.open(file)))
-        known = _known(session, single)
+        known = Layer(None)
+        if single.result:
+            from ..feed.numbers import read_results
+
+            known = read_results(session, single.result)
         if web:
             process, page = viewer.open_server(viewer.WHOLE_IN_MEMORY)
-        else:
-            process, page = viewer.open_window(), ""
-        stack.enter_context(process)
-        if page:
-            process.wait_until_it_listens()
+            stack.enter_context(process).wait_until_it_listens()
             echo(page)
-        # Rerun would report a closed window as errors of its own, in colours.
+        else:
+            process = stack.enter_context(viewer.open_window())
+        # Rerun would tell a closed window as errors of its own, in colours.
         os.environ.setdefault("RUST_LOG", "off")
         from ..feed.numbers import Analysing
         from ..feed.progressive import NoLongerWantedError, Task, show_session, steps
@@ -128,25 +125,16 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
             with progress("view", total=steps(session)) as bar:
                 bar.update(0, note=_FIRST)
                 front = single.tab or "session"
-                task = Task(session, known, analysing, front, bar, begun=_make_way)
+                # What is looked at goes before what is converted.
+                begun = partial(_be_nice, _NICENESS)
+                task = Task(session, known, analysing, front, bar, begun=begun)
                 notes = show_session(task, process, stop)
         except NoLongerWantedError:
             return
         echo(f"{file}: {session.duration_s:.1f} s, all of it in the viewer")
-        for note in notes:
-            echo(f"note: {note}")
+        echo(*(f"note: {note}" for note in notes))
         process.wait(stop)
 
 
-def _make_way() -> None:
-    """Have what is looked at go before what is converted."""
-    os.nice(max(_NICENESS - os.nice(0), 0))
-
-
-def _known(session: SessionView, single: SingleOptions) -> Layer:
-    """Its entry in results."""
-    if not single.result:
-        return Layer(None)
-    from ..feed.numbers import read_results
-
-    return read_results(session, single.result)
+def _be_nice(niceness: int) -> None:
+    os.nice(max(niceness - os.nice(0), 0))

@@ -25,7 +25,7 @@ from ..samples.timeline import Clock, Span, Stretch
 from ..samples.tracks import Track, drawn_topics, read_columns
 from . import facts
 from .cycles.heat_maps import heat_maps, log_maps
-from .cycles.mean_cycle import Look, averaged_ns, log_mean_cycle, read_channels
+from .cycles.mean_cycle import Look, log_mean_cycle, read_averaged
 from .cycles.steps import charts, cycle_tables, log_charts, log_current, log_cycles
 from .plots import gait, joints
 from .plots.write import Plots, log_others, log_words
@@ -183,11 +183,10 @@ class Drawing:
         analysis, sources = layer.analysis, self._sources
         tables = cycle_tables(analysis, layer.steady) if analysis is not None else ()
         cycles = log_cycles(self._rec, self._clock, tables, self._palette)
-        part_ns = averaged_ns(self._clock, analysis)
         mean = log_mean_cycle(
             self._rec,
             self._clock,
-            read_channels(sources.session, sources.found.wanted, part_ns),
+            read_averaged(sources.session, sources.found.wanted, self._clock, analysis),
             Look(sources.session.robot, self._places, self._palette, self.limit_w),
             analysis=analysis,
             warnings=sources.warnings,
@@ -235,9 +234,6 @@ class Drawing:
             errors=plots.series(entities.ERROR),
             has_power=any(one.startswith(entities.TOTAL) for one in self._sources.found.samples),
             joint_power=plots.series(entities.MECHANICAL),
-            charts=(),
-            modes=0,
-            has_events=False,
             signals=self._signals(),
         )
 

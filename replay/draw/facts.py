@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from undulog.analysis.results.analysis import Analysis, GroupFacts
+from undulog.analysis.results.analysis import Analysis, GaitFacts, GroupFacts
 from undulog.analysis.results.formats import utc
 from undulog.capture import SessionView
 from undulog.capture.common.console import plain
@@ -70,18 +70,26 @@ def markdown(
         *_health(session.metadata),
         *_versions(session.metadata),
     )
-    parts = [f"**{escaped(_told_first(analysis, awaited=awaited))}**"]
-    if named:
-        told = ", ".join(f"{escaped(one.joint)} ({escaped(one.why)})" for one in named)
-        parts.append(f"**Named, pink in the pictures:** {told}")
-    parts.append(" · ".join(facts))
-    told = dict.fromkeys([*notes, *(() if analysis is None else analysis.warnings)])
-    if told:
-        parts.append("\n".join(f"- {escaped(note)}" for note in told))
-    legend = _legend(colors, content, has_cycles=has_cycles)
-    if legend:
-        parts.append(legend)
-    return "\n\n".join(parts) + "\n"
+    joints = ", ".join(f"{escaped(one.joint)} ({escaped(one.why)})" for one in named)
+    return document(
+        [
+            f"**{escaped(_told_first(analysis, awaited=awaited))}**",
+            f"**Named, pink in the pictures:** {joints}" if named else "",
+            " · ".join(facts),
+            listed([*notes, *(() if analysis is None else analysis.warnings)]),
+            _legend(colors, content, has_cycles=has_cycles),
+        ]
+    )
+
+
+def document(paragraphs: Sequence[str]) -> str:
+    """Markdown of those paragraphs that aren't empty."""
+    return "\n\n".join(filter(None, paragraphs)) + "\n"
+
+
+def listed(notes: Sequence[str]) -> str:
+    """Notes as a list in Markdown, each once."""
+    return "\n".join(f"- {escaped(note)}" for note in dict.fromkeys(notes))
 
 
 def _told_first(analysis: Analysis | None, *, awaited: bool) -> str:
@@ -127,24 +135,20 @@ def _robot(session: SessionView) -> str:
 def _gait(analysis: Analysis | None) -> list[str]:
     if analysis is None or analysis.gait.frequency_hz.value is None:
         return []
-    text = f"{analysis.gait.frequency_hz.value:.3f} Hz"
-    if len(analysis.gait.groups) > 1:
-        return [_group(group) for group in analysis.gait.groups]
-    if analysis.gait.wave is not None:
-        text += f", wave {analysis.gait.wave}"
-    for plane, lag in analysis.gait.lag_per_joint_rad.items():
-        text += f", {math.degrees(lag):.1f}° a joint ({plane})"
-    return [text]
+    groups = analysis.gait.groups
+    if len(groups) > 1:
+        return [_wave(group, f" ({len(group.joints)} joints)") for group in groups]
+    return [_wave(analysis.gait)]
 
 
-def _group(group: GroupFacts) -> str:
-    """Frequency, number of joints and wave of one group."""
-    text = f"{group.frequency_hz.value:.3f} Hz ({len(group.joints)} joints)"
-    if group.wave is not None:
-        text += f", wave {group.wave}"
-    for plane, lag in group.lag_per_joint_rad.items():
-        text += f", {math.degrees(lag):.1f}° a joint ({plane})"
-    return text
+def _wave(gait: GaitFacts | GroupFacts, joints: str = "") -> str:
+    """Frequency, number of joints and wave of one group, or of all joints."""
+    parts = [f"{gait.frequency_hz.value:.3f} Hz{joints}"]
+    if gait.wave is not None:
+        parts.append(f"wave {gait.wave}")
+    for plane, lag in gait.lag_per_joint_rad.items():
+        parts.append(f"{math.degrees(lag):.1f}° a joint ({plane})")
+    return ", ".join(parts)
 
 
 def _health(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:

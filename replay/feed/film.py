@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import av
 import numpy as np
@@ -35,18 +35,6 @@ GIF_FPS = 50
 """More frames a second than this a browser slows down to ten."""
 
 _COLORS = 128
-
-
-class Film(Protocol):
-    """A file that takes frames."""
-
-    def add(self, frame: Image.Image) -> None:
-        """Append a frame.
-
-        Args:
-            frame: RGB, of the film's size.
-        """
-        ...
 
 
 @contextmanager
@@ -100,15 +88,24 @@ def check_film(kind: str, size: tuple[int, int], fps: int) -> None:
         raise UsageError(f"--size {size[0]}x{size[1]}: H.264 needs an even width and height")
 
 
-class _Frames:
-    """Frames into one stream of a container."""
+class Film:
+    """A file that takes frames: one stream of a container."""
 
     options: ClassVar[dict[str, str]] = {}
 
     def __init__(self, container: Any, stream: VideoStream, fps: int) -> None:
+        """Take a stream of the container that has no frames yet."""
         self._container = container
         self._stream: Any = stream  # the stub's packets are of unknown kind
         self._step, self._count = Fraction(1, fps), 0
+
+    def add(self, frame: Image.Image) -> None:
+        """Append a frame.
+
+        Args:
+            frame: RGB, of the film's size.
+        """
+        raise NotImplementedError
 
     def end(self) -> None:
         """Write what the encoder still holds."""
@@ -120,7 +117,7 @@ class _Frames:
         self._container.mux(self._stream.encode(frame))
 
 
-class _Gif(_Frames):
+class _Gif(Film):
     """One palette for all frames and no dither: what doesn't move doesn't flicker, and is small."""
 
     def __init__(
@@ -146,7 +143,7 @@ class _Gif(_Frames):
         self._write(av.VideoFrame.from_ndarray(both, format="pal8"))
 
 
-class _Mp4(_Frames):
+class _Mp4(Film):
     """H.264 that every browser plays, its colours named, its index in front."""
 
     options: ClassVar[dict[str, str]] = {"movflags": "+faststart"}

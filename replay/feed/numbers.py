@@ -16,8 +16,8 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Self
 
 from undulog.analysis.present.notebook.files import load
 from undulog.analysis.results.analysis import Analysis
@@ -36,8 +36,8 @@ from ..samples.content import Layer, Named
 _NICENESS = 10
 
 
-class Analysing:
-    """An analysis that is on its way."""
+class Analysing(AbstractContextManager["Analysing"]):
+    """An analysis that is started when there is time for it, and ended on leaving."""
 
     def __init__(self, path: Path, topics: tuple[str, str]) -> None:
         """Prepare it.
@@ -49,10 +49,6 @@ class Analysing:
         self._process: subprocess.Popen[bytes] | None = None
         self._answer = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
         self._said = tempfile.TemporaryFile()  # noqa: SIM115
-
-    def __enter__(self) -> Self:
-        """Nothing to do: it is started when there is time for it."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """End it."""
@@ -170,45 +166,37 @@ def read_results(session: SessionView, paths: Sequence[Path]) -> Layer:
                 f"{path}: a {kind} names no session; give the result that it is part of"
             )
         own = _own(result, session, path)
-        if own is not None and analysis is not None:
-            raise DataError(f"{path}: the second result with numbers of this session; give one")
-        analysis = own or analysis
+        found = list(_named(result))
         if own is not None:
+            if analysis is not None:
+                raise DataError(f"{path}: the second result with numbers of this session; give one")
+            analysis = own
             notes.append(f"gain, lag and energy are those of {path.name}")
-        for one in (
-            *_named(result),
-            *(_named(own) if own is not None and own is not result else ()),
-        ):
+            found += _named(own) if own is not result else ()
+        for one in found:
             named.setdefault(one.joint, []).append(f"{one.why} ({path.name})")
-    found = tuple(Named(joint, "; ".join(dict.fromkeys(why))) for joint, why in named.items())
-    return Layer(analysis, named=found, notes=tuple(notes))
+    told = tuple(Named(joint, "; ".join(dict.fromkeys(why))) for joint, why in named.items())
+    return Layer(analysis, named=told, notes=tuple(notes))
 
 
 def _own(
     result: Analysis | Experiment | Comparison, session: SessionView, path: Path
 ) -> Analysis | None:
     """The session's own numbers in a result, or None where it only compares."""
-    if isinstance(result, Analysis):
-        known = [result.session.id]
-    elif isinstance(result, Experiment):
-        known = [one.session.id for one in result.sessions]
+    numbers: dict[str, Analysis | None]
+    if isinstance(result, Comparison):
+        numbers = dict.fromkeys(one.id for one in (*result.a, *result.b))
     else:
-        known = [one.id for one in (*result.a, *result.b)]
-    if session.session_id not in known:
+        several = result.sessions if isinstance(result, Experiment) else [result]
+        numbers = {one.session.id: one for one in several}
+    if session.session_id not in numbers:
+        ids = list(numbers)
+        few = f"session{'s' * (len(ids) > 1)} {', '.join(ids[:3])}{' and others' * (len(ids) > 3)}"
         raise DataError(
-            f"{path}: a result of {_listed(known)}; the session is {session.session_id}, so give "
-            "the result of that one"
+            f"{path}: a result of {few}; the session is {session.session_id}, so give the result "
+            "of that one"
         )
-    if isinstance(result, Analysis):
-        return result
-    if isinstance(result, Experiment):
-        return result.sessions[known.index(session.session_id)]
-    return None
-
-
-def _listed(ids: Sequence[str]) -> str:
-    few = ", ".join(ids[:3])
-    return f"session{'s' * (len(ids) > 1)} {few}{' and others' * (len(ids) > 3)}"
+    return numbers[session.session_id]
 
 
 def _named(result: Analysis | Experiment | Comparison) -> Iterator[Named]:
@@ -221,16 +209,14 @@ def _named(result: Analysis | Experiment | Comparison) -> Iterator[Named]:
     elif isinstance(result, Comparison):
         for joint in result.named:
             if joint.size >= 1.0:  # in margins: what differs by less is there, but small
-                yield Named(
-                    joint.name, f"answers differently in A and B, {p_value_text(joint.p_holm)}"
-                )
+                why = f"answers differently in A and B, {p_value_text(joint.p_holm)}"
+                yield Named(joint.name, why)
     elif isinstance(result, ModelledAnalysis):
         test = result.null_model
         for module in test.modules:
             if module.name in test.named:
-                yield Named(
-                    module.name, f"deviates from the others' model, {p_value_text(module.p)}"
-                )
+                why = f"deviates from the others' model, {p_value_text(module.p)}"
+                yield Named(module.name, why)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ import rerun.blueprint as rrb
 
 from undulog.capture import SessionView
 from undulog.capture.common.console import Progress
-from undulog.capture.common.errors import DataError, MissingChannelError, UndulogError
+from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.process import StopRequest
 
 from ..draw.cycles import mean_cycle
@@ -44,11 +44,10 @@ from ..samples.content import (
     Content,
     Layer,
     MeanCycle,
-    Quantity,
     Series,
     Tab,
 )
-from ..samples.survey import GAIT, Survey, survey
+from ..samples.survey import GAIT, Survey, comes, survey
 from ..samples.timeline import STRETCH_NS, Rhythm, Span, Stretch, stretches
 from ..samples.tracks import wanted_fields
 from ..viewer.viewer import Viewer
@@ -71,21 +70,29 @@ def predict_layout(content: Content, rhythm: Rhythm | None) -> Content:
         return content
     has_power = bool(content.joint_power)
     quantities = (GAIN, LAG, *((ENERGY,) if has_power else ()))
-    charts = tuple(Chart(one.key, _title(one), ()) for one in quantities)
+    # What is one a cycle is so in its bar.
+    units = [one.unit.partition("/")[0] for one in quantities]
+    charts = tuple(
+        Chart(one.key, f"{one.name} [{unit}]", ())
+        for one, unit in zip(quantities, units, strict=True)
+    )
     if rhythm is None:
         return replace(content, charts=charts)
     measured = _names(content.measured)
-    maps = (GAIN, LAG, *((POWER,) if has_power else ()))
+    mapped = (GAIN, LAG, *((POWER,) if has_power else ()))
+    cycles = abs(float(rhythm.cycles[-1] - rhythm.cycles[0]))
     return replace(
         content,
         charts=charts,
-        maps=tuple(_map(one) for one in maps),
+        maps=tuple(
+            AwaitedMap(f"{MAPS}/{one.key}", f"{one.name} map [{one.unit}]") for one in mapped
+        ),
         cycles=tuple((one, (Series(f"{CYCLES}/{one.key}", measured),)) for one in quantities),
         mean=MeanCycle(
-            period_s=_period_s(rhythm),
+            period_s=float(np.ptp(rhythm.t_ns)) * 1e-9 / cycles,
             has_body=content.start is not None,
             has_places=content.places is not None,
-            measured=(Series(f"{mean_cycle.ENSEMBLE}/measured", measured),),
+            measured=_mean_series("measured", measured),
             error=_mean_series("error", _names(content.errors)),
             power=_mean_series("power", _names(content.joint_power)),
         ),
@@ -111,26 +118,12 @@ def _arrangement(content: Content) -> tuple[object, ...]:
     return views, lines, content.modes > 1
 
 
-def _title(quantity: Quantity) -> str:
-    unit, _, _ = quantity.unit.partition("/")  # what is one a cycle is so in its bar
-    return f"{quantity.name} [{unit}]"
-
-
 def _names(series: tuple[Series, ...]) -> tuple[str, ...]:
     return tuple(name for one in series for name in one.names)
 
 
 def _mean_series(kind: str, names: tuple[str, ...]) -> tuple[Series, ...]:
     return (Series(f"{mean_cycle.ENSEMBLE}/{kind}", names),) if names else ()
-
-
-def _map(quantity: Quantity) -> AwaitedMap:
-    return AwaitedMap(f"{MAPS}/{quantity.key}", f"{quantity.name} map [{quantity.unit}]")
-
-
-def _period_s(rhythm: Rhythm) -> float:
-    cycles = abs(float(rhythm.cycles[-1] - rhythm.cycles[0]))
-    return float(np.ptp(rhythm.t_ns)) * 1e-9 / cycles
 
 
 _TAKE_S = 0.1
@@ -341,21 +334,19 @@ class _Numbers:
 
     def draw(self) -> Layer | None:
         """Draw them, unless they are drawn; None as long as they aren't known."""
-        if self._drawn is None:
-            known = self._known()
-            if known is not None:
-                self._drawing.write_response(known)
-                self._drawing.write_cycles(known)
-                self._drawing.write_facts(self._task.session, known, self._drawing.content)
-                self._drawn = known
-        return self._drawn
-
-    def _known(self) -> Layer | None:
+        if self._drawn is not None:
+            return self._drawn
         known = self._task.known
-        if known.analysis is not None:
-            return known
-        computed = self._task.analysing.layer
-        return None if computed is None else known.with_numbers(computed)
+        if known.analysis is None:
+            computed = self._task.analysing.layer
+            if computed is None:
+                return None
+            known = known.with_numbers(computed)
+        self._drawing.write_response(known)
+        self._drawing.write_cycles(known)
+        self._drawing.write_facts(self._task.session, known, self._drawing.content)
+        self._drawn = known
+        return known
 
 
 def _whole(session: SessionView, found: Survey) -> Survey:
@@ -381,13 +372,8 @@ def _require_nothing_else(session: SessionView, found: Survey) -> None:
     """Look for fields that begin after all that a brief survey saw."""
     for topic, fields in wanted_fields(session).items():
         for one in fields if topic != GAIT else ():
-            if one in found.wanted.get(topic, ()):
-                continue
-            try:
-                session.joints(topic, one)
-            except (MissingChannelError, DataError):
-                continue  # it never comes
-            raise _UnforeseenError(f"{topic} ({one})")
+            if one not in found.wanted.get(topic, ()) and comes(session, topic, one):
+                raise _UnforeseenError(f"{topic} ({one})")
 
 
 def _words(session: SessionView) -> int:

@@ -23,7 +23,7 @@ from undulog.capture.robot.model import Robot
 
 from ..samples.quantities import products
 from ..samples.survey import GAIT
-from ..samples.tracks import Track
+from ..samples.tracks import Track, one_after_another
 from .decode import Batch
 from .inbox import PATIENCE_NS
 
@@ -69,25 +69,23 @@ class _Store:
     """Samples of one joint, the last minute's."""
 
     def __init__(self) -> None:
-        self._parts: list[tuple[IntArray, FloatArray]] = []
+        self._parts: list[Track] = []
 
     def add(self, track: Track) -> None:
-        self._parts.append((track.t_ns, track.values))
+        self._parts.append(track)
 
     def forget(self, before_ns: int) -> None:
         """Let go of batches that end before a time."""
-        while self._parts and int(self._parts[0][0][-1]) < before_ns:
+        while self._parts and int(self._parts[0].t_ns[-1]) < before_ns:
             self._parts.pop(0)
 
     @property
     def last_ns(self) -> int:
-        return int(self._parts[-1][0][-1]) if self._parts else 0
+        return int(self._parts[-1].t_ns[-1]) if self._parts else 0
 
     def track(self, name: str) -> Track:
-        if not self._parts:
-            return Track(name, np.zeros(0, dtype=np.int64), np.zeros(0))
-        times, values = zip(*self._parts, strict=True)
-        return Track(name, np.concatenate(times), np.concatenate(values))
+        nothing = Track(name, np.zeros(0, dtype=np.int64), np.zeros(0))
+        return one_after_another(self._parts or [nothing])
 
 
 class CycleMeter:

@@ -38,8 +38,8 @@ _STRING = "std_msgs/msg/String"
 _LOG = "rcl_interfaces/msg/Log"
 
 
-_Offsets = dict[str, tuple[IntArray, FloatArray]]
-"""Joint to stamps [ns] and sample time minus stamp [s]."""
+Samples = tuple[IntArray, FloatArray]
+"""Times [ns], and a value at each."""
 
 
 @dataclass
@@ -57,9 +57,7 @@ class Batch:
 
     columns: Columns = field(default_factory=Columns)
     head: HeadPath | None = None
-    ranges: dict[str, tuple[IntArray, FloatArray]] = field(
-        default_factory=dict[str, tuple[IntArray, FloatArray]]
-    )
+    ranges: dict[str, Samples] = field(default_factory=dict[str, Samples])
     modes: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])
     events: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
     newest_ns: int = 0
@@ -103,7 +101,8 @@ class LiveLog:
         self._topics: dict[int, _Topic] = {}
         self._files: dict[str, str] = {}
         self._robot: Robot | None = None
-        self._offsets: dict[str, _Offsets] = {}
+        # Topic and joint to stamps and sample time minus stamp [s].
+        self._offsets: dict[str, dict[str, Samples]] = {}
         self._robot_is_read = True
         self._shift_ns: int | None = None
 
@@ -142,7 +141,7 @@ class LiveLog:
                     self._files[record.name] = text
                     self._robot_is_read = False
             case _:
-                return
+                pass
 
     def decode(self, messages: Iterable[LiveMessage]) -> Batch:
         """Read messages.
@@ -158,10 +157,11 @@ class LiveLog:
             batch.messages += 1
         found: list[tuple[_Topic, list[LiveMessage]]] = []
         for channel_id, own in by_channel.items():
-            if channel_id in self._topics:
-                found.append((self._topics[channel_id], own))
-            else:
+            topic = self._topics.get(channel_id)
+            if topic is None:
                 self.unread += len(own)
+            else:
+                found.append((topic, own))
         found.sort(key=lambda pair: pair[0].channel.topic not in OFFSETS)  # these tell the times
         for topic, own in found:
             self._read(topic, own, batch)
@@ -197,21 +197,26 @@ class LiveLog:
         if type_name == JOINT_STATE:
             self._read_joints(topic, messages, batch)
         elif type_name == _ODOMETRY and name == "/odom":
-            groups = self._groups(topic, messages)
-            if groups:
-                poses = [np.concatenate([g.values(p) for p in POSE], axis=1) for g in groups]
-                t_ns = np.concatenate([group.t_ns for group in groups])
-                batch.head = tracked_head(t_ns, np.concatenate(poses).astype(np.float64))
+            if samples := self._samples(topic, messages, POSE):
+                batch.head = tracked_head(*samples)
         elif type_name == _RANGE:
-            groups = self._groups(topic, messages)
-            if groups:
-                t_ns = np.concatenate([group.t_ns for group in groups])
-                values = np.concatenate([group.values("range")[:, 0] for group in groups])
-                batch.ranges[name] = ordered(t_ns, values.astype(np.float64))
+            if samples := self._samples(topic, messages, ["range"]):
+                batch.ranges[name] = ordered(samples[0], samples[1][:, 0])
         elif type_name == _STRING and name == MODE:
             batch.modes += [(t, str(m.data)) for t, m in self._general(topic, messages)]
         elif type_name == _LOG:
             batch.events += self._general(topic, messages)
+
+    def _samples(
+        self, topic: _Topic, messages: Sequence[LiveMessage], fields: Sequence[str]
+    ) -> Samples | None:
+        """Some numbers of each message, shape (n, number of fields); None where none is read."""
+        groups = self._groups(topic, messages)
+        if not groups:
+            return None
+        rows = [np.concatenate([group.values(one) for one in fields], axis=1) for group in groups]
+        t_ns = np.concatenate([group.t_ns for group in groups])
+        return t_ns, np.concatenate(rows).astype(np.float64)
 
     def _read_joints(self, topic: _Topic, messages: Sequence[LiveMessage], batch: Batch) -> None:
         name = topic.channel.topic

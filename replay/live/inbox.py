@@ -12,8 +12,9 @@ import socket
 import threading
 from collections import deque
 from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -76,7 +77,7 @@ class Window:
         for topic, (t_ns, values) in batch.ranges.items():
             self.ranges[topic] = _grown(self.ranges.get(topic), t_ns, values)
         if batch.head is not None:
-            self.head = _joined(self.head, batch.head)
+            self.head = joined(self.head, batch.head)
         ends = [one.t_ns[-1] for tracks in batch.columns.values() for one in tracks]
         self._newest_ns = max([self._newest_ns, *map(int, ends)])
 
@@ -141,19 +142,18 @@ def _grown(
     old: tuple[IntArray, FloatArray] | None, t_ns: IntArray, values: FloatArray
 ) -> tuple[IntArray, FloatArray]:
     """New samples after those of the last seconds before them."""
-    if old is None or not t_ns.size:
-        return (t_ns, values) if old is None else old
+    if old is None:
+        return t_ns, values
+    if not t_ns.size:
+        return old
     first = int(np.searchsorted(old[0], int(t_ns[0]) - KEPT_NS))
     return ordered(np.concatenate([old[0][first:], t_ns]), np.concatenate([old[1][first:], values]))
 
 
-def _joined(old: HeadPath | None, new: HeadPath) -> HeadPath:
-    kept = None
-    if old is not None:
-        kept = old.t_ns, np.concatenate([old.position, old.quaternion], axis=1)
-    pose = np.concatenate([new.position, new.quaternion], axis=1)
-    t_ns, pose = _grown(kept, new.t_ns, pose)
-    return HeadPath(t_ns, pose[:, :3], pose[:, 3:], tracked=True)
+def joined(old: HeadPath | None, new: HeadPath) -> HeadPath:
+    """A tracked head's path after that of the last seconds before it."""
+    kept = None if old is None else (old.t_ns, old.pose)
+    return HeadPath.of(*_grown(kept, new.t_ns, new.pose), tracked=True)
 
 
 _LOOK_S = 0.01
@@ -170,7 +170,7 @@ class Datagram(NamedTuple):
     data: bytes
 
 
-class Inbox:
+class Inbox(AbstractContextManager["Inbox"]):
     """Binds the socket and reads it until it is left."""
 
     def __init__(self, path: Path, *, max_bytes: int = 16 << 20) -> None:
@@ -197,10 +197,6 @@ class Inbox:
         self._thread = threading.Thread(target=self._read, name="live inbox", daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> Self:
-        """Nothing to do: it reads."""
-        return self
-
     def __exit__(self, *_: object) -> None:
         """Stop reading and remove the socket."""
         self.close()
@@ -210,11 +206,9 @@ class Inbox:
         self._ending.set()
         self._thread.join()
         self._socket.close()
-        try:
+        with suppress(FileNotFoundError):
             if self.path.stat().st_ino == self._file:
                 self.path.unlink()
-        except FileNotFoundError:
-            return
 
     def take(self) -> list[Datagram]:
         """What has come since the last time, in order."""

@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
-from rerun.components import InterpolationMode
 
 from undulog.capture.common.arrays import FloatArray
 
 from ..draw.cycles.heat_maps import POWER
 from ..draw.cycles.steps import CYCLES, SEGMENTS
-from ..draw.plots.joints import DEGREES, log_look, log_rows, part_entity
+from ..draw.plots.joints import DEGREES, log_look, log_rows, part_entities
 from ..samples.content import GAIN, LAG, SCALARS, Chart, Color, Quantity, Series
 from ..samples.sampling import GAP_STEPS, mark_gaps, typical_step_ns
 from ..samples.timeline import SESSION_TIME, Clock
@@ -55,15 +54,15 @@ class LiveStream(rr.RecordingStream):
         super().log(entity_path, entity, *extra, static=static, strict=strict)
 
     def _is_news(self, entity_path: str, archetypes: Sequence[Any]) -> bool:
-        news = False
-        for archetype in archetypes:
-            for batch in archetype.as_component_batches():
-                key = (entity_path, str(batch.component_descriptor()))
-                value = batch.as_arrow_array()
-                if key not in self._said or not self._said[key].equals(value):
-                    self._said[key] = value
-                    news = True
-        return news
+        batches = [batch for one in archetypes for batch in one.as_component_batches()]
+        values = {
+            (entity_path, str(batch.component_descriptor())): batch.as_arrow_array()
+            for batch in batches
+        }
+        known = self._said
+        news = [key for key in values if key not in known or not known[key].equals(values[key])]
+        known.update(values)
+        return bool(news)
 
 
 class LivePlot:
@@ -79,8 +78,7 @@ class LivePlot:
         *,
         degrees: bool = False,
         component: str | None = None,
-        titles: Mapping[str, str] | None = None,
-        width: float | None = None,
+        **look: Any,
     ) -> None:
         """Start without joints.
 
@@ -88,12 +86,11 @@ class LivePlot:
             entity: E.g. ``/joints/measured``.
             degrees: Whether the values are angles [rad], to be plotted in degrees.
             component: What is written; None for ``Angle:degrees`` or ``Scalars:scalars``.
-            titles: Lines' names by joint name; None for the joints' own.
-            width: Of the lines [points]; None for the viewer's own.
+            look: As :func:`~.replay.draw.plots.joints.log_look` takes it.
         """
         self._entity, self._degrees = entity, degrees
         self._component = component or (DEGREES if degrees else SCALARS)
-        self._titles, self._width = titles, width
+        self._kind = look
         self._parts: list[tuple[str, ...]] = []
         self._last: dict[str, tuple[int, int]] = {}
         self._looks: dict[str, tuple[tuple[str, ...], list[Color | None] | None]] = {}
@@ -101,7 +98,9 @@ class LivePlot:
     @property
     def series(self) -> tuple[Series, ...]:
         """What has been written."""
-        return tuple(Series(self._path(part), part, self._component) for part in self._parts)
+        paths = part_entities(self._entity, self._parts)
+        pairs = zip(paths, self._parts, strict=True)
+        return tuple(Series(path, part, self._component) for path, part in pairs)
 
     def write(
         self,
@@ -124,38 +123,17 @@ class LivePlot:
             if own and (len(own) < len(part) or len(tables(own)) > 1):
                 at = self._parts.index(part)
                 self._parts[at : at + 1] = [(name,) for name in part]
-        for part in self._parts:
+        for path, part in zip(part_entities(self._entity, self._parts), self._parts, strict=True):
             if part[0] in by_name:
                 (table,) = tables([by_name[name] for name in part])
-                path = self._path(part)
                 table = self._with_gap(path, table)
-                self._say_look(rec, path, part, palette)
+                look = part, None if palette is None else [palette.get(name) for name in part]
+                if self._looks.get(path) != look:
+                    self._looks[path] = look
+                    log_look(rec, path, part, palette, **self._kind)
                 t_ns, values = mark_gaps(table.t_ns, table.values)
-                log_rows(
-                    rec,
-                    clock,
-                    path,
-                    t_ns,
-                    values,
-                    degrees=self._degrees,
-                    component=self._component,
-                )
-
-    def _say_look(
-        self,
-        rec: rr.RecordingStream,
-        path: str,
-        part: tuple[str, ...],
-        palette: Mapping[str, Color] | None,
-    ) -> None:
-        """Say how the lines look, unless it has been said."""
-        look = part, None if palette is None else [palette.get(name) for name in part]
-        if self._looks.get(path) != look:
-            self._looks[path] = look
-            log_look(rec, path, part, palette, titles=self._titles, width=self._width)
-
-    def _path(self, part: tuple[str, ...]) -> str:
-        return self._entity if len(self._parts) == 1 else part_entity(self._entity, part[0])
+                component = self._component
+                log_rows(rec, clock, path, t_ns, values, degrees=self._degrees, component=component)
 
     def _with_gap(self, path: str, table: Table) -> Table:
         """A row of NaN before the samples where there was a gap, which ends the line."""
@@ -169,7 +147,6 @@ class LivePlot:
 
 
 _WIDTH = 0.8
-_STEPS = rr.SeriesLines.from_fields(interpolation_mode=InterpolationMode.StepAfter)
 
 
 class CycleBars:
@@ -186,8 +163,7 @@ class CycleBars:
         """The bar charts that have been written to."""
         return tuple(
             Chart(quantity.key, f"{quantity.name} [{quantity.unit}]", ())
-            for quantity in (GAIN, LAG, POWER)
-            if quantity in self._plots
+            for quantity, _ in self.cycles
         )
 
     @property
@@ -232,10 +208,9 @@ class CycleBars:
             )
             self._write_bars(rec, quantity, tracks, palette)
             rec.reset_time()
-            plot = self._plots.setdefault(quantity, LivePlot(f"{CYCLES}/{quantity.key}"))
+            entity = f"{CYCLES}/{quantity.key}"
+            plot = self._plots.setdefault(quantity, LivePlot(entity, steps=True))
             plot.write(rec, clock, tracks, palette)
-            for one in plot.series:
-                rec.log(one.entity, _STEPS, static=True)
             if not everything:
                 return
 

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import threading
 import time
-import uuid
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -137,11 +135,10 @@ class Relay:
     @property
     def report(self) -> RelayReport:
         """What became of the feed so far."""
-        lags = tuple(self._lags)
         lag_s = None
-        if lags:
+        if lags := tuple(self._lags):
             p50, p99 = np.percentile(lags, [50.0, 99.0]).tolist()
-            lag_s = (float(p50), float(p99), max(lags))
+            lag_s = (p50, p99, max(lags))
         return RelayReport(
             sessions=tuple(self._sessions),
             shown=self._shown,
@@ -228,8 +225,7 @@ class Relay:
             return
         batch = self._log.decode(messages)
         if self._scene is None:
-            first_ns = min(message.log_time_ns for message in messages)
-            self._scene = self._open(first_ns)
+            self._scene = self._open(min(message.log_time_ns for message in messages))
         if self._states:  # said before, and told again to whoever comes
             self._scene.draw(self._log.decode(self._states), self._not_shown)
             self._states.clear()
@@ -247,7 +243,8 @@ class Relay:
         epoch_ns = int(epoch) if epoch.isdecimal() else first_ns
         if self._rec is not None:
             self._rec.disconnect()
-        rec = LiveStream(APPLICATION, live_recording_id(session_id))
+        # Not the id of the replay, which has more in it; a relay that is started anew goes on here.
+        rec = LiveStream(APPLICATION, recording_id(f"{session_id}/live"))
         rec.set_log_time_enabled(False)
         rec.set_log_tick_enabled(False)
         self._connect(rec)
@@ -261,18 +258,6 @@ class Relay:
         if self._scene is not None and not self.ended:
             self._scene.finish(self._not_shown)
         self.ended = True
-
-
-def live_recording_id(session_id: str) -> str:
-    """The live recording's id: not that of the replay, which has more in it.
-
-    Args:
-        session_id: The session's id.
-
-    Returns:
-        A name-based UUID; a relay that is started anew goes on in the same recording.
-    """
-    return str(uuid.UUID(recording_id(f"{session_id}/live")))
 
 
 def relay_to_viewer(path: Path, viewer: Viewer | None, address: str) -> RelayReport:
@@ -308,10 +293,7 @@ def relay_to_file(path: Path, output: Path) -> RelayReport:
         DataError: If no session came.
         LogWriteError: If the file can't be written.
     """
-    with ExitStack() as stack:
-        request = stack.enter_context(interruptible())
-        draft = stack.enter_context(part_file(output))
-        inbox = stack.enter_context(Inbox(path))
+    with interruptible() as request, part_file(output) as draft, Inbox(path) as inbox:
 
         def save(rec: rr.RecordingStream) -> None:
             try:

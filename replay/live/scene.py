@@ -14,17 +14,12 @@ from datetime import UTC, datetime
 import numpy as np
 import rerun as rr
 
-from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import IntArray
 
 from ..draw.drawing import palette_of, start_of
-from ..draw.facts import code, escaped, log_facts
+from ..draw.facts import code, document, listed, log_facts
 from ..draw.plots import gait, joints
-from ..draw.plots import joints as power
-from ..draw.scene import body
-from ..draw.scene import body as markers
-from ..draw.scene import stage as ranges
-from ..draw.scene import stage as trail
-from ..draw.scene.body import body_title
+from ..draw.scene import body, stage
 from ..draw.scene.motion import BODY_RATE_HZ, SPARSE_RATE_HZ, HeadPath, Motion, assemble, still_head
 from ..layout import build_blueprint
 from ..samples import content as entities
@@ -36,13 +31,13 @@ from ..samples.timeline import Clock
 from ..samples.tracks import Track
 from .cycles import CycleMeter
 from .decode import Batch, LiveLog
-from .inbox import Fresh, Window
+from .inbox import Fresh, Window, joined
 from .plot import CycleBars, LivePlot
 
 _LAYOUT_EVERY_S = 1.0
 _FACTS_EVERY_S = 2.0
 _PLACES_EVERY_S = 0.2
-_TAIL_NS = round(1e9 / trail.TRAIL_RATE_HZ)
+_TAIL_NS = round(1e9 / stage.TRAIL_RATE_HZ)
 _CLEARER = 2.0
 """Another plane's joints are plotted once they swing so many times as far."""
 
@@ -68,9 +63,8 @@ class LiveScene:
         self._errors = LivePlot(entities.ERROR, degrees=True)
         self._joint_power = LivePlot(entities.MECHANICAL)
         self._meter, self._bars = CycleMeter(epoch_ns), CycleBars()
-        self._signals: dict[str, LivePlot] = {}
+        self._signals: dict[str, tuple[LivePlot, bool]] = {}  # and whether it is of the joints
         self._palette: dict[str, entities.Color] = {}
-        self._of_joints: dict[str, bool] = {}
         self._places: entities.Places | None = None
         self._place_plots: dict[tuple[str, tuple[str, ...]], LivePlot] = {}
         self._start: Start | None = None
@@ -80,7 +74,7 @@ class LiveScene:
         self._mode_ns = 0
         self._modes = 0
         self._has_events = self._has_power = False
-        self._trail_end: tuple[int, FloatArray] | None = None
+        self._trail_end: HeadPath | None = None
         self._laid_out: tuple[object, ...] = ()
         self._layout_at = self._facts_at = self._places_at = 0.0
 
@@ -102,12 +96,8 @@ class LiveScene:
             modes=min(self._modes, 2),  # one or several: more lay out nothing anew
             has_events=self._has_events,
             signals=tuple(
-                Signal(
-                    signal_title(topic, self._log.unit(topic)),
-                    plot.series,
-                    self._of_joints[topic],
-                )
-                for topic, plot in self._signals.items()
+                Signal(signal_title(topic, self._log.unit(topic)), plot.series, of_joints)
+                for topic, (plot, of_joints) in self._signals.items()
             ),
             live=True,
         )
@@ -119,12 +109,8 @@ class LiveScene:
             dropped: Messages that could not be shown so far.
         """
         self._window.add(batch)
-        names = [
-            track.name
-            for track in self._window.tracks("/joint_states")
-            or self._window.tracks("/joint_commands")
-        ]
-        palette = palette_of(self._log.robot, names)
+        tracks = self._window.tracks("/joint_states") or self._window.tracks("/joint_commands")
+        palette = palette_of(self._log.robot, [track.name for track in tracks])
         self._draw_angles(batch, palette)
         self._draw_power(palette)
         self._draw_signals(batch, palette)
@@ -158,33 +144,22 @@ class LiveScene:
         new = self._fresh.tracks("error", window[0])
         self._errors.write(rec, clock, quantities.tracking_errors(new, window[1]), palette)
         self._choose_places(window[1] or window[0])
-        if self._places is not None:
-            self._draw_places(self._places, measured, commanded, palette)
+        self._draw_places("measured", measured, palette)
+        self._draw_places("commanded", commanded, None)
 
     def _draw_places(
-        self,
-        places: entities.Places,
-        measured: tuple[Track, ...],
-        commanded: tuple[Track, ...],
-        palette: dict[str, entities.Color],
+        self, kind: str, tracks: tuple[Track, ...], palette: dict[str, entities.Color] | None
     ) -> None:
         """Head, middle and tail once more, for a plot that can be read at a glance."""
-        for kind, tracks, colors in (
-            ("measured", measured, palette),
-            ("commanded", commanded, None),
-        ):
-            plot = self._place_plots.setdefault(
-                (kind, places.names),
-                LivePlot(
-                    f"{joints.PLACES}/{kind}",
-                    degrees=True,
-                    component=entities.SCALARS,
-                    titles=joints.places_titles(places, kind),
-                    width=joints.PLACES_WIDTHS[kind],
-                ),
-            )
-            own = [track for track in tracks if track.name in places.names]
-            plot.write(self._rec, self._clock, own, colors)
+        places = self._places
+        if places is None:
+            return
+        look = joints.places_look(places, kind)
+        entity = f"{joints.PLACES}/{kind}"
+        new = LivePlot(entity, degrees=True, component=entities.SCALARS, **look)
+        plot = self._place_plots.setdefault((kind, places.names), new)
+        own = [track for track in tracks if track.name in places.names]
+        plot.write(self._rec, self._clock, own, palette)
 
     def _choose_places(self, moving: tuple[Track, ...]) -> None:
         """Head, middle and tail of the plane that moves, once it is clear which does."""
@@ -197,8 +172,10 @@ class LiveScene:
             return
         if self._places is not None and self._places.plane is not found.plane:
             swing = {track.name: float(np.nanstd(track.values)) for track in moving}
-            before = max(swing.get(name, 0.0) for name in self._places.names)
-            if max(swing.get(name, 0.0) for name in found.names) < _CLEARER * before + 1e-3:
+            before, after = (
+                max(swing.get(name, 0.0) for name in one.names) for one in (self._places, found)
+            )
+            if after < _CLEARER * before + 1e-3:
                 return
         self._places = found
 
@@ -208,25 +185,23 @@ class LiveScene:
         electrical = quantities.electrical_power(columns)
         for kind, tracks in (("electrical", electrical), ("mechanical", mechanical)):
             whole = quantities.total(tracks)
-            if whole is None:
-                continue
             upto_ns = self._window.ready_ns([tracks])
-            for part in self._fresh.tracks(kind, [whole], upto_ns):
-                power.log_sum(self._rec, self._clock, kind, part)
+            for part in self._fresh.tracks(kind, [whole] if whole else [], upto_ns):
+                joints.log_sum(self._rec, self._clock, kind, part)
                 self._has_power = True
-        upto_ns = self._window.ready_ns([mechanical])
-        self._joint_power.write(
-            self._rec, self._clock, self._fresh.tracks("power", mechanical, upto_ns), palette
-        )
+        fresh = self._fresh.tracks("power", mechanical, self._window.ready_ns([mechanical]))
+        self._joint_power.write(self._rec, self._clock, fresh, palette)
 
     def _draw_signals(self, batch: Batch, palette: dict[str, entities.Color]) -> None:
         for (topic, field), tracks in batch.columns.items():
             if topic in DRAWN or field != "position":
                 continue
             names = [track.name for track in self._window.tracks(topic)]
-            self._of_joints[topic] = bool(set(names) & set(palette))
-            colors = palette if self._of_joints[topic] else joints.joint_palette(names)
-            plot = self._signals.setdefault(topic, LivePlot(topic_entity(SIGNALS, topic)))
+            of_joints = bool(set(names) & set(palette))
+            colors = palette if of_joints else joints.joint_palette(names)
+            known = self._signals.get(topic)
+            plot = known[0] if known else LivePlot(topic_entity(SIGNALS, topic))
+            self._signals[topic] = plot, of_joints
             plot.write(self._rec, self._clock, tracks, colors)
 
     def _draw_words(self, batch: Batch) -> None:
@@ -248,37 +223,28 @@ class LiveScene:
         if robot is None or not positions:
             return
         head = self._window.head or still_head(positions[0].t_ns)
-        commands = self._window.tracks("/joint_commands")
-        drive = quantities.mechanical_power(self._window.columns)
+        columns = self._window.columns
+        drive = quantities.mechanical_power(columns)
         upto_ns = self._window.ready_ns([positions, drive], head.t_ns)
         fresh = self._fresh.rows("body", head.t_ns, upto_ns)
-
-        def motion_of(rows: IntArray) -> Motion:
-            rows = rows[(rows >= fresh.start) & (rows < fresh.stop)]
-            place = HeadPath(
-                head.t_ns[rows], head.position[rows], head.quaternion[rows], head.tracked
-            )
-            return assemble(robot, place, positions=positions, commands=commands, power=drive)
-
         chosen = self._slots(head.t_ns, BODY_RATE_HZ)
-        motion = motion_of(chosen)
-        ghost = motion_of(chosen[self._slots(head.t_ns[chosen], SPARSE_RATE_HZ)])
-        if not motion.t_ns.size:
+        sparse = chosen[self._slots(head.t_ns[chosen], SPARSE_RATE_HZ)]
+        chosen = chosen[(chosen >= fresh.start) & (chosen < fresh.stop)]
+        if not chosen.size:
             return
+        sparse = np.flatnonzero(np.isin(chosen, sparse))
+        motion = assemble(robot, head.at(chosen), columns)
+        rec, clock = self._rec, self._clock
         if self._start is None:
-            self._start = start_of(
-                HeadPath(motion.t_ns, motion.head_position, motion.head_quaternion, head.tracked)
-            )
-            self._rec.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            self._start = start_of(motion.head)
+            rec.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._scale(drive)
-        body.log_body(self._rec, self._clock, motion, limit_w=self._limit_w)
-        sparse = np.flatnonzero(np.isin(motion.t_ns, ghost.t_ns))
-        body.log_ghost(self._rec, self._clock, motion, sparse)
-        self._draw_ranges(ghost)
-        if self._places is not None:
-            markers.log_markers(self._rec, self._clock, motion, self._places, palette, named=sparse)
+        body.log_body(rec, clock, motion, limit_w=self._limit_w)
+        body.log_ghost(rec, clock, motion, sparse)
+        self._draw_ranges(motion, sparse)
+        body.log_markers(rec, clock, motion, self._places, palette, named=sparse)
         if head.tracked:
-            self._draw_trail(motion)
+            self._draw_trail(motion.head)
 
     def _slots(self, t_ns: IntArray, rate_hz: float) -> IntArray:
         """At most so many of the rows a second; :func:`~.replay.samples.sampling.decimate` chooses.
@@ -302,32 +268,23 @@ class LiveScene:
                 decade * next(s for s in (1, 2, 5, 10) if seen <= s * decade * (1 + 1e-9))
             )
 
-    def _draw_ranges(self, motion: Motion) -> None:
-        known = self._window.ranges
-        sensors = tuple(
-            sensor for sensor in ranges.range_sensors(motion.robot) if sensor.topic in known
-        )
-        if not sensors:
-            return
-        chosen = np.arange(motion.t_ns.size)
-        reading = np.stack([hold(*known[sensor.topic], motion.t_ns) for sensor in sensors], axis=1)
-        ranges.log_rays(self._rec, self._clock, motion, chosen, sensors=sensors, reading=reading)
+    def _draw_ranges(self, motion: Motion, chosen: IntArray) -> None:
+        known, at_ns = self._window.ranges, motion.t_ns[chosen]
+        sensors = stage.range_sensors(motion.robot, known)
+        if sensors:
+            reading = np.stack([hold(*known[one.topic], at_ns) for one in sensors], axis=1)
+            stage.log_rays(self._rec, self._clock, motion, chosen, sensors=sensors, reading=reading)
 
-    def _draw_trail(self, motion: Motion) -> None:
+    def _draw_trail(self, head: HeadPath) -> None:
         """The head's path from the last point that was drawn, ten points a second."""
-        for t_ns, position in zip(motion.t_ns.tolist(), motion.head_position, strict=True):
+        for row in range(head.t_ns.size):
+            point = head.at(slice(row, row + 1))
             last = self._trail_end
-            if last is not None and t_ns - last[0] < _TAIL_NS:
-                continue
-            self._trail_end = (t_ns, position)
             if last is not None:
-                piece = HeadPath(
-                    np.array([last[0], t_ns]),
-                    np.stack([last[1], position]),
-                    np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)),
-                    tracked=True,
-                )
-                trail.log_trail(self._rec, self._clock, piece)
+                if point.t_ns[0] - last.t_ns[0] < _TAIL_NS:
+                    continue
+                stage.log_trail(self._rec, self._clock, joined(last, point))
+            self._trail_end = point
 
     # -- layout ----------------------------------------------------------------------------
 
@@ -348,43 +305,23 @@ class LiveScene:
         """The session in words, as in :mod:`.replay.draw.facts`."""
         robot = content.robot
         start = datetime.fromtimestamp(self._clock.start_ns // 1_000_000_000, UTC)
-        facts = [
-            code(self._session_id),
-            "no robot description"
-            if robot is None
-            else f"{robot.name}, {len(robot.joints)} joints",
-            f"since {start:%Y-%m-%d %H:%M:%S} UTC",
-        ]
+        made = "no robot description"
+        if robot is not None:
+            made = f"{robot.name}, {len(robot.joints)} joints"
+        facts = [code(self._session_id), made, f"since {start:%Y-%m-%d %H:%M:%S} UTC"]
         notes = list(self._log.notes)
         if robot is not None and self._window.head is None:
             notes.append("no /odom: the head is held at the origin")
         if dropped:
             notes.append(f"{dropped} messages were not shown here; what is recorded is not touched")
-        parts = [f"**{'Recorded.' if ended else 'Recording.'}**", " · ".join(facts)]
-        if notes:
-            parts.append("\n".join(f"- {escaped(note)}" for note in notes))
-        legend = f"{body_title(replace(content, live=False))}. Grey is commanded."
+        legend = f"{body.body_title(replace(content, live=False))}. Grey is commanded."
         if content.charts:
             legend += " Bars are the last whole cycle of the gait."
-        parts.append(legend)
-        return "\n\n".join(parts) + "\n"
+        first = "Recorded." if ended else "Recording."
+        return document([f"**{first}**", " · ".join(facts), listed(notes), legend])
 
 
 def _shape(content: Content) -> tuple[object, ...]:
-    """What the layout depends on."""
-    return (
-        content.robot is None,
-        content.start is None,
-        content.power_limit_w is None,
-        content.places,
-        content.commanded,
-        content.measured,
-        content.errors,
-        content.has_power,
-        content.joint_power,
-        content.modes,
-        content.has_events,
-        content.signals,
-        content.charts,
-        content.cycles,
-    )
+    """What the layout depends on: not which robot, and where, but whether there is one."""
+    bare = replace(content, robot=None, start=None, power_limit_w=None)
+    return content.robot is None, content.start is None, content.power_limit_w is None, bare

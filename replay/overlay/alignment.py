@@ -52,32 +52,25 @@ class Align(StrEnum):
 
 
 @dataclass(frozen=True)
-class Ruler:
-    """A session's place on the common timelines.
+class Aligned:
+    """A session with its place on the common timelines.
 
     Attributes:
         zero_ns: Its time at 0 of ``session_time`` [Unix ns].
         cycles: Whole cycles that are added to its gait's phase.
     """
 
+    side: Side
     zero_ns: int
     cycles: int
-
-
-@dataclass(frozen=True)
-class Aligned:
-    """A session with its place on the common timelines."""
-
-    side: Side
-    ruler: Ruler
 
     @property
     def clock(self) -> Clock:
         """Turns the session's sampling times into places on the common timelines."""
         rhythm = self.side.rhythm
         if rhythm is not None:
-            rhythm = Rhythm(rhythm.t_ns, rhythm.cycles + self.ruler.cycles)
-        return Clock(self.ruler.zero_ns, rhythm)
+            rhythm = Rhythm(rhythm.t_ns, rhythm.cycles + self.cycles)
+        return Clock(self.zero_ns, rhythm)
 
 
 def align(sides: Sequence[Side], how: Align) -> tuple[Aligned, ...]:
@@ -86,21 +79,19 @@ def align(sides: Sequence[Side], how: Align) -> tuple[Aligned, ...]:
     Raises:
         UsageError: If a session has no gait to be aligned by.
     """
-    if how is not Align.TIME:
-        without = [side.name for side in sides if side.rhythm is None]
-        if without:
-            raise UsageError(
-                f"--align {how}: no phase of a gait was logged (/gait) in {', '.join(without)}; "
-                "align by --align time"
-            )
-    if how is Align.PHASE:
-        back = [side.name for side in sides if side.rhythm is not None and _runs_back(side.rhythm)]
-        if back:
-            raise UsageError(
-                f"--align phase: the gait's phase runs backwards in {', '.join(back)}, so its "
-                "cycles can't be counted; align by --align time"
-            )
-    return tuple(Aligned(side, _ruler(side, how)) for side in sides)
+    without = ", ".join(side.name for side in sides if side.rhythm is None)
+    if without and how is not Align.TIME:
+        raise UsageError(
+            f"--align {how}: no phase of a gait was logged (/gait) in {without}; "
+            "align by --align time"
+        )
+    back = ", ".join(side.name for side in sides if side.runs_back)
+    if back and how is Align.PHASE:
+        raise UsageError(
+            f"--align phase: the gait's phase runs backwards in {back}, so its "
+            "cycles can't be counted; align by --align time"
+        )
+    return tuple(_aligned(side, how) for side in sides)
 
 
 def counterparts(a: Aligned, b: Aligned, how: Align, t_ns: IntArray) -> tuple[IntArray, BoolArray]:
@@ -115,7 +106,7 @@ def counterparts(a: Aligned, b: Aligned, how: Align, t_ns: IntArray) -> tuple[In
         phase, and outside of it, it isn't.
     """
     if how is not Align.PHASE:
-        return t_ns - a.ruler.zero_ns + b.ruler.zero_ns, np.ones(t_ns.shape, dtype=np.bool_)
+        return t_ns - a.zero_ns + b.zero_ns, np.ones(t_ns.shape, dtype=np.bool_)
     one, other = a.clock.rhythm, b.clock.rhythm
     assert one is not None  # noqa: S101 - align() saw to it
     assert other is not None  # noqa: S101
@@ -148,17 +139,12 @@ def times_of(rhythm: Rhythm, cycles: FloatArray) -> tuple[IntArray, BoolArray]:
     return np.where(known, t_ns[left] + step, 0), known
 
 
-def _ruler(side: Side, how: Align) -> Ruler:
+def _aligned(side: Side, how: Align) -> Aligned:
     rhythm = side.rhythm
     if rhythm is None:
-        return Ruler(side.start_ns, 0)
+        return Aligned(side, side.start_ns, 0)
     zero_ns = int(rhythm.t_ns[0]) if how is Align.GAIT else side.start_ns
-    cycles = -int(np.floor(rhythm.cycles[0]))
-    return Ruler(zero_ns, cycles)
-
-
-def _runs_back(rhythm: Rhythm) -> bool:
-    return bool(rhythm.cycles[-1] < rhythm.cycles[0])
+    return Aligned(side, zero_ns, -int(np.floor(rhythm.cycles[0])))
 
 
 _LOOK_AT = 1000

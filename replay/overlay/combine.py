@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -42,13 +43,11 @@ def combine_sessions(
         LogError: If a session can't be read, or the file can't be written.
         DataError: If a session holds nothing that can be drawn.
     """
-    done = 0
+    done = itertools.count()
 
     def step(note: str) -> None:
-        nonlocal done
         check_stop(path, stop)
-        on_step(done, note)
-        done += 1
+        on_step(next(done), note)
 
     called = names_of(files, names)
     with ExitStack() as stack:

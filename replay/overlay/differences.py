@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import rerun as rr
@@ -26,8 +26,9 @@ from undulog.analysis.results.comparison import BODY, Comparison
 from undulog.analysis.results.estimate import Estimate
 from undulog.capture.common.arrays import FloatArray, IntArray
 
+from ..draw.cycles.steps import bar_of, log_bar
 from ..draw.plots.joints import log_look, log_rows
-from ..samples.content import GREY, TOTAL, Places
+from ..samples.content import GREY, TOTAL, Bar, Places, line_title
 from ..samples.sampling import mark_gaps, typical_step_ns
 from .alignment import Aligned
 from .side import COMPARED, Side
@@ -99,19 +100,18 @@ def log_lines(rec: rr.RecordingStream, one: Aligned, rank: int, places: Places |
     Returns:
         Whether any of them was measured.
     """
-    side, tracks = one.side, {track.name: track for track in one.side.measured}
-    named = () if places is None else zip(places.names, places.labels, strict=True)
-    measured = [(tracks[name], label) for name, label in named if name in tracks]
-    for track, label in measured:
-        name = track.name
+    side, labels = one.side, {} if places is None else places.labelled
+    tracks = {track.name: track for track in side.measured if track.name in labels}
+    for name in (name for name in labels if name in tracks):
+        track, label = tracks[name], labels[name]
         entity = f"{LINES}{side.entity}/{rr.escape_entity_path_part(label)}"
-        title = f"{side.name}: {name}" if label == name else f"{side.name}: {name} {label}"
+        title = f"{side.name}: {line_title(name, label)}"
         log_look(rec, entity, [name], side.palette, titles={name: title}, width=_WIDTH)
         t_ns, values = mark_gaps(track.t_ns, track.values[:, None])
         if rank:
             values = dashed(values, dashes_of(track.t_ns, rank))
         log_rows(rec, one.clock, entity, t_ns, values, degrees=True)
-    return bool(measured)
+    return bool(tracks)
 
 
 def log_power_names(rec: rr.RecordingStream, powers: Mapping[int, Side]) -> None:
@@ -162,16 +162,6 @@ QUANTITIES = (
 )
 
 
-@dataclass(frozen=True)
-class _Bar:
-    """Where a bar stands and what it shows, in the unit shown."""
-
-    left: float
-    width: float
-    height: float
-    far: float | None
-
-
 def log_bars(
     rec: rr.RecordingStream, sides: Sequence[tuple[Side, ComparedSession]]
 ) -> tuple[Quantity, ...]:
@@ -192,54 +182,59 @@ def log_bars(
                 if key != quantity.key or joint == BODY:
                     continue
                 estimate = _estimate(known, log=key == "gain")
-                bar = _bar(estimate, quantity.baseline, quantity.scale, left - _ALL / 2, width)
-                _log(rec, f"{BARS}/{key}{side.entity}", side, joint, bar)
+                bar = _bar(side, joint, estimate, quantity.scale, quantity.baseline)
+                entity = f"{BARS}/{key}{side.entity}"
+                _log(rec, entity, side, bar, left=left - _ALL / 2, width=width)
                 found.add(key)
     return tuple(quantity for quantity in QUANTITIES if quantity.key in found)
 
 
-def log_differences(
-    rec: rr.RecordingStream, first: Side, other: Side, comparison: Comparison
+def log_difference_bars(
+    rec: rr.RecordingStream, first: Side, other: Side, comparison: Comparison | None
 ) -> tuple[Quantity, ...]:
     """Write how a session's joints answer otherwise than the first one's.
 
     Args:
         first: The first session.
+        comparison: What it says; None where there is none.
 
     Returns:
         Quantities of which there is a difference.
     """
     found: set[str] = set()
     for quantity in QUANTITIES:
-        for one in comparison.differences:
+        for one in () if comparison is None else comparison.differences:
             if one.quantity == quantity.key and one.place != BODY:
-                bar = _bar(one.difference, 0.0, quantity.scale, -_ALL / 2, _ALL)
-                _log(rec, f"{other.own}{DIFFERENCES}/{quantity.key}", first, one.place, bar)
+                bar = _bar(first, one.place, one.difference, quantity.scale, 0.0)
+                entity = f"{other.own}{DIFFERENCES}/{quantity.key}"
+                _log(rec, entity, first, bar, left=-_ALL / 2, width=_ALL)
                 found.add(quantity.key)
     return tuple(quantity for quantity in QUANTITIES if quantity.key in found)
 
 
-def _bar(
-    estimate: Estimate, baseline: float, scale: float, left: float, width: float
-) -> _Bar | None:
-    if estimate.value is None:
-        return None
-    ends = [scale * (end - baseline) for end in estimate.ci95 or ()]
-    return _Bar(left, width, scale * (estimate.value - baseline), max(ends, key=abs, default=None))
-
-
-def _log(rec: rr.RecordingStream, entity: str, side: Side, joint: str, bar: _Bar | None) -> None:
-    if bar is None or joint not in side.joints:
+def _log(
+    rec: rr.RecordingStream, entity: str, side: Side, bar: Bar | None, *, left: float, width: float
+) -> None:
+    """Write a bar that stands by ``left`` off its joint's place."""
+    if bar is None:
         return
-    name, place = rr.escape_entity_path_part(joint), side.joints.index(joint) + 1
-    color = side.palette.get(joint, GREY)
-    drawn = rr.BarChart([bar.height], abscissa=[place + bar.left], widths=[bar.width], color=color)
-    rec.log(f"{entity}/estimate/{name}", drawn, static=True)
-    if bar.far is not None and abs(bar.far - bar.height) > _SEEN * abs(bar.height):
-        width = _WHISKER * bar.width
-        left = place + bar.left + (bar.width - width) / 2
-        thin = rr.BarChart([bar.far], abscissa=[left], widths=[width], color=GREY)
-        rec.log(f"{entity}/ci95/{name}", thin, static=True)
+    if bar.far is not None and abs(bar.far - bar.value) <= _SEEN * abs(bar.value):
+        bar = replace(bar, far=None)
+    log_bar(
+        rec,
+        entity,
+        bar,
+        left=bar.place + left,
+        width=width,
+        whisker=_WHISKER * width,
+        color=side.palette.get(bar.joint, GREY),
+    )
+
+
+def _bar(side: Side, joint: str, estimate: Estimate, scale: float, baseline: float) -> Bar | None:
+    if joint not in side.joints:
+        return None
+    return bar_of(joint, side.joints.index(joint) + 1, estimate, scale, baseline)
 
 
 def _estimate(known: Known, *, log: bool) -> Estimate:

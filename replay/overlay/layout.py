@@ -9,19 +9,17 @@ from typing import Any, cast
 import rerun.blueprint as rrb
 from rerun.encodings import EntityPathLike
 
-from undulog.analysis.compare.alignment import changes
 from undulog.analysis.results.comparison import Change, Comparison
 from undulog.analysis.results.formats import short, utc
 
 from ..draw.facts import FACTS as SESSION
-from ..draw.facts import code, escaped
+from ..draw.facts import code, document, escaped, listed
 from ..draw.plots import gait
 from ..draw.scene import stage as ranges
 from ..draw.scene.body import COMMANDED, LABELS, MARKERS, MEASURED
-from ..draw.scene.stage import TRAIL, TRAIL_SECONDS
-from ..layout import AFTER_CURSOR_S, BEFORE_CURSOR_S, build_views
+from ..draw.scene.stage import TRAIL
+from ..layout import bar_chart, blueprint, build_views, plot, tabs, trail_window
 from ..samples.content import Content, Series
-from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
 from .alignment import Align
 from .differences import BARS, DIFFERENCES, LINES, POWER, Quantity
 from .side import COMPARED, Side
@@ -73,11 +71,6 @@ def answer(first: Side, other: Side, found: Found) -> str:
     return f"{other.name} (B) against {first.name} (A): {told}"
 
 
-def changed_between(first: Side, other: Side) -> tuple[Change, ...]:
-    """What two sessions say of how they were made, and say otherwise."""
-    return changes([first.facts], [other.facts])
-
-
 def markdown(
     sides: Sequence[Side],
     found: Mapping[str, Found],
@@ -99,16 +92,11 @@ def markdown(
     parts = [f"**{escaped(answer(first, other, found[other.name]))}.**" for other in others]
     parts.append(_table(sides))
     parts += [_changes(first, other, found[other.name].changed) for other in others]
-    told = dict.fromkeys(notes)
-    if told:
-        parts.append(
-            "\n".join(["Placed and assumed:", "", *(f"- {escaped(note)}" for note in told)])
-        )
-    drawn = [_ALIGNED[how], legend]
-    if has_cycles:
-        drawn.append("On `gait_cycle` one second is one cycle of the gait, for all sessions alike.")
-    parts.append(" ".join(drawn))
-    return "\n\n".join(parts) + "\n"
+    if notes:
+        parts.append(f"Placed and assumed:\n\n{listed(notes)}")
+    cycles = "On `gait_cycle` one second is one cycle of the gait, for all sessions alike."
+    parts.append(" ".join([_ALIGNED[how], legend, *([cycles] if has_cycles else [])]))
+    return document(parts)
 
 
 def _table(sides: Sequence[Side]) -> str:
@@ -183,22 +171,18 @@ def build_blueprint(
     Returns:
         The blueprint; it opens playing.
     """
-    rows: list[rrb.Container | rrb.View] = []
-    heights: list[float] = []
-    for group, height in ((_both(shown), 1.25), (_differences(shown), 1.0)):
-        if group:
-            rows.append(_tabs(group))
-            heights.append(height)
-    if bars:
-        rows.append(rrb.Horizontal(*_bars(bars)))
-        heights.append(1.0)
     differing = [
         rrb.Horizontal(*_bar_differences(one), name=one.side.name) for one in shown[1:] if one.bars
     ]
-    if differing:
-        rows.append(_tabs(differing))
-        heights.append(1.0)
-    words = _tabs(_words(shown))
+    groups = (
+        (_both(shown), 1.25),
+        (_differences(shown), 1.0),
+        ([rrb.Horizontal(*_bars(bars))] if bars else [], 1.0),
+        (differing, 1.0),
+    )
+    rows = [tabs(group) for group, _ in groups if group]
+    heights = [height for group, height in groups if group]
+    words = tabs(_words(shown))
     bodies = [one for one in shown if one.body]
     root: rrb.Container
     if bodies:
@@ -207,35 +191,10 @@ def build_blueprint(
         root = rrb.Horizontal(left, right, column_shares=[1.0, 1.0]) if rows else left
     else:
         root = rrb.Vertical(*rows, words, row_shares=[*heights, 1.4])
-    return rrb.Blueprint(
-        root,
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(
-            state="collapsed", timeline=how.timeline, play_state="playing", loop_mode="all"
-        ),
-        auto_views=False,
-        auto_layout=False,
+    panel = rrb.TimePanel(
+        state="collapsed", timeline=how.timeline, play_state="playing", loop_mode="all"
     )
-
-
-def all_views(
-    shown: Sequence[Shown], bars: Sequence[Quantity], how: Align, title: str
-) -> rrb.Blueprint:
-    """Every view at once, none behind a tab: a layout to look for what isn't drawn.
-
-    Args:
-        shown: What was written of each session, the first one first.
-        bars: Quantities whose bars stand next to each other.
-        title: Name of the bodies' view.
-    """
-    bodies = [one for one in shown if one.body]
-    views = [*([_scene(bodies, title)] if bodies else []), *_words(shown), *_both(shown)]
-    views += [*_differences(shown), *_bars(bars)]
-    for one in shown[1:]:
-        views += _bar_differences(one)
-    panel = rrb.TimePanel(state="collapsed", timeline=how.timeline)
-    return rrb.Blueprint(rrb.Grid(*views), panel, collapse_panels=True)
+    return blueprint(root, panel)
 
 
 def _scene(bodies: Sequence[Shown], title: str) -> rrb.Spatial3DView:
@@ -245,18 +204,11 @@ def _scene(bodies: Sequence[Shown], title: str) -> rrb.Spatial3DView:
     assert scene is not None  # noqa: S101 - its body is drawn
     looks = cast("dict[str, Any]", scene.properties)
     looks["EyeControls3D"].tracking_entity = f"{first.side.entity}{MEASURED}"
-    last_s = rrb.VisibleTimeRange(
-        SESSION_TIME,
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_SECONDS),
-        end=rrb.TimeRangeBoundary.cursor_relative(),
-    )
     overrides: dict[EntityPathLike, Any] = {
-        f"{one.side.entity}{TRAIL}": rrb.VisibleTimeRanges([last_s]) for one in bodies
+        f"{one.side.entity}{TRAIL}": trail_window() for one in bodies
     }
-    for one in bodies[1:]:
-        overrides |= {
-            f"{one.side.entity}{path}": rrb.EntityBehavior(visible=False) for path in _HIDDEN
-        }
+    for path in (f"{one.side.entity}{path}" for one in bodies[1:] for path in _HIDDEN):
+        overrides[path] = rrb.EntityBehavior(visible=False)
     return rrb.Spatial3DView(
         name=title,
         origin="/",
@@ -271,10 +223,10 @@ def _scene(bodies: Sequence[Shown], title: str) -> rrb.Spatial3DView:
 def _both(shown: Sequence[Shown]) -> list[rrb.View]:
     found: list[rrb.View] = []
     if any(one.lines for one in shown):
-        found.append(_plot("Head, middle, tail [°]", [f"{LINES}/**"]))
+        found.append(plot("Head, middle, tail [°]", [f"{LINES}/**"]))
     powers = [f"{one.side.entity}{POWER}" for one in shown if one.content.has_power]
     if powers:
-        found.append(_plot("Mechanical power [W]", powers))
+        found.append(plot("Mechanical power [W]", powers))
     return found
 
 
@@ -283,38 +235,23 @@ def _differences(shown: Sequence[Shown]) -> list[rrb.View]:
     first, *others = shown
     found: list[rrb.View] = []
     for one in others:
-        bare = Content(
-            robot=first.side.robot,
-            start=None,
-            power_limit_w=None,
-            places=None,
-            commanded=(),
-            measured=one.differences,
-            errors=(),
-            has_power=False,
-            joint_power=(),
-            charts=(),
-            modes=0,
-            has_events=False,
-            signals=(),
-        )
-        for view in build_views(bare).angles:
+        for view in build_views(Content(first.side.robot, measured=one.differences)).angles:
             plane = str(view.name).lower().replace("measured", "").strip()
             view.name = f"{one.side.name} − {first.side.name}, {plane}".replace(", [", " [")
             found.append(view)
     apart = [f"{one.side.own}{SEPARATE}" for one in others if one.apart]
     if apart:
-        found.append(_plot("Heads apart [m]", apart))
+        found.append(plot("Heads apart [m]", apart))
     return found
 
 
 def _bars(quantities: Sequence[Quantity]) -> list[rrb.View]:
-    return [_chart(one.title, f"{BARS}/{one.key}/**") for one in quantities]
+    return [bar_chart(one.title, f"{BARS}/{one.key}/**") for one in quantities]
 
 
 def _bar_differences(one: Shown) -> list[rrb.View]:
     return [
-        _chart(f"{one.side.name}: {q.difference}", f"{one.side.own}{DIFFERENCES}/{q.key}/**")
+        bar_chart(f"{one.side.name}: {q.difference}", f"{one.side.own}{DIFFERENCES}/{q.key}/**")
         for q in one.bars
     ]
 
@@ -329,31 +266,3 @@ def _words(shown: Sequence[Shown]) -> list[rrb.View]:
     if events:
         found.append(rrb.TextLogView(name="Events", contents=events))
     return found
-
-
-def _chart(title: str, contents: str) -> rrb.BarChartView:
-    legend = rrb.PlotLegend(visible=False)
-    return rrb.BarChartView(name=title, contents=[contents], plot_legend=legend)
-
-
-def _plot(title: str, contents: Sequence[str]) -> rrb.TimeSeriesView:
-    window = [
-        rrb.VisibleTimeRange(
-            timeline,
-            start=rrb.TimeRangeBoundary.cursor_relative(seconds=-BEFORE_CURSOR_S),
-            end=rrb.TimeRangeBoundary.cursor_relative(seconds=AFTER_CURSOR_S),
-        )
-        for timeline in (SESSION_TIME, GAIT_CYCLE)
-    ]
-    return rrb.TimeSeriesView(
-        name=title,
-        contents=list(contents),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
-        time_ranges=rrb.VisibleTimeRanges(window),
-    )
-
-
-def _tabs(
-    views: Sequence[rrb.View] | Sequence[rrb.Horizontal],
-) -> rrb.View | rrb.Horizontal | rrb.Tabs:
-    return views[0] if len(views) == 1 else rrb.Tabs(*views, active_tab=0)

@@ -71,6 +71,11 @@ class Side:
         return f"{COMPARED}/{rr.escape_entity_path_part(self.name)}"
 
     @property
+    def runs_back(self) -> bool:
+        """Whether the gait's phase falls."""
+        return self.rhythm is not None and bool(self.rhythm.cycles[-1] < self.rhythm.cycles[0])
+
+    @property
     def joints(self) -> tuple[str, ...]:
         """Joint names, head to tail."""
         if self.robot is not None:

@@ -109,9 +109,9 @@ def log_ends(rec: rr.RecordingStream, sessions: Sequence[Aligned]) -> None:
     """Take each body away when its session is over and others go on."""
     for timeline in (SESSION_TIME, GAIT_CYCLE):
         ends = {one.side.entity: _end(one, timeline) for one in sessions}
-        last = max(end for end in ends.values() if end is not None) if any(ends.values()) else 0
-        for entity, end in ends.items():
-            if end is not None and end < last:
+        known = {entity: end for entity, end in ends.items() if end is not None}
+        for entity, end in known.items():
+            if end < max(known.values()):
                 after = np.array([end + 1], dtype="timedelta64[ns]")
                 cleared = rr.Clear.columns(is_recursive=[True])
                 times = [rr.TimeColumn(timeline, duration=after)]
@@ -121,6 +121,6 @@ def log_ends(rec: rr.RecordingStream, sessions: Sequence[Aligned]) -> None:
 def _end(one: Aligned, timeline: str) -> int | None:
     """A session's end on a timeline [ns], or None where it isn't on it."""
     if timeline == SESSION_TIME:
-        return one.side.end_ns - one.ruler.zero_ns
+        return one.side.end_ns - one.zero_ns
     rhythm = one.clock.rhythm
     return None if rhythm is None else round(float(rhythm.cycles.max()) * 1e9)

@@ -8,6 +8,7 @@ recording is moved along the timelines.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -20,23 +21,22 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
+from undulog.analysis.compare.alignment import changes
 from undulog.analysis.compare.compare import Choices, compare_fitted
 from undulog.analysis.compare.side import ComparedSession
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.files import check_stop, part_file
 from undulog.capture.common.process import StopRequest
 
-from ..draw.plots.joints import log_scalars, log_table, part_entity
+from ..draw.plots.joints import log_table, part_entities
 from ..draw.scene.body import body_title
 from ..feed.recording import Recording, open_recording, recording_id, require_whole, rerun_writes
-from ..samples.content import Series
+from ..samples.content import Color, Series
 from ..samples.sampling import decimate, interpolate
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
-from ..samples.tracks import Track, join_tracks
-from . import differences as bars
-from . import differences as lines
+from ..samples.tracks import Table, Track, join_tracks, pairs
+from . import differences, style
 from . import layout as words
-from . import style as dress
 from .alignment import (
     Align,
     Aligned,
@@ -47,6 +47,7 @@ from .alignment import (
     placement_text,
 )
 from .layout import SEPARATE, Found, Shown, build_blueprint
+from .side import Side
 
 _ARROW: Any = pa  # comes without types
 _CHUNK: Any = Chunk
@@ -70,11 +71,10 @@ def chunks_of(
         The stream, which reads when it is used. The recording's own properties are left out.
     """
     moves = {SESSION_TIME: later_ns, GAIT_CYCLE: more_cycles * 1_000_000_000}
-    moves = {timeline: by for timeline, by in moves.items() if by}
 
     def placed(chunk: Chunk) -> Chunk:
         chunk = chunk.with_entity_path(f"{entity}{chunk.entity_path}")
-        return chunk if chunk.is_static or not moves else _moved(chunk, moves)
+        return chunk if chunk.is_static or not any(moves.values()) else _moved(chunk, moves)
 
     return RrdReader(recording).stream().drop(content=_PROPERTIES).map(placed)
 
@@ -85,12 +85,10 @@ def send(rec: rr.RecordingStream, streams: Sequence[LazyChunkStream]) -> None:
     Left to itself the reader runs ahead of the writer, and hours of chunks, unpacked, wait in
     between; so now and then it waits until all are written.
     """
-    count = 0
+    count = itertools.count(1)
 
     def waiting(chunk: Chunk) -> Chunk:
-        nonlocal count
-        count += 1
-        if count % _AHEAD == 0:
+        if next(count) % _AHEAD == 0:
             rec.flush()
         return chunk
 
@@ -102,7 +100,7 @@ def _moved(chunk: Any, moves: dict[str, int]) -> Chunk:
     batch = chunk.to_record_batch()
     for timeline, by in moves.items():
         place = batch.schema.get_field_index(timeline)
-        if place >= 0:
+        if place >= 0 and by:
             field = batch.schema.field(place)
             later = batch.column(place).to_numpy() + np.timedelta64(by, "ns")
             batch = batch.set_column(place, field, _ARROW.array(later, field.type))
@@ -120,11 +118,9 @@ def angle_differences(a: Aligned, b: Aligned, how: Align) -> tuple[Track, ...]:
         A track [rad] for each joint that both have; ``b`` is taken on the straight line between
         its samples, NaN where it has none.
     """
-    other = {track.name: track for track in b.side.measured}
     return tuple(
-        Track(track.name, track.t_ns, _taken(a, b, how, track, other[track.name]) - track.values)
-        for track in a.side.measured
-        if track.name in other
+        Track(one.name, one.t_ns, _taken(a, b, how, one, other) - one.values)
+        for one, other in pairs(a.side.measured, b.side.measured)
     )
 
 
@@ -151,24 +147,18 @@ def log_differences(
     """
     known = {track.name: track for track in differences}
     parts = [[known[name] for name in one.names if name in known] for one in drawn]
-    parts = [part for part in parts if part]
+    tables = [join_tracks(part) for part in parts if part]
+    paths = part_entities(entity, [table.names for table in tables])
     return tuple(
-        log_table(
-            rec,
-            a.clock,
-            entity if len(parts) == 1 else part_entity(entity, part[0].name),
-            join_tracks(part),
-            a.side.palette,
-            degrees=True,
-        )
-        for part in parts
+        log_table(rec, a.clock, path, table, a.side.palette, degrees=True)
+        for path, table in zip(paths, tables, strict=True)
     )
 
 
 ANGLES = "/angles"
 """Differences of the measured angles, below a session's own path."""
 
-Layout = Callable[[Sequence[Shown], Sequence[bars.Quantity], Align, str], rrb.Blueprint]
+Layout = Callable[[Sequence[Shown], Sequence[differences.Quantity], Align, str], rrb.Blueprint]
 
 _APART_RATE_HZ = 25.0
 
@@ -195,6 +185,11 @@ class Converted:
     aligned: Aligned
     recording: Recording
     seen: ComparedSession | None
+
+    @property
+    def side(self) -> Side:
+        """The session."""
+        return self.aligned.side
 
 
 @dataclass(frozen=True)
@@ -239,17 +234,11 @@ def write_overlay(
         LogWriteError: If the file can't be written, or an end was asked for.
     """
     rr.set_strict_mode(True)
-    sides = [one.aligned.side for one in sessions]
-    told = [
-        f"{one.aligned.side.name}: {said}" for one in sessions for said in one.recording.warnings
-    ]
-    found = {one.aligned.side.name: _compare(sessions[0], one) for one in sessions[1:]}
-    several = len(found) > 1
-    told += [
-        f"{name} (B): {said}" if several else said
-        for name, one in found.items()
-        for said in one.notes
-    ]
+    sides = [one.side for one in sessions]
+    told = [f"{one.side.name}: {said}" for one in sessions for said in one.recording.warnings]
+    found = {one.side.name: _compare(sessions[0], one) for one in sessions[1:]}
+    for name, one in found.items():
+        told += [f"{name} (B): {said}" if len(found) > 1 else said for said in one.notes]
     placements = _placements(sessions, how, place, told)
     names = [side.name for side in sides]
     identity = recording_id("\n".join([*(side.session_id for side in sides), *names, how, place]))
@@ -263,9 +252,8 @@ def write_overlay(
             send(rec, [_chunks(one) for one in sessions])
             check_stop(path, stop)
             shown = _log(rec, sessions, found, placements, how)
-            quantities = bars.log_bars(
-                rec, [(one.aligned.side, one.seen) for one in sessions if one.seen is not None]
-            )
+            seen = [(one.side, one.seen) for one in sessions if one.seen is not None]
+            quantities = differences.log_bars(rec, seen)
             title = _title(shown)
             text = words.markdown(
                 sides,
@@ -287,38 +275,17 @@ def write_overlay(
 
 def _chunks(one: Converted) -> LazyChunkStream:
     """A session's own recording under its name and on the common timelines."""
-    side, ruler = one.aligned.side, one.aligned.ruler
-    return chunks_of(
-        one.recording.path,
-        side.entity,
-        later_ns=side.start_ns - ruler.zero_ns,
-        more_cycles=ruler.cycles,
-    )
-
-
-@dataclass(frozen=True)
-class _Pair:
-    """A session and the first one.
-
-    Attributes:
-        rank: Which session it is, 1 for the second.
-        placed: How its body is moved, or None.
-    """
-
-    rank: int
-    found: Found
-    placed: Placement | None
+    aligned = one.aligned
+    later_ns = aligned.side.start_ns - aligned.zero_ns
+    entity = aligned.side.entity
+    return chunks_of(one.recording.path, entity, later_ns=later_ns, more_cycles=aligned.cycles)
 
 
 def _compare(first: Converted, other: Converted) -> Found:
-    changed = words.changed_between(first.aligned.side, other.aligned.side)
-    for one in (first, other):
-        if one.seen is None:
-            return Found(
-                None, f"not compared, since {one.aligned.side.name} has no analysis", changed
-            )
-    assert first.seen is not None  # noqa: S101 - just looked
-    assert other.seen is not None  # noqa: S101
+    changed = changes([first.side.facts], [other.side.facts])
+    if first.seen is None or other.seen is None:
+        without = first if first.seen is None else other
+        return Found(None, f"not compared, since {without.side.name} has no analysis", changed)
     try:
         comparison = compare_fitted([first.seen], [other.seen], Choices(any_gait=True))
     except UndulogError as error:
@@ -358,52 +325,47 @@ def _log(
     rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     first = sessions[0]
     content = first.recording.content
-    drawn = lines.log_lines(rec, first.aligned, 0, content.places)
-    shown = [Shown(first.aligned.side, content, content.start is not None, drawn)]
+    drawn = differences.log_lines(rec, first.aligned, 0, content.places)
+    shown = [Shown(first.side, content, content.start is not None, drawn)]
     for rank, one in enumerate(sessions[1:], start=1):
-        name = one.aligned.side.name
-        pair = _Pair(rank, found[name], placements.get(name))
-        shown.append(_log_other(rec, first, one, how, pair))
+        a, b, own = first.aligned, one.aligned, one.recording.content
+        comparison = found[b.side.name].comparison
+        placed = placements.get(b.side.name, Placement())
+        places = differences.places_in(b.side, content.places, own.places)
+        drawn = differences.log_lines(rec, b, rank, places)
+        angles = angle_differences(a, b, how)
+        angles = log_differences(rec, a, f"{b.side.own}{ANGLES}", angles, content.measured)
+        apart = _log_apart(rec, (a, b), how, placed, style.tint(rank))
+        bars = differences.log_difference_bars(rec, a.side, b.side, comparison)
+        shown.append(Shown(b.side, own, own.start is not None, drawn, angles, apart, bars))
     bodies = [k for k, one in enumerate(shown) if one.body]
     for rank, k in enumerate(bodies):
         _log_body(rec, sessions[k].aligned, rank, placements)
-    dress.log_ends(rec, [sessions[k].aligned for k in bodies])
+    style.log_ends(rec, [sessions[k].aligned for k in bodies])
     powers = {k: one.side for k, one in enumerate(shown) if one.content.has_power}
-    lines.log_power_names(rec, powers)
+    differences.log_power_names(rec, powers)
     return tuple(shown)
 
 
-def _log_other(
-    rec: rr.RecordingStream, first: Converted, one: Converted, how: Align, pair: _Pair
-) -> Shown:
-    a, b = first.aligned, one.aligned
-    content = one.recording.content
-    places = lines.places_in(b.side, first.recording.content.places, content.places)
-    comparison = pair.found.comparison
-    angles = angle_differences(a, b, how)
-    return Shown(
-        b.side,
-        content,
-        content.start is not None,
-        lines.log_lines(rec, b, pair.rank, places),
-        log_differences(rec, a, f"{b.side.own}{ANGLES}", angles, first.recording.content.measured),
-        apart=_log_apart(rec, a, b, how, pair),
-        bars=() if comparison is None else bars.log_differences(rec, a.side, b.side, comparison),
-    )
-
-
-def _log_apart(rec: rr.RecordingStream, a: Aligned, b: Aligned, how: Align, pair: _Pair) -> bool:
+def _log_apart(
+    rec: rr.RecordingStream,
+    pair: tuple[Aligned, Aligned],
+    how: Align,
+    placed: Placement,
+    color: Color,
+) -> bool:
     """How far the heads are apart, where both were tracked."""
+    a, b = pair
     one, other = a.side.head, b.side.head
     if one is None or other is None or not (one.tracked and other.tracked):
         return False
     t_ns = one.t_ns[decimate(one.t_ns, _APART_RATE_HZ)]
-    apart = head_distance(a, b, how, pair.placed or Placement(), t_ns)
+    apart = head_distance(a, b, how, placed, t_ns)
     known = bool(np.isfinite(apart).any())
     if known:
         name = f"{b.side.name}, {a.side.name}"
-        colors = {name: dress.tint(pair.rank)}
-        log_scalars(rec, a.clock, f"{b.side.own}{SEPARATE}", [Track(name, t_ns, apart)], colors)
+        table = Table((name,), t_ns, apart[:, None])
+        log_table(rec, a.clock, f"{b.side.own}{SEPARATE}", table, {name: color}, degrees=False)
     return known
 
 
@@ -413,11 +375,11 @@ def _log_body(
     side = one.side
     if side.head is None or side.robot is None:
         return
-    dress.log_name(rec, one, rank, side.head, side.robot)
+    style.log_name(rec, one, rank, side.head, side.robot)
     if rank:
-        dress.log_look(rec, side.entity, rank, side.robot)
+        style.log_look(rec, side.entity, rank, side.robot)
     if side.name in placements:
-        dress.log_placement(rec, side.entity, placements[side.name])
+        style.log_placement(rec, side.entity, placements[side.name])
 
 
 def _title(shown: Sequence[Shown]) -> str:

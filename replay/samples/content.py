@@ -53,6 +53,16 @@ class Places:
         """``head``, ``middle`` and ``tail``, or the joints' names where there are fewer."""
         return ("head", "middle", "tail") if len(self.names) == 3 else self.names
 
+    @property
+    def labelled(self) -> dict[str, str]:
+        """Label by joint name."""
+        return dict(zip(self.names, self.labels, strict=True))
+
+
+def line_title(name: str, label: str) -> str:
+    """Name of a joint's line: its name, and its label where that is another word."""
+    return name if label == name else f"{name} {label}"
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -317,18 +327,18 @@ class Content:
     """
 
     robot: Robot | None
-    start: Start | None
-    power_limit_w: float | None
-    places: Places | None
-    commanded: tuple[Series, ...]
-    measured: tuple[Series, ...]
-    errors: tuple[Series, ...]
-    has_power: bool
-    joint_power: tuple[Series, ...]
-    charts: tuple[Chart, ...]
-    modes: int
-    has_events: bool
-    signals: tuple[Signal, ...]
+    start: Start | None = None
+    power_limit_w: float | None = None
+    places: Places | None = None
+    commanded: tuple[Series, ...] = ()
+    measured: tuple[Series, ...] = ()
+    errors: tuple[Series, ...] = ()
+    has_power: bool = False
+    joint_power: tuple[Series, ...] = ()
+    charts: tuple[Chart, ...] = ()
+    modes: int = 0
+    has_events: bool = False
+    signals: tuple[Signal, ...] = ()
     live: bool = False
     cycles: tuple[tuple[Quantity, tuple[Series, ...]], ...] = ()
     maps: tuple[HeatMap | AwaitedMap, ...] = ()

@@ -11,7 +11,7 @@ from undulog.capture.common.arrays import FloatArray
 
 from .content import COMMANDED, ERROR, MEASURED, MECHANICAL, TOTAL
 from .sampling import hold, interpolate
-from .tracks import Columns, Track
+from .tracks import Columns, Track, pairs
 
 
 def tracking_errors(measured: Sequence[Track], commanded: Sequence[Track]) -> tuple[Track, ...]:
@@ -24,15 +24,9 @@ def tracking_errors(measured: Sequence[Track], commanded: Sequence[Track]) -> tu
     Returns:
         A track for each joint that has both [rad]; the command is the last one given by then.
     """
-    command = {track.name: track for track in commanded}
     return tuple(
-        Track(
-            track.name,
-            track.t_ns,
-            track.values - hold(command[track.name].t_ns, command[track.name].values, track.t_ns),
-        )
-        for track in measured
-        if track.name in command
+        Track(one.name, one.t_ns, one.values - hold(other.t_ns, other.values, one.t_ns))
+        for one, other in pairs(measured, commanded)
     )
 
 
@@ -71,16 +65,9 @@ def products(first: Sequence[Track], second: Sequence[Track]) -> tuple[Track, ..
     Returns:
         A track for each joint that has both; NaN where either is missing.
     """
-    other = {track.name: track for track in second}
     return tuple(
-        Track(
-            track.name,
-            track.t_ns,
-            track.values
-            * interpolate(other[track.name].t_ns, other[track.name].values, track.t_ns),
-        )
-        for track in first
-        if track.name in other
+        Track(one.name, one.t_ns, one.values * interpolate(other.t_ns, other.values, one.t_ns))
+        for one, other in pairs(first, second)
     )
 
 

@@ -8,11 +8,9 @@ little of some others are enough to choose colours, scales and the joints that s
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TypeVar
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray, IntArray
@@ -23,7 +21,16 @@ from .content import MEASURED, MECHANICAL
 from .quantities import power_limit, quantities, segment_power
 from .sampling import GAP_STEPS, decimate, interpolate, typical_step_ns
 from .timeline import STRETCH_NS, stretches
-from .tracks import OFFSETS, Columns, Track, in_turn, read_columns, resampled, wanted_fields
+from .tracks import (
+    OFFSETS,
+    Columns,
+    Track,
+    in_turn,
+    one_after_another,
+    read_columns,
+    resampled,
+    wanted_fields,
+)
 
 GAIT = "/gait"
 
@@ -36,8 +43,6 @@ _LOOKS = 8
 """How many stretches after the first one are looked into where not all is read, at most."""
 _LOOK_NS = 2_000_000_000
 """How long is looked into each of them [ns]."""
-
-_Number = TypeVar("_Number", np.int64, np.float64)
 
 
 @dataclass(frozen=True)
@@ -65,14 +70,6 @@ class Survey:
     is_whole: bool
 
 
-@dataclass
-class _Line:
-    """Kept samples of one line."""
-
-    t_ns: list[IntArray] = field(default_factory=list[IntArray])
-    values: list[FloatArray] = field(default_factory=list[FloatArray])
-
-
 def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Survey:
     """Go through a session.
 
@@ -94,8 +91,9 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
     every = {topic: 1 + round(share * session.channels[topic].count) // _KEPT for topic in wanted}
     thin = max(every.values(), default=1)
     takes_turns = any(topic in session.channels for topic in OFFSETS)
-    chain = {} if session.robot is None else _ranks(session.robot.joint_names)
-    lines: dict[str, dict[str, _Line]] = {}
+    names = () if session.robot is None else session.robot.joint_names
+    chain = {name: i for i, name in enumerate(names)}
+    lines: dict[str, dict[str, list[Track]]] = {}
     parts: dict[str, list[tuple[str, ...]]] = {}
     times: list[IntArray] = []
     powers: list[FloatArray] = []
@@ -108,9 +106,9 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
         for entity, tracks in quantities(columns).items():
             own = lines.setdefault(entity, {})
             for track in tracks:
-                line = own.setdefault(track.name, _Line())
-                line.t_ns.append(track.t_ns[::thin].copy())  # not a view, which keeps all
-                line.values.append(track.values[::thin].copy())
+                # Not a view, which keeps all.
+                some = Track(track.name, track.t_ns[::thin].copy(), track.values[::thin].copy())
+                own.setdefault(track.name, []).append(some)
             parts[entity] = _refined(parts.get(entity, []), _parts(tracks, turns=takes_turns))
             if entity == MEASURED:
                 times.append(tracks[0].t_ns[decimate(tracks[0].t_ns, rate_hz)])
@@ -120,13 +118,13 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
         wanted={topic: fields for topic, fields in wanted.items() if fields},
         samples={
             entity: tuple(
-                Track(name, _joined(line.t_ns), _joined(line.values))
-                for name, line in sorted(own.items(), key=lambda item: chain.get(item[0], 1 << 30))
+                one_after_another(own[name])
+                for name in sorted(own, key=lambda name: chain.get(name, 1 << 30))
             )
             for entity, own in lines.items()
         },
         parts={entity: _in_order(found, chain) for entity, found in parts.items()},
-        drawing_ns=_joined(times) if times else np.zeros(0, dtype=np.int64),
+        drawing_ns=np.concatenate([np.zeros(0, dtype=np.int64), *times]),
         power_limit_w=power_limit(np.concatenate(powers)) if powers else None,
         context_ns=int(np.clip(round(_REACH_STEPS * step_ns), *_CONTEXT_NS)),
         seen=seen,
@@ -167,13 +165,14 @@ def _carried(session: SessionView) -> dict[str, list[str]]:
         session.joint_columns(wanted, stop_ns=stop_ns)
     except (MissingChannelError, DataError):
         return {
-            topic: [one for one in fields if _comes(session, topic, one)]
+            topic: [one for one in fields if comes(session, topic, one)]
             for topic, fields in wanted.items()
         }
     return wanted
 
 
-def _comes(session: SessionView, topic: str, one: str) -> bool:
+def comes(session: SessionView, topic: str, one: str) -> bool:
+    """Whether a field of a JointState topic ever comes."""
     try:
         session.joints(topic, one)
     except (MissingChannelError, DataError):
@@ -223,11 +222,3 @@ def _in_order(
     """Parts in the order of their first lines, lines in chain order."""
     inside = [tuple(sorted(part, key=lambda name: chain.get(name, 1 << 30))) for part in parts]
     return tuple(sorted(inside, key=lambda part: chain.get(part[0], 1 << 30)))
-
-
-def _ranks(names: Sequence[str]) -> dict[str, int]:
-    return {name: i for i, name in enumerate(names)}
-
-
-def _joined(pieces: Sequence[NDArray[_Number]]) -> NDArray[_Number]:
-    return np.concatenate(pieces)

@@ -153,6 +153,18 @@ def without_filler(track: Track) -> Track:
     return Track(track.name, track.t_ns[known], track.values[known])
 
 
+def pairs(first: Sequence[Track], second: Sequence[Track]) -> list[tuple[Track, Track]]:
+    """Two quantities of each joint that has both, in the order of the first."""
+    other = {track.name: track for track in second}
+    return [(track, other[track.name]) for track in first if track.name in other]
+
+
+def one_after_another(pieces: Sequence[Track]) -> Track:
+    """Pieces of one track, at least one, as a whole."""
+    t_ns = np.concatenate([piece.t_ns for piece in pieces])
+    return Track(pieces[0].name, t_ns, np.concatenate([piece.values for piece in pieces]))
+
+
 def tables(tracks: Sequence[Track]) -> tuple[Table, ...]:
     """Put joints that were sampled at the same times into one table each.
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Self
 
 from rerun.experimental import View, ViewerClient
 
@@ -24,7 +24,7 @@ _GREETINGS_GONE = 8
 """Equal pictures in a row of the empty window after which its greetings are over."""
 
 
-class HeadlessViewer:
+class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
     """A viewer without a window, which this machine only can reach."""
 
     def __init__(self, size: tuple[int, int] = (1440, 900)) -> None:
@@ -48,10 +48,6 @@ class HeadlessViewer:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> Self:
-        """Nothing to do: it runs."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """End it."""

@@ -14,9 +14,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
-from typing import Self
 from urllib.parse import quote
 
 from undulog.capture.common.errors import MissingExtraError, UndulogError, UsageError
@@ -67,7 +66,7 @@ def require_display() -> None:
         )
 
 
-class Viewer:
+class Viewer(AbstractContextManager["Viewer"]):
     """A viewer, or a server of one, as a process of ours that only this machine reaches."""
 
     def __init__(self, arguments: Sequence[str], port: int | None = None) -> None:
@@ -100,10 +99,6 @@ class Viewer:
             env={**os.environ, "TMPDIR": self._scratch.name},
             process_group=0,  # a Ctrl-C ends it through us
         )
-
-    def __enter__(self) -> Self:
-        """Nothing to do: it runs."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """End it."""

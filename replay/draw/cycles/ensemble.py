@@ -196,25 +196,16 @@ def mean_cycles(tracks: Sequence[Track], pace: Pace) -> MeanCycles | None:
     Returns:
         Those of them that have a whole cycle; None where none has.
     """
-    names: list[str] = []
-    values: list[FloatArray] = []
-    halves: list[FloatArray] = []
-    counts: list[int] = []
-    for track in tracks:
-        cut = _cut(track, pace)
-        if not len(cut):
-            continue
-        half = np.full(PHASES, np.nan)
-        if len(cut) > 1:
-            runs = from_runs(cut)
-            half = t_factor(float(runs.dof[0])) * np.sqrt(runs.variance)
-        names.append(track.name)
-        values.append(_closed(cut.mean(axis=0)))
-        halves.append(_closed(half))
-        counts.append(len(cut))
-    if not names:
+    cuts = {track.name: _cut(track, pace) for track in tracks}
+    cuts = {name: cut for name, cut in cuts.items() if len(cut)}
+    if not cuts:
         return None
-    return MeanCycles(tuple(names), np.array(values), np.array(halves), np.array(counts))
+    return MeanCycles(
+        tuple(cuts),
+        np.array([_closed(cut.mean(axis=0)) for cut in cuts.values()]),
+        np.array([_closed(_half(cut)) for cut in cuts.values()]),
+        np.array([len(cut) for cut in cuts.values()]),
+    )
 
 
 def body_frame(robot: Robot, angles: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -298,6 +289,14 @@ def _cut(track: Track, pace: Pace) -> FloatArray:
         start_s=pace.ends_rad[0],
         stop_s=pace.ends_rad[1],
     )
+
+
+def _half(cut: FloatArray) -> FloatArray:
+    """Half widths of the 95 % intervals of the mean of c cycles, shape (``PHASES``,)."""
+    if len(cut) == 1:
+        return np.full(PHASES, np.nan)
+    runs = from_runs(cut)
+    return t_factor(float(runs.dof[0])) * np.sqrt(runs.variance)
 
 
 def _closed(values: FloatArray) -> FloatArray:

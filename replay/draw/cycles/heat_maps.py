@@ -10,6 +10,7 @@ A frame marks the cycle at the time cursor.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import rerun as rr
@@ -23,7 +24,7 @@ from undulog.capture.common.palette import joint_colors
 from ...samples.content import ENERGY, GAIN, LAG, NAMED, Color, CycleTable, HeatMap, Quantity
 from ...samples.timeline import Clock
 from ..scene.body import power_colors
-from .steps import cycle_times_ns, mean_power, together
+from .steps import cycle_edges_ns, together
 
 POWER = Quantity("power_milliwatt", "Power", "mW")
 
@@ -68,7 +69,8 @@ def heat_maps(
             continue
         table = _in_order(together(parts), place)
         if quantity is ENERGY:
-            table = mean_power(table, POWER)
+            milliwatt = 1e3 * table.value / (table.stop_s - table.start_s)
+            table = replace(table, quantity=POWER, value=milliwatt)
         low, high = _limits(table, _settled(analysis, table), signed=quantity is ENERGY)
         places = tuple(place.get(name, i + 1) for i, name in enumerate(table.names))
         found.append(HeatMap(table, places, low, high, quantity is ENERGY))
@@ -96,10 +98,7 @@ def cell_colors(shown: HeatMap) -> NDArray[np.uint8]:
 
 
 def log_maps(
-    rec: rr.RecordingStream,
-    clock: Clock,
-    maps: Sequence[HeatMap],
-    named: Collection[str] = (),
+    rec: rr.RecordingStream, clock: Clock, maps: Sequence[HeatMap], named: Collection[str] = ()
 ) -> None:
     """Write the maps.
 
@@ -116,7 +115,7 @@ def log_maps(
             side = np.array([width, height], dtype=np.float32)
             corner = (missing[:, ::-1] * side).astype(np.float32)
             strokes = np.stack([corner, corner + side], axis=1)
-            drawn = rr.LineStrips2D(strokes, colors=_STROKE, radii=rr.Radius.ui_points(0.5))
+            drawn = rr.LineStrips2D(strokes, colors=_STROKE, radii=_DOT)
             rec.log(f"{shown.entity}/missing", drawn, static=True)
         _log_axes(rec, shown, named)
         _log_bar(rec, shown)
@@ -133,8 +132,7 @@ def _cells(shown: HeatMap) -> tuple[int, float, float]:
 
 def _in_order(table: CycleTable, place: dict[str, int]) -> CycleTable:
     order = sorted(range(len(table.names)), key=lambda i: place.get(table.names[i], len(place) + i))
-    names = tuple(table.names[i] for i in order)
-    return CycleTable(table.quantity, names, table.start_s, table.stop_s, table.value[order])
+    return replace(table, names=tuple(table.names[i] for i in order), value=table.value[order])
 
 
 def _settled(analysis: Analysis, table: CycleTable) -> FloatArray:
@@ -235,9 +233,7 @@ def _told(shown: HeatMap) -> Iterator[str]:
 def _log_frame(rec: rr.RecordingStream, clock: Clock, shown: HeatMap) -> None:
     """A frame about the cycle at the cursor, gone where there is none."""
     count, _, height = _cells(shown)
-    start, stop = cycle_times_ns(shown.table, clock.start_ns)
-    ends = np.flatnonzero(np.append(start[1:] - stop[:-1] > 1000, True))
-    t_ns = np.insert(start, ends + 1, stop[ends])
+    t_ns, ends = cycle_edges_ns(shown.table, clock.start_ns)
     drawn = np.insert(np.ones(count, dtype=np.int64), ends + 1, 0)
     center = np.stack([np.full(count, SIZE[0] / 2), (np.arange(count) + 0.5) * height], axis=1)
     half = np.tile([SIZE[0] / 2 + 3.0, height / 2], (count, 1))

@@ -21,10 +21,11 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Robot
 
-from ...samples.content import GREY, Color, MeanCycle, Places, Series
+from ...samples.content import GREY, Color, MeanCycle, Places, Series, line_title
 from ...samples.quantities import mechanical_power, segment_power
 from ...samples.timeline import ENSEMBLE_CYCLE, Clock
-from ...samples.tracks import Track, read_columns
+from ...samples.tracks import Columns, read_columns
+from ..plots.joints import log_look
 from ..scene.body import capsule_columns, capsule_poses, power_colors
 from .ensemble import DEGREES, MeanCycles, Pace, body_frame, falsified, mean_cycles, pace_of
 
@@ -44,21 +45,6 @@ _FAINT = 110
 
 
 @dataclass(frozen=True)
-class Channels:
-    """What is averaged.
-
-    Attributes:
-        measured: Measured angles [rad].
-        commanded: Commanded angles [rad].
-        mechanical: Mechanical power of the joints [W].
-    """
-
-    measured: Sequence[Track]
-    commanded: Sequence[Track]
-    mechanical: Sequence[Track]
-
-
-@dataclass(frozen=True)
 class Look:
     """How the session is drawn, and so its mean cycle.
 
@@ -75,49 +61,31 @@ class Look:
     limit_w: float | None
 
 
-def averaged_ns(clock: Clock, analysis: Analysis | None) -> tuple[int, int]:
-    """Which part of a session is averaged at most.
-
-    Args:
-        clock: The session's timelines.
-        analysis: The session's analysis, or None.
-
-    Returns:
-        Start and end [Unix ns].
-    """
-    windows = () if analysis is None else analysis.gait.windows
-    start_ns = clock.start_ns + round(windows[0].start_s * 1e9) if windows else clock.start_ns
-    return start_ns, start_ns + round(MOST_S * 1e9)
-
-
-def read_channels(
-    session: SessionView, wanted: Mapping[str, Sequence[str]], part_ns: tuple[int, int]
-) -> Channels:
-    """Read what is averaged.
+def read_averaged(
+    session: SessionView,
+    wanted: Mapping[str, Sequence[str]],
+    clock: Clock,
+    analysis: Analysis | None,
+) -> Columns:
+    """Read what is averaged: at most :data:`MOST_S` from the start of the analysed window on.
 
     Args:
         wanted: JointState topic to the fields that come.
-        part_ns: Start and end of the part that is averaged [Unix ns].
-
-    Returns:
-        The channels; none of a kind that the session doesn't have.
+        analysis: The session's analysis, or None.
     """
-    start_ns, stop_ns = part_ns
+    windows = () if analysis is None else analysis.gait.windows
+    start_ns = clock.start_ns + round(windows[0].start_s * 1e9) if windows else clock.start_ns
     drawn = {topic: fields for topic, fields in wanted.items() if topic in _TOPICS}
+    stop_ns = start_ns + round(MOST_S * 1e9)
     columns = read_columns(session, drawn, start_ns=start_ns, stop_ns=stop_ns)
-    channels = Channels(
-        columns.get(("/joint_states", "position"), ()),
-        columns.get(("/joint_commands", "position"), ()),
-        mechanical_power(columns),
-    )
     session.forget()
-    return channels
+    return columns
 
 
 def log_mean_cycle(
     rec: rr.RecordingStream,
     clock: Clock,
-    channels: Channels,
+    columns: Columns,
     look: Look,
     *,
     analysis: Analysis | None,
@@ -126,6 +94,7 @@ def log_mean_cycle(
     """Average the cycles and write what comes out.
 
     Args:
+        columns: From :func:`read_averaged`.
         clock: The session's timelines; their rhythm is the phase, where one was logged.
         analysis: The session's analysis, for its window and what is wrong with samples, or None.
         warnings: Grows by a sentence where joints are left out.
@@ -133,12 +102,10 @@ def log_mean_cycle(
     Returns:
         What was written; None where there is no phase, or no measured joint has a whole cycle.
     """
+    measured = columns.get(("/joint_states", "position"), ())
+    commanded = columns.get(("/joint_commands", "position"), ())
     pace = pace_of(
-        clock.rhythm,
-        analysis,
-        commanded=channels.commanded,
-        places=look.places,
-        start_ns=clock.start_ns,
+        clock.rhythm, analysis, commanded=commanded, places=look.places, start_ns=clock.start_ns
     )
     if pace is None:
         return None
@@ -148,11 +115,11 @@ def log_mean_cycle(
         warnings.append(
             f"the mean cycle leaves out {', '.join(false)}: a sensor falsifies the angles"
         )
-    moved = mean_cycles([one for one in channels.measured if one.name not in false], pace)
+    moved = mean_cycles([one for one in measured if one.name not in false], pace)
     if moved is None:
         return None
-    asked = mean_cycles(channels.commanded, pace)
-    power = mean_cycles(channels.mechanical, pace)
+    asked = mean_cycles(commanded, pace)
+    power = mean_cycles(mechanical_power(columns), pace)
     steady = analysis is None or analysis.gait.frequency_hz.value is not None
     about = _about(pace, moved, steady=steady)
     rec.log(ABOUT, rr.TextDocument(about, media_type="text/markdown"), static=True)
@@ -264,9 +231,9 @@ def _log_places(
     rec: rr.RecordingStream, look: Look, moved: MeanCycles, asked: MeanCycles | None
 ) -> bool:
     drawn = False
-    places = look.places
-    pairs = () if places is None else zip(places.names, places.labels, strict=True)
-    for name, label in pairs:
+    if look.places is None:
+        return drawn
+    for name, label in look.places.labelled.items():
         path = f"{PLACES}/{rr.escape_entity_path_part(label)}"
         if asked is not None and name in asked.names:
             line = rr.SeriesLines(names="command", colors=GREY, widths=1.0)
@@ -280,8 +247,7 @@ def _log_places(
             line = rr.SeriesLines(names="95 % interval", colors=(*color[:3], _FAINT), widths=1.0)
             _log_line(rec, f"{path}/low", line, mean - half)
             _log_line(rec, f"{path}/high", line, mean + half)
-        title = name if label == name else f"{name} {label}"
-        line = rr.SeriesLines(names=title, colors=color, widths=2.0)
+        line = rr.SeriesLines(names=line_title(name, label), colors=color, widths=2.0)
         _log_line(rec, f"{path}/measured", line, mean)
     return drawn
 
@@ -290,8 +256,14 @@ def _log_line(
     rec: rr.RecordingStream, entity: str, line: rr.SeriesLines, angle_rad: FloatArray
 ) -> None:
     rec.log(entity, line, static=True)
-    rec.flush()
-    rec.send_columns(entity, _times(), rr.Scalars.columns(scalars=np.degrees(angle_rad)))
+    _send(rec, entity, np.degrees(angle_rad)[:, None])
+
+
+def _send(rec: rr.RecordingStream, entity: str, values: FloatArray) -> None:
+    """Write lines over the phases; ``values`` of shape (p, k)."""
+    rec.flush()  # else what comes first in the file is chance
+    columns = rr.Scalars.columns(scalars=values.ravel())
+    rec.send_columns(entity, _times(), columns.partition([values.shape[1]] * len(values)))
 
 
 def _log_joints(
@@ -304,10 +276,6 @@ def _log_joints(
     """A line a joint; ``values`` of shape (p, k)."""
     if not names:
         return ()
-    colors = [palette.get(name, GREY) for name in names]
-    rec.log(entity, rr.SeriesLines(names=list(names), colors=colors), static=True)
-    rec.flush()
-    size = np.full(DEGREES.size, len(names))
-    columns = rr.Scalars.columns(scalars=values.ravel()).partition(size)
-    rec.send_columns(entity, _times(), columns)
+    log_look(rec, entity, names, palette)
+    _send(rec, entity, values)
     return (Series(entity, names),)

@@ -24,9 +24,8 @@ from typing import Any, cast
 import numpy as np
 import pyarrow as pa
 import rerun as rr
-from rerun.components import InterpolationMode
 
-from undulog.analysis.results.analysis import Analysis, JointOverTime
+from undulog.analysis.results.analysis import Analysis, JointOverTime, JointResult
 from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.session.cycles import LEAST_COVERED, CycleMaps
 from undulog.capture.common.arrays import FloatArray, IntArray
@@ -47,7 +46,7 @@ from ...samples.content import (
 from ...samples.timeline import Clock
 from ...samples.tracks import Track
 from ...samples.tracks import tables as tables_of
-from ..plots.joints import log_rows, part_entity
+from ..plots.joints import log_look, log_rows, part_entities
 
 CYCLES = "/cycles"
 
@@ -97,20 +96,6 @@ def together(tables: Sequence[CycleTable]) -> CycleTable:
     return replace(main, names=names, value=np.concatenate(rows))
 
 
-def mean_power(energy: CycleTable, quantity: Quantity) -> CycleTable:
-    """Mean power of each cycle from its net energy.
-
-    Args:
-        energy: Net energy [J].
-        quantity: What the power is called; its unit is mW.
-
-    Returns:
-        The table [mW].
-    """
-    milliwatt = 1e3 * energy.value / (energy.stop_s - energy.start_s)
-    return replace(energy, quantity=quantity, value=milliwatt)
-
-
 def log_cycles(
     rec: rr.RecordingStream,
     clock: Clock,
@@ -134,16 +119,10 @@ def log_cycles(
             for track in _steps(table, clock.start_ns)
         ]
         parts = tables_of(tracks)
+        paths = part_entities(f"{CYCLES}/{quantity.key}", [part.names for part in parts])
         series: list[Series] = []
-        for part in parts:
-            entity = f"{CYCLES}/{quantity.key}"
-            entity = entity if len(parts) == 1 else part_entity(entity, part.names[0])
-            look = rr.SeriesLines(
-                names=list(part.names),
-                colors=[palette.get(name, GREY) for name in part.names],
-                interpolation_mode=InterpolationMode.StepAfter,
-            )
-            rec.log(entity, look, static=True)
+        for entity, part in zip(paths, parts, strict=True):
+            log_look(rec, entity, part.names, palette, steps=True)
             rec.flush()  # else what comes first in the file is chance
             log_rows(rec, clock, entity, part.t_ns, part.values)
             series.append(Series(entity, part.names))
@@ -168,12 +147,24 @@ def cycle_times_ns(table: CycleTable, start_ns: int) -> tuple[IntArray, IntArray
     return start_ns + start, start_ns + stop
 
 
-def _steps(table: CycleTable, start_ns: int) -> list[Track]:
-    """Values at the starts, and NaN at each end that no cycle follows."""
+def cycle_edges_ns(table: CycleTable, start_ns: int) -> tuple[IntArray, IntArray]:
+    """When a cycle starts, or ends without another that follows.
+
+    Args:
+        start_ns: Unix time of the session's start [ns].
+
+    Returns:
+        Unix times [ns], and the indices of the cycles that no other follows.
+    """
     start, stop = cycle_times_ns(table, start_ns)
     # A microsecond is the rounding of edges in seconds, not a pause.
     ends = np.flatnonzero(np.append(start[1:] - stop[:-1] > 1000, True))
-    t_ns = np.insert(start, ends + 1, stop[ends])
+    return np.insert(start, ends + 1, stop[ends]), ends
+
+
+def _steps(table: CycleTable, start_ns: int) -> list[Track]:
+    """Values at the starts, and NaN at each end that no cycle follows."""
+    t_ns, ends = cycle_edges_ns(table, start_ns)
     values = np.insert(table.value, ends + 1, np.nan, axis=1)
     return [Track(name, t_ns, row) for name, row in zip(table.names, values, strict=True)]
 
@@ -248,15 +239,13 @@ def charts(analysis: Analysis) -> tuple[Chart, ...]:
         Gain less one [%], lag [degrees] and net mechanical energy [J], of a mean cycle where
         there is a gait, else of the whole window; without those of which no joint has a value.
     """
-    gain = [(j.name, _scaled(j.gain, 100.0, 1.0)) for j in analysis.joints]
-    lag = [(j.name, _scaled(j.lag_rad, math.degrees(1.0), 0.0)) for j in analysis.joints]
-    count = sum(window.cycles for window in analysis.gait.windows)
-    share = 1.0 / count if count else 1.0
-    energy = [(j.name, _scaled(Estimate(j.energy_net_j), share, 0.0)) for j in analysis.joints]
+    joints = analysis.joints
+    share = 1.0 / (sum(window.cycles for window in analysis.gait.windows) or 1)
+    energy = [Estimate(joint.energy_net_j) for joint in joints]
     found = (
-        Chart(GAIN.key, "Gain − 1 [%]", _bars(gain)),
-        Chart(LAG.key, "Lag [°]", _bars(lag)),
-        Chart(ENERGY.key, "Net energy [J]", _bars(energy)),
+        Chart(GAIN.key, "Gain − 1 [%]", _bars(joints, [j.gain for j in joints], 100.0, 1.0)),
+        Chart(LAG.key, "Lag [°]", _bars(joints, [j.lag_rad for j in joints], math.degrees(1.0))),
+        Chart(ENERGY.key, "Net energy [J]", _bars(joints, energy, share)),
     )
     return tuple(chart for chart in found if chart.bars)
 
@@ -276,22 +265,43 @@ def log_charts(
     for chart in found:
         tallest = max((bar.value for bar in chart.bars), key=abs, default=0.0)
         marked = [bar.place + _MARK_LEFT for bar in chart.bars if bar.joint in named]
+        entity = f"{SEGMENTS}/{chart.key}"
         if marked:
             many = len(marked)
             drawn = rr.BarChart(
                 [tallest] * many, abscissa=marked, widths=[_MARK_WIDTH] * many, color=NAMED
             )
-            rec.log(f"{SEGMENTS}/{chart.key}/named", drawn, static=True)
+            rec.log(f"{entity}/named", drawn, static=True)
         for bar in chart.bars:
-            name = rr.escape_entity_path_part(bar.joint)
+            color = palette.get(bar.joint, GREY)
             left = bar.place + _LEFT
-            parts = [("estimate", bar.value, left, _WIDTH, palette.get(bar.joint, GREY))]
-            if bar.far is not None:
-                left += (_WIDTH - _WHISKER) / 2
-                parts.append(("ci95", bar.far, left, _WHISKER, GREY))
-            for kind, height, left, width, color in parts:
-                drawn = rr.BarChart([height], abscissa=[left], widths=[width], color=color)
-                rec.log(f"{SEGMENTS}/{chart.key}/{kind}/{name}", drawn, static=True)
+            log_bar(rec, entity, bar, left=left, width=_WIDTH, whisker=_WHISKER, color=color)
+
+
+def log_bar(
+    rec: rr.RecordingStream,
+    entity: str,
+    bar: Bar,
+    *,
+    left: float,
+    width: float,
+    whisker: float,
+    color: Color,
+) -> None:
+    """Write a bar and, where its interval is known, a whisker in its middle.
+
+    Args:
+        entity: The chart's.
+        left: Where it starts; its joint's place is 1 from the next.
+        whisker: Width of the whisker.
+    """
+    name = rr.escape_entity_path_part(bar.joint)
+    parts = [("estimate", bar.value, left, width, color)]
+    if bar.far is not None:
+        parts.append(("ci95", bar.far, left + (width - whisker) / 2, whisker, GREY))
+    for kind, height, start, wide, shade in parts:
+        drawn = rr.BarChart([height], abscissa=[start], widths=[wide], color=shade)
+        rec.log(f"{entity}/{kind}/{name}", drawn, static=True)
 
 
 def log_current(
@@ -352,22 +362,32 @@ class _Arrow:
         return self._array
 
 
-def _scaled(estimate: Estimate, scale: float, baseline: float) -> Estimate:
+def _bars(
+    joints: Sequence[JointResult],
+    estimates: Sequence[Estimate],
+    scale: float,
+    baseline: float = 0.0,
+) -> tuple[Bar, ...]:
+    pairs = zip(joints, estimates, strict=True)
+    bars = (bar_of(j.name, i + 1, one, scale, baseline) for i, (j, one) in enumerate(pairs))
+    return tuple(bar for bar in bars if bar is not None)
+
+
+def bar_of(
+    joint: str, place: int, estimate: Estimate, scale: float, baseline: float = 0.0
+) -> Bar | None:
+    """A joint's bar.
+
+    Args:
+        place: Its number along the body, the head's joint is 1.
+        scale: From SI to the unit shown.
+        baseline: Where the bar starts, in SI.
+
+    Returns:
+        The bar in the unit shown; None without a value.
+    """
     if estimate.value is None:
-        return estimate
-    low_high = estimate.ci95
-    if low_high is not None:
-        low_high = (scale * (low_high[0] - baseline), scale * (low_high[1] - baseline))
-    return Estimate(scale * (estimate.value - baseline), low_high)
-
-
-def _bars(values: list[tuple[str, Estimate]]) -> tuple[Bar, ...]:
-    return tuple(
-        Bar(name, i + 1, value.value, _far(value))
-        for i, (name, value) in enumerate(values)
-        if value.value is not None
-    )
-
-
-def _far(estimate: Estimate) -> float | None:
-    return None if estimate.ci95 is None else max(estimate.ci95, key=abs)
+        return None
+    ends = [scale * (end - baseline) for end in estimate.ci95 or ()]
+    far = max(ends, key=abs, default=None)
+    return Bar(joint, place, scale * (estimate.value - baseline), far)

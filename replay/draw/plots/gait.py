@@ -17,10 +17,12 @@ from ...samples.tracks import Track
 MODE = "/gait/mode"
 EVENTS = "/events"
 
+INFO = rr.TextLogLevel.INFO
+
 # Levels of rcl_interfaces/msg/Log.
 _LEVELS = {
     10: rr.TextLogLevel.DEBUG,
-    20: rr.TextLogLevel.INFO,
+    20: INFO,
     30: rr.TextLogLevel.WARN,
     40: rr.TextLogLevel.ERROR,
     50: rr.TextLogLevel.CRITICAL,
@@ -37,19 +39,15 @@ def rhythm_of(gait: Sequence[Track]) -> Rhythm | None:
         The rhythm, or None where there is no phase or none advances by a whole cycle.
     """
     by_name = {track.name: track for track in gait}
-    best: tuple[float, Rhythm] | None = None
+    found: list[tuple[float, Rhythm]] = []
     for name, track in by_name.items():
-        plane, dot, key = name.rpartition(".")
-        if not dot or key != "phase":
-            continue
-        rhythm = Rhythm.from_phase(track.t_ns, track.values)
-        if np.ptp(rhythm.cycles) < 1.0:
-            continue
-        amplitude = by_name.get(f"{plane}.A")
-        swing = float(np.nanmax(np.abs(amplitude.values))) if amplitude else 0.0
-        if best is None or swing > best[0]:
-            best = (swing, rhythm)
-    return None if best is None else best[1]
+        if name.endswith(".phase"):
+            rhythm = Rhythm.from_phase(track.t_ns, track.values)
+            if np.ptp(rhythm.cycles) >= 1.0:
+                amplitude = by_name.get(f"{name.removesuffix('.phase')}.A")
+                swing = float(np.nanmax(np.abs(amplitude.values))) if amplitude else 0.0
+                found.append((swing, rhythm))
+    return max(found, key=lambda one: one[0], default=(0.0, None))[1]
 
 
 def changes(states: Sequence[str]) -> list[int]:
@@ -73,9 +71,8 @@ def log_mode(
         How often a mode began.
     """
     found = _read(session, MODE, {"data": str}, warnings)
-    messages = [(t_ns, message.data) for t_ns, message in found]
-    turns = changes([state for _, state in messages])
-    log_states(rec, clock, [messages[i] for i in turns])
+    turns = [(found[i][0], found[i][1].data) for i in changes([one.data for _, one in found])]
+    log_states(rec, clock, turns)
     return len(turns)
 
 
@@ -110,12 +107,22 @@ def log_lines(rec: rr.RecordingStream, clock: Clock, events: Sequence[tuple[int,
     Args:
         events: When each happened [ns], and its ``rcl_interfaces/msg/Log``.
     """
-    t_ns = np.array([time for time, _ in events], dtype=np.int64)
-    texts = [f"{event.name}: {event.msg}" if event.name else event.msg for _, event in events]
-    levels = [_LEVELS.get(event.level, rr.TextLogLevel.INFO) for _, event in events]
-    for rows, times in clock.rows(t_ns):
-        columns = rr.TextLog.columns(text=texts[rows], level=levels[rows])
-        rec.send_columns(EVENTS, times, columns)
+    lines = [(t_ns, f"{one.name}: {one.msg}" if one.name else one.msg) for t_ns, one in events]
+    levels = [_LEVELS.get(event.level, INFO) for _, event in events]
+    log_texts(rec, clock, EVENTS, lines, levels)
+
+
+def log_texts(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    entity: str,
+    lines: Sequence[tuple[int, str]],
+    levels: Sequence[rr.TextLogLevel],
+) -> None:
+    """Write lines of text, each at its time [ns]."""
+    for rows, times in clock.rows(np.array([t_ns for t_ns, _ in lines], dtype=np.int64)):
+        texts = [text for _, text in lines[rows]]
+        rec.send_columns(entity, times, rr.TextLog.columns(text=texts, level=levels[rows]))
 
 
 def _read(

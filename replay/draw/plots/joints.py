@@ -9,24 +9,24 @@ are 32-bit: the recording is for looking at, and the session keeps what was logg
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import rerun as rr
+from rerun.components import InterpolationMode
 from rerun.encodings import Float32Batch
 
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Plane, Robot
 
-from ...samples.content import GREY, SCALARS, TOTAL, Color, Places, Series
+from ...samples.content import GREY, SCALARS, TOTAL, Color, Places, Series, line_title
 from ...samples.sampling import mark_gaps, rounded
 from ...samples.timeline import Clock
-from ...samples.tracks import Table, Track, tables
+from ...samples.tracks import Table, Track
 
 PLACES = "/joints/places"
 DEGREES = "Angle:degrees"
-PLACES_WIDTHS = {"commanded": 1.0, "measured": 2.0}
-"""Of the lines of head, middle and tail [points]."""
 
 _DESCRIPTORS = {
     DEGREES: rr.ComponentDescriptor(DEGREES, archetype="Angle"),
@@ -44,12 +44,8 @@ def joint_palette(names: Sequence[str]) -> dict[str, Color]:
     Returns:
         sRGB and opacity by joint name.
     """
-    if not names:
-        return {}
-    return {
-        name: (int(color[0]), int(color[1]), int(color[2]), int(color[3]))
-        for name, color in zip(names, joint_colors(len(names)), strict=True)
-    }
+    colors: list[list[int]] = joint_colors(len(names)).tolist() if names else []
+    return {name: (r, g, b, a) for name, (r, g, b, a) in zip(names, colors, strict=True)}
 
 
 def head_middle_tail(robot: Robot | None, moving: Sequence[Track]) -> Places | None:
@@ -77,81 +73,32 @@ def head_middle_tail(robot: Robot | None, moving: Sequence[Track]) -> Places | N
     return Places(tuple(chosen), plane)
 
 
-def log_angles(
-    rec: rr.RecordingStream,
-    clock: Clock,
-    entity: str,
-    tracks: Sequence[Track],
-    palette: Mapping[str, Color] | None = None,
-) -> tuple[Series, ...]:
-    """Write one kind of angle of all joints.
-
-    Args:
-        entity: E.g. ``/joints/measured``.
-        tracks: The angles [rad].
-        palette: Colour by joint name; None for the grey of everything commanded.
-
-    Returns:
-        What was written; one series where all joints share their times.
-    """
-    return tuple(
-        log_table(rec, clock, path, table, palette, degrees=True)
-        for path, table in _placed(entity, tables(tracks))
-    )
-
-
-def log_scalars(
-    rec: rr.RecordingStream,
-    clock: Clock,
-    entity: str,
-    tracks: Sequence[Track],
-    palette: Mapping[str, Color] | None = None,
-) -> tuple[Series, ...]:
-    """Write a quantity of all joints that needs no other unit.
-
-    Args:
-        palette: Colour by joint name; None for grey.
-    """
-    return tuple(
-        log_table(rec, clock, path, table, palette, degrees=False)
-        for path, table in _placed(entity, tables(tracks))
-    )
-
-
-def places_titles(places: Places, kind: str) -> dict[str, str]:
-    """Names of the lines of head, middle and tail.
+def places_look(places: Places, kind: str) -> dict[str, Any]:
+    """Names and width of the lines of head, middle and tail, for :func:`log_look`.
 
     Args:
         kind: ``measured`` or ``commanded``.
-
-    Returns:
-        Line's name by joint name.
     """
-    return {
-        name: name
-        if (title := label if kind == "measured" else "command") == name
-        else f"{name} {title}"
-        for name, label in zip(places.names, places.labels, strict=True)
+    titles = {
+        name: line_title(name, label if kind == "measured" else "command")
+        for name, label in places.labelled.items()
     }
+    return {"titles": titles, "width": 2.0 if kind == "measured" else 1.0}
 
 
-def _placed(entity: str, parts: Sequence[Table]) -> list[tuple[str, Table]]:
-    if len(parts) == 1:
-        return [(entity, parts[0])]
-    return [(part_entity(entity, part.names[0]), part) for part in parts]
-
-
-def part_entity(entity: str, first: str) -> str:
+def part_entities(entity: str, parts: Sequence[Sequence[str]]) -> list[str]:
     """Where joints go that were sampled at times of their own.
 
     Args:
         entity: E.g. ``/joints/measured``.
-        first: The first joint of those sampled together.
+        parts: Joints that were sampled together.
 
     Returns:
-        The path of their entity.
+        A path for each part: the entity where there is one only, else below it by the first joint.
     """
-    return f"{entity}/{rr.escape_entity_path_part(first)}"
+    if len(parts) == 1:
+        return [entity]
+    return [f"{entity}/{rr.escape_entity_path_part(part[0])}" for part in parts]
 
 
 def log_table(
@@ -184,6 +131,7 @@ def log_look(
     *,
     titles: Mapping[str, str] | None = None,
     width: float | None = None,
+    steps: bool = False,
 ) -> None:
     """Say how the lines of an entity are drawn.
 
@@ -192,11 +140,13 @@ def log_look(
         palette: Colour by joint name; None for grey.
         titles: Lines' names by joint name; None for the joints' own.
         width: Of the lines [points]; None for the viewer's own.
+        steps: Whether a value holds until the next one.
     """
     look = rr.SeriesLines(
         names=[name if titles is None else titles.get(name, name) for name in names],
         colors=[GREY if palette is None else palette.get(name, GREY) for name in names],
         widths=None if width is None else [width] * len(names),
+        interpolation_mode=InterpolationMode.StepAfter if steps else None,
     )
     rec.log(entity, look, static=True)
 

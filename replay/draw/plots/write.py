@@ -36,17 +36,16 @@ from ...samples.sampling import mark_gaps, ordered, plot_step
 from ...samples.survey import Survey
 from ...samples.timeline import Clock, Span, Stretch, stretch_length_ns
 from ...samples.tracks import JOINT_STATE, Track, join_tracks
-from .gait import EVENTS, changes
+from .gait import EVENTS, INFO, changes, log_texts
 from .joints import (
     DEGREES,
     PLACES,
-    PLACES_WIDTHS,
     joint_palette,
     log_look,
     log_rows,
     log_total_look,
-    part_entity,
-    places_titles,
+    part_entities,
+    places_look,
 )
 
 OTHERS = "/others"
@@ -119,13 +118,7 @@ def log_words(rec: rr.RecordingStream, clock: Clock, session: SessionView) -> bo
             turns = changes([word for _, word in messages])
             said += [(messages[i][0], f"{topic}: {messages[i][1]}") for i in turns]
     said.sort()
-    t_ns = np.array([time for time, _ in said], dtype=np.int64)
-    texts = [text for _, text in said]
-    for rows, times in clock.rows(t_ns):
-        levels = [rr.TextLogLevel.INFO] * (rows.stop - rows.start)
-        rec.send_columns(
-            f"{EVENTS}/said", times, rr.TextLog.columns(text=texts[rows], level=levels)
-        )
+    log_texts(rec, clock, f"{EVENTS}/said", said, [INFO] * len(said))
     return bool(said)
 
 
@@ -211,7 +204,7 @@ class Plot:
             parts: Names of the lines, those in one part that are drawn at common times.
             degrees: Whether the values are angles [rad], to be plotted in degrees.
         """
-        paths = [entity if len(parts) == 1 else part_entity(entity, part[0]) for part in parts]
+        paths = part_entities(entity, parts)
         self.series = tuple(
             Series(path, part, component) for path, part in zip(paths, parts, strict=True)
         )
@@ -335,23 +328,15 @@ class Plots:
     ) -> None:
         """Head, middle and tail once more, for a plot that can be read at a glance."""
         samples = [one for one in found.samples.get(source, ()) if one.name in places.names]
-        parts = [
-            tuple(n for n in part if n in places.names) for part in found.parts.get(source, ())
-        ]
-        parts = [part for part in parts if part]
         if not samples:
             return
+        parts = [tuple(n for n in part if n in places.names) for part in found.parts[source]]
+        parts = [part for part in parts if part]
         plot = Plot(f"{PLACES}/{kind}", samples, parts, degrees=True)
         self._places[source] = (plot, places)
         for one in plot.series:
-            log_look(
-                self._rec,
-                one.entity,
-                one.names,
-                palette if kind == "measured" else None,
-                titles=places_titles(places, kind),
-                width=PLACES_WIDTHS[kind],
-            )
+            colors = palette if kind == "measured" else None
+            log_look(self._rec, one.entity, one.names, colors, **places_look(places, kind))
 
 
 def _colors(entity: str, plot: Plot, palette: Mapping[str, Color]) -> Mapping[str, Color]:

@@ -309,7 +309,7 @@ def log_markers(
     rec: rr.RecordingStream,
     clock: Clock,
     motion: Motion,
-    places: Places,
+    places: Places | None,
     palette: Mapping[str, Color],
     *,
     named: IntArray,
@@ -317,18 +317,17 @@ def log_markers(
     """Mark the joints that stand for the body.
 
     Args:
+        places: These joints; nothing is drawn without them.
         palette: Colour by joint name.
         named: At which of the motion's times the names are moved, shape (n,).
     """
     robot = motion.robot
-    labels = {
-        name: label
-        for name, label in zip(places.names, places.labels, strict=True)
-        if name in robot.joint_names
-    }
-    if not labels:
+    if places is None:
         return
-    names = tuple(labels)
+    labels = places.labelled
+    names = tuple(name for name in labels if name in robot.joint_names)
+    if not names:
+        return
     radius = np.array([0.5 * robot.links[robot.joint_names.index(n)].radius for n in names])
     color = np.array([palette[name] for name in names], dtype=np.uint8)
     # Labels take their point's colour, and blue can't be read on black: they get white points.
@@ -338,10 +337,12 @@ def log_markers(
     rec.log(LABELS, look, static=True)
     for rows, times in clock.rows(motion.t_ns):
         point, count, which = _known_points(motion, names, rows)
+        point = rounded_to(point, ROUNDING)
         balls = rr.Points3D.columns(positions=point, radii=radius[which], colors=color[which])
         rec.send_columns(MARKERS, times, balls.partition(count))
     for part, times in clock.rows(motion.t_ns[named]):
         point, count, which = _known_points(motion, names, named[part])
+        point = rounded_to(point, ROUNDING)
         titles = [labels[names[i]] for i in which.tolist()]
         text = rr.Points3D.columns(positions=point, labels=titles)
         rec.send_columns(LABELS, times, text.partition(count))
@@ -349,11 +350,11 @@ def log_markers(
 
 def _known_points(
     motion: Motion, names: tuple[str, ...], rows: slice | IntArray
-) -> tuple[NDArray[np.float32], IntArray, IntArray]:
+) -> tuple[FloatArray, IntArray, IntArray]:
     """Points above joints whose pose is known: where, how many a row, and of which joint."""
     point = above_joints(motion.robot, names, *motion.links(rows))
     known = np.isfinite(point).all(axis=-1)
-    return rounded_to(point[known], ROUNDING), np.count_nonzero(known, axis=1), np.nonzero(known)[1]
+    return point[known], np.count_nonzero(known, axis=1), np.nonzero(known)[1]
 
 
 MARKS = "/world/snake/named"
@@ -379,8 +380,7 @@ def log_marks(
     look = rr.Points3D.from_fields(colors=NAMED, radii=rr.Radius.ui_points(5.0), show_labels=True)
     rec.log(MARKS, look, static=True)
     for part, times in clock.rows(motion.t_ns[chosen]):
-        point = above_joints(robot, known, *motion.links(chosen[part])).astype(np.float32)
-        drawn = np.isfinite(point).all(axis=-1)
-        labels = [known[i] for i in np.nonzero(drawn)[1].tolist()]
-        dots = rr.Points3D.columns(positions=point[drawn], labels=labels)
-        rec.send_columns(MARKS, times, dots.partition(np.count_nonzero(drawn, axis=1)))
+        point, count, which = _known_points(motion, known, chosen[part])
+        labels: list[str] = [known[i] for i in which.tolist()]
+        dots = rr.Points3D.columns(positions=point.astype(np.float32), labels=labels)
+        rec.send_columns(MARKS, times, dots.partition(count))

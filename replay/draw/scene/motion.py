@@ -13,8 +13,9 @@ from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.capture.robot.model import Robot
 
+from ...samples.quantities import mechanical_power
 from ...samples.sampling import decimate, hold, interpolate, mark_gaps, ordered
-from ...samples.tracks import Track, resampled
+from ...samples.tracks import Columns, Track, resampled
 
 BODY_RATE_HZ = 50.0
 SPARSE_RATE_HZ = 25.0
@@ -33,21 +34,22 @@ class Motion:
 
     Attributes:
         robot: The robot, m joints.
-        t_ns: Drawing times [ns], shape (n,).
-        head_position: Centre of the head link [m], shape (n, 3).
-        head_quaternion: Its orientation x, y, z, w, shape (n, 4).
+        head: Where its head was at the n drawing times.
         angles: Measured joint angles [rad], shape (n, m).
         commands: Commanded joint angles [rad], shape (n, m), or None where none were logged.
         power_w: Mechanical power of the joints [W], shape (n, m), or None where none is known.
     """
 
     robot: Robot
-    t_ns: IntArray
-    head_position: FloatArray
-    head_quaternion: FloatArray
+    head: HeadPath
     angles: FloatArray
     commands: FloatArray | None
     power_w: FloatArray | None
+
+    @property
+    def t_ns(self) -> IntArray:
+        """Drawing times [ns], shape (n,)."""
+        return self.head.t_ns
 
     def links(
         self, rows: slice | IntArray, angles: FloatArray | None = None
@@ -65,14 +67,13 @@ class Motion:
         if angles is None:
             centre, rotation = self._links
             return centre[rows], rotation[rows]
-        turn = rotation_from_quaternion(self.head_quaternion[rows])
-        return link_poses(self.robot, self.head_position[rows], turn, angles)
+        turn = rotation_from_quaternion(self.head.quaternion[rows])
+        return link_poses(self.robot, self.head.position[rows], turn, angles)
 
     @cached_property
     def _links(self) -> tuple[FloatArray, FloatArray]:
         """All links, as they were measured."""
-        turn = rotation_from_quaternion(self.head_quaternion)
-        return link_poses(self.robot, self.head_position, turn, self.angles)
+        return self.links(slice(None), self.angles)
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,20 @@ class HeadPath:
     position: FloatArray
     quaternion: FloatArray
     tracked: bool
+
+    @classmethod
+    def of(cls, t_ns: IntArray, pose: FloatArray, *, tracked: bool) -> HeadPath:
+        """Take a path apart, of columns as in :data:`POSE`, shape (n, 7)."""
+        return cls(t_ns, pose[:, :3], pose[:, 3:], tracked)
+
+    @property
+    def pose(self) -> FloatArray:
+        """Columns as in :data:`POSE`, shape (n, 7)."""
+        return np.concatenate([self.position, self.quaternion], axis=1)
+
+    def at(self, rows: slice | IntArray) -> HeadPath:
+        """Some of its times."""
+        return HeadPath(self.t_ns[rows], self.position[rows], self.quaternion[rows], self.tracked)
 
 
 @dataclass(frozen=True)
@@ -112,9 +127,7 @@ class Frames:
         Returns:
             These only.
         """
-        head = self.head
-        part = HeadPath(head.t_ns[rows], head.position[rows], head.quaternion[rows], head.tracked)
-        return Frames(part, self.sparse[rows])
+        return Frames(self.head.at(rows), self.sparse[rows])
 
 
 def frames_of(head: HeadPath, end_ns: int) -> Frames:
@@ -124,14 +137,13 @@ def frames_of(head: HeadPath, end_ns: int) -> Frames:
         head: The head's path.
         end_ns: The session's end [ns].
     """
-    chosen = decimate(head.t_ns, BODY_RATE_HZ)
-    pose = np.concatenate([head.position, head.quaternion], axis=1)[chosen]
-    t_ns, pose = mark_gaps(head.t_ns[chosen], pose, end_ns)
+    chosen = head.at(decimate(head.t_ns, BODY_RATE_HZ))
+    t_ns, pose = mark_gaps(chosen.t_ns, chosen.pose, end_ns)
     sparse = np.zeros(t_ns.size, dtype=np.bool_)
     sparse[decimate(t_ns, SPARSE_RATE_HZ)] = True
     # A gap ends whatever is drawn.
     sparse |= np.isnan(pose).any(axis=1)
-    return Frames(HeadPath(t_ns, pose[:, :3], pose[:, 3:], head.tracked), sparse)
+    return Frames(HeadPath.of(t_ns, pose, tracked=head.tracked), sparse)
 
 
 def read_head(
@@ -165,7 +177,7 @@ def still_head(t_ns: IntArray) -> HeadPath:
         t_ns: Times [ns], shape (n,).
     """
     still = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (t_ns.size, 1))
-    return HeadPath(t_ns, still[:, :3], still[:, 3:], tracked=False)
+    return HeadPath.of(t_ns, still, tracked=False)
 
 
 def tracked_head(t_ns: IntArray, pose: FloatArray) -> HeadPath:
@@ -188,29 +200,26 @@ def tracked_head(t_ns: IntArray, pose: FloatArray) -> HeadPath:
 def assemble(
     robot: Robot,
     head: HeadPath,
-    *,
-    positions: Sequence[Track],
-    commands: Sequence[Track],
-    power: Sequence[Track],
+    columns: Columns,
 ) -> Motion:
     """Bring joints and power to the times at which the body is drawn.
 
     Args:
         robot: The robot, m joints.
         head: Where its head was at these times.
-        positions: Measured angles [rad].
-        commands: Commanded angles [rad]; none where none were logged.
-        power: Mechanical power of the joints [W]; none where it isn't known.
+        columns: Angles, commands, efforts and velocities, as far as they were logged.
 
     Returns:
         What moved; NaN in gaps.
     """
     names, t_ns = robot.joint_names, head.t_ns
+    positions, commands = (
+        columns.get((topic, "position"), ()) for topic in ("/joint_states", "/joint_commands")
+    )
+    power = mechanical_power(columns)
     return Motion(
         robot=robot,
-        t_ns=t_ns,
-        head_position=head.position,
-        head_quaternion=head.quaternion,
+        head=head,
         angles=resampled(positions, names, t_ns, interpolate),
         commands=resampled(commands, names, t_ns, hold) if commands else None,
         power_w=resampled(power, names, t_ns, interpolate) if power else None,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,12 +19,9 @@ from undulog.sim.scenario.obstacles import Box, Cylinder, Obstacle, Target, Wall
 from undulog.sim.scenario.world import World, read_world
 
 from ...samples.content import Color, Places
-from ...samples.quantities import mechanical_power
 from ...samples.sampling import decimate, gaps, hold, ordered
 from ...samples.timeline import Clock, Span, Stretch
 from . import body
-from . import body as markers
-from . import body as marks
 from .body import ROUNDING, rounded_to
 from .motion import HeadPath, Motion, assemble, frames_of
 
@@ -69,29 +65,18 @@ def rays(
     return origin, seen[..., None] * np.einsum("nkij,kj->nki", turn, axis)
 
 
-@dataclass(frozen=True)
-class Readings:
-    """What the distance sensors said at the times at which they are drawn.
-
-    Attributes:
-        sensors: The sensors, k of them.
-        distance: The last reading at each time, held until the next [m], shape (n, k).
-    """
-
-    sensors: tuple[Sensor, ...]
-    distance: NDArray[np.float32]
-
-
-def read_ranges(session: SessionView, robot: Robot, at_ns: IntArray) -> Readings:
-    """Read all distance sensors.
+def read_ranges(
+    session: SessionView, sensors: Sequence[Sensor], at_ns: IntArray
+) -> NDArray[np.float32]:
+    """Read distance sensors.
 
     Args:
+        sensors: Those of which something was logged, k of them.
         at_ns: When they are drawn [ns], shape (n,).
 
     Returns:
-        The readings; without sensors where none was logged.
+        The last reading at each time, held until the next [m], shape (n, k).
     """
-    sensors = tuple(one for one in range_sensors(robot) if one.topic in session.channels)
     distance = np.full((at_ns.size, len(sensors)), np.nan, dtype=np.float32)
     for first in range(0, len(sensors), _AT_ONCE):
         some = sensors[first : first + _AT_ONCE]
@@ -101,17 +86,20 @@ def read_ranges(session: SessionView, robot: Robot, at_ns: IntArray) -> Readings
             t_ns, values = table.index.to_numpy(dtype=np.int64), table["range"].to_numpy(np.float64)
             distance[:, i] = hold(*ordered(t_ns, values), at_ns)
         session.forget()
-    return Readings(sensors, distance)
+    return distance
 
 
-def range_sensors(robot: Robot) -> tuple[Sensor, ...]:
-    """The robot's distance sensors.
+def range_sensors(robot: Robot, topics: Collection[str]) -> tuple[Sensor, ...]:
+    """The robot's distance sensors of which something was logged.
+
+    Args:
+        topics: Topics that were.
 
     Returns:
         Infrared and ultrasound, in the robot's order.
     """
     kinds = (SensorKind.IR, SensorKind.SONAR)
-    return tuple(sensor for sensor in robot.sensors if sensor.kind in kinds)
+    return tuple(one for one in robot.sensors if one.kind in kinds and one.topic in topics)
 
 
 def log_rays(
@@ -130,10 +118,11 @@ def log_rays(
         sensors: The sensors, k of them.
         reading: Distances at those times [m], shape (n, k); NaN where there is none.
     """
-    t_ns = motion.t_ns[chosen]
+    if not sensors:
+        return
     look = rr.Arrows3D.from_fields(colors=_RANGE_COLOR, radii=rr.Radius.ui_points(1.0))
     rec.log(RANGES, look, static=True)
-    for part, times in clock.rows(t_ns):
+    for part, times in clock.rows(motion.t_ns[chosen]):
         origin, vector = rays(motion.robot, sensors, *motion.links(chosen[part]), reading[part])
         known = np.isfinite(origin).all(axis=-1) & np.isfinite(vector).all(axis=-1)
         columns = rr.Arrows3D.columns(
@@ -293,8 +282,9 @@ class Scene:
         """Joints of modules that a test names, which carry a mark."""
         self._frames = frames_of(head, session.end_ns)
         self._sparse = np.flatnonzero(self._frames.sparse)
+        self._sensors = range_sensors(robot, session.channels)
         at_ns = self._frames.head.t_ns[self._sparse]
-        self._readings = read_ranges(session, robot, at_ns)
+        self._distance = read_ranges(session, self._sensors, at_ns)
         rec.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         world = world_of(session, warnings)
         if world is not None:
@@ -308,29 +298,12 @@ class Scene:
         if rows.stop <= rows.start:
             return
         frames = self._frames.between(rows)
-        columns = stretch.columns
-        motion = assemble(
-            self._robot,
-            frames.head,
-            positions=columns.get(("/joint_states", "position"), ()),
-            commands=columns.get(("/joint_commands", "position"), ()),
-            power=mechanical_power(columns),
-        )
+        motion = assemble(self._robot, frames.head, stretch.columns)
         sparse = np.flatnonzero(frames.sparse)
-        body.log_body(self._rec, self._clock, motion, limit_w=self._limit_w)
-        body.log_ghost(self._rec, self._clock, motion, sparse)
-        if self._readings.sensors:
-            own = slice(*np.searchsorted(self._sparse, [rows.start, rows.stop]).tolist())
-            log_rays(
-                self._rec,
-                self._clock,
-                motion,
-                sparse,
-                sensors=self._readings.sensors,
-                reading=self._readings.distance[own],
-            )
-        marks.log_marks(self._rec, self._clock, motion, self.named, sparse)
-        if self._places is not None:
-            markers.log_markers(
-                self._rec, self._clock, motion, self._places, self._palette, named=sparse
-            )
+        own = slice(*np.searchsorted(self._sparse, [rows.start, rows.stop]).tolist())
+        rec, clock = self._rec, self._clock
+        body.log_body(rec, clock, motion, limit_w=self._limit_w)
+        body.log_ghost(rec, clock, motion, sparse)
+        log_rays(rec, clock, motion, sparse, sensors=self._sensors, reading=self._distance[own])
+        body.log_marks(rec, clock, motion, self.named, sparse)
+        body.log_markers(rec, clock, motion, self._places, self._palette, named=sparse)

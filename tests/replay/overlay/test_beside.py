@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import rerun.blueprint as rrb
 
 import undulog
 from undulog.analysis.compare.compare import Choices, compare_sessions
@@ -19,10 +20,10 @@ from undulog.capture.common.palette import joint_colors
 from undulog.capture.common.process import StopRequest
 from undulog.replay.overlay.alignment import Align, align, times_of
 from undulog.replay.overlay.combine import combine_sessions
-from undulog.replay.overlay.layout import all_views
+from undulog.replay.overlay.layout import build_blueprint
 from undulog.replay.overlay.side import convert, read_side
 from undulog.replay.overlay.write import Converted, write_overlay
-from undulog.replay.samples.timeline import Rhythm
+from undulog.replay.samples.timeline import SESSION_TIME, Rhythm
 
 EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("joint01", "joint02", "joint03", "joint04", "joint05")
@@ -537,9 +538,22 @@ def window(show, converted, tmp_path_factory):
     return show(path, 3.0)
 
 
+def in_a_grid(*shown):
+    """Every view at once, none behind a tab."""
+
+    def views(part):
+        if isinstance(part, rrb.View):
+            return [part]
+        return [view for one in part.contents for view in views(one)]
+
+    grid = rrb.Grid(*views(build_blueprint(*shown).root_container))
+    panel = rrb.TimePanel(state="collapsed", timeline=SESSION_TIME)
+    return rrb.Blueprint(grid, panel, collapse_panels=True)
+
+
 @pytest.mark.slow
 def test_no_view_complains_and_each_shows_something(show, converted, rgb, tmp_path):
-    write_overlay(converted, tmp_path / "all.rrd", Align.TIME, layout=all_views)
+    write_overlay(converted, tmp_path / "all.rrd", Align.TIME, layout=in_a_grid)
     grid = show(tmp_path / "all.rrd", 3.0)
     assert grid.complaints() == []
     # Bodies, three texts, places, power, differences, heads; three bars and three differences.

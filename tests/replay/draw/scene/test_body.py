@@ -100,7 +100,7 @@ def test_the_body_is_drawn_on_the_heads_own_times(snake25):
     slow = t_ns[::4] + 1_000_000
     positions = tuple(Track(n, slow, 1e-9 * slow) for n in snake25.joint_names)
     frames = frames_of(head, int(t_ns[-1]))
-    motion = assemble(snake25, frames.head, positions=positions, commands=(), power=())
+    motion = assemble(snake25, frames.head, {("/joint_states", "position"): tuple(positions)})
     np.testing.assert_array_equal(motion.t_ns, t_ns[::2])
     inside = (motion.t_ns >= slow[0]) & (motion.t_ns <= slow[-1])
     np.testing.assert_allclose(motion.angles[inside, 7], 1e-9 * motion.t_ns[inside])
