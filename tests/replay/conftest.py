@@ -2,14 +2,16 @@
 
 import io
 import math
-import subprocess
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from undulog.analysis.results.analysis import Analysis, GaitFacts, JointResult, SessionFacts, Window
+import undulog
+from support import processes
+from support.built_results import around, passive_joint
+from undulog.analysis.results.analysis import Analysis, GaitFacts, SessionFacts, Window
 from undulog.analysis.results.coupling import Coupling
 from undulog.analysis.results.estimate import Estimate, Provenance
 from undulog.capture import Session, SessionWriter, load_robot
@@ -77,14 +79,9 @@ def write(snake25, truth):
     ):
         position = truth.position if position is None else position
         keep = np.ones(len(truth.t), dtype=bool) if keep is None else keep
-        names = snake25.joint_names
-        with SessionWriter(
-            path,
-            session_id=session_id,
-            epoch_ns=EPOCH_NS,
-            robot=snake25 if robot else None,
-            clock={"robot": "simulated"},
-        ) as w:
+        names, level = snake25.joint_names, np.array([0.0, 0.0, 0.0, 1.0])
+        known = {"robot": snake25 if robot else None, "clock": {"robot": "simulated"}}
+        with SessionWriter(path, session_id=session_id, epoch_ns=EPOCH_NS, **known) as w:
             commands = w.joint_state("/joint_commands", names, unit="rad")
             states = w.joint_state(
                 "/joint_states", names, unit="rad", velocity=effort, effort=effort
@@ -104,21 +101,12 @@ def write(snake25, truth):
             for i in np.flatnonzero(keep):
                 t_ns = int(truth.t_ns[i])
                 commands.write(t_ns, truth.command[i])
-                states.write(
-                    t_ns,
-                    position[i],
-                    *([truth.velocity[i], truth.effort[i]] if effort else []),
-                )
+                drive = [truth.velocity[i], truth.effort[i]] if effort else []
+                states.write(t_ns, position[i], *drive)
                 current.write(t_ns, truth.effort[i])
                 voltage.write(t_ns, np.full(25, 6.0))
                 if odometry:
-                    odom.write(
-                        t_ns,
-                        truth.head[i],
-                        np.array([0.0, 0.0, 0.0, 1.0]),
-                        np.zeros(3),
-                        np.zeros(3),
-                    )
+                    odom.write(t_ns, truth.head[i], level, np.zeros(3), np.zeros(3))
                 if gait:
                     facts.write(t_ns, np.array([0.4, truth.phase[i]]))
             w.set_verdict("good")
@@ -176,24 +164,11 @@ def analysis(snake25):
     """An analysis with made-up but distinct numbers a joint."""
     joints = []
     for i, joint in enumerate(snake25.joints):
-        driven = joint.plane is Plane.HORIZONTAL
-        gain, lag = 0.95 + 0.004 * i, math.radians(7.0 + 0.3 * i)
-        joints.append(
-            JointResult(
-                name=joint.name,
-                plane=str(joint.plane),
-                command_amplitude_rad=0.4 if driven else 0.0,
-                gain=Estimate(gain, (gain - 0.01, gain + 0.01)) if driven else Estimate(),
-                lag_rad=Estimate(lag, (lag - 0.02, lag + 0.02)) if driven else Estimate(),
-                energy_net_j=0.01 * i - 0.02,
-                energy_plus_j=0.3,
-                energy_abs_j=0.3,
-                energy_el_j=None,
-                energy_el_clipped_j=None,
-                coverage=1.0,
-                samples=300,
-            )
-        )
+        one = replace(passive_joint(joint.name, str(joint.plane)), energy_net_j=0.01 * i - 0.02)
+        if joint.plane is Plane.HORIZONTAL:
+            gain, lag = around(0.95 + 0.004 * i, 0.01), around(math.radians(7.0 + 0.3 * i), 0.02)
+            one = replace(one, command_amplitude_rad=0.4, gain=gain, lag_rad=lag)
+        joints.append(one)
     return Analysis(
         session=SessionFacts("made-for-tests", "made.mcap", "snake25", EPOCH_NS, 3.0, "good"),
         gait=GaitFacts(
@@ -247,6 +222,11 @@ class Recorded:
             rows += batch.column(component).to_pylist()
         return rows
 
+    def rows(self, entity, component):
+        """Session time [ns] to values, in order; rows without any are left out."""
+        found = zip(self.times(entity).tolist(), self.column(entity, component), strict=True)
+        return dict(sorted((t, v) for t, v in found if v is not None))
+
     def times(self, entity, timeline="session_time"):
         """Times of an entity's rows [ns]; rows that are not on the timeline are missing."""
         times = [
@@ -281,19 +261,25 @@ def recording(session_file, analysis, tmp_path_factory):
     return written, Recorded(path)
 
 
+@pytest.fixture
+def view(capsys):
+    """Runs ``undulog view``; returns exit code, standard output and standard error."""
+
+    def run(*arguments):
+        code = undulog.run(["view", *map(str, arguments)])
+        told = capsys.readouterr()
+        return code, told.out, told.err
+
+    return run
+
+
 @pytest.fixture(scope="session")
 def rerun_command():
     """Runs Rerun's own command line; returns its standard output."""
     from undulog.replay.viewer.viewer import viewer_binary
 
     def run(*arguments):
-        done = subprocess.run(
-            [viewer_binary(), *map(str, arguments)],
-            check=False,
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
+        done = processes.run(viewer_binary(), *arguments, timeout=120)
         assert done.returncode == 0, done.stderr
         return done.stdout
 

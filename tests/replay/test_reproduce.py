@@ -6,47 +6,22 @@ import numpy as np
 import pytest
 
 import undulog as front
+from support.twin_chains import chain, wave
 from undulog.capture import Session, SessionWriter
 from undulog.replay.reproduce import compare_logs
-
-ROBOT = """name = "chain5"
-description = "Five yaw joints."
-clock = "simulated"
-assumed = ["links", "servo"]
-[chain]
-joints = 5
-planes = ["horizontal"]
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-"""
-WORLD = """description = "A wave on the ground."
-robot = "chain5.toml"
-duration_s = 5.0
-settle_s = 1.0
-physics_rate_hz = 4000
-[noise]
-position = 0.001
-[gait]
-ramp_s = 0.5
-[gait.horizontal]
-amplitude = 0.4
-frequency_hz = 1.0
-lag = 1.0
-"""
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     """A run of a robot whose file is gone by the time that it is run again."""
     folder = tmp_path_factory.mktemp("again")
-    (folder / "chain5.toml").write_text(ROBOT)
-    (folder / "wave.toml").write_text(WORLD)
+    (folder / "chain.toml").write_text(chain(5, planes=["horizontal"]))
+    run = {"duration_s": 5.0, "settle_s": 1.0, "physics_rate_hz": 4000, "gait": {"ramp_s": 0.5}}
+    world = wave(**run, horizontal={"lag": 1.0}, noise={"position": 0.001})
+    (folder / "wave.toml").write_text(world)
     words = ["sim", "run", str(folder / "wave.toml"), "-o", str(folder / "run.mcap")]
     assert front.run(words) == 0
-    (folder / "chain5.toml").unlink()
+    (folder / "chain.toml").unlink()
     return folder
 
 

@@ -95,6 +95,17 @@ def load(path):
         return np.asarray(picture.convert("RGB")).astype(int)
 
 
+def glowing(picture):
+    """Where a picture is vermilion, by hue, since the light shades the body."""
+    red, green, blue = np.moveaxis(picture, -1, 0)
+    return (red > 1.6 * blue) & (red > 1.4 * green) & (red > 90)
+
+
+def marked(picture):
+    """How many pixels stand out from the ground."""
+    return int((np.abs(picture - np.median(picture, axis=(0, 1))).max(axis=-1) > 60).sum())
+
+
 def differing(found, golden, reach=1):
     """Which pixels of either picture have no like within ``reach`` in the other, shape (h, w)."""
     return _lost(found, golden, reach) | _lost(golden, found, reach)

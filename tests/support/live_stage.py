@@ -55,6 +55,23 @@ class Recorder:
             wait_for(lambda: self.feed.queued == 0, each=self.feed.pump)
         return ticks
 
+    def send_all(self):
+        """All messages, and the end."""
+        self.connect()
+        self.send()
+        self.feed.close()
+
+
+def seen_live(session, folder):
+    """A session recorded and relayed to a file: what the relay reports, and the file."""
+    relay = Relay(folder / "live.sock", folder / "live.rrd")
+    try:
+        Recorder(session, folder / "live.sock").send_all()
+        return relay.finish(), relay.output
+    finally:
+        relay.process.kill()
+        relay.process.communicate()
+
 
 class Relay:
     """The command in a process of its own."""

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import urllib.request
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -82,3 +83,34 @@ def freeze(pid):
         }
 
     wait_for(lambda: states() == {"T"}, "all threads to stand")
+
+
+@contextmanager
+def served_page(file, scratch):
+    """``undulog view --web`` once its page answers: the process and the address."""
+    with process(
+        *UNDULOG, "view", file, "--web", env={**os.environ, "TMPDIR": str(scratch)}
+    ) as one:
+        address = wait_for(lambda: _page(one.stdout.readline().strip()), "an address", alive=(one,))
+        wait_for(lambda: _answers(address.partition("?")[0]), "the page", alive=(one,))
+        yield one, address
+
+
+def _page(line):
+    return line if line.startswith("http") else None
+
+
+def _answers(page):
+    try:
+        with urllib.request.urlopen(page, timeout=5) as answer:
+            return answer.status == 200
+    except OSError:
+        return False
+
+
+def listening(*ports):
+    """Address, as the kernel prints it, and port of all sockets that listen at some ports."""
+    tables = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
+    lines = [line for one in tables if one.exists() for line in one.read_text().splitlines()[1:]]
+    local = [line.split()[1].split(":") for line in lines if line.split()[3] == "0A"]
+    return {(address, int(port, 16)) for address, port in local if int(port, 16) in ports}

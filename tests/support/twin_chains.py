@@ -20,7 +20,7 @@ def toml(table, path=()):
     return text
 
 
-def chain(joints, *, assumed=("links", "servo"), **servo):
+def chain(joints, *, assumed=("links", "servo"), planes=("horizontal", "vertical"), **servo):
     """A robot with a yaw joint first and last, and a pitch joint between each two."""
     return toml(
         {
@@ -28,7 +28,7 @@ def chain(joints, *, assumed=("links", "servo"), **servo):
             "description": "Yaw joints with a pitch joint between each two.",
             "clock": "simulated",
             "assumed": list(assumed),
-            "chain": {"joints": joints, "planes": ["horizontal", "vertical"]},
+            "chain": {"joints": joints, "planes": list(planes)},
             "defaults": {"link": LINK, "servo": servo},
         }
     )

@@ -2,7 +2,10 @@
 
 import json
 
+import numpy as np
+
 import undulog as front
+from undulog.capture import Session, SessionWriter
 
 ROBOT = """name = "chain"
 description = "Yaw joints."
@@ -59,3 +62,19 @@ def fitted(room, capsys, *words, source="run.mcap"):
     assert front.run([*command, *words, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     return report, {(one["name"], one["module"]): one for one in report["parameters"]}
+
+
+def rewritten(source, target, change):
+    """Commands and states of a session once more; of states ``change`` gives times and rows."""
+    with Session.open(source) as session:
+        commands, states = (session.joints(t) for t in ("/joint_commands", "/joint_states"))
+        robot = session.robot
+    epoch_ns = int(commands.t_ns[0][0])
+    with SessionWriter(target, session_id=target.stem, epoch_ns=epoch_ns, robot=robot) as writer:
+        for topic, signals in (("/joint_commands", commands), ("/joint_states", states)):
+            channel = writer.joint_state(topic, signals.names, unit="rad")
+            t_ns, rows = signals.t_ns[0], np.array(signals.values).T.copy()
+            if signals is states:
+                t_ns, rows = change(t_ns, rows)
+            for one, row in zip(t_ns.tolist(), rows, strict=True):
+                channel.write(one, row)

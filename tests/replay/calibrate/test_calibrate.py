@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 
 import undulog as front
 from support.paths import TRACE
-from support.twin_fits import fitted, room_for
-from undulog.capture import Session, SessionWriter, load_robot
+from support.twin_fits import fitted, rewritten, room_for
+from undulog.capture import load_robot
 from undulog.capture.common.process import StopRequest
 from undulog.replay.calibrate.identifiability import ridges
 from undulog.replay.calibrate.lack_of_fit import misfit
@@ -73,20 +73,8 @@ def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, capsys):
 
 def test_a_dead_time_is_told_and_not_written(small, tmp_path, capsys):
     late_s = 0.012
-    with Session.open(small / "run.mcap") as session:
-        commands, states = (session.joints(t) for t in ("/joint_commands", "/joint_states"))
-        robot = session.robot
-    with SessionWriter(
-        tmp_path / "late.mcap", session_id="late", epoch_ns=int(commands.t_ns[0][0]), robot=robot
-    ) as writer:
-        for topic, signals, shift in (
-            ("/joint_commands", commands, 0),
-            ("/joint_states", states, round(late_s * 1e9)),
-        ):
-            channel = writer.joint_state(topic, signals.names, unit="rad")
-            rows = np.array(signals.values).T
-            for t_ns, row in zip(signals.t_ns[0].tolist(), rows, strict=True):
-                channel.write(t_ns + shift, row)
+    late_ns = round(late_s * 1e9)
+    rewritten(small / "run.mcap", tmp_path / "late.mcap", lambda t, rows: (t + late_ns, rows))
     for name in ("robot.toml", "nominal.toml"):
         (tmp_path / name).write_text((small / name).read_text())
     words = (*TWO, "--delay", "--settle", "1.5", "-o", str(tmp_path / "fitted.toml"))

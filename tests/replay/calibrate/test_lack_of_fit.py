@@ -10,7 +10,6 @@ from scipy.signal import lfilter
 
 import undulog as front
 from support import twin_fits
-from undulog.capture import Session, SessionWriter
 from undulog.replay.calibrate.identifiability import play_direction
 from undulog.replay.calibrate.lack_of_fit import (
     JointFit,
@@ -157,7 +156,7 @@ def test_joints_without_enough_cycles_are_tested_for_memory():
 ONLY = ("stall_torque", "coulomb_friction", "mu_tangential", "mu_normal")
 
 
-def fitted(folder, capsys, hidden, joints, only, *, source="run.mcap", more=()):
+def fitted(folder, capsys, only, *, source="run.mcap", more=()):
     words = [word for name in only for word in ("--only", name)]
     report, found = twin_fits.fitted(
         folder, capsys, *words, *more, "-o", str(folder / "f.toml"), source=source
@@ -170,7 +169,7 @@ def test_another_friction_law_excludes_no_truth(tmp_path, capsys):
     """The robot slips by Transeth's law, the model by the ellipse; the servo is 5 % off."""
     hidden = '[servo]\nstall_torque = 0.315\n[world.ground]\nlaw = "transeth"\n'
     twin_fits.room_for(tmp_path, 5, 8.0, hidden)
-    report, found = fitted(tmp_path, capsys, hidden, 5, ONLY)
+    report, found = fitted(tmp_path, capsys, ONLY)
     truth = dict(zip(ONLY, (0.315, 0.03, 0.05, 0.5), strict=True))
     for name, value in truth.items():
         one = found[name]
@@ -203,9 +202,7 @@ def test_hidden_play_is_the_first_line(tmp_path, capsys):
     """Play of 0.02 rad behind one joint's encoder, as a worn gear has it."""
     twin_fits.room_for(tmp_path, 3, 6.0, "", noise=0.002)
     with_play(tmp_path / "run.mcap", tmp_path / "play.mcap", 0.02)
-    report, found = fitted(
-        tmp_path, capsys, "", 3, ONLY[:2], source="play.mcap", more=("--settle", "1.5")
-    )
+    report, found = fitted(tmp_path, capsys, ONLY[:2], source="play.mcap", more=("--settle", "1.5"))
     assert not report["fits"]
     assert report["lack_of_fit"]["worst"] == "joint02"
     assert all(one["ci95"] is None and not one["determined"] for one in found.values())
@@ -216,29 +213,21 @@ def test_hidden_play_is_the_first_line(tmp_path, capsys):
 
 def with_play(source, target, width):
     """A session whose second joint has play behind its encoder."""
-    with Session.open(source) as session:
-        commands, states = (session.joints(t) for t in ("/joint_commands", "/joint_states"))
-        robot = session.robot
-    epoch_ns = int(commands.t_ns[0][0])
-    with SessionWriter(target, session_id="play", epoch_ns=epoch_ns, robot=robot) as writer:
-        for topic, signals in (("/joint_commands", commands), ("/joint_states", states)):
-            channel = writer.joint_state(topic, signals.names, unit="rad")
-            rows = np.array(signals.values).T.copy()
-            if topic == "/joint_states":
-                before = rows[:, 1].copy()
-                for k in range(1, len(before)):
-                    rows[k, 1] = np.clip(
-                        rows[k - 1, 1], before[k] - width / 2, before[k] + width / 2
-                    )
-            for t_ns, row in zip(signals.t_ns[0].tolist(), rows, strict=True):
-                channel.write(t_ns, row)
+
+    def change(t_ns, rows):
+        before = rows[:, 1].copy()
+        for k in range(1, len(before)):
+            rows[k, 1] = np.clip(rows[k - 1, 1], before[k] - width / 2, before[k] + width / 2)
+        return t_ns, rows
+
+    twin_fits.rewritten(source, target, change)
 
 
 @pytest.mark.slow
 def test_the_right_law_is_left_alone(tmp_path, capsys):
     hidden = "[servo]\nstall_torque = 0.33\n"
     twin_fits.room_for(tmp_path, 4, 6.0, hidden)
-    report, found = fitted(tmp_path, capsys, hidden, 4, ONLY)
+    report, found = fitted(tmp_path, capsys, ONLY)
     assert report["fits"]
     assert found["stall_torque"]["ci95"][0] <= 0.33 <= found["stall_torque"]["ci95"][1]
     assert json.dumps(report, allow_nan=False)

@@ -1,39 +1,29 @@
 """Command ``view`` as it is used: files, errors, and a server that only this machine reaches."""
 
 import json
-import os
 import re
 import signal
 import subprocess
 import sys
-import time
-import urllib.request
 from pathlib import Path
 
 import pytest
 
-import undulog
+from support.processes import listening, served_page, wait_for
 from undulog.replay.viewer.viewer import viewer_binary
 
 
-def run(capsys, *arguments):
-    """Exit code, standard output, standard error."""
-    code = undulog.run(["view", *map(str, arguments)])
-    told = capsys.readouterr()
-    return code, told.out, told.err
-
-
-def test_save_writes_a_recording_and_says_so_first(session_file, tmp_path, capsys):
+def test_save_writes_a_recording_and_says_so_first(session_file, tmp_path, view):
     path = tmp_path / "made.rrd"
-    code, out, _ = run(capsys, session_file, "--save", path)
+    code, out, _ = view(session_file, "--save", path)
     assert code == 0
     assert out.startswith(f"{path}: 3.0 s, ")
     assert path.stat().st_size > 100_000
 
 
-def test_json_reports_what_was_written(session_file, tmp_path, capsys, snake25):
+def test_json_reports_what_was_written(session_file, tmp_path, view, snake25):
     path = tmp_path / "made.rrd"
-    code, out, _ = run(capsys, session_file, "--save", path, "--json")
+    code, out, _ = view(session_file, "--save", path, "--json")
     told = json.loads(out)
     assert code == 0
     assert told["path"] == str(path)
@@ -42,20 +32,20 @@ def test_json_reports_what_was_written(session_file, tmp_path, capsys, snake25):
     assert told["body"] is True
 
 
-def test_a_session_without_a_gait_is_shown_all_the_same(write, tmp_path, capsys):
+def test_a_session_without_a_gait_is_shown_all_the_same(write, tmp_path, view):
     session = write(tmp_path / "a.mcap", robot=False, gait=False, odometry=False)
-    code, out, _ = run(capsys, session, "--save", tmp_path / "a.rrd")
+    code, out, _ = view(session, "--save", tmp_path / "a.rrd")
     assert code == 0
     assert "no robot description" in out
 
 
-def test_nothing_is_overwritten_without_force(session_file, tmp_path, capsys):
+def test_nothing_is_overwritten_without_force(session_file, tmp_path, view):
     path = tmp_path / "made.rrd"
     path.write_bytes(b"mine")
-    code, _, err = run(capsys, session_file, "--save", path)
+    code, _, err = view(session_file, "--save", path)
     assert (code, path.read_bytes()) == (2, b"mine")
     assert "--force" in err
-    code, _, _ = run(capsys, session_file, "--save", path, "--force")
+    code, _, _ = view(session_file, "--save", path, "--force")
     assert code == 0
     assert path.stat().st_size > 100_000
 
@@ -68,35 +58,35 @@ def test_nothing_is_overwritten_without_force(session_file, tmp_path, capsys):
         (["--json"], "--save"),
     ],
 )
-def test_wrong_usage_is_explained(session_file, capsys, arguments, complaint):
-    code, _, err = run(capsys, session_file, *arguments)
+def test_wrong_usage_is_explained(session_file, view, arguments, complaint):
+    code, _, err = view(session_file, *arguments)
     assert code == 2
     assert complaint in err
 
 
-def test_without_a_display_the_way_out_is_named(session_file, capsys, monkeypatch):
+def test_without_a_display_the_way_out_is_named(session_file, view, monkeypatch):
     if not sys.platform.startswith("linux"):
         pytest.skip("only on Linux can a display be told to be missing")
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
-    code, _, err = run(capsys, session_file)
+    code, _, err = view(session_file)
     assert code == 2
     assert "--save" in err
     assert "--web" in err
 
 
-def test_a_viewer_that_fails_is_reported(session_file, capsys, monkeypatch):
+def test_a_viewer_that_fails_is_reported(session_file, view, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":987")  # nobody there
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_SOCKET", raising=False)
-    code, _, err = run(capsys, session_file)
+    code, _, err = view(session_file)
     assert code == 1
     assert "the Rerun viewer failed" in err
 
 
-def test_no_session_no_recording(tmp_path, capsys):
+def test_no_session_no_recording(tmp_path, view):
     (tmp_path / "x.mcap").write_bytes(b"not a log at all")
-    code, _, err = run(capsys, tmp_path / "x.mcap", "--save", tmp_path / "x.rrd")
+    code, _, err = view(tmp_path / "x.mcap", "--save", tmp_path / "x.rrd")
     assert code == 1
     assert "not an MCAP file" in err
     assert not (tmp_path / "x.rrd").exists()
@@ -113,51 +103,11 @@ def test_the_viewer_is_reruns_own():
 def test_web_serves_this_machine_only_until_told_to_end(session_file, tmp_path):
     if not Path("/proc/net/tcp").exists():
         pytest.skip("listening sockets are told from /proc/net/tcp")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "undulog", "view", session_file, "--web"],
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "TMPDIR": str(tmp_path)},
-    )
-    try:
-        address = process.stdout.readline().strip()
-        while not address.startswith("http"):
-            assert process.poll() is None
-            address = process.stdout.readline().strip()
+    with served_page(session_file, tmp_path) as (process, address):
         page, data = (int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", address))
-        for _ in range(100):
-            try:
-                with urllib.request.urlopen(address.partition("?")[0], timeout=5) as answer:
-                    assert answer.status == 200
-                break
-            except OSError:
-                assert process.poll() is None
-        for _ in range(300):  # the page may answer before the data's server listens
-            if listening(data):
-                break
-            assert process.poll() is None
-            time.sleep(0.1)
-        assert listening(page) == listening(data) == {"0100007F"}
+        wait_for(lambda: listening(data), alive=(process,))  # the page may answer before it does
+        assert listening(page, data) == {("0100007F", port) for port in (page, data)}
         process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=20) == 0
         assert not listening(page)
         assert list(tmp_path.iterdir()) == []
-    finally:
-        if process.poll() is None:
-            process.terminate()  # so that it ends its server too, which kill() would orphan
-            process.wait(timeout=60)
-        process.stdout.close()
-
-
-def listening(port):
-    """Local addresses, as the kernel prints them, that listen on a port."""
-    found = set()
-    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
-        if not Path(table).exists():
-            continue
-        for line in Path(table).read_text().splitlines()[1:]:
-            local, _, state = line.split()[1:4]
-            address, _, hexadecimal = local.partition(":")
-            if state == "0A" and int(hexadecimal, 16) == port:
-                found.add(address)
-    return found

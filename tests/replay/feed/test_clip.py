@@ -13,20 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import undulog
-from support import processes
+from support import golden_pictures, processes
 from undulog.capture.common.errors import UsageError
 from undulog.replay.feed.film import Shot, open_film
 
 VERMILION = (255, 84, 48)
 GROUND = (16, 18, 22)
-
-
-def run(capsys, *arguments):
-    """Exit code, standard output, standard error."""
-    code = undulog.run(["view", *map(str, arguments)])
-    told = capsys.readouterr()
-    return code, told.out, told.err
 
 
 def square(step, size=(160, 160)):
@@ -45,10 +37,7 @@ def squares(path, *, kind, fps, count=25):
 
 def glowing(picture):
     """Where it is vermilion."""
-    rgb = np.asarray(picture.convert("RGB")).astype(int)
-    return (
-        (rgb[..., 0] > 1.6 * rgb[..., 2]) & (rgb[..., 0] > 1.4 * rgb[..., 1]) & (rgb[..., 0] > 90)
-    )
+    return golden_pictures.glowing(np.asarray(picture.convert("RGB")).astype(int))
 
 
 def left_edge(picture):
@@ -160,8 +149,8 @@ def played(browser, path, seconds):
         (["--from", "0", "--size", "640x480"], "--from, --size"),
     ],
 )
-def test_wrong_usage_is_explained(session_file, capsys, empty_folder, arguments, complaint):
-    code, _, err = run(capsys, session_file, *arguments)
+def test_wrong_usage_is_explained(session_file, view, empty_folder, arguments, complaint):
+    code, _, err = view(session_file, *arguments)
     assert code == 2
     assert complaint in err
     assert list(empty_folder.iterdir()) == []
@@ -174,25 +163,24 @@ def empty_folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_nothing_is_overwritten_without_force(session_file, capsys, tmp_path):
+def test_nothing_is_overwritten_without_force(session_file, view, tmp_path):
     (tmp_path / "a.gif").write_bytes(b"mine")
-    code, _, err = run(capsys, session_file, "--clip", tmp_path / "a.gif")
+    code, _, err = view(session_file, "--clip", tmp_path / "a.gif")
     assert (code, (tmp_path / "a.gif").read_bytes()) == (2, b"mine")
     assert "--force" in err
 
 
-def test_a_session_without_a_body_says_what_it_takes(write, capsys, tmp_path):
+def test_a_session_without_a_body_says_what_it_takes(write, view, tmp_path):
     session = write(tmp_path / "a.mcap", robot=False)
-    code, _, err = run(capsys, session, "--clip", tmp_path / "a.gif")
+    code, _, err = view(session, "--clip", tmp_path / "a.gif")
     assert code == 1
     assert "robot description" in err
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
 @pytest.mark.slow
-def test_a_gif_shows_the_gait(session_file, vulkan, capsys, tmp_path):
-    code, out, _ = run(
-        capsys,
+def test_a_gif_shows_the_gait(session_file, vulkan, view, tmp_path):
+    code, out, _ = view(
         *(session_file, "--clip", tmp_path / "a.gif", "--json"),
         *("--from", 0.4, "--to", 2.8, "--fps", 5, "--size", "480x300"),
     )
@@ -217,9 +205,8 @@ def shared(one, other):
 
 
 @pytest.mark.slow
-def test_an_mp4_of_the_body_plays_in_chromium(session_file, vulkan, browser, capsys, tmp_path):
-    code, out, _ = run(
-        capsys,
+def test_an_mp4_of_the_body_plays_in_chromium(session_file, vulkan, browser, view, tmp_path):
+    code, out, _ = view(
         *(session_file, "--clip", tmp_path / "a.mp4"),
         *("--to", 1, "--fps", 10, "--speed", 0.5, "--size", "640x360"),
     )

@@ -28,13 +28,6 @@ NO_COUPLING = Coupling(identifiable=False, why="one gait")
 MADE = Provenance("", {}, {}, {})
 
 
-def run(capsys, *arguments):
-    """Exit code, standard output, standard error."""
-    code = undulog.run(["view", *map(str, arguments)])
-    told = capsys.readouterr()
-    return code, told.out, told.err
-
-
 @pytest.fixture
 def session(session_file):
     """The whole session, open."""
@@ -217,16 +210,16 @@ def test_without_results_nothing_is_marked(recording):
     assert not any("named" in path for path in recorded.entities)
 
 
-def test_results_and_tabs_are_of_one_session(session_file, tmp_path, capsys):
+def test_results_and_tabs_are_of_one_session(session_file, tmp_path, view):
     for words in (["--result", tmp_path / "a.json"], ["--tab", "cycles"]):
-        code, _, err = run(capsys, session_file, session_file, *words)
+        code, _, err = view(session_file, session_file, *words)
         assert code == 2
         assert f"{words[0]}: needs one session" in err
 
 
-def test_a_result_that_is_not_there_fails(session_file, tmp_path, capsys):
+def test_a_result_that_is_not_there_fails(session_file, tmp_path, view):
     missing = tmp_path / "nowhere.json"
-    code, _, err = run(capsys, session_file, "--result", missing, "--save", tmp_path / "a.rrd")
+    code, _, err = view(session_file, "--result", missing, "--save", tmp_path / "a.rrd")
     assert code == 1
     assert "nowhere.json" in err
     assert not (tmp_path / "a.rrd").exists()

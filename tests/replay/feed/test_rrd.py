@@ -18,6 +18,17 @@ def converted(file, path, **options):
         return write_recording(session, path, **options)
 
 
+@pytest.fixture
+def made(write, tmp_path, read_back):
+    """Writes and converts the session without some parts: what was said, what is in the file."""
+
+    def make(**parts):
+        written = converted(write(tmp_path / "a.mcap", **parts), tmp_path / "a.rrd")
+        return written, read_back(written.path)
+
+    return make
+
+
 def rows(column):
     """Rows of equal length as an array."""
     return np.array(column, dtype=float)
@@ -183,20 +194,18 @@ def test_a_file_cut_short_by_a_full_disk_is_an_error(session_file, tmp_path, mon
     assert list(tmp_path.iterdir()) == []
 
 
-def test_lost_samples_stay_holes(write, truth, read_back, tmp_path):
+def test_lost_samples_stay_holes(made, truth):
     position = truth.position.copy()
     position[100:110, 6] = np.nan
-    written = converted(write(tmp_path / "a.mcap", position=position), tmp_path / "a.rrd")
-    found = read_back(written.path)
+    _, found = made(position=position)
     assert_drawn(rows(found.column("/joints/measured", "Angle:degrees")), np.degrees(position))
     links = [len(row) for row in found.column("/world/snake/measured", "Capsules3D:translations")]
     assert links == [7 if 50 <= i < 55 else 26 for i in range(150)]
 
 
-def test_a_pause_is_not_bridged(write, truth, read_back, tmp_path):
+def test_a_pause_is_not_bridged(made, truth):
     keep = (truth.t < 1.0) | (truth.t >= 2.0)
-    written = converted(write(tmp_path / "a.mcap", keep=keep), tmp_path / "a.rrd")
-    found = read_back(written.path)
+    _, found = made(keep=keep)
     measured = rows(found.column("/joints/measured", "Angle:degrees"))
     assert measured.shape == (201, 25)
     assert np.isnan(measured[100]).all()
@@ -208,36 +217,32 @@ def test_a_pause_is_not_bridged(write, truth, read_back, tmp_path):
     assert not ((trail > 1_000_000_000) & (trail <= 2_000_000_000)).any()
 
 
-def test_without_odometry_the_head_stays_at_the_origin(write, read_back, tmp_path):
-    written = converted(write(tmp_path / "a.mcap", odometry=False), tmp_path / "a.rrd")
+def test_without_odometry_the_head_stays_at_the_origin(made):
+    written, found = made(odometry=False)
     assert "no /odom in the session: the head is held at the origin" in written.warnings
-    found = read_back(written.path)
     origin = rows(found.column("/world/snake/measured", "Capsules3D:translations"))
     assert (origin[:, 0] == origin[0, 0]).all()
     assert "/world/trail" not in found.entities
 
 
-def test_without_a_robot_there_are_plots_but_no_body(write, truth, read_back, tmp_path):
-    written = converted(write(tmp_path / "a.mcap", robot=False), tmp_path / "a.rrd")
+def test_without_a_robot_there_are_plots_but_no_body(made, truth):
+    written, found = made(robot=False)
     assert any("no robot description" in warning for warning in written.warnings)
-    found = read_back(written.path)
     assert not [entity for entity in found.entities if entity.startswith("/world")]
     shown = rows(found.column("/joints/measured", "Angle:degrees"))
     assert_drawn(shown, np.degrees(truth.position))
 
 
-def test_without_torques_the_body_wears_the_colours_of_its_joints(write, read_back, tmp_path):
-    written = converted(write(tmp_path / "a.mcap", effort=False), tmp_path / "a.rrd")
+def test_without_torques_the_body_wears_the_colours_of_its_joints(made):
+    written, found = made(effort=False)
     assert written.content.power_limit_w is None
-    found = read_back(written.path)
     packed = joint_colors(26).astype(int) @ [1 << 24, 1 << 16, 1 << 8, 1]
     assert found.column("/world/snake/measured", "Capsules3D:colors")[0] == packed.tolist()
     assert "/power/mechanical" not in found.entities
 
 
-def test_without_a_gait_there_is_one_timeline(write, read_back, tmp_path):
-    written = converted(write(tmp_path / "a.mcap", gait=False), tmp_path / "a.rrd")
-    found = read_back(written.path)
+def test_without_a_gait_there_is_one_timeline(made):
+    _, found = made(gait=False)
     assert found.times("/joints/measured", "gait_cycle").size == 0
     assert "/events" not in found.entities
 

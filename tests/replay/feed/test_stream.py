@@ -2,6 +2,7 @@
 
 import signal
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,19 +55,29 @@ class Stopping(Told):
         self.stop.signal = signal.SIGINT
 
 
+@contextmanager
+def streaming(file, path):
+    """A Rerun process that writes what it takes of a session, and what makes a task of it."""
+    with (
+        Session.open(file) as session,
+        Viewer(["--save", str(path)]) as viewer,
+        Analysing(file, TOPICS) as analysing,
+    ):
+
+        def task_of(bar, known=None):
+            return Task(session, known or Layer(None), analysing, "session", bar)
+
+        yield viewer, task_of
+
+
 @pytest.fixture
 def receive(tmp_path, read_back):
     """Streams a session to a Rerun process that writes what it takes; returns notes and file."""
 
     def stream(file, known=None, identity=None):
         path = tmp_path / "received.rrd"
-        with (
-            Session.open(file) as session,
-            Viewer(["--save", str(path)]) as viewer,
-            Analysing(file, TOPICS) as analysing,
-        ):
-            task = Task(session, known or Layer(None), analysing, "session", Told())
-            notes = show_session(task, viewer, StopRequest())
+        with streaming(file, path) as (viewer, task_of):
+            notes = show_session(task_of(Told(), known), viewer, StopRequest())
         return notes, read_back(path, identity)
 
     return stream
@@ -192,41 +203,28 @@ def test_the_layout_foreseen_is_that_of_the_analysed_session(tmp_path):
 def test_an_end_that_is_asked_for_comes_soon_and_ends_the_viewer(long_file, tmp_path):
     stop = StopRequest()
     bar = Stopping(stop)
-    with (
-        Session.open(long_file) as session,
-        Viewer(["--save", str(tmp_path / "a.rrd")]) as viewer,
-        Analysing(long_file, TOPICS) as analysing,
-    ):
+    with streaming(long_file, tmp_path / "a.rrd") as (viewer, task_of):
         with pytest.raises(NoLongerWantedError):
-            show_session(Task(session, Layer(None), analysing, "session", bar), viewer, stop)
+            show_session(task_of(bar), viewer, stop)
         assert viewer.ended
     assert len(bar.heard) == 1
 
 
 def test_a_viewer_that_dies_is_told(long_file, tmp_path):
-    with (
-        Session.open(long_file) as session,
-        Viewer(["--save", str(tmp_path / "a.rrd")]) as viewer,
-        Analysing(long_file, TOPICS) as analysing,
-    ):
+    with streaming(long_file, tmp_path / "a.rrd") as (viewer, task_of):
 
         class Killing(Told):
             def update(self, done, note=""):
                 viewer._process.kill()
 
-        task = Task(session, Layer(None), analysing, "session", Killing())
         with pytest.raises(UndulogError, match="viewer was ended by signal 9"):
-            show_session(task, viewer, StopRequest())
+            show_session(task_of(Killing()), viewer, StopRequest())
 
 
 @pytest.mark.slow
 def test_a_frozen_viewer_holds_up_the_reading_and_can_be_ended(long_file, tmp_path):
     stop = StopRequest()
-    with (
-        Session.open(long_file) as session,
-        Viewer(["--save", str(tmp_path / "a.rrd")]) as viewer,
-        Analysing(long_file, TOPICS) as analysing,
-    ):
+    with streaming(long_file, tmp_path / "a.rrd") as (viewer, task_of):
 
         class Freezing(Told):
             def update(self, done, note=""):
@@ -241,7 +239,7 @@ def test_a_frozen_viewer_holds_up_the_reading_and_can_be_ended(long_file, tmp_pa
         bar, stop = Freezing(), Impatient()
         end = time.monotonic() + 8.0
         with pytest.raises(NoLongerWantedError):
-            show_session(Task(session, Layer(None), analysing, "session", bar), viewer, stop)
+            show_session(task_of(bar), viewer, stop)
         assert time.monotonic() < end + 30.0
         # What the sockets hold may be sent; the session is longer than that only for the hour.
         assert bar.heard

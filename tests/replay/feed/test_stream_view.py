@@ -9,10 +9,10 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from rerun.experimental import ViewerClient
 
-from support import processes
+from support import golden_pictures, processes
 from support.processes import freeze
+from undulog.replay.viewer.headless import client_of
 from undulog.replay.viewer.viewer import Viewer
 
 pytestmark = pytest.mark.slow
@@ -37,11 +37,7 @@ undulog.main()
 
 
 def until(condition):
-    deadline = time.monotonic() + WAIT_S
-    while not (found := condition()):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    return found
+    return processes.wait_for(condition, seconds=WAIT_S)
 
 
 class Shown:
@@ -66,17 +62,7 @@ class Shown:
 
     def look_into(self, address):
         """Look into a viewer."""
-
-        def connected():
-            assert self.process.poll() is None, self.process.stderr.read()
-            try:
-                client = ViewerClient.connect(address)
-                client.get_state()
-            except (ConnectionError, RuntimeError, TimeoutError):
-                return None
-            return client
-
-        self.client = until(connected)
+        self.client = client_of(address, lambda: self.process.poll() is not None)
 
     @property
     def views(self):
@@ -120,8 +106,7 @@ def view(vulkan, tmp_path):
 
 
 def glows(picture):
-    red, green, blue = (picture[..., channel] for channel in range(3))
-    return int(((red > 1.6 * blue) & (red > 1.4 * green) & (red > 90)).sum())
+    return golden_pictures.glowing(picture).sum()
 
 
 def body_of(views):

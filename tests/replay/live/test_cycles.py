@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from support.live_stage import EPOCH_NS, WAIT_S, Recorder, Relay
+from support.live_stage import EPOCH_NS, WAIT_S, Relay, seen_live
 from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session, SessionWriter
 from undulog.capture.recorder.live_wire import LiveMessage
@@ -125,19 +125,9 @@ def test_without_a_logged_phase_there_are_no_cycles(write, tmp_path):
 
 
 def test_the_live_view_draws_bars_and_steps_of_each_cycle(walk, snake25, tmp_path, read_back):
-    socket_path = tmp_path / "live.sock"
-    relay = Relay(socket_path, tmp_path / "live.rrd")
-    try:
-        recorder = Recorder(walk, socket_path)
-        recorder.connect()
-        recorder.send()
-        recorder.feed.close()
-        report = relay.finish()
-    finally:
-        relay.process.kill()
-        relay.process.communicate()
+    report, output = seen_live(walk, tmp_path)
     assert report["dropped"] == report["unread"] == 0
-    drawn = read_back(tmp_path / "live.rrd")
+    drawn = read_back(output)
     expected = measured_in_batches(walk, 50_000_000)
     starts = [cycle.start_ns - EPOCH_NS for cycle in expected]
     for key, of in (

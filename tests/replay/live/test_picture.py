@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from support.live_stage import EPOCH_NS, Recorder, Relay
+from support.live_stage import EPOCH_NS, seen_live
 from undulog.capture import Session
 from undulog.replay.feed.recording import write_recording
 
@@ -11,18 +11,8 @@ from undulog.replay.feed.recording import write_recording
 @pytest.fixture(scope="module")
 def live(session_file, tmp_path_factory, read_back):
     """The whole session seen live: (what the relay reports, what it drew)."""
-    folder = tmp_path_factory.mktemp("live")
-    socket_path = folder / "live.sock"
-    relay = Relay(socket_path, folder / "live.rrd")
-    try:
-        recorder = Recorder(session_file, socket_path)
-        recorder.connect()
-        recorder.send()
-        recorder.feed.close()
-        return relay.finish(), read_back(relay.output)
-    finally:
-        relay.process.kill()
-        relay.process.communicate()
+    report, output = seen_live(session_file, tmp_path_factory.mktemp("live"))
+    return report, read_back(output)
 
 
 @pytest.fixture(scope="module")
@@ -32,18 +22,6 @@ def replay(session_file, tmp_path_factory, read_back):
     with Session.open(session_file) as session:
         write_recording(session, path)
     return read_back(path)
-
-
-def rows(recorded, entity, component):
-    """Time to values, in order."""
-    found = zip(recorded.times(entity).tolist(), recorded.column(entity, component), strict=True)
-    return dict(sorted((t, v) for t, v in found if v is not None))
-
-
-def same(first, second, atol=1e-12):
-    return np.allclose(
-        np.asarray(first, dtype=float), np.asarray(second, dtype=float), atol=atol, equal_nan=True
-    )
 
 
 def test_every_message_is_shown(live, session_file):
@@ -63,17 +41,17 @@ def test_angles_are_those_that_were_measured(live, truth):
         ("/joints/commanded", truth.command),
         ("/joints/error", truth.position - truth.command),
     ):
-        found = rows(drawn, entity, "Angle:degrees")
+        found = drawn.rows(entity, "Angle:degrees")
         assert list(found) == t_ns.tolist()
         np.testing.assert_allclose(list(found.values()), np.degrees(values), atol=2e-6)
 
 
 def test_power_is_torque_times_velocity(live, truth):
     _, drawn = live
-    found = rows(drawn, "/power/mechanical", "Scalars:scalars")
+    found = drawn.rows("/power/mechanical", "Scalars:scalars")
     assert list(found) == (truth.t_ns - EPOCH_NS).tolist()
     np.testing.assert_allclose(list(found.values()), truth.effort * truth.velocity, atol=1e-8)
-    total = rows(drawn, "/power/total/electrical", "Scalars:scalars")
+    total = drawn.rows("/power/total/electrical", "Scalars:scalars")
     shown = np.ravel(list(total.values()))
     np.testing.assert_allclose(shown, 6.0 * truth.effort.sum(axis=1), atol=1e-6)
 
@@ -94,7 +72,7 @@ def test_power_is_torque_times_velocity(live, truth):
 )
 def test_live_and_replay_draw_the_same(live, replay, entity, component):
     _, drawn = live
-    seen, expected = rows(drawn, entity, component), rows(replay, entity, component)
+    seen, expected = drawn.rows(entity, component), replay.rows(entity, component)
     common = [t for t in expected if t in seen]
     assert len(common) >= 0.9 * len(expected)
     # A replay rounds its lines by no more than a thousandth of their range.
@@ -105,7 +83,8 @@ def test_live_and_replay_draw_the_same(live, replay, entity, component):
         if isinstance(expected[t][0], str):
             assert seen[t] == expected[t]
         else:
-            assert same(seen[t], expected[t], atol)
+            one, other = (np.array(values[t], dtype=float) for values in (seen, expected))
+            np.testing.assert_allclose(one, other, rtol=1e-5, atol=atol)
 
 
 def test_names_and_colours_are_the_replays(live, replay):

@@ -17,12 +17,6 @@ from undulog.capture.recorder.live_wire import DatagramHead, Kind, pack_datagram
 from undulog.replay.live.inbox import Inbox
 
 
-def rows(recorded, entity, component):
-    """Time to values, in order."""
-    found = zip(recorded.times(entity).tolist(), recorded.column(entity, component), strict=True)
-    return dict(sorted((t, v) for t, v in found if v is not None))
-
-
 def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back):
     recorder = stage.recorder()
     recorder.send(0.0, 1.5, wait=False)
@@ -33,12 +27,12 @@ def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back)
     report = relay.finish()
     assert report["dropped"] == 0
     drawn = read_back(relay.output)
-    found = rows(drawn, "/joints/measured", "Angle:degrees")
+    found = drawn.rows("/joints/measured", "Angle:degrees")
     assert list(found) == (truth.t_ns - EPOCH_NS)[150:].tolist()
     expected = np.degrees(truth.position[150:])
     np.testing.assert_allclose(list(found.values()), expected, atol=2e-6)
     # The mode was said before, and still holds.
-    assert rows(drawn, "/gait/mode", "StateChange:state") == {1_000_000_000: ["avoid"]}
+    assert drawn.rows("/gait/mode", "StateChange:state") == {1_000_000_000: ["avoid"]}
 
 
 def test_nothing_derived_is_lost_when_much_comes_at_once(stage, truth, read_back):
@@ -56,7 +50,7 @@ def test_nothing_derived_is_lost_when_much_comes_at_once(stage, truth, read_back
         ("/joints/error", "Angle:degrees"),
         ("/power/mechanical", "Scalars:scalars"),
     ):
-        found = rows(drawn, entity, component)
+        found = drawn.rows(entity, component)
         assert list(found) == (truth.t_ns - EPOCH_NS).tolist()
 
 
@@ -76,7 +70,7 @@ def test_frozen_relay_holds_nothing_up_and_goes_on(stage, read_back, monkeypatch
     report = relay.finish()
     assert report["dropped"] == recorder.feed.counts.dropped
     assert report["shown"] == recorder.feed.counts.sent
-    found = list(rows(read_back(relay.output), "/joints/measured", "Angle:degrees"))
+    found = list(read_back(relay.output).rows("/joints/measured", "Angle:degrees"))
     assert found[:50] == [10_000_000 * i for i in range(50)]
     assert found[-50:] == [2_500_000_000 + 10_000_000 * i for i in range(50)]
 
@@ -95,7 +89,7 @@ def test_killed_relay_is_replaced(stage, read_back, monkeypatch):
     recorder.send(1.5)
     recorder.feed.close()
     second.finish()
-    found = list(rows(read_back(second.output), "/joints/measured", "Angle:degrees"))
+    found = list(read_back(second.output).rows("/joints/measured", "Angle:degrees"))
     assert found == [1_500_000_000 + 10_000_000 * i for i in range(150)]
 
 
@@ -111,18 +105,16 @@ def test_joints_sampled_in_turn_are_drawn_at_their_own_times(
             offsets.write(t_ns, offset)
             states.write(t_ns, truth.position[i])
     recorder, relay = stage.recorder(path), stage.relay()
-    recorder.connect()
-    recorder.send()
-    recorder.feed.close()
+    recorder.send_all()
     relay.finish()
     drawn = read_back(relay.output)
     for j in (0, 12, 24):
-        found = rows(drawn, f"/joints/measured/{snake25.joint_names[j]}", "Angle:degrees")
+        found = drawn.rows(f"/joints/measured/{snake25.joint_names[j]}", "Angle:degrees")
         expected = truth.t_ns - EPOCH_NS + round(offset[j] * 1e9)
         assert np.abs(np.array(list(found)) - expected).max() <= 1
         shown = np.ravel(list(found.values()))
         np.testing.assert_allclose(shown, np.degrees(truth.position[:, j]), atol=2e-6)
-    centres = rows(drawn, "/world/snake/measured", "Capsules3D:translations")
+    centres = drawn.rows("/world/snake/measured", "Capsules3D:translations")
     assert len(centres) > 100  # at the origin, without odometry
 
 
@@ -133,9 +125,7 @@ def test_noise_on_the_socket_is_counted_and_borne(stage):
         link.send(b"")
         link.send(b"not ours")
         link.send(pack_datagram(DatagramHead(Kind.MESSAGES, 1, 1, 0), [b"\x05\0\0\0cut"]))
-    recorder.connect()
-    recorder.send()
-    recorder.feed.close()
+    recorder.send_all()
     report = relay.finish()
     assert report["unread"] == 3
     assert report["sessions"] == ["made-for-tests"]
@@ -179,9 +169,7 @@ def test_inbox_drops_the_oldest_and_keeps_what_explains_the_rest(tmp_path, sessi
     path = tmp_path / "s"
     with Inbox(path, max_bytes=100_000) as inbox:
         recorder = Recorder(session_file, path)
-        recorder.connect()
-        recorder.send()
-        recorder.feed.close()
+        recorder.send_all()
         kinds = []
 
         def end_has_come():

@@ -10,7 +10,7 @@ import pytest
 
 import undulog
 from support.live_stage import WAIT_S
-from support.processes import freeze
+from support.processes import freeze, listening
 from undulog.replay.viewer.viewer import free_ports, viewer_binary
 
 
@@ -76,21 +76,12 @@ def test_web_serves_this_machine_only_and_leaves_nothing(stage):
     )
     ports = {int(text) for text in re.findall(r"(?:127.0.0.1:|127.0.0.1%3A)(\d+)", page)}
     assert len(ports) == 2
-    assert listening(ports) == {(f"{0x0100007F:08X}", port) for port in ports}
+    assert listening(*ports) == {("0100007F", port) for port in ports}
     relay.process.send_signal(signal.SIGINT)
     relay.process.communicate(timeout=WAIT_S)
     assert relay.process.returncode == 0
     assert not Path(f"/proc/{child}").exists()
     assert not stage.path.exists()
-
-
-def listening(ports):
-    """Address and port of all listening sockets at some ports."""
-    lines = Path("/proc/net/tcp").read_text().splitlines()[1:]
-    lines += Path("/proc/net/tcp6").read_text().splitlines()[1:]
-    entries = [line.split() for line in lines]
-    local = [entry[1].split(":") for entry in entries if entry[3] == "0A"]
-    return {(address, int(port, 16)) for address, port in local if int(port, 16) in ports}
 
 
 @pytest.mark.parametrize(

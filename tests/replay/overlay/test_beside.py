@@ -12,6 +12,8 @@ import pytest
 import rerun.blueprint as rrb
 
 import undulog
+from support.golden_pictures import marked
+from support.twin_chains import chain as chain_text
 from undulog.analysis.compare.compare import Choices, compare_sessions
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import LogWriteError
@@ -28,20 +30,6 @@ from undulog.replay.samples.timeline import SESSION_TIME, Rhythm
 EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("joint01", "joint02", "joint03", "joint04", "joint05")
 LAG = 0.7
-
-CHAIN = """name = "{name}"
-description = "Yaw joints in a row."
-clock = "simulated"
-assumed = ["links", "servo"]
-[chain]
-joints = {joints}
-planes = ["horizontal"]
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-"""
 
 
 @dataclass(frozen=True)
@@ -88,7 +76,7 @@ def chain(tmp_path_factory):
 
     def make(joints, name="chain"):
         path = folder / f"{name}{joints}.toml"
-        path.write_text(CHAIN.format(name=f"{name}{joints}", joints=joints))
+        path.write_text(chain_text(joints, planes=["horizontal"]))
         return load_robot(path)
 
     return make
@@ -559,9 +547,7 @@ def test_no_view_complains_and_each_shows_something(show, converted, rgb, tmp_pa
     # Bodies, three texts, places, power, differences, heads; three bars and three differences.
     assert len(grid.views) == 14
     for name in grid.views:
-        picture = rgb(grid.picture(name))
-        marks = np.abs(picture - np.median(picture, axis=(0, 1))).max(axis=-1) > 60
-        assert marks.sum() > 150, f"the view {name!r} is empty"
+        assert marked(rgb(grid.picture(name))) > 150, f"the view {name!r} is empty"
 
 
 @pytest.mark.slow

@@ -6,11 +6,7 @@ rasterisers that know nothing of each other.
 
 import base64
 import io
-import os
-import subprocess
-import sys
 import time
-import urllib.request
 
 import numpy as np
 import pytest
@@ -18,7 +14,7 @@ from PIL import Image
 
 import undulog
 from support import golden_pictures
-from support.processes import wait_for
+from support.processes import served_page, wait_for
 
 pytestmark = pytest.mark.slow
 
@@ -49,29 +45,8 @@ def native(show, rgb, tmp_path_factory):
 @pytest.fixture
 def address(tmp_path):
     """Where ``undulog view --web`` serves the session, until the test is over."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "undulog", "view", golden_pictures.SESSION, "--web"],
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "TMPDIR": str(tmp_path)},
-    )
-    try:
-        line = process.stdout.readline().strip()
-        while not line.startswith("http"):
-            assert process.poll() is None
-            line = process.stdout.readline().strip()
-        for _ in range(100):
-            try:
-                urllib.request.urlopen(line.partition("?")[0], timeout=5).close()
-                break
-            except OSError:
-                assert process.poll() is None
-                time.sleep(0.1)
+    with served_page(golden_pictures.SESSION, tmp_path) as (_, line):
         yield line
-    finally:
-        process.terminate()
-        process.wait(timeout=60)
-        process.stdout.close()
 
 
 def part(picture, name):
@@ -81,8 +56,7 @@ def part(picture, name):
 
 def glows(picture):
     """How many pixels are vermilion, which only the body's power is here."""
-    red, green, blue = (part(picture, "body")[..., channel] for channel in range(3))
-    return int(((red > 1.6 * blue) & (red > 1.4 * green) & (red > 90)).sum())
+    return golden_pictures.glowing(part(picture, "body")).sum()
 
 
 class Page:

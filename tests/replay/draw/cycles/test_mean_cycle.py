@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import undulog
+from support.twin_chains import chain, wave
 from undulog.analysis.results.artefact import Artefact
 from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.session.analyse import measure_session
@@ -17,39 +18,14 @@ from undulog.replay.feed.numbers import computed
 from undulog.replay.feed.recording import write_recording
 from undulog.replay.samples.timeline import ENSEMBLE_CYCLE
 
-CHAIN = """name = "chain5"
-description = "Five yaw joints."
-clock = "simulated"
-assumed = ["links", "servo"]
-[chain]
-joints = 5
-planes = ["horizontal"]
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-"""
-WAVE = """description = "A wave on the ground."
-robot = "chain5.toml"
-duration_s = 8.0
-settle_s = 3.0
-physics_rate_hz = 4000
-[gait]
-ramp_s = 0.5
-[gait.horizontal]
-amplitude = 0.4
-frequency_hz = 1.0
-lag = 1.0
-"""
-
 
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory, read_back):
     """A chain of five joints in a steady wave: (session's file, what was said, recording)."""
     folder = tmp_path_factory.mktemp("twin")
-    (folder / "chain5.toml").write_text(CHAIN)
-    (folder / "wave.toml").write_text(WAVE)
+    (folder / "chain.toml").write_text(chain(5, planes=["horizontal"]))
+    run = {"duration_s": 8.0, "settle_s": 3.0, "physics_rate_hz": 4000, "gait": {"ramp_s": 0.5}}
+    (folder / "wave.toml").write_text(wave(**run, horizontal={"lag": 1.0}))
     words = ["sim", "run", str(folder / "wave.toml"), "-o", str(folder / "run.mcap")]
     assert undulog.run(words) == 0
     with Session.open(folder / "run.mcap") as session:
