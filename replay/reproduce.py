@@ -22,7 +22,7 @@ from undulog.capture import Session, SessionView, load_robot
 from undulog.capture.common.console import echo, emit_json
 from undulog.capture.common.errors import DataError, MissingChannelError, UsageError
 from undulog.capture.common.process import StopRequest
-from undulog.capture.log.edit.raw_messages import RawLog, RawMessage
+from undulog.capture.log.edit.raw_messages import RawLog
 from undulog.sim.commands.drive_bus import drive_armed, drive_on_bus
 from undulog.sim.drive.in_process import drive_twin
 from undulog.sim.drive.motion import MotionSource, find_motion
@@ -71,17 +71,15 @@ def compare_logs(one: Path, other: Path) -> LogDifference:
         LogError: If one can't be read.
     """
     with RawLog(one) as first, RawLog(other) as second:
-        ids = [
+        own, others = (
             {channel.topic: key for key, channel in log.file.channels.items()}
             for log in (first, second)
-        ]
-        topics = [topic for topic in ids[0] if topic in ids[1] and topic != EVENTS]
+        )
         same: list[str] = []
         differs_s: dict[str, float] = {}
         messages = 0
-        for topic in topics:
-            pairs = zip_longest(_told(first, ids[0][topic]), _told(second, ids[1][topic]))
-            for a, b in pairs:
+        for topic in [one for one in own if one in others and one != EVENTS]:
+            for a, b in zip_longest(_told(first, own[topic]), _told(second, others[topic])):
                 messages += a is not None
                 if a != b:
                     at_ns = min(told[0] for told in (a, b) if told is not None)
@@ -89,13 +87,12 @@ def compare_logs(one: Path, other: Path) -> LogDifference:
                     break
             else:
                 same.append(topic)
-        one_sided = tuple(sorted(({*ids[0]} ^ {*ids[1]}) - {EVENTS}))
+    one_sided = tuple(sorted((own.keys() ^ others.keys()) - {EVENTS}))
     return LogDifference(tuple(same), differs_s, one_sided, messages)
 
 
 def _told(log: RawLog, channel_id: int) -> Iterator[tuple[int, int, bytes]]:
     """Log time, publish time and bytes of a channel's messages."""
-    message: RawMessage
     for message in log.messages({channel_id}, 0, _ALWAYS):
         yield message.log_time_ns, message.publish_time_ns, message.data
 
@@ -263,27 +260,16 @@ def replay_on_bus(
     driven = find_motion(str(file), robot=described)
     if driven.kind != "commands":
         raise UsageError(f"{file} is no session; 'undulog drive {file} --on {on}' drives a gait")
+    given: dict[str, Any] = {
+        "robot": described,
+        "duration_s": duration_s,
+        "output": output,
+        "recorder": recorder,
+        "force": force,
+    }
     if not arm:
-        return drive_on_bus(
-            driven,
-            on,
-            arm=False,
-            robot=described,
-            duration_s=duration_s,
-            output=output,
-            recorder=recorder,
-            force=force,
-            as_json=as_json,
-        )
-    run = drive_armed(
-        driven,
-        on,
-        robot=described,
-        duration_s=duration_s,
-        output=output,
-        recorder=recorder,
-        force=force,
-    )
+        return drive_on_bus(driven, on, arm=False, as_json=as_json, **given)
+    run = drive_armed(driven, on, **given)
     comparison, why = None, "it did not run to its end"
     if run.complete:
         with Session.open(file) as first, Session.open(run.plan.output) as second:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
+from undulog.capture.common.console import echo, emit_json, progress
 from undulog.capture.common.errors import UsageError
+from undulog.capture.common.files import check_output
 
 from .view_film import view_clip
 from .view_options import ClipOptions, OverlayOptions, SingleOptions
@@ -77,9 +78,7 @@ def view(
         view_clip(files[0], clip, shot or ClipOptions(), force=force, json=json)
         return
     if save is not None:
-        if save.suffix.lower() != ".rrd":
-            raise UsageError(f"{save}: a Rerun recording; end its name in .rrd")
-        refuse_existing(save, force=force)
+        check_output(save, [".rrd"], "a Rerun recording; end its name in .rrd", force=force)
     if live is not None:
         from .view_viewer import view_live
 
@@ -133,7 +132,7 @@ def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording
     from undulog.analysis.signals.stretch import Options
     from undulog.capture import Session
 
-    from ..feed.numbers import computed, saved
+    from ..feed.numbers import saved
 
     command, response = single.topics
     options = Options(command_topic=command, response_topic=response)
@@ -142,10 +141,7 @@ def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording
         session = stack.enter_context(Session.open(file, column_folder=folder))
         bar = stack.enter_context(progress("view", total=2))
         bar.update(0, note="results" if single.result else "analysis")
-        if single.result:
-            layer = saved(session, single.result, options)
-        else:
-            layer = computed(session, options)
+        layer = saved(session, single.result or (), options)
         session.forget()
         bar.update(1, note="recording")
         # Here, not above: Rerun takes memory that the analysis can use before.

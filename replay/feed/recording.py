@@ -89,8 +89,7 @@ def write_recording(
         LogWriteError: If the file can't be written.
     """
     layer = Layer(analysis, steady, tuple(named), tuple(notes))
-    sources = Sources.of(session)
-    clock = clock_of(session)
+    sources, clock = Sources.of(session), clock_of(session)
     identity = recording_id(session.session_id)
     with part_file(path) as draft, rerun_writes(path):
         rec = open_recording(identity, in_file=True)

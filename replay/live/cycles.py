@@ -161,8 +161,6 @@ class CycleMeter:
 
     def _cut_gait(self, first: int) -> None:
         """Keep the run that goes on, and of it no more than is needed."""
-        if first:
-            self._next.clear()
         oldest_ns = int(self._gait_ns[-1]) - round(KEPT_S * 1e9)
         first = max(first, int(np.searchsorted(self._gait_ns, oldest_ns)))
         self._gait_ns = self._gait_ns[first:]

@@ -163,13 +163,11 @@ class Relay:
             self._heard_at = time.monotonic()
             if datagram.head.feed_id != self._feed_id:
                 self._draw(pending)
-                pending = []
                 if not self._begin(datagram.head.feed_id):
                     return
             self._take(datagram, pending)
             if datagram.head.kind is Kind.END:
                 self._draw(pending)
-                pending = []
                 self._end()
         self._draw(pending)
         if not self.ended and self._sessions and self._silent_s() > SILENCE_S:
@@ -221,6 +219,7 @@ class Relay:
             self._refused += 1
 
     def _draw(self, messages: list[LiveMessage]) -> None:
+        """Draw messages, and take them off the list."""
         if not messages:
             return
         batch = self._log.decode(messages)
@@ -233,6 +232,7 @@ class Relay:
         self._shown += batch.messages
         now_ns = time.monotonic_ns()
         self._lags.extend((now_ns - message.offered_ns) * 1e-9 for message in messages)
+        messages.clear()
 
     def _open(self, first_ns: int) -> LiveScene:
         """A recording stream for the session."""

@@ -86,10 +86,10 @@ def wanted_fields(session: SessionView) -> dict[str, list[str]]:
     Returns:
         Topic to fields: the position of every topic, velocity and effort of ``/joint_states``.
     """
-    return {
-        topic: ["position", *(["velocity", "effort"] if topic == "/joint_states" else [])]
-        for topic in drawn_topics(session)[0]
-    }
+    wanted = {topic: ["position"] for topic in drawn_topics(session)[0]}
+    if "/joint_states" in wanted:
+        wanted["/joint_states"] += ["velocity", "effort"]
+    return wanted
 
 
 def read_columns(

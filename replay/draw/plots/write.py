@@ -94,9 +94,7 @@ def log_others(
         log_look(rec, entity, lines, joint_palette(lines))
         rec.flush()  # else what comes first in the file is chance
         for table in _tables(session, topic):
-            known = [line for line in lines if line in table.columns]
-            values = np.full((len(table), len(lines)), np.nan)
-            values[:, [lines.index(line) for line in known]] = table[known].to_numpy(np.float64)
+            values = table.reindex(columns=list(lines)).to_numpy(np.float64)
             t_ns = table.index.to_numpy(dtype=np.int64)
             log_rows(rec, clock, entity, *mark_gaps(*ordered(t_ns, values)))
         found.append(Signal(topic.lstrip("/"), (Series(entity, lines),), of_joints=False))
@@ -160,11 +158,8 @@ def _lines(session: SessionView, topic: str) -> tuple[str, ...]:
     """Fields to plot: those that vary first, if they are many."""
     for table in _tables(session, topic):
         numbers = table.select_dtypes("number")
-        names = [
-            str(name)
-            for name in numbers.columns
-            if not any(word in str(name) for word in _NOT_PLOTTED)
-        ]
+        columns = map(str, numbers.columns)
+        names = [one for one in columns if not any(word in one for word in _NOT_PLOTTED)]
         moving = {name for name in names if numbers[name].nunique() > 1}
         chosen = sorted(names, key=lambda name: name not in moving)[:MOST_LINES]
         return tuple(name for name in names if name in chosen)
@@ -235,17 +230,16 @@ class Plot:
             t_ns, values = mark_gaps(table.t_ns, values, span.known_ns)
             rows = span.rows(t_ns)
             steps: FloatArray = np.array([self._steps.get(name, 0.0) for name in one.names])
-            if rows.stop > rows.start:
-                log_rows(
-                    rec,
-                    clock,
-                    one.entity,
-                    t_ns[rows],
-                    values[rows],
-                    degrees=self._degrees,
-                    component=one.component,
-                    steps=steps,
-                )
+            log_rows(
+                rec,
+                clock,
+                one.entity,
+                t_ns[rows],
+                values[rows],
+                degrees=self._degrees,
+                component=one.component,
+                steps=steps,
+            )
 
 
 class Plots:

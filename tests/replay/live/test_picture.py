@@ -84,7 +84,7 @@ def test_live_and_replay_draw_the_same(live, replay, entity, component):
             assert seen[t] == expected[t]
         else:
             one, other = (np.array(values[t], dtype=float) for values in (seen, expected))
-            np.testing.assert_allclose(one, other, rtol=1e-5, atol=atol)
+            assert np.allclose(one, other, atol=atol, equal_nan=True)
 
 
 def test_names_and_colours_are_the_replays(live, replay):

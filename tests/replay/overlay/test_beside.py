@@ -131,6 +131,17 @@ def view(capsys, *words, code=0):
     return told.out if code == 0 else told.err
 
 
+@pytest.fixture
+def overlaid(capsys, tmp_path, read_back):
+    """Puts sessions side by side: standard output, and what is in the file."""
+
+    def save(*words):
+        out = view(capsys, *words, "--save", tmp_path / "x.rrd")
+        return out, read_back(tmp_path / "x.rrd")
+
+    return save
+
+
 def degrees(found, entity):
     """Rows of an angle's entity [degrees]."""
     return np.array(found.column(entity, "Angle:degrees"), dtype=float)
@@ -282,11 +293,10 @@ def test_a_body_leaves_when_its_session_ends_before_the_others(beside):
     assert beside["time"].times(cleared, "gait_cycle").tolist() == [end + 1]  # at 1 Hz
 
 
-def test_bars_and_their_differences_are_those_of_compare(make, read_back, tmp_path, capsys):
+def test_bars_and_their_differences_are_those_of_compare(make, tmp_path, overlaid):
     slow = Wave(amplitude=0.36, delay=0.2)
     files = make(tmp_path / "a.mcap", ROBOT), make(tmp_path / "b.mcap", slow)
-    view(capsys, *files, "--save", tmp_path / "ab.rrd")
-    found = read_back(tmp_path / "ab.rrd")
+    _, found = overlaid(*files)
 
     def bar(entity, joint):
         (drawn,) = found.static(f"{entity}/{joint}", "BarChart:values")
@@ -353,14 +363,13 @@ def test_without_a_robot_the_other_body_stands_alone(files, make, read_back, tmp
         assert not [e for e in found.entities if e.startswith("/bare/world")]
 
 
-def test_sessions_without_measured_angles_are_seen_too(chain, files, read_back, tmp_path, capsys):
+def test_sessions_without_measured_angles_are_seen_too(chain, files, tmp_path, overlaid):
     with SessionWriter(tmp_path / "c.mcap", session_id="c", epoch_ns=EPOCH_NS, robot=chain(5)) as w:
         commands = w.joint_state("/joint_commands", NAMES, unit="rad")
         for i in range(100):
             commands.write(EPOCH_NS + i * 10_000_000, np.zeros(5))
-    out = view(capsys, tmp_path / "c.mcap", files[0], "--save", tmp_path / "x.rrd")
+    out, found = overlaid(tmp_path / "c.mcap", files[0])
     assert "note: c: no measured joint angles on /joint_states" in out
-    found = read_back(tmp_path / "x.rrd")
     assert found.times("/c/joints/commanded").size == 100
     assert {e for e in found.entities if e.startswith("/compared/places")} == {
         f"/compared/places/a/{label}" for label in ("head", "middle", "tail")
@@ -368,36 +377,33 @@ def test_sessions_without_measured_angles_are_seen_too(chain, files, read_back, 
     assert "/compared/a/angles" not in found.entities
 
 
-def test_of_different_robots_the_joints_in_common_are_compared(make, read_back, tmp_path, capsys):
+def test_of_different_robots_the_joints_in_common_are_compared(make, tmp_path, overlaid):
     long = make(tmp_path / "long.mcap", ROBOT)
     short = make(tmp_path / "short.mcap", ROBOT, names=NAMES[:3])
-    view(capsys, long, short, "--save", tmp_path / "x.rrd")
-    found = read_back(tmp_path / "x.rrd")
+    _, found = overlaid(long, short)
     assert found.static("/compared/short/angles", "SeriesLines:names") == list(NAMES[:3])
     facts = found.static("/compared/facts", "TextDocument:text")[0]
     assert "robot: chain5 → chain3" in facts
 
 
-def test_without_a_joint_in_common_there_is_no_difference(make, read_back, tmp_path, capsys):
+def test_without_a_joint_in_common_there_is_no_difference(make, tmp_path, overlaid):
     one = make(tmp_path / "one.mcap", ROBOT, robot=False)
     other = make(tmp_path / "other.mcap", ROBOT, robot=False, names=("left", "right"))
-    out = view(capsys, one, other, "--save", tmp_path / "x.rrd")
+    out, found = overlaid(one, other)
     assert out.startswith("other (B) against one (A): not compared: no joint")
-    assert "/compared/other/angles" not in read_back(tmp_path / "x.rrd").entities
+    assert "/compared/other/angles" not in found.entities
 
 
 @pytest.mark.slow
-def test_three_sessions_are_each_held_against_the_first(files, still, read_back, tmp_path, capsys):
-    path = tmp_path / "three.rrd"
-    out = view(capsys, *files, still, "--names", "robot,twin,no gait", "--save", path)
+def test_three_sessions_are_each_held_against_the_first(files, still, overlaid):
+    out, found = overlaid(*files, still, "--names", "robot,twin,no gait")
     assert [line.split(" (B)")[0] for line in out.splitlines()[:2]] == ["twin", "no gait"]
-    found = read_back(path)
     assert {"/compared/twin/angles", "/compared/no\\ gait/angles"} <= found.entities
     assert found.times("/no\\ gait/joints/measured", "gait_cycle").size == 0
 
 
 def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
-    files, chain, read_back, tmp_path, capsys
+    files, chain, tmp_path, overlaid
 ):
     late = tmp_path / "late.mcap"
     with SessionWriter(late, session_id="late", epoch_ns=EPOCH_NS, robot=chain(5)) as w:
@@ -408,8 +414,7 @@ def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
             states.write(t_ns, np.full(5, i * 1e-3))
             if i >= 100:
                 phase.write(t_ns, np.array([0.4, 2 * np.pi * (i - 100) / 100]))
-    view(capsys, files[0], late, "--align", "gait", "--save", tmp_path / "x.rrd")
-    found = read_back(tmp_path / "x.rrd")
+    _, found = overlaid(files[0], late, "--align", "gait")
     times = found.times("/late/joints/measured")
     np.testing.assert_array_equal(times, (np.arange(300) - 100) * 10_000_000)
     rows = degrees(found, "/compared/late/angles")
@@ -418,12 +423,11 @@ def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
     assert np.abs(rows[: at.size] - np.rad2deg(truth)).max() < 1e-4
 
 
-def test_servos_polled_in_turn_differ_at_times_of_the_first(make, read_back, tmp_path, capsys):
+def test_servos_polled_in_turn_differ_at_times_of_the_first(make, tmp_path, overlaid):
     wave = Wave(amplitude=0.3, frequency_hz=0.9, seconds=3.0)
     a = make(tmp_path / "a.mcap", Wave(seconds=3.0), noise=0.0, polled_s=1e-3)
     b = make(tmp_path / "b.mcap", wave, noise=0.0, polled_s=1.5e-3)
-    view(capsys, a, b, "--save", tmp_path / "x.rrd")
-    found = read_back(tmp_path / "x.rrd")
+    _, found = overlaid(a, b)
     entity, joints = "/compared/b/angles", np.arange(5)
     at = found.times(entity) * 1e-9
     np.testing.assert_array_equal(found.times(entity), found.times("/a/joints/measured"))
