@@ -3,8 +3,8 @@
 ::
 
     from pathlib import Path
-    from .combine import bring_together
+    from .combine import combine_sessions
 
-    both = bring_together([Path("robot.mcap"), Path("twin.mcap")], Path("both.rrd"))
+    both = combine_sessions([Path("robot.mcap"), Path("twin.mcap")], Path("both.rrd"))
     print(both.found["twin"].comparison, both.placements["twin"])
 """
