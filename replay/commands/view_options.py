@@ -32,13 +32,13 @@ class _Options:
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class SingleOptions(_Options):
-    """How one session is shown; None where nothing is said.
+    """How one session is shown; None where an option is not given.
 
     Attributes:
         result: With one session: show what was found before instead of analysing now, `.json` of
             `undulog analyse`. Results of an experiment or a comparison that it is part of mark the
             modules they name. May be given several times.
-        tab: With one session: the tab in front, `session` where nothing is said; the mean cycle's
+        tab: With one session: the tab in front, `session` by default; the mean cycle's
             plays at once.
         command_topic: With one session: JointState topic of the commands, in a bag of another make.
         response_topic: With one session: JointState topic of the responses.
@@ -79,14 +79,14 @@ class SingleOptions(_Options):
 
 @dataclass(frozen=True, kw_only=True)
 class ClipOptions(_Options):
-    """What the command line says of a clip; None is what it doesn't say.
+    """The command line's options of a clip; None for those not given.
 
     Attributes:
         start: With `--clip`: where it begins, in seconds of the session.
         end: With `--clip`: where it ends.
-        fps: With `--clip`: frames a second; 25 where nothing is said.
+        fps: With `--clip`: frames a second; 25 by default.
         speed: With `--clip`: seconds of the session in a second of the clip, e.g. 0.25.
-        size: With `--clip`: WIDTHxHEIGHT in pixels; 960x540 where nothing is said.
+        size: With `--clip`: WIDTHxHEIGHT in pixels; 960x540 by default.
     """
 
     start: Annotated[float | None, Parameter(name="--from")] = None
@@ -98,16 +98,16 @@ class ClipOptions(_Options):
 
 @dataclass(frozen=True, kw_only=True)
 class OverlayOptions(_Options):
-    """What the command line says of sessions side by side; None is what it doesn't say.
+    """The command line's options of sessions side by side; None for those not given.
 
     Attributes:
         align: With several sessions, what happens at once: the same `time` since each one's first
-            sample (where nothing is said), the same time since the start of its `gait`, or the
+            sample (the default), the same time since the start of its `gait`, or the
             same `phase` of the gait.
         names: With several sessions: what they are called, with commas, e.g. `robot,twin`; the
-            files' names where nothing is said.
+            files' names by default.
         place: With several sessions: whether bodies are laid on the first one at the `start`
-            (where nothing is said) or stay where each session's `world` has them.
+            (the default) or stay where each session's `world` has them.
     """
 
     align: Annotated[Literal["time", "gait", "phase"] | None, Parameter(name="--align")] = None

@@ -115,7 +115,7 @@ def view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
             echo(page)
         else:
             process = stack.enter_context(viewer.open_window())
-        # Rerun would tell a closed window as errors of its own, in colours.
+        # Rerun would report a closed window as errors of its own, in colours.
         os.environ.setdefault("RUST_LOG", "off")
         from ..feed.numbers import Analysing
         from ..feed.progressive import NoLongerWantedError, Task, show_session, steps
