@@ -133,8 +133,15 @@ class UnixSource:
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             os.fchmod(listener.fileno(), 0o600)  # before it has a name: no moment without
-            listener.bind(str(self._path))
-            listener.listen(_BACKLOG)  # at once: who sees the socket connects
+            # It gets its name when it listens: a sender that sees the name can connect.
+            unnamed = self._path.with_name(f"{self._path.name}~")
+            unnamed.unlink(missing_ok=True)
+            listener.bind(str(unnamed))
+            try:
+                listener.listen(_BACKLOG)
+                self._path.hardlink_to(unnamed)
+            finally:
+                unnamed.unlink(missing_ok=True)
             made = self._path.lstat()
         except OSError as error:
             listener.close()
