@@ -79,7 +79,9 @@ def compare_logs(one: Path, other: Path) -> LogDifference:
         differs_s: dict[str, float] = {}
         messages = 0
         for topic in [one for one in own if one in others and one != EVENTS]:
-            for a, b in zip_longest(_told(first, own[topic]), _told(second, others[topic])):
+            for a, b in zip_longest(
+                _messages_of(first, own[topic]), _messages_of(second, others[topic])
+            ):
                 messages += a is not None
                 if a != b:
                     at_ns = min(told[0] for told in (a, b) if told is not None)
@@ -91,7 +93,7 @@ def compare_logs(one: Path, other: Path) -> LogDifference:
     return LogDifference(tuple(same), differs_s, one_sided, messages)
 
 
-def _told(log: RawLog, channel_id: int) -> Iterator[tuple[int, int, bytes]]:
+def _messages_of(log: RawLog, channel_id: int) -> Iterator[tuple[int, int, bytes]]:
     """Log time, publish time and bytes of a channel's messages."""
     for message in log.messages({channel_id}, 0, _ALWAYS):
         yield message.log_time_ns, message.publish_time_ns, message.data

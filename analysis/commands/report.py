@@ -79,7 +79,7 @@ def _one(file: Path, options: Options) -> tuple[str, dict[str, Any], int]:
             analysis = measured.analysis
             bar.update(1, note="page")
             page = render(analysis, session, cycle_maps(measured))
-    told = _told(analysis)
+    told = _summary(analysis)
     return page, {"answer": told["sentence"], "answers": [told]}, len(analysis.warnings)
 
 
@@ -92,12 +92,12 @@ def _several(files: Sequence[Path], options: Options) -> tuple[str, dict[str, An
     page = render(experiment)
     told = {
         "answer": f"{len(files)} sessions: {experiment.answer}.",
-        "answers": [_told(one) for one in experiment.sessions],
+        "answers": [_summary(one) for one in experiment.sessions],
     }
     return page, told, len(experiment.warnings)
 
 
-def _told(analysis: Analysis) -> dict[str, Any]:
+def _summary(analysis: Analysis) -> dict[str, Any]:
     told = analysis.answer
     return {
         "session": analysis.session.id,

@@ -71,13 +71,13 @@ def changes(a: Sequence[Mapping[str, str]], b: Sequence[Mapping[str, str]]) -> t
     found = [
         Change(name, *sides)
         for name in names
-        if (sides := (_told(a, name), _told(b, name)))[0] != sides[1]
+        if (sides := (_recorded_value(a, name), _recorded_value(b, name)))[0] != sides[1]
     ]
     found.sort(key=lambda one: _ORDER.index(one.name.partition(":")[0]))
     return tuple(found)
 
 
-def _told(side: Sequence[Mapping[str, str]], name: str) -> str | None:
+def _recorded_value(side: Sequence[Mapping[str, str]], name: str) -> str | None:
     values = sorted({facts[name] for facts in side if name in facts})
     return ", ".join(values) if values else None
 

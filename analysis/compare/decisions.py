@@ -276,7 +276,7 @@ def _without(decided: Decided, broken: Sequence[BrokenJoint]) -> Decided:
     )
 
 
-def told(one: Difference) -> str:
+def difference_text(one: Difference) -> str:
     """A difference with its interval.
 
     Returns:
@@ -328,9 +328,9 @@ def _largest(decided: Decided) -> str:
         more = f"; and {others} more" if others else ""
         where = f"{plain(first.place)}:" if first.size >= 1 else "one joint's"
         where = "the body's" if first.place == BODY else where
-        return f"{where} {told(first)} ({formats.p_value_text(first.p_holm)}){more}"
+        return f"{where} {difference_text(first)} ({formats.p_value_text(first.p_holm)}){more}"
     own = [one for one in beyond_doubt if one.place == named[0] and one.quantity != "energy_abs"]
-    parts = ", ".join(told(one) for one in sorted(own, key=lambda one: one.quantity))
+    parts = ", ".join(difference_text(one) for one in sorted(own, key=lambda one: one.quantity))
     smallest = min(one.p_holm for one in own)
     others = [plain(name) for name in named[1:]]
     listed = ", ".join(others[:MOST])

@@ -47,10 +47,10 @@ def log_recover(
     if json:
         emit_json(report.as_json())
         return
-    _tell_recovered(report)
+    _print_recovered(report)
 
 
-def _tell_recovered(report: RecoverReport) -> None:
+def _print_recovered(report: RecoverReport) -> None:
     messages = sum(report.messages.values())
     missing = {None: "how many are missing is unknown", 0: "none is missing"}
     lost = missing.get(report.missing, f"{report.missing} are missing")
@@ -112,7 +112,7 @@ def log_cut(
             force=force,
             stop=request,
         )
-    _tell(report, as_json=json)
+    _print_report(report, as_json=json)
 
 
 def log_merge(
@@ -147,10 +147,10 @@ def log_merge(
 
     with interruptible() as request:
         report = merge_logs(files, output, robot=robot, apart=apart, force=force, stop=request)
-    _tell(report, as_json=json)
+    _print_report(report, as_json=json)
 
 
-def _tell(report: EditReport, *, as_json: bool) -> None:
+def _print_report(report: EditReport, *, as_json: bool) -> None:
     if as_json:
         emit_json(report.as_json())
         return

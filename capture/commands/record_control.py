@@ -116,7 +116,7 @@ def stop(*, wait: bool = False, socket: Path | None = None, json: bool = False) 
     with _recorder(socket, for_ever=wait) as recorder:
         reply = recorder.ask({"do": "stop", "wait": True} if wait else {"do": "stop"})
     if json or not wait:
-        _tell("stopping", reply, as_json=json)
+        _print_reply("stopping", reply, as_json=json)
     else:
         files = ", ".join(str(file) for file in reply.get("files", []))
         echo(f"{files or 'nothing written'}: {_facts(reply)}")
@@ -214,10 +214,10 @@ def _facts(reply: Mapping[str, Any]) -> str:
 def _ask(request: Mapping[str, Any], done: str, socket: Path | None, *, as_json: bool) -> None:
     with _recorder(socket) as recorder:
         reply = recorder.ask(request)
-    _tell(done, reply, as_json=as_json)
+    _print_reply(done, reply, as_json=as_json)
 
 
-def _tell(done: str, reply: Mapping[str, Any], *, as_json: bool) -> None:
+def _print_reply(done: str, reply: Mapping[str, Any], *, as_json: bool) -> None:
     if as_json:
         emit_json(dict(reply))
     elif reply:

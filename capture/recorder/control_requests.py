@@ -104,7 +104,7 @@ class OperatorLog:
     def __init__(
         self,
         writer: SessionWriter,
-        say: Callable[[str, str, str], None],
+        log_event: Callable[[str, str, str], None],
         now_ns: Callable[[], int],
     ) -> None:
         """Nothing is written yet; channels open with their first message.
@@ -113,7 +113,7 @@ class OperatorLog:
             say: Writes to ``/rosout``: level, who, text.
             now_ns: The session's clock [Unix ns].
         """
-        self._writer, self._say, self._now_ns = writer, say, now_ns
+        self._writer, self._say, self._now_ns = writer, log_event, now_ns
         self._gait: tuple[tuple[str, ...], JointStateChannel] | None = None
         self._mode: StringChannel | None = None
 

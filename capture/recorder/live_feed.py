@@ -238,7 +238,7 @@ class LiveFeed:
         if self._socket is not None:
             if isinstance(record, Channel) and record.id in self._words.periods:
                 self._due[record.id] = 0
-            self._to_tell.append(self._told([packed]))
+            self._to_tell.append(self._pack_definitions([packed]))
 
     def offer(
         self,
@@ -310,7 +310,7 @@ class LiveFeed:
 
     # -- what is told ----------------------------------------------------------------------
 
-    def _told(self, records: list[bytes]) -> _Packed:
+    def _pack_definitions(self, records: list[bytes]) -> _Packed:
         return _Packed(pack_datagram(self._head(Kind.DEFINITIONS, 0), records), 0)
 
     def _end(self) -> _Packed:
@@ -408,7 +408,9 @@ class LiveFeed:
             self.counts.connections += 1
             self._due = dict.fromkeys(self._periods, 0)
         if not self._to_tell:
-            self._to_tell.extend(self._told(group) for group in self._words.groups(_DATAGRAM))
+            self._to_tell.extend(
+                self._pack_definitions(group) for group in self._words.groups(_DATAGRAM)
+            )
 
     def _lose(self, now_ns: int) -> None:
         """There is no relay any more: forget what was meant for it."""

@@ -106,7 +106,7 @@ class Recorder:
         self._sources = tuple(sources)
         self._robot, self._decoded = robot, decoded
         self._each_tick = tuple(each_tick)
-        tasks = (self._write_clocks, self._tell_odd_frames, lambda: gc.collect(1), *each_second)
+        tasks = (self._write_clocks, self._log_unknown_frames, lambda: gc.collect(1), *each_second)
         self._each_second = EachSecond(tasks, time.monotonic_ns())
         self._events = writer.log("/rosout")
         self._clock_channels: dict[str, TimeReferenceChannel] = {}
@@ -126,7 +126,7 @@ class Recorder:
         """
         self._on_event = listener
 
-    def say(self, level: str, name: str, text: str, t_ns: int | None = None) -> None:
+    def log_event(self, level: str, name: str, text: str, t_ns: int | None = None) -> None:
         """Write an event.
 
         Args:
@@ -186,7 +186,7 @@ class Recorder:
                 fault = f"its kind of source failed to start: {error!r}"
                 raise SourceError(source.name, fault) from error
         listed = ", ".join(source.name for source in self._sources)
-        self.say("info", "recorder", f"recording {listed}")
+        self.log_event("info", "recorder", f"recording {listed}")
 
     @contextmanager
     def _urgent(self) -> Generator[None]:
@@ -196,7 +196,7 @@ class Recorder:
             return
         with raised_priority() as self.priority:
             if self.priority.refused:
-                self.say(
+                self.log_event(
                     "info",
                     "recorder",
                     "priority was refused: while other programs hold the processors, frames may be "
@@ -240,7 +240,7 @@ class Recorder:
             until_ns = self._clock.now_ns() + _DECODE_BUDGET_NS
             for name, bus in self.buses.items():
                 bus.decode(self._clock.now_ns, until_ns, rest=due)
-                self._tell_clock(name)
+                self._log_clock_events(name)
         self._each_second.run(now_ns)
         for each in self._each_tick:
             each()
@@ -283,7 +283,7 @@ class Recorder:
                 arrays = tuple(frames for frames in kept if len(frames))
             self._came += sum(map(len, arrays))
             for event in polled.events:
-                self.say(event.level, source.name, event.text, event.t_ns)
+                self.log_event(event.level, source.name, event.text, event.t_ns)
             for frames in arrays:
                 bus = self.buses.get(source.name)
                 if bus is None:
@@ -320,7 +320,7 @@ class Recorder:
 
     def _give_up(self, source: Source, why: str) -> None:
         self._failed.add(source.name)
-        self.say("error", source.name, f"this source {why}")
+        self.log_event("error", source.name, f"this source {why}")
 
     def _end_source(self, source: Source) -> None:
         """End a source that can refuse what comes later; one that fails in that is given up."""
@@ -363,17 +363,17 @@ class Recorder:
             elif name not in self._odd_clocks:
                 self._odd_clocks.add(name)
                 text = f"the device's time, {device_ns} ns, doesn't fit /clock/{name}"
-                self.say("warn", name, text)
+                self.log_event("warn", name, text)
 
-    def _tell_clock(self, name: str) -> None:
+    def _log_clock_events(self, name: str) -> None:
         for text in self.clocks[name].take_events():
-            self.say("warn", name, text)
+            self.log_event("warn", name, text)
 
-    def _tell_odd_frames(self) -> None:
+    def _log_unknown_frames(self) -> None:
         """Say once what nobody knows and what is too short; the counts come at the end."""
         for name, bus in self.buses.items():
             for text in bus.take_faults():
-                self.say("error", name, text)
+                self.log_event("error", name, text)
             if not bus.decodes:
                 continue
             for level, what, found in (
@@ -385,23 +385,23 @@ class Recorder:
                     self._told[name] |= fresh
                     listed = ", ".join(sorted(fresh)[:8])
                     more = f" and {len(fresh) - 8} more" if len(fresh) > 8 else ""
-                    self.say(level, name, f"{what}: {listed}{more}")
+                    self.log_event(level, name, f"{what}: {listed}{more}")
 
     def _finish(self) -> None:
         """Decode what waits, and say what became of the frames."""
         for name, bus in self.buses.items():
             bus.finish(self._clock.now_ns)
-            self._tell_clock(name)
+            self._log_clock_events(name)
             if bus.decodes:
                 for text in bus.tally.problems():
-                    self.say("warn", name, text)
+                    self.log_event("warn", name, text)
                 for text in bus.tally.notes():
-                    self.say("info", name, text)
+                    self.log_event("info", name, text)
         self._write_clocks()
-        self._tell_odd_frames()
+        self._log_unknown_frames()
         ending = self.ending
         assert ending is not None  # noqa: S101 - set by the loop
-        self.say("error" if ending.failed else "info", "recorder", f"ends: {ending.reason}")
+        self.log_event("error" if ending.failed else "info", "recorder", f"ends: {ending.reason}")
 
 
 def _check(polled: Polled) -> None:

@@ -170,10 +170,10 @@ class Recording:
                 robot=robot,
                 decoded=decoded,
                 each_tick=(self._each_tick,),
-                each_second=(self._look, self._diagnose, self._tell, self._look_at_disk),
+                each_second=(self._look, self._diagnose, self._publish_status, self._look_at_disk),
             )
             self._recorder.on_event(self._note_event)
-            log = OperatorLog(self._writer, self._recorder.say, self._clock.now_ns)
+            log = OperatorLog(self._writer, self._recorder.log_event, self._clock.now_ns)
             self._control.serve(request_handler(self, log))
             opened.pop_all()
         # What a recording can do without; each is given up where it fails.
@@ -193,7 +193,7 @@ class Recording:
         Raises:
             LogWriteError: If it can't be written.
         """
-        self._recorder.say("warn", name, text)
+        self._recorder.log_event("warn", name, text)
 
     def run(self, show: Callable[[RecorderSnapshot], None] | None = None) -> RecordReport:
         """Record until something ends it, and finalise.
@@ -274,15 +274,15 @@ class Recording:
             except Exception as error:  # noqa: BLE001 - the recording goes on without it
                 del self._asides[name]
                 text = f"the {name} is given up: it failed with {error!r}"
-                self._recorder.say("error", "recorder", text)
+                self._recorder.log_event("error", "recorder", text)
         self._notifier.alive()
 
     def _look(self) -> RecorderSnapshot:
         """Take a new snapshot."""
         for level, text in self._storage.tick():
-            self._recorder.say(level, "recorder", text)
+            self._recorder.log_event(level, "recorder", text)
         for text in self._control.take_faults():
-            self._recorder.say("error", "recorder", text)
+            self._recorder.log_event("error", "recorder", text)
         self._snapshot = self._new_snapshot("recording")
         return self._snapshot
 
@@ -290,7 +290,7 @@ class Recording:
         if self._snapshot is not None:
             self._diagnostics.write(self._clock.now_ns(), statuses(self._snapshot))
 
-    def _tell(self) -> None:
+    def _publish_status(self) -> None:
         if self._snapshot is None:
             return
         self._notifier.status(plain_line(self._snapshot))

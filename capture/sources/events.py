@@ -48,7 +48,7 @@ class EventLog:
         self._repeats: dict[str, _Repeats] = {}
         self._events: list[SourceEvent] = []
 
-    def say(self, level: str, text: str, count: int = 1) -> None:
+    def log_event(self, level: str, text: str, count: int = 1) -> None:
         """Note an event.
 
         Args:
@@ -131,7 +131,7 @@ class Tally:
         """
         self.counts.dropped = (self.counts.dropped or 0) + count
         if count:
-            self.events.say(level, text, count)
+            self.events.log_event(level, text, count)
 
     def malformed(self, text: str, count: int) -> None:
         """Count what could not be read, and say so.
@@ -141,7 +141,7 @@ class Tally:
         """
         if count:
             self.counts.malformed += count
-            self.events.say("warn", text, count)
+            self.events.log_event("warn", text, count)
 
 
 BUS_OFF = 0x40
@@ -218,13 +218,13 @@ class BusWatch:
             self._back(tally)
         if classes & BUS_OFF and not self._off:
             self._off = True
-            tally.events.say("error", "bus-off: the controller left the bus")
+            tally.events.log_event("error", "bus-off: the controller left the bus")
         said = [text for bit, text in _CLASSES.items() if classes & bit]
         if classes & _CONTROLLER:
             said += [text for bit, text in _CONTROLLER_STATES.items() if data[1] & bit]
         if said or not classes & (RESTARTED | BUS_OFF):
-            tally.events.say("warn", f"error frame: {', '.join(said) or 'no class given'}")
+            tally.events.log_event("warn", f"error frame: {', '.join(said) or 'no class given'}")
 
     def _back(self, tally: Tally) -> None:
         self._off = False
-        tally.events.say("info", "the controller is back on the bus")
+        tally.events.log_event("info", "the controller is back on the bus")

@@ -237,7 +237,7 @@ class LinkedSource:
                 self._connect(now)
             except SourceError as error:
                 self.finished = True
-                self._tally.events.say("error", str(error))
+                self._tally.events.log_event("error", str(error))
         frames = self._read(now)
         for array in frames:
             self._tally.counts.frames += len(array)
@@ -286,11 +286,13 @@ class LinkedSource:
         self._complaint = ""
         detail = f" ({self._link.detail})" if self._link.detail else ""
         if not self._was_up:
-            self._tally.events.say("info", f"connected to {self._place}{detail}")
+            self._tally.events.log_event("info", f"connected to {self._place}{detail}")
         else:
             self._tally.counts.reconnects += 1
             away_s = (now_ns - (self._lost_ns or now_ns)) / 1e9
-            self._tally.events.say("info", f"{self._place} is back after {away_s:.1f} s{detail}")
+            self._tally.events.log_event(
+                "info", f"{self._place} is back after {away_s:.1f} s{detail}"
+            )
         self._was_up = True
 
     def _read(self, now_ns: int) -> tuple[FrameArray, ...]:
@@ -313,7 +315,7 @@ class LinkedSource:
         """Tell why there is no connection, once for each new reason."""
         if text != self._complaint:
             self._complaint = text
-            self._tally.events.say("warn", text)
+            self._tally.events.log_event("warn", text)
 
 
 def _reason(error: OSError) -> str:

@@ -137,7 +137,7 @@ def _record(message: str, t_host_ns: int, tally: Tally) -> bytes | None:
     if found is None:
         told = _TOLD.fullmatch(message)
         if told is not None:
-            tally.events.say("warn", f"the server answered: {told[1]!r}")
+            tally.events.log_event("warn", f"the server answered: {told[1]!r}")
         elif not _WORD.fullmatch(message):
             tally.malformed("malformed message", 1)
         return None
@@ -156,7 +156,7 @@ def _record(message: str, t_host_ns: int, tally: Tally) -> bytes | None:
         data = bytes.fromhex(rest) if len(rest) % 2 == 0 else None
         length = -1 if data is None else len(data)
     if length > 8 and kind == "frame":
-        tally.events.say("warn", "CAN FD frame left out")
+        tally.events.log_event("warn", "CAN FD frame left out")
         return None
     highest = ID_MASK if extended else _HIGHEST_STANDARD
     if data is None or not 0 <= length <= 8 or identifier > highest:

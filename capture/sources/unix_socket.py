@@ -155,7 +155,7 @@ class UnixSource:
             target=self._accept, args=(listener,), name="undulog-accept", daemon=True
         )
         self._acceptor.start()
-        self._tally.events.say("info", f"listens at {self._path}")
+        self._tally.events.log_event("info", f"listens at {self._path}")
 
     def poll(self) -> Polled:
         """Take what has come.
@@ -224,7 +224,7 @@ class UnixSource:
                     return
                 if error.errno != errno.ECONNABORTED:
                     reason = error.strerror or str(error)
-                    self._tally.events.say("error", f"can't accept a sender: {reason}")
+                    self._tally.events.log_event("error", f"can't accept a sender: {reason}")
                     time.sleep(_PAUSE_S)
                 continue
             now_ns = self._tally.now_ns()
@@ -234,13 +234,13 @@ class UnixSource:
         back = self._had_sender and not self._senders
         self._had_sender = True
         self._tally.counts.reconnects += back
-        self._tally.events.say("info", "a sender is back" if back else "a sender connected")
+        self._tally.events.log_event("info", "a sender is back" if back else "a sender connected")
         self._senders.append(sender)
         stay = [each for each in self._senders if not each.leaves]
         if len(stay) > MOST_SENDERS:
             longest = min(stay, key=lambda each: (each.spoke, each.last_ns))
             text = f"more than {MOST_SENDERS} senders: the one silent for longest is disconnected"
-            self._tally.events.say("warn", text)
+            self._tally.events.log_event("warn", text)
             longest.leaves = True
             longest.receiver.end()  # what it could send before is still taken
 
@@ -316,7 +316,7 @@ class UnixSource:
     def _forget(self, sender: _Sender) -> None:
         self._senders.remove(sender)
         sender.receiver.close()
-        self._tally.events.say("warn", "a sender disconnected")
+        self._tally.events.log_event("warn", "a sender disconnected")
 
 
 def open_unix(address: SourceAddress) -> Source:

@@ -227,13 +227,13 @@ def calibrate(
     gait = partial(driven.make, scenario.robot, scenario)
     answers = Answers(scenario, gait, measured, kernels, on_tick)
 
-    def told(k: int, rms: float) -> None:
+    def report_iteration(k: int, rms: float) -> None:
         on_iteration(k, rms, answers.speed)
 
-    first = solution = solve(answers, open_ones, on_iteration=told)
+    first = solution = solve(answers, open_ones, on_iteration=report_iteration)
     search = None
     if wish.search:
-        search, with_module = find_weak_module(answers, first, wish.spread, told)
+        search, with_module = find_weak_module(answers, first, wish.spread, report_iteration)
         solution = with_module if search.named else first
     lack = lack_of_fit(
         measured,

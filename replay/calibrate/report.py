@@ -126,7 +126,7 @@ NOT_NOISE = 3.0
 """An autocorrelation time of the residual from which it is called out [samples]."""
 
 
-def told(calibration: Calibration) -> Iterator[str]:
+def summary_lines(calibration: Calibration) -> Iterator[str]:
     """Lines for a terminal.
 
     Yields:

@@ -69,7 +69,7 @@ def fit(
     from undulog.sim.scenario.scenario import Kernels
 
     from ..calibrate.fit import Wanted, calibrate
-    from ..calibrate.report import reported, told, write_calibration
+    from ..calibrate.report import reported, summary_lines, write_calibration
 
     compiled = kernels == "numba" or (kernels == "auto" and find_spec("numba") is not None)
     wanted = Wanted(tuple(only or ()), module, modules, delay, spread, within, settle)
@@ -90,7 +90,7 @@ def fit(
         paths = {"robot": str(output), "scenario": None if scenario is None else str(scenario)}
         emit_json({**reported(calibration), "written": paths})
         return 0
-    echo(*told(calibration))
+    echo(*summary_lines(calibration))
     echo(f"{output}: the robot with the fitted servo")
     if scenario is not None:
         echo(f"{scenario}: the scenario with the fitted ground, on that robot")

@@ -114,7 +114,7 @@ def replay(
     if json:
         emit_json(_reported(again, changes))
     else:
-        echo(*_told(again))
+        echo(*_summary(again))
         if again.comparison is not None and not again.exact:
             _show(again.comparison)
         echo(*what_next(file, again.recording.path, comparable=again.comparison is not None))
@@ -130,7 +130,7 @@ def _show(comparison: Comparison) -> None:
     show(lambda width, color: render_comparison(comparison, width=width, color=color), None)
 
 
-def _told(again: ReproducedRun) -> Iterator[str]:
+def _summary(again: ReproducedRun) -> Iterator[str]:
     recording, scenario = again.recording, again.scenario
     yield (
         f"{recording.path}: {again.original.name} again on the twin of {scenario.robot.name} in "

@@ -55,13 +55,13 @@ def view_live(path: Path, *, save: Path | None, web: bool, connect: str | None, 
     if json:
         emit_json(_facts(report, save))
     else:
-        _tell(report, save)
+        _print_report(report, save)
     if connect is not None and report.complaint:
         complain(f"error: {report.complaint}")
         os._exit(1)  # at once: Rerun would wait at its end for a viewer that takes nothing
 
 
-def _tell(report: RelayReport, save: Path | None) -> None:
+def _print_report(report: RelayReport, save: Path | None) -> None:
     where = f"{save}: " if save is not None else ""
     late = "" if report.lag_s is None else f", {report.lag_s[0] * 1e3:.0f} ms late (median)"
     echo(f"{where}{report.shown} messages shown, {report.dropped} dropped{late}")

@@ -73,7 +73,7 @@ def markdown(
     joints = ", ".join(f"{escaped(one.joint)} ({escaped(one.why)})" for one in named)
     return document(
         [
-            f"**{escaped(_told_first(analysis, awaited=awaited))}**",
+            f"**{escaped(_first_sentence(analysis, awaited=awaited))}**",
             f"**Named, pink in the pictures:** {joints}" if named else "",
             " · ".join(facts),
             listed([*notes, *(() if analysis is None else analysis.warnings)]),
@@ -92,7 +92,7 @@ def listed(notes: Sequence[str]) -> str:
     return "\n".join(f"- {escaped(note)}" for note in dict.fromkeys(notes))
 
 
-def _told_first(analysis: Analysis | None, *, awaited: bool) -> str:
+def _first_sentence(analysis: Analysis | None, *, awaited: bool) -> str:
     if analysis is not None:
         return analysis.answer.sentence
     return "Being analysed: the answer comes in a moment." if awaited else "Not analysed."

@@ -239,7 +239,7 @@ class LiveLog:
         rows: Sequence[JointRows],
         own: dict[tuple[str, int], IntArray],
     ) -> tuple[Track, ...]:
-        names, times, values = merge_rows(rows, topic, one, _say_nothing)
+        names, times, values = merge_rows(rows, topic, one, _ignore)
         offsets = self._offsets.get(OFFSET_TOPICS.get(topic, ""), {})
         found: dict[str, Track] = {}
         for name, t_ns, column in zip(names, times, values, strict=True):
@@ -258,7 +258,7 @@ class LiveLog:
     def _keep_offsets(self, topic: str, rows: Sequence[JointRows]) -> None:
         """Keep the last sample times relative to the stamp; none where all are zero."""
         kept = self._offsets.setdefault(topic, {})
-        names, times, values = merge_rows(rows, topic, "position", _say_nothing)
+        names, times, values = merge_rows(rows, topic, "position", _ignore)
         if not kept and not any(column.any() for column in values):
             return  # sampled together
         for name, t_ns, column in zip(names, times, values, strict=True):
@@ -319,5 +319,5 @@ def _sorter(kind: MessageType) -> LayoutSorter:
     return LayoutSorter(partial(layout_of, kind), in_all=True)
 
 
-def _say_nothing(_sentence: str) -> None:
+def _ignore(_sentence: str) -> None:
     """What is odd in a log is told by the recorder and by ``log check``, not by the picture."""

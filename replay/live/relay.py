@@ -44,7 +44,7 @@ def open_window() -> Viewer:
     return _ready(viewer.open_window(_WINDOW))
 
 
-def open_server(tell: Callable[[str], None]) -> Viewer:
+def open_server(notify: Callable[[str], None]) -> Viewer:
     """Serve the viewer to browsers on this machine.
 
     Args:
@@ -55,7 +55,7 @@ def open_server(tell: Callable[[str], None]) -> Viewer:
     """
     server, page = viewer.open_server(_SERVER)
     _ready(server)
-    tell(page)
+    notify(page)
     return server
 
 

@@ -204,7 +204,7 @@ def show(recording: Path) -> None:
         viewer.wait(stop)
 
 
-def serve(recording: Path, tell: Callable[[str], None]) -> None:
+def serve(recording: Path, notify: Callable[[str], None]) -> None:
     """Serve a recording to browsers on this machine until interrupted.
 
     Args:
@@ -216,7 +216,7 @@ def serve(recording: Path, tell: Callable[[str], None]) -> None:
     with interruptible() as stop:
         server, page = open_server(WHOLE_IN_MEMORY, str(recording))
         with server:
-            tell(page)
+            notify(page)
             server.wait(stop)
 
 

@@ -124,7 +124,7 @@ def _on_twin(
     if as_json:
         emit_json(_reported(driven, scenario, recording, factor))
     else:
-        echo(*_told(driven, scenario, recording, factor))
+        echo(*_summary(driven, scenario, recording, factor))
     return 0
 
 
@@ -146,7 +146,7 @@ def _reported(
     }
 
 
-def _told(
+def _summary(
     driven: MotionSource, scenario: Scenario, recording: Recording, factor: float
 ) -> list[str]:
     if recording.complete:

@@ -17,7 +17,7 @@ from undulog.capture.recorder.control_client import find_sockets
 from undulog.capture.robot.model import Robot
 
 from ..drive.dry_run import dry_run
-from ..drive.dry_run_text import reported, told
+from ..drive.dry_run_text import reported, summary_lines
 from ..drive.loop import BusTick, ConsoleWatch
 from ..drive.motion import MotionSource
 from ..drive.over_bus import BusPlan, bus_plan, check_drivable, drive_bus
@@ -83,7 +83,7 @@ def run_dry(
         emit_json({"on": on, **reported(run)})
     else:
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else _UNLIMITED
-        echo(*told(run, width))
+        echo(*summary_lines(run, width))
         if run.verdict.fit:
             echo("", f"To send it to {on}, the same with --arm and -o SESSION.mcap")
     return 0 if run.verdict.fit else 1

@@ -175,7 +175,7 @@ def run(
     if json:
         emit_json(_reported(chosen, recording, factor))
     else:
-        echo(*_told(chosen, recording, factor))
+        echo(*_summary(chosen, recording, factor))
     return 0 if recording.complete else 1
 
 
@@ -233,7 +233,7 @@ def _reported(scenario: Scenario, recording: Recording, factor: float) -> dict[s
     }
 
 
-def _told(scenario: Scenario, recording: Recording, factor: float) -> list[str]:
+def _summary(scenario: Scenario, recording: Recording, factor: float) -> list[str]:
     energy, closure = recording.energy, _closure(recording)
     if recording.complete:
         first = f"{recording.path}: {recording.duration_s:g} s of {scenario.name}"

@@ -129,8 +129,8 @@ def _run(plan: _Plan, report: _Report) -> int:
     sender = None if plan.unix is None else FrameSender(plan.unix)
     server = None
     if plan.address is not None:
-        server = SocketcandServer(*plan.address, plan.bus, events.say)
-    bus = VirtualBus(server, sender, events.say)
+        server = SocketcandServer(*plan.address, plan.bus, events.log_event)
+    bus = VirtualBus(server, sender, events.log_event)
     pacer = Pacer(PERIOD_NS, fast=plan.fast)
     with interruptible() as stop:
         try:
@@ -141,7 +141,7 @@ def _run(plan: _Plan, report: _Report) -> int:
                 faults=plan.faults,
                 lockstep=plan.lockstep,
                 wait=plan.wait,
-                say=events.say,
+                log_event=events.log_event,
                 each_tick=lambda: report.events(events.take()),
                 stop=stop,
             )
@@ -204,13 +204,13 @@ class _Report:
             "unix_accepted": sender.accepted if sender else None,
             "unix_refused": sender.refused if sender else None,
         }
-        self._say(facts, _told(self._plan, served, bus, sender))
+        self._say(facts, _summary(self._plan, served, bus, sender))
 
     def _say(self, facts: dict[str, Any], lines: list[str]) -> None:
         echo(*([dumps(facts)] if self._json else lines))
 
 
-def _told(plan: _Plan, served: Served, bus: VirtualBus, sender: FrameSender | None) -> list[str]:
+def _summary(plan: _Plan, served: Served, bus: VirtualBus, sender: FrameSender | None) -> list[str]:
     pace = served.pace
     first = f"{plan.scenario.robot.name} ran for {served.duration_s:g} s of {plan.scenario.name}"
     if plan.fast:

@@ -85,7 +85,7 @@ class AdaptiveGait:
             tick = self._generator.step(time_s, readings)
             lag = float(tick.values[self._lag_at])
             self._wave = BodyWave(len(self._horizontal), lag)
-            return self._told(tick, time_s)
+            return self._reported_tick(tick, time_s)
         elapsed_s, phase = time_s - self._time_s, self._phase
         pose = self._reckoning.step(elapsed_s, phase, self._steering.offset, readings)
         now = ControlInput(time_s, elapsed_s, phase, pose, readings)
@@ -104,9 +104,9 @@ class AdaptiveGait:
             else unchanged.frequency_factor,
         )
         self._generator.modulate(change)
-        return self._told(self._generator.step(time_s, readings), time_s)
+        return self._reported_tick(self._generator.step(time_s, readings), time_s)
 
-    def _told(self, tick: GaitTick, time_s: float) -> GaitTick:
+    def _reported_tick(self, tick: GaitTick, time_s: float) -> GaitTick:
         """The generator's tick, with what the controller meant."""
         self._phase, self._time_s = float(tick.values[self._phase_at]), time_s
         values = np.concatenate((tick.values, *(part.values for part in self._parts)))

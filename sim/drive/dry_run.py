@@ -236,15 +236,15 @@ class _Session:
     def write(self, sample: Sample, remarks: Iterable[GateEvent]) -> None:
         self._log.write(sample)
         for remark in remarks:
-            self._log.say(*remark)
+            self._log.log_event(*remark)
 
     def finish(self, why_bad: str | None) -> None:
-        self._log.hear(self._twin.flush())
+        self._log.receive(self._twin.flush())
         self._writer.set_verdict("good" if why_bad is None else "bad", [why_bad] if why_bad else [])
 
     def fail(self, why: str) -> None:
         self.finish(why)
-        self._log.say("error", why)
+        self._log.log_event("error", why)
 
 
 def nominal_world(robot: Robot) -> Scenario:

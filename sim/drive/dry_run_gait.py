@@ -171,7 +171,7 @@ class DemandTally:
         """
         self._error = np.fmax(self._error, np.abs(error))
 
-    def hear(self, samples: Sequence[SensorSample]) -> None:
+    def receive(self, samples: Sequence[SensorSample]) -> None:
         """Take what the servos report.
 
         Args:
@@ -326,7 +326,7 @@ class GatedGait:
         self._phase = step.phase
         if was is Phase.RUN:
             self.tally.measured(readings.angle - before)
-            self.tally.hear(self.twin.sensed)
+            self.tally.receive(self.twin.sensed)
         if step.command is not None:
             self._command = step.command
         if step.gait is None or step.wanted is None:

@@ -86,7 +86,7 @@ _SHOWN_AS = {  # of a demand: unit and how many of it are one of SI's
 }
 
 
-def told(run: DryRun, width: int) -> Iterator[str]:
+def summary_lines(run: DryRun, width: int) -> Iterator[str]:
     """Lines for a terminal.
 
     Args:

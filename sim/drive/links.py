@@ -55,7 +55,7 @@ _OF_JOINTS = (
     Quantity.VOLTAGE,
 )
 _VECTORS = (Quantity.ACCELERATION, Quantity.MAGNETIC_FIELD)
-_TOLD = {*_OF_JOINTS, Quantity.RANGE, *_VECTORS}
+_GAIT_QUANTITIES = {*_OF_JOINTS, Quantity.RANGE, *_VECTORS}
 
 
 class BusReadings:
@@ -71,7 +71,7 @@ class BusReadings:
         Raises:
             DataError: If the robot has no bus, or not the databases that its map needs.
         """
-        self._decoder = BusDecoder(_as_far_as_told(robot))
+        self._decoder = BusDecoder(_with_gait_signals(robot))
         self._oldest_s = oldest_s
         self._joints = {name: i for i, name in enumerate(robot.joint_names)}
         self._range_max = {
@@ -173,11 +173,11 @@ class BusReadings:
                 known[target] = time_s, frozen(vector)
 
 
-def _as_far_as_told(robot: Robot) -> Robot:
+def _with_gait_signals(robot: Robot) -> Robot:
     """The robot with a bus map of what a gait is told: the rest costs time in every tick."""
     if robot.bus is None:
         return robot
-    signals = tuple(signal for signal in robot.bus.signals if signal.quantity in _TOLD)
+    signals = tuple(signal for signal in robot.bus.signals if signal.quantity in _GAIT_QUANTITIES)
     return dataclasses.replace(robot, bus=dataclasses.replace(robot.bus, signals=signals))
 
 

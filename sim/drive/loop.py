@@ -288,7 +288,7 @@ class ControlLoop:
         while self._gate.phase is not Phase.DONE:
             try:
                 tick, received = self._pace.next()
-                heard = self._hear(tick, received)
+                heard = self._receive(tick, received)
                 gone = gone or (console is not None and console.gone())
                 step = self._gate.step(
                     tick, heard, stop_reason(stop, console_gone=gone), at_once=stop.again
@@ -312,7 +312,7 @@ class ControlLoop:
         if failed := unwritten or self._gate.gait_error:
             raise failed
 
-    def _hear(self, tick: int, received: Sequence[FrameArray]) -> GateInput:
+    def _receive(self, tick: int, received: Sequence[FrameArray]) -> GateInput:
         time_s, trouble, before = tick / CONTROL_RATE_HZ, None, self._known.angles.copy()
         for frames in received:
             self._known.add(frames, time_s)

@@ -168,7 +168,7 @@ def drive_bus(
         if plan.recorder is not None:
             teller = GaitPublisher(plan.recorder, gait.names)
             opened.callback(teller.close)
-        tell = _Telling(
+        publish = _Telling(
             plan,
             session,
             teller,
@@ -194,26 +194,26 @@ def drive_bus(
         loop = ControlLoop(gate, robot, link, pace, spacing=spacing, confirmation=confirmation)
 
         def each_tick(tick: BusTick) -> None:
-            tell.tick(tick)
-            tell.feedback(_feedback(gate, loop))
+            publish.tick(tick)
+            publish.feedback(_feedback(gate, loop))
             if (shortage := session.shortage) is not None:  # it still takes what the ending is
                 gate.report(GateFault(FaultKind.LOG, shortage))
 
         opened.enter_context(quick_collections())
         begun = time.monotonic()
         try:
-            tell.begin()
+            publish.begin()
             loop.run(stop, each_tick, console)
             report = _report(gate, loop, spacing, tally.counts)
-            tell.end(report)
+            publish.end(report)
             session.close()
         except LogWriteError as error:
             raise _unwritten(error, session, gate, loop.tally) from error
         except Exception as error:
-            tell.failed(str(error) or type(error).__name__)
+            publish.failed(str(error) or type(error).__name__)
             raise
         report.wall_s = time.monotonic() - begun
-        report.first_frames = tell.first_frames
+        report.first_frames = publish.first_frames
     if teller is not None:  # closed: all that could be told is
         report.told = teller.told
         report.not_told = teller.error or (
@@ -322,7 +322,7 @@ class _Telling:
     def begin(self) -> None:
         driven = self._plan.driven
         text = f"drives {driven.name} ({driven.kind}) on {self._plan.address.text}"
-        self._session.say("info", text)
+        self._session.log_event("info", text)
         if self._teller is not None:
             self._teller.note(text)
 
@@ -335,10 +335,10 @@ class _Telling:
             t_ns = self._simulated_ns + tick.tick * (_NS // CONTROL_RATE_HZ)
             self._session.write(stamped(tick, t_ns), t_ns)
         for event in self._events.take():
-            self._session.say(event.level, event.text)
+            self._session.log_event(event.level, event.text)
         if self._teller is not None:
             if tick.step.gait is not None:
-                self._teller.tell(tick.step.gait, time.time_ns())
+                self._teller.publish(tick.step.gait, time.time_ns())
             for level, text in tick.step.remarks:
                 self._teller.note(text, level)
         if self._on_tick is not None:
@@ -349,13 +349,13 @@ class _Telling:
         if feedback is None or feedback == self._feedback:
             return
         if self._feedback is not None:
-            self._session.say("warn", f"gate: {UNASKED}")
+            self._session.log_event("warn", f"gate: {UNASKED}")
         self._feedback = feedback
         self._session.writer.note("undulog.gate.feedback", feedback.facts())
 
     def end(self, report: BusReport) -> None:
         for event in self._events.flush():
-            self._session.say(event.level, event.text)
+            self._session.log_event(event.level, event.text)
         self._session.finish(report.outcome, remarks_of(report))
         if report.jitter is not None:
             facts = {name: str(value) for name, value in report.jitter.to_dict().items()}

@@ -78,7 +78,7 @@ class GaitPublisher:
         """
         self._held.append({"do": "note", "text": text, "level": level})
 
-    def tell(self, tick: GaitTick, t_ns: int) -> None:
+    def publish(self, tick: GaitTick, t_ns: int) -> None:
         """Leave what the gait says, without waiting.
 
         Args:
@@ -225,7 +225,7 @@ class BusSession:
         self._keep_sent(tick.sent)
         if tick.tick % _DECODE_TICKS == 0:
             self._frames.decode(self._now_ns, t_ns + 1)
-            self._say_faults()
+            self._log_faults()
         self._change("phase", self._phase, step.phase)
         for level, text in step.remarks:
             self._events.write(t_ns, level, _EVENTS_OF, text)
@@ -236,9 +236,9 @@ class BusSession:
         if step.gait is not None:
             self._write_gait(step.gait, t_ns)
 
-    def _say_faults(self) -> None:
+    def _log_faults(self) -> None:
         for text in self._frames.take_faults():
-            self.say("error", text)
+            self.log_event("error", text)
 
     def _keep_sent(self, frames: FrameArray) -> None:
         """Keep what was sent, with the time on the device's clock as far as that is known."""
@@ -258,7 +258,7 @@ class BusSession:
             self._gait.write(t_ns, gait.values)
         self._change("mode", self._mode, gait.mode)
         for name in gait.clamped:
-            self.say("warn", f"{name} clamped to the joint limits")
+            self.log_event("warn", f"{name} clamped to the joint limits")
 
     def _change(self, what: str, channel: StringChannel, text: str) -> None:
         """Write a text where it changed."""
@@ -266,7 +266,7 @@ class BusSession:
             self._last[what] = text
             channel.write(self._t_ns, text)
 
-    def say(self, level: str, text: str) -> None:
+    def log_event(self, level: str, text: str) -> None:
         """Write an event, once.
 
         Args:
@@ -284,9 +284,9 @@ class BusSession:
         """
         level = "error" if outcome.how is DriveEnding.FAULT else "info"
         why = f": {outcome.why}" if outcome.why else ""
-        self.say(level, f"{outcome.how}{why}; {outcome.ended}")
+        self.log_event(level, f"{outcome.how}{why}; {outcome.ended}")
         for each in remarks:
-            self.say(*each)
+            self.log_event(*each)
         reasons = [text for kind, text in remarks if kind == "warn"]
         if outcome.how is DriveEnding.FAULT:
             self.writer.set_verdict("bad", [outcome.why, *reasons])
@@ -295,7 +295,7 @@ class BusSession:
 
     def fail(self, text: str) -> None:
         """Say why it failed."""
-        self.say("error", text)
+        self.log_event("error", text)
         self.writer.set_verdict("bad", [text])
 
     def close(self) -> None:
@@ -309,7 +309,7 @@ class BusSession:
         self._open = False
         try:
             self._frames.finish(self._now_ns)
-            self._say_faults()
+            self._log_faults()
         finally:
             self.writer.close()
 

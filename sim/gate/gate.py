@@ -134,14 +134,14 @@ class Gate:
         clamp = self._clamp or self._begin(tick, heard, stop)
         if clamp is None:
             return self._quiet()
-        self._tell_left_out(tick, heard.late_s)
-        self._heed(tick, heard, clamp, stop, at_once=at_once)
+        self._log_skipped(tick, heard.late_s)
+        self._follow(tick, heard, clamp, stop, at_once=at_once)
         if self.phase in {Phase.DONE, Phase.HOLD}:
             return self._quiet()
         wanted, gait = self._wanted(tick, heard, clamp)
         pulled = self._yielding.apply(wanted, heard.status.angle, heard.status.current)
         given = clamp.apply(pulled, heard.bounds)
-        self._tell_changes(given)
+        self._log_changes(given)
         phase = self.phase
         self._end_in_time()
         return GateStep(phase, given.command, wanted, gait, tuple(self._remarks))
@@ -239,7 +239,9 @@ class Gate:
 
     # -- what goes wrong -------------------------------------------------------------------
 
-    def _heed(self, tick: int, heard: GateInput, clamp: Clamp, stop: str, *, at_once: bool) -> None:
+    def _follow(
+        self, tick: int, heard: GateInput, clamp: Clamp, stop: str, *, at_once: bool
+    ) -> None:
         """Change the phase where a fault, or who asks to stop, wants it."""
         found = self._trouble(tick, heard, clamp)
         if self.phase is Phase.HOLD and (found is None or found.kind not in MUTE):
@@ -341,7 +343,7 @@ class Gate:
 
     # -- telling ---------------------------------------------------------------------------
 
-    def _tell_left_out(self, tick: int, late_s: float) -> None:
+    def _log_skipped(self, tick: int, late_s: float) -> None:
         """Say what is skipped where the loop came late; the way of a ramp goes on where it was."""
         before, self._tick = self._tick, tick
         left_out = 0 if before is None else tick - before - 1
@@ -361,7 +363,7 @@ class Gate:
     def _quiet(self) -> GateStep:
         return GateStep(self.phase, None, None, None, tuple(self._remarks))
 
-    def _tell_changes(self, given: Clamped) -> None:
+    def _log_changes(self, given: Clamped) -> None:
         """Say once for each joint what the gate changes."""
         limits, names = self._limits, self._limits.joint_names
         reasons = (

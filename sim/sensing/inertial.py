@@ -82,7 +82,7 @@ class Accelerometer:
             done += len(taken)
             if self._steps == self._count:
                 time_s = (start + done - self._count / 2) * self._dt
-                samples += self._told(self._summed / self._count, time_s)
+                samples += self._measured(self._summed / self._count, time_s)
                 self._summed[:] = 0.0
                 self._steps = 0
         return samples
@@ -105,7 +105,7 @@ class Accelerometer:
             means.append(0.5 * (at_ends[:, :count] + at_ends[:, count:]).T)
         return np.stack(means, axis=1)
 
-    def _told(self, force: FloatArray, time_s: float) -> list[VectorSample]:
+    def _measured(self, force: FloatArray, time_s: float) -> list[VectorSample]:
         force = (force[:, None] @ self._mounts.rotation)[:, 0]  # into the sensors' frames
         force += self._model.noise * self._random.standard_normal(force.shape)
         told = self._axes * quantised(force, self._model.resolution)

@@ -236,7 +236,7 @@ class FaultLine:
             told.append(sample._replace(position=position, current=current))
         return told
 
-    def hears(self, time_s: float) -> bool:
+    def is_receiving(self, time_s: float) -> bool:
         """Whether the robot hears the bus.
 
         Args:
@@ -256,7 +256,7 @@ class FaultLine:
             What is on the bus by now: frames, those of before that were late, and error frames.
         """
         parts: list[FrameArray] = []
-        if self._off == self.hears(time_s):
+        if self._off == self.is_receiving(time_s):
             self._off = not self._off
             parts.append(_error_frames(BUS_OFF if self._off else RESTARTED, now_ns, 1))
         for fault in self._of[FaultKind.LOST]:

@@ -162,7 +162,7 @@ class VirtualRobot:
         faults: Sequence[BusFault] = (),
         lockstep: bool = False,
         wait: bool = False,
-        say: Callable[[str, str], None],
+        log_event: Callable[[str, str], None],
         each_tick: Callable[[], None] = lambda: None,
         stop: StopRequest | None = None,
     ) -> None:
@@ -182,7 +182,7 @@ class VirtualRobot:
         """
         self._scenario, self._bus, self._pacer = scenario, bus, pacer
         self._lockstep, self._wait_for_commands = lockstep, wait
-        self._say, self._each_tick = say, each_tick
+        self._say, self._each_tick = log_event, each_tick
         self._stop = stop or StopRequest()
         robot = self._robot = scenario.robot
         self._replies = ReplyEncoder(robot)
@@ -191,12 +191,12 @@ class VirtualRobot:
         self._line = FaultLine(ordered, robot, self._replies, scenario.seed)
         self._tick = 0
         self._silent = False
-        self._told_cut: set[str] = set()
+        self._logged_cuts: set[str] = set()
         self._twin: Twin | None = None
         pace = "lockstep" if lockstep else "paced"
         bus.identify(f"virtual-robot {scenario.robot.name} {pace}")
         if made_up := self._replies.made_up:
-            say("warn", f"reads 0 on the bus, as the twin has none: {', '.join(made_up)}")
+            log_event("warn", f"reads 0 on the bus, as the twin has none: {', '.join(made_up)}")
 
     names: tuple[str, ...] = ()
     """No values: what the controller meant is not on the bus."""
@@ -260,7 +260,7 @@ class VirtualRobot:
             self._keep_pace(tick)
             self._watch()
         self._tick += 1
-        self._tell_cuts()
+        self._log_cuts()
         command = self._line.command(self._latch.angle, readings.angle, time_s)
         return GaitTick(command, np.empty(0), "bus", ())
 
@@ -302,11 +302,11 @@ class VirtualRobot:
         self._idle(timeout_s)
         if sent := self._bus.pull():
             frames = self._bus.relay(sent, self._pacer.now_ns())
-            self._latch.take(frames, heard=self._line.hears(self._tick / CONTROL_RATE_HZ))
+            self._latch.take(frames, heard=self._line.is_receiving(self._tick / CONTROL_RATE_HZ))
 
     def _listen_to_all(self, tick: int) -> None:
         """Lockstep: take frames until every servo has a command, and no more."""
-        heard = self._line.hears(tick / CONTROL_RATE_HZ)
+        heard = self._line.is_receiving(tick / CONTROL_RATE_HZ)
         missing = self._latch.commanded.copy()
         pulled: list[Sent] = []
         waited_ns, told = time.monotonic_ns(), False
@@ -357,9 +357,9 @@ class VirtualRobot:
             else:
                 self._say("info", "commands are back")
 
-    def _tell_cuts(self) -> None:
-        for name in sorted(self._latch.cut - self._told_cut):
-            self._told_cut.add(name)
+    def _log_cuts(self) -> None:
+        for name in sorted(self._latch.cut - self._logged_cuts):
+            self._logged_cuts.add(name)
             self._say("warn", f"{name} was commanded beyond its limits, and stops there")
 
     def _listed(self, chosen: BoolArray) -> str:

@@ -50,7 +50,9 @@ class SocketcandServer:
         identity: What a client that asks is told of the robot.
     """
 
-    def __init__(self, host: str, port: int, bus: str, say: Callable[[str, str], None]) -> None:
+    def __init__(
+        self, host: str, port: int, bus: str, log_event: Callable[[str, str], None]
+    ) -> None:
         """Listen.
 
         Args:
@@ -66,7 +68,7 @@ class SocketcandServer:
         self.identity = ""
         self._tick: int | None = None
         self._state = b""
-        self._bus, self._say = bus, say
+        self._bus, self._say = bus, log_event
         self._clients: dict[int, BusClient] = {}
         self._number = 0
         self._sent: deque[Sent] = deque()
@@ -202,14 +204,14 @@ class SocketcandServer:
         for message in messages:
             if client.number not in self._clients:
                 return
-            self._hear(client, message)
+            self._receive(client, message)
         if not chunk:
             self._lose(client)
         elif len(self._sent) >= MOST_SENT:
             for each in self._clients.values():
                 self._watch(each)
 
-    def _hear(self, client: BusClient, message: str) -> None:
+    def _receive(self, client: BusClient, message: str) -> None:
         """Act on one message."""
         word, _, rest = message.partition(" ")
         if word in _SEND and client.bus_open:
@@ -310,7 +312,7 @@ class VirtualBus:
         self,
         server: SocketcandServer | None,
         sender: FrameSender | None,
-        say: Callable[[str, str], None],
+        log_event: Callable[[str, str], None],
     ) -> None:
         """Put the bus together.
 
@@ -323,7 +325,7 @@ class VirtualBus:
             UsageError: If the recorder's socket can never be used.
         """
         self.sent = self.heard = 0
-        self._server, self._sender, self._say = server, sender, say
+        self._server, self._sender, self._say = server, sender, log_event
         self._recorder = False
         if sender is not None:
             try:

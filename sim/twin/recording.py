@@ -202,23 +202,23 @@ def record(
                 if stop is not None and stop.requested:
                     break
         except SimulationError as error:
-            log.hear(twin.flush())
-            log.say("error", str(error))
+            log.receive(twin.flush())
+            log.log_event("error", str(error))
             writer.set_verdict("bad", [str(error)])
             raise
-        log.hear(twin.flush())
+        log.receive(twin.flush())
         assert sample is not None  # noqa: S101 - a run has at least two samples
         complete = sample.tick == scenario.tick_count - 1
         if complete:
-            log.say("info", f"end at {sample.time_s:g} s")
+            log.log_event("info", f"end at {sample.time_s:g} s")
             writer.set_verdict("good")
         elif driver is not None:  # it was asked to come to rest, and has
             planned = f"{scenario.duration_s:g} s"
-            log.say("info", f"at rest at {sample.time_s:g} s of {planned}: it was stopped")
+            log.log_event("info", f"at rest at {sample.time_s:g} s of {planned}: it was stopped")
             writer.set_verdict("good")
         else:
             text = f"stopped at {sample.time_s:g} s of {scenario.duration_s:g} s"
-            log.say("warn", text)
+            log.log_event("warn", text)
             writer.set_verdict("degraded", [text])
     return Recording(
         path=Path(path),

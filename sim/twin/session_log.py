@@ -212,13 +212,15 @@ class SessionLog:
         self._t_ns = self._epoch_ns
         writer.string("/robot_description").write(self._t_ns, description)
         for text in warnings(scenario):
-            self.say("warn", text)
+            self.log_event("warn", text)
         if scenario.faults:
             text = "the scenario's faults are those of a bus, which this run does not have"
-            self.say("warn", text)
-        self.say("info", f"start of {scenario.name}, seed {scenario.seed}: {scenario.description}")
+            self.log_event("warn", text)
+        self.log_event(
+            "info", f"start of {scenario.name}, seed {scenario.seed}: {scenario.description}"
+        )
 
-    def say(self, level: str, text: str) -> None:
+    def log_event(self, level: str, text: str) -> None:
         """Write an event, once.
 
         Args:
@@ -237,7 +239,7 @@ class SessionLog:
         t_ns = self._t_ns = self._epoch_ns + sample.tick * _TICK_NS
         body = sample.step.body
         self._commands.write(t_ns, sample.gait.command)
-        self.hear(sample.sensed)
+        self.receive(sample.sensed)
         if self._gait is not None:
             self._gait.write(t_ns, sample.gait.values)
         self._energy.write(t_ns, sample.energy)
@@ -256,7 +258,7 @@ class SessionLog:
             self._mode.write(t_ns, sample.gait.mode)
         self._note(sample)
 
-    def hear(self, samples: Sequence[SensorSample]) -> None:
+    def receive(self, samples: Sequence[SensorSample]) -> None:
         """Write what the sensors told, as arrived by the time of the last sample written.
 
         Args:
@@ -294,17 +296,17 @@ class SessionLog:
     def _note(self, sample: Sample) -> None:
         """Say what deserves saying about a sample."""
         if sample.tick == round(self._scenario.settle_s * CONTROL_RATE_HZ):
-            self.say("info", f"settled: {self._scenario.settle_s:g} s have passed")
+            self.log_event("info", f"settled: {self._scenario.settle_s:g} s have passed")
         target = self._scenario.world.target
         head = sample.step.body.position[:2, 0]
         if target is not None and math.dist(head, target.position) <= target.radius:
-            self.say("info", "the head has met the target")
+            self.log_event("info", "the head has met the target")
         for name in sample.gait.clamped:
-            self.say("warn", f"{name} clamped to the joint limits")
+            self.log_event("warn", f"{name} clamped to the joint limits")
         angle = sample.step.body.angle
         for i in np.flatnonzero((angle < self._lower) | (angle > self._upper)):
             joint = self._scenario.robot.joints[i]
-            self.say(
+            self.log_event(
                 "warn", f"{joint.name} passed its limits {joint.lower:g} to {joint.upper:g} rad"
             )
 

@@ -117,7 +117,7 @@ class TwinSource:
                 continue
             self._finished = True
             if self._twin is not None:
-                self._log.hear(self._twin.flush())
+                self._log.receive(self._twin.flush())
             now_ns = self._context.now_ns()
             if item is None:
                 events.append(SourceEvent(now_ns, "info", f"{self._scenario.name} has ended"))

@@ -61,7 +61,7 @@ class Robot:
         self.arrivals.append((now, joint, raw * STEP))
         self.angles[joint] = raw
 
-    def say(self):
+    def log_event(self):
         """What is due by now, and when more will be."""
         now, text = time.monotonic(), b""
         while self.due and self.due[0][0] <= now:
@@ -129,7 +129,7 @@ def serve_robot(robot):
                 else:
                     client.sendall(b"< error unknown command >")
         if raw:
-            text, wait_s = robot.say()
+            text, wait_s = robot.log_event()
             try:
                 client.sendall(text)
             except OSError:

@@ -181,7 +181,7 @@ def experiment_view(experiment: Experiment) -> ExperimentView:
         matrices=tuple(
             matrix_picture(one, f"matrix-{k + 1}", small=k > 0) for k, one in enumerate(entries)
         ),
-        told=_told(coupling),
+        told=_checks(coupling),
         modes=None if body is None else modes_drawing(body, "modes-figure"),
         body_facts=() if body is None else tuple(body_facts(body)),
         entrainment=None if body is None else entrainment_entries(body),
@@ -197,7 +197,7 @@ def experiment_view(experiment: Experiment) -> ExperimentView:
     )
 
 
-def _told(coupling: Coupling) -> tuple[str, ...]:
+def _checks(coupling: Coupling) -> tuple[str, ...]:
     if isinstance(coupling, LocalCoupling):
         return tuple(kick_checks(coupling))
     return tuple(sweep_checks(coupling)) if isinstance(coupling, LinearCoupling) else ()

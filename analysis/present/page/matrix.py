@@ -58,7 +58,7 @@ class Entries:
         largest = float(beside.max()) if beside.size else 0.0
         return largest or float(size.max()) or 1.0
 
-    def told(self, i: int, j: int, decimals: int) -> str:
+    def entry_text(self, i: int, j: int, decimals: int) -> str:
         """One entry in words.
 
         Args:
@@ -241,13 +241,14 @@ def _row(entries: Entries, i: int, first: _Box, *, small: bool) -> Markup:
     if small:
         return element("g", label, *parts)
     words = ", ".join(
-        f"{name} {entries.told(i, j, entries.decimals)}" for j, name in enumerate(entries.columns)
+        f"{name} {entries.entry_text(i, j, entries.decimals)}"
+        for j, name in enumerate(entries.columns)
     )
     frame = element(
         "rect", x=left - 1, y=y - 1, width=k * cell + 2, height=cell + 2, class_="frame"
     )
-    told = f"{entries.rows[i]} {entries.verb}: {words}"
-    return element("g", label, *parts, frame, class_="row", tabindex=0, role="img", aria_label=told)
+    text = f"{entries.rows[i]} {entries.verb}: {words}"
+    return element("g", label, *parts, frame, class_="row", tabindex=0, role="img", aria_label=text)
 
 
 def _cell(entries: Entries, i: int, j: int, box: _Box, *, small: bool) -> Markup:
@@ -277,7 +278,7 @@ def _cell(entries: Entries, i: int, j: int, box: _Box, *, small: bool) -> Markup
     if small:
         return joined(parts)
     who = f"{entries.rows[i]} {entries.verb} {entries.columns[j]}"
-    hint = f"{who}: {entries.told(i, j, entries.decimals)}"
+    hint = f"{who}: {entries.entry_text(i, j, entries.decimals)}"
     return element("g", element("title", hint), *parts, *_numbers(entries, i, j, box))
 
 
@@ -296,9 +297,9 @@ def _numbers(entries: Entries, i: int, j: int, box: _Box) -> list[Markup]:
         )
     ]
     if half is not None and len(entries.rows) <= MOST_IN_CELLS:
-        told = f"\N{PLUS-MINUS SIGN}{number(half, entries.decimals)}"
+        half_text = f"\N{PLUS-MINUS SIGN}{number(half, entries.decimals)}"
         small = {"y": y + size * 0.95, "font_size": size * 0.72}
-        parts.append(element("text", told, class_="half", **small, **place))
+        parts.append(element("text", half_text, class_="half", **small, **place))
     return parts
 
 

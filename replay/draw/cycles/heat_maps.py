@@ -120,7 +120,7 @@ def log_maps(
         _log_axes(rec, shown, named)
         _log_bar(rec, shown)
         if shown.table.value.size <= _MOST_TOLD:
-            _log_told(rec, shown)
+            _log_cell_texts(rec, shown)
         _log_frame(rec, clock, shown)
 
 
@@ -206,14 +206,14 @@ def _log_text(
     rec.log(entity, drawn, static=True)
 
 
-def _log_told(rec: rr.RecordingStream, shown: HeatMap) -> None:
+def _log_cell_texts(rec: rr.RecordingStream, shown: HeatMap) -> None:
     """What a cell holds, in words, under the mouse: a dot of the cell's own colour."""
     count, width, height = _cells(shown)
     m = len(shown.places)
     at = np.stack(np.meshgrid(np.arange(m), np.arange(count)), axis=-1).reshape(-1, 2)
     dots = rr.Points2D(
         (at + 0.5) * (width, height),
-        labels=list(_told(shown)),
+        labels=list(_cell_texts(shown)),
         show_labels=False,
         colors=cell_colors(shown).reshape(-1, 3),
         radii=_DOT,
@@ -221,7 +221,7 @@ def _log_told(rec: rr.RecordingStream, shown: HeatMap) -> None:
     rec.log(f"{shown.entity}/values", dots, static=True)
 
 
-def _told(shown: HeatMap) -> Iterator[str]:
+def _cell_texts(shown: HeatMap) -> Iterator[str]:
     table = shown.table
     unit = table.quantity.unit
     for k, (start, stop) in enumerate(zip(table.start_s, table.stop_s, strict=True)):

@@ -24,7 +24,7 @@ def test_one_text_is_told_once_a_second_with_its_count() -> None:
     events = EventLog(clock)
     told = []
     for _ in range(2500):  # one each millisecond
-        events.say("warn", "malformed line")
+        events.log_event("warn", "malformed line")
         told += events.take()
         clock.t_ns += S // 1000
     told += events.flush()
@@ -42,7 +42,7 @@ def test_one_text_is_told_once_a_second_with_its_count() -> None:
 def test_different_texts_do_not_hide_each_other() -> None:
     events = EventLog(Clock())
     for text in ("a", "b", "a"):
-        events.say("info", text)
+        events.log_event("info", text)
     assert [event.text for event in events.take()] == ["a", "b"]
     assert [event.text for event in events.flush()] == ["a"]
 
@@ -50,11 +50,11 @@ def test_different_texts_do_not_hide_each_other() -> None:
 def test_after_a_quiet_second_the_next_is_told_at_once() -> None:
     clock = Clock()
     events = EventLog(clock)
-    events.say("info", "a")
+    events.log_event("info", "a")
     events.take()
     clock.t_ns += 2 * S
     assert events.take() == ()
-    events.say("info", "a", 3)
+    events.log_event("info", "a", 3)
     assert [event.text for event in events.take()] == ["a (3 times)"]
 
 

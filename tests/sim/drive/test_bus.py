@@ -50,7 +50,7 @@ def alive(scenario, *, lockstep=True):
     server = SocketcandServer("127.0.0.1", 0, "can0", silent)
     bus, stop, served = VirtualBus(server, None, silent), StopRequest(), []
     pacer = Pacer(PERIOD_NS, fast=lockstep)
-    robot = VirtualRobot(scenario, bus, pacer, lockstep=lockstep, stop=stop, say=silent)
+    robot = VirtualRobot(scenario, bus, pacer, lockstep=lockstep, stop=stop, log_event=silent)
 
     def live():
         try:
@@ -387,11 +387,11 @@ def test_joints_that_say_nothing_are_named(capsys, tmp_path):
     keys = [(name, Quantity.POSITION, "") for name in robot.joint_names if name != "joint07"]
     frames = BusEncoder(robot, Direction.RX).encode(dict.fromkeys(keys, 0.0))
 
-    def say(bus):
+    def log_event(bus):
         for frame in frames:
             bus.send(message_of(frame))
 
-    code, said = refused("gate-silent", say, capsys, tmp_path)
+    code, said = refused("gate-silent", log_event, capsys, tmp_path)
     assert code == 1
     why = "the pose is not known, joint07 reported no angle within 2 s"
     assert f"no command was sent: {why}" in said

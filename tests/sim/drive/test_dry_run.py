@@ -15,7 +15,7 @@ from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Safety
 from undulog.sim.drive.dry_run import Verdict, dry_run, nominal_world
-from undulog.sim.drive.dry_run_text import reported, told
+from undulog.sim.drive.dry_run_text import reported, summary_lines
 from undulog.sim.drive.motion import find_motion
 
 RATE_HZ = 100
@@ -96,7 +96,7 @@ def test_it_would_run_and_the_first_line_says_so(waved):
     assert run.verdict is Verdict.RUNS
     assert run.verdict.fit
     assert (run.duration_s, run.planned_s, run.missing, run.fault) == (1.5, 1.5, (), None)
-    lines = list(told(run, WIDE))
+    lines = list(summary_lines(run, WIDE))
     assert lines[0].startswith("wave.mcap on short would run as it is; closest to a limit")
     joint, demand = run.closest
     assert demand.share == max(
@@ -109,7 +109,7 @@ def test_it_would_run_and_the_first_line_says_so(waved):
 @pytest.mark.parametrize("width", [WIDE, 120, 100, 80, 40])
 def test_the_table_is_aligned_and_narrow_terminals_go_without_columns(waved, width):
     _, run, _ = waved
-    lines = list(told(run, width))
+    lines = list(summary_lines(run, width))
     head = next(k for k, line in enumerate(lines) if line.startswith("joint "))
     assert [line.split()[0] for line in lines[head + 1 :]] == [one.name for one in run.joints]
     assert len({len(line) for line in lines[head:]}) == 1  # numbers end at one column
@@ -188,7 +188,7 @@ def test_a_step_would_be_clamped_to_the_greatest_rate(robot, tmp_path):
     # Where it holds back: in seven of sixty ticks, the eighth step is there.
     assert run.joints[2].clamped == pytest.approx(7 / 60)
     assert [joint.name for joint in run.joints if joint.clamped] == ["joint03"]
-    first, second = list(told(run, WIDE))[:2]
+    first, second = list(summary_lines(run, WIDE))[:2]
     assert first.startswith("step.mcap on short would run, clamped: joint03 12% of the ")
     assert second == "  gate: joint03: command held back to 4 rad/s"
 
@@ -206,7 +206,7 @@ def test_a_servo_that_is_too_weak_would_stop_the_drive(robot, tmp_path):
     assert (run.fault.kind, run.fault.joint) == ("tracking", "joint03")
     assert run.fault.limit == 0.35
     assert 0.0 <= run.duration_s < 3.0
-    first = next(told(run, WIDE))
+    first = next(summary_lines(run, WIDE))
     assert "wave.mcap on short would stop " in first
     assert "joint03: tracking error 0." in first
     stop = reported(run)["stop"]
@@ -221,7 +221,7 @@ def test_limits_that_are_missing_are_named_and_the_numbers_are_there_all_the_sam
     assert run.missing == ("ramp_rate", "max_tracking_error", "reply_timeout_s", "max_late_s")
     assert math.isnan(run.approach_s)
     assert run.joints[0].rate == pytest.approx(0.4 * np.pi, rel=2e-3)
-    lines = list(told(run, WIDE))
+    lines = list(summary_lines(run, WIDE))
     assert "would not start: short lacks the limits ramp_rate, max_track" in lines[0]
     assert "  [safety]" in lines
     assert reported(run)["approach_s"] is None
@@ -268,9 +268,9 @@ def test_what_arming_would_refuse_the_dry_run_refuses_too(tmp_path, capsys):
     joints = ("joint01", "joint02")
     write_commands(few, joints, [np.zeros(2)], robot=whole, clock={"c": "host"})
     assert front.run(["drive", str(few), *on]) == 2
-    told = capsys.readouterr().err
-    assert "it commands 2 joints: joint01, joint02" in told
-    assert "snake25 has 25: joint01, joint02, joint03" in told
+    summary_lines = capsys.readouterr().err
+    assert "it commands 2 joints: joint01, joint02" in summary_lines
+    assert "snake25 has 25: joint01, joint02, joint03" in summary_lines
 
 
 def test_a_twin_that_fails_leaves_a_session_that_says_so(robot, tmp_path):

@@ -57,7 +57,7 @@ def test_everything_is_told_in_order(tmp_path):
         teller = GaitPublisher(tmp_path / "a.sock", NAMES)
         teller.note("drives")
         for k in range(300):
-            teller.tell(tick(k, "walk" if k < 200 else "avoid"), 10**18 + k)
+            teller.publish(tick(k, "walk" if k < 200 else "avoid"), 10**18 + k)
         teller.close()
     assert (teller.told, teller.dropped, teller.error) == (300, 0, None)
     gait = [request for request in heard if request["do"] == "gait"]
@@ -76,7 +76,7 @@ def test_what_json_has_no_number_for_is_null(tmp_path):
     values = np.array([1.0, 2.0, 3.0, 4.0, 5.0, np.nan, np.inf])
     with control_socket(tmp_path / "a.sock") as (heard, _):
         teller = GaitPublisher(tmp_path / "a.sock", names)
-        teller.tell(GaitTick(np.zeros(25), values, "walk", ()), 1)
+        teller.publish(GaitTick(np.zeros(25), values, "walk", ()), 1)
         teller.close()
     told = [1.0, 2.0, 3.0, 4.0, 5.0, None, None]
     assert heard[-1]["values"] == dict(zip(names, told, strict=True))
@@ -85,7 +85,7 @@ def test_what_json_has_no_number_for_is_null(tmp_path):
 def test_commands_without_a_gait_tell_their_mode_only(tmp_path):
     with control_socket(tmp_path / "a.sock") as (heard, _):
         teller = GaitPublisher(tmp_path / "a.sock", ())
-        teller.tell(tick(0, "replay", count=0), 1)
+        teller.publish(tick(0, "replay", count=0), 1)
         teller.close()
     assert heard == [{"do": "mode", "text": "replay"}]
     assert teller.told == 0
@@ -94,17 +94,17 @@ def test_commands_without_a_gait_tell_their_mode_only(tmp_path):
 def test_a_recorder_that_goes_or_refuses_is_told_nothing_more(tmp_path):
     with control_socket(tmp_path / "a.sock") as (_, end):
         teller = GaitPublisher(tmp_path / "a.sock", NAMES)
-        teller.tell(tick(0), 1)
+        teller.publish(tick(0), 1)
         teller_told(teller, 1)
         end()
         for k in range(5000):  # more than is held: nothing waits, nothing fails
-            teller.tell(tick(k), k)
+            teller.publish(tick(k), k)
         teller.close()
     assert teller.told == 1
     assert "went" in teller.error
     with control_socket(tmp_path / "b.sock", refuse=("gait",)):
         teller = GaitPublisher(tmp_path / "b.sock", NAMES)
-        teller.tell(tick(0), 1)
+        teller.publish(tick(0), 1)
         teller.close()
     assert (teller.told, teller.error) == (0, "a source writes that topic")
 

@@ -62,12 +62,12 @@ class Running:
 
     def __init__(self, scenario, *, fast=True, **options):
         self.said = []
-        self.server = SocketcandServer("127.0.0.1", 0, "can0", self.say)
-        self.bus = VirtualBus(self.server, None, self.say)
+        self.server = SocketcandServer("127.0.0.1", 0, "can0", self.log_event)
+        self.bus = VirtualBus(self.server, None, self.log_event)
         self.stop = StopRequest()
         self.pacer = Pacer(PERIOD_NS, fast=fast)
         self.robot = VirtualRobot(
-            scenario, self.bus, self.pacer, say=self.say, stop=self.stop, **options
+            scenario, self.bus, self.pacer, log_event=self.log_event, stop=self.stop, **options
         )
         self.served = None
         self.ready = threading.Event()
@@ -79,7 +79,7 @@ class Running:
         )
         self.encoder = BusEncoder(scenario.robot, Direction.TX)
 
-    def say(self, level, text):
+    def log_event(self, level, text):
         self.said.append(text)
 
     def run(self):
@@ -343,7 +343,7 @@ def test_off_the_bus_the_robot_neither_speaks_nor_hears(robot):
     assert [len(frames) for frames in shown] == [4] * 5 + [1] + [0] * 9 + [5] + [4] * 14
     assert shown[5]["id_flags"].tolist() == [ERROR_FLAG | 0x40]
     assert shown[15]["id_flags"].tolist() == [ERROR_FLAG | 0x100, 513, 514, 515, 516]
-    assert [line.hears(t) for t in (0.04, 0.05, 0.14, 0.15)] == [True, False, False, True]
+    assert [line.is_receiving(t) for t in (0.04, 0.05, 0.14, 0.15)] == [True, False, False, True]
 
 
 def test_a_frozen_encoder_tells_its_last_angle_and_a_stuck_servo_holds_it(robot):
