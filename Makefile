@@ -70,7 +70,7 @@ check: $(READY)  ## lint, format, types, layers
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/pyright
 
-format: $(READY)  ## mend what lint and format can mend
+format: $(READY)  ## fix what lint and format can fix
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 

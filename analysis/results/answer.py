@@ -133,7 +133,7 @@ class NotFollowing:
     """A joint that does not follow its command.
 
     Attributes:
-        kinds: Kinds of fault that fit and that the data can't tell apart: keys of
+        kinds: Kinds of fault that fit and that the data can't separate: keys of
             :data:`.capture.following.fault.KINDS`.
         since_s: From the session's start [s]; None where it holds from the beginning.
         until_s: Its end [s]; None where it holds to the end.

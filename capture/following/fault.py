@@ -35,7 +35,7 @@ class Fault:
     """One joint that does not follow its command.
 
     Attributes:
-        kinds: The kinds of :data:`KINDS` that fit and that the data can't tell apart.
+        kinds: The kinds of :data:`KINDS` that fit and that the data can't separate.
         spans_s: When it holds, from the common origin [s].
         since_s: Start of the first span [s]; None where it holds from the beginning.
         until_s: End of the last span [s]; None where it holds to the end.

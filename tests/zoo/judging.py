@@ -23,7 +23,7 @@ class Judgement:
     Attributes:
         missing: Why it is wrong, a phrase each; right if empty.
         sound: Sound joints that it names.
-        narrow: Whether it states fewer kinds than the data can't tell apart, the true one among
+        narrow: Whether it states fewer kinds than the data can't separate, the true one among
             them: right here, but a matter of luck.
     """
 

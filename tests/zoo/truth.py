@@ -30,7 +30,7 @@ class JointTruth:
     Attributes:
         joint: Its place in the chain.
         names: Kinds that name what was planted; one of them must be among the kinds stated.
-        allowed: The kinds that the data can't tell apart; none but these may be stated.
+        allowed: The kinds that the data can't separate; none but these may be stated.
         stands_out: Quantities by which it may stand out instead; if ``names`` is empty, must.
         since_s: Onset [s], None: from the beginning.
         checked: Whether ``log check`` must name it.

@@ -378,7 +378,7 @@ def test_a_bus_of_another_robot_is_refused_before_anything_is_sent(capsys, tmp_p
     code, said = refused("gate-other", lambda bus: bus.send(frame), capsys, tmp_path)
     assert code == 2
     assert "no command was sent: another robot is on this bus: of " in said
-    assert "frames heard 0 are of snake25; others have the identifiers 14B" in said
+    assert "frames received 0 are of snake25; others have the identifiers 14B" in said
 
 
 @pytest.mark.slow
