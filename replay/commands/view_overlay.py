@@ -40,9 +40,8 @@ def view_overlay(
         UsageError: If the names don't fit, or a session has no gait to be aligned by.
     """
     from ..overlay.alignment import Align
-    from ..overlay.combine import combine_sessions, steps
     from ..overlay.side import names_of
-    from ..overlay.write import Place
+    from ..overlay.write import Place, combine_sessions, steps
 
     names = names_of(files, None if options.names is None else options.names.split(","))
     how, place = Align(options.align or Align.TIME), Place(options.place or Place.START)

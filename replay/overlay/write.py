@@ -9,9 +9,12 @@ recording is moved along the timelines.
 from __future__ import annotations
 
 import itertools
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +27,7 @@ from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 from undulog.analysis.compare.alignment import changes
 from undulog.analysis.compare.compare import Choices, compare_fitted
 from undulog.analysis.compare.side import ComparedSession
+from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.files import check_stop, part_file
 from undulog.capture.common.process import StopRequest
@@ -41,13 +45,14 @@ from .alignment import (
     Align,
     Aligned,
     Placement,
+    align,
     counterparts,
     head_distance,
     placement,
     placement_text,
 )
 from .layout import SEPARATE, Found, Shown, build_blueprint
-from .side import Side
+from .side import Side, convert, names_of, read_side
 
 _ARROW: Any = pa  # comes without types
 _CHUNK: Any = Chunk
@@ -399,3 +404,57 @@ def _legend(shown: Sequence[Shown], title: str) -> str:
         f"{title}. {scale}. The grey wireframe and lines are commanded, of {shown[0].side.name}. "
         f"In the plots {shown[0].side.name} is solid, the others are dashed."
     )
+
+
+def combine_sessions(
+    files: Sequence[Path],
+    path: Path,
+    *,
+    names: Sequence[str] | None = None,
+    how: Align = Align.TIME,
+    place: Place = Place.START,
+    on_step: Callable[[int, str], None] = lambda _done, _note: None,
+    stop: StopRequest | None = None,
+) -> Overlay:
+    """Convert sessions and bring them together.
+
+    Args:
+        files: Two or more sessions; differences are from the first.
+        path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
+        names: What they are called, or None for the files' names.
+        place: Where the bodies are drawn.
+        on_step: Told before each of :func:`steps` how many are done, and what comes.
+        stop: Looked at now and then; once an end is asked for, nothing is written.
+
+    Raises:
+        UsageError: If the names don't fit, or a session has no gait to be aligned by.
+        LogError: If a session can't be read, or the file can't be written.
+        DataError: If a session holds nothing that can be drawn.
+    """
+    done = itertools.count()
+
+    def step(note: str) -> None:
+        check_stop(path, stop)
+        on_step(next(done), note)
+
+    called = names_of(files, names)
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="undulog-beside-")))
+        pairs: list[tuple[SessionView, str]] = []
+        for file, name in zip(files, called, strict=True):
+            session = stack.enter_context(Session.open(file, column_folder=folder))
+            pairs.append((session.view(on_read=partial(check_stop, path, stop)), name))
+        step("angles")
+        # Aligned before the long part, since that may refuse.
+        aligned = align([read_side(session, name) for session, name in pairs], how)
+        converted: list[Converted] = []
+        for k, ((session, name), one) in enumerate(zip(pairs, aligned, strict=True)):
+            step(f"recording of {name}")
+            converted.append(Converted(one, *convert(session, folder / f"{k}.rrd")))
+        step("side by side")
+        return write_overlay(converted, path, how, place=place, stop=stop)
+
+
+def steps(count: int) -> int:
+    """How many steps it takes."""
+    return count + 2

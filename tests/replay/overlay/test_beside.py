@@ -21,10 +21,9 @@ from undulog.capture.common.files import check_stop
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.common.process import StopRequest
 from undulog.replay.overlay.alignment import Align, align, times_of
-from undulog.replay.overlay.combine import combine_sessions
 from undulog.replay.overlay.layout import build_blueprint
 from undulog.replay.overlay.side import convert, read_side
-from undulog.replay.overlay.write import Converted, write_overlay
+from undulog.replay.overlay.write import Converted, combine_sessions, write_overlay
 from undulog.replay.samples.timeline import SESSION_TIME, Rhythm
 
 EPOCH_NS = 1_735_689_600_000_000_000
