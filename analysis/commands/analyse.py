@@ -37,6 +37,7 @@ def analyse(
     Works on sessions of undulog and on any ROS 2 bag (MCAP) that has JointStates of commands and
     of responses. The first line printed is the answer; the method comes last. Several sessions are
     one experiment: runs of a gait and of its reverse separate boundary from module.
+    The glossary of the manual, also at the end of each report, defines the words of results.
 
     Example: `undulog analyse run.mcap --json -o run.json`
 

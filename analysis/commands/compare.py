@@ -38,7 +38,7 @@ def compare(
     force: bool = False,
     json: bool = False,
 ) -> None:
-    """Say what differs between two sessions, or two groups of runs, and what is the same.
+    """Report what differs between two sessions, or two groups of runs, and what is the same.
 
     Robot and twin, before and after a repair, two surfaces: gain, lag and energy of each joint,
     speed and cost of transport, aligned by the gait's phase. The first line printed is the answer;

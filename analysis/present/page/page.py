@@ -6,6 +6,7 @@ No script, no outside reference: style and figures are inside, and a content sec
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -183,11 +184,7 @@ def _page(
     *,
     left_out: bool,
 ) -> str:
-    style = (
-        files("undulog.analysis.present.page")
-        .joinpath("templates/style.css")
-        .read_text(encoding="utf-8")
-    )
+    style = _template_text("style.css")
     if isinstance(result, Experiment):
         template, view = "experiment.html.j2", experiment_view(result)
     elif isinstance(result, Comparison):
@@ -201,10 +198,28 @@ def _page(
             v=view,
             left_out=left_out,
             style=Markup(style),  # noqa: S704  our own file
+            words=_glossary(),
             body_gradient=", ".join(joint_hex(9)),
             MISSING=formats.MISSING,
             LEVEL_NOTE=LEVEL_NOTE,
         )
+    )
+
+
+def _template_text(name: str) -> str:
+    folder = files("undulog.analysis.present.page")
+    return folder.joinpath("templates", name).read_text(encoding="utf-8")
+
+
+@cache
+def _glossary() -> tuple[tuple[str, str], ...]:
+    """Words of the results and their meanings: the rows of the manual's tables."""
+    rows = re.findall(r"^\| (.+?) \| (.+) \|$", _template_text("glossary.md"), re.MULTILINE)
+    links = re.compile(r"\[([^]]*)\]\([^)]*\)")
+    return tuple(
+        (word.replace("`", ""), re.sub(r"[`*]", "", links.sub(r"\1", meaning)))
+        for word, meaning in rows
+        if word != "word"
     )
 
 

@@ -171,7 +171,7 @@ class Recovered:
         elif self.looked:
             missing = "none is missing"
         else:
-            missing = "none is known to be missing"
+            missing = "none is missing as far as is known"
         return (
             f"the recorder did not finish: {total} messages are read, {self.from_wal} of them "
             f"from its write-ahead log; {missing}"

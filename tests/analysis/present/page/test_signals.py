@@ -62,7 +62,7 @@ def test_a_page_that_grows_too_large_goes_without_signals_and_says_so(snake, rec
         assert "the cycles one by one, are not drawn" in lean
         assert "the cycles one by one, are not drawn" not in full
         monkeypatch.setattr("undulog.analysis.present.page.page.LARGEST_BYTES", 1000)
-        with pytest.raises(UsageError, match=r"page on one session would be 0\.157 MB"):
+        with pytest.raises(UsageError, match=r"page on one session would be 0\.162 MB"):
             render(snake, session)
 
 

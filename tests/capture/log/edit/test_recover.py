@@ -165,7 +165,7 @@ def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
         assert found == recorder.truth(6000)
         assert fingerprint(path.parent) == before
         if warnings:
-            assert "none is missing" in warnings[0] or "can't be told" in warnings[0]
+            assert "none is missing" in warnings[0] or "is unknown" in warnings[0]
         with Session(path) as session:  # what was known at the end is in the log before it
             whole += session.verdict == "good"
         shutil.rmtree(path.parent)
