@@ -76,7 +76,7 @@ def test_a_kicked_session_tells_its_couplings(tmp_path, capsys, feedback):
     for one in chain["oscillators"]:
         assert one["feedback"]["value"] == pytest.approx(feedback, abs=0.06)
     assert undulog.run(["analyse", str(path)]) == 0
-    assert "Oscillators, horizontal: 10 couplings told (condition number" in capsys.readouterr().out
+    assert "Oscillators, horizontal: 10 couplings identified (condition number" in capsys.readouterr().out
 
 
 def test_a_locked_session_is_refused(tmp_path, capsys):

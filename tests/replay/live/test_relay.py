@@ -148,7 +148,7 @@ def test_without_a_recording_nothing_is_written(stage):
     relay.process.terminate()
     _, err = relay.process.communicate(timeout=WAIT_S)
     assert relay.process.returncode == 1
-    assert "no recording was heard" in err
+    assert "no recording was received" in err
     assert not relay.output.exists()
 
 

@@ -354,11 +354,11 @@ def test_who_is_on_the_bus():
     assert presence.add(frames_of(0x201, 0x202, 0x300)) is None
     assert presence.another_robot() is None
     assert presence.add(frames_of(0x101, way=DIR_TX)) is None  # an echo of our own
-    assert "frame 107 was heard" in presence.add(frames_of(0x201, 0x107)).text
+    assert "frame 107 was received" in presence.add(frames_of(0x201, 0x107)).text
     assert presence.add(frames_of(ERROR_FLAG | BUS_OFF)).kind is FaultKind.BUS_OFF
     assert presence.add(frames_of(ERROR_FLAG | 0x80)) is None  # a hit frame is repeated
     presence.add(frames_of(*[0x14B] * 7))
-    assert "heard 4 are of snake25" in presence.another_robot()
+    assert "received 4 are of snake25" in presence.another_robot()
     # A request and its reply that share an identifier can't be told apart.
     assert BusCheck(load_robot("arcsnake-joint")).add(frames_of(0x14B)) is None
 

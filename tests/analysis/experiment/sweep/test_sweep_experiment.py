@@ -148,7 +148,7 @@ def test_h_and_z_are_those_planted(result):
 
 def test_contact_that_is_not_known_is_said(result):
     assert result.coupling.contact is None
-    assert "which its sessions don't say" in result.coupling.validity
+    assert "which its sessions don't record" in result.coupling.validity
     assert [one for one in result.warnings if "whether the robot touched anything" in one]
     assert len(result.warnings) == 1
 
