@@ -76,7 +76,8 @@ def test_a_kicked_session_tells_its_couplings(tmp_path, capsys, feedback):
     for one in chain["oscillators"]:
         assert one["feedback"]["value"] == pytest.approx(feedback, abs=0.06)
     assert undulog.run(["analyse", str(path)]) == 0
-    assert "Oscillators, horizontal: 10 couplings identified (condition number" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "Oscillators, horizontal: 10 couplings identified (condition number" in out
 
 
 def test_a_locked_session_is_refused(tmp_path, capsys):
