@@ -2,7 +2,7 @@
 
 ::
 
-    from .session.analyse import analyse_session
+    from undulog.analysis import analyse_session
     from undulog.capture import Session
 
     with Session.open("run.mcap") as session:

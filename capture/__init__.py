@@ -2,7 +2,7 @@
 
 ::
 
-    from .log.read.session import Session
+    from undulog.capture import Session
 
     with Session.open("run.mcap") as session:
         measured = session.joints("/joint_states", "position")

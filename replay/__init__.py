@@ -4,7 +4,7 @@
 
     from pathlib import Path
     from undulog.capture import Session
-    from .feed.recording import write_recording
+    from undulog.replay import write_recording
 
     with Session.open("run.mcap") as session:
         recording = write_recording(session, Path("run.rrd"))

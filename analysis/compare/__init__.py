@@ -2,7 +2,7 @@
 
 ::
 
-    from .compare import compare_sessions
+    from undulog.analysis import compare_sessions
     from undulog.capture import Session
 
     with Session.open("before.mcap") as before, Session.open("after.mcap") as after:

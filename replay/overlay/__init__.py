@@ -3,7 +3,7 @@
 ::
 
     from pathlib import Path
-    from .write import combine_sessions
+    from undulog.replay.overlay.write import combine_sessions
 
     both = combine_sessions([Path("robot.mcap"), Path("twin.mcap")], Path("both.rrd"))
     print(both.found["twin"].comparison, both.placements["twin"])

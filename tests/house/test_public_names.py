@@ -1,8 +1,12 @@
 """The public names of the four packages: what a release may not lose without a word."""
 
+import ast
 import importlib
+import re
 
 import pytest
+
+from support.paths import ROOT
 
 PUBLIC = {
     "analysis": (
@@ -28,3 +32,19 @@ def test_public_names_are_these_and_can_be_imported(package):
     module = importlib.import_module(f"undulog.{package}")
     assert sorted(module.__all__) == sorted(PUBLIC[package].split())
     assert all(hasattr(module, name) for name in module.__all__)
+
+
+def test_examples_in_docstrings_import_what_exists():
+    lines = [
+        (path, line.strip())
+        for package in PUBLIC
+        for path in (ROOT / package).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        for line in (ast.get_docstring(node) or "").splitlines()
+        if re.match(r"\s+from \S+ import \w", line)
+    ]
+    assert len(lines) > 10
+    for path, line in lines:
+        assert not line.startswith("from ."), path
+        exec(line, {})

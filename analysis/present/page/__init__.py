@@ -2,7 +2,7 @@
 
 ::
 
-    from .page import render
+    from undulog.analysis.present.page.page import render
     from undulog.capture import Session
 
     with Session.open("run.mcap") as session:
