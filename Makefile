@@ -44,19 +44,22 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 	  '$(BIN)/undulog log info $(DEMO)/session.mcap' 'what was recorded' \
 	  '$(BIN)/undulog sim list' 'what else can be simulated'
 
-test: $(READY)  ## all tests but the slow ones
-	$(BIN)/python -m pytest -m "not slow"
-
 # Two processes at once: tests that compute, and tests of processes, time and pictures.
 COMPUTING = tests/analysis tests/docs tests/zoo tests/replay/calibrate \
   $(addprefix tests/sim/,control gait physics scenario sensing twin)
+define tests
+	@log=$$(mktemp); \
+	$(BIN)/python -m pytest -p no:cacheprovider -m $(1) $(COMPUTING) >$$log 2>&1 & first=$$!; \
+	trap "kill $$first; rm -f $$log; exit 130" INT TERM; \
+	$(BIN)/python -m pytest -m $(1) $(addprefix --ignore=,$(COMPUTING)); second=$$?; \
+	wait $$first; first=$$?; cat $$log; rm -f $$log; exit $$((first + second))
+endef
+
+test: $(READY)  ## all tests but the slow ones
+	$(call tests,"not slow")
 
 slow: $(READY)  ## the slow tests
-	@log=$$(mktemp); \
-	$(BIN)/python -m pytest -p no:cacheprovider -m slow $(COMPUTING) >$$log 2>&1 & first=$$!; \
-	trap "kill $$first; rm -f $$log; exit 130" INT TERM; \
-	$(BIN)/python -m pytest -m slow $(addprefix --ignore=,$(COMPUTING)); second=$$?; \
-	wait $$first; first=$$?; cat $$log; rm -f $$log; exit $$((first + second))
+	$(call tests,slow)
 
 zoo: $(READY)  ## planted faults, 100 seeds each: is every output right? (SEEDS=10 for fewer)
 	PYTHONPATH=tests $(BIN)/python -m zoo.run --seeds $(or $(SEEDS),100)
