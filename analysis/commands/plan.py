@@ -141,7 +141,7 @@ def _plan(
 def announce(
     plan: str, folder: Path, files: Sequence[Path], times_s: tuple[float, float], *, as_json: bool
 ) -> None:
-    """Say what was written, and what to do with it.
+    """Print what was written, and what to do with it.
 
     Args:
         plan: Name of the design.

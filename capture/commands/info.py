@@ -46,7 +46,7 @@ def base_versions() -> dict[str, str]:
 
 
 def info(*, json: bool = False) -> None:
-    """Say what is installed, for a bug report.
+    """Show what is installed, for a bug report.
 
     Example: `undulog info --json`
 

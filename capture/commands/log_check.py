@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def log_check(file: Path, /, *, json: bool = False) -> int:
-    """Say whether a recorded session is good, degraded or bad, and why.
+    """Judge whether a recorded session is good, degraded or bad, and why.
 
     Everything is computed from the data: rhythm, gaps, jitter and dropped messages of every
     channel, values that are not a number, frozen joints and joints at their limits, the CRC of

@@ -84,7 +84,7 @@ def _fd_frames(session: Session, channel: Channel) -> int | None:
 
 
 def log_info(file: Path, /, *, json: bool = False) -> None:
-    """Say what a log holds: robot, times, topics, attachments, and what is wrong with it.
+    """Show what a log holds: robot, times, topics, attachments, and what is wrong with it.
 
     Example: `undulog log info run.mcap`
 

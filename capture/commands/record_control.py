@@ -29,7 +29,7 @@ def counted_faults(source: Mapping[str, Any]) -> list[str]:
 
 
 def status(*, socket: Path | None = None, json: bool = False) -> int:
-    """Say how the running recordings go.
+    """Show the state of the running recordings.
 
     Example: `undulog record status`
 
@@ -91,7 +91,7 @@ def note(
 
 
 def split(*, socket: Path | None = None, json: bool = False) -> None:
-    """Have the running recording begin a new part.
+    """Begin a new part of the running recording.
 
     Example: `undulog record split`
 
