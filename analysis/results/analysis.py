@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from .answer import Answer
 from .artefact import Artefact, DeadBand, Span
@@ -113,6 +113,12 @@ class EnergyResult:
     closure: Closure | None
     unknown: str | None = None
 
+    def __post_init__(self) -> None:
+        """Raise ValueError where values and cycles differ in number."""
+        _check_cycles("energy", self, len(self.start_s))
+        for joint in self.joints:
+            _check_cycles(joint.name, joint, len(self.start_s))
+
 
 Maybe = tuple[float | None, ...]
 Intervals = tuple[tuple[float, float] | None, ...]
@@ -143,6 +149,20 @@ class JointOverTime:
     gain_ci95: Intervals
     lag_rad: Maybe
     lag_ci95: Intervals
+
+    def __post_init__(self) -> None:
+        """Raise ValueError where values and cycles differ in number."""
+        _check_cycles(self.name, self, len(self.start_s))
+
+
+def _check_cycles(owner: str, record: object, cycles: int) -> None:
+    """Refuse per-cycle arrays of unequal length, which a damaged result file can hold."""
+    for name, value in vars(record).items():
+        if not isinstance(value, tuple) or name == "joints":
+            continue
+        values = len(cast("tuple[object, ...]", value))
+        if values != cycles:
+            raise ValueError(f"{owner}: {name} has {values} values for {cycles} cycles")
 
 
 @dataclass(frozen=True)
