@@ -59,6 +59,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "plan reversal": ("analysis plan:reversal", "Commands that separate boundary from module."),
     "report": ("analysis report:report", "The offline report, one HTML page."),
     "replay": ("replay replay:replay", "Run a recorded experiment again in the twin; compare."),
+    "sweep": ("replay sweep:sweep", "Run the twin over a design of parameters."),
     "view": ("replay view:view", "See a session in Rerun."),
     "info": ("capture info:info", "Versions and extras, for a bug report."),
 }
@@ -82,6 +83,7 @@ _EXTRAS = {
     "matplotlib": "report",
     "asammdf": "mf4",
     "distributed": "cluster",
+    "pyarrow": "parquet",
 }
 """Optional package to the extra that installs it."""
 

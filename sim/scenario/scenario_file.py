@@ -93,7 +93,7 @@ from typing import Any, cast
 
 from undulog.capture.common.config import read, read_field
 from undulog.capture.common.errors import Fault, ScenarioError, UsageError
-from undulog.capture.common.files import Shelf, is_file
+from undulog.capture.common.files import Description, Shelf, is_file
 from undulog.capture.common.strict_table import NAME_PATTERN, Faults, Table, listed, read_toml
 from undulog.capture.robot.description import load_robot, robot_names
 from undulog.capture.robot.model import Plane, Robot
@@ -128,8 +128,19 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
         ScenarioError: If it has faults; lists all of them.
         RobotFileError: If the robot's own file has faults.
     """
-    found = _SHELF.read(name_or_path)
+    found = scenario_text(name_or_path)
     return parse_scenario(found.text, found.source, changes=changes)
+
+
+def scenario_text(name_or_path: str | Path) -> Description:
+    """Read a scenario's text, not yet parsed.
+
+    Raises:
+        UsageError: If no scenario has that name.
+        InputFileError: If it is a path, and the file isn't there or can't be read.
+        ScenarioError: If it is not UTF-8.
+    """
+    return _SHELF.read(name_or_path)
 
 
 def parse_scenario(

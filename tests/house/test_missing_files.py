@@ -50,6 +50,7 @@ LINES = [
     "plan phase-kicks --like {no}.mcap -o {out}",
     "plan reversal --like {no}.mcap -o {out}",
     "report {no}.mcap -o {out}.html",
+    "sweep {no}.toml -o {out}",
     "replay {no}.mcap --on twin -o {out}.mcap",
     "replay {run} --on twin:{no}.toml -o {out}.mcap",
     "replay {run} --on can:virtual:bus --robot {no}.toml",

@@ -1,0 +1,120 @@
+"""A sweep on a Dask cluster on loopback whose workers and scheduler are killed."""
+
+import json
+import os
+import signal
+import socket
+import sys
+import time
+from contextlib import ExitStack, contextmanager
+
+import pytest
+
+from support.processes import UNDULOG, process, undulog
+from support.sweep_plans import comparable, write_plan
+from undulog.replay.sweep.rows import RowStore
+
+STRENGTHS = tuple(0.1 + k / 100 for k in range(20))
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+@contextmanager
+def scheduler(port):
+    words = (sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1")
+    with process(*words, "--port", port, "--no-dashboard", "--no-jupyter") as running:
+        until = time.monotonic() + 60
+        while time.monotonic() < until:
+            try:
+                socket.create_connection(("127.0.0.1", port), 1).close()
+                break
+            except OSError:
+                time.sleep(0.05)
+        yield running
+
+
+def workers(port, folder):
+    """Two worker processes of one thread, restarted if they are killed."""
+    words = (sys.executable, "-m", "distributed.cli.dask_worker", f"tcp://127.0.0.1:{port}")
+    options = ("--nthreads", "1", "--nworkers", "2", "--no-dashboard")
+    place = ("--host", "127.0.0.1", "--local-directory", folder)
+    return process(*words, *options, *place)
+
+
+def rows_of(output):
+    return comparable(RowStore(str(output)).rows())
+
+
+def wait_for(output, rows):
+    until = time.monotonic() + 200
+    while len(list(output.glob("pending/*.json"))) < rows:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory):
+    """The same sweep on the processes of this computer."""
+    folder = tmp_path_factory.mktemp("local")
+    plan = write_plan(folder, STRENGTHS)
+    assert undulog("sweep", plan, "-o", folder / "rows").returncode == 0
+    return rows_of(folder / "rows")
+
+
+@pytest.mark.slow
+def test_rows_are_the_same_though_worker_and_scheduler_are_killed(local, tmp_path):
+    plan, output, port = write_plan(tmp_path, STRENGTHS), tmp_path / "rows", free_port()
+    address = f"tcp://127.0.0.1:{port}"
+    words = (*UNDULOG, "sweep", plan, "-o", output, "--cluster", address, "--json")
+    with ExitStack() as stack:
+        first = stack.enter_context(scheduler(port))
+        stack.enter_context(workers(port, tmp_path / "dask1"))
+        sweep = stack.enter_context(process(*words))
+        wait_for(output, 2)
+        names = [json.loads(p.read_text())["worker"] for p in output.glob("pending/*.json")]
+
+        os.kill(int(names[0].rpartition(":")[2]), signal.SIGKILL)
+        wait_for(output, 6)
+        first.kill()
+        first.wait()
+        stack.enter_context(scheduler(port))
+        stack.enter_context(workers(port, tmp_path / "dask2"))
+        out, err = sweep.communicate(timeout=300)
+    assert sweep.returncode == 0, err
+    report = json.loads(out)
+    assert (report["run"], report["failed"], report["complete"]) == (20, 0, True)
+    assert err == f"{address}: the scheduler ended; waiting 300 s for another\n"
+    assert rows_of(output) == local
+
+
+@pytest.mark.slow
+def test_a_sweep_on_a_cluster_can_be_interrupted_and_goes_on_here(local, tmp_path):
+    plan, output, port = write_plan(tmp_path, STRENGTHS), tmp_path / "rows", free_port()
+    words = (*UNDULOG, "sweep", plan, "-o", output, "--json")
+    cluster = ("--cluster", f"tcp://127.0.0.1:{port}")
+    with (
+        scheduler(port),
+        workers(port, tmp_path / "dask"),
+        process(*words, *cluster) as sweep,
+    ):
+        wait_for(output, 3)
+        sweep.send_signal(signal.SIGINT)
+        out, _ = sweep.communicate(timeout=60)
+    report = json.loads(out)
+    assert report["complete"] is False
+    there = len(rows_of(output))
+    rest = json.loads(undulog(*words[3:]).stdout)
+    assert (rest["there_before"], rest["run"]) == (there, 20 - there)
+    assert rows_of(output) == local
+
+
+def test_a_scheduler_that_does_not_answer_is_named(tmp_path):
+    address = f"tcp://127.0.0.1:{free_port()}"
+    plan = write_plan(tmp_path)
+    done = undulog("sweep", plan, "-o", tmp_path / "rows", "--cluster", address)
+    assert done.returncode == 1
+    assert f"{address}: no Dask scheduler answers" in done.stderr
+    assert "Traceback" not in done.stderr

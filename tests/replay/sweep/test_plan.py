@@ -1,0 +1,85 @@
+"""Plans of sweeps: their designs against SciPy's own, and what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from support.sweep_plans import write_plan
+from undulog.capture.common.errors import PlanError
+from undulog.replay.sweep.plan import Design, Parameter, SweepPlan, points_of, read_plan, runs_of
+
+STRENGTH = Parameter("servo.stall_torque", low=0.1, high=10.0, log=True)
+RANGE = 'scenario = "flat"\ndesign = "sobol"\npoints = 2\n[parameters.x]\n'
+JOINTS = Parameter("robot.chain.joints", low=5, high=9, integer=True)
+
+
+def planned(design, points, *parameters, seed=0):
+    return SweepPlan("flat", design=design, points=points, parameters=parameters, design_seed=seed)
+
+
+def test_a_grid_has_every_combination_once_and_each_seed(tmp_path):
+    path = write_plan(tmp_path, (0.1, 0.2, 0.3), seeds=2, top="first_seed = 7")
+    path.write_text(path.read_text() + '[parameters."noise.position"]\nvalues = [0.0, 0.01]\n')
+    runs = list(runs_of(read_plan(path)))
+    assert len(runs) == 12
+    assert {run.seed for run in runs} == {7, 8}
+    pairs = {(r.changes["servo.stall_torque"], r.changes["noise.position"]) for r in runs}
+    assert pairs == {(a, b) for a in (0.1, 0.2, 0.3) for b in (0.0, 0.01)}
+
+
+@pytest.mark.parametrize("design", [Design.RANDOM, Design.SOBOL])
+@given(few=st.integers(1, 40), more=st.integers(0, 40), seed=st.integers(0, 1000))
+def test_a_longer_design_begins_with_the_shorter_one(design, few, more, seed):
+    short = points_of(planned(design, few, STRENGTH, JOINTS, seed=seed))
+    assert points_of(planned(design, few + more, STRENGTH, JOINTS, seed=seed))[:few] == short
+
+
+@pytest.mark.parametrize("design", [Design.RANDOM, Design.SOBOL])
+def test_points_are_even_in_the_logarithm_and_over_the_integers(design):
+    points = points_of(planned(design, 1024, STRENGTH, JOINTS))
+    strength = np.array([point["servo.stall_torque"] for point in points])
+    shares = (np.log(strength) - math.log(0.1)) / math.log(100.0)
+    assert stats.kstest(shares, "uniform").pvalue > 0.01
+    counts = np.bincount([point["robot.chain.joints"] for point in points])[5:]
+    assert len(counts) == 4
+    assert stats.chisquare(counts).pvalue > 0.01
+
+
+def test_a_sobol_design_covers_better_than_chance():
+    def shares(design):
+        points = points_of(planned(design, 256, STRENGTH, Parameter("x", low=0.0, high=1.0)))
+        return np.array([[math.log10(p["servo.stall_torque"]) / 2 + 0.5, p["x"]] for p in points])
+
+    even, chance = (stats.qmc.discrepancy(shares(one)) for one in (Design.SOBOL, Design.RANDOM))
+    assert even < chance / 5
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[", "syntax"),
+        ('scenario = "flat"', "parameters"),
+        ('scenario = "flat"\n[parameters.x]', "low"),
+        ('scenario = "flat"\n[parameters.x]\nvalues = []', "at least one value"),
+        ('scenario = "flat"\n[parameters.x]\nlow = 1\nhigh = 2', "random or sobol"),
+        ('scenario = "flat"\npoints = 2\n[parameters.x]\nvalues = [1]', "none for grid"),
+        ('scenario = "flat"\ndesign = "sobol"\n[parameters.x]\nlow = 1\nhigh = 2', "points"),
+        (
+            RANGE + "low = -1\nhigh = 2\nlog = true",
+            "above 0",
+        ),
+        ('scenario = "flat"\n[parameters.seed]\nvalues = [1]', "first_seed"),
+        ('scenario = "flat"\nseeds = 2000000\n[parameters.x]\nvalues = [1]', "at most 1000000"),
+        ('scenario = "flat"\nfoo = 1\n[parameters.x]\nvalues = [1]', "foo"),
+        ('scenario = "flat"\nduration_s = 1\n[parameters.duration_s]\nvalues = [1]', "left out"),
+    ],
+)
+def test_what_can_not_be_meant_is_refused_with_the_key(text, said, tmp_path):
+    path = tmp_path / "plan.toml"
+    path.write_text(text)
+    with pytest.raises(PlanError, match=said):
+        read_plan(path)

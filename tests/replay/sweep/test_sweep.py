@@ -1,0 +1,191 @@
+"""Sweeps on the processes of this computer: interrupted, extended, with failing runs."""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from support.processes import UNDULOG, process, run, undulog
+from support.sweep_plans import comparable, write_plan
+from undulog.analysis.session.analyse import analyse_session
+from undulog.capture import Session
+from undulog.replay.sweep.rows import RowStore
+
+STRENGTHS = (0.1, 0.15, 0.2, 0.25, 0.3)
+
+
+def swept(plan, output, *words):
+    """Run a sweep; return its report."""
+    done = undulog("sweep", plan, "-o", output, "--json", *words)
+    assert done.stdout, done.stderr
+    return json.loads(done.stdout), done.returncode
+
+
+def rows_of(output):
+    return comparable(RowStore(str(output)).rows())
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """A sweep of ten runs by one worker, sessions kept: its plan's folder and its rows."""
+    folder = tmp_path_factory.mktemp("reference")
+    plan = write_plan(folder, STRENGTHS, seeds=2, top="sessions = true")
+    report, code = swept(plan, folder / "rows", "--workers", "1")
+    assert code == 0
+    assert report["run"] == report["planned"] == 10
+    return folder
+
+
+def test_a_row_is_what_the_commands_give_one_by_one(reference, tmp_path):
+    frame = pd.read_parquet(reference / "rows" / "rows")
+    row = frame[(frame["servo.stall_torque"] == 0.2) & (frame.seed == 1)].iloc[0]
+    path = tmp_path / "run.mcap"
+    words = ("--set", "servo.stall_torque=0.2", "--seed", "1", "-o", path)
+    assert undulog("sim", "run", reference / "wave.toml", *words).returncode == 0
+    result = json.loads(undulog("analyse", path, "--json").stdout)
+    assert row.sentence == result["answer"]["sentence"]
+    assert list(row.joint) == [joint["name"] for joint in result["joints"]]
+    assert list(row.gain) == [joint["gain"] for joint in result["joints"]]
+    assert row.lag_sd == result["heterogeneity"]["lag_sd"]["value"]
+    kept = reference / "rows" / row.session
+    assert kept.read_bytes() == path.read_bytes()
+    with Session.open(kept) as session:
+        assert session.session_id == row.session_id
+        assert analyse_session(session).answer.sentence == row.sentence
+
+
+def test_what_is_there_is_not_run_again_and_what_is_new_is(reference, tmp_path):
+    plan = write_plan(tmp_path, (0.1, 0.2), seeds=2)
+    first, _ = swept(plan, tmp_path / "rows", "--workers", "2")
+    assert (first["run"], first["there_before"]) == (4, 0)
+    again, _ = swept(plan, tmp_path / "rows")
+    assert (again["run"], again["there_before"], again["complete"]) == (0, 4, True)
+    plan = write_plan(tmp_path, STRENGTHS[::-1], seeds=2, top="sessions = true")
+    longer, _ = swept(plan, tmp_path / "rows")
+    assert (longer["run"], longer["there_before"]) == (10, 0)  # the sessions were missing
+    assert rows_of(tmp_path / "rows") == rows_of(reference / "rows")
+    assert len(list((tmp_path / "rows" / "sessions").glob("*.mcap"))) == 10
+
+
+def test_a_dry_run_runs_nothing(reference, tmp_path):
+    plan = reference / "plan.toml"
+    done = undulog("sweep", plan, "-o", tmp_path / "rows", "--dry-run")
+    assert "10 runs of 2 s: 5 points of a grid design, 2 seeds each" in done.stdout
+    assert "to run: 10" in done.stdout
+    assert not (tmp_path / "rows").exists()
+    there = json.loads(
+        undulog("sweep", plan, "-o", reference / "rows", "--dry-run", "--json").stdout
+    )
+    assert (there["to_run"], there["estimated_s"]) == (0, 0)
+
+
+def test_a_failed_run_keeps_its_error_and_can_be_run_again(tmp_path):
+    plan = write_plan(tmp_path, (0.3, -1.0, "strong", 0.2))
+    report, code = swept(plan, tmp_path / "rows")
+    assert code == 0
+    assert (report["run"], report["failed"], report["complete"]) == (4, 2, True)
+    frame = pd.read_parquet(tmp_path / "rows" / "rows").set_index("servo.stall_torque")
+    assert "ScenarioError" in frame.loc["-1.0", "error"]
+    assert "stall_torque" in frame.loc["strong", "error"]
+    assert frame.loc["0.3", "status"] == "done"
+    again, _ = swept(plan, tmp_path / "rows")
+    assert (again["run"], again["failed"]) == (0, 2)
+    again, _ = swept(plan, tmp_path / "rows", "--retry-failed")
+    assert (again["run"], again["failed"], again["there_before"]) == (2, 2, 2)
+    assert pd.read_parquet(tmp_path / "rows" / "rows").key.is_unique
+
+
+def test_parameters_of_robot_and_analysis(tmp_path):
+    plan = write_plan(tmp_path, (0.3,))
+    plan.write_text(
+        plan.read_text() + '[parameters."robot.chain.joints"]\nvalues = [2, 4]\n'
+        '[parameters."analysis.start_s"]\nvalues = [0.0, 0.5]\n'
+    )
+    report, _ = swept(plan, tmp_path / "rows")
+    assert report["failed"] == 0
+    frame = pd.read_parquet(tmp_path / "rows" / "rows")
+    assert frame.gain.map(len).to_list() == frame["robot.chain.joints"].to_list()
+    same = frame.groupby("robot.chain.joints").session_id.nunique()
+    assert same.eq(1).all()  # the analysis changes no session
+    assert frame.gain.map(lambda gain: gain[0]).nunique() == 4
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("servo.stall_torque", "servo.stal_torque"), "stal_torque"),
+        (("servo.stall_torque", "robot.chian.joints"), "chian"),
+        (("servo.stall_torque", "analysis.strat_s"), "strat_s"),
+        (('"wave.toml"', '"wvae"'), "wvae"),
+    ],
+)
+def test_a_key_that_is_none_is_refused_before_anything_runs(change, said, tmp_path):
+    plan = write_plan(tmp_path)
+    plan.write_text(plan.read_text().replace(*change))
+    done = undulog("sweep", plan, "-o", tmp_path / "rows")
+    assert done.returncode in (1, 2)
+    assert said in done.stderr
+    assert not (tmp_path / "rows").exists()
+
+
+def _begun(output, rows):
+    """Wait until so many rows are there."""
+    until = time.monotonic() + 120
+    while len(list(Path(output).glob("pending/*.json"))) < rows:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+def _workers(parent):
+    """Processes that work for a sweep, by id; the tracker of resources is none."""
+    found = run("pgrep", "-P", parent, "-f", "spawn_main").stdout.split()
+    return [int(word) for word in found]
+
+
+def _alive(worker):
+    try:
+        return Path(f"/proc/{worker}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_an_interrupted_sweep_goes_on_where_it_stopped(number, reference, tmp_path):
+    plan = write_plan(tmp_path, STRENGTHS, seeds=2, top="sessions = true")
+    words = (*UNDULOG, "sweep", plan, "-o", tmp_path / "rows", "--workers", "2", "--json")
+    with process(*words) as sweep:
+        _begun(tmp_path / "rows", 1)
+        workers = _workers(sweep.pid)
+        assert len(workers) == 2
+        sweep.send_signal(number)
+        out, _ = sweep.communicate(timeout=60)
+    there = len(rows_of(tmp_path / "rows"))
+    assert 1 <= there < 10
+    if number != signal.SIGKILL:
+        report = json.loads(out)
+        assert (report["run"], report["complete"], sweep.returncode) == (there, False, 1)
+    until = time.monotonic() + 20
+    while any(_alive(worker) for worker in workers):
+        assert time.monotonic() < until  # workers end with their coordinator
+        time.sleep(0.05)
+    rest, code = swept(plan, tmp_path / "rows")
+    assert (rest["there_before"], rest["run"], code) == (there, 10 - there, 0)
+    assert rows_of(tmp_path / "rows") == rows_of(reference / "rows")
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_takes_no_row_with_it(reference, tmp_path):
+    plan = write_plan(tmp_path, STRENGTHS, seeds=2, top="sessions = true")
+    words = (*UNDULOG, "sweep", plan, "-o", tmp_path / "rows", "--workers", "2", "--json")
+    with process(*words) as sweep:
+        _begun(tmp_path / "rows", 1)
+        os.kill(_workers(sweep.pid)[0], signal.SIGKILL)
+        out, err = sweep.communicate(timeout=120)
+    report = json.loads(out)
+    assert (report["run"], report["failed"], err) == (10, 0, "")
+    assert rows_of(tmp_path / "rows") == rows_of(reference / "rows")
