@@ -193,14 +193,16 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Run the process's own command line and exit."""
-    from undulog.capture.common.lazy import defer
-
-    defer()
     if not sys.stderr.isatty():
         os.environ.setdefault("NO_COLOR", "1")  # Rerun's log is coloured anyway: no-color.org
     try:
+        from undulog.capture.common.lazy import defer
+
+        defer()
         code = run(sys.argv[1:])
         sys.stdout.flush()
+    except KeyboardInterrupt:  # while the first modules were imported
+        code = _complain("interrupted", 1)
     except BrokenPipeError:  # the reader (head, less) has seen enough
         _discard_output()
         code = 1

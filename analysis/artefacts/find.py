@@ -18,9 +18,9 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.common.process import in_threads
-from undulog.capture.log.read.signals import Signal
+from undulog.capture.log.read.signals import LARGEST, Signal
 
-from ..estimators.series import LARGEST, Series, clean_together
+from ..estimators.series import Series, clean_together
 from ..response.rhythm import DRIVEN_SHARE
 from ..results.artefact import FALSIFYING, Artefact, Span
 from ..signals.columns import QUANTITIES, Columns

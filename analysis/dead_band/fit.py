@@ -310,9 +310,12 @@ def _errors(
     nudge, unit = scales.nudge[joint, :n], scales.unit[joint, :n]
     at_bound = chosen[:n] <= scales.lower[:n] + 1e-12
     free = np.flatnonzero(~at_bound)
-    sets = np.stack([chosen + tie[:, m] * nudge[m] for m in free])
+    sets = chosen + tie[:, free].T * nudge[free, np.newaxis]
     still = one.follower[0, :, cycles.first :]
-    moved = misfit(cycles, np.full(free.size, joint), sets).follower[:, :, cycles.first :] - still
+    moved: FloatArray = np.empty((0, *still.shape))
+    if free.size:
+        follower = misfit(cycles, np.full(free.size, joint), sets).follower
+        moved = follower[:, :, cycles.first :] - still
     gain = float(one.gain[0])
     z: FloatArray = still - still.mean()
     columns = [gain * moved[k] * unit[m] / nudge[m] for k, m in enumerate(free)]

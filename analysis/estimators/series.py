@@ -9,13 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray, IntArray, frozen
-from undulog.capture.log.read.signals import Signal
+from undulog.capture.log.read.signals import LARGEST, Signal
 
 GAP_FACTOR = 3.0
 """An interval longer than this many median intervals is a gap: nothing is assumed inside it."""
-
-LARGEST = 1e100
-"""A value above it counts as missing: no sensor sends it, and its powers have no finite value."""
 
 _HALF_NS = 0.5e-9
 

@@ -10,7 +10,7 @@ from ..common.arrays import FloatArray, IntArray
 from ..common.errors import DataError, LogError, MissingChannelError
 from ..log.read.sample_times import longest_unbroken
 from ..log.read.session import SessionView
-from ..log.read.signals import Signal
+from ..log.read.signals import LARGEST, Signal
 from .fault import Fault
 from .find import joints_not_following
 from .motion import JointMotion, Samples
@@ -110,14 +110,14 @@ class _Times:
         self._known: dict[int, tuple[slice, IntArray, FloatArray]] = {}
 
     def samples(self, signal: Signal | None) -> Samples | None:
-        """The finite samples at increasing times; None without any."""
+        """The samples that are no larger than LARGEST, at increasing times; None without any."""
         if signal is None:
             return None
         part, t_ns, t_s = self._converted(signal.t_ns)
         values = signal.values[part]
-        finite = np.isfinite(values)
-        if not finite.all():
-            t_ns, t_s, values = t_ns[finite], t_s[finite], values[finite]
+        possible = np.abs(values) <= LARGEST
+        if not possible.all():
+            t_ns, t_s, values = t_ns[possible], t_s[possible], values[possible]
         if t_ns.size > 1 and (np.diff(t_ns) <= 0).any():
             first = np.unique(t_ns, return_index=True)[1]
             t_s, values = t_s[first], values[first]

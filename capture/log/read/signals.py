@@ -15,6 +15,9 @@ from ...common.errors import DataError
 if TYPE_CHECKING:
     import pandas as pd
 
+LARGEST = 1e100
+"""A value above it counts as missing: no sensor sends it, and its powers have no finite value."""
+
 
 @dataclass(frozen=True)
 class Signal:
