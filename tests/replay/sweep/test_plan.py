@@ -1,6 +1,7 @@
 """Plans of sweeps: their designs against SciPy's own, and what is refused."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy import stats
 from support.sweep_plans import write_plan
 from undulog.capture.common.errors import PlanError
 from undulog.replay.sweep.plan import Design, Parameter, SweepPlan, points_of, read_plan, runs_of
+from undulog.replay.sweep.sweep import prepare
 
 STRENGTH = Parameter("servo.stall_torque", low=0.1, high=10.0, log=True)
 RANGE = 'scenario = "flat"\ndesign = "sobol"\npoints = 2\n[parameters.x]\n'
@@ -83,3 +85,12 @@ def test_what_can_not_be_meant_is_refused_with_the_key(text, said, tmp_path):
     path.write_text(text)
     with pytest.raises(PlanError, match=said):
         read_plan(path)
+
+
+def test_the_plan_of_the_manual_is_one(tmp_path):
+    page = (Path(__file__).parents[3] / "docs" / "sweeps.md").read_text()
+    path = tmp_path / "strength.toml"
+    path.write_text(page.split("```toml\n")[1].split("```")[0])
+    sweep = prepare(read_plan(path), tmp_path, str(tmp_path / "strength"))
+    assert len(sweep.jobs) == 16
+    assert sweep.simulated_s == 16.0
