@@ -1,0 +1,96 @@
+"""A sweep on two processes against one, and what the coordinator costs.
+
+Runs: a chain of five yaw joints on the ground, 2 s each, a random design over the servos' strength.
+The baseline is a tenth of the runs on one worker. Overhead is the part of the workers' time, wall
+clock times workers, that was not spent in runs, without the start of the workers.
+
+Run: python bench/sweep.py [--runs 2000]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from undulog.replay.sweep.plan import read_plan
+from undulog.replay.sweep.rows import Row, RowStore
+from undulog.replay.sweep.sweep import prepare, run_sweep
+
+ROBOT = """name = "chain5"
+description = "Five yaw joints."
+clock = "simulated"
+assumed = ["links", "servo"]
+[chain]
+joints = 5
+planes = ["horizontal"]
+[defaults.link]
+length = 0.06
+radius = 0.025
+mass = 0.1
+inertia = [4e-5, 5e-5, 5e-5]
+[defaults.servo]
+stall_torque = 0.3
+gear_stiffness = 12.0
+gear_damping = 0.008
+"""
+SCENARIO = """description = "A wave on the ground."
+robot = "chain5.toml"
+duration_s = 2.0
+settle_s = 0.5
+[gait]
+ramp_s = 0.25
+[gait.horizontal]
+amplitude = 0.3
+frequency_hz = 2.0
+lag = 1.0
+"""
+PLAN = """scenario = "wave.toml"
+design = "random"
+points = {points}
+[parameters."servo.stall_torque"]
+low = 0.1
+high = 0.4
+"""
+
+
+def measure(folder: Path, points: int, workers: int) -> tuple[float, float]:
+    """Return runs a second and the share of overhead, from the first row on."""
+    plan = folder / "plan.toml"
+    plan.write_text(PLAN.format(points=points))
+    output = str(folder / f"rows{workers}")
+    ends: list[float] = []
+    spent: list[float] = []
+
+    def note(row: Row, _before: int) -> None:
+        ends.append(time.perf_counter())
+        spent.append(row["run_wall"])
+
+    report = run_sweep(
+        prepare(read_plan(plan), folder, output), RowStore(output), workers=workers, on_row=note
+    )
+    assert (report.run, report.failed) == (points, 0), report
+    first = 2 * workers  # the workers' start, imports included
+    wall = ends[-1] - ends[first - 1]
+    return (points - first) / wall, 1 - sum(spent[first:]) / (workers * wall)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=2000)
+    runs: int = parser.parse_args().runs
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "chain5.toml").write_text(ROBOT)
+        (folder / "wave.toml").write_text(SCENARIO)
+        one, _ = measure(folder, max(20, runs // 10), 1)
+        two, overhead = measure(folder, runs, 2)
+    print(f"1 worker:  {one:.2f} runs/s ({max(20, runs // 10)} runs)")
+    print(f"2 workers: {two:.2f} runs/s ({runs} runs), {two / one:.2f} times one worker")
+    print(f"overhead:  {100 * overhead:.1f} % of the workers' time")
+
+
+if __name__ == "__main__":
+    main()
