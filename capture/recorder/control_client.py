@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, Self, cast
 
 from ..common.errors import ControlError, SocketInUseError
+from ..common.unix_listener import listen_at
 
 _SUFFIX = ".sock"
 _LONGEST_PATH = 107  # bytes of sun_path, less the closing zero
@@ -111,12 +112,7 @@ def listen(
     try:
         with _locked(path.parent, patience_s):
             _remove_stale(path)
-            before = os.umask(0o177)
-            try:
-                listener.bind(os.fspath(path))
-            finally:
-                os.umask(before)
-            listener.listen(backlog)
+            listen_at(listener, path, backlog)
             found = path.lstat()
         listener.setblocking(False)
     except OSError as error:

@@ -23,6 +23,7 @@ import numpy as np
 
 from ..common.errors import SourceError, UsageError
 from ..common.process import share_priority
+from ..common.unix_listener import listen_at
 from ..log.messages.frames import FrameArray, frames_from_bytes
 from ..robot.model import ClockDomain, Robot
 from .address import flag, only
@@ -132,16 +133,7 @@ class UnixSource:
         _clear(self._address.text, self._path)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
-            os.fchmod(listener.fileno(), 0o600)  # before it has a name: no moment without
-            # It gets its name when it listens: a sender that sees the name can connect.
-            unnamed = self._path.with_name(f"{self._path.name}~")
-            unnamed.unlink(missing_ok=True)
-            listener.bind(str(unnamed))
-            try:
-                listener.listen(_BACKLOG)
-                self._path.hardlink_to(unnamed)
-            finally:
-                unnamed.unlink(missing_ok=True)
+            listen_at(listener, self._path, _BACKLOG)
             made = self._path.lstat()
         except OSError as error:
             listener.close()

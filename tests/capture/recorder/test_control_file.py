@@ -26,6 +26,8 @@ from undulog.capture.recorder.control_client import (
     ControlClient,
     default_sockets,
     find_sockets,
+    listen,
+    release,
     socket_folder,
 )
 
@@ -121,6 +123,35 @@ def test_an_impossible_path_is_told(tmp_path):
         ControlServer(tmp_path / ("x" * 120), echo)
     with pytest.raises(ControlError, match="No such file"):
         ControlServer(tmp_path / "none" / "c.sock", echo)
+
+
+def test_the_longest_path_is_served(tmp_path):
+    for name in ("x", "x" * (107 - len(str(tmp_path)) - 1)):
+        server = ControlServer(tmp_path / name, echo)
+        with polled(server), ControlClient(tmp_path / name) as client:
+            client.ask({"do": "x"})
+        server.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_whoever_sees_the_file_can_connect(tmp_path):
+    paths = [tmp_path / f"{number}.sock" for number in range(200)]
+    results = []
+
+    def connect_at_once():
+        for path in paths:
+            while not path.exists():
+                pass
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as caller:
+                results.append(caller.connect_ex(str(path)))
+
+    thread = threading.Thread(target=connect_at_once)
+    thread.start()
+    made = [(path, *listen(path, backlog=8)) for path in paths]
+    thread.join()
+    for one in made:
+        release(*one)
+    assert results == [0] * len(paths)
 
 
 def test_a_successor_s_socket_is_not_removed_by_a_late_close(tmp_path):
