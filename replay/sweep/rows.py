@@ -25,12 +25,11 @@ from typing import Any, cast
 
 import pyarrow as pa
 import pyarrow.fs as pafs
-import pyarrow.parquet as pq
 
 from undulog.capture.common.errors import InputFileError, LogWriteError, UsageError
+from undulog.capture.common.object_store import ObjectStore
 
 _ARROW: Any = pa  # comes without types
-_PARQUET: Any = pq
 _FS: Any = pafs
 
 GATHER = 256
@@ -55,21 +54,8 @@ _LISTS_OF_TEXTS = ("joint", "warnings")
 Row = dict[str, Any]
 
 
-def _connect(where: str) -> tuple[Any, str]:
-    try:
-        if "://" in where:
-            return _FS.FileSystem.from_uri(where)
-        return _FS.LocalFileSystem(), Path(where).resolve().as_posix()
-    except (OSError, ValueError) as error:
-        raise InputFileError(where, str(error)) from error
-
-
 class RowStore:
-    """Rows under a folder or a URL such as ``s3://bucket/sweep``.
-
-    Credentials and the endpoint of an object store are those that pyarrow finds, e.g. in
-    ``AWS_ACCESS_KEY_ID``, ``AWS_SECRET_ACCESS_KEY`` and ``AWS_ENDPOINT_URL``.
-    """
+    """Rows under a folder or a URL such as ``s3://bucket/sweep``."""
 
     def __init__(self, where: str) -> None:
         """Open a store.
@@ -78,8 +64,7 @@ class RowStore:
             InputFileError: If the address is none, or can't be reached.
         """
         self.where = where
-        self._fs, self._base = _connect(where)
-        self._local = "://" not in where
+        self._store = ObjectStore(where)
         self._pending = 0
 
     @contextmanager
@@ -91,11 +76,10 @@ class RowStore:
             UsageError: If another sweep writes there.
         """
         with ExitStack() as stack:
+            self._store.make_folders("pending", "rows", "settings", "sessions")
             try:
-                for folder in ("pending", "rows", "settings", "sessions"):
-                    self._fs.create_dir(f"{self._base}/{folder}", recursive=True)
-                if self._local:
-                    lock = stack.enter_context((Path(self._base) / "lock").open("w"))
+                if self._store.is_local:
+                    lock = stack.enter_context((Path(self._store.base) / "lock").open("w"))
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise UsageError(f"{self.where}: another sweep is writing there") from error
@@ -115,8 +99,8 @@ class RowStore:
         for row in self._pending_rows():
             done[row["key"]] = {name: row.get(name, "") for name in columns}
             self._pending += 1
-        for path in self._listed("rows", ".parquet"):
-            for row in self._table(path, columns).to_pylist():
+        for path in self._row_files():
+            for row in self._store.read_table(path, columns).to_pylist():
                 done[row["key"]] = row
         return done
 
@@ -126,7 +110,7 @@ class RowStore:
         Raises:
             LogWriteError: If it can't be written.
         """
-        self._write(f"settings/{digest}.json", json.dumps(setting, indent=1).encode())
+        self._store.write(f"settings/{digest}.json", json.dumps(setting, indent=1).encode())
 
     def add(self, row: Row) -> None:
         """Store a row; the process may be killed when this returns.
@@ -134,7 +118,7 @@ class RowStore:
         Raises:
             LogWriteError: If it can't be written.
         """
-        self._write(f"pending/{row['key']}.json", json.dumps(row).encode())
+        self._store.write(f"pending/{row['key']}.json", json.dumps(row).encode())
         self._pending += 1
         if self._pending >= GATHER:
             self.gather()
@@ -147,16 +131,14 @@ class RowStore:
         """
         pending = list(self._pending_rows())
         gathered = set[str]()
-        for path in self._listed("rows", ".parquet")[-1:] if pending else ():
-            gathered.update(self._table(path, ["key"]).column("key").to_pylist())
+        for path in self._row_files()[-1:] if pending else ():
+            gathered.update(self._store.read_table(path, ["key"]).column("key").to_pylist())
         rows = [row for row in pending if row["key"] not in gathered]
         if rows:
-            sink = _ARROW.BufferOutputStream()
-            _PARQUET.write_table(_arrow(rows), sink)
             name = f"rows/{time.time_ns()}-{uuid.uuid4().hex[:8]}.parquet"
-            self._write(name, sink.getvalue().to_pybytes())
+            self._store.write_table(name, _arrow(rows))
         for row in pending:
-            self._remove(f"pending/{row['key']}.json")
+            self._store.remove(f"pending/{row['key']}.json")
         self._pending = 0
 
     def drop(self, keys: Iterable[str]) -> None:
@@ -169,23 +151,20 @@ class RowStore:
         if not unwanted:
             return
         self.gather()
-        for path in self._listed("rows", ".parquet"):
-            rows = self._table(path).to_pylist()
+        for name in self._row_files():
+            rows = self._store.read_table(name).to_pylist()
             kept = [row for row in rows if row["key"] not in unwanted]
             if len(kept) == len(rows):
                 continue
-            name = path.removeprefix(f"{self._base}/")
             if kept:
-                sink = _ARROW.BufferOutputStream()
-                _PARQUET.write_table(_arrow(kept), sink)
-                self._write(name, sink.getvalue().to_pybytes())
+                self._store.write_table(name, _arrow(kept))
             else:
-                self._remove(name)
+                self._store.remove(name)
 
     def rows(self) -> Iterator[Row]:
         """Yield every row once, in no order."""
         seen = set[str]()
-        tables = (self._table(path).to_pylist() for path in self._listed("rows", ".parquet"))
+        tables = (self._store.read_table(path).to_pylist() for path in self._row_files())
         for rows in (self._pending_rows(), *tables):
             for row in rows:
                 if row["key"] not in seen:
@@ -199,60 +178,27 @@ class RowStore:
             LogWriteError: If it can't be written.
         """
         name = f"sessions/{path.name}"
-        goal = f"{self._base}/{name}"
+        goal = self._store.path(name)
         try:
-            if self._local:
+            if self._store.is_local:
                 shutil.move(path, f"{goal}.part")
                 Path(f"{goal}.part").replace(goal)
             else:
-                _FS.copy_files(path.as_posix(), goal, _FS.LocalFileSystem(), self._fs)
+                filesystem = self._store.filesystem
+                _FS.copy_files(path.as_posix(), goal, _FS.LocalFileSystem(), filesystem)
         except OSError as error:
             raise LogWriteError(f"{self.where}/{name}", str(error)) from error
         return name
 
-    def _table(self, path: str, columns: list[str] | None = None) -> Any:
-        try:
-            return _PARQUET.read_table(path, columns=columns, filesystem=self._fs)
-        except (OSError, ValueError) as error:
-            raise InputFileError(f"{self.where}: {path}", str(error)) from error
+    def _row_files(self) -> list[str]:
+        return [file.name for file in self._store.files("rows", [".parquet"])]
 
     def _pending_rows(self) -> Iterator[Row]:
-        for path in self._listed("pending", ".json"):
+        for file in self._store.files("pending", [".json"]):
             try:
-                with self._fs.open_input_stream(path) as stream:
-                    yield cast("Row", json.loads(stream.read()))
-            except (OSError, ValueError) as error:
-                raise InputFileError(f"{self.where}: {path}", str(error)) from error
-
-    def _listed(self, folder: str, ending: str) -> list[str]:
-        selector = _FS.FileSelector(f"{self._base}/{folder}", allow_not_found=True)
-        try:
-            paths = [info.path for info in self._fs.get_file_info(selector) if info.is_file]
-        except OSError as error:
-            raise InputFileError(self.where, str(error)) from error
-        return sorted(path for path in paths if path.endswith(ending))
-
-    def _write(self, name: str, data: bytes) -> None:
-        """Write an object whole or not at all."""
-        path = f"{self._base}/{name}"
-        try:
-            if self._local:
-                part = Path(f"{path}.part")
-                part.write_bytes(data)
-                part.replace(path)
-            else:
-                with self._fs.open_output_stream(path) as stream:
-                    stream.write(data)
-        except OSError as error:
-            raise LogWriteError(f"{self.where}/{name}", str(error)) from error
-
-    def _remove(self, name: str) -> None:
-        try:
-            self._fs.delete_file(f"{self._base}/{name}")
-        except FileNotFoundError:
-            return
-        except OSError as error:
-            raise LogWriteError(f"{self.where}/{name}", str(error)) from error
+                yield cast("Row", json.loads(self._store.read(file.name)))
+            except ValueError as error:
+                raise InputFileError(f"{self.where}/{file.name}", str(error)) from error
 
 
 def _arrow(rows: list[Row]) -> Any:

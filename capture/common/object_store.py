@@ -1,0 +1,184 @@
+"""Files under a folder, or objects under a URL of an object store such as ``s3://bucket/lab``.
+
+Credentials and the endpoint of an object store are those that pyarrow finds, e.g. in
+``AWS_ACCESS_KEY_ID``, ``AWS_SECRET_ACCESS_KEY`` and ``AWS_ENDPOINT_URL``.
+"""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .errors import InputFileError, LogWriteError, MissingExtraError
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """One file of a store.
+
+    Attributes:
+        name: Path relative to the store, with ``/`` between its parts.
+        size: In bytes.
+        modified_ns: Time of the last change [Unix ns], 0 where the store has none.
+    """
+
+    name: str
+    size: int
+    modified_ns: int
+
+
+class ObjectStore:
+    """A folder of this computer or of an object store."""
+
+    def __init__(self, where: str) -> None:
+        """Connect; nothing is made.
+
+        Args:
+            where: A folder, or a URL.
+
+        Raises:
+            InputFileError: If the address is none, or can't be reached.
+            MissingExtraError: If pyarrow is not installed.
+        """
+        try:
+            import pyarrow.fs as pafs
+            import pyarrow.parquet as pq
+        except ImportError as error:
+            raise MissingExtraError("a store of Parquet files", "parquet", "pyarrow") from error
+        self._fs_module: Any = pafs
+        self._parquet: Any = pq
+        self.where = where
+        self.is_local = "://" not in where
+        try:
+            if self.is_local:
+                self.filesystem: Any = self._fs_module.LocalFileSystem()
+                self.base = Path(where).resolve().as_posix()
+            else:
+                self.filesystem, self.base = self._fs_module.FileSystem.from_uri(where)
+        except (OSError, ValueError) as error:
+            raise InputFileError(where, str(error)) from error
+
+    def path(self, name: str) -> str:
+        """Return the path of a file in its file system."""
+        return f"{self.base}/{name}" if name else self.base
+
+    def make_folders(self, *names: str) -> None:
+        """Make folders that are not there.
+
+        Raises:
+            InputFileError: If one can't be made.
+        """
+        try:
+            for name in names:
+                self.filesystem.create_dir(self.path(name), recursive=True)
+        except OSError as error:
+            raise InputFileError(self.where, str(error)) from error
+
+    def files(
+        self, folder: str = "", endings: Sequence[str] = ("",), *, recursive: bool = False
+    ) -> list[StoredFile]:
+        """List files, in order of their names; none where the folder isn't there.
+
+        Args:
+            endings: Of the names that are wanted.
+            recursive: Also list those of folders in the folder.
+
+        Raises:
+            InputFileError: If it can't be listed.
+        """
+        selector = self._fs_module.FileSelector(
+            self.path(folder), allow_not_found=True, recursive=recursive
+        )
+        try:
+            found = self.filesystem.get_file_info(selector)
+        except OSError as error:
+            raise InputFileError(self.where, str(error)) from error
+        start = len(self.base) + 1
+        files = [
+            StoredFile(info.path[start:], info.size or 0, info.mtime_ns or 0)
+            for info in found
+            if info.is_file and info.path.endswith(tuple(endings))
+        ]
+        return sorted(files, key=lambda file: file.name)
+
+    def read(self, name: str) -> bytes:
+        """Read a whole file.
+
+        Raises:
+            InputFileError: If it can't be read.
+        """
+        try:
+            with self.filesystem.open_input_stream(self.path(name)) as stream:
+                return stream.read()
+        except OSError as error:
+            raise InputFileError(f"{self.where}/{name}", str(error)) from error
+
+    def read_table(self, name: str, columns: Sequence[str] | None = None) -> Any:
+        """Read a Parquet file.
+
+        Args:
+            columns: Those that are wanted; all by default.
+
+        Returns:
+            A ``pyarrow.Table``.
+
+        Raises:
+            InputFileError: If it can't be read.
+        """
+        try:
+            return self._parquet.read_table(
+                self.path(name), columns=columns, filesystem=self.filesystem
+            )
+        except (OSError, ValueError) as error:
+            raise InputFileError(f"{self.where}/{name}", str(error)) from error
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write a file whole or not at all; one that is there is replaced.
+
+        Raises:
+            LogWriteError: If it can't be written.
+        """
+        path = self.path(name)
+        try:
+            if self.is_local:
+                part = Path(f"{path}.{os.getpid()}-{uuid.uuid4().hex[:8]}.part")
+                try:
+                    part.write_bytes(data)
+                    part.replace(path)
+                finally:
+                    part.unlink(missing_ok=True)
+            else:
+                with self.filesystem.open_output_stream(path) as stream:
+                    stream.write(data)
+        except OSError as error:
+            raise LogWriteError(f"{self.where}/{name}", str(error)) from error
+
+    def write_table(self, name: str, table: Any) -> None:
+        """Write a ``pyarrow.Table`` as Parquet, whole or not at all.
+
+        Raises:
+            LogWriteError: If it can't be written.
+        """
+        import pyarrow as pa
+
+        arrow: Any = pa
+        sink = arrow.BufferOutputStream()
+        self._parquet.write_table(table, sink)
+        self.write(name, sink.getvalue().to_pybytes())
+
+    def remove(self, name: str) -> None:
+        """Remove a file; one that isn't there is no error.
+
+        Raises:
+            LogWriteError: If it can't be removed.
+        """
+        try:
+            self.filesystem.delete_file(self.path(name))
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise LogWriteError(f"{self.where}/{name}", str(error)) from error
