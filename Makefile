@@ -90,6 +90,8 @@ bench: $(READY)  ## speed, as ratios against named peers
 	$(BIN)/python bench/analyse_hour.py
 	$(BIN)/python bench/analyse_hour.py --adaptive
 	$(BIN)/python bench/twin_step.py
+	$(BIN)/python bench/sweep.py
+	$(BIN)/python bench/catalog.py
 	$(BIN)/python bench/replay_convert.py --minutes 5
 	$(BIN)/python bench/replay_merge.py
 	$(BIN)/python bench/first_picture.py 5

@@ -58,6 +58,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "plan phase-kicks": ("analysis plan:phase_kicks", "Commands that identify the coupling."),
     "plan reversal": ("analysis plan:reversal", "Commands that separate boundary from module."),
     "report": ("analysis report:report", "The offline report, one HTML page."),
+    "catalog": ("analysis catalog:catalog", "Find sessions by robot, date, verdict and results."),
     "replay": ("replay replay:replay", "Run a recorded experiment again in the twin; compare."),
     "sweep": ("replay sweep:sweep", "Run the twin over a design of parameters."),
     "view": ("replay view:view", "See a session in Rerun."),
@@ -84,6 +85,7 @@ _EXTRAS = {
     "asammdf": "mf4",
     "distributed": "cluster",
     "pyarrow": "parquet",
+    "duckdb": "catalog",
 }
 """Optional package to the extra that installs it."""
 

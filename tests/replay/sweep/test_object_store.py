@@ -1,46 +1,20 @@
 """A sweep into a bucket of an S3 server on loopback, read back by pandas and by boto3."""
 
 import json
-import os
-import socket
-import sys
-import time
 
-import boto3
 import pandas as pd
 import pytest
 
-from support.processes import process, undulog
+from support.bucket import s3_bucket
+from support.processes import undulog
 from support.sweep_plans import comparable, write_plan
 from undulog.capture import Session
 from undulog.replay.sweep.rows import RowStore
 
-KEYS = {"AWS_ACCESS_KEY_ID": "any", "AWS_SECRET_ACCESS_KEY": "any", "AWS_REGION": "us-east-1"}
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
 
 @pytest.fixture
 def bucket(monkeypatch):
-    """A boto3 client and an empty bucket, for this process and those that it starts."""
-    port = free_port()
-    for name, value in {**KEYS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}.items():
-        monkeypatch.setenv(name, value)
-    code = "import sys; from moto.server import main; main(['-H', '127.0.0.1', '-p', sys.argv[1]])"
-    with process(sys.executable, "-c", code, str(port), stderr=None, stdout=None):
-        until = time.monotonic() + 60
-        while time.monotonic() < until:
-            try:
-                socket.create_connection(("127.0.0.1", port), 1).close()
-                break
-            except OSError:
-                time.sleep(0.05)
-        address = os.environ["AWS_ENDPOINT_URL"]
-        client = boto3.client("s3", endpoint_url=address, region_name="us-east-1")
-        client.create_bucket(Bucket="robots")
+    with s3_bucket(monkeypatch) as client:
         yield client
 
 

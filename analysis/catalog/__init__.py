@@ -1,0 +1,1 @@
+"""Find sessions by robot, gait, date, verdict and results."""

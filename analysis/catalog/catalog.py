@@ -1,0 +1,493 @@
+"""A catalogue of the sessions in a folder or under a URL.
+
+The catalogue lies beside the sessions, in the folder :data:`FOLDER`, as Parquet files of four
+kinds (:data:`.rows.SCHEMAS` and ``sources``). A scan reads what is new or changed, and adds files;
+none is ever changed, so any number of scans and analyses may write at once. Of several rows of one
+source those of the latest scan count.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import tempfile
+import time
+import uuid
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from undulog.capture.common.errors import (
+    DataError,
+    InputFileError,
+    NotALogError,
+    UndulogError,
+    UsageError,
+)
+from undulog.capture.common.object_store import ObjectStore, StoredFile
+from undulog.capture.common.process import StopRequest
+from undulog.capture.log.file.parts import split_part_path
+from undulog.capture.log.read.facts import LogFacts, read_facts
+
+from .query import connect, put_together
+from .rows import SCHEMAS, Row, is_result, result_rows, session_row, sweep_rows, table_of
+
+_ARROW: Any = pa  # comes without types
+_PARQUET: Any = pq
+
+FOLDER = ".undulog-catalog"
+"""Folder of the catalogue, beside the sessions."""
+
+_BATCH = 2000
+"""Files that are read before their rows are written."""
+
+_MOST_FILES = 64
+"""Parquet files of a kind from which on they are put into one,"""
+_MOST_ROWS = 50_000
+"""and their rows."""
+
+_MOST_RESULT = 256 << 20
+_REMOTE_THREADS = 16
+_ANALYSED = "analysis of "
+
+
+@dataclass(frozen=True)
+class ScanReport:
+    """What a scan found.
+
+    Attributes:
+        sessions: Files of sessions that are there.
+        read: Files that were read now: sessions, results of ``analyse``, rows of ``sweep``.
+        removed: Files that are no longer there.
+        damaged: Sessions without a whole summary, and results that can't be read.
+        wall_s: How long it took [s].
+        complete: Whether it came to its end.
+    """
+
+    sessions: int
+    read: int
+    removed: int
+    damaged: int
+    wall_s: float
+    complete: bool
+
+
+class Catalog:
+    """The catalogue of a folder or URL."""
+
+    def __init__(self, where: str) -> None:
+        """Connect; nothing is read.
+
+        Args:
+            where: A folder with sessions, or a URL such as ``s3://bucket/lab``.
+
+        Raises:
+            InputFileError: If there is no such folder, or the store can't be reached.
+            MissingExtraError: If pyarrow is not installed.
+        """
+        self.where = where
+        self._store = ObjectStore(where)
+        if self._store.is_local and not Path(self._store.base).is_dir():
+            raise InputFileError(where, "there is no such folder")
+
+    # -- reading ---------------------------------------------------------------------------------
+
+    def find(self, where: str = "", *, joints: bool = False) -> Any:
+        """Return the sessions that a condition holds for.
+
+        Args:
+            where: A condition in SQL over the columns of the view ``catalog``, e.g. ``robot =
+                'snake25' and lag_sd > 0.05``; all by default.
+            joints: Return a row a joint and window instead, of the view ``joints``.
+
+        Returns:
+            A ``pandas.DataFrame``.
+
+        Raises:
+            UsageError: If DuckDB doesn't understand the condition.
+        """
+        view = "joints" if joints else "catalog"
+        order = "path, position" if joints else "path"
+        condition = f"where {where}" if where.strip() else ""
+        return self.sql(f"select * from {view} {condition} order by {order}")  # noqa: S608
+
+    def sql(self, query: str) -> Any:
+        """Run a query in DuckDB over the views ``sessions``, ``analyses``, ``joints``, ``catalog``.
+
+        Returns:
+            A ``pandas.DataFrame``.
+
+        Raises:
+            UsageError: If DuckDB can't run it.
+            MissingExtraError: If DuckDB is not installed.
+        """
+        for attempt in range(3):
+            try:
+                return self._sql(query)
+            except FileNotFoundError:  # another process put files together meanwhile
+                if attempt == 2:
+                    raise
+        raise AssertionError("unreachable")
+
+    def _sql(self, query: str) -> Any:
+        import duckdb
+
+        with self._database() as database:
+            try:
+                return database.execute(query).df()
+            except duckdb.IOException as error:
+                if "No files found" in str(error) or "Cannot open file" in str(error):
+                    raise FileNotFoundError(str(error)) from error
+                raise UsageError(f"DuckDB: {error}") from error
+            except duckdb.Error as error:
+                raise UsageError(f"DuckDB: {error}") from error
+
+    # -- writing ---------------------------------------------------------------------------------
+
+    def scan(
+        self,
+        *,
+        stop: StopRequest | None = None,
+        on_read: Callable[[int, int], None] = lambda _done, _total: None,
+    ) -> ScanReport:
+        """Read the facts of new and changed sessions, and results that lie beside them.
+
+        A result is a file that ``undulog analyse -o`` wrote, or the rows of ``undulog sweep``.
+
+        Args:
+            on_read: Called with the number of files read and of those to read.
+
+        Raises:
+            InputFileError: If the folder can't be listed.
+            LogWriteError: If the catalogue can't be written.
+        """
+        begun, stop = time.monotonic(), stop or StopRequest()
+        listed = {file.name: file for file in self._listed()}
+        known = self._known()
+        scanned_ns = self._next_scan(known)
+        fresh = [
+            file
+            for file in listed.values()
+            if known.get(file.name, (None,))[:2] != (file.size, file.modified_ns)
+        ]
+        gone = [name for name in known if name not in listed and not name.startswith(_ANALYSED)]
+        changed = [*gone, *(file.name for file in fresh if file.name in known)]
+        stale = [_ANALYSED + name for name in changed if name.endswith(".mcap")]
+        self._remove([*gone, *stale], scanned_ns)
+        read = damaged = 0
+        for start in range(0, len(fresh), _BATCH):
+            if stop.requested:
+                break
+            rows: dict[str, list[Row]] = {"sessions": [], "analyses": [], "joints": []}
+            sources: list[Row] = []
+            for file, found, fault in self._read_files(fresh[start : start + _BATCH]):
+                read += 1
+                damaged += bool(fault)
+                on_read(read, len(fresh))
+                stamp = {"scanned_ns": scanned_ns, "modified_ns": file.modified_ns}
+                for kind, own in found.items():
+                    rows[kind] += [
+                        {"source": file.name, "removed": False, **row, **stamp} for row in own
+                    ]
+                sources.append(_source(file, fault) | stamp)
+            for kind, own in rows.items():
+                self._write(kind, table_of(kind, own))
+            self._write("sources", _ARROW.Table.from_pylist(sources, _SOURCES))
+        self._put_together()
+        n_sessions = sum(name.endswith(".mcap") for name in listed)
+        return ScanReport(
+            n_sessions, read, len(gone), damaged, time.monotonic() - begun, read == len(fresh)
+        )
+
+    def analyse(
+        self,
+        names: Sequence[str] | None = None,
+        *,
+        workers: int = 1,
+        stop: StopRequest | None = None,
+        on_done: Callable[[int, int], None] = lambda _done, _total: None,
+    ) -> dict[str, str]:
+        """Analyse sessions that have no results yet, and keep their rows.
+
+        Args:
+            names: Paths of sessions in the catalogue; all that are not analysed by default.
+            workers: Processes at a time.
+            on_done: Called with the number of sessions analysed and of those to analyse.
+
+        Returns:
+            Path of a session to why it couldn't be analysed.
+
+        Raises:
+            LogWriteError: If the rows can't be written.
+        """
+        stop = stop or StopRequest()
+        query = "select path from catalog where status = 'not analysed' and damage is null"
+        missing: Sequence[str] = self.sql(query)["path"].to_list() if names is None else names
+        faults: dict[str, str] = {}
+        for done, (name, outcome) in enumerate(self._analysed(missing, workers, stop), start=1):
+            on_done(done, len(missing))
+            if isinstance(outcome, str):
+                faults[name] = outcome
+                continue
+            self.add_result(_ANALYSED + name, outcome)
+        self._put_together()
+        return faults
+
+    def add_result(self, source: str, result: Mapping[str, Any]) -> None:
+        """Keep the rows of an analysis; safe in any number of processes at once.
+
+        Args:
+            source: Names where it comes from; a later result of the same source replaces it.
+            result: JSON object of the analysis.
+
+        Raises:
+            DataError: If it is no result of one session.
+            LogWriteError: If it can't be written.
+        """
+        analysis, joints = _checked(source, result)
+        stamp = {"source": source, "scanned_ns": time.time_ns(), "removed": False}
+        self._write("analyses", table_of("analyses", [analysis | stamp]))
+        self._write("joints", table_of("joints", [joint | stamp for joint in joints]))
+
+    # -- inside ----------------------------------------------------------------------------------
+
+    def _listed(self) -> list[StoredFile]:
+        """Sessions and files that may hold results."""
+        found = self._store.files("", [".mcap", ".json", ".parquet"], recursive=True)
+        return [
+            file
+            for file in found
+            for path in [PurePosixPath(file.name)]
+            if FOLDER not in path.parts
+            and not (path.suffix == ".json" and path.parent.name in ("pending", "settings"))
+            and not (path.suffix == ".parquet" and path.parent.name != "rows")
+        ]
+
+    def _known(self) -> dict[str, tuple[int, int, int]]:
+        """Name of each file that was read and is there to its size, modification and scan."""
+        latest: dict[str, tuple[int, int, int, bool]] = {}
+        for name in self._files("sources"):
+            columns = self._store.read_table(name).to_pydict()
+            for source, size, modified, scanned, removed in zip(
+                *(
+                    columns[key]
+                    for key in ("source", "size", "modified_ns", "scanned_ns", "removed")
+                ),
+                strict=True,
+            ):
+                if source not in latest or latest[source][2] < scanned:
+                    latest[source] = size, modified, scanned, removed
+        return {name: facts[:3] for name, facts in latest.items() if not facts[3]}
+
+    def _next_scan(self, known: Mapping[str, tuple[int, int, int]]) -> int:
+        """A time later than those of all scans before, whatever the clocks of others say."""
+        return max([time.time_ns(), *(scanned + 1 for _, _, scanned in known.values())])
+
+    def _read_files(
+        self, files: Sequence[StoredFile]
+    ) -> Iterable[tuple[StoredFile, dict[str, list[Row]], str]]:
+        if self._store.is_local:
+            return map(self._read_file, files)
+        with ThreadPoolExecutor(_REMOTE_THREADS) as pool:
+            return list(pool.map(self._read_file, files))
+
+    def _read_file(self, file: StoredFile) -> tuple[StoredFile, dict[str, list[Row]], str]:
+        """Return the rows of a file, and why it has none."""
+        try:
+            if file.name.endswith(".mcap"):
+                facts = self._facts(file)
+                return file, {"sessions": [_session(file, facts)]}, facts.damage
+            if file.name.endswith(".parquet"):
+                return file, self._sweep(file), ""
+            return file, self._result(file), ""
+        except (UndulogError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+            rows = (
+                [_session(file, LogFacts(damage=str(error)))] if file.name.endswith(".mcap") else []
+            )
+            return file, {"sessions": rows}, str(error)
+
+    def _facts(self, file: StoredFile) -> LogFacts:
+        path = self._store.path(file.name)
+        if self._store.is_local:
+            with open(path, "rb", buffering=0) as stream:  # noqa: PTH123 - unbuffered, of a path
+                descriptor = stream.fileno()
+                return read_facts(
+                    path, file.size, lambda start, stop: os.pread(descriptor, stop - start, start)
+                )
+        with self._store.filesystem.open_input_file(path) as stream:
+            return read_facts(
+                path, file.size, lambda start, stop: stream.read_at(stop - start, start)
+            )
+
+    def _sweep(self, file: StoredFile) -> dict[str, list[Row]]:
+        analyses: list[Row] = []
+        joints: list[Row] = []
+        for row in self._store.read_table(file.name).to_pylist():
+            if (found := sweep_rows(row)) is not None:
+                analyses.append(found[0])
+                joints += found[1]
+        return {"analyses": analyses, "joints": joints}
+
+    def _result(self, file: StoredFile) -> dict[str, list[Row]]:
+        if file.size > _MOST_RESULT:
+            return {}
+        value = json.loads(self._store.read(file.name))
+        if not is_result(value):
+            return {}
+        analysis, joints = _checked(file.name, value)
+        return {"analyses": [analysis], "joints": joints}
+
+    def _remove(self, names: Sequence[str], scanned_ns: int) -> None:
+        gone = [{"source": name, "scanned_ns": scanned_ns, "removed": True} for name in names]
+        for kind in SCHEMAS:
+            own = [row | ({"path": row["source"]} if kind == "sessions" else {}) for row in gone]
+            self._write(kind, table_of(kind, own))
+        self._write("sources", _ARROW.Table.from_pylist(gone, _SOURCES))
+
+    def _analysed(
+        self, names: Sequence[str], workers: int, stop: StopRequest
+    ) -> Generator[tuple[str, str | dict[str, Any]]]:
+        """Yield the result of each session, or why it has none."""
+        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+            running = {pool.submit(_analyse, self.where, name): name for name in names}
+            for future in as_completed(running):
+                yield running[future], future.result()
+                if stop.requested:
+                    pool.shutdown(cancel_futures=True)
+                    return
+
+    def _files(self, kind: str) -> list[str]:
+        """Names of the Parquet files of a kind, without those that another one replaces."""
+        names = [file.name for file in self._store.files(f"{FOLDER}/{kind}", [".parquet"])]
+        replaced: set[str] = set()
+        for name in names:
+            if _is_base(name):
+                path, filesystem = self._store.path(name), self._store.filesystem
+                schema: Any = _PARQUET.read_schema(path, filesystem=filesystem)
+                replaced.update(json.loads(schema.metadata[b"replaces"]))
+        return [name for name in names if name not in replaced]
+
+    def _write(self, kind: str, table: Any, prefix: str = "rows") -> None:
+        if not table.num_rows:
+            return
+        self._store.make_folders(f"{FOLDER}/{kind}")
+        name = f"{FOLDER}/{kind}/{prefix}-{time.time_ns()}-{uuid.uuid4().hex[:8]}.parquet"
+        self._store.write_table(name, table)
+
+    def _database(self) -> AbstractContextManager[Any]:
+        base: dict[str, list[str]] = {}
+        new: dict[str, list[str]] = {}
+        for kind in SCHEMAS:
+            names = self._files(kind)
+            base[kind] = [name for name in names if _is_base(name)][-1:]
+            new[kind] = [name for name in names if name not in base[kind]]
+        return connect(self._store, base, new)
+
+    def _put_together(self) -> None:
+        """Put many small files into one; on an object store they stay as they are."""
+        if not self._store.is_local:
+            return
+        kinds = [kind for kind in (*SCHEMAS, "sources") if self._is_scattered(kind)]
+        if not kinds:
+            return
+        with _lock(Path(self._store.path(f"{FOLDER}/lock"))) as locked:
+            if not locked:
+                return
+            for kind in kinds:
+                names = self._files(kind)
+                if kind == "sources":
+                    table = _ARROW.concat_tables([self._store.read_table(name) for name in names])
+                else:
+                    with self._database() as database:
+                        table = put_together(database, kind)
+                facts = {b"replaces": json.dumps(names).encode()}
+                self._write(kind, table.replace_schema_metadata(facts), "all")
+                for name in names:
+                    self._store.remove(name)
+
+    def _is_scattered(self, kind: str) -> bool:
+        new = [name for name in self._files(kind) if not _is_base(name)]
+        if len(new) >= _MOST_FILES:
+            return True
+        rows = [_PARQUET.read_metadata(self._store.path(name)).num_rows for name in new]
+        return sum(rows) >= _MOST_ROWS
+
+
+def _is_base(name: str) -> bool:
+    return PurePosixPath(name).name.startswith("all-")
+
+
+_SOURCES: Any = _ARROW.schema(
+    [
+        ("source", _ARROW.string()),
+        ("size", _ARROW.int64()),
+        ("modified_ns", _ARROW.int64()),
+        ("scanned_ns", _ARROW.int64()),
+        ("removed", _ARROW.bool_()),
+        ("fault", _ARROW.string()),
+    ]
+)
+
+
+@contextmanager
+def _lock(path: Path) -> Generator[bool]:
+    """Hold a lock file; False where another process holds it."""
+    with path.open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+            return
+        yield True
+
+
+def _source(file: StoredFile, fault: str) -> Row:
+    return {"source": file.name, "size": file.size, "removed": False, "fault": fault or None}
+
+
+def _session(file: StoredFile, facts: LogFacts) -> Row:
+    row = session_row(facts)
+    head = split_part_path(Path(file.name))[0].as_posix() if row["part"] > 1 else file.name
+    name = PurePosixPath(head).stem  # as a session without an id calls itself
+    return {**row, "session_id": row["session_id"] or name, "path": file.name, "head": head} | {
+        "size": file.size
+    }
+
+
+def _checked(source: str, result: Mapping[str, Any]) -> tuple[Row, list[Row]]:
+    try:
+        analysis, joints = result_rows(result)
+        for kind, rows in (("analyses", [analysis]), ("joints", joints)):
+            table_of(kind, rows)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise DataError(f"{source}: a damaged result: {error!r}") from error
+    return analysis, joints
+
+
+def _analyse(where: str, name: str) -> str | dict[str, Any]:
+    """Analyse one session, in a process of its own; return why not where it can't be."""
+    from undulog.capture import Session
+
+    from ..session.analyse import analyse_session
+
+    store = ObjectStore(where)
+    try:
+        with tempfile.TemporaryDirectory(prefix="undulog-catalog-") as folder:
+            path = Path(store.path(name))
+            if not store.is_local:
+                path = Path(folder) / PurePosixPath(name).name
+                path.write_bytes(store.read(name))
+            with Session.open(path) as session:
+                return analyse_session(session).to_dict()
+    except NotALogError as error:
+        return str(error)
+    except (UndulogError, OSError) as error:
+        return str(error)

@@ -1,0 +1,202 @@
+"""The catalogue: facts of many sessions, a scan with nothing new, queries, many writers.
+
+``python bench/catalog.py [SESSIONS] [ROWS]``: writes SESSIONS (10,000) small sessions (5 joints,
+4 s), scans them, scans again, and reads some of them whole for comparison; then queries ROWS
+(1,000,000) synthetic rows beside pandas over the same rows as JSON lines.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from undulog.analysis.catalog.catalog import FOLDER, Catalog
+from undulog.analysis.catalog.rows import table_of
+from undulog.capture import Session, SessionWriter
+from undulog.capture.common.object_store import ObjectStore
+
+EPOCH_NS = 1_735_689_600_000_000_000
+NAMES = tuple(f"joint{k:02d}" for k in range(1, 6))
+COMPARED = 200
+WRITERS = 16
+WHERE = "robot = 'snake5' and lag_sd > 0.09"
+
+
+def write(folder: Path, count: int) -> None:
+    """Write distinct sessions, 100 in a folder."""
+    times_s = np.arange(0.0, 4.0, 0.02)
+    for number in range(count):
+        place = folder / f"{number // 100:04d}"
+        place.mkdir(exist_ok=True)
+        path = place / f"run{number:05d}.mcap"
+        epoch_ns = EPOCH_NS + number * 60_000_000_000
+        facts = {"robot": "snake5", "operator": f"operator{number % 7}"}
+        with SessionWriter(
+            path, session_id=f"session{number:05d}", epoch_ns=epoch_ns, metadata=facts
+        ) as writer:
+            commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
+            states = writer.joint_state("/joint_states", NAMES, unit="rad")
+            phase = 2 * np.pi * times_s[:, None] + number + np.arange(len(NAMES))
+            for t_s, command, state in zip(
+                times_s, 0.4 * np.sin(phase), 0.36 * np.sin(phase - 0.1), strict=True
+            ):
+                t_ns = epoch_ns + round(t_s * 1e9)
+                commands.write(t_ns, command)
+                states.write(t_ns, state)
+            writer.set_verdict("good", [])
+
+
+def whole(paths: list[Path]) -> float:
+    """Time to read the columns of sessions, one by one [s]."""
+    start = time.perf_counter()
+    for path in paths:
+        with Session.open(path) as session:
+            session.joints("/joint_states")
+    return time.perf_counter() - start
+
+
+def synthetic(folder: Path, count: int) -> Path:
+    """Write rows as a catalogue and as JSON lines."""
+    rng = np.random.default_rng(1)
+    store = ObjectStore(str(folder))
+    store.make_folders(f"{FOLDER}/sessions", f"{FOLDER}/analyses")
+    lines = folder / "rows.jsonl"
+    step = 100_000
+    with lines.open("w") as stream:
+        for start in range(0, count, step):
+            numbers = range(start, min(start + step, count))
+            lag_sd = rng.uniform(0.0, 0.1, len(numbers)).tolist()
+            sessions = [
+                {
+                    "path": f"lab/{k}.mcap",
+                    "head": f"lab/{k}.mcap",
+                    "session_id": f"s{k}",
+                    "robot": f"snake{5 + k % 3}",
+                    "part": 1,
+                    "scanned_ns": 1,
+                    "removed": False,
+                    "start_ns": EPOCH_NS + k,
+                    "duration_s": 4.0,
+                    "verdict": "good",
+                }
+                for k in numbers
+            ]
+            analyses = [
+                {
+                    "source": f"lab/{k}.json",
+                    "session_id": f"s{k}",
+                    "lag_sd": value,
+                    "scanned_ns": 1,
+                    "removed": False,
+                    "answer": "unlike",
+                }
+                for k, value in zip(numbers, lag_sd, strict=True)
+            ]
+            for kind, rows in (("sessions", sessions), ("analyses", analyses)):
+                store.write_table(f"{FOLDER}/{kind}/rows-{start}.parquet", table_of(kind, rows))
+            for session, analysis in zip(sessions, analyses, strict=True):
+                stream.write(json.dumps({**session, **analysis}) + "\n")
+    return lines
+
+
+def query(folder: str) -> tuple[float, int, float]:
+    """Time [s], rows and peak memory [MB] of a query in a process of its own."""
+    catalog = Catalog(folder)
+    catalog.sql("select 1")  # imports
+    start, used = time.perf_counter(), time.process_time()
+    rows = catalog.sql(f"select path, robot, start_ns, lag_sd from catalog where {WHERE}")
+    print(f"query: {time.process_time() - used:.2f} s of processor time")
+    return time.perf_counter() - start, len(rows), _peak_mb()
+
+
+def peer(lines: str) -> tuple[float, int, float]:
+    """The same by pandas over JSON."""
+    start = time.perf_counter()
+    frame = pd.read_json(lines, lines=True)
+    rows = frame.query("robot == 'snake5' and lag_sd > 0.09")
+    return time.perf_counter() - start, len(rows), _peak_mb()
+
+
+def add(folder: str, writer: int) -> int:
+    """Scan and add rows, as one of many writers."""
+    Catalog(folder).scan()
+    return writer
+
+
+def _peak_mb() -> float:
+    """Peak resident memory; that of getrusage counts the parent's, too [MB]."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1e3
+
+
+def alone(function: object, *arguments: object) -> tuple[float, int, float]:
+    """Call a function in a fresh process."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()  # type: ignore[arg-type]
+
+
+def main() -> None:
+    """Run everything and judge it."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sessions", type=int, nargs="?", default=10_000)
+    parser.add_argument("rows", type=int, nargs="?", default=1_000_000)
+    given = parser.parse_args()
+    verdicts: list[tuple[bool, str]] = []
+    with tempfile.TemporaryDirectory(prefix="undulog-bench-") as name:
+        folder = Path(name)
+        write(folder, given.sessions)
+        used = time.process_time()
+        first = Catalog(name).scan()
+        used = time.process_time() - used
+        again = Catalog(name).scan()
+        some = sorted(folder.rglob("*.mcap"))[:COMPARED]
+        each = whole(some) / len(some) * given.sessions
+        print(
+            f"{given.sessions} sessions: facts {first.wall_s:.1f} s ({used:.1f} s of one core), "
+            f"again {again.wall_s:.2f} s; reading each log {each:.0f} s"
+        )
+        share = given.sessions / 10_000
+        verdicts += [
+            (first.read == given.sessions and used <= 600 * share, "facts: 10 min for 10,000"),
+            (again.read == 0 and again.wall_s <= 10, "scan with nothing new: 10 s"),
+        ]
+        with ProcessPoolExecutor(WRITERS, get_context("spawn")) as pool:
+            (folder / FOLDER).rename(folder / "away")
+            done = list(pool.map(add, [name] * WRITERS, range(WRITERS)))
+        found = Catalog(name).sql(
+            "select count(*) as n, count(distinct path) as paths from catalog"
+        )
+        complete = found.n[0] == found.paths[0] == given.sessions and len(done) == WRITERS
+        verdicts.append((complete, f"{WRITERS} writers at once: {found.n[0]} rows, each once"))
+    with tempfile.TemporaryDirectory(prefix="undulog-bench-") as name:
+        lines = synthetic(Path(name), given.rows)
+        Catalog(name).scan()  # puts the files together
+        ours_s, ours_n, ours_mb = alone(query, name)
+        peer_s, peer_n, peer_mb = alone(peer, str(lines))
+        print(
+            f"{given.rows} rows: {ours_s:.2f} s, {ours_mb:.0f} MB; "
+            f"pandas over JSON {peer_s:.1f} s, {peer_mb:.0f} MB ({peer_s / ours_s:.0f} times)"
+        )
+        verdicts += [
+            (ours_n == peer_n, f"the same {ours_n} rows"),
+            (ours_s <= 1.0, "query: 1 s"),
+            (ours_mb <= 1000, "memory: 1 GB"),
+        ]
+    for passed, words in verdicts:
+        print("PASS" if passed else "FAIL", words)
+    sys.exit(not all(passed for passed, _ in verdicts))
+
+
+if __name__ == "__main__":
+    main()

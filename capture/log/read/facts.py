@@ -1,0 +1,165 @@
+"""Facts of a log from its first and last bytes: what it is, without opening it as a session.
+
+A file that lies in an object store costs at most :data:`MOST_REQUESTS` requests for ranges of
+bytes, whatever its size: the header and the first metadata, the footer and the summary behind it,
+and metadata between them.
+
+Format: https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import Any
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Footer, Metadata, MetadataIndex, Statistics
+
+from ...common.errors import NotALogError
+from ..mcap.chunk import MAGIC, walk_records
+
+MOST_REQUESTS = 5
+"""Ranges that are read of one file."""
+
+_EDGE = 64 * 1024
+_MOST_SUMMARY = 64 << 20
+_METADATA = ("undulog", "undulog.health", "undulog.part")
+_FOOTER = 1 + 8 + 20 + len(MAGIC)
+
+
+@dataclass(frozen=True)
+class LogFacts:
+    """What the first and last bytes of a log say.
+
+    Attributes:
+        start_ns: Log time of its first message [Unix ns]; None without messages or summary.
+        end_ns: Log time of its last message [Unix ns].
+        messages: Their number, or None.
+        topics: In order of name.
+        metadata: Of the log contract: ``undulog``, ``undulog.health`` and ``undulog.part``.
+        damage: Why there is no summary; empty where there is one.
+    """
+
+    start_ns: int | None = None
+    end_ns: int | None = None
+    messages: int | None = None
+    topics: tuple[str, ...] = ()
+    metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
+    damage: str = ""
+
+
+class _Ranges:
+    """Ranges of a file that were read."""
+
+    def __init__(self, read: Callable[[int, int], bytes], size: int) -> None:
+        self._read, self._size = read, size
+        self._parts: list[tuple[int, bytes]] = []
+        self.left = MOST_REQUESTS
+
+    def get(self, start: int, stop: int, ahead: int = 0) -> bytes | None:
+        """Return bytes of the file; None where they take one request too many."""
+        if not 0 <= start <= stop <= self._size:
+            return None
+        for base, data in self._parts:
+            if base <= start and stop <= base + len(data):
+                return data[start - base : stop - base]
+        if not self.left:
+            return None
+        self.left -= 1
+        data = self._read(start, min(max(stop, start + ahead), self._size))
+        self._parts.append((start, data))
+        return data[: stop - start] if len(data) >= stop - start else None
+
+
+def read_facts(name: str, size: int, read: Callable[[int, int], bytes]) -> LogFacts:
+    """Read the facts of an MCAP file.
+
+    Args:
+        name: For messages.
+        size: Its size in bytes.
+        read: Returns the bytes from a first offset up to a second one.
+
+    Returns:
+        The facts; of a file that was cut or written without a summary, those of its beginning.
+
+    Raises:
+        NotALogError: If it is no MCAP file.
+        OSError: As ``read`` raises it.
+    """
+    ranges = _Ranges(read, size)
+    head = ranges.get(0, min(size, _EDGE)) or b""
+    if not head.startswith(MAGIC):
+        raise NotALogError(name, "no MCAP file: it doesn't start as one")
+    metadata: dict[str, dict[str, str]] = {}
+    _add_metadata(metadata, _records(head, len(MAGIC)))
+    tail_start = max(0, size - _EDGE)
+    tail = ranges.get(tail_start, size) or b""
+    if size < 2 * len(MAGIC) + 29 or not tail.endswith(MAGIC):
+        return LogFacts(metadata=metadata, damage="it has no end: undulog log recover")
+    try:
+        footer = _parse(Footer, tail[len(tail) - _FOOTER + 9 : len(tail) - len(MAGIC)])
+        start, stop = footer.summary_start, footer.summary_offset_start or size - _FOOTER
+        if not start:
+            return LogFacts(metadata=metadata, damage="it has no summary")
+        summary = ranges.get(start, stop) if stop - start <= _MOST_SUMMARY else None
+        if summary is None:
+            damage = f"its summary claims the bytes {start:,} to {stop:,}"
+            return LogFacts(metadata=metadata, damage=damage)
+        return _from_summary(summary, ranges, metadata)
+    except (McapError, struct.error, ValueError, OverflowError) as error:
+        return LogFacts(metadata=metadata, damage=f"its summary is damaged: {error}")
+
+
+def _from_summary(summary: bytes, ranges: _Ranges, metadata: dict[str, dict[str, str]]) -> LogFacts:
+    topics: set[str] = set()
+    statistics: Statistics | None = None
+    metadata.clear()  # its index tells of all records
+    for opcode, body in _records(summary, 0):
+        if opcode == Opcode.CHANNEL:
+            topics.add(_parse(Channel, body).topic)
+        elif opcode == Opcode.STATISTICS:
+            statistics = _parse(Statistics, body)
+        elif opcode == Opcode.METADATA_INDEX:
+            index = _parse(MetadataIndex, body)
+            if index.name in _METADATA:
+                record = ranges.get(index.offset, index.offset + index.length, _EDGE)
+                if record is not None:
+                    _add_metadata(metadata, _records(record, 0))
+    if statistics is None or not statistics.message_count:
+        count = None if statistics is None else 0
+        return LogFacts(messages=count, topics=tuple(sorted(topics)), metadata=metadata)
+    return LogFacts(
+        start_ns=statistics.message_start_time,
+        end_ns=statistics.message_end_time,
+        messages=statistics.message_count,
+        topics=tuple(sorted(topics)),
+        metadata=metadata,
+    )
+
+
+def _records(data: bytes, start: int) -> list[tuple[int, bytes]]:
+    """Return opcode and body of each whole record."""
+    found: list[tuple[int, bytes]] = []
+    try:
+        for opcode, begin, end in walk_records(data, start, len(data)):
+            found.append((opcode, data[begin:end]))
+    except (McapError, struct.error):
+        pass  # the range ends within a record
+    return found
+
+
+def _add_metadata(metadata: dict[str, dict[str, str]], records: list[tuple[int, bytes]]) -> None:
+    for opcode, body in records:
+        if opcode == Opcode.METADATA:
+            record = _parse(Metadata, body)
+            if record.name in _METADATA:
+                metadata.setdefault(record.name, {}).update(record.metadata)
+
+
+def _parse(kind: Any, body: bytes) -> Any:
+    return kind.read(ReadDataStream(BytesIO(body)))

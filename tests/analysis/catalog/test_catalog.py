@@ -1,0 +1,277 @@
+"""The catalogue against the sessions themselves, the mcap package and many writers at once."""
+
+import json
+import multiprocessing
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from mcap.reader import make_reader
+
+from support import durable_child as recorder
+from support.bucket import s3_bucket
+from support.linear_chain import CHAIN, WAVE, write_run
+from support.processes import undulog
+from support.written_sessions import write_foreign, write_session
+from undulog.analysis import analyse_session
+from undulog.analysis.catalog.catalog import FOLDER, Catalog
+from undulog.capture import Session
+from undulog.capture.common.errors import InputFileError, NotALogError, UsageError
+from undulog.capture.log.read.facts import MOST_REQUESTS, read_facts
+
+
+def facts_of(path, requests=None):
+    data = path.read_bytes()
+
+    def read(start, stop):
+        assert 0 <= start <= stop <= len(data)
+        if requests is not None:
+            requests.append((start, stop))
+        return data[start:stop]
+
+    return read_facts(str(path), len(data), read)
+
+
+@pytest.fixture(scope="module")
+def analysed(tmp_path_factory):
+    """A session with a gait, and its result."""
+    folder = tmp_path_factory.mktemp("analysed")
+    path = write_run(folder / "gait.mcap", WAVE, CHAIN @ WAVE, 1, 0.003)
+    with Session.open(path) as session:
+        result = analyse_session(session)
+    return path, result
+
+
+@pytest.fixture
+def lab(tmp_path, analysed):
+    """Sessions in a folder and one below, one of them analysed."""
+    path, result = analysed
+    (tmp_path / "day1").mkdir()
+    shutil.copy(path, tmp_path / "day1" / "gait.mcap")
+    result.save(tmp_path / "day1" / "gait.json")
+    write_session(tmp_path / "plain.mcap", metadata={"operator": "Ada"})
+    (tmp_path / "notes.json").write_text('{"answer": 42}')
+    return tmp_path
+
+
+def test_facts_are_those_of_the_mcap_package_within_few_requests(tmp_path):
+    write_session(tmp_path / "long.mcap", count=20_000)
+    requests = []
+    facts = facts_of(tmp_path / "long.mcap", requests)
+    with (tmp_path / "long.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+    statistics = summary.statistics
+    assert (facts.start_ns, facts.end_ns, facts.messages) == (
+        statistics.message_start_time,
+        statistics.message_end_time,
+        statistics.message_count,
+    )
+    assert facts.topics == tuple(sorted({one.topic for one in summary.channels.values()}))
+    assert facts.metadata == {name: metadata[name] for name in facts.metadata}
+    assert {"undulog", "undulog.health"} <= facts.metadata.keys()
+    assert len(requests) <= MOST_REQUESTS
+    assert sum(stop - start for start, stop in requests) < 300_000
+
+
+def test_facts_of_cut_and_lying_files(tmp_path):
+    write_session(tmp_path / "whole.mcap")
+    whole = (tmp_path / "whole.mcap").read_bytes()
+    path = tmp_path / "cut.mcap"
+    for size in (8, 9, 40, 700, len(whole) // 2, len(whole) - 9, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        assert "recover" in facts_of(path).damage
+    path.write_bytes(b"no log")
+    with pytest.raises(NotALogError):
+        facts_of(path)
+    random = np.random.default_rng(3)
+    for _ in range(300):  # any answer, but no error of another kind and nothing beyond the file
+        data = bytearray(whole)
+        for at in random.integers(max(8, len(whole) - 3000), len(whole) - 8, 4):
+            data[at] = random.integers(256)
+        path.write_bytes(data)
+        facts_of(path)
+
+
+def test_a_row_a_session_with_the_results_beside_it(lab, analysed):
+    _, result = analysed
+    catalog = Catalog(str(lab))
+    report = catalog.scan()
+    assert (report.sessions, report.read, report.damaged, report.complete) == (2, 4, 0, True)
+    rows = catalog.find().set_index("path")
+    assert rows.index.to_list() == ["day1/gait.mcap", "plain.mcap"]
+    with Session.open(lab / "plain.mcap") as session:
+        plain = rows.loc["plain.mcap"]
+        assert plain.duration_s == session.duration_s
+        assert plain.start_ns == session.start_ns
+        assert plain.start == pd.Timestamp(session.start_ns)  # UTC
+        assert (plain.verdict, plain.operator, plain.session_id) == ("good", "Ada", "s1")
+        assert plain.messages == sum(channel.count for channel in session.channels.values())
+    assert rows.status.to_list() == ["analysed", "not analysed"]
+    assert pd.isna(rows.lag_sd["plain.mcap"])
+    gait = rows.loc["day1/gait.mcap"]
+    assert gait.sentence == result.answer.sentence
+    assert gait.lag_sd == result.heterogeneity["lag_sd"].value
+    assert (gait.lag_sd_low, gait.lag_sd_high) == result.heterogeneity["lag_sd"].ci95
+    joints = catalog.find(joints=True)
+    assert joints.joint.to_list() == [one.name for one in result.joints]
+    assert joints.gain.to_list() == [one.gain.value for one in result.joints]
+    assert joints.lag_rad_high.to_list() == [one.lag_rad.ci95[1] for one in result.joints]
+    assert set(joints.path) == {"day1/gait.mcap"}
+    assert len(catalog.find(f"lag_sd > {gait.lag_sd / 2} and duration_s > 5")) == 1
+    assert len(catalog.find("operator = 'Ada' and status = 'not analysed'")) == 1
+    assert catalog.sql("select count(*) as n from joints").n[0] == len(result.joints)
+
+
+def test_only_new_and_changed_files_are_read(lab, monkeypatch):
+    Catalog(str(lab)).scan()
+    opened = []
+    monkeypatch.setattr(Catalog, "_read_file", lambda self, file: opened.append(file))
+    assert Catalog(str(lab)).scan().read == 0
+    assert opened == []
+    monkeypatch.undo()
+    write_session(lab / "plain.mcap", count=10, force=True)
+    write_session(lab / "new.mcap", count=20)
+    (lab / "day1" / "gait.mcap").unlink()
+    report = Catalog(str(lab)).scan()
+    assert (report.read, report.removed, report.sessions) == (2, 1, 2)
+    rows = Catalog(str(lab)).find()
+    assert rows.path.to_list() == ["new.mcap", "plain.mcap"]
+    assert rows.duration_s.to_list() == [0.19, 0.09]
+    write_session(lab / "day1" / "gait.mcap", count=5)  # and it comes back
+    Catalog(str(lab)).scan()
+    assert "day1/gait.mcap" in Catalog(str(lab)).find().path.to_list()
+
+
+def test_analyses_are_made_on_request_and_again_when_the_session_changes(lab, analysed):
+    _, result = analysed
+    (lab / "day1" / "gait.json").unlink()
+    catalog = Catalog(str(lab))
+    catalog.scan()
+    faults = catalog.analyse()
+    assert faults == {}
+    rows = catalog.find().set_index("path")
+    assert rows.sentence["day1/gait.mcap"] == result.answer.sentence
+    assert (rows.status == "analysed").all()
+    assert catalog.analyse() == {}
+    (lab / "day1" / "gait.mcap").unlink()
+    write_run(lab / "day1" / "gait.mcap", WAVE, CHAIN @ WAVE, 2, 0.002)
+    catalog.scan()
+    assert catalog.find("path = 'day1/gait.mcap'").status.to_list() == ["not analysed"]
+
+
+def test_a_session_that_can_t_be_analysed_has_its_reason(tmp_path):
+    write_foreign(tmp_path / "text.mcap", [("/a", 1, {"data": "x"})], "std_msgs/msg/String")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "no.mcap").write_text("no log")
+    catalog = Catalog(str(tmp_path))
+    assert catalog.scan().damaged == 1
+    assert catalog.find("damage is not null").path.to_list() == ["other/no.mcap"]
+    assert catalog.analyse().keys() == {"text.mcap"}
+    assert "/joint_commands" in catalog.analyse()["text.mcap"]
+
+
+def test_parts_of_a_session_are_one_row(tmp_path):
+    sink = recorder.open_sink(tmp_path / "run.mcap")
+    for number in range(900):
+        if number in (300, 600):
+            sink.split()
+        recorder.write(sink, number)
+    sink.close(())
+    write_session(tmp_path / "other.mcap")
+    catalog = Catalog(str(tmp_path))
+    assert catalog.scan().sessions == 4
+    rows = catalog.find().set_index("path")
+    assert rows.parts.to_dict() == {"other.mcap": 1, "run.mcap": 3}
+    with Session.open(tmp_path / "run.mcap") as session:
+        assert rows.messages["run.mcap"] == sum(one.count for one in session.channels.values())
+        assert rows.duration_s["run.mcap"] == session.duration_s
+        assert rows.start_ns["run.mcap"] == session.start_ns
+
+
+def _write_many(arguments):
+    folder, number = arguments
+    catalog = Catalog(folder)
+    result = json.loads((Path(folder) / "day1" / "gait.json").read_text())
+    for k in range(20):
+        own = result | {"session": result["session"] | {"id": f"{number}-{k}"}}
+        catalog.add_result(f"{number}-{k}", own)
+    catalog.scan()
+    return number
+
+
+@pytest.mark.slow
+def test_many_writers_at_once_lose_no_row(lab):
+    with multiprocessing.get_context("spawn").Pool(16) as pool:
+        pool.map(_write_many, [(str(lab), number) for number in range(16)], chunksize=1)
+    catalog = Catalog(str(lab))
+    names = catalog.sql("select session_id from analyses where source not like '%.json'").session_id
+    assert sorted(names) == sorted(f"{number}-{k}" for number in range(16) for k in range(20))
+    assert catalog.find().path.to_list() == ["day1/gait.mcap", "plain.mcap"]
+    count = catalog.sql("select count(*) as n from all_joints where source not like '%.json'").n[0]
+    assert count == 320 * catalog.sql("select max(joints) as n from analyses").n[0]
+    catalog.scan()  # puts the files together
+    assert len(list((lab / FOLDER / "analyses").iterdir())) < 64
+    assert len(catalog.sql("select * from analyses")) == 321
+
+
+def test_rows_that_were_put_together_but_not_removed_count_once(lab, monkeypatch):
+    monkeypatch.setattr("undulog.analysis.catalog.catalog._MOST_FILES", 2)
+    catalog = Catalog(str(lab))
+    catalog.scan()
+    write_session(lab / "new.mcap", count=20)
+    before = {path: path.read_bytes() for path in (lab / FOLDER).rglob("rows-*.parquet")}
+    catalog.scan()
+    assert len(list((lab / FOLDER / "sessions").iterdir())) == 1
+    for path, data in before.items():  # as if killed before they were removed
+        path.write_bytes(data)
+    assert len(Catalog(str(lab)).find()) == 3
+    assert Catalog(str(lab)).scan().read == 0
+
+
+def test_wrong_places_and_conditions_are_refused(lab):
+    with pytest.raises(InputFileError, match="no such folder"):
+        Catalog(str(lab / "none"))
+    catalog = Catalog(str(lab))
+    assert catalog.find().empty  # before the first scan
+    with pytest.raises(UsageError, match="lag_sdd"):
+        catalog.find("lag_sdd > 2")
+    with pytest.raises(UsageError, match="DuckDB"):
+        catalog.sql("selct 1")
+
+
+def test_the_command(lab):
+    found = json.loads(undulog("catalog", lab, "--where", "status = 'analysed'", "--json").stdout)
+    assert [row["path"] for row in found["rows"]] == ["day1/gait.mcap"]
+    assert found["scan"]["read"] == 4
+    text = undulog("catalog", lab).stdout
+    assert "plain.mcap" in text
+    assert "2 rows; 2 sessions, 0 files read now" in text
+    done = undulog("catalog", lab, "--joints", "-o", lab / "joints.csv")
+    assert done.returncode == 0, done.stderr
+    assert len(pd.read_csv(lab / "joints.csv")) > 1
+    query = "select robot, count(*) as n from catalog group by robot"
+    assert undulog("catalog", lab, "--sql", query).returncode == 0
+    refused = undulog("catalog", lab, "--sql", query, "--joints")
+    assert refused.returncode == 2
+    assert undulog("catalog", lab / "none").returncode == 1
+
+
+@pytest.mark.slow
+def test_a_bucket_has_the_catalogue_of_a_folder(lab, monkeypatch):
+    local = Catalog(str(lab))
+    local.scan()
+    with s3_bucket(monkeypatch) as client:
+        for path in lab.rglob("*"):
+            if path.is_file() and FOLDER not in path.parts:
+                client.upload_file(os.fspath(path), "robots", path.relative_to(lab).as_posix())
+        catalog = Catalog("s3://robots")
+        assert catalog.scan().read == 4
+        pd.testing.assert_frame_equal(catalog.find(), local.find(), check_dtype=False)
+        assert catalog.scan().read == 0
+        assert catalog.analyse() == {}
+        assert (catalog.find().status == "analysed").all()
