@@ -86,6 +86,7 @@ _EXTRAS = {
     "distributed": "cluster",
     "pyarrow": "parquet",
     "duckdb": "catalog",
+    "statsmodels": "catalog",
 }
 """Optional package to the extra that installs it."""
 

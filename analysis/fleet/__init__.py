@@ -1,0 +1,1 @@
+"""Many sessions of a robot over weeks: change points, variance components, outliers."""
