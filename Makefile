@@ -65,7 +65,7 @@ zoo: $(READY)  ## planted faults, 100 seeds each: is every output right? (SEEDS=
 	PYTHONPATH=tests $(BIN)/python -m zoo.run --seeds $(or $(SEEDS),100)
 
 campaign: $(READY)  ## 50,000 attacks with new seeds, resumable (SEED=1 CASES=2000 for fewer)
-	PYTHONPATH=tests:. $(BIN)/python -m campaign.run $(and $(SEED),--seed $(SEED)) $(and $(CASES),--cases $(CASES))
+	PYTHONPATH=tests:bench:. $(BIN)/python -m campaign.run $(and $(SEED),--seed $(SEED)) $(and $(CASES),--cases $(CASES))
 
 check: $(READY)  ## lint, format, types, layers
 	$(BIN)/ruff check .
@@ -80,7 +80,6 @@ format: $(READY)  ## fix what lint and format can fix
 bench: $(READY)  ## speed, as ratios against named peers
 	$(BIN)/python bench/read_jointstate.py
 	$(BIN)/python bench/limits.py
-	$(BIN)/python bench/wal.py
 	$(BIN)/python bench/durable.py
 	$(BIN)/python bench/sources.py
 	$(BIN)/python bench/record_buses.py

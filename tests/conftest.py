@@ -1,4 +1,4 @@
-"""What display tests share: a Chromium, or a skip that says so."""
+"""Signals and child processes of all tests; fixtures of display tests and of full disks."""
 
 import contextlib
 import ctypes
@@ -26,26 +26,48 @@ ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 def _children():
-    """Processes whose parent this one is; multiprocessing ends its tracker itself."""
+    """Return the running processes whose parent this one is, but for trackers of multiprocessing.
+
+    A tracker is ended by multiprocessing itself.
+    """
+    found = set()
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():
             with contextlib.suppress(OSError):
-                parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-                if parent == os.getpid() and b"tracker" not in (folder / "cmdline").read_bytes():
-                    yield int(folder.name)
+                state, parent = (folder / "stat").read_text().rpartition(")")[2].split()[:2]
+                is_tracker = b"tracker" in (folder / "cmdline").read_bytes()
+                if int(parent) == os.getpid() and state != "Z" and not is_tracker:
+                    found.add(int(folder.name))
+    return found
+
+
+def _end_children(but=frozenset()):
+    """Kill running children; those of a killed one become children of this process."""
+    for _ in range(10):
+        found = _children() - but
+        for pid in found:
+            with contextlib.suppress(OSError):
+                os.kill(pid, signal.SIGKILL)
+                os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)  # left to its Popen object
+        if not found:
+            return
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call():
+    """End the processes that a test started before it failed or was interrupted."""
+    before = _children()
+    try:
+        return (yield)
+    except BaseException:
+        _end_children(before)
+        raise
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish():
-    """End what is still running."""
-    for _ in range(10):  # the children of those that end come here, too
-        found = list(_children())
-        for pid in found:
-            with contextlib.suppress(OSError):
-                os.kill(pid, signal.SIGKILL)
-                os.waitpid(pid, 0)
-        if not found:
-            return
+    """End all processes that still run."""
+    _end_children()
 
 
 REQUIRE = "UNDULOG_REQUIRE_ALL_TESTS"
@@ -58,17 +80,20 @@ def display_tests_required():
     return os.environ.get(REQUIRE, "") not in ("", "0")
 
 
+def _miss(missing, *, required):
+    """Skip, or fail where all tests are required."""
+    if required:
+        pytest.fail(f"{missing}, and {REQUIRE} is set")
+    pytest.skip(f"{missing}; set {REQUIRE}=1 to make this a failure")
+
+
 @pytest.fixture(scope="session")
 def chromium(display_tests_required):
     """Path of a Chromium; skips where there is none, fails where one is required."""
-    for name in NAMES:
-        path = shutil.which(name)
-        if path is not None:
-            return path
+    if path := next(filter(None, map(shutil.which, NAMES)), None):
+        return path
     missing = f"no Chromium on the path (looked for {', '.join(NAMES)})"
-    if display_tests_required:
-        pytest.fail(f"{missing}, and {REQUIRE} is set")
-    pytest.skip(f"{missing}; set {REQUIRE}=1 to make this a failure")
+    return _miss(missing, required=display_tests_required)
 
 
 @pytest.fixture(scope="session")
@@ -77,12 +102,9 @@ def vulkan(display_tests_required):
     folders = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]
     named = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
     drivers = [file for folder in folders for file in folder.glob("*.json")]
-    if ctypes.util.find_library("vulkan") and (drivers or named):
-        return
-    missing = "no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)"
-    if display_tests_required:
-        pytest.fail(f"{missing}, and {REQUIRE} is set")
-    pytest.skip(f"{missing}; set {REQUIRE}=1 to make this a failure")
+    if not (ctypes.util.find_library("vulkan") and (drivers or named)):
+        missing = "no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)"
+        _miss(missing, required=display_tests_required)
 
 
 @pytest.fixture(scope="session")

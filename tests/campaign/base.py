@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2.writer import Writer as RosWriter
 
+from support.twin_chains import snake4
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.log.messages.definitions import schema_text
 from undulog.capture.log.messages.frames import empty_frames
@@ -33,37 +34,13 @@ DBC = 'VERSION ""\nNS_ :\nBS_:\nBU_: A\n' + "".join(
     for base, kind in ((0x100, "command"), (0x200, "state"))
     for number, name in enumerate(JOINTS)
 )
-ROBOT = """
-name = "snake4"
-description = "Four joints."
-clock = "device"
-joints = [
-  { name = "joint01", plane = "horizontal" },
-  { name = "joint02", plane = "vertical" },
-  { name = "joint03", plane = "horizontal" },
-  { name = "joint04", plane = "vertical" },
-]
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-[defaults.joint]
-lower = -0.5235987755982988
-upper = 0.5235987755982988
-[bus]
-databases = ["snake4.dbc"]
-bitrate = 1000000
-""" + "".join(
-    f'[[bus.signals]]\nmessage = "{{joint}}_{message}"\nsignal = "{name}"\ndirection = "{way}"\n'
-    f'target = "{{joint}}"\nquantity = "{quantity}"\nunit = "{unit}"\n'
-    for message, name, way, quantity, unit in (
-        ("command", "position", "tx", "command", "deg"),
-        ("state", "position", "rx", "position", "deg"),
-        ("state", "velocity", "rx", "velocity", "deg/s"),
-        ("state", "current", "rx", "current", "mA"),
-    )
+SIGNALS = (
+    ("command", "position", "tx", "command", "deg"),
+    ("state", "position", "rx", "position", "deg"),
+    ("state", "velocity", "rx", "velocity", "deg/s"),
+    ("state", "current", "rx", "current", "mA"),
 )
+ROBOT = snake4("snake4.dbc", SIGNALS)
 SCENARIO = """
 description = "Four joints on flat ground."
 robot = "snake4.toml"
@@ -137,10 +114,10 @@ class Base:
     """Files that belong together.
 
     Attributes:
-        kind: Which command lines there are for it.
-        name: Of the file, or folder, that a command line names.
+        kind: Key of its command lines.
+        name: File or folder on the command line.
         files: Relative path to content.
-        mutable: The paths that get faults.
+        mutable: Paths in which faults are made.
     """
 
     kind: str
@@ -193,13 +170,8 @@ def foreign_session(path: Path, ticks: int = 240) -> None:
                 for k, name in enumerate(JOINTS[:2]):
                     seconds, rest = divmod(t_ns + k * 1000, 10**9)
                     angle = 0.3 * np.sin(0.25 * tick + k - lag)
-                    message = {
-                        "header": {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": ""},
-                        "name": [name],
-                        "position": [float(angle)],
-                        "velocity": [],
-                        "effort": [],
-                    }
+                    stamp = {"sec": seconds, "nanosec": rest}
+                    message = {"header": {"stamp": stamp}, "name": [name], "position": [angle]}
                     writer.write_message(topic, schema, message, log_time=t_ns)
         writer.finish()
 
@@ -211,29 +183,24 @@ def rewrite(source: Path, path: Path, **options: object) -> None:
         writer = Writer(out, **options)
         writer.start("ros2", "another make")
         schemas, channels = {}, {}
-        for schema, channel, one in reader.iter_messages():
-            if schema.id not in schemas:
-                schemas[schema.id] = writer.register_schema(
-                    schema.name, schema.encoding, schema.data
-                )
+        for kind, channel, one in reader.iter_messages():
+            if kind.id not in schemas:
+                schemas[kind.id] = writer.register_schema(kind.name, kind.encoding, kind.data)
             if channel.id not in channels:
-                channels[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
-                )
-            writer.add_message(
-                channels[channel.id], one.log_time, one.data, one.publish_time, one.sequence
-            )
+                facts = (channel.message_encoding, schemas[kind.id], channel.metadata)
+                channels[channel.id] = writer.register_channel(channel.topic, *facts)
+            times = (one.log_time, one.data, one.publish_time, one.sequence)
+            writer.add_message(channels[channel.id], *times)
         for one in reader.iter_attachments():
             writer.add_attachment(0, EPOCH_NS, one.name, one.media_type, one.data)
         writer.finish()
 
 
 def write_logs(folder: Path, ticks: int = 200) -> dict[str, bytes]:
-    """The session, a foreign one, and what other makes write: name to content.
+    """Write the session, a foreign one, and those of other makes beside the robot's files.
 
-    Args:
-        folder: Has the robot.
-        ticks: Of the session.
+    Returns:
+        File name to content.
     """
     gait, foreign = folder / "gait.mcap", folder / "foreign.mcap"
     gait_session(gait, ticks)
@@ -259,8 +226,8 @@ def can_messages(count: int = 160) -> Iterator[can.Message]:
         )
 
 
-def _trace(path: Path, make: Callable[..., can.Listener] = can.Logger) -> Path:
-    writer = make(str(path))
+def _trace(path: Path) -> Path:
+    writer = can.Logger(str(path))
     for message in can_messages():
         writer.on_message_received(message)
     writer.stop()
@@ -290,26 +257,16 @@ def _files_below(folder: Path) -> dict[str, bytes]:
 
 
 def make_bases(folder: Path, result_of: Callable[[Path], bytes]) -> list[Base]:
-    """Write every base file once.
-
-    Args:
-        folder: An empty folder to work in.
-        result_of: Gives the JSON of ``undulog analyse`` for a session.
-
-    Returns:
-        All of them.
-    """
+    """Write all base files to an empty folder; ``result_of`` analyses a session, as JSON."""
     texts = write_texts(folder)
     logs = write_logs(folder)
     bases = [Base("log", name, {name: data, **texts}, (name,)) for name, data in logs.items()]
-    bases += of_recorder(folder, texts)
-    traces = [folder / f"trace.{kind}" for kind in ("log", "blf", "asc", "trc", "csv", "db")]
-    for path in traces:
-        _trace(path)
-    for path in traces:
+    bases += of_recorder(folder)
+    for kind in ("log", "blf", "asc", "trc", "csv", "db"):
+        path = _trace(folder / f"trace.{kind}")
         files = {path.name: path.read_bytes(), **texts}
         bases.append(Base("trace", path.name, files, (path.name,)))
-    trace = {"trace.log": traces[0].read_bytes(), **texts}
+    trace = {"trace.log": (folder / "trace.log").read_bytes(), **texts}
     of_text = {
         "table": ("table.csv", ("table.csv", "columns.toml")),
         "robot": ("trace.log", ("snake4.toml", "snake4.dbc")),
@@ -324,46 +281,41 @@ def make_bases(folder: Path, result_of: Callable[[Path], bytes]) -> list[Base]:
     return bases
 
 
-def of_recorder(folder: Path, texts: dict[str, bytes]) -> list[Base]:
-    """What a killed recorder leaves, and a session in parts."""
-    work = folder / "recorded"
-    work.mkdir()
-    for name, data in texts.items():
-        (work / name).write_bytes(data)
-    path = work / "run.mcap"
-    sink = DurableSink(path, segment_size=1 << 14, ballast=0)
+def of_recorder(folder: Path) -> list[Base]:
+    """Return the files that a killed recorder leaves, and a session in parts."""
+    work, split = folder / "recorded", folder / "split"
+    for path in (work, split):
+        path.mkdir()
+    texts = write_texts(work)
     robot = load_robot(str(work / "snake4.toml"))
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=robot, sink=sink) as writer:
-        states = writer.joint_state("/joint_states", JOINTS, unit="rad")
-        commands = writer.joint_state("/joint_commands", JOINTS, unit="rad")
-        for tick in range(150):
-            for channel in (states, commands):
-                channel.write(
-                    EPOCH_NS + tick * PERIOD_NS, 0.3 * np.sin([tick / 8 + k for k in range(4)])
-                )
-            if tick == 100:
-                shutil.copytree(work, folder / "unfinished")
-        unfinished = _files_below(folder / "unfinished")
-    split = folder / "split"
-    split.mkdir()
-    sink = DurableSink(split / "run.mcap", segment_size=1 << 16, ballast=0)
-    with SessionWriter(
-        split / "run.mcap", session_id="s", epoch_ns=EPOCH_NS, robot=robot, sink=sink
-    ) as writer:
-        states = writer.joint_state("/joint_states", JOINTS, unit="rad")
-        for tick in range(150):
-            states.write(
-                EPOCH_NS + tick * PERIOD_NS, 0.3 * np.sin([tick / 8 + k for k in range(4)])
-            )
-            if tick in {50, 100}:
-                sink.split()
-    parts = _files_below(split)
+
+    def record(
+        path: Path, size: int, topics: tuple[str, ...], at: Callable[[int, DurableSink], object]
+    ) -> None:
+        sink = DurableSink(path, segment_size=size, ballast=0)
+        with SessionWriter(
+            path, session_id="s", epoch_ns=EPOCH_NS, robot=robot, sink=sink
+        ) as writer:
+            channels = [writer.joint_state(topic, JOINTS, unit="rad") for topic in topics]
+            for tick in range(150):
+                for channel in channels:
+                    angles = 0.3 * np.sin([tick / 8 + k for k in range(4)])
+                    channel.write(EPOCH_NS + tick * PERIOD_NS, angles)
+                at(tick, sink)
+
+    def copy(tick: int, _sink: DurableSink) -> None:
+        if tick == 100:
+            shutil.copytree(work, folder / "unfinished")
+
+    def divide(tick: int, sink: DurableSink) -> None:
+        if tick in {50, 100}:
+            sink.split()
+
+    record(work / "run.mcap", 1 << 14, ("/joint_states", "/joint_commands"), copy)
+    record(split / "run.mcap", 1 << 16, ("/joint_states",), divide)
+    unfinished, parts = _files_below(folder / "unfinished"), _files_below(split)
+    left = tuple(name for name in unfinished if name.startswith("run.mcap"))
     return [
-        Base(
-            "unfinished",
-            "run.mcap",
-            unfinished,
-            tuple(name for name in unfinished if name.startswith("run.mcap")),
-        ),
+        Base("unfinished", "run.mcap", unfinished, left),
         Base("split", next(iter(parts)), {**parts, **texts}, tuple(parts)),
     ]

@@ -82,8 +82,12 @@ class Result:
     skipped: str = ""
 
     def add(self, outcome: Outcome) -> None:
-        """Take what a command's run gives: its failures, and the largest figures."""
+        """Add the failures of a command's run, and keep the largest figures."""
         self.failures += judge(outcome)
+        self.measure(outcome)
+
+    def measure(self, outcome: Outcome) -> None:
+        """Keep the largest processor time and memory."""
         self.at_most("cpu_s", outcome.cpu_s)
         self.at_most("peak_mib", outcome.peak / MIB)
 
@@ -126,10 +130,9 @@ def _be_child(work: Callable[[], int | None], folder: Path, streams: tuple[Path,
             code = end.code if isinstance(end.code, int) else int(end.code is not None)
         except BaseException:  # noqa: BLE001 - each one that gets here is what is looked for
             traceback.print_exc()
-        with contextlib.suppress(OSError, ValueError):
-            sys.stdout.flush()
-        with contextlib.suppress(OSError, ValueError):
-            sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
     finally:
         os._exit(code)
 
@@ -153,18 +156,15 @@ def run_forked(
     stdout: Path | None = None,
     meanwhile: Callable[[int], None] | None = None,
 ) -> Outcome:
-    """Run something in a forked process under limits.
+    """Run a function in a forked process under limits.
 
     Args:
-        work: What to do there.
-        folder: Its working folder; its streams go to files beside it.
-        end_after_s: Send a signal after this time [s].
+        work: The function.
+        folder: Working folder; the streams go to files beside it.
+        end_after_s: Time until a signal is sent [s].
         end_by: That signal.
         stdout: Another standard output, e.g. ``/dev/full``.
-        meanwhile: Called with the process's number while it runs; returns when it may be awaited.
-
-    Returns:
-        What became of it.
+        meanwhile: Called with the process number; the process is awaited when it returns.
     """
     streams = tuple(folder.parent / f"{folder.name}.{name}" for name in ("out", "err"))
     for path in streams:

@@ -63,15 +63,7 @@ COMMANDS: dict[str, list[tuple[float, str]]] = {
 """Kind to command lines and their weights; ``{file}`` is the base's file, faults in it."""
 
 WEIGHTS = {
-    "log": 10,
-    "unfinished": 4,
-    "split": 2,
-    "trace": 6,
-    "table": 2,
-    "robot": 2,
-    "scenario": 2,
-    "plan": 1,
-    "settings": 1,
-    "result": 0.5,
-}
+    "log": 10, "unfinished": 4, "split": 2, "trace": 6, "table": 2, "robot": 2, "scenario": 2,
+    "plan": 1, "settings": 1, "result": 0.5,
+}  # fmt: skip
 """How often each kind comes."""

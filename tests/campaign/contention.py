@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from .case import Result
-from .recording import check_kept, end, recorder, senders
+from .recording import check_kept, end, recorder, senders, start
 from .stage import Stage
 
 RATE = 9000
@@ -29,14 +29,11 @@ def run(seed: int, stage: Stage) -> Result:
     result = Result(f"record 2 x {RATE} frames/s, {per_packet} a packet, all cores busy")
     with stage.fresh() as folder, ExitStack() as stack:
         for words in [*[[sys.executable, "-c", BUSY]] * 4, _syncing(folder)]:
-            process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-            stack.callback(process.wait, 30)
-            stack.callback(process.kill)
+            start(stack, *words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        load = {"rate": RATE, "per_packet": per_packet, "seconds": SECONDS + rng.random()}
         with (
             recorder(folder, ("a", "b")) as running,
-            senders(
-                folder, ("a", "b"), rate=RATE, per_packet=per_packet, seconds=SECONDS + rng.random()
-            ) as sending,
+            senders(folder, ("a", "b"), **load) as sending,
         ):
             ends = [one.result() for one in sending]
             time.sleep(1.0)

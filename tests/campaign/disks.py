@@ -20,14 +20,8 @@ from .recording import check_kept, recorder, senders
 from .stage import Stage
 
 TEXTS = (
-    "log info run.mcap",
-    "log check run.mcap --json",
-    "analyse run.mcap",
-    "info",
-    "sim list",
-    "compare run.mcap other.mcap",
-    "log cut run.mcap -o new.mcap",
-    "--help",
+    *("log info run.mcap", "log check run.mcap --json", "analyse run.mcap", "info", "sim list"),
+    *("compare run.mcap other.mcap", "log cut run.mcap -o new.mcap", "--help"),
 )
 
 
@@ -49,10 +43,9 @@ def disk(place: Path, size: str, *, read_only: bool = False) -> Iterator[bool]:
 def run(seed: int, stage: Stage) -> Result:
     """One command, or the recorder, on a bad disk."""
     rng = random.Random(seed)
-    kind = rng.choices(
-        ["small", "text", "read-only", "vanish", "recorder small", "recorder vanish"],
-        [8, 4, 2, 4, 1, 1],
-    )[0]
+    kinds = {"small": 8, "text": 4, "read-only": 2, "vanish": 4}
+    kinds |= {"recorder small": 1, "recorder vanish": 1}
+    (kind,) = rng.choices(list(kinds), list(kinds.values()))
     with stage.fresh() as folder:
         if kind == "text":
             return _full_terminal(rng.choice(TEXTS), folder, stage)
@@ -79,9 +72,8 @@ def _command(kind: str, folder: Path, rng: random.Random, stage: Stage) -> Resul
     words = shlex.split(line)
     at = words.index("--save" if "--save" in words else "-o") + 1
     name, words[at] = words[at], f"disk/{words[at]}"
-    with disk(
-        folder / "disk", size if kind == "small" else "8m", read_only=kind == "read-only"
-    ) as can:
+    size = size if kind == "small" else "8m"
+    with disk(folder / "disk", size, read_only=kind == "read-only") as can:
         if not can:
             result.skipped = "mounting is not permitted here"
             return result
@@ -147,9 +139,8 @@ def _recorder(kind: str, folder: Path, rng: random.Random) -> Result:
             if code != 1 or b"error:" not in said:
                 result.failures.append(f"full disk: exit code {code}, {said[-200:]!r}")
             (folder / "kept").mkdir()
-            outcome = run_command(
-                ["log", "recover", output, "-o", folder / "kept" / "r.mcap"], folder
-            )
+            words = ["log", "recover", output, "-o", folder / "kept" / "r.mcap"]
+            outcome = run_command(words, folder)
             result.failures += judge(outcome)
             if outcome.code:  # the recording is whole already
                 shutil.copy(output, folder / "kept" / "r.mcap")

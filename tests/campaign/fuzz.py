@@ -11,12 +11,13 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mcap.reader import make_reader
 
@@ -24,6 +25,9 @@ from .base import EPOCH_NS, Base
 from .case import Outcome, Result, front_door, judge, run_forked
 from .commands import COMMANDS, WEIGHTS
 from .mutate import mutate_bytes, mutate_text, remake_database, remake_log
+
+if TYPE_CHECKING:
+    from undulog.capture import Session
 
 RECORDS_FOR_S = 12.0
 """A recorder with mutated settings may have been given an hour: it is ended then [s]."""
@@ -53,14 +57,9 @@ class Case:
         return cls(tuple(fields["words"]), files, fields["ended_after_s"])
 
     def run(self, folder: Path, modules: Path | None = None) -> Outcome:
-        """Lay the files out in an empty folder and run the command there.
+        """Write the files to an empty folder and run the command there.
 
-        Args:
-            folder: The empty folder.
-            modules: A file to list the modules in that it imported.
-
-        Returns:
-            What became of it.
+        The names of the imported modules go to the file ``modules``.
         """
         for name, data in self.files.items():
             path = folder / name
@@ -68,7 +67,7 @@ class Case:
             path.write_bytes(data)
         work = front_door(self.words)
         if self.words[0] == "api":
-            work = partial(read_session, folder / self.words[1])
+            work = partial(try_session, folder / self.words[1])
 
         def listed() -> None:
             try:
@@ -89,10 +88,10 @@ def make_case(seed: int, bases: list[Base], scratch: Path) -> Case:
     line = rng.choices([text for _, text in lines], [weight for weight, _ in lines])[0]
     files = dict(base.files)
     if "gait0.mcap" in line:
-        files["gait0.mcap"] = next(one for one in bases if one.name == "gait.mcap").files[
-            "gait.mcap"
-        ]
-    for name in {rng.choice(base.mutable) for _ in range(rng.choice([1, 1, 1, 2]))}:
+        gait = next(one for one in bases if one.name == "gait.mcap")
+        files["gait0.mcap"] = gait.files["gait.mcap"]
+    names = [rng.choice(base.mutable) for _ in range(rng.choice([1, 1, 1, 2]))]
+    for name in dict.fromkeys(names):  # in this order, whatever the hash seed of the process is
         files[name] = _mutated(files[name], Path(name).suffix, rng, scratch)
     if kind in {"unfinished", "split"} and rng.random() < 0.1:
         del files[rng.choice(base.mutable)]
@@ -114,41 +113,48 @@ def _mutated(data: bytes, suffix: str, rng: random.Random, scratch: Path) -> byt
 
 
 def read_session(path: Path) -> None:
-    """Everything that a session offers; errors of the error tree are answers too."""
+    """Read all parts of a session; errors of the error tree are answers, too."""
     from undulog.capture import Session
     from undulog.capture.common.errors import UndulogError
 
-    def tried(part: Callable[[], object]) -> None:
-        try:
-            part()
-        except UndulogError as error:
-            str(error)
+    with Session(path) as session:
+        for part in session_parts(session):
+            try:
+                part()
+            except UndulogError as error:
+                str(error)
 
-    def read() -> None:
-        with Session(path) as session:
-            window = {"start_ns": EPOCH_NS + 20_000_000, "stop_ns": EPOCH_NS + 50_000_000}
-            tried(lambda: session.robot)
-            tried(lambda: (session.session_id, session.verdict, session.metadata))
-            tried(lambda: session.attachments)
-            tried(lambda: (session.start_ns, session.end_ns, session.duration_s))
-            for topic in session.channels:
-                tried(lambda t=topic: session.table(t))
-                tried(lambda t=topic: sum(1 for _ in session.messages(t)))
-                tried(lambda t=topic: session.frames(t))
-                for name in FIELDS:
-                    tried(lambda t=topic, n=name: session.joints(t, n))
-                tried(lambda t=topic: session.joints(t, **window))
 
-    tried(read)
+def try_session(path: Path) -> None:
+    """Read a session if it can be opened."""
+    from undulog.capture.common.errors import UndulogError
+
+    with contextlib.suppress(UndulogError):
+        read_session(path)
+
+
+def session_parts(session: Session) -> Iterator[Callable[[], object]]:
+    """Yield functions that read one part of a session each."""
+    window = {"start_ns": EPOCH_NS + 20_000_000, "stop_ns": EPOCH_NS + 50_000_000}
+    yield lambda: session.robot
+    yield lambda: (session.session_id, session.verdict, session.metadata)
+    yield lambda: session.attachments
+    yield lambda: (session.start_ns, session.end_ns, session.duration_s)
+    for topic in session.channels:
+        yield partial(session.table, topic)
+        yield partial(session.table, topic, start_ns=EPOCH_NS + 30_000_000)
+        yield lambda t=topic: sum(1 for _ in session.messages(t))
+        yield partial(session.frames, topic)
+        for name in FIELDS:
+            yield partial(session.joints, topic, name)
+        yield partial(session.joints, topic, **window)
 
 
 def check_output(folder: Path) -> list[str]:
     """Each output that a command left under its final name is whole, by mcap's own reader."""
     found = []
     for path in [
-        *folder.glob("new*.mcap"),
-        *folder.glob("new/*.mcap"),
-        *folder.glob("frames.mcap"),
+        one for name in ("new*", "new/*", "frames") for one in folder.glob(f"{name}.mcap")
     ]:
         try:
             with path.open("rb") as stream:
@@ -175,8 +181,7 @@ def run_seed(seed: int, bases: list[Base], folder: Path) -> tuple[Result, Case]:
     case = make_case(seed, bases, folder.parent / "scratch")
     failures, outcome = run_case(case, folder)
     result = Result(" ".join(case.words), failures)
-    result.at_most("cpu_s", outcome.cpu_s)
-    result.at_most("peak_mib", outcome.peak / (1 << 20))
+    result.measure(outcome)
     return result, case
 
 
@@ -195,20 +200,9 @@ def minimise(
     fresh: Callable[[], AbstractContextManager[Path]],
     seconds: float = 40.0,
 ) -> Case:
-    """A smaller case with the same kind of failure, as far as the time allows.
+    """Return a smaller case with the same kind of failure, as far as the time allows.
 
-    Files that aren't needed are left out, faults that aren't needed are undone, then stretches are
-    cut out by halves.
-
-    Args:
-        case: The failing case.
-        kind: Of its failure, see :func:`kind_of`.
-        bases: The whole files.
-        fresh: Gives an empty folder.
-        seconds: How long to try.
-
-    Returns:
-        The smallest case found.
+    Unneeded files are left out, unneeded faults are undone, then parts are cut out by halves.
     """
     deadline = time.monotonic() + seconds
     originals = {(one.name, path): data for one in bases for path, data in one.files.items()}
@@ -246,14 +240,10 @@ def minimise(
 
 
 def warm(cases: Sequence[Case], fresh: Callable[[], AbstractContextManager[Path]]) -> list[str]:
-    """Import here whatever some cases import, so that forked processes needn't.
-
-    Args:
-        cases: Of whole files.
-        fresh: Gives an empty folder.
+    """Import here all modules that some cases import, so that forked processes needn't.
 
     Returns:
-        What is wrong with any of them.
+        Failures of the cases.
     """
     wanted: dict[str, None] = {}
     found = []
@@ -264,9 +254,8 @@ def warm(cases: Sequence[Case], fresh: Callable[[], AbstractContextManager[Path]
             if listing.exists():
                 wanted |= dict.fromkeys(listing.read_text().split("\n"))
         if outcome.code:
-            failures.append(
-                f"exit code {outcome.code}: {outcome.err.decode(errors='replace')[-300:]}"
-            )
+            said = outcome.err.decode(errors="replace")[-300:]
+            failures.append(f"exit code {outcome.code}: {said}")
         found += [f"{' '.join(case.words)}: {fault}" for fault in failures]
     for name in wanted:
         if name not in sys.modules and not name.startswith("__"):

@@ -1,6 +1,6 @@
 """Logs written by hand to take memory or time, or to break a reader's assumptions.
 
-The records are packed here, byte by byte, since no writer would make them.
+The records are packed byte by byte, since no writer would make them.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 
 import lz4.frame
 import zstandard
+from hostile_logs import MAGIC, joint_state, record, text
 
 from undulog.capture.log.messages.definitions import schema_text
 
@@ -22,18 +23,8 @@ from .case import Result, run_command
 from .fuzz import check_output
 from .stage import Stage
 
-MAGIC = b"\x89MCAP0\r\n"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 GIB = 1 << 30
-
-
-def text(value: str | bytes) -> bytes:
-    data = value.encode() if isinstance(value, str) else value
-    return struct.pack("<I", len(data)) + data
-
-
-def record(kind: int, body: bytes) -> bytes:
-    return struct.pack("<BQ", kind, len(body)) + body
 
 
 HEADER = MAGIC + record(1, text("ros2") + text("hand"))
@@ -46,9 +37,8 @@ def schema(number: int = 1, name: str = JOINT_STATE, data: str | None = None) ->
 
 
 def channel(number: int, topic: str, of: int = 1) -> bytes:
-    return record(
-        4, struct.pack("<HH", number, of) + text(topic) + text("cdr") + struct.pack("<I", 0)
-    )
+    head = struct.pack("<HH", number, of)
+    return record(4, head + text(topic) + text("cdr") + struct.pack("<I", 0))
 
 
 def message(number: int, log_ns: int, payload: bytes, sequence: int = 0) -> bytes:
@@ -63,34 +53,18 @@ def chunk(
     return record(6, head + text(kind) + struct.pack("<Q", len(data)) + data)
 
 
-def joint_state(names: list[str], values: list[float], stamp_ns: int = EPOCH_NS) -> bytes:
-    """One JointState as CDR, its velocity and effort empty."""
-    body = bytearray(struct.pack("<iI", *divmod(stamp_ns, 10**9)) + text(b"\0") + b"\0\0\0")
-    body += struct.pack("<I", len(names))
-    for name in names:
-        body += bytes(-len(body) % 4) + text(name.encode() + b"\0")
-    body += bytes(-len(body) % 4) + struct.pack("<I", len(values))
-    body += bytes(-len(body) % 8) + struct.pack(f"<{len(values)}d", *values)
-    body += struct.pack("<II", 0, 0)
-    return b"\0\1\0\0" + bytes(body)
-
-
 PAIR = schema() + channel(1, "/joint_commands") + channel(2, "/joint_states")
 
 
-def sines(ticks: int, jump_ns: int = 0, names: tuple[str, ...] = ("a", "b")) -> Iterator[bytes]:
+def sines(ticks: int, jump_ns: int = 0) -> Iterator[bytes]:
     """Commands and states; the clock jumps once, in the middle."""
     rng = random.Random(1)
     for tick in range(ticks):
         t_ns = EPOCH_NS + tick * PERIOD_NS + (jump_ns if tick >= ticks // 2 else 0)
         for number in (1, 2):
-            values = [
-                0.3 * ((tick * 7 + 3 * k) % 50 / 25 - 1) + rng.gauss(0, 1e-3)
-                for k in range(len(names))
-            ]
-            yield message(
-                number, t_ns % 2**64, joint_state(list(names), values, t_ns % 2**62), tick
-            )
+            values = [0.3 * ((tick * 7 + 3 * k) % 50 / 25 - 1) + rng.gauss(0, 1e-3) for k in (0, 1)]
+            state = joint_state(t_ns % 2**62, ["a", "b"], values)
+            yield message(number, t_ns % 2**64, state, tick)
 
 
 def zeros(size: int, *, stated: bool = True) -> bytes:
@@ -112,18 +86,14 @@ def bomb(*, size: int, declared: int, stated: bool = True, cut: int = 0) -> byte
 
 def lz4_bomb() -> bytes:
     stream = lz4.frame.LZ4FrameCompressor()
-    packed = (
-        stream.begin()
-        + b"".join(stream.compress(bytes(1 << 24)) for _ in range(96))
-        + stream.flush()
-    )
+    parts = [stream.begin(), *(stream.compress(bytes(1 << 24)) for _ in range(96)), stream.flush()]
+    packed = b"".join(parts)
     return HEADER + PAIR + chunk(b"", size=1000, packed=packed, kind="lz4") + END
 
 
 def many_chunks(count: int) -> bytes:
-    return (
-        HEADER + PAIR + chunk(b"", kind="", packed=b"") * count + chunk(b"".join(sines(20))) + END
-    )
+    empty = chunk(b"", kind="", packed=b"") * count
+    return HEADER + PAIR + empty + chunk(b"".join(sines(20))) + END
 
 
 def chunk_indexed(times: int) -> bytes:
@@ -138,7 +108,7 @@ def chunk_indexed(times: int) -> bytes:
 
 def many_channels(count: int, *, joints: bool) -> bytes:
     inside = schema() if joints else schema(1, "std_msgs/msg/String")
-    payload = joint_state(["a"], [0.1]) if joints else b"\0\1\0\0" + text(b"x\0")
+    payload = joint_state(EPOCH_NS, ["a"], [0.1]) if joints else b"\0\1\0\0" + text("x\0")
     for number in range(1, count + 1):
         inside += channel(number, f"/t{number}") + message(number, EPOCH_NS + number, payload)
     return HEADER + chunk(inside) + END
@@ -148,9 +118,9 @@ def many_joints(count: int) -> bytes:
     names, values = [f"j{k}" for k in range(count)], [0.1] * count
     inside = PAIR
     for tick in range(4):
-        payload = joint_state(names, values, EPOCH_NS + tick * PERIOD_NS)
-        inside += message(1, EPOCH_NS + tick * PERIOD_NS, payload)
-        inside += message(2, EPOCH_NS + tick * PERIOD_NS, payload)
+        t_ns = EPOCH_NS + tick * PERIOD_NS
+        payload = joint_state(t_ns, names, values)
+        inside += message(1, t_ns, payload) + message(2, t_ns, payload)
     return HEADER + chunk(inside) + END
 
 
@@ -158,7 +128,8 @@ def many_names() -> bytes:
     """Every message has a joint of its own."""
     inside = PAIR
     for tick in range(20_000):
-        inside += message(1 + tick % 2, EPOCH_NS + tick * 10**6, joint_state([f"j{tick}"], [0.1]))
+        payload = joint_state(EPOCH_NS, [f"j{tick}"], [0.1])
+        inside += message(1 + tick % 2, EPOCH_NS + tick * 10**6, payload)
     return HEADER + chunk(inside) + END
 
 
@@ -172,7 +143,7 @@ def empty_payloads() -> bytes:
 
 
 def counts_that_lie() -> bytes:
-    good = joint_state(["a"], [0.1])
+    good = joint_state(EPOCH_NS, ["a"], [0.1])
     rows = [
         good[:at] + struct.pack("<I", value) + good[at + 4 :]
         for at in range(12, len(good) - 4, 4)
@@ -183,13 +154,8 @@ def counts_that_lie() -> bytes:
 
 
 def schema_of(data: str) -> bytes:
-    return (
-        HEADER
-        + schema(1, "a/msg/B", data)
-        + channel(1, "/joint_states")
-        + message(1, EPOCH_NS, bytes(64))
-        + END
-    )
+    log = HEADER + schema(1, "a/msg/B", data) + channel(1, "/joint_states")
+    return log + message(1, EPOCH_NS, bytes(64)) + END
 
 
 def nested_schema() -> bytes:
@@ -235,20 +201,12 @@ def attached(content: str) -> bytes:
 
 
 READ = (
-    "log info {f}",
-    "log check {f}",
-    "log recover {f} -o new.mcap",
-    "analyse {f}",
+    *("log info {f}", "log check {f}", "log recover {f} -o new.mcap", "analyse {f}"),
     "log cut {f} --start 0 --stop 1 -o new.mcap",
 )
 MORE = (
-    *READ,
-    "log export {f} -o new.csv",
-    "view {f} --save new.rrd",
-    "report {f} -o new.html",
-    "log info {f} --json",
-    "log merge {f} gait.mcap -o new.mcap",
-    "compare {f} gait.mcap",
+    *(*READ, "log export {f} -o new.csv", "view {f} --save new.rrd", "report {f} -o new.html"),
+    *("log info {f} --json", "log merge {f} gait.mcap -o new.mcap", "compare {f} gait.mcap"),
 )
 DAY_NS = 86_400 * 10**9
 LOGS: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
@@ -279,16 +237,9 @@ LOGS: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
     "a robot of 1e308 kg": (lambda: attached(ROBOT.replace("mass = 0.1", "mass = 1e308")), MORE),
 }
 WORDS: dict[str, tuple[str, ...]] = {
-    "a folder": tuple(
-        f"{verb} folder{more}"
-        for verb, more in (
-            ("analyse", ""),
-            ("report", " -o new.html"),
-            ("compare", " gait.mcap"),
-            ("view", " --save new.rrd"),
-            ("log info", ""),
-            ("log check", ""),
-        )
+    "a folder": (
+        *("analyse folder", "report folder -o new.html", "compare folder gait.mcap"),
+        *("view folder --save new.rrd", "log info folder", "log check folder"),
     ),
     "a folder to plan from": (
         "plan lag-sweep --like folder -o new",
@@ -302,14 +253,7 @@ WORDS: dict[str, tuple[str, ...]] = {
         "report gait.mcap -o /proc/n.html",
     ),
     "wrong words": (
-        "--bogus",
-        "--",
-        "log",
-        "",
-        "log info",
-        "log info ''",
-        "sim run ''",
-        "'\x1b[2J'",
+        *("--bogus", "--", "log", "", "log info", "log info ''", "sim run ''", "'\x1b[2J'"),
     ),
     "masses of 1e308": ("sim run heavy.toml -o new.mcap", "drive heavy.toml --on twin -o new.mcap"),
 }
@@ -323,10 +267,11 @@ COUNT = len(LOGS) + len(WORDS)
 def run(seed: int, stage: Stage) -> Result:
     """A hostile log, or hostile words, through one command; each log comes with each in turn."""
     number = seed % 1_000_000
-    names = [*LOGS, *WORDS]
-    name = names[number % len(names)]
+    name = [*LOGS, *WORDS][number % COUNT]
     lines = LOGS[name][1] if name in LOGS else WORDS[name]
-    line = lines[(number + number // len(names) + seed // 1_000_000) % len(lines)]
+    line = lines[(number + number // COUNT + seed // 1_000_000) % len(lines)].format(
+        f="hostile.mcap"
+    )
     with stage.fresh() as folder:
         for path, data in stage.files_of("gait.mcap").items():
             (folder / path).write_bytes(data)
@@ -335,9 +280,8 @@ def run(seed: int, stage: Stage) -> Result:
         (folder / "heavy.toml").write_text(SCENARIO.replace("snake4.toml", "robot.toml"))
         if name in LOGS:
             (folder / "hostile.mcap").write_bytes(_kept(stage, name))
-        words = shlex.split(line.format(f="hostile.mcap"))
-        outcome = run_command(words, folder)
-        result = Result(f"{line.format(f='hostile.mcap')!r}: {name}")
+        outcome = run_command(shlex.split(line), folder)
+        result = Result(f"{line!r}: {name}")
         result.add(outcome)
         result.failures += check_output(folder)
         if name == "constant images" and b"error:" in outcome.err:

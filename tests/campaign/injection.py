@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import random
 import re
@@ -21,34 +22,14 @@ from .mutate import remake_log
 from .stage import Stage
 
 EVIL = [
-    "\x1b]0;owned\x07",
-    "\x1b[2J\x1b[H",
-    "\x1b]52;c;b3duZWQ=\x07",
-    "fine\rerror: forged",
-    "a\nb: good",
-    "\x9b31m",
-    "\u202egnp.exe",
-    "\u2028",
-    "\x00",
-    "\x08\x08\x08",
-    "\x7f",
-    '=HYPERLINK("http://x")',
-    "@SUM(1+1)",
-    "+1+1|cmd",
-    "<script>alert(1)</script>",
-    "<img src=x onerror=alert(1)>",
-    "a|b",
-    "[x](javascript:alert(1))",
-    "`#`",
-    "../../up",
-    "/etc/x",
-    "{{7*7}}",
-    "%s%n",
-    "\ud83d\ude00".encode("utf-16", "surrogatepass").decode("utf-16"),
-    "[bold red]x[/]",
-    "$HOME",
-    "x" * 3000,
-]
+    "\x1b]0;owned\x07", "\x1b[2J\x1b[H", "\x1b]52;c;b3duZWQ=\x07", "fine\rerror: forged",
+    "a\nb: good", "\x9b31m", "\u202egnp.exe", "\u2028", "\x00", "\x08\x08\x08", "\x7f",
+    '=HYPERLINK("http://x")', "@SUM(1+1)", "+1+1|cmd", "<script>alert(1)</script>",
+    "<img src=x onerror=alert(1)>", "a|b", "[x](javascript:alert(1))", "`#`", "../../up",
+    "/etc/x", "{{7*7}}", "%s%n",
+    "\ud83d\ude00".encode("utf-16", "surrogatepass").decode("utf-16"), "[bold red]x[/]",
+    "$HOME", "x" * 3000,
+]  # fmt: skip
 HTML = re.compile(rb"<script>alert\(1\)|<img src=x onerror|href=\"javascript:", re.IGNORECASE)
 TEXTS = ("toml", "dbc", "scenario", "plan", "trace", "columns")
 
@@ -77,31 +58,18 @@ def _evil_session(path: Path, rng: random.Random) -> None:
                 angles = 0.3 * np.sin(0.3 * tick + np.arange(len(names)) - lag)
                 if topic == "/joint_states" and tick > 100:
                     angles[1] = 0.0  # one that stands still has to be named
-                row = {
-                    "header": {"stamp": stamp, "frame_id": evil("f") if tick == 3 else ""},
-                    "name": names,
-                    "position": angles.tolist(),
-                    "velocity": [],
-                    "effort": [],
-                }
+                header = {"stamp": stamp, "frame_id": evil("f") if tick == 3 else ""}
+                row = {"header": header, "name": names, "position": angles.tolist()}
                 writer.write_message(topic, schema, row, log_time=t_ns)
             if tick % 40 == 0:
-                said = {
-                    "stamp": stamp,
-                    "level": 40,
-                    "name": evil("node"),
-                    "msg": evil("text"),
-                    "file": evil("file"),
-                    "function": "",
-                    "line": 0,
-                }
-                writer.write_message("/rosout", events, said, log_time=t_ns)
+                texts = {"name": evil("node"), "msg": evil("text"), "file": evil("file")}
+                event = {"stamp": stamp, "level": 40, **texts}
+                writer.write_message("/rosout", events, event, log_time=t_ns)
         inner = writer._writer
         facts = {evil(key): evil("x") for key in ("session_id", "operator", "notes", "robot", "x")}
         inner.add_metadata("undulog", facts | {"session_id": evil("s")})
-        inner.add_metadata(
-            "undulog.health", {"verdict": evil("good"), "reasons": f'["{evil("r")}"]'}
-        )
+        health = {"verdict": evil("good"), "reasons": f'["{evil("r")}"]'}
+        inner.add_metadata("undulog.health", health)
         inner.add_metadata(evil("name"), {"a": evil("b")})
         inner.add_attachment(0, 0, evil("robot.toml"), evil("text/plain"), b"x")
         writer.finish()
@@ -146,35 +114,27 @@ def run(seed: int, stage: Stage) -> Result:
 def _lay_out(kind: str, folder: Path, rng: random.Random, stage: Stage) -> str:
     """Write the spoilt file; the command line to run on it."""
     trace = folder / "trace.log"
-    trace.write_text(
-        "".join(
-            f"({m.timestamp:.6f}) can0 {m.arbitration_id:03X}#{m.data.hex()}\n"
-            for m in can_messages()
-        )
-    )
+    with trace.open("w") as stream:
+        for m in can_messages():
+            stream.write(f"({m.timestamp:.6f}) can0 {m.arbitration_id:03X}#{m.data.hex()}\n")
     if kind in {"log", "foreign"}:
         name = "evil.mcap"
         if rng.random() < 0.3:
-            name = (
-                "e"
-                + rng.choice([x for x in EVIL if "/" not in x and "\0" not in x and len(x) < 99])
-                + ".mcap"
-            )
+            possible = [x for x in EVIL if "/" not in x and "\0" not in x and len(x) < 99]
+            name = f"e{rng.choice(possible)}.mcap"
         _evil_session(folder / name, rng)
         if kind == "foreign":  # with faults besides, so that errors and warnings name things
-            data = (folder / name).read_bytes()
-            (folder / name).write_bytes(
-                remake_log(data, rng, stage.folder / f"scratch{folder.parent.name}")
-            )
+            scratch = stage.folder / f"scratch{folder.parent.name}"
+            data = remake_log((folder / name).read_bytes(), rng, scratch)
+            (folder / name).write_bytes(data)
         lines = [line for _, line in COMMANDS["log"] if line != "api"]
         return rng.choice(lines).format(file=shlex.quote(name))
     imports = "import trace.log -o new.mcap -r snake4.toml"
     if kind == "toml":
         (folder / "snake4.toml").write_text(_spoil(ROBOT, rng))
     elif kind == "dbc":
-        (folder / "snake4.dbc").write_text(
-            DBC.replace("position", "position" + rng.choice(EVIL), 1)
-        )
+        worse = DBC.replace("position", "position" + rng.choice(EVIL), 1)
+        (folder / "snake4.dbc").write_text(worse)
     elif kind == "scenario":
         (folder / "scenario.toml").write_text(_spoil(SCENARIO + '[x]\ny = "z"\n', rng))
         return "sim run scenario.toml -o new.mcap"
@@ -185,14 +145,12 @@ def _lay_out(kind: str, folder: Path, rng: random.Random, stage: Stage) -> str:
         which = rng.choice(["bus", "text", "id"])
         evil = rng.choice(EVIL)
         old, new = {"bus": ("can0", evil), "text": ("#", evil), "id": ("100#", evil + "#")}[which]
-        trace.write_text(
-            trace.read_text().replace(old, new, rng.choice([1, -1])), "utf-8", "replace"
-        )
+        text = trace.read_text().replace(old, new, rng.choice([1, -1]))
+        trace.write_text(text, "utf-8", "replace")
     else:
         evil = rng.choice(EVIL).replace('"', "")
-        (folder / "table.csv").write_text(
-            f"time,{evil},b\n" + "".join(f"{k},{k},{evil}\n" for k in range(9))
-        )
+        rows = "".join(f"{k},{k},{evil}\n" for k in range(9))
+        (folder / "table.csv").write_text(f"time,{evil},b\n{rows}")
         column = shlex.quote(evil.replace("\0", ""))
         imports = "import table.csv -o new.mcap -r snake4.toml --map time=time:s"
         return f"{imports} --map {column}=joint01.position:deg"
@@ -218,8 +176,7 @@ def _check_pages(folder: Path) -> list[str]:
 
 
 def _is_number(cell: str) -> bool:
-    try:
+    with contextlib.suppress(ValueError):
         float(cell)
-    except ValueError:
-        return False
-    return True
+        return True
+    return False

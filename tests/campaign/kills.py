@@ -125,9 +125,8 @@ def run_recorder(seed: int, stage: Stage) -> Result:
             running.wait(30)
             accepted = [one.accepted_before(killed_ns - 50_000_000) for one in sending]
         (folder / "recovered").mkdir()
-        outcome = run_command(
-            ["log", "recover", folder / "run.mcap", "-o", folder / "recovered" / "r.mcap"], folder
-        )
+        words = ["log", "recover", folder / "run.mcap", "-o", folder / "recovered" / "r.mcap"]
+        outcome = run_command(words, folder)
         result.add(outcome)
         if outcome.code:
             result.failures.append(f"recover: {outcome.err.decode(errors='replace')[-200:]}")

@@ -17,6 +17,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 
 from support.paths import ROOT
+from support.processes import UNDULOG
 
 SENDER = Path(__file__).with_name("sender.py")
 RECORD = 32
@@ -31,34 +32,22 @@ def recorder(
     buses: Sequence[str],
     options: Sequence[str] = (),
     output: Path | None = None,
-    prefix: Sequence[str] = (),
 ) -> Iterator[subprocess.Popen[bytes]]:
     """A recording of what other processes send; what it prints goes to ``recorder.err``."""
     sources = [f"{name}=unix:{folder / name}.sock" for name in buses]
-    command = [
-        *prefix,
-        sys.executable,
-        "-m",
-        "undulog",
-        "record",
-        *sources,
-        *options,
-        "--quiet",
-        "--floor",
-        "0",
-        "--socket",
-        folder / "control.sock",
-        "-o",
-        output or folder / "run.mcap",
-    ]
-    with (folder / "recorder.err").open("wb") as errors:
-        running = subprocess.Popen([str(one) for one in command], stderr=errors, cwd=ROOT)
-    try:
-        yield running
-    finally:
-        if running.poll() is None:
-            running.kill()
-        running.wait(30)
+    command = [*UNDULOG, "record", *sources, *options, "--quiet", "--floor", "0"]
+    command += ["--socket", folder / "control.sock", "-o", output or folder / "run.mcap"]
+    with ExitStack() as stack:
+        errors = stack.enter_context((folder / "recorder.err").open("wb"))
+        yield start(stack, *command, stderr=errors, cwd=ROOT)
+
+
+def start(stack: ExitStack, *command: object, **options: object) -> subprocess.Popen[bytes]:
+    """Start a process that is killed when the stack is closed."""
+    process = subprocess.Popen([str(word) for word in command], **options)
+    stack.callback(process.wait, 30)
+    stack.callback(process.kill)
+    return process
 
 
 @dataclass
@@ -106,18 +95,8 @@ def senders(
         found = []
         for name in buses:
             log = folder / f"{name}.accepted"
-            command = [
-                sys.executable,
-                str(SENDER),
-                str(folder / f"{name}.sock"),
-                str(log),
-                str(rate),
-                str(per_packet),
-                str(seconds),
-            ]
-            process = subprocess.Popen(command, stdout=subprocess.PIPE)
-            stack.callback(process.wait, 30)
-            stack.callback(process.kill)
+            words = (SENDER, folder / f"{name}.sock", log, rate, per_packet, seconds)
+            process = start(stack, sys.executable, *words, stdout=subprocess.PIPE)
             found.append(Sending(name, process, log))
         yield found
 
@@ -132,17 +111,12 @@ def numbers_in(paths: Sequence[Path], bus: str) -> list[int]:
                 data = message.data
                 # The array is the last field: a length before it, then whole records.
                 size = len(data)
-                start = size - RECORD
-                while (
-                    start >= RECORD and struct.unpack_from("<I", data, start - 4)[0] != size - start
-                ):
-                    start -= RECORD
-                if start < size:
-                    rows = data[start:]
-                    found += [
-                        struct.unpack_from("<Q", rows, at + AT_DATA)[0]
-                        for at in range(0, len(rows), RECORD)
-                    ]
+                at = size - RECORD
+                while at >= RECORD and struct.unpack_from("<I", data, at - 4)[0] != size - at:
+                    at -= RECORD
+                rows = data[at:]
+                ends = range(AT_DATA, len(rows), RECORD)
+                found += [struct.unpack_from("<Q", rows, end)[0] for end in ends]
     return found
 
 

@@ -11,36 +11,23 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 from .base import DBC, ROBOT, SCENARIO
-from .case import Result, run_command
+from .case import Outcome, Result, run_command
 from .stage import Stage
 
 PATIENCE_S = 30.0
 MORE = 4
 """So many descriptors more than before may stay: of threads and files opened on the first use."""
 WORDS = (
-    b"< open can0 >",
-    b"< rawmode >",
-    b"< send 123 2 11 F1 >",
-    b"< send 123 8 1 >",
-    b"<>",
-    b"> <",
-    b"< bcmmode >",
-    b"< send 1AAAAAAAA 0 >",
-    b"<" * 5000,
-    b"< send " + b"F" * 100_000,
-    b"\x1b[2J",
-    b'{"do": "status"}\n',
-    b'{"do": "mark", "text": "\\u001b[2J"}\n',
-    b"[" * 20_000 + b"\n",
-    b'{"do": []}\n',
-    b"{" * 9000,
-    b"GET / HTTP/1.1\r\n",
-    b"\0" * 4096,
+    b"< open can0 >", b"< rawmode >", b"< send 123 2 11 F1 >", b"< send 123 8 1 >", b"<>",
+    b"> <", b"< bcmmode >", b"< send 1AAAAAAAA 0 >", b"<" * 5000, b"< send " + b"F" * 100_000,
+    b"\x1b[2J", b'{"do": "status"}\n', b'{"do": "mark", "text": "\\u001b[2J"}\n',
+    b"[" * 20_000 + b"\n", b'{"do": []}\n', b"{" * 9000, b"GET / HTTP/1.1\r\n", b"\0" * 4096,
     b"\xff\xfe\n",
-)
+)  # fmt: skip
 
 
 def _connect(address: tuple[str, int] | str) -> socket.socket:
@@ -169,49 +156,68 @@ def _watched(
     _check_descriptors(result, pid, before)
 
 
+def _attacked(
+    result: Result,
+    folder: Path,
+    words: list[str],
+    *,
+    rng: random.Random,
+    ready: Callable[[], tuple[str, int] | str | None],
+    request: tuple[bytes, Callable[[bytes], bool]],
+    foreign: bool = False,
+    end_by: int = signal.SIGTERM,
+    more: Callable[[int, Callable[[], str]], None] | None = None,
+) -> Outcome:
+    """Run a server under attack.
+
+    Args:
+        result: Receives the failures.
+        folder: The working folder.
+        words: The command line of the server.
+        rng: Generator of the attack.
+        ready: Returns the address as soon as the server listens.
+        request: Bytes that a good client sends, and whether an answer is right.
+        foreign: See :func:`_watched`.
+        end_by: Signal that ends the server.
+        more: A further attack on the process; it gets the good client.
+    """
+
+    def meanwhile(pid: int) -> None:
+        try:
+            good = partial(_answer, _wait(ready), *request)
+            _watched(result, pid, good.args[0], rng, good, foreign=foreign)
+            if more is not None:
+                more(pid, good)
+        except (TimeoutError, ValueError) as error:
+            result.failures.append(f"server: {error}")
+        os.kill(pid, end_by)
+
+    outcome = run_command(words, folder, meanwhile=meanwhile)
+    result.add(outcome)
+    return outcome
+
+
 def serve(result: Result, folder: Path, rng: random.Random) -> None:
     """``sim serve``: the good client gets the robot's frames."""
     (folder / "long.toml").write_text(SCENARIO.replace("duration_s = 0.1", "duration_s = 600.0"))
     out = folder.parent / f"{folder.name}.out"
 
-    def meanwhile(pid: int) -> None:
-        try:
-            ready = _wait(lambda: out.exists() and out.read_bytes().split(b"\n")[0])
-            address = ("127.0.0.1", json.loads(ready)["port"])
-
-            def good() -> str:
-                return _answer(
-                    address, b"< open can0 >< rawmode >", lambda data: b"< frame 20" in data
-                )
-
-            _watched(result, pid, address, rng, good)
-        except (TimeoutError, ValueError) as error:
-            result.failures.append(f"server: {error}")
-        os.kill(pid, signal.SIGTERM)
+    def ready() -> tuple[str, int] | None:
+        line = out.read_bytes().split(b"\n")[0] if out.exists() else b""
+        return ("127.0.0.1", json.loads(line)["port"]) if line else None
 
     words = ["sim", "serve", "long.toml", "--socketcand", "0", "--json"]
-    outcome = run_command(words, folder, meanwhile=meanwhile)
-    result.add(outcome)
+    request = b"< open can0 >< rawmode >", lambda data: b"< frame 20" in data
+    _attacked(result, folder, words, rng=rng, ready=ready, request=request)
 
 
 def control(result: Result, folder: Path, rng: random.Random) -> None:
-    """A recorder's control socket, and its source: status is answered, senders are heard."""
+    """A recorder's control socket, and its source: status is answered, senders are received."""
     path, source = str(folder / "c.sock"), str(folder / "s.sock")
 
-    def meanwhile(pid: int) -> None:
-        try:
-            _wait(lambda: Path(path).exists() and Path(source).exists())
-
-            def good() -> str:
-                return _answer(
-                    path,
-                    b'{"do": "status"}\n',
-                    lambda data: b'"ok":true' in data.replace(b" ", b""),
-                )
-
-            _watched(result, pid, path, rng, good)
-            before = _descriptors(pid)
-            silent = []
+    def silent_senders(pid: int, good: Callable[[], str]) -> None:
+        before = _descriptors(pid)
+        with _closing() as silent:
             for _ in range(100):
                 with suppress(OSError):
                     link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -222,18 +228,17 @@ def control(result: Result, folder: Path, rng: random.Random) -> None:
                     silent.append(link)
             if said := good():
                 result.failures.append(f"locked out: beside {len(silent)} senders: {said}")
-            for link in silent:
-                link.close()
-            _check_descriptors(result, pid, before, " senders")
-        except TimeoutError as error:
-            result.failures.append(f"server: {error}")
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGTERM)
+        _check_descriptors(result, pid, before, " senders")
 
     words = ["record", f"unix:{source}", "--quiet", "--floor", "1MB"]
     words += ["--socket", path, "-o", "new.mcap"]
-    outcome = run_command(words, folder, meanwhile=meanwhile)
-    result.add(outcome)
+    request = b'{"do": "status"}\n', lambda data: b'"ok":true' in data.replace(b" ", b"")
+
+    def ready() -> str | None:
+        return path if Path(path).exists() and Path(source).exists() else None
+
+    how = {"rng": rng, "ready": ready, "request": request}
+    outcome = _attacked(result, folder, words, **how, more=silent_senders)
     if outcome.code != 0:
         result.failures.append(f"recorder: exit code {outcome.code}: {outcome.err[-200:]!r}")
 
@@ -243,24 +248,14 @@ def viewer(result: Result, folder: Path, rng: random.Random, stage: Stage) -> No
     (folder / "gait.mcap").write_bytes(stage.files_of("gait.mcap")["gait.mcap"])
     out = folder.parent / f"{folder.name}.out"
 
-    def meanwhile(pid: int) -> None:
-        try:
-            found = _wait(
-                lambda: out.exists() and re.search(rb"127\.0\.0\.1:(\d+)", out.read_bytes())
-            )
-            address = ("127.0.0.1", int(found.group(1)))
-            request = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    def ready() -> tuple[str, int] | None:
+        found = out.exists() and re.search(rb"127\.0\.0\.1:(\d+)", out.read_bytes())
+        return ("127.0.0.1", int(found.group(1))) if found else None
 
-            def good() -> str:
-                return _answer(address, request, lambda data: data.startswith(b"HTTP/1"))
-
-            _watched(result, pid, address, rng, good, foreign=True)
-        except TimeoutError as error:
-            result.failures.append(f"server: {error}")
-        os.kill(pid, signal.SIGINT)
-
-    outcome = run_command(["view", "gait.mcap", "--web"], folder, meanwhile=meanwhile)
-    result.add(outcome)
+    words = ["view", "gait.mcap", "--web"]
+    page = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    how = {"rng": rng, "ready": ready, "request": (page, lambda data: data.startswith(b"HTTP/1"))}
+    _attacked(result, folder, words, **how, foreign=True, end_by=signal.SIGINT)
 
 
 ATTACKS = ("sim serve", "record", "view --web")

@@ -8,17 +8,9 @@ import subprocess
 import time
 
 FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-dev-shm-usage",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-default-apps",
-    "--disable-extensions",
-    "--disable-sync",
-    "--hide-scrollbars",
+    *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),
+    *("--no-first-run", "--disable-background-networking", "--disable-component-update"),
+    *("--disable-default-apps", "--disable-extensions", "--disable-sync", "--hide-scrollbars"),
 )
 WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """Drawing on the processor, for pages that take a graphics card."""
@@ -34,13 +26,12 @@ class Browser:
         # The protocol is spoken on descriptors 3 (to Chromium) and 4 (from it).
         shell = f'exec 3<&{fd} 4>&{fd}; exec "$@"'
         arguments = [path, *flags, "--remote-debugging-pipe", f"--user-data-dir={profile}"]
+        silent = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
         self._process = subprocess.Popen(
             ["bash", "-c", shell, "bash", *arguments, "about:blank"],
             pass_fds=(fd,),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
             start_new_session=True,
+            **silent,
         )
         theirs.close()
         self._buffer = b""
@@ -79,13 +70,8 @@ class Browser:
 
     def open(self, url, *, width=1280, height=900, dark=False, media=""):
         """Load a page and wait until it is drawn; forgets earlier events."""
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=1,
-            mobile=width < 600,
-        )
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", media=media, features=[scheme])
         self.events = []

@@ -9,11 +9,26 @@ import sys
 import threading
 import time
 
-from support.processes import wait_for
+from support.processes import start, wait_for
 from undulog.capture.common.errors import DataError
 from undulog.capture.recorder.control import LATER
 
 PATIENCE_S = 60.0
+RECORDER = """
+import sys, time
+from pathlib import Path
+from undulog.capture.recorder.control import ControlServer
+from undulog.capture.common.errors import ControlError
+{extra}
+try:
+    server = ControlServer(Path({path!r}), lambda request: {{}})
+except ControlError as error:
+    sys.exit(print(error, flush=True))
+print('ready', flush=True)
+while True:
+    server.poll()
+    time.sleep(0.005)
+"""
 
 
 def echo(request):
@@ -85,24 +100,8 @@ def drain(server, client, count):
 
 def start_recorder(path, extra=""):
     """A process that serves the socket until it is killed; says 'ready' or why not."""
-    code = (
-        "import sys, time\n"
-        "from pathlib import Path\n"
-        "from undulog.capture.recorder.control import ControlServer\n"
-        "from undulog.capture.common.errors import ControlError\n"
-        f"{extra}\n"
-        "try:\n"
-        f"    server = ControlServer(Path({str(path)!r}), lambda request: {{}})\n"
-        "except ControlError as error:\n"
-        "    sys.exit(print(error, flush=True))\n"
-        "print('ready', flush=True)\n"
-        "while True:\n"
-        "    server.poll()\n"
-        "    time.sleep(0.005)\n"
-    )
-    return subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True
-    )
+    code = RECORDER.format(extra=extra, path=str(path))
+    return start(sys.executable, "-c", code, stdin=subprocess.PIPE, stderr=None)
 
 
 def end(process):

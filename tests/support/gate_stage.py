@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from support.processes import UNDULOG, process, serving, wait_for
+from support.twin_chains import snake4
 from support.written_sessions import write_commands
 from undulog.capture import load_robot
 
@@ -46,31 +47,6 @@ SAFETY = {
     "on_fault": '"ramp-down"',
 }
 
-ROBOT = """
-name = "snake4"
-description = "Four joints of snake25, two a plane."
-clock = "device"
-joints = [
-  { name = "joint01", plane = "horizontal" },
-  { name = "joint02", plane = "vertical" },
-  { name = "joint03", plane = "horizontal" },
-  { name = "joint04", plane = "vertical" },
-]
-
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-
-[defaults.joint]
-lower = -0.5235987755982988
-upper = 0.5235987755982988
-
-[bus]
-databases = ["snake25.dbc"]
-bitrate = 1000000
-"""
 SIGNALS = (
     ("command", "position", "tx", "command", "deg"),
     ("state", "position", "rx", "position", "deg"),
@@ -93,13 +69,7 @@ def robot_files(folder, *, safety=SAFETY):
     """Write the small robot and a scenario for it; returns (robot file, scenario file)."""
     folder.mkdir(exist_ok=True)
     (folder / "snake25.dbc").write_text(dict(load_robot("snake25").databases)["snake25.dbc"])
-    text = ROBOT
-    for message, name, direction, quantity, unit in SIGNALS:
-        text += (
-            f'[[bus.signals]]\nmessage = "{{joint}}_{message}"\nsignal = "{name}"\n'
-            f'direction = "{direction}"\ntarget = "{{joint}}"\nquantity = "{quantity}"\n'
-            f'unit = "{unit}"\n'
-        )
+    text = snake4("snake25.dbc", SIGNALS)
     if safety:
         text += "[safety]\n" + "".join(f"{key} = {value}\n" for key, value in safety.items())
     robot, scenario = folder / "snake4.toml", folder / "short.toml"

@@ -2,36 +2,8 @@
 
 import json
 
-ROBOT = """name = "chain"
-description = "Yaw joints."
-clock = "simulated"
-assumed = ["links", "servo"]
-[chain]
-joints = 3
-planes = ["horizontal"]
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-[defaults.servo]
-stall_torque = 0.3
-gear_stiffness = 12.0
-gear_damping = 0.008
-"""
-SCENARIO = """description = "A wave on the ground."
-robot = "chain.toml"
-duration_s = 2.0
-settle_s = 0.5
-[noise]
-position = 0.001
-[gait]
-ramp_s = 0.25
-[gait.horizontal]
-amplitude = 0.3
-frequency_hz = 2.0
-lag = 1.0
-"""
+from support import twin_chains
+
 STRENGTHS = """scenario = "wave.toml"
 seeds = {seeds}
 {top}
@@ -41,9 +13,18 @@ values = {values}
 
 
 def write_plan(folder, values=(0.2, 0.3), seeds=1, top="", name="plan.toml"):
-    """A plan over the servos' strength, with its scenario and robot; returns its path."""
-    (folder / "chain.toml").write_text(ROBOT)
-    (folder / "wave.toml").write_text(SCENARIO)
+    """Write a plan over the servos' strength, with its scenario and robot; return its path."""
+    servo = {"stall_torque": 0.3, "gear_stiffness": 12.0, "gear_damping": 0.008}
+    robot = twin_chains.chain(3, planes=["horizontal"], **servo)
+    scenario = twin_chains.wave(
+        duration_s=2.0,
+        settle_s=0.5,
+        gait={"ramp_s": 0.25},
+        horizontal={"amplitude": 0.3, "frequency_hz": 2.0, "lag": 1.0},
+        noise={"position": 0.001},
+    )
+    (folder / "chain.toml").write_text(robot)
+    (folder / "wave.toml").write_text(scenario)
     path = folder / name
     path.write_text(STRENGTHS.format(values=list(values), seeds=seeds, top=top))
     return path

@@ -1,4 +1,4 @@
-"""What the tests on twins share: short chains and their scenarios, as TOML text.
+"""Short robots and their scenarios, as TOML text.
 
 Joints and servos are as the robot description has them by default, which are those of snake25.
 """
@@ -47,3 +47,36 @@ def wave(*, duration_s, settle_s, gait=None, horizontal=None, **tables):
             **tables,
         }
     )
+
+
+def snake4(database, signals):
+    """Return a robot of four joints; signals: (message, signal, direction, quantity, unit)."""
+    return SNAKE4.format(database=database) + "".join(
+        f'[[bus.signals]]\nmessage = "{{joint}}_{message}"\nsignal = "{name}"\n'
+        f'direction = "{way}"\ntarget = "{{joint}}"\nquantity = "{quantity}"\nunit = "{unit}"\n'
+        for message, name, way, quantity, unit in signals
+    )
+
+
+SNAKE4 = """
+name = "snake4"
+description = "Four joints."
+clock = "device"
+joints = [
+  {{ name = "joint01", plane = "horizontal" }},
+  {{ name = "joint02", plane = "vertical" }},
+  {{ name = "joint03", plane = "horizontal" }},
+  {{ name = "joint04", plane = "vertical" }},
+]
+[defaults.link]
+length = 0.06
+radius = 0.025
+mass = 0.1
+inertia = [4e-5, 5e-5, 5e-5]
+[defaults.joint]
+lower = -0.5235987755982988
+upper = 0.5235987755982988
+[bus]
+databases = ["{database}"]
+bitrate = 1000000
+"""

@@ -5,38 +5,8 @@ import json
 import numpy as np
 
 import undulog as front
+from support import twin_chains
 from undulog.capture import Session, SessionWriter
-
-ROBOT = """name = "chain"
-description = "Yaw joints."
-clock = "simulated"
-assumed = ["links", "servo"]
-[chain]
-joints = {joints}
-planes = ["horizontal"]
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-[defaults.servo]  # of the data sheet
-stall_torque = 0.3
-gear_stiffness = 12.0
-gear_damping = 0.008
-"""
-WORLD = """description = "A wave on the ground."
-robot = "robot.toml"
-duration_s = {duration}
-settle_s = 1.5
-[noise]
-position = {noise}
-[gait]
-ramp_s = 0.5
-[gait.horizontal]
-amplitude = {amplitude}
-frequency_hz = {frequency_hz}
-lag = 1.0
-"""
 
 
 def room_for(folder, joints, duration, hidden, *, noise=0.005, gait=(0.4, 1.0), seed=2):
@@ -44,10 +14,17 @@ def room_for(folder, joints, duration, hidden, *, noise=0.005, gait=(0.4, 1.0), 
 
     The checks whether a twin fits have a level of 5 %: one noise in twenty is taken for a misfit.
     """
-    (folder / "robot.toml").write_text(ROBOT.format(joints=joints))
+    servo = {"stall_torque": 0.3, "gear_stiffness": 12.0, "gear_damping": 0.008}  # data sheet
+    robot = twin_chains.chain(joints, planes=["horizontal"], **servo)
+    (folder / "robot.toml").write_text(robot)
     amplitude, frequency_hz = gait
-    world = WORLD.format(
-        duration=duration, noise=noise, amplitude=amplitude, frequency_hz=frequency_hz
+    world = twin_chains.wave(
+        robot="robot.toml",
+        duration_s=duration,
+        settle_s=1.5,
+        gait={"ramp_s": 0.5},
+        horizontal={"amplitude": amplitude, "frequency_hz": frequency_hz, "lag": 1.0},
+        noise={"position": noise},
     )
     (folder / "nominal.toml").write_text(world)
     (folder / "hidden.toml").write_text(world + hidden)

@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from .planting import FAULTS, GAIN, OFFSET, RESPONSE, fault, hold
+from .planting import FAULTS, GAIN, OFFSET, RESPONSE, fault, hold, single
 from .responding import clipped, weak
 from .robot import Change
+from .sensing import misled
 from .standing import again
-from .truth import PAUSED, STOPPED, JointTruth, Truth, either, standing
+from .truth import PAUSED, STOPPED, Truth, either, standing
 
 
 @fault("jam that comes loose again")
@@ -17,18 +18,16 @@ def _(robot, rng, j):
     acts = (t >= start) & (t < start + rng.uniform(0.25, 0.4) * robot.duration_s)
     change = Change(j, position=hold(robot.moved(j), acts))
     kinds = again(standing(robot.channels, "pushing"))
-    names = frozenset({"jammed", "stalled", "intermittent"})
-    return (change,), Truth((JointTruth(j, names, kinds, since_s=start),))
+    return single(change, {"jammed", "stalled", "intermittent"}, kinds, since_s=start)
 
 
 @fault("single samples read zero")
 def _(robot, rng, j):
     """Samples of the position are zero at random."""
     lost = rng.random(len(robot.t_s)) < rng.uniform(0.02, 0.1)
+    change = Change(j, reading=lambda read: np.where(lost, 0.0, read))
     kinds = frozenset({"noisy_sensor", "lost_samples"})
-    return (Change(j, reading=lambda read: np.where(lost, 0.0, read)),), Truth(
-        (JointTruth(j, kinds, kinds | {"wrapped_sensor"}, compared=False),)
-    )
+    return single(change, kinds, kinds | {"wrapped_sensor"}, compared=False)
 
 
 @fault("sensor clipped at the end of its range")
@@ -39,21 +38,20 @@ def _(robot, rng, j):
     kinds = clipped(robot) | {"clipped_sensor"}
     if not robot.channels.second:
         kinds |= STOPPED | PAUSED
-    return (
-        Change(j, reading=lambda read: about + side * np.minimum(side * (read - about), level)),
-    ), Truth((JointTruth(j, frozenset({"clipped_sensor"}), kinds, GAIN | OFFSET, checked=False),))
+    change = Change(j, reading=lambda read: about + side * np.minimum(side * (read - about), level))
+    return single(change, {"clipped_sensor"}, kinds, stands_out=GAIN | OFFSET, checked=False)
 
 
 @fault("follows its neighbour's command")
 def _(robot, rng, j):
     """The position is in step with the joint beside it."""
     other = j + 1 if j + 1 < robot.m else j - 1
-    change = Change(j, position=robot.moved(j, of=other), wanted=robot.wanted(other, at=j))
     kinds = frozenset({"swapped"})
     apart = np.angle(np.exp(1j * (robot.phase[other] - robot.phase[j])))
     if abs(apart) > np.radians(120):  # as good as inverted
         kinds |= either(robot.channels, "inverted", "inverted_sensor", cause="inverted")
-    return (change,), Truth((JointTruth(j, kinds, kinds, RESPONSE | OFFSET, checked=False),))
+    change = misled(robot, j, other)
+    return single(change, kinds, stands_out=RESPONSE | OFFSET, checked=False)
 
 
 @fault("off by a whole turn from the beginning")
@@ -63,9 +61,8 @@ def _(robot, rng, j):
     kinds = frozenset({"wrapped_sensor"})
     if not robot.channels.second:
         kinds |= {"slipped"}
-    return (Change(j, reading=lambda read: read + turn),), Truth(
-        (JointTruth(j, kinds, kinds | {"slipped_sensor"}, OFFSET, checked=False),)
-    )
+    change = Change(j, reading=lambda read: read + turn)
+    return single(change, kinds, kinds | {"slipped_sensor"}, stands_out=OFFSET, checked=False)
 
 
 def _both(first: str, second: str):

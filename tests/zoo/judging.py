@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,30 +41,19 @@ def named_in(text: str, names: Sequence[str]) -> list[str]:
     """Joints whose names a text contains as whole words, in order of their first place."""
     found: dict[str, int] = {}
     for name in names:
-        place = re.search(rf"(?<![\w/]){re.escape(name)}(?![\w/])", text)
-        if place is not None:
-            found[name] = place.start()
+        if match := re.search(rf"(?<![\w/]){re.escape(name)}(?![\w/])", text):
+            found[name] = match.start()
     return sorted(found, key=found.__getitem__)
 
 
 def judge(output: str, said: Statement, truth: Truth, robot: Robot) -> Judgement:
-    """Judge what an output says.
-
-    Args:
-        output: Its name.
-        said: What it says.
-        truth: What was planted.
-        robot: The robot.
-
-    Returns:
-        The judgement.
-    """
+    """Judge the statement of an output against the planted truth."""
     if said.error:
         return Judgement((f"error: {said.error}",))
     planted = {robot.names[one.joint]: one for one in truth.joints}
     expected = [name for name, one in planted.items() if _must_name(output, one)]
     first = named_in(said.text, robot.names)
-    listed = [*(said.not_following or {}), *(said.stands_out or {})]
+    listed = [*(said.not_following or ()), *(said.stands_out or ())]
     sound = tuple(dict.fromkeys(n for n in [*listed, *first] if n not in planted))
     if truth.undecided and output != "compare":
         return _undecided(said, [*listed, *first])
@@ -79,11 +68,10 @@ def judge(output: str, said: Statement, truth: Truth, robot: Robot) -> Judgement
     if not planted and output == "log check" and not said.alike:
         missing.append("calls a healthy bag less than good")
     narrow = False
-    if said.not_following is not None:
-        for name, one in planted.items():
-            wrong, few = _of_joint(name, one, said, robot)
-            missing += wrong
-            narrow |= few
+    for name, one in planted.items() if said.not_following is not None else ():
+        wrong, few = _of_joint(name, one, said, robot)
+        missing += wrong
+        narrow |= few
     return Judgement(tuple(missing), sound, narrow)
 
 
@@ -141,8 +129,3 @@ def _onset(name: str, truth: JointTruth, since_s: float | None, robot: Robot) ->
 
 def _listed(words: frozenset[str], by: str = ", ") -> str:
     return by.join(sorted(words))
-
-
-def judge_all(said: Mapping[str, Statement], truth: Truth, robot: Robot) -> dict[str, Judgement]:
-    """Judge every output of a session."""
-    return {output: judge(output, one, truth, robot) for output, one in said.items()}

@@ -1,4 +1,4 @@
-"""What undulog says of a bag, output by output: the only module here that imports it."""
+"""Outputs of undulog on a bag or on arrays: the only module here that imports it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
 
+import numpy as np
+
 from undulog.analysis.compare.compare import Choices, compare_sessions
 from undulog.analysis.present.page.page import render
 from undulog.analysis.results.answer import Answer
@@ -15,11 +17,13 @@ from undulog.analysis.session.analyse import analyse_session
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session
 from undulog.capture.common.errors import UndulogError
+from undulog.capture.following.find import joints_not_following
+from undulog.capture.following.motion import JointMotion, Samples
 from undulog.capture.log.health.session_check import check_session
 from undulog.replay.draw.facts import markdown
 from undulog.replay.samples.content import Content
 
-from .robot import SECOND_TOPIC
+from .robot import SECOND_TOPIC, Log
 
 OUTPUTS = ("answer", "log check", "compare", "page", "rerun")
 EMPTY = Content(None, None, None, None, (), (), (), False, (), (), 0, False, ())
@@ -62,27 +66,20 @@ class Statement:
 def statements(
     path: Path, healthy: Path | None, *, second: bool, outputs: tuple[str, ...] = OUTPUTS
 ) -> dict[str, Statement]:
-    """Run undulog on a bag.
+    """Return the statement of each output on a bag.
 
     Args:
         path: The bag.
-        healthy: A healthy session of the same robot, for ``compare``; None goes without.
+        healthy: A healthy session of the same robot, for ``compare``; None: no comparison.
         second: Whether the bag has a second sensor.
-        outputs: Those that are wanted.
-
-    Returns:
-        By output.
+        outputs: Names of the outputs.
     """
     options = Options(reference_topic=SECOND_TOPIC if second else None)
-    found: dict[str, Statement] = {}
     try:
-        found |= _analysed(path, options, outputs)
+        found = _analysed(path, options, outputs)
     except UndulogError as error:
-        found |= {
-            name: Statement("", error=str(error))
-            for name in ("answer", "page", "rerun")
-            if name in outputs
-        }
+        names = {"answer", "page", "rerun"} & set(outputs)
+        found = {name: Statement("", error=str(error)) for name in names}
     if "log check" in outputs:
         health = check_session(path)
         found["log check"] = Statement("\n".join(health.reasons), alike=health.verdict == "good")
@@ -108,11 +105,7 @@ def _analysed(path: Path, options: Options, outputs: tuple[str, ...]) -> dict[st
 
 
 def structured(answer: Answer) -> Statement:
-    """The answer with its lists.
-
-    Args:
-        answer: An answer.
-    """
+    """Return the statement of an answer, with its lists."""
     quantities: dict[str, frozenset[str]] = {}
     for one in answer.stand_out:
         quantities[one.joint] = quantities.get(one.joint, frozenset()) | {one.quantity}
@@ -123,6 +116,34 @@ def structured(answer: Answer) -> Statement:
         answer.undecided is not None,
         bool(answer.alike),
     )
+
+
+def detected(log: Log) -> Statement:
+    """Return the joints that do not follow by the detection alone, on arrays: no bag, no answer."""
+    robot = log.robot
+    sent = robot.sent()
+
+    def samples(columns: np.ndarray | None, j: int) -> Samples | None:
+        if columns is None:
+            return None
+        kept = np.isfinite(columns[:, j])
+        return Samples(robot.t_s[kept, j], columns[kept, j])
+
+    motions = [
+        JointMotion(
+            name,
+            Samples(robot.sent_s, sent[:, j]),
+            samples(log.position, j),
+            velocity=samples(log.velocity, j),
+            effort=samples(log.effort, j),
+            reference=samples(log.second, j),
+        )
+        for j, name in enumerate(robot.names)
+    ]
+    found = {
+        one.joint: Named(frozenset(one.kinds), one.since_s) for one in joints_not_following(motions)
+    }
+    return Statement(" ".join(found), found)
 
 
 def _compared(healthy: Path, path: Path, options: Options) -> Statement:

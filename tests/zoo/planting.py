@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from .robot import MARGIN_GAIN, MARGIN_RAD, Change, Channels, Robot
-from .truth import Truth
+from .truth import JointTruth, Truth
 
 Generator = np.random.Generator
+Kinds = frozenset[str]
 Planted = tuple[tuple[Change, ...], Truth]
 
 
@@ -24,12 +25,10 @@ class Fault:
     """One kind of planted fault.
 
     Attributes:
-        name: Its name.
-        plant: From robot, generator and joint to the changes and the truth.
+        plant: Returns the changes and the truth for a robot, a generator and a joint.
         place: ``head``, ``middle``, ``tail`` or None: anywhere.
-        channels: Those it needs; None: any.
+        channels: Required channels; None: any.
         joints: Least and most joints, or None.
-        cycles: Least cycles that the session must have.
     """
 
     name: str
@@ -41,11 +40,7 @@ class Fault:
 
 FAULTS: dict[str, Fault] = {}
 
-WITH_EFFORT = (
-    Channels(effort=True),
-    Channels(velocity="derived", effort=True),
-    Channels(velocity="true", effort=True),
-)
+WITH_EFFORT = tuple(Channels(velocity, effort=True) for velocity in (None, "derived", "true"))
 GAIN, LAG, OFFSET = (frozenset({word}) for word in ("gain", "lag", "offset"))
 RESPONSE = GAIN | LAG
 
@@ -60,50 +55,45 @@ def fault(name, **more):
     return register
 
 
-def where(fault: Fault, robot: Robot, rng: Generator) -> int:
-    """The joint at which a fault is planted."""
-    anywhere = int(rng.integers(robot.m))
-    places = {"head": 0, "middle": robot.m // 2, "tail": robot.m - 1}
-    return anywhere if fault.place is None else places[fault.place]
+def single(change: Change, names: Kinds = frozenset(), allowed: Kinds | None = None, **truth):
+    """Return the change of one joint with its truth; ``allowed`` is ``names`` by default."""
+    names = frozenset(names)
+    of_joint = JointTruth(change.joint, names, names if allowed is None else allowed, **truth)
+    return (change,), Truth((of_joint,))
 
 
 def plant(fault: Fault, robot: Robot, seed: int) -> Planted:
-    """Plant a fault.
-
-    Args:
-        fault: The fault.
-        robot: The healthy robot.
-        seed: Of place, size and time.
-
-    Returns:
-        The changes and the truth.
-    """
+    """Plant a fault in a healthy robot; the seed determines place, size and time."""
     rng = np.random.default_rng([seed, 3])
-    return fault.plant(robot, rng, where(fault, robot, rng))
+    anywhere = int(rng.integers(robot.m))
+    places = {"head": 0, "middle": robot.m // 2, "tail": robot.m - 1}
+    return fault.plant(robot, rng, places.get(fault.place, anywhere))
 
 
-def relative(robot: Robot, j: int, rng: Generator, most: float, share: float = 1.0) -> float:
-    """A relative size of gain, or of lag in rad, of three half intervals or more."""
-    half = robot.half(j, len(robot.t_s) * share)[0]
-    least = max(3 * half, MARGIN_GAIN + 2 * half) / share
-    return float(np.exp(rng.uniform(np.log(least), np.log(max(most, 2 * least)))))
+def relative(robot: Robot, j: int, rng: Generator, most: float) -> float:
+    """Draw a relative size of gain, or of lag in rad, of three half intervals or more."""
+    return _size(robot.half(j)[0], MARGIN_GAIN, rng, most)
 
 
 def offset(robot: Robot, j: int, rng: Generator, most: float, share: float = 1.0) -> float:
-    half = robot.half(j, len(robot.t_s) * share)[1]
-    least = max(3 * half, MARGIN_RAD + 2 * half) / share
-    size = float(np.exp(rng.uniform(np.log(least), np.log(max(most, 2 * least)))))
+    """Draw an offset [rad] of three half intervals or more; it acts for a share of the time."""
+    size = _size(robot.half(j, len(robot.t_s) * share)[1], MARGIN_RAD, rng, most, share)
     return float(rng.choice([-1.0, 1.0])) * size
 
 
+def _size(half: float, margin: float, rng: Generator, most: float, share: float = 1.0) -> float:
+    least = max(3 * half, margin + 2 * half) / share
+    return float(np.exp(rng.uniform(np.log(least), np.log(max(most, 2 * least)))))
+
+
 def onset(robot: Robot, j: int, rng: Generator, low: float = 0.25, high: float = 0.7):
-    """Time of an onset [s], and where it acts, shape (n,)."""
+    """Draw the time of an onset [s]; return it and when the fault acts, shape (n,)."""
     start = float(rng.uniform(low, high)) * robot.duration_s
     return start, robot.t_s[:, j] >= start
 
 
 def hold(values: np.ndarray, acts: np.ndarray) -> np.ndarray:
-    """Values that stay, while something acts, what they were when it began."""
+    """Return values that stay constant while a fault acts, as they were when it began."""
     index = np.arange(len(values))
     begins = acts & ~np.concatenate(([False], acts[:-1]))
     last = np.maximum.accumulate(np.where(begins | ~acts, index, 0))
@@ -111,7 +101,7 @@ def hold(values: np.ndarray, acts: np.ndarray) -> np.ndarray:
 
 
 def bouts(robot: Robot, j: int, rng: Generator, share: float) -> np.ndarray:
-    """Where something acts for a share of the time, in bouts of a cycle or so, shape (n,)."""
+    """Return when a fault acts for a share of the time, in bouts of about a cycle, shape (n,)."""
     period = 2 * np.pi / robot.omega
     count = max(2, round(share * robot.duration_s / period))
     long = share * robot.duration_s / count

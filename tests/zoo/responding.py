@@ -2,20 +2,19 @@
 
 import numpy as np
 
-from .planting import GAIN, LAG, OFFSET, RESPONSE, fault, offset, onset, relative
+from .planting import GAIN, LAG, OFFSET, RESPONSE, fault, offset, onset, relative, single
 from .robot import MARGIN_GAIN, MARGIN_RAD, Change
-from .truth import LOADED, PAUSED, STOPPED, JointTruth, Truth
+from .truth import LOADED, PAUSED, STOPPED
 
 
-def _responds(j, quantities, **more):
-    more = {"checked": False} | more
-    return Truth((JointTruth(j, stands_out=quantities, **more),))
+def _responds(j, position, quantities):
+    return single(Change(j, position=position), stands_out=quantities, checked=False)
 
 
 def weak(robot, rng, j):
     """The position is smaller."""
     size = min(relative(robot, j, rng, 0.5), 0.6)
-    return (Change(j, position=robot.moved(j, gain=1 - size)),), _responds(j, GAIN)
+    return _responds(j, robot.moved(j, gain=1 - size), GAIN)
 
 
 for _place in ("head", "middle", "tail", None):
@@ -28,21 +27,21 @@ fault("gain less, of forty", joints=(40, 40))(weak)
 def _(robot, rng, j):
     """The position is larger."""
     size = relative(robot, j, rng, 0.4)
-    return (Change(j, position=robot.moved(j, gain=1 + size)),), _responds(j, GAIN)
+    return _responds(j, robot.moved(j, gain=1 + size), GAIN)
 
 
 @fault("lag more")
 def _(robot, rng, j):
     """The position is later."""
     size = relative(robot, j, rng, 0.5)
-    return (Change(j, position=robot.moved(j, more_lag=size)),), _responds(j, LAG)
+    return _responds(j, robot.moved(j, more_lag=size), LAG)
 
 
 @fault("offset only")
 def _(robot, rng, j):
     """The position is off by a constant."""
     size = offset(robot, j, rng, 0.3)
-    return (Change(j, position=robot.moved(j) + size),), _responds(j, OFFSET)
+    return _responds(j, robot.moved(j) + size, OFFSET)
 
 
 @fault("gain fades")
@@ -50,7 +49,7 @@ def _(robot, rng, j):
     """The position becomes smaller from cycle to cycle."""
     size = min(2 * relative(robot, j, rng, 0.25), 0.9)
     gain = 1 - size * robot.t_s[:, j] / robot.duration_s
-    return (Change(j, position=robot.moved(j, gain=gain)),), _responds(j, GAIN)
+    return _responds(j, robot.moved(j, gain=gain), GAIN)
 
 
 @fault("gain less from half-way on")
@@ -58,14 +57,18 @@ def _(robot, rng, j):
     """The position becomes smaller at once."""
     _, acts = onset(robot, j, rng, 0.4, 0.6)
     size = min(2.5 * relative(robot, j, rng, 0.2), 0.5)
-    change = Change(j, position=robot.moved(j, gain=np.where(acts, 1 - size, 1.0)))
-    return (change,), _responds(j, GAIN)
+    return _responds(j, robot.moved(j, gain=np.where(acts, 1 - size, 1.0)), GAIN)
 
 
 def clipped(robot):
-    """A flat top is the sensor's as well, unless another sensor shows it too."""
-    proved = robot.channels.second
-    return frozenset() if proved else frozenset({"clipped_sensor", "frozen_sensor"})
+    """Return the sensor's kinds of a flat top; none if another sensor shows it, too."""
+    kinds = () if robot.channels.second else ("clipped_sensor", "frozen_sensor")
+    return frozenset(kinds)
+
+
+def _at_limit(robot, j, position, more, quantities):
+    change, kinds = Change(j, position=position), LOADED | clipped(robot) | more
+    return single(change, {"at_limit"}, kinds, stands_out=quantities, checked=False)
 
 
 @fault("saturates at both ends")
@@ -74,9 +77,7 @@ def _(robot, rng, j):
     level = rng.uniform(0.5, 0.75) * robot.swing(j)
     about = robot.bias[j]
     position = about + np.clip(robot.moved(j) - about, -level, level)
-    kinds = LOADED | clipped(robot)
-    truth = JointTruth(j, frozenset({"at_limit"}), kinds | STOPPED, GAIN, checked=False)
-    return (Change(j, position=position),), Truth((truth,))
+    return _at_limit(robot, j, position, STOPPED, GAIN)
 
 
 @fault("at its limit on one side")
@@ -85,11 +86,7 @@ def _(robot, rng, j):
     level = rng.uniform(-0.2, 0.4) * robot.swing(j)
     side, about = rng.choice([-1, 1]), robot.bias[j]
     position = about + side * np.minimum(side * (robot.moved(j) - about), level)
-    kinds = LOADED | clipped(robot)
-    truth = JointTruth(
-        j, frozenset({"at_limit"}), kinds | STOPPED | PAUSED, GAIN | OFFSET, checked=False
-    )
-    return (Change(j, position=position),), Truth((truth,))
+    return _at_limit(robot, j, position, STOPPED | PAUSED, GAIN | OFFSET)
 
 
 @fault("speed limited")
@@ -101,11 +98,11 @@ def _(robot, rng, j):
     for k in range(1, len(t)):
         step = most * (t[k] - t[k - 1])
         position[k] = position[k - 1] + np.clip(moved[k] - position[k - 1], -step, step)
-    return (Change(j, position=position),), _responds(j, RESPONSE)
+    return _responds(j, position, RESPONSE)
 
 
 def _grown(robot, j, rng, make):
-    """The position that an operator makes, its size grown until the response shows it.
+    """Return the position of an operator, its size increased until the response shows it.
 
     Flat tops at the reversals change the fundamental by little: a size that is large as a share
     of the motion may leave gain and lag within the margins.
@@ -115,10 +112,8 @@ def _grown(robot, j, rng, make):
     while size < 1.0:
         position = make(size * robot.swing(j))
         ratio = _fundamental(robot, j, position) / _fundamental(robot, j, robot.moved(j))
-        if (
-            abs(abs(ratio) - 1) > max(3 * half, MARGIN_GAIN + 2 * half)
-            or abs(np.angle(ratio)) > max(3 * half, MARGIN_RAD + 2 * half)
-        ):  # fmt: skip
+        gain_off, lag_off = abs(abs(ratio) - 1) - 2 * half, abs(np.angle(ratio)) - 2 * half
+        if gain_off > max(half, MARGIN_GAIN) or lag_off > max(half, MARGIN_RAD):
             break
         size *= 1.2
     return position
@@ -143,7 +138,7 @@ def _(robot, rng, j):
             position[k] = np.clip(position[k - 1], moved[k] - half, moved[k] + half)
         return position
 
-    return (Change(j, position=_grown(robot, j, rng, play)),), _responds(j, RESPONSE)
+    return _responds(j, _grown(robot, j, rng, play), RESPONSE)
 
 
 @fault("sticks at both reversals")
@@ -160,7 +155,7 @@ def _(robot, rng, j):
             position[k] = moved[k] if moves else position[k - 1]
         return position
 
-    return (Change(j, position=_grown(robot, j, rng, stuck)),), _responds(j, RESPONSE)
+    return _responds(j, _grown(robot, j, rng, stuck), RESPONSE)
 
 
 @fault("lag grows")
@@ -168,7 +163,7 @@ def _(robot, rng, j):
     """The position becomes later from cycle to cycle."""
     size = 2 * relative(robot, j, rng, 0.3)
     position = robot.moved(j, more_lag=size * robot.t_s[:, j] / robot.duration_s)
-    return (Change(j, position=position),), _responds(j, LAG)
+    return _responds(j, position, LAG)
 
 
 @fault("weak to one side")
@@ -178,4 +173,4 @@ def _(robot, rng, j):
     moved, about = robot.moved(j), robot.bias[j] + robot.zero[j]
     side = rng.choice([-1, 1]) * (moved - about) > 0
     position = np.where(side, about + (1 - size) * (moved - about), moved)
-    return (Change(j, position=position),), _responds(j, GAIN | OFFSET)
+    return _responds(j, position, GAIN | OFFSET)

@@ -7,7 +7,7 @@ are kept apart: what reached the servo, where the joint is, and what each sensor
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import lfilter
@@ -56,14 +56,8 @@ class Channels:
 
 
 CHANNELS = (
-    Channels(),
-    Channels(),
-    Channels(velocity="true"),
-    Channels(velocity="derived"),
-    Channels(effort=True),
-    Channels(velocity="derived", effort=True),
-    Channels(velocity="true", effort=True),
-    Channels(second=True),
+    *(Channels(), Channels(), Channels("true"), Channels("derived"), Channels(effort=True)),
+    *(Channels("derived", effort=True), Channels("true", effort=True), Channels(second=True)),
 )
 
 
@@ -287,7 +281,6 @@ class Change:
         position: Where it really is [rad], shape (n,).
         wanted: Command that reached its servo [rad], shape (n,).
         power: Share of the effort that the motor gives, shape (n,).
-        most_effort: The effort saturates there [N m].
         exact: Where its sensors add no noise, shape (n,).
         reading: From the position that its sensor would report to the one that it does.
         telemetry: Applied to each channel that its servo reports, position included.
@@ -298,7 +291,6 @@ class Change:
     position: np.ndarray | None = None
     wanted: np.ndarray | None = None
     power: np.ndarray | None = None
-    most_effort: float = np.inf
     exact: np.ndarray | None = None
     reading: Callable[[np.ndarray], np.ndarray] | None = None
     telemetry: Callable[[np.ndarray], np.ndarray] | None = None
@@ -352,7 +344,7 @@ def record(robot: Robot, changes: tuple[Change, ...] = (), seed: int = 0) -> Log
             read, other = (np.round(one / robot.step) * robot.step for one in (read, other))
         rate = np.gradient(where, t) + 0.01 * robot.omega * swing * noisy * rng.normal(size=n)
         scale = STIFFNESS * robot.amplitude[j] * abs(1 - robot.gain[j] * np.exp(-1j * robot.lag[j]))
-        pull = np.clip(STIFFNESS * (wanted - where), -change.most_effort, change.most_effort)
+        pull = STIFFNESS * (wanted - where)
         if change.power is not None:
             pull = pull * change.power
         pull = pull + EFFORT_NOISE * scale * rng.normal(size=n)
@@ -384,8 +376,3 @@ def _noise(robot: Robot, rng: np.random.Generator) -> np.ndarray:
     drawn += robot.shared**0.5 * rng.normal(size=(n + 100, 1))
     color = robot.color
     return robot.sigma * lfilter([(1 - color**2) ** 0.5], [1.0, -color], drawn, axis=0)[100:]
-
-
-def with_channels(robot: Robot, channels: Channels) -> Robot:
-    """The same robot, logged in another way."""
-    return replace(robot, channels=channels)

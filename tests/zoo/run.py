@@ -14,16 +14,16 @@ import zlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from itertools import groupby
+from functools import partial
+from itertools import groupby, product
 from pathlib import Path
 
 import numpy as np
 
 from .bags import write_bag
-from .detection import detected
 from .faults import FAULTS, Fault, plant
-from .judging import Judgement, judge_all
-from .outputs import OUTPUTS, Statement, statements
+from .judging import Judgement, judge
+from .outputs import OUTPUTS, Statement, detected, statements
 from .robot import Robot, draw, record
 from .truth import Truth
 
@@ -36,7 +36,7 @@ SOUND = 0.05
 
 @dataclass(frozen=True)
 class Case:
-    """One fault planted with one seed, and what undulog says of it."""
+    """One fault planted with one seed, and the outputs of undulog."""
 
     fault: str
     seed: int
@@ -47,13 +47,7 @@ class Case:
 
 
 def robot_for(fault: Fault, seed: int, *, small: bool = False) -> Robot:
-    """The healthy robot into which a fault is planted.
-
-    Args:
-        fault: The fault.
-        seed: Of the robot.
-        small: Few joints and samples.
-    """
+    """Return the healthy robot into which a fault is planted; small: few joints and samples."""
     own = seed_of(fault.name, seed)
     rng = np.random.default_rng([own, 4])
     channels = None if fault.channels is None else fault.channels[rng.integers(len(fault.channels))]
@@ -68,14 +62,7 @@ def seed_of(name: str, seed: int) -> int:
 def run_case(
     name: str, seed: int, *, small: bool = False, outputs: tuple[str, ...] = OUTPUTS
 ) -> Case:
-    """Plant, write, run, judge.
-
-    Args:
-        name: Of the fault.
-        seed: Of robot, fault and noise.
-        small: Few joints and samples.
-        outputs: Those that are judged.
-    """
+    """Plant a fault, write the bag, run undulog, judge the outputs."""
     fault = FAULTS[name]
     robot = robot_for(fault, seed, small=small)
     own = seed_of(name, seed)
@@ -83,18 +70,18 @@ def run_case(
     log = record(robot, changes, own)
     if outputs == (DETECTION,):  # on arrays, so without a file
         said = {DETECTION: detected(log)}
-        return Case(name, seed, robot, truth, said, judge_all(said, truth, robot))
-    with tempfile.TemporaryDirectory() as folder:
-        bag = write_bag(log, Path(folder) / "faulty.mcap")
-        healthy = None
-        if "compare" in outputs:
-            healthy = write_bag(record(robot, (), own + 10**6), Path(folder) / "healthy.mcap")
-        said = statements(bag, healthy, second=robot.channels.second, outputs=outputs)
-    return Case(name, seed, robot, truth, said, judge_all(said, truth, robot))
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            bag = write_bag(log, Path(folder) / "faulty.mcap")
+            healthy = None
+            if "compare" in outputs:
+                healthy = write_bag(record(robot, (), own + 10**6), Path(folder) / "healthy.mcap")
+            said = statements(bag, healthy, second=robot.channels.second, outputs=outputs)
+    judged = {output: judge(output, one, truth, robot) for output, one in said.items()}
+    return Case(name, seed, robot, truth, said, judged)
 
 
-def _work(job: tuple[str, int, bool, tuple[str, ...]]) -> Case:
-    name, seed, small, outputs = job
+def _work(name: str, seed: int, *, small: bool, outputs: tuple[str, ...]) -> Case:
     try:
         return run_case(name, seed, small=small, outputs=outputs)
     except Exception as error:
@@ -110,12 +97,13 @@ def run_all(
     jobs: int = 1,
 ) -> Iterator[Case]:
     """Every fault with every seed, in order."""
-    work = [(name, seed, small, outputs) for name in names for seed in seeds]
+    work = partial(_work, small=small, outputs=outputs)
+    pairs = zip(*product(names, seeds), strict=True)
     if jobs == 1:
-        yield from map(_work, work)
+        yield from map(work, *pairs)
         return
     with ProcessPoolExecutor(jobs) as pool:
-        yield from pool.map(_work, work, chunksize=4)
+        yield from pool.map(work, *pairs, chunksize=4)
 
 
 def header(width: int, outputs: tuple[str, ...] = OUTPUTS) -> str:
@@ -150,18 +138,13 @@ def failures(cases: Sequence[Case]) -> Iterator[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the zoo.
-
-    Returns:
-        0 if every fault meets the bar, else 1.
-    """
+    """Run the zoo; return 0 if every fault meets the bar, else 1."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=100, help="seeds a fault")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--fault", action="append", help="only faults whose name contains this")
-    parser.add_argument(
-        "--outputs", nargs="*", default=list(OUTPUTS), choices=[*OUTPUTS, DETECTION]
-    )
+    choices = {"default": list(OUTPUTS), "choices": [*OUTPUTS, DETECTION]}
+    parser.add_argument("--outputs", nargs="*", **choices)
     parser.add_argument("--small", action="store_true", help="few joints and samples")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--quiet", action="store_true", help="the table only")
@@ -175,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     all_fine = True
     runs = run_all(names, seeds, small=chosen.small, outputs=outputs, jobs=chosen.jobs)
     for k, (_, of_one) in enumerate(groupby(runs, lambda case: case.fault)):
-        cases: list[Case] = []
+        cases = []
         for case in of_one:
             cases.append(case)
             if sys.stderr.isatty():

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from .planting import GAIN, LAG, OFFSET, RESPONSE, fault, offset, onset, relative
+from .planting import GAIN, LAG, OFFSET, RESPONSE, fault, offset, onset, relative, single
 from .robot import Change
-from .truth import PAUSED, JointTruth, Truth, either
+from .truth import PAUSED, Truth, either
 
 
 @fault("inverted")
@@ -15,23 +15,19 @@ def _(robot, rng, j):
     # Turned as a whole: its servo sees what it always saw, and so does its effort.
     wanted = robot.wanted(j) - robot.moved(j) + position
     kinds = either(robot.channels, "inverted", "inverted_sensor", cause="inverted")
-    return (Change(j, position=position, wanted=wanted),), Truth(
-        (JointTruth(j, frozenset({"inverted"}), kinds),)
-    )
+    return single(Change(j, position=position, wanted=wanted), {"inverted"}, kinds)
 
 
 @fault("sensor inverted")
 def _(robot, rng, j):
     """The same; a velocity of its own has the other sign."""
     kinds = either(robot.channels, "inverted", "inverted_sensor", cause="inverted_sensor")
-    return (Change(j, reading=lambda read: -read),), Truth(
-        (JointTruth(j, frozenset({"inverted_sensor"}), kinds),)
-    )
+    return single(Change(j, reading=np.negative), {"inverted_sensor"}, kinds)
 
 
-def _scaled(j):
-    kinds = frozenset({"scaled_sensor"})
-    return Truth((JointTruth(j, kinds, kinds, GAIN | OFFSET, checked=False),))
+def _scaled(j, reading):
+    change = Change(j, reading=reading)
+    return single(change, {"scaled_sensor"}, stands_out=GAIN | OFFSET, checked=False)
 
 
 @fault("sensor of wrong scale")
@@ -39,27 +35,29 @@ def _(robot, rng, j):
     """The position has a gain of its own, in its constant part too."""
     size = relative(robot, j, rng, 0.5)
     scale = 1 - min(size, 0.6) if rng.random() < 0.5 else 1 + size
-    return (Change(j, reading=lambda read: scale * read),), _scaled(j)
+    return _scaled(j, lambda read: scale * read)
 
 
 @fault("sensor in degrees")
 def _(robot, rng, j):
     """The position is 180/pi times as large."""
-    return (Change(j, reading=np.degrees),), _scaled(j)
+    return _scaled(j, np.degrees)
 
 
 @fault("swapped cables")
 def _(robot, rng, j):
     """Two joints carry out each other's command."""
     other = j + 1 if j + 1 < robot.m else j - 1
-    changes = tuple(
-        Change(a, position=robot.moved(a, of=b), wanted=robot.wanted(b, at=a))
+    first, second = (
+        single(misled(robot, a, b), {"swapped"}, stands_out=RESPONSE | OFFSET, checked=False)
         for a, b in ((j, other), (other, j))
     )
-    kinds = frozenset({"swapped"})
-    return changes, Truth(
-        tuple(JointTruth(k, kinds, kinds, RESPONSE | OFFSET, checked=False) for k in (j, other))
-    )
+    return first[0] + second[0], Truth(first[1].joints + second[1].joints)
+
+
+def misled(robot, j, other):
+    """Return a joint that carries out the command of another one."""
+    return Change(j, position=robot.moved(j, of=other), wanted=robot.wanted(other, at=j))
 
 
 @fault("stale samples")
@@ -70,9 +68,8 @@ def _(robot, rng, j):
     kinds = frozenset({"stale_sensor", "frozen_sensor", "lost_samples"})
     if not (robot.channels.effort or robot.channels.second):
         kinds |= PAUSED
-    return (Change(j, telemetry=lambda one: one[old]),), Truth(
-        (JointTruth(j, frozenset({"stale_sensor"}), kinds, LAG, checked=False),)
-    )
+    change = Change(j, telemetry=lambda one: one[old])
+    return single(change, {"stale_sensor"}, kinds, stands_out=LAG, checked=False)
 
 
 @fault("wrapped counter")
@@ -85,8 +82,7 @@ def _(robot, rng, j):
     def wrapped(read):
         return np.where(side * (read - at) > 0, read - side * 2 * np.pi, read)
 
-    kinds = frozenset({"wrapped_sensor"})
-    return (Change(j, reading=wrapped),), Truth((JointTruth(j, kinds, kinds),))
+    return single(Change(j, reading=wrapped), {"wrapped_sensor"})
 
 
 def _slip(robot, rng, j):
@@ -97,14 +93,16 @@ def _slip(robot, rng, j):
     return since, np.where(acts, size, 0.0)
 
 
+def _slipped(change, name, kinds, since):
+    return single(change, {name}, kinds, stands_out=OFFSET, since_s=since, checked=False)
+
+
 @fault("encoder slips")
 def _(robot, rng, j):
     """The position makes a step and goes on from there."""
     since, step = _slip(robot, rng, j)
     kinds = either(robot.channels, "slipped", "slipped_sensor", cause="slipped_sensor", fast=True)
-    return (Change(j, reading=lambda read: read + step),), Truth(
-        (JointTruth(j, frozenset({"slipped_sensor"}), kinds, OFFSET, since_s=since, checked=False),)
-    )
+    return _slipped(Change(j, reading=lambda read: read + step), "slipped_sensor", kinds, since)
 
 
 @fault("horn slips")
@@ -113,9 +111,7 @@ def _(robot, rng, j):
     since, step = _slip(robot, rng, j)
     kinds = either(robot.channels, "slipped", "slipped_sensor", cause="slipped")
     change = Change(j, position=robot.moved(j) + step, wanted=robot.wanted(j) + step)
-    return (change,), Truth(
-        (JointTruth(j, frozenset({"slipped"}), kinds, OFFSET, since_s=since, checked=False),)
-    )
+    return _slipped(change, "slipped", kinds, since)
 
 
 @fault("sensor drifts")
@@ -126,9 +122,8 @@ def _(robot, rng, j):
     kinds = frozenset({"drifting_sensor"})
     if not robot.channels.second:
         kinds |= {"slipped", "slipped_sensor"}
-    return (Change(j, reading=lambda read: read + drift),), Truth(
-        (JointTruth(j, frozenset({"drifting_sensor"}), kinds, OFFSET, checked=False),)
-    )
+    change = Change(j, reading=lambda read: read + drift)
+    return single(change, {"drifting_sensor"}, kinds, stands_out=OFFSET, checked=False)
 
 
 @fault("noise bursts")
@@ -141,17 +136,14 @@ def _(robot, rng, j):
     kinds = frozenset({"noisy_sensor"})
     if not robot.channels.second:
         kinds |= PAUSED
-    return (Change(j, reading=lambda read: read + noise),), Truth(
-        (JointTruth(j, frozenset({"noisy_sensor"}), kinds),)
-    )
+    return single(Change(j, reading=lambda read: read + noise), {"noisy_sensor"}, kinds)
 
 
 @fault("packets of one servo lost")
 def _(robot, rng, j):
     """Samples of one joint are missing at random."""
     lost = rng.random(len(robot.t_s)) < rng.uniform(0.1, 0.5)
-    kinds = frozenset({"lost_samples"})
-    return (Change(j, lost=lost),), Truth((JointTruth(j, kinds, kinds, compared=False),))
+    return single(Change(j, lost=lost), {"lost_samples"}, compared=False)
 
 
 @fault("one servo silent for a while")
@@ -160,7 +152,4 @@ def _(robot, rng, j):
     start = float(rng.uniform(0.25, 0.5)) * robot.duration_s
     t = robot.t_s[:, j]
     lost = (t >= start) & (t < start + rng.uniform(0.15, 0.3) * robot.duration_s)
-    kinds = frozenset({"lost_samples"})
-    return (Change(j, lost=lost),), Truth(
-        (JointTruth(j, kinds, kinds, since_s=start, compared=False),)
-    )
+    return single(Change(j, lost=lost), {"lost_samples"}, since_s=start, compared=False)

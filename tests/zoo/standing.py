@@ -2,22 +2,15 @@
 
 import numpy as np
 
-from .planting import WITH_EFFORT, bouts, fault, hold, onset
+from .planting import WITH_EFFORT, bouts, fault, hold, onset, single
 from .robot import Change, Channels
-from .truth import LOADED, PAUSED, STOPPED, JointTruth, Truth, standing
+from .truth import LOADED, PAUSED, STOPPED, Truth, standing
 
 
 def _jam(robot, rng, j, acts, since, *, exact=None):
     still = rng.random() < 0.5 if exact is None else exact
-    change = Change(
-        j,
-        position=hold(robot.moved(j), acts),
-        exact=acts if still else None,
-    )
-    kinds = standing(robot.channels, "pushing")
-    return (change,), Truth(
-        (JointTruth(j, frozenset({"jammed", "stalled"}), kinds, since_s=since),)
-    )
+    change = Change(j, position=hold(robot.moved(j), acts), exact=acts if still else None)
+    return single(change, {"jammed", "stalled"}, standing(robot.channels, "pushing"), since_s=since)
 
 
 def _plant_jam(robot, rng, j):
@@ -51,8 +44,7 @@ def _(robot, rng, j):
 @fault("jam from the beginning")
 def _(robot, rng, j):
     """The position never moves."""
-    acts = np.ones(len(robot.t_s), dtype=bool)
-    return _jam(robot, rng, j, acts, None)
+    return _jam(robot, rng, j, np.ones(len(robot.t_s), dtype=bool), None)
 
 
 @fault("stall at constant effort", channels=WITH_EFFORT)
@@ -64,15 +56,12 @@ def _(robot, rng, j):
     pull = rng.choice([-1, 1]) * robot.amplitude[j] * rng.uniform(2.0, 6.0)
     wanted = np.where(acts, position + pull, robot.wanted(j))
     change = Change(j, position=position, wanted=wanted, exact=acts if rng.random() < 0.5 else None)
-    return (change,), Truth((JointTruth(j, frozenset({"stalled"}), LOADED, since_s=since),))
+    return single(change, {"stalled"}, LOADED, since_s=since)
 
 
 def _dead(robot, j, acts, since, position):
-    power = np.where(acts, 0.0, 1.0)
-    kinds = standing(robot.channels, "dead")
-    return (Change(j, position=position, power=power),), Truth(
-        (JointTruth(j, frozenset({"dead"}), kinds, since_s=since),)
-    )
+    change = Change(j, position=position, power=np.where(acts, 0.0, 1.0))
+    return single(change, {"dead"}, standing(robot.channels, "dead"), since_s=since)
 
 
 @fault("dead from the beginning")
@@ -104,17 +93,16 @@ def _(robot, rng, j):
     """The position repeats one value to the bit; all else goes on."""
     since, acts = onset(robot, j, rng)
     kinds = standing(robot.channels, "sensor")
-    return (Change(j, reading=lambda read: hold(read, acts)),), Truth(
-        (JointTruth(j, frozenset({"frozen_sensor"}), kinds, since_s=since),)
-    )
+    change = Change(j, reading=lambda read: hold(read, acts))
+    return single(change, {"frozen_sensor"}, kinds, since_s=since)
 
 
 @fault("sensor frozen from the beginning")
 def _(robot, rng, j):
     """The position is one value; all else is as usual."""
     kinds = standing(robot.channels, "sensor")
-    return (Change(j, reading=lambda read: np.full_like(read, read[0])),), Truth(
-        (JointTruth(j, frozenset({"frozen_sensor"}), kinds),)
+    return single(
+        Change(j, reading=lambda read: np.full_like(read, read[0])), {"frozen_sensor"}, kinds
     )
 
 
@@ -125,9 +113,8 @@ def _(robot, rng, j):
     # A constant effort is what a stall shows; a second sensor, of another make, goes on.
     kinds = frozenset({"frozen_sensor", "stale_sensor", "lost_samples"})
     kinds |= frozenset() if robot.channels.second else STOPPED
-    return (Change(j, telemetry=lambda one: hold(one, acts)),), Truth(
-        (JointTruth(j, frozenset({"frozen_sensor", "stale_sensor"}), kinds, since_s=since),)
-    )
+    change = Change(j, telemetry=lambda one: hold(one, acts))
+    return single(change, {"frozen_sensor", "stale_sensor"}, kinds, since_s=since)
 
 
 def again(kinds):
@@ -141,7 +128,7 @@ def _(robot, rng, j):
     acts = bouts(robot, j, rng, 0.2)
     change = Change(j, position=hold(robot.moved(j), acts), power=np.where(acts, 0.0, 1.0))
     kinds = again(standing(robot.channels, "dead"))
-    return (change,), Truth((JointTruth(j, frozenset({"intermittent", "dead"}), kinds),))
+    return single(change, {"intermittent", "dead"}, kinds)
 
 
 @fault("sensor frozen at times, a fifth of the time")
@@ -151,9 +138,8 @@ def _(robot, rng, j):
     kinds = standing(robot.channels, "sensor") | {"stale_sensor"}
     if not (robot.channels.effort or robot.channels.second or robot.channels.velocity == "true"):
         kinds |= PAUSED
-    return (Change(j, reading=lambda read: hold(read, acts)),), Truth(
-        (JointTruth(j, frozenset({"frozen_sensor", "stale_sensor"}), kinds),)
-    )
+    change = Change(j, reading=lambda read: hold(read, acts))
+    return single(change, {"frozen_sensor", "stale_sensor"}, kinds)
 
 
 @fault("commands don't reach a servo for a while")
@@ -165,15 +151,14 @@ def _(robot, rng, j):
     acts = (t >= start) & (t < start + long)
     held = hold(robot.wanted(j), acts)
     # It goes to where it was last sent and stays, with the small effort that this takes.
-    rest = robot.wanted(j)[acts][0] * (1.0 if not acts.any() else robot.gain[j])
+    rest = robot.wanted(j)[acts][0] * robot.gain[j]
     moved = robot.moved(j)
     settles = rest + (hold(moved, acts) - rest) * np.exp(-(t - start).clip(0) / 0.1)
     change = Change(j, position=np.where(acts, settles, moved), wanted=held)
     kinds = PAUSED | STOPPED
     if not (robot.channels.effort or robot.channels.second):
         kinds |= {"frozen_sensor", "stale_sensor"}
-    names = frozenset({"intermittent", "dead", "jammed", "stalled"})
-    return (change,), Truth((JointTruth(j, names, kinds, since_s=start),))
+    return single(change, {"intermittent", "dead", "jammed", "stalled"}, kinds, since_s=start)
 
 
 @fault("a third of the joints dead", joints=(6, 40))

@@ -8,7 +8,7 @@ from contextlib import closing
 import pytest
 
 import undulog
-from support.processes import UNDULOG, process
+from support.processes import serving
 from undulog.capture import Session, load_robot
 from undulog.capture.sources.address import parse_address
 from undulog.capture.sources.events import Tally
@@ -71,30 +71,27 @@ def logged_on_the_bus(folder, scenario, faults):
     """
     robot = load_robot("snake25")
     words = [word for fault in faults for word in ("--fault", fault)]
-    words += ["--socketcand", "0", "--lockstep", "--fast", "--json", "--duration", str(DURATION_S)]
+    words += ["--lockstep", "--fast", "--duration", str(DURATION_S)]
     lines = []
-    with process(*UNDULOG, "sim", "serve", scenario, *words) as served:
-        port = json.loads(served.stdout.readline())["port"]
+    with serving(scenario, *words) as (served, ready):
         gait = find_motion(str(scenario)).make(robot, None)
         encoder, blind = CommandEncoder(robot), Readings.nothing(robot)
-        address = parse_address(f"can:socketcand:can0?port={port}")
+        address = parse_address(f"can:socketcand:can0?port={ready['port']}")
         with closing(find_virtual_robot(address, Tally(time.time_ns))) as link:
             for tick in range(round(DURATION_S * 100) + 1):
                 now, received = link.wait_tick(PATIENCE_S)
                 assert now == tick
                 sent = encoder.frames(gait.step(tick / 100, blind).command)
                 link.send(sent)
-                lines += [(one["t_device_ns"], one) for frames in received for one in frames]
-                lines += [(None, tick, one) for one in sent]
+                lines += [(int(f["t_device_ns"]), True, f) for frames in received for f in frames]
+                lines += [(tick * 10**7, False, frame) for frame in sent]
         end = json.loads(served.communicate(timeout=PATIENCE_S)[0])
         assert served.returncode == 0
     start_ns = round(end["start_s"] * 1e9)
-    times = [
-        (int(line[0]) - start_ns if len(line) == 2 else line[1] * 10**7, line[-1]) for line in lines
-    ]
     log = folder / "bus.log"
     with log.open("w") as file:
-        for t_ns, frame in sorted(times, key=lambda line: line[0]):
+        times = [(t_ns - start_ns * of_robot, frame) for t_ns, of_robot, frame in lines]
+        for t_ns, frame in sorted(times, key=lambda row: row[0]):
             data = frame["data"][: frame["dlc"]].tobytes().hex().upper()
             identifier = frame["id_flags"] & 0x7FF
             file.write(f"({1_700_000_000 + t_ns * 1e-9:.6f}) can0 {identifier:03X}#{data}\n")

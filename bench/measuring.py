@@ -1,0 +1,78 @@
+"""Helpers of the benches: command line, verdicts, processes, and an hour to measure."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+HERE = Path(__file__).parent
+HOUR_S = 3600
+TICKS_S = os.sysconf("SC_CLK_TCK")
+
+
+def arguments(doc: str | None) -> argparse.ArgumentParser:
+    """Return a parser whose help is the docstring of the bench."""
+    return argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+
+
+def verdict(what: str, value: float, bar: float, unit: str, *, most: bool = True) -> bool:
+    """Print a figure beside its bar; return whether the bar is met."""
+    good = value <= bar if most else value >= bar
+    sign = "at most" if most else "at least"
+    print(f"{'PASS' if good else 'FAIL'}  {what}: {value:.2f} {unit} (bar: {sign} {bar:g} {unit})")
+    return good
+
+
+def start(stack: ExitStack, *command: object, **options: object) -> subprocess.Popen[str]:
+    """Start a process that is killed when the stack is closed; its output goes to a pipe."""
+    options = {"stdout": subprocess.PIPE, "text": True} | options
+    process = subprocess.Popen([str(word) for word in command], **options)
+    stack.callback(_end, process)
+    return process
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    if process.poll() is None:
+        process.kill()
+    process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
+
+
+def cpu_s(pid: int) -> float:
+    """Return the processor time of a process, all its threads [s]."""
+    parts = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(parts[11]) + int(parts[12])) / TICKS_S
+
+
+def wait_for(condition: Callable[[], bool], pause_s: float = 0.01) -> None:
+    """Wait until a condition holds, a minute at most."""
+    deadline = time.monotonic() + 60
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError("the condition did not hold within a minute")
+        time.sleep(pause_s)
+
+
+def write_hour(path: Path, seconds: int, *, can: bool, adaptive: bool = False) -> None:
+    """Write the session of hour_session.py in another process, so that its memory is apart."""
+    code = (
+        "import sys; from pathlib import Path; from hour_session import write_session; "
+        f"write_session(Path(sys.argv[1]), int(sys.argv[2]), can={can}, adaptive={adaptive})"
+    )
+    subprocess.run([sys.executable, "-c", code, str(path), str(seconds)], check=True, cwd=HERE)
+
+
+def add_place(parser: argparse.ArgumentParser, room: str) -> None:
+    """Add the options of the hour's file."""
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument("--folder", type=Path, help=f"a folder with {room} to spare")
+    place.add_argument("--keep", type=Path, help="the session, written if it is not there")
