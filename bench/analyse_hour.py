@@ -16,7 +16,6 @@ Run: python bench/analyse_hour.py [--minutes 60] [--runs 2] [--adaptive]
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -25,8 +24,9 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+from measuring import HOUR_S, add_place, arguments, verdict, write_hour
+
 MIB = 1 << 20
-HOUR_S = 3600
 ANALYSE_S, ANALYSE_MIB, REPORT_S, PAGE_MIB = 10.0, 1.5e9 / MIB, 30.0, 3e6 / MIB
 """The bars, for an hour."""
 
@@ -46,14 +46,7 @@ class Cost(NamedTuple):
 
 
 def cost(*words: str) -> Cost:
-    """Run one command line of ours.
-
-    Args:
-        words: After ``undulog``.
-
-    Returns:
-        What it took.
-    """
+    """Run ``undulog WORDS...`` and return its cost."""
     start = time.perf_counter()
     child = subprocess.Popen([sys.executable, "-m", "undulog", *words], stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(child.pid, 0)
@@ -64,24 +57,14 @@ def cost(*words: str) -> Cost:
     return Cost(took, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / MIB)
 
 
-def verdict(what: str, value: float, bar: float, unit: str) -> bool:
-    """Print a figure beside its bar."""
-    good = value <= bar
-    print(f"{'PASS' if good else 'FAIL'}  {what}: {value:.2f} {unit} (bar: at most {bar:g} {unit})")
-    return good
-
-
 def measure(path: Path, part: float, runs: int, *, adaptive: bool = False) -> bool:
-    """Run both commands and print; whether all bars are met.
+    """Run both commands and print; return whether all bars are met.
 
     Args:
         path: The session.
         part: Its length over an hour; the bars of time shrink with it.
-        runs: Of each command.
+        runs: Runs of each command.
         adaptive: Whether its gait varies all the time.
-
-    Returns:
-        Whether all bars are met.
     """
     page = path.with_suffix(".html")
     analysed = [cost("analyse", str(path)) for _ in range(runs)]
@@ -103,33 +86,19 @@ def measure(path: Path, part: float, runs: int, *, adaptive: bool = False) -> bo
     return all(good)
 
 
-def write(path: Path, seconds: int, *, adaptive: bool = False) -> None:
-    """Write the session in another process, so that its memory is not this one's."""
-    code = (
-        "import sys; from pathlib import Path; from hour_session import write_session; "
-        f"write_session(Path(sys.argv[1]), int(sys.argv[2]), can=False, adaptive={adaptive})"
-    )
-    folder = Path(__file__).parent
-    subprocess.run([sys.executable, "-c", code, str(path), str(seconds)], check=True, cwd=folder)
-
-
 def main() -> None:
     """Write, measure, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--runs", type=int, default=2)
     parser.add_argument("--adaptive", action="store_true", help="a gait that varies all the time")
-    place = parser.add_mutually_exclusive_group()
-    place.add_argument("--folder", type=Path, help="a folder with 1 GB to spare")
-    place.add_argument("--keep", type=Path, help="the session, written if it is not there")
+    add_place(parser, "1 GB")
     options = parser.parse_args()
     seconds = max(round(options.minutes * 60), 60)
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         path: Path = (options.keep or Path(folder) / "hour.mcap").resolve()
         if not path.exists():
-            write(path, seconds, adaptive=options.adaptive)
+            write_hour(path, seconds, can=False, adaptive=options.adaptive)
         good = measure(path, seconds / HOUR_S, options.runs, adaptive=options.adaptive)
     sys.exit(0 if good else 1)
 

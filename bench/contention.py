@@ -8,7 +8,6 @@ when ``send()`` returned for each frame; the recorder has its priority granted (
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -16,23 +15,23 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from measuring import HERE, arguments, cpu_s, start, wait_for
 
 from undulog.capture import Session
 
-HERE = Path(__file__).parent
 BUSES = ("front", "rear")
 RATE = 9000.0
 START_UP_NS = 1_000_000_000
 LATE_NS = 5_000_000
 PYTHON_CAN = "python-can Logger, BLF"
 REFUSED_PRIORITY = ("setpriv", "--bounding-set=-sys_nice")
-TICKS_S = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass
@@ -96,57 +95,65 @@ def contention(folder: Path) -> Iterator[None]:
             process.wait()
 
 
-def end(process: subprocess.Popen[str]) -> None:
-    """End a process that we started."""
-    if process.poll() is None:
-        process.kill()
-    process.wait()
-    if process.stdout is not None:
-        process.stdout.close()
-
-
 def start_sender(
-    kind: str, where: str, folder: Path, stack: ExitStack, *, seconds: float, per_packet: int
+    stack: ExitStack, kind: str, place: object, *options: object
 ) -> subprocess.Popen[str]:
-    """One bus, in a process of real-time priority."""
-    sent = folder / f"sent-{len(list(folder.glob('*.begun')))}.npz"
-    sent.with_suffix(".begun").touch()
-    command = [sys.executable, str(HERE / "bus_sender.py"), kind, where, "--fifo"]
-    command += ["--rate", str(RATE), "--seconds", str(seconds), "--buffer", "0"]
-    command += ["--per-packet", str(per_packet), "--sent", str(sent)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    stack.callback(end, process)
-    return process
+    """Start the sender of one bus; ``place`` is its socket, 0 for socketcand."""
+    return start(stack, sys.executable, HERE / "bus_sender.py", kind, place, *options)
 
 
-def cpu_s(pid: int) -> float:
-    """Processor time of a process, all its threads [s]."""
-    parts = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(parts[11]) + int(parts[12])) / TICKS_S
+def served(senders: Sequence[subprocess.Popen[str]]) -> list[int]:
+    """Return the ports of socketcand senders."""
+    return [json.loads(sender.stdout.readline())["port"] for sender in senders]
 
 
-def waited(senders: Sequence[subprocess.Popen[str]], pid: int) -> tuple[float, int]:
-    """Wait for the senders; the recorder's processor share meanwhile, and frames sent late."""
+def sources_at(kind: str, places: Sequence[object]) -> list[str]:
+    """Return the addresses of two buses by their sockets or ports."""
+    form = "{}=unix:{}" if kind == "unix" else "{}=can:socketcand:can0?host=127.0.0.1&port={}"
+    return [form.format(*pair) for pair in zip(BUSES, places, strict=True)]
+
+
+def start_undulog(
+    stack: ExitStack, folder: Path, sources: Sequence[str], *before: str
+) -> subprocess.Popen[str]:
+    """Start the recorder as a user does, to ``run.mcap``."""
+    command = [*before, sys.executable, "-m", "undulog", "record", *sources, "--robot", "snake25"]
+    command += ["--bus", "front", "-o", folder / "run.mcap", "--floor", 0, "--json", "--quiet"]
+    return start(stack, *command, "--socket", folder / "control.sock")
+
+
+def start_peer(
+    stack: ExitStack, kind: str, folder: Path, ports: Sequence[int]
+) -> subprocess.Popen[str]:
+    """Start a recorder of another make."""
+    command = [sys.executable, HERE / "peer_recorder.py", kind, folder / "peer", *ports]
+    return start(stack, *command, stderr=subprocess.DEVNULL)
+
+
+def ended(recorder: subprocess.Popen[str], after_s: float = 1.0) -> str:
+    """End a recorder as a service manager does; return its output."""
+    time.sleep(after_s)
+    recorder.send_signal(signal.SIGTERM)
+    return recorder.communicate(timeout=120)[0]
+
+
+def waited(senders: Sequence[subprocess.Popen[str]], pid: int) -> float:
+    """Wait for the senders; return the recorder's processor share meanwhile."""
     begun, used = time.monotonic(), cpu_s(pid)
-    late = 0
     for sender in senders:
-        text, _ = sender.communicate(timeout=120)
-        late += json.loads(text.splitlines()[-1])["late"]
-    return (cpu_s(pid) - used) / (time.monotonic() - begun), late
+        sender.communicate(timeout=120)
+    return (cpu_s(pid) - used) / (time.monotonic() - begun)
 
 
 def judged(name: str, folder: Path, stamps: Sequence[dict[int, int] | int], cpu: float) -> Shares:
-    """Hold what is in the file against what the senders noted.
+    """Compare the frames in the file with those noted by the senders.
 
     Args:
         name: Of the run.
-        folder: Where the senders noted it.
-        stamps: For each bus the recorded time of arrival of each frame by its number, or only how
-            many frames were recorded.
+        folder: Folder of the senders' notes.
+        stamps: For each bus the recorded time of arrival of each frame by its number, or only the
+            number of recorded frames.
         cpu: The recorder's processor share.
-
-    Returns:
-        The shares.
     """
     total = Shares(name, 0, 0, 0, 0, None, 0.0, cpu)
     for k, found in enumerate(stamps):
@@ -171,42 +178,39 @@ def judged(name: str, folder: Path, stamps: Sequence[dict[int, int] | int], cpu:
     return total
 
 
+def loaded(
+    stack: ExitStack,
+    kind: str,
+    places: Sequence[object],
+    folder: Path,
+    *size: float,
+) -> list[subprocess.Popen[str]]:
+    """Start senders of real-time priority that note when each frame was taken."""
+    seconds, per_packet = size
+    options = ("--fifo", "--rate", RATE, "--seconds", seconds, "--buffer", 0)
+    options += ("--per-packet", per_packet, "--sent")
+    return [
+        start_sender(stack, kind, place, *options, folder / f"sent-{k}.npz")
+        for k, place in enumerate(places)
+    ]
+
+
 def undulog(kind: str, folder: Path, seconds: float, per_packet: int, *, granted: bool) -> Shares:
     """Our recorder."""
-    output = folder / "run.mcap"
-    paths = [str(folder / f"{name}.sock") for name in BUSES]
+    places = [folder / f"{name}.sock" if kind == "unix" else 0 for name in BUSES]
+    before = () if granted else REFUSED_PRIORITY
     with ExitStack() as stack:
-        senders: list[subprocess.Popen[str]] = []
         if kind == "unix":
-            sources = [f"{n}=unix:{p}" for n, p in zip(BUSES, paths, strict=True)]
+            recorder = start_undulog(stack, folder, sources_at(kind, places), *before)
+            wait_for(places[1].exists)
+            senders = loaded(stack, kind, places, folder, seconds, per_packet)
         else:
-            ports: list[int] = []
-            for _ in BUSES:
-                senders.append(
-                    start_sender(kind, "0", folder, stack, seconds=seconds, per_packet=per_packet)
-                )
-                ports.append(served(senders[-1]))
-            sources = [
-                f"{name}=can:socketcand:can0?host=127.0.0.1&port={port}"
-                for name, port in zip(BUSES, ports, strict=True)
-            ]
-        command: list[str] = [] if granted else list(REFUSED_PRIORITY)
-        command += [sys.executable, "-m", "undulog", "record", *sources, "--robot", "snake25"]
-        command += ["--bus", "front", "-o", str(output), "--floor", "0", "--json", "--quiet"]
-        command += ["--socket", str(folder / "control.sock")]
-        recorder = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        stack.callback(end, recorder)
-        if kind == "unix":
-            wait_for(Path(paths[1]))
-            senders = [
-                start_sender(kind, p, folder, stack, seconds=seconds, per_packet=per_packet)
-                for p in paths
-            ]
+            senders = loaded(stack, kind, places, folder, seconds, per_packet)
+            recorder = start_undulog(stack, folder, sources_at(kind, served(senders)), *before)
         stack.enter_context(contention(folder))
-        cpu, _ = waited(senders, recorder.pid)
-        recorder.send_signal(signal.SIGTERM)
-        recorder.communicate(timeout=120)
-    with Session.open(output) as session:
+        cpu = waited(senders, recorder.pid)
+        ended(recorder, 0.0)
+    with Session.open(folder / "run.mcap") as session:
         stamps = [numbered(session, name, folder / f"sent-{k}.npz") for k, name in enumerate(BUSES)]
     how = "granted" if granted else "refused"
     packets = f", {per_packet} a packet" if kind == "unix" else ""
@@ -226,82 +230,41 @@ def numbered(session: Session, name: str, sent: Path) -> dict[int, int]:
 def python_can(folder: Path, seconds: float) -> Shares:
     """python-can's own Logger on socketcand; it keeps the server's times, none of arrival."""
     with ExitStack() as stack:
-        senders = [
-            start_sender("socketcand", "0", folder, stack, seconds=seconds, per_packet=1)
-            for _ in BUSES
-        ]
-        ports = [str(served(sender)) for sender in senders]
-        command = [sys.executable, str(HERE / "peer_recorder.py"), "blf", str(folder / "peer")]
-        peer = subprocess.Popen(
-            [*command, *ports], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
-        stack.callback(end, peer)
+        senders = loaded(stack, "socketcand", (0, 0), folder, seconds, 1)
+        peer = start_peer(stack, "blf", folder, served(senders))
         stack.enter_context(contention(folder))
-        cpu, _ = waited(senders, peer.pid)
-        time.sleep(1.0)
-        peer.send_signal(signal.SIGTERM)
-        frames = int(json.loads(peer.communicate(timeout=120)[0].splitlines()[-1])["frames"])
+        cpu = waited(senders, peer.pid)
+        frames = int(json.loads(ended(peer).splitlines()[-1])["frames"])
     return judged(PYTHON_CAN, folder, [frames, 0], cpu)  # it doesn't say of which bus
-
-
-def served(sender: subprocess.Popen[str]) -> int:
-    """Port of a socketcand sender."""
-    assert sender.stdout is not None
-    return int(json.loads(sender.stdout.readline())["port"])
-
-
-def wait_for(path: Path) -> None:
-    """Until the recorder listens."""
-    deadline = time.monotonic() + 60
-    while not path.exists():
-        if time.monotonic() > deadline:
-            sys.exit(f"{path}: the recorder doesn't listen")
-        time.sleep(0.02)
 
 
 def measure(
     seconds: float, *, runs: int, only: str = "", folder: Path | None = None
 ) -> list[Shares]:
-    """Run every case and print a line for each run.
+    """Run every case whose name contains ``only``, and print a line for each run.
 
-    Args:
-        seconds: Of each run.
-        runs: Of each case.
-        only: Cases whose name has this text.
-        folder: On the disk to be measured; the usual place for temporary files by default.
-
-    Returns:
-        What became of the frames in each run.
+    The folder is on the disk to be measured; that of temporary files by default.
     """
-    cases: dict[str, Callable[[Path], Shares]] = {
-        f"{kind} {per_packet} {'granted' if granted else 'refused'}": (
-            lambda place, kind=kind, per_packet=per_packet, granted=granted: undulog(
-                kind, place, seconds, per_packet, granted=granted
-            )
+    cases = {
+        f"{kind} {packet} {'granted' if granted else 'refused'}": partial(
+            undulog, kind, seconds=seconds, per_packet=packet, granted=granted
         )
         for granted in (True, False)
-        for kind, per_packet in (("unix", 1), ("unix", 9), ("socketcand", 1))
+        for kind, packet in (("unix", 1), ("unix", 9), ("socketcand", 1))
     }
-    cases["python-can"] = lambda place: python_can(place, seconds)
-    found: list[Shares] = []
+    cases["python-can"] = partial(python_can, seconds=seconds)
+    found = []
     for name, run in cases.items():
         for _ in range(runs if only in name else 0):
             with tempfile.TemporaryDirectory(prefix="undulog-bench-", dir=folder) as place:
-                found.append(run(Path(place)))
+                found.append(run(folder=Path(place)))
             print(found[-1].line(), flush=True)
     return found
 
 
 def verdicts(found: Sequence[Shares]) -> list[tuple[bool, str]]:
-    """Hold the runs against the bars.
-
-    Args:
-        found: The runs.
-
-    Returns:
-        For each bar whether it is reached, and the figures.
-    """
-    lines: list[tuple[bool, str]] = []
+    """Return for each bar whether the runs reach it, and the figures."""
+    lines = []
     for name in dict.fromkeys(each.name for each in found if each.name != PYTHON_CAN):
         runs = [each for each in found if each.name == name]
         offered = sum(each.offered for each in runs)
@@ -323,9 +286,7 @@ def verdicts(found: Sequence[Shares]) -> list[tuple[bool, str]]:
 
 def main() -> None:
     """Run everything and judge it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("seconds", type=float, nargs="?", default=6.0, help="of each run")
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--only", default="", help="cases whose name has this text")

@@ -18,15 +18,16 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
-from replay_convert import write
+from live_view import start_viewer
+from measuring import write_hour
 from rerun.experimental import ViewerClient
 
 from undulog.capture import Session
 from undulog.replay import write_recording
 from undulog.replay.viewer.headless import client_of
-from undulog.replay.viewer.viewer import LOOPBACK, free_ports, viewer_binary
 
 BAR_S = 3.0
 REST_S = 5.0
@@ -121,19 +122,10 @@ def of_command(session: Path) -> tuple[float, float, float]:
 
 def of_viewer(file: Path) -> tuple[float, float]:
     """Rerun's viewer on a file: view and whole picture, each after so many seconds."""
-    (port,) = free_ports(1)
-    serve = ("--bind", LOOPBACK, "--port", str(port), SIZE)
     start = time.monotonic()
-    process = subprocess.Popen(
-        [str(viewer_binary()), str(file), "--headless", *serve],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        return look(f"rerun+http://{LOOPBACK}:{port}/proxy", start)
-    finally:
-        process.terminate()
-        process.wait()
+    with ExitStack() as stack:
+        _, address = start_viewer(stack, file, "--headless", SIZE)
+        return look(address, start)
 
 
 def measure(log: Path, recording: Path) -> bool:
@@ -176,7 +168,7 @@ def main(what: str) -> None:
         if what.endswith(".mcap"):
             log = Path(what)
         else:
-            write(log, round(float(what) * 60), can=False)
+            write_hour(log, round(float(what) * 60), can=False)
         good = measure(log, recording)
     sys.exit(0 if good else 1)
 

@@ -9,7 +9,6 @@ Run: python bench/limits.py [--runs 3] [DIMENSION...]
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import os
@@ -21,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from hostile_logs import EPOCH_NS, NS, HostileLog, Message, joint_state, zeros
+from measuring import arguments
 
 import undulog
 
@@ -131,7 +131,7 @@ def cost(arguments: list[str]) -> tuple[float, float]:
 
 def main() -> int:
     """Write, read, print; 1 if any dimension costs more than it may."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = arguments(__doc__)
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("dimensions", nargs="*", metavar="DIMENSION")
     options = parser.parse_args()

@@ -15,33 +15,31 @@ Run: python bench/live_lag.py [--scenario weak-servo-pi3] [--size 1440x900]
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from live_view import wait_for
+from live_view import Message, connect, relay, start_viewer
 from mcap.reader import make_reader
 from mcap.records import Metadata
+from measuring import arguments
 from rerun.experimental import ViewerClient
 
 from undulog.capture.log.sinks.mcap_sink import Description
 from undulog.capture.recorder.live_feed import LiveFeed
 from undulog.replay.samples.timeline import SESSION_TIME
 from undulog.replay.viewer.headless import client_of
-from undulog.replay.viewer.viewer import LOOPBACK, free_ports, viewer_binary
 
 LAG_MS = 150.0
 """The bar."""
 TICK_NS = 5_000_000
 LOOK_S = 0.003
-
-Message = tuple[int, int, int, int, bytes]
 
 
 class Watch(threading.Thread):
@@ -120,43 +118,23 @@ def send(feed: LiveFeed, messages: list[Message], epoch_ns: int, start_ns: int) 
 
 def measure(session: Path, folder: Path, size: str) -> bool:
     """Show a session as it is recorded, and print how late; whether the bar is met."""
-    (port,) = free_ports(1)
-    place = ["--bind", LOOPBACK, "--port", str(port)]
-    address = f"rerun+http://{LOOPBACK}:{port}/proxy"
-    viewer = subprocess.Popen(
-        [str(viewer_binary()), "--headless", "--window-size", size, *place],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
     path = folder / "live.sock"
-    relay = subprocess.Popen(
-        [sys.executable, "-m", "undulog", "view", "--live", str(path), "--connect", address]
-    )
-    feed = LiveFeed(path)
-    try:
+    with ExitStack() as stack:
+        _, address = start_viewer(stack, "--headless", "--window-size", size)
+        relay(stack, path, "--connect", address)
+        feed = LiveFeed(path)
+        stack.callback(feed.close)
         client = client_of(address)
-        wait_for(path.is_socket)
         definitions, messages, epoch_ns = read(session)
         for one in definitions:
             feed.define(one)
-
-        def found() -> bool:
-            feed.pump()
-            return feed.connected
-
-        wait_for(found)
+        connect(feed)
         start_ns = time.monotonic_ns() + 200_000_000
         watch = Watch(client, start_ns)
         watch.start()
         send(feed, messages, epoch_ns, start_ns)
         watch.ending.set()
         watch.join()
-    finally:
-        feed.close()
-        relay.terminate()
-        relay.wait()
-        viewer.terminate()
-        viewer.wait()
     return report(watch)
 
 
@@ -179,9 +157,7 @@ def report(watch: Watch) -> bool:
 
 def main() -> None:
     """Record a session of the twin, show it, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("--scenario", default="weak-servo-pi3")
     parser.add_argument("--size", default="1440x900", help="of the viewer's window")
     options = parser.parse_args()

@@ -11,7 +11,6 @@ Run: python bench/live_view.py [--seconds 20]
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import os
 import signal
@@ -19,12 +18,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mcap.records import Channel, Metadata, Schema
+from measuring import arguments, start, wait_for
 
 from undulog.capture import load_robot
 from undulog.capture.log.messages.cdr import encode, layout_of
@@ -34,13 +33,7 @@ from undulog.replay.viewer.viewer import LOOPBACK, free_ports, viewer_binary
 
 TICK_S = 0.005
 RATE_HZ = 100
-TOPICS = (
-    "/joint_commands",
-    "/joint_states",
-    "/joint_current",
-    "/joint_voltage",
-    "/joint_temperature",
-)
+TOPICS = tuple(f"/joint_{w}" for w in ["commands", "states", "current", "voltage", "temperature"])
 ROBOT = load_robot("snake25")
 
 Message = tuple[int, int, int, int, bytes]
@@ -58,33 +51,20 @@ def define(feed: LiveFeed) -> None:
 
 
 def sample(number: int) -> list[Message]:
-    """The messages of one round of the bus."""
-    return [(k + 1, t, t, number, p) for k, t, p in ((k, *stamped(k, number)) for k in range(5))]
-
-
-def stamped(_topic: int, number: int) -> tuple[int, bytes]:
-    """Time and bytes of one message."""
+    """Return the messages of one round of the bus, all with the same values."""
     t_ns = 1_735_689_600_000_000_000 + number * 1_000_000_000 // RATE_HZ
     view = np.frombuffer(TEMPLATE, dtype="<f8", count=25, offset=LAYOUT.leaves["position"].offset)
     view[:] = np.sin(number * 0.03 - np.arange(25) / 3.0)
     sec, nanosec = divmod(t_ns, 1_000_000_000)
     stamp = LAYOUT.leaves["header.stamp.sec"].offset
     TEMPLATE[stamp : stamp + 8] = sec.to_bytes(4, "little") + nanosec.to_bytes(4, "little")
-    return t_ns, bytes(TEMPLATE)
+    payload = bytes(TEMPLATE)
+    return [(k, t_ns, t_ns, number, payload) for k in range(1, len(TOPICS) + 1)]
 
 
 _KIND = message_type("sensor_msgs/msg/JointState")
-TEMPLATE = bytearray(
-    encode(
-        _KIND,
-        {
-            "name": list(ROBOT.joint_names),
-            "position": [0.0] * 25,
-            "velocity": [0.0] * 25,
-            "effort": [0.0] * 25,
-        },
-    )
-)
+_VALUES = dict.fromkeys(("position", "velocity", "effort"), [0.0] * 25)
+TEMPLATE = bytearray(encode(_KIND, {"name": list(ROBOT.joint_names), **_VALUES}))
 LAYOUT = layout_of(_KIND, bytes(TEMPLATE))
 
 
@@ -134,27 +114,25 @@ def measure_hot(feed: LiveFeed, count: int = 200_000) -> None:
     print(f"{'nobody watches, tight loop':28s} {each:6.2f} us an offer")
 
 
-def relay(path: Path, *arguments: Any) -> subprocess.Popen[bytes]:
-    """A relay in a process of its own, ready."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "undulog", "view", "--live", path, *map(str, arguments)]
-    )
+def relay(stack: ExitStack, path: Path, *options: object) -> subprocess.Popen[str]:
+    """Start a relay in a process of its own; it is ready."""
+    view = (sys.executable, "-m", "undulog", "view", "--live", path)
+    process = start(stack, *view, *options, stdout=None)
     wait_for(path.is_socket)
     return process
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    """Wait until something is so."""
-    deadline = time.monotonic() + 60
-    while not condition():
-        if time.monotonic() > deadline:
-            raise TimeoutError("nothing came within a minute")
-        time.sleep(0.01)
+def start_viewer(stack: ExitStack, *options: object) -> tuple[subprocess.Popen[str], str]:
+    """Start Rerun's viewer; return it and its address."""
+    (port,) = free_ports(1)
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    place = ("--bind", LOOPBACK, "--port", port)
+    viewer = start(stack, viewer_binary(), *options, *place, **silent)
+    return viewer, f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 
 def connect(feed: LiveFeed) -> None:
-    """Wait until the feed has found its relay, and the relay has drawn a little."""
-    define(feed)
+    """Wait until the feed has found its relay."""
 
     def found() -> bool:
         feed.pump()
@@ -165,7 +143,7 @@ def connect(feed: LiveFeed) -> None:
 
 def main() -> None:
     """Measure all cases."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = arguments(__doc__)
     parser.add_argument("--seconds", type=float, default=20.0, help="of each case")
     seconds = parser.parse_args().seconds
     with tempfile.TemporaryDirectory(prefix="undulog-bench-") as folder:
@@ -176,41 +154,32 @@ def main() -> None:
         measure(feed, seconds, "nobody watches")
         feed.close()
 
-        feed = LiveFeed(path)
-        process = relay(path, "--save", Path(folder) / "a.rrd", "--json")
-        try:
+        with ExitStack() as stack:
+            feed = LiveFeed(path)
+            process = relay(stack, path, "--save", Path(folder) / "a.rrd", "--json")
+            define(feed)
             connect(feed)
             measure(feed, seconds, "relay draws to a file")
-            os.kill(process.pid, signal.SIGSTOP)
+            process.send_signal(signal.SIGSTOP)
             measure(feed, seconds, "relay frozen")
-            os.kill(process.pid, signal.SIGCONT)
+            process.send_signal(signal.SIGCONT)
             feed.close()
-            process.wait()
-        finally:
-            process.kill()
             process.wait()
 
-        (port,) = free_ports(1)
-        server = subprocess.Popen(
-            [viewer_binary(), "--serve-grpc", "--bind", LOOPBACK, "--port", str(port)],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        feed = LiveFeed(path)
-        process = relay(path, "--connect", f"rerun+http://{LOOPBACK}:{port}/proxy")
-        try:
+        with ExitStack() as stack:
+            server, address = start_viewer(stack, "--serve-grpc")
+            feed = LiveFeed(path)
+            stack.callback(feed.close)
+            process = relay(stack, path, "--connect", address)
+            define(feed)
             connect(feed)
             measure(feed, seconds, "relay draws in a viewer")
-            os.kill(server.pid, signal.SIGSTOP)
+            server.send_signal(signal.SIGSTOP)
             measure(feed, seconds, "viewer frozen")
-            os.kill(server.pid, signal.SIGKILL)
+            server.kill()
             measure(feed, seconds, "viewer killed")
-        finally:
-            feed.close()
             process.terminate()
             process.wait()
-            server.kill()
-            server.wait()
 
 
 if __name__ == "__main__":

@@ -32,8 +32,8 @@ import pandas as pd
 import zstandard
 from hour_session import BUS, EPOCH_NS, JOINT_TOPICS, write_session
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex
 from mcap_ros2.decoder import DecoderFactory
+from measuring import HOUR_S, arguments, verdict
 
 from undulog.capture import Session
 from undulog.capture.common.console import progress
@@ -44,7 +44,6 @@ from undulog.capture.log.read.signals import JointSignals
 Loaded = tuple[dict[tuple[str, str], JointSignals], dict[str, pd.DataFrame]]
 
 MIB = 1 << 20
-HOUR_S = 3600
 PEER_S = 30
 """Seconds of the session that the slow peer reads."""
 LATER_WINDOWS = 7
@@ -62,22 +61,15 @@ def sensor_fields(session: Session) -> dict[str, list[str]]:
     return fields
 
 
-def cpu_s(work: Callable[[], object]) -> float:
-    """Processor time of a piece of work [s]; what it gives is dropped within that time."""
-    start = time.process_time()
+def took_s(work: Callable[[], object], clock: Callable[[], float]) -> float:
+    """Return the time of a piece of work [s]; its result is dropped within that time."""
+    start = clock()
     work()
-    return time.process_time() - start
+    return clock() - start
 
 
-def chunks_with(path: Path, topics: Collection[str]) -> list[ChunkIndex]:
-    """The chunks in which any message of some topics lies."""
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    ids = {key for key, channel in summary.channels.items() if channel.topic in topics}
-    return [
-        chunk for chunk in summary.chunk_indexes if not ids.isdisjoint(chunk.message_index_offsets)
-    ]
+cpu_s = partial(took_s, clock=time.process_time)
+wall_s = partial(took_s, clock=time.perf_counter)
 
 
 def topics_loaded(path: Path) -> set[str]:
@@ -87,17 +79,17 @@ def topics_loaded(path: Path) -> set[str]:
 
 
 def inflate_s(path: Path, topics: Collection[str]) -> float:
-    """The reference: decompress each chunk that has one of some topics and drop it.
+    """Return the reference: the time of decompressing each chunk with one of some topics [s].
 
-    Args:
-        path: The session.
-        topics: The topics.
-
-    Returns:
-        Processor time [s], opening left out.
+    It is processor time, opening left out.
     """
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    ids = {key for key, channel in summary.channels.items() if channel.topic in topics}
     places = [
-        (chunk.chunk_start_offset, chunk.uncompressed_size) for chunk in chunks_with(path, topics)
+        (chunk.chunk_start_offset, chunk.uncompressed_size)
+        for chunk in summary.chunk_indexes
+        if not ids.isdisjoint(chunk.message_index_offsets)
     ]
     data = np.memmap(path, mode="r")
     start = time.process_time()
@@ -123,26 +115,12 @@ def load_frames(path: Path) -> object:
         return session.frames(BUS)
 
 
-def wall_s(work: Callable[[], object]) -> float:
-    """Wall-clock time of a piece of work [s]; what it gives is dropped within that time."""
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
 def message_times(
     path: Path, window: tuple[int, int], threads: Sequence[int], runs: int
 ) -> tuple[list[float], float]:
-    """Seconds a message of our reader, all of the session, and of the peer, a window of it.
+    """Return wall-clock times a message [s]: ours for each number of threads, and the peer's.
 
-    Args:
-        path: The session.
-        window: What the peer reads [Unix ns], half-open.
-        threads: For each reading of ours how many it has.
-        runs: How often all read, in turn.
-
-    Returns:
-        Wall-clock times [s]: ours, one a number of threads, and the peer's.
+    Ours reads the whole session, the peer a window of it [Unix ns], half-open.
     """
     topics = [*JOINT_TOPICS, *OWN_TIMES]
     with Session.open(path) as session:
@@ -206,31 +184,16 @@ def memory(path: Path) -> dict[str, int]:
 def _sizes(found: Loaded) -> dict[int, int]:
     """Memory of the arrays that were loaded, each counted once, by address."""
     joints, tables = found
-    sizes: dict[int, int] = {}
-    for signals in joints.values():
-        for array in (*signals.t_ns, *signals.values):
-            sizes[array.ctypes.data] = array.nbytes
+    arrays = [array for one in joints.values() for array in (*one.t_ns, *one.values)]
     for table in tables.values():
-        for column in (table.index, *(table[name] for name in table)):
-            array = column.to_numpy()
-            sizes[array.ctypes.data] = array.nbytes
-    return sizes
+        arrays += [one.to_numpy() for one in (table.index, *(table[name] for name in table))]
+    return {array.ctypes.data: array.nbytes for array in arrays}
 
 
 def _status(key: str) -> int:
     """A figure of this process's memory [byte]."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(f"{key}:"):
-            return int(line.split()[1]) * 1024
-    raise KeyError(key)
-
-
-def verdict(what: str, value: float, bar: float, unit: str, *, most: bool = True) -> bool:
-    """Print a figure beside its bar."""
-    good = value <= bar if most else value >= bar
-    sign = "at most" if most else "at least"
-    print(f"{'PASS' if good else 'FAIL'}  {what}: {value:.2f} {unit} (bar: {sign} {bar:g} {unit})")
-    return good
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{key}:"))
 
 
 def make(path: Path, seconds: int, *, can: bool) -> None:
@@ -248,21 +211,19 @@ def measure(path: Path, without: Path, seconds: int, runs: int) -> bool:
     ]
     loaded_topics = topics_loaded(path)
     load(path, 1)  # memory that was never used costs more the first time, file pages too
-    inflated: list[float] = []
-    loaded: list[float] = []
-    frames: list[float] = []
-    for _ in range(runs):
-        inflated.append(inflate_s(path, loaded_topics))
-        loaded.append(cpu_s(lambda: load(path, 1)))
-        frames.append(cpu_s(lambda: load_frames(path)))
-    reference = statistics.median(inflated)
+    took = [
+        (
+            inflate_s(path, loaded_topics),
+            cpu_s(lambda: load(path, 1)),
+            cpu_s(lambda: load_frames(path)),
+        )
+        for _ in range(runs)
+    ]
+    reference, loaded, frames = (statistics.median(each) for each in zip(*took, strict=True))
     print(f"      decompress the chunks they lie in and drop them, one thread: {reference:.2f} s")
-    ratio = statistics.median(loaded) / reference
     what = "load joint, time, power and sensor columns, one thread"
-    good.append(verdict(what, ratio, 2.0, "x that"))
-    print(
-        f"      load the raw frames, one thread: {statistics.median(frames) / reference:.2f} x that"
-    )
+    good.append(verdict(what, loaded / reference, 2.0, "x that"))
+    print(f"      load the raw frames, one thread: {frames / reference:.2f} x that")
     threads = threads_or_default(None)
     command = [sys.executable, __file__, "--memory", str(path)]
     told = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
@@ -287,9 +248,7 @@ def measure(path: Path, without: Path, seconds: int, runs: int) -> bool:
 
 def main() -> None:
     """Write, measure, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--folder", type=Path, help="a folder with 2 GB to spare")

@@ -9,7 +9,6 @@ Run: python bench/read_jointstate.py [--minutes 5] [--runs 3]
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import tempfile
 import time
@@ -20,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from measuring import arguments
 
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.arrays import FloatArray
@@ -86,7 +86,7 @@ def timed(
 
 def main() -> None:
     """Write, read with each in turn, compare, print."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = arguments(__doc__)
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--runs", type=int, default=3)
     options = parser.parse_args()

@@ -10,7 +10,6 @@ busy loops and a busy disk (``bench/contention.py``).
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -24,13 +23,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import contention
+from contention import (
+    BUSES,
+    RATE,
+    ended,
+    served,
+    sources_at,
+    start_peer,
+    start_sender,
+    start_undulog,
+)
+from measuring import arguments, cpu_s, start, wait_for
 
 from undulog.capture import Session
 
-HERE = Path(__file__).parent
-RATE = 9000.0
 SETTLE_S = 3.0
-TICKS_S = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass
@@ -68,38 +75,9 @@ HEAD = (
 )
 
 
-def cpu_s(pid: int) -> float:
-    """Processor time of a process, all its threads [s]."""
-    parts = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(parts[11]) + int(parts[12])) / TICKS_S
-
-
 def rss_mb(pid: int) -> float:
     """Resident memory [MB]."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
-
-
-def start_senders(
-    kind: str, where: Sequence[str], seconds: float, rate: float, stack: ExitStack
-) -> list[subprocess.Popen[str]]:
-    """One process a bus."""
-    senders: list[subprocess.Popen[str]] = []
-    for place in where:
-        command = [sys.executable, str(HERE / "bus_sender.py"), kind, place]
-        command += ["--rate", str(rate), "--seconds", str(seconds)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        stack.callback(end, process)
-        senders.append(process)
-    return senders
-
-
-def end(process: subprocess.Popen[str]) -> None:
-    """End a process that we started."""
-    if process.poll() is None:
-        process.kill()
-    process.wait()
-    if process.stdout is not None:
-        process.stdout.close()
 
 
 def watch(outcome: Outcome, pid: int, seconds: float, senders: list[subprocess.Popen[str]]) -> None:
@@ -118,96 +96,58 @@ def watch(outcome: Outcome, pid: int, seconds: float, senders: list[subprocess.P
         outcome.worst_behind_ms = max(outcome.worst_behind_ms, said["worst_behind_ms"])
 
 
-def start_undulog(
-    folder: Path, sources: Sequence[str], stack: ExitStack
-) -> tuple[subprocess.Popen[str], Path]:
-    """The recorder as a user starts it."""
-    output = folder / "run.mcap"
-    command = [sys.executable, "-m", "undulog", "record", *sources, "--robot", "snake25"]
-    command += ["--bus", "front", "-o", str(output), "--floor", "0", "--json"]
-    command += ["--socket", str(folder / "control.sock"), "--quiet"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    stack.callback(end, process)
-    return process, output
+def start_senders(
+    stack: ExitStack, kind: str, places: Sequence[object], seconds: float, rate: float = RATE
+) -> list[subprocess.Popen[str]]:
+    """Start a sender for each bus."""
+    options = ("--rate", rate, "--seconds", seconds)
+    return [start_sender(stack, kind, place, *options) for place in places]
 
 
-def finish_undulog(outcome: Outcome, process: subprocess.Popen[str], output: Path) -> None:
-    """Stop it as a service manager does, and count what is in the file."""
-    time.sleep(1.0)
-    process.send_signal(signal.SIGTERM)
-    text, _ = process.communicate(timeout=120)
-    report = json.loads(text)
+def finish(outcome: Outcome, recorder: subprocess.Popen[str], folder: Path) -> Outcome:
+    """End our recorder and count the frames in the file."""
+    report = json.loads(ended(recorder))
     outcome.tick_p99_ms = float(report["recorder"]["tick_p99_s"]) * 1e3
+    output = folder / "run.mcap"
     outcome.size = output.stat().st_size
     with Session.open(output) as session:
-        outcome.in_file = sum(len(session.frames(f"/can/{n}")) for n in ("front", "rear"))
-
-
-def over_unix(folder: Path, seconds: float, rate: float = RATE, name: str = "") -> Outcome:
-    """Our recorder, frames by packets."""
-    outcome = Outcome(name or "undulog, AF_UNIX")
-    paths = [str(folder / f"{name}.sock") for name in ("front", "rear")]
-    with ExitStack() as stack:
-        sources = [f"{n}=unix:{p}" for n, p in zip(("front", "rear"), paths, strict=True)]
-        recorder, output = start_undulog(folder, sources, stack)
-        senders = start_senders("unix", paths, seconds, rate, stack)
-        wait_for_socket(Path(paths[1]))
-        watch(outcome, recorder.pid, seconds, senders)
-        finish_undulog(outcome, recorder, output)
+        outcome.in_file = sum(len(session.frames(f"/can/{n}")) for n in BUSES)
     return outcome
 
 
-def wait_for_socket(path: Path) -> None:
-    """Until the recorder listens."""
-    deadline = time.monotonic() + 60
-    while not path.exists():
-        if time.monotonic() > deadline:
-            sys.exit(f"{path}: the recorder doesn't listen")
-        time.sleep(0.02)
-
-
-def served(senders: list[subprocess.Popen[str]]) -> list[int]:
-    """Ports of socketcand senders."""
-    ports: list[int] = []
-    for sender in senders:
-        assert sender.stdout is not None
-        ports.append(json.loads(sender.stdout.readline())["port"])
-    return ports
+def over_unix(
+    folder: Path, seconds: float, rate: float = RATE, name: str = "undulog, AF_UNIX"
+) -> Outcome:
+    """Our recorder, frames by packets."""
+    outcome = Outcome(name)
+    paths = [folder / f"{name}.sock" for name in BUSES]
+    with ExitStack() as stack:
+        recorder = start_undulog(stack, folder, sources_at("unix", paths))
+        senders = start_senders(stack, "unix", paths, seconds, rate)
+        wait_for(paths[1].exists)
+        watch(outcome, recorder.pid, seconds, senders)
+        return finish(outcome, recorder, folder)
 
 
 def over_socketcand(folder: Path, seconds: float) -> Outcome:
     """Our recorder, frames as text over TCP."""
     outcome = Outcome("undulog, socketcand")
     with ExitStack() as stack:
-        senders = start_senders("socketcand", ["0", "0"], seconds, RATE, stack)
-        sources = [
-            f"{name}=can:socketcand:can0?host=127.0.0.1&port={port}"
-            for name, port in zip(("front", "rear"), served(senders), strict=True)
-        ]
-        recorder, output = start_undulog(folder, sources, stack)
+        senders = start_senders(stack, "socketcand", (0, 0), seconds)
+        recorder = start_undulog(stack, folder, sources_at("socketcand", served(senders)))
         time.sleep(1.0)
         watch(outcome, recorder.pid, seconds, senders)
-        finish_undulog(outcome, recorder, output)
-    return outcome
+        return finish(outcome, recorder, folder)
 
 
-def peer(kind: str, folder: Path, seconds: float) -> Outcome:
+def peer(folder: Path, seconds: float, kind: str, name: str) -> Outcome:
     """A recorder of another make on the same buses."""
-    title = {"blf": "python-can Logger, BLF", "candump": "python-can Logger, candump"}
-    outcome = Outcome(title.get(kind, "mcap-ros2-support, a message a frame"))
+    outcome = Outcome(name)
     with ExitStack() as stack:
-        senders = start_senders("socketcand", ["0", "0"], seconds, RATE, stack)
-        ports = [str(port) for port in served(senders)]
-        command = [sys.executable, str(HERE / "peer_recorder.py"), kind, str(folder / "peer")]
-        process = subprocess.Popen(
-            [*command, *ports], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
-        stack.callback(end, process)
-        watch(outcome, process.pid, seconds, senders)
-        time.sleep(1.0)
-        process.send_signal(signal.SIGTERM)
-        text, _ = process.communicate(timeout=120)
-        outcome.in_file = json.loads(text.splitlines()[-1])["frames"]
+        senders = start_senders(stack, "socketcand", (0, 0), seconds)
+        recorder = start_peer(stack, kind, folder, served(senders))
+        watch(outcome, recorder.pid, seconds, senders)
+        outcome.in_file = json.loads(ended(recorder).splitlines()[-1])["frames"]
         outcome.size = sum(file.stat().st_size for file in folder.glob("peer.*"))
     return outcome
 
@@ -215,50 +155,41 @@ def peer(kind: str, folder: Path, seconds: float) -> Outcome:
 def frozen_viewer(folder: Path, seconds: float) -> Outcome:
     """Our recorder with a live view that is stopped after a second and never looked at again."""
     outcome = Outcome("undulog, AF_UNIX, frozen viewer")
-    paths = [str(folder / f"{name}.sock") for name in ("front", "rear")]
+    paths = [folder / f"{name}.sock" for name in BUSES]
     with ExitStack() as stack:
-        sources = [f"{n}=unix:{p}" for n, p in zip(("front", "rear"), paths, strict=True)]
-        recorder, output = start_undulog(folder, sources, stack)
-        wait_for_socket(folder / "control.sock")
-        view = [sys.executable, "-m", "undulog", "view", "--live", str(folder / "control.live")]
-        relay = subprocess.Popen(
-            [*view, "--save", str(folder / "live.rrd")],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
-        stack.callback(end, relay)
-        wait_for_socket(folder / "control.live")
-        senders = start_senders("unix", paths, seconds, RATE, stack)
+        recorder = start_undulog(stack, folder, sources_at("unix", paths))
+        wait_for((folder / "control.sock").exists)
+        view = [sys.executable, "-m", "undulog", "view", "--live", folder / "control.live"]
+        relay = start(stack, *view, "--save", folder / "live.rrd", stderr=subprocess.DEVNULL)
+        wait_for((folder / "control.live").exists)
+        senders = start_senders(stack, "unix", paths, seconds)
         time.sleep(2.0)
         relay.send_signal(signal.SIGSTOP)
         watch(outcome, recorder.pid, seconds, senders)
-        finish_undulog(outcome, recorder, output)
+        finish(outcome, recorder, folder)
         relay.send_signal(signal.SIGCONT)
     return outcome
 
 
 def main() -> None:
     """Run everything and judge it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("seconds", type=float, nargs="?", default=60.0, help="of each run")
     seconds = parser.parse_args().seconds
     print(f"two buses of {RATE:.0f} frames/s, {seconds:.0f} s\n{HEAD}", flush=True)
     runs = [
-        lambda folder: over_unix(folder, seconds),
-        lambda folder: over_socketcand(folder, seconds),
-        lambda folder: frozen_viewer(folder, seconds),
-        lambda folder: over_unix(folder, 2.0 + SETTLE_S, 250_000.0, "undulog, burst 500k frames/s"),
-        lambda folder: peer("blf", folder, seconds),
-        lambda folder: peer("candump", folder, seconds),
-        lambda folder: peer("mcap-ros2", folder, seconds),
+        (over_unix, seconds),
+        (over_socketcand, seconds),
+        (frozen_viewer, seconds),
+        (over_unix, 2.0 + SETTLE_S, 250_000.0, "undulog, burst 500k frames/s"),
+        (peer, seconds, "blf", "python-can Logger, BLF"),
+        (peer, seconds, "candump", "python-can Logger, candump"),
+        (peer, seconds, "mcap-ros2", "mcap-ros2-support, a message a frame"),
     ]
-    outcomes: list[Outcome] = []
-    for run in runs:
+    outcomes = []
+    for run, *options in runs:
         with tempfile.TemporaryDirectory(prefix="undulog-bench-") as folder:
-            outcomes.append(run(Path(folder)))
+            outcomes.append(run(Path(folder), *options))
         print(outcomes[-1].line(), flush=True)
     print(f"\nbeside two busy loops a core and dd with fsync\n{contention.HEAD}", flush=True)
     contended = contention.measure(6.0, runs=3)

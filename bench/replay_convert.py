@@ -18,7 +18,6 @@ Run: python bench/replay_convert.py [--minutes 60] [--runs 2] [--can] [--rows 20
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
@@ -29,7 +28,8 @@ from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
-from analyse_hour import cost, verdict
+from analyse_hour import cost
+from measuring import HOUR_S, add_place, arguments, verdict, write_hour
 
 from undulog.capture import Session
 from undulog.replay.draw.scene.body import capsule_poses, capsule_shape
@@ -37,7 +37,6 @@ from undulog.replay.draw.scene.motion import assemble, frames_of, read_head
 from undulog.replay.samples.quantities import quantities
 from undulog.replay.samples.tracks import read_columns, wanted_fields
 
-HOUR_S = 3600
 CONVERT_S, SIZE_MB, PEAK_MB = 30.0, 350.0, 500.0
 """The bars, for an hour; memory is not to grow with the session."""
 
@@ -170,34 +169,20 @@ def measure(path: Path, minutes: float, runs: int, rows_s: float) -> bool:
     return all(good)
 
 
-def write(path: Path, seconds: int, *, can: bool) -> None:
-    """Write the session in another process, so that its memory is not this one's."""
-    code = (
-        "import sys; from pathlib import Path; from hour_session import write_session; "
-        f"write_session(Path(sys.argv[1]), int(sys.argv[2]), can={can})"
-    )
-    command = [sys.executable, "-c", code, str(path), str(seconds)]
-    subprocess.run(command, check=True, cwd=Path(__file__).parent)
-
-
 def main() -> None:
     """Write, measure, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--runs", type=int, default=2)
     parser.add_argument("--can", action="store_true", help="with raw frames, 8,000 a second")
     parser.add_argument("--rows", type=float, default=20.0, help="what the peer takes [s]")
-    place = parser.add_mutually_exclusive_group()
-    place.add_argument("--folder", type=Path, help="a folder with 2 GB to spare")
-    place.add_argument("--keep", type=Path, help="the session, written if it is not there")
+    add_place(parser, "2 GB")
     options = parser.parse_args()
     seconds = max(round(options.minutes * 60), 60)
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         path: Path = (options.keep or Path(folder) / "hour.mcap").resolve()
         if not path.exists():
-            write(path, seconds, can=options.can)
+            write_hour(path, seconds, can=options.can)
         good = measure(path, seconds / 60, options.runs, options.rows)
     sys.exit(0 if good else 1)
 

@@ -11,7 +11,6 @@ Run: python bench/sources.py [--frames 20000] [--runs 2] [--rate 8000]
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import importlib.util
 import multiprocessing
@@ -30,6 +29,7 @@ from typing import Any
 
 import can
 import numpy as np
+from measuring import arguments
 
 from undulog.capture import SessionWriter
 from undulog.capture.log.messages.frames import FRAME_DTYPE, empty_frames
@@ -227,7 +227,7 @@ def virtual(count: int, context: SourceContext) -> tuple[float, float]:
 
 def main() -> None:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = arguments(__doc__)
     parser.add_argument("--frames", type=int, default=20_000)
     parser.add_argument("--runs", type=int, default=2)
     parser.add_argument("--rate", type=float, default=8000.0)

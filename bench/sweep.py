@@ -9,43 +9,20 @@ Run: python bench/sweep.py [--runs 2000]
 
 from __future__ import annotations
 
-import argparse
+import sys
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+from measuring import arguments
 
 from undulog.replay.sweep.plan import read_plan
 from undulog.replay.sweep.rows import Row, RowStore
 from undulog.replay.sweep.sweep import prepare, run_sweep
 
-ROBOT = """name = "chain5"
-description = "Five yaw joints."
-clock = "simulated"
-assumed = ["links", "servo"]
-[chain]
-joints = 5
-planes = ["horizontal"]
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-[defaults.servo]
-stall_torque = 0.3
-gear_stiffness = 12.0
-gear_damping = 0.008
-"""
-SCENARIO = """description = "A wave on the ground."
-robot = "chain5.toml"
-duration_s = 2.0
-settle_s = 0.5
-[gait]
-ramp_s = 0.25
-[gait.horizontal]
-amplitude = 0.3
-frequency_hz = 2.0
-lag = 1.0
-"""
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from support.sweep_plans import write_plan
+
 PLAN = """scenario = "wave.toml"
 design = "random"
 points = {points}
@@ -78,13 +55,12 @@ def measure(folder: Path, points: int, workers: int) -> tuple[float, float]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = arguments(__doc__)
     parser.add_argument("--runs", type=int, default=2000)
     runs: int = parser.parse_args().runs
     with TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "chain5.toml").write_text(ROBOT)
-        (folder / "wave.toml").write_text(SCENARIO)
+        write_plan(folder, joints=5)  # its robot and scenario serve here
         one, _ = measure(folder, max(20, runs // 10), 1)
         two, overhead = measure(folder, runs, 2)
     print(f"1 worker:  {one:.2f} runs/s ({max(20, runs // 10)} runs)")

@@ -14,7 +14,6 @@ Run: python bench/target_following.py [--seeds 101-130] [--jobs 2] [--walk-limit
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import arguments
 from scipy.stats import binom
 
 from undulog.sim import load_scenario
@@ -172,7 +172,7 @@ def study(
 
 def main() -> None:
     """Run, print, keep."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = arguments(__doc__)
     parser.add_argument("--seeds", default=f"{UNTUNED.start}-{UNTUNED.stop - 1}", help="FIRST-LAST")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--follow-limit", type=float, default=90.0, help="longest run [s]")

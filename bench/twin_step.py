@@ -13,7 +13,6 @@ Run: python bench/twin_step.py [--seconds 1] [--runs 5]
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import os
@@ -21,6 +20,7 @@ import time
 from collections.abc import Callable
 
 import pybullet
+from measuring import arguments
 
 from undulog.capture.robot.model import Plane, Robot
 from undulog.sim.gait.contract import CONTROL_RATE_HZ, Readings
@@ -151,7 +151,7 @@ def least(ways: dict[str, Callable[[], float]], runs: int) -> dict[str, float]:
 
 def main() -> None:
     """Step all in turn, print."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = arguments(__doc__)
     parser.add_argument("--seconds", type=float, default=1.0)
     parser.add_argument("--runs", type=int, default=5)
     options = parser.parse_args()

@@ -65,17 +65,14 @@ class Recorded(NamedTuple):
 
 
 def session(random, noise, planes, *, odd=None, quantity="gain"):
-    """Identical joints in one kind of noise, one of them off if wanted.
+    """Return a session of identical joints in one kind of noise.
 
     Args:
         random: Generator.
         noise: One of ``NOISES``.
         planes: 1 or 2, each with ``JOINTS`` joints, in turn along the body.
-        odd: Index of the joint that is off by three half widths, or None.
-        quantity: ``gain`` or ``lag``: by what it is off.
-
-    Returns:
-        The session.
+        odd: Index of a joint that is off by three half widths, or None.
+        quantity: ``gain`` or ``lag``: the quantity of that joint that is off.
     """
     m, rate = JOINTS * planes, 50.0
     frequency = 0.5 if noise == "quantised" else random.uniform(0.4, 1.2)
@@ -90,14 +87,8 @@ def session(random, noise, planes, *, odd=None, quantity="gain"):
     )
     gain, lag = np.full(m, GAIN), np.full(m, LAG)
     if odd is not None:
-        half = half_width(
-            noise,
-            planes,
-            odd,
-            t,
-            omega=omega,
-            response=gain * amplitude * np.exp(1j * (phase - lag)),
-        )
+        response = gain * amplitude * np.exp(1j * (phase - lag))
+        half = half_width(noise, planes, odd, t, omega=omega, response=response)
         margin = MARGIN_GAIN if quantity == "gain" else MARGIN_LAG_RAD
         size = max(3 * half, margin + 2 * half) * random.choice([-1.0, 1.0])
         gain[odd] *= np.exp(size) if quantity == "gain" else 1.0
@@ -155,34 +146,24 @@ def half_width(noise, planes, joint, t, *, omega, response):
 
 
 def stated(recorded):
-    """What the answer states of a session: the only call of the code under test.
+    """Return the joints that are named by each of ``STATEMENTS``; for ``shape`` its kinds.
 
-    Args:
-        recorded: The session.
-
-    Returns:
-        The joints that are named by each of ``STATEMENTS``; for ``shape`` its kinds.
+    This is the only call of the code under test.
     """
-    joints = range(len(recorded.names))
+    joints, planes, t_s, command, position = recorded
     motions = [
-        JointMotion(
-            recorded.names[j],
-            Samples(recorded.t_s, recorded.command[j]),
-            Samples(recorded.t_s, recorded.position[j]),
-        )
-        for j in joints
+        JointMotion(name, Samples(t_s, asked), Samples(t_s, moved))
+        for name, asked, moved in zip(joints, command, position, strict=True)
     ]
     broken = tuple(fault.joint for fault in joints_not_following(motions))
     series = [
-        {recorded.names[j]: Series(recorded.names[j], recorded.t_s, rows[j]) for j in joints}
-        for rows in (recorded.command, recorded.position)
+        {name: Series(name, t_s, row) for name, row in zip(joints, rows, strict=True)}
+        for rows in (command, position)
     ]
-    gait = fit_gait(*series, float(recorded.t_s[-1]), lambda _: None)
+    gait = fit_gait(*series, float(t_s[-1]), lambda _: None)
     chains = []
-    for plane in dict.fromkeys(recorded.planes):
-        commanded = tuple(
-            name for name, own in zip(recorded.names, recorded.planes, strict=True) if own == plane
-        )
+    for plane in dict.fromkeys(planes):
+        commanded = tuple(n for n, own in zip(joints, planes, strict=True) if own == plane)
         names = tuple(name for name in commanded if name in gait.answered and name not in broken)
         response = gait.response.select([gait.answered.index(name) for name in names])
         chains.append(Chain(plane, 0, commanded, names, response))
@@ -193,14 +174,9 @@ def stated(recorded):
 
 
 def identical(sessions, seed=1):
-    """Share of sessions of identical joints with any statement, and with each.
+    """Return shares of sessions of identical joints by (noise, planes).
 
-    Args:
-        sessions: Of each cell.
-        seed: Of all.
-
-    Returns:
-        Noise and planes to the share with any statement, then with each of ``STATEMENTS``.
+    The shares are those with any statement, then with each of ``STATEMENTS``.
     """
     return {cell: identical_cell(sessions, seed, *cell) for cell in CELLS}
 
@@ -217,14 +193,9 @@ def identical_cell(sessions, seed, noise, planes):
 
 
 def one_off(sessions, seed=2):
-    """Share of sessions in which the joint that is off is named, and in which another one is.
+    """Return shares of sessions by (noise, planes, quantity).
 
-    Args:
-        sessions: Of each cell.
-        seed: Of all.
-
-    Returns:
-        Noise, planes and quantity to both shares.
+    The shares are those in which the joint that is off is named, and in which another one is.
     """
     return {cell: one_off_cell(sessions, seed, *cell) for cell in ODD_CELLS}
 
@@ -253,15 +224,18 @@ def main(sessions=2000):
         print(f"Identical joints, {sessions:,} sessions a line:\n")
         print("| noise | planes | any statement | not following | stands out | shape |")
         print("|---|---|---|---|---|---|")
-        for (noise, planes), shares in zip(CELLS, rows, strict=True):
-            row = " | ".join(f"{100 * x:.2f} %" for x in shares)
-            print(f"| {noise} | {planes} | {row} |", flush=True)
+        for cell, shares in zip(CELLS, rows, strict=True):
+            print_row(*cell, *(f"{100 * x:.2f} %" for x in shares))
         print(f"\nOne joint off by three half widths, {odd_sessions:,} sessions a line:\n")
         print("| noise | planes | by | it is named | another is |")
         print("|---|---|---|---|---|")
-        for (noise, planes, quantity), shares in zip(ODD_CELLS, odd_rows, strict=True):
-            row = " | ".join(f"{100 * x:.1f} %" for x in shares)
-            print(f"| {noise} | {planes} | {quantity} | {row} |", flush=True)
+        for cell, shares in zip(ODD_CELLS, odd_rows, strict=True):
+            print_row(*cell, *(f"{100 * x:.1f} %" for x in shares))
+
+
+def print_row(*cells):
+    """Print a row of a Markdown table."""
+    print(f"| {' | '.join(map(str, cells))} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -91,14 +91,16 @@ def fitted(t, command, own, responses, guess):
     series = [Series("c", t, command), *(Series("r", own, one) for one in responses)]
     fit = fit_shared(series, guess)
     noise = residual_noise(series, fit)
-    m = len(responses)
-    part = [
-        Noise(noise.level[k], noise.dof[k], noise.covariance[k]) for k in ([0] * m, slice(1, None))
-    ]
-    found = respond(np.repeat(fit.fundamental[:1], m), part[0], fit.fundamental[1:], part[1])
-    factor = np.array([t_factor(dof) for dof in found.dof])
-    half = factor * np.sqrt([found.lag_variance, found.log_gain_variance])
+    found, half = responded(fit, noise, [0] * len(responses), slice(1, None))
     return found.lag_rad - LAG, found.gain / GAIN - 1, half
+
+
+def responded(fit, noise, commands, answers):
+    """Return responses, and half widths of the 95 % intervals of lag and log gain, (2, draws)."""
+    part = [Noise(noise.level[k], noise.dof[k], noise.covariance[k]) for k in (commands, answers)]
+    found = respond(fit.fundamental[commands], part[0], fit.fundamental[answers], part[1])
+    factor = np.array([t_factor(dof) for dof in found.dof])
+    return found, factor * np.sqrt([found.lag_variance, found.log_gain_variance])
 
 
 def by_hilbert(command, response):
@@ -128,14 +130,8 @@ def compared(*, frequency=0.97, duration=7.3, rate=100.0, sigma=0.01, draws=2000
         Name to (lag bias, lag sd, lag RMSE / bound, gain RMSE / bound, seconds an estimate).
     """
     random = np.random.default_rng(seed)
-    t, command, own, responses = sampled(
-        random,
-        draws=draws,
-        cycles=duration * frequency,
-        rate=rate,
-        sigma=sigma,
-        frequency=frequency,
-    )
+    how = {"draws": draws, "cycles": duration * frequency, "rate": rate, "sigma": sigma}
+    t, command, own, responses = sampled(random, **how, frequency=frequency)
     omega = 2 * np.pi * frequency
     bound = (2 * sigma**2 / ((GAIN * 0.5) ** 2 * t.size)) ** 0.5
     rows = {}
@@ -144,14 +140,12 @@ def compared(*, frequency=0.97, duration=7.3, rate=100.0, sigma=0.01, draws=2000
     took = (time.process_time() - start) / draws
     covered = float(np.mean(np.abs(lag) <= half[0]))
     rows["harmonic least squares, shared frequency"] = (*_figures(lag, gain, bound), covered, took)
-    for name, way in (
-        ("Hilbert transform (SciPy)", lambda y: by_hilbert(command, y)),
-        (
-            "maximum of the cross-correlation (SciPy)",
-            lambda y: by_correlation(t, command, y, omega),
-        ),
-        ("nearest FFT bin", lambda y: by_fft(t, command, y, omega)),
-    ):
+    ways = {
+        "Hilbert transform (SciPy)": lambda y: by_hilbert(command, y),
+        "maximum of the cross-correlation (SciPy)": lambda y: by_correlation(t, command, y, omega),
+        "nearest FFT bin": lambda y: by_fft(t, command, y, omega),
+    }
+    for name, way in ways.items():
         start = time.process_time()
         found = np.array([way(one) for one in responses])
         took = (time.process_time() - start) / draws
@@ -175,19 +169,9 @@ def coverage(cycles, ar, *, draws=4000, seed=1, **more):
 
 
 def rounded(
-    *,
-    draws=1000,
-    seed=1,
-    frequency=0.5,
-    rate=50.0,
-    cycles=10.0,
-    step=STEP,
-    mean=None,
-    phase=None,
-    sigma=0.0,
-    fifth=0.0,
-    command_too=False,
-):
+    *, draws=1000, seed=1, frequency=0.5, rate=50.0, cycles=10.0, step=STEP, mean=None,
+    phase=None, sigma=0.0, fifth=0.0, command_too=False,
+):  # fmt: skip
     """Coverage and width of 95 % intervals where position is rounded to steps.
 
     Args:
@@ -229,19 +213,11 @@ def rounded(
     alone = Noise(level, dof, (bins.spread * level / 2)[:, None, None] * np.eye(2))
     covered = []
     for one in (alone, noise):
-        parts = [
-            Noise(one.level[k], one.dof[k], one.covariance[k])
-            for k in (slice(draws), slice(draws, None))
-        ]
-        found = respond(fit.fundamental[:draws], parts[0], fit.fundamental[draws:], parts[1])
+        found, half = responded(fit, one, slice(draws), slice(draws, None))
         error = np.array([found.lag_rad - lag[:, 0], np.log(found.gain / GAIN)])
-        factor = np.array([t_factor(dof) for dof in found.dof])
-        half = factor * np.sqrt([found.lag_variance, found.log_gain_variance])
         covered.append(np.mean(np.abs(error) <= half, axis=1))
-    width = np.median(half * size[:, 0], axis=1) / np.sqrt(
-        np.mean((error * size[:, 0]) ** 2, axis=1)
-    )
-    return covered[1], covered[0], width
+    rms = np.sqrt(np.mean((error * size[:, 0]) ** 2, axis=1))
+    return covered[1], covered[0], np.median(half * size[:, 0], axis=1) / rms
 
 
 def main():
@@ -253,10 +229,8 @@ def main():
     print("|---|---|---|---|---|---|---|")
     for name, (bias, sd, lag, gain, covered, took) in compared(**draws).items():
         held = "none given" if covered is None else f"{100 * covered:.1f} %"
-        print(
-            f"| {name} | {bias:.4f}° | {sd:.4f}° | {lag:.2f} | {gain:.2f} | {held} | "
-            f"{1e6 * took:.0f} µs |"
-        )
+        figures = f"{bias:.4f}° | {sd:.4f}° | {lag:.2f} | {gain:.2f}"
+        print(f"| {name} | {figures} | {held} | {1e6 * took:.0f} µs |")
     print("\n| cycles | white: lag | gain | AR(0.9): lag | gain | AR(0.9), 20 % lost: lag | gain |")
     print("|---|---|---|---|---|---|---|")
     for cycles in (7.0, 7.4, 10.0, 20.0):

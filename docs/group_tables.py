@@ -75,9 +75,8 @@ class Snake:
         found = np.full((2, 3, self.joints), np.nan)
         for group in gait.groups:
             for k, name in enumerate(group.answered):
-                for row, one in enumerate(
-                    (lag_estimate(group.response, k), gain_estimate(group.response, k))
-                ):
+                for row, estimate in enumerate((lag_estimate, gain_estimate)):
+                    one = estimate(group.response, k)
                     found[row, :, self.names.index(name)] = one.value, *one.ci95
         return found
 
@@ -123,16 +122,10 @@ class Snake:
 
 
 def draws_of(snake, sigma, count, seed):
-    """Errors of the lag, and whether each interval of lag and gain holds the noise-free value.
+    """Return errors of the lag [rad], shape (count, joints), and coverage of both intervals.
 
-    Args:
-        snake: The joints.
-        sigma: Standard deviation of the noise [rad].
-        count: Records.
-        seed: Of the noise.
-
-    Returns:
-        Shapes (count, joints) and (count, 2, joints).
+    The coverage, shape (count, 2, joints), is whether the interval of lag or gain holds the
+    noise-free value; ``sigma`` is the standard deviation of the noise [rad].
     """
     rng = np.random.default_rng(seed)
     truth = snake.estimates(snake.fit())[:, 0]
@@ -145,17 +138,7 @@ def draws_of(snake, sigma, count, seed):
 
 
 def figures(snake, sigma, draws, seed=5):
-    """RMSE of the lag over its bound, and coverage of lag and gain, by group.
-
-    Args:
-        snake: The joints.
-        sigma: Standard deviation of the noise [rad].
-        draws: Records.
-        seed: Of the noise.
-
-    Returns:
-        Three figures a group, shape (groups, 3).
-    """
+    """Return RMSE of the lag over its bound, and coverage of lag and gain, shape (groups, 3)."""
     error, covered = draws_of(snake, sigma, draws, seed)
     ratio = np.mean(error**2, axis=0) / snake.bound(sigma) ** 2
     one = snake.omega[0] == snake.omega[1]

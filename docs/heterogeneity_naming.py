@@ -19,14 +19,12 @@ from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
-from heterogeneity_tables import LEVEL, WAYS
+from heterogeneity_tables import LEVEL, WAYS, responses, with_weak_servo
 
-from undulog.analysis import analyse_session
 from undulog.analysis.experiment.reversal.mirror import mirror_test
 from undulog.analysis.experiment.reversal.modules import ordered_pairs
-from undulog.capture import Session
 from undulog.sim import Wave, load_scenario, parse_scenario
-from undulog.sim.scenario.scenario import Kernels, Modules
+from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.recording import record
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -43,15 +41,10 @@ def drawn(seed, folder):
     """Two scenarios, a wave and its reverse, with a gait, servos and ground of their own."""
     random = np.random.default_rng(seed)
     frequency = random.uniform(0.4, 1.0)
-    numbers = {
-        "frequency_hz": frequency,
-        "amplitude": random.uniform(0.25, 0.45),
-        "lag": random.uniform(np.pi / 6, np.pi / 2),
-    }
-    ground = {
-        "mu_tangential": random.uniform(0.03, 0.1),
-        "mu_normal": random.uniform(0.3, 0.8),
-    }
+    amplitude, lag = random.uniform(0.25, 0.45), random.uniform(np.pi / 6, np.pi / 2)
+    numbers = {"frequency_hz": frequency, "amplitude": amplitude, "lag": lag}
+    along, across = random.uniform(0.03, 0.1), random.uniform(0.3, 0.8)
+    ground = {"mu_tangential": along, "mu_normal": across}
     text = twin_chains.wave(
         duration_s=10 / frequency,
         settle_s=5 / frequency,
@@ -69,16 +62,10 @@ def drawn(seed, folder):
 
 
 def profile(scenario, weak, folder):
-    """Responses of the driven joints with one servo weakened: names, and y, shape (m,)."""
-    name, share = weak
-    stall = scenario.modules.servo["stall_torque"]
-    modules = Modules(scenario.modules.servo, {name: {"stall_torque": stall * (1 - share)}})
-    chosen = dataclasses.replace(scenario, modules=modules, robot=modules.fitted(scenario.robot))
-    record(chosen, folder / "run.mcap", kernels=Kernels.NUMBA, force=True)
-    with Session.open(folder / "run.mcap") as session:
-        joints = [one for one in analyse_session(session).joints if one.gain.value is not None]
-    y = [np.log(one.gain.value) - 1j * one.lag_rad.value for one in joints]
-    return [one.name for one in joints], np.array(y)
+    """Return names and responses of the driven joints with one servo weakened by a share."""
+    chosen, path = with_weak_servo(scenario, *weak), folder / "run.mcap"
+    record(chosen, path, kernels=Kernels.NUMBA, force=True)
+    return responses(path)
 
 
 def cases(ways, weakened, folder, most=None):

@@ -18,14 +18,14 @@ import argparse
 import math
 import tempfile
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from heterogeneity_tables import responses
 
-from undulog.analysis import analyse_session
 from undulog.analysis.experiment.reversal.mirror import mirror_test
 from undulog.analysis.experiment.reversal.modules import SIGNIFICANT, ordered_pairs, tilt_check
-from undulog.capture import Session
 from undulog.sim import load_scenario
 from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.recording import record
@@ -79,11 +79,9 @@ def profile(case, folder):
     scenario = load_scenario("weak-servo-pi3" + ("-reverse" if case.reverse else ""), changes)
     path = folder / "run.mcap"
     record(scenario, path, kernels=Kernels.NUMBA, force=True)
-    with Session.open(path) as session:
-        joints = [one for one in analyse_session(session).joints if one.gain.value is not None]
-    if tuple(one.name for one in joints) != YAW:
-        raise RuntimeError(f"{case}: gain and lag of {len(joints)} joints only")
-    y = np.array([np.log(one.gain.value) - 1j * one.lag_rad.value for one in joints])
+    names, y = responses(path)
+    if tuple(names) != YAW:
+        raise RuntimeError(f"{case}: gain and lag of {len(names)} joints only")
     np.save(kept, y)
     return y
 
@@ -106,19 +104,9 @@ def mirrored(case, folder):
     return profile(replace(case, heading_deg=heading, joint=mirror), folder)[::-1]
 
 
-@dataclass
-class Rates:
-    """Shares of experiments, counted up."""
-
-    rejected: int = 0
-    stated: int = 0
-    named: int = 0
-    right: int = 0
-
-    def text(self, count):
-        """As percentages."""
-        parts = (self.rejected, self.stated, self.named, self.right)
-        return "  ".join(f"{100 * part / count:5.1f}" for part in parts)
+def text(rates, count):
+    """Return counts of experiments as percentages."""
+    return "  ".join(f"{100 * part / count:5.1f}" for part in rates)
 
 
 def experiments(case, folder, *, balanced, count, scatter, seed):
@@ -126,15 +114,15 @@ def experiments(case, folder, *, balanced, count, scatter, seed):
 
     Args:
         case: The floor and the module; its heading is that of the runs with one heading.
-        folder: Of the kept profiles.
+        folder: Folder of the kept profiles.
         balanced: Whether half of the runs of each direction are turned.
         count: Experiments.
         scatter: Standard deviation of a run's log gain, and of its lag [rad].
-        seed: Of the scatter.
+        seed: Seed of the scatter.
 
     Returns:
-        How often identical modules are rejected, a pair is stated, it is named (stated without
-        'or the floor is tilted'), and the right one is first and in the right order.
+        Counts, shape (4,): identical modules are rejected; a pair is stated; it is named (stated
+        without 'or the floor is tilted'); the right one is first and in the right order.
     """
     random = np.random.default_rng(seed)
     headings = (0, 180) if balanced and case.tilt_deg else (0, 0)
@@ -148,19 +136,17 @@ def experiments(case, folder, *, balanced, count, scatter, seed):
     if case.joint:
         pair = (case.joint, YAW[-1 - YAW.index(case.joint)])
         first = pair if case.share < 0 else pair[::-1]
-    rates = Rates()
+    rates = np.zeros(4)
     for _ in range(count):
         noise = random.normal(0.0, scatter, (2, 2, 6, len(YAW)))
         runs = [
             np.repeat(y, 3, axis=0) + z[0] + 1j * z[1] for y, z in zip(ways, noise, strict=True)
         ]
         test = mirror_test(*runs, strata)
-        rates.rejected += test.p < SIGNIFICANT
-        pairs = ordered_pairs(YAW, test)
-        if pairs:
-            rates.stated += 1
-            rates.named += balanced or tilt_check(*runs, test).excluded
-            rates.right += (pairs[0].name, pairs[0].mirror) == first
+        rates[0] += test.p < SIGNIFICANT
+        if pairs := ordered_pairs(YAW, test):
+            named = balanced or tilt_check(*runs, test).excluded
+            rates[1:] += 1, named, (pairs[0].name, pairs[0].mirror) == first
     return rates
 
 
@@ -171,9 +157,7 @@ def check_relation(folder, tilts, directions):
         for heading in (0, 180):
             checked += [Case(tilt, direction, heading) for tilt in tilts]
             checked.append(Case(2.0, direction, heading, "joint05", -SHARE))
-    worst = max(
-        float(np.abs(other_way(case, folder) - mirrored(case, folder)).max()) for case in checked
-    )
+    worst = max(np.abs(other_way(case, folder) - mirrored(case, folder)).max() for case in checked)
     print(
         f"{len(checked)} runs of the reversed wave against the relation: at most "
         f"{math.degrees(worst):.4f} degrees"
@@ -182,9 +166,7 @@ def check_relation(folder, tilts, directions):
 
 def check_cancelling(folder, tilts, directions):
     """Print what a floor leaves of d with one heading and with both, identical modules."""
-    print(
-        "floor                 |d| in degrees: one heading, balanced; common/contrast, one heading"
-    )
+    print(f"{'floor':22}|d| in degrees: one heading, balanced; common/contrast, one heading")
     for tilt in tilts:
         for direction in directions:
             plus = [profile(Case(tilt, direction, one), folder) for one in (0, 180)]
@@ -216,12 +198,11 @@ def main():
         print("                                        rejected stated named right, in %")
         floors = [(0.0, "fore-aft"), *((t, d) for t in tilts for d in directions)]
         plans = {"one heading": False, "balanced": True}
+        drawn = partial(experiments, folder=folder, count=count, scatter=scatter)
         for plan, balanced in plans.items():
             for seed, (tilt, direction) in enumerate(floors):
-                case = Case(tilt, direction)
-                how = {"balanced": balanced, "count": count, "scatter": scatter, "seed": seed}
-                rates = experiments(case, folder, **how)
-                print(f"  identical {plan:11s} {tilt:3.1f} {direction:9s}  {rates.text(count)}")
+                rates = drawn(Case(tilt, direction), balanced=balanced, seed=seed)
+                print(f"  identical {plan:11s} {tilt:3.1f} {direction:9s}  {text(rates, count)}")
         for plan, balanced in plans.items():
             for tilt, direction, share in (
                 (0.0, "fore-aft", -SHARE),
@@ -230,21 +211,14 @@ def main():
             ):
                 rows = {}
                 for joint in modules:
-                    seed = YAW.index(joint)
                     case = Case(tilt, direction, joint=joint, share=share)
-                    how = {"balanced": balanced, "count": count, "scatter": scatter, "seed": seed}
-                    rows[joint] = experiments(case, folder, **how)
-                hardest = min(rows, key=lambda joint: rows[joint].right)
+                    rows[joint] = drawn(case, balanced=balanced, seed=YAW.index(joint))
+                hardest = min(rows, key=lambda joint: rows[joint][-1])
                 title = f"{100 * share:+.0f} % {plan:11s} {tilt:3.1f} {direction:9s}"
-                mean = Rates(
-                    *(
-                        np.mean([getattr(one, key) for one in rows.values()])
-                        for key in ("rejected", "stated", "named", "right")
-                    )
-                )
-                print(f"  {title} joint05       {rows['joint05'].text(count)}")
-                print(f"  {title} mean of {len(rows):2d}    {mean.text(count)}")
-                print(f"  {title} worst {hardest} {rows[hardest].text(count)}", flush=True)
+                mean = np.mean(list(rows.values()), axis=0)
+                print(f"  {title} joint05       {text(rows['joint05'], count)}")
+                print(f"  {title} mean of {len(rows):2d}    {text(mean, count)}")
+                print(f"  {title} worst {hardest} {text(rows[hardest], count)}", flush=True)
 
 
 if __name__ == "__main__":

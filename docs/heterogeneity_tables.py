@@ -42,19 +42,18 @@ def boundary_pattern(joints):
 
 
 def sensed(random, ratio, *, sets, runs, ar=0.0, sigma=0.01, noisy=None):
-    """Responses of runs whose encoders carry noise, fitted over four cycles of 10 samples.
+    """Return ln(response/command) of runs with noise on the encoders, shape (sets, runs, m).
+
+    The fit is over four cycles of 10 samples.
 
     Args:
         random: Generator.
         ratio: Response over command without noise, shape (m,).
         sets: Experiments.
-        runs: Runs in each.
+        runs: Runs of each experiment.
         ar: Coefficient of the noise's autoregression; 0 is white.
-        sigma: Its standard deviation [rad]; the commands' amplitude is 0.4 rad.
+        sigma: Standard deviation of the noise [rad]; the commands' amplitude is 0.4 rad.
         noisy: Index of a joint whose noise is three times as large.
-
-    Returns:
-        ln(response/command), shape (sets, runs, m).
     """
     wave = np.exp(-2j * np.pi * 4 * np.arange(40) / 40)
     noise = random.normal(size=(sets, runs, ratio.size, 40 + 40))
@@ -91,13 +90,21 @@ def _p(forward, reverse, labels):
 
 
 def twin_profile(scenario, weakened, folder):
-    """Responses of the yaw joints of the 25-joint twin, one servo weakened by a share."""
-    chosen = load_scenario(scenario)
-    stall = chosen.modules.servo["stall_torque"]
-    modules = Modules(chosen.modules.servo, {WEAK: {"stall_torque": stall * (1 - weakened)}})
-    chosen = dataclasses.replace(chosen, modules=modules, robot=modules.fitted(chosen.robot))
+    """Return the responses of the 25-joint twin's yaw joints, one servo weakened by a share."""
     path = Path(folder) / f"{scenario}-{weakened:g}.mcap"
-    record(chosen, path)
+    record(with_weak_servo(load_scenario(scenario), WEAK, weakened), path)
+    return responses(path)
+
+
+def with_weak_servo(scenario, joint, share):
+    """Return a scenario in which the servo of a joint is weakened by a share."""
+    servo = scenario.modules.servo
+    modules = Modules(servo, {joint: {"stall_torque": servo["stall_torque"] * (1 - share)}})
+    return dataclasses.replace(scenario, modules=modules, robot=modules.fitted(scenario.robot))
+
+
+def responses(path):
+    """Return the names of a session's driven joints, and ln(response/command), shape (m,)."""
     with Session.open(path) as session:
         joints = [one for one in analyse_session(session).joints if one.gain.value is not None]
     y = [np.log(one.gain.value) - 1j * one.lag_rad.value for one in joints]

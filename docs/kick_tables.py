@@ -113,9 +113,8 @@ def row(random, count, m, scatter_deg, *, coupled=True, base_runs=6, how="each",
         failed += not found.agree.all()
         halves.append(np.median(found.P.half))
         if index:
-            of = nonlinearity(
-                found.P, found.R, found.G, found.S, correlation=found.errors.correlation
-            )
+            matrices = (found.P, found.R, found.G, found.S)
+            of = nonlinearity(*matrices, correlation=found.errors.correlation)
             called += of.ci95 is not None and of.ci95[0] > 0
     shares = {name: float(one.mean() / count) for name, one in inside.items()}
     return {

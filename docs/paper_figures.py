@@ -43,13 +43,7 @@ OTHER_MODE = "#ffc9c9"
 LAGS = ("pi2", "pi3")
 QUICK_S, QUICK_GAIT_S = 2.0, 8.0
 """Durations of quick runs; those whose gait is analysed need three cycles of it."""
-ABOVE: dict[str, Any] = {
-    "frameon": False,
-    "fontsize": 8,
-    "loc": "lower left",
-    "bbox_to_anchor": (0.0, 1.0),
-}
-DOT: dict[str, Any] = {"marker": "o", "ms": 5, "capsize": 3}
+ABOVE = {"frameon": False, "fontsize": 8, "loc": "lower left", "bbox_to_anchor": (0.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -60,7 +54,6 @@ class Run:
         t_s: Times of the samples [s], shape (n,).
         names: Joint names, head to tail.
         command: Commanded angles [rad], shape (n, m).
-        angle: Measured angles [rad], shape (n, m).
         centre: Link centres [m], shape (n, m + 1, 3).
         modes: When each mode began [s], and its name.
         world: Where it ran.
@@ -69,7 +62,6 @@ class Run:
     t_s: FloatArray
     names: tuple[str, ...]
     command: FloatArray
-    angle: FloatArray
     centre: FloatArray
     modes: tuple[tuple[float, str], ...]
     world: World
@@ -126,18 +118,12 @@ def _read(session: Session, world: World) -> Run:
     )
     start = session.start_ns
     modes = session.table("/gait/mode")
-    return Run(
-        t_s=(odom.index.to_numpy(dtype=np.int64)[:count] - start) * 1e-9,
-        names=robot.joint_names,
-        command=command[:count],
-        angle=angles,
-        centre=centre,
-        modes=tuple(
-            ((int(t) - start) * 1e-9, str(text))
-            for t, text in zip(modes.index, modes["data"], strict=True)
-        ),
-        world=world,
+    t_s = (odom.index.to_numpy(dtype=np.int64)[:count] - start) * 1e-9
+    named = tuple(
+        ((int(t) - start) * 1e-9, str(text))
+        for t, text in zip(modes.index, modes["data"], strict=True)
     )
+    return Run(t_s, robot.joint_names, command[:count], centre, named, world)
 
 
 def draw_world(ax: Axes, world: World) -> None:
@@ -293,16 +279,10 @@ def places_figure(runs: Runs) -> mpl.figure.Figure:
             below.plot(places, turn, style, color=GREY)
         for point, color in zip(body.observed, colors, strict=True):
             size = point.amplitude_m
-            top.errorbar(
-                point.place, 1e3 * (size.value or math.nan), _half(size, 1e3), color=color, **DOT
-            )
-            below.errorbar(
-                point.place,
-                _phase(point),
-                _half(point.phase_rad, 180 / math.pi),
-                color=color,
-                **DOT,
-            )
+            dot = {"color": color, "marker": "o", "ms": 5, "capsize": 3}
+            top.errorbar(point.place, 1e3 * (size.value or math.nan), _half(size, 1e3), **dot)
+            half = _half(point.phase_rad, 180 / math.pi)
+            below.errorbar(point.place, _phase(point), half, **dot)
         top.set_title(name.removeprefix("snake13-"), fontsize=9)
     axes[0, 0].set_ylabel("amplitude [mm]")
     axes[1, 0].set_ylabel("phase to the head [deg]")
@@ -341,13 +321,9 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="short runs")
     options = parser.parse_args()
     mpl.use("Agg")
-    plt.rcParams |= {
-        "svg.hashsalt": "undulog",
-        "font.size": 9,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "figure.constrained_layout.use": True,
-    }
+    plt.rcParams |= {"svg.hashsalt": "undulog", "font.size": 9}
+    plt.rcParams |= {"axes.spines.top": False, "axes.spines.right": False}
+    plt.rcParams |= {"figure.constrained_layout.use": True}
     images: Path = options.images
     images.mkdir(parents=True, exist_ok=True)
     runs = Runs(options.sessions, quick=options.quick)

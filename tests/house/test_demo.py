@@ -1,7 +1,5 @@
 """The main job end to end, on the files that `make demo` makes, held by foreign tools."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys
@@ -20,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
     makefile = ROOT / "Makefile"
     recipe = re.findall(r"\$\(call undulog,(.*)\)\n", makefile.read_text())
@@ -31,13 +29,13 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(*command: object) -> str:
+def run(*command):
     done = processes.run(*[str(word) for word in command])
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def test_rosbags_reads_every_message(demo: Path) -> None:
+def test_rosbags_reads_every_message(demo):
     with AnyReader([demo / "session.mcap"]) as reader:
         counts = dict.fromkeys((connection.topic for connection in reader.connections), 0)
         for connection, _, raw in reader.messages():
@@ -49,7 +47,7 @@ def test_rosbags_reads_every_message(demo: Path) -> None:
     assert counts["/odom"] == 2001
 
 
-def test_rerun_shows_the_named_joints_of_the_session(demo: Path) -> None:
+def test_rerun_shows_the_named_joints_of_the_session(demo):
     run(RERUN, "mcap", "convert", demo / "session.mcap", "-o", demo / "native.rrd")
     run(RERUN, "rrd", "verify", demo / "native.rrd")
     where = ("--entity", "/joint_states/position")
@@ -57,11 +55,11 @@ def test_rerun_shows_the_named_joints_of_the_session(demo: Path) -> None:
     assert ", ".join(JOINTS[:10]) in printed  # it cuts long lists short
 
 
-def test_the_replay_file_verifies(demo: Path) -> None:
+def test_the_replay_file_verifies(demo):
     run(RERUN, "rrd", "verify", demo / "replay.rrd")
 
 
-def test_the_result_has_the_papers_claim_with_an_interval(demo: Path) -> None:
+def test_the_result_has_the_papers_claim_with_an_interval(demo):
     result = json.loads((demo / "result.json").read_text())
     contrast = result["heterogeneity"]["boundary_contrast_lag"]
     degrees = [-57.29577951308232 * value for value in (contrast["value"], *contrast["ci95"])]
@@ -69,7 +67,7 @@ def test_the_result_has_the_papers_claim_with_an_interval(demo: Path) -> None:
     assert [joint["name"] for joint in result["joints"]] == JOINTS
 
 
-def test_the_page_opens_silently(demo: Path, browser) -> None:
+def test_the_page_opens_silently(demo, browser):
     browser.open((demo / "report.html").as_uri())
     assert browser.complaints() == []
     assert [url for url in browser.requests() if not url.endswith("report.html")] == []

@@ -1,7 +1,5 @@
 """The command line: every command has help with an example, and wrong words exit with 2."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -15,14 +13,14 @@ from support.processes import python, run
 
 
 @pytest.mark.parametrize("verb", sorted(undulog.VERBS))
-def test_help_of_every_verb_shows_an_example(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_of_every_verb_shows_an_example(verb, capsys):
     assert undulog.run([*verb.split(), "--help"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert f"Usage: undulog {verb}" in shown
     assert f"Example: undulog {verb}" in shown
 
 
-def test_help_lists_all_verbs_without_importing_any() -> None:
+def test_help_lists_all_verbs_without_importing_any():
     code = (
         "import sys, undulog; undulog.run(['--help']);"
         "heavy = {'pandas', 'scipy', 'pybullet', 'rerun', 'matplotlib', 'can'} & set(sys.modules);"
@@ -42,7 +40,7 @@ COMMANDS = sorted(
 
 
 @pytest.mark.parametrize("module", COMMANDS)
-def test_a_command_loads_neither_viewer_nor_engine_before_it_runs(module: str) -> None:
+def test_a_command_loads_neither_viewer_nor_engine_before_it_runs(module):
     # Rerun reads its log level when it's loaded, so `view` has to be able to set it before.
     code = (
         f"import sys, {module};"
@@ -53,7 +51,7 @@ def test_a_command_loads_neither_viewer_nor_engine_before_it_runs(module: str) -
     assert done.returncode == 0, done.stderr
 
 
-def test_a_mistyped_verb_exits_2_and_names_the_near_one(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mistyped_verb_exits_2_and_names_the_near_one(capsys):
     assert undulog.run(["analyze", "x.mcap"]) == 2
     said = capsys.readouterr().err
     assert "no command 'analyze'" in said
@@ -61,20 +59,18 @@ def test_a_mistyped_verb_exits_2_and_names_the_near_one(capsys: pytest.CaptureFi
 
 
 @pytest.mark.parametrize("words", [["--bogus"], ["-x", "analyse"], ["log", "--bogus"]])
-def test_an_unknown_option_is_named_and_exits_2(
-    words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unknown_option_is_named_and_exits_2(words, capsys):
     assert undulog.run(words) == 2
     option = next(word for word in words if word.startswith("-"))
     assert f"there is no option '{option}'" in capsys.readouterr().err
 
 
-def test_a_missing_argument_exits_2(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_argument_exits_2(capsys):
     assert undulog.run(["log", "info"]) == 2
     assert "FILE" in capsys.readouterr().err
 
 
-def test_a_missing_extra_says_which_one_to_install() -> None:
+def test_a_missing_extra_says_which_one_to_install():
     # None in sys.modules makes Python raise the same ImportError as a package that isn't there.
     code = (
         "import sys; sys.modules['pybullet'] = None; import undulog;"
@@ -85,20 +81,20 @@ def test_a_missing_extra_says_which_one_to_install() -> None:
     assert "pip install 'undulog[sim]'" in done.stderr
 
 
-def test_info_names_versions(capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_names_versions(capsys):
     assert undulog.run(["info"]) == 0
     said = capsys.readouterr().out
     assert "undulog 0" in said
     assert "numpy" in said
 
 
-def test_a_closed_pipe_is_no_traceback() -> None:
+def test_a_closed_pipe_is_no_traceback():
     command = f"{sys.executable} -m undulog info --json | true"
     done = run("bash", "-c", command)
     assert "Traceback" not in done.stderr
 
 
-def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path: Path) -> None:
+def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path):
     pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
     trace, session = tmp_path / "trace.mf4", tmp_path / "trace.mcap"
     script = (
@@ -115,7 +111,7 @@ def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("words", ["--help", "info --json", "sim list"])
-def test_a_full_device_behind_the_output_is_an_error(words: str) -> None:
+def test_a_full_device_behind_the_output_is_an_error(words):
     command = [sys.executable, "-m", "undulog", *words.split()]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(

@@ -1,11 +1,8 @@
 """A file that isn't there is told alike by every command: one line that names it, exit code 1."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import shlex
-from pathlib import Path
 
 import pytest
 
@@ -64,7 +61,7 @@ WITHOUT_FILES |= {"record unit", "sim list", "info"}
 
 
 @pytest.fixture(scope="module")
-def there(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def there(tmp_path_factory):
     """A session and a CSV that can be read."""
     folder = tmp_path_factory.mktemp("there")
     record(load_scenario("flat").changed(duration_s=0.1), folder / "run.mcap")
@@ -74,13 +71,7 @@ def there(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.parametrize("kind", ["empty", "several", "rosbag2", "rosbag2 of sqlite3"])
 @pytest.mark.parametrize("line", LINES)
-def test_a_folder_that_is_no_session_is_named_with_the_fix(
-    line: str,
-    kind: str,
-    there: dict[str, Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_folder_that_is_no_session_is_named_with_the_fix(line, kind, there, tmp_path, capsys):
     folder = tmp_path / "folder"
     folder.mkdir()
     for name in ("a.mcap", "b.mcap") if kind in ("several", "rosbag2") else ():
@@ -110,9 +101,7 @@ def test_a_folder_that_is_no_session_is_named_with_the_fix(
         "plan lag-sweep --like {folder} -o {out}",
     ],
 )
-def test_a_folder_of_one_session_is_that_session(
-    line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_one_session_is_that_session(line, tmp_path, capsys):
     folder = tmp_path / "folder"
     folder.mkdir()
     record(load_scenario("flat").changed(duration_s=12.0), folder / "run.mcap")
@@ -120,15 +109,13 @@ def test_a_folder_of_one_session_is_that_session(
     assert undulog.run(shlex.split(line.format_map(words))) == 0, capsys.readouterr().err
 
 
-def test_every_verb_is_here() -> None:
+def test_every_verb_is_here():
     tried = {max((v for v in undulog.VERBS if line.startswith(v)), key=len) for line in LINES}
     assert tried == set(undulog.VERBS) - WITHOUT_FILES
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_a_file_that_is_not_there_is_named_and_the_work_has_failed(
-    line: str, there: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_is_not_there_is_named_and_the_work_has_failed(line, there, tmp_path, capsys):
     words = {"no": tmp_path / "nowhere", "out": tmp_path / "out", **there}
     suffix = re.search(r"\{no\}(\.\w+)", line)
     assert suffix is not None
@@ -139,17 +126,12 @@ def test_a_file_that_is_not_there_is_named_and_the_work_has_failed(
     assert not any(tmp_path.iterdir())
 
 
-def test_a_file_that_vanishes_meanwhile_is_named(
-    there: dict[str, Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_file_that_vanishes_meanwhile_is_named(there, tmp_path, monkeypatch, capsys):
     path = tmp_path / "run.mcap"
     path.write_bytes(there["run"].read_bytes())
     digest = hashlib.sha256
 
-    def vanish(*data: bytes) -> object:
+    def vanish(*data):
         path.unlink(missing_ok=True)
         return digest(*data)
 

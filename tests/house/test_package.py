@@ -1,7 +1,5 @@
 """One package name: what is built and installed, and that no module exists under two names."""
 
-from __future__ import annotations
-
 import ast
 import csv
 import json
@@ -22,7 +20,7 @@ FOLDERS = ("analysis", "capture", "replay", "sim")
 BUILD = [sys.executable, "-m", "hatchling", "build"]
 
 
-def tracked(*patterns: str) -> list[Path]:
+def tracked(*patterns):
     command = ["git", "ls-files", "--", *patterns]
     done = processes.run(*command, cwd=ROOT)
     if done.returncode:
@@ -30,14 +28,14 @@ def tracked(*patterns: str) -> list[Path]:
     return [ROOT / name for name in done.stdout.splitlines()]
 
 
-def run(*words: str | Path, cwd: Path = ROOT, fails: bool = False, **environment: str) -> str:
+def run(*words, cwd=ROOT, fails=False, **environment):
     keep = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = processes.run(*words, cwd=cwd, env=keep | environment)
     assert (done.returncode != 0) == fails, done.stderr
     return done.stderr if fails else done.stdout
 
 
-def record(wheel: Path) -> dict[str, str]:
+def record(wheel):
     with zipfile.ZipFile(wheel) as archive:
         (name,) = [n for n in archive.namelist() if n.endswith(".dist-info/RECORD")]
         rows = csv.reader(archive.read(name).decode().splitlines())
@@ -45,7 +43,7 @@ def record(wheel: Path) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tree(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tree") / "undulog"
     for path in tracked():
         copy = folder / path.relative_to(ROOT)
@@ -55,14 +53,12 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def wheel(tree: Path) -> Path:
+def wheel(tree):
     run(*BUILD, "-t", "wheel", "-d", tree.parent / "wheel", cwd=tree)
     return next((tree.parent / "wheel").glob("*.whl"))
 
 
-def test_the_source_archive_holds_each_file_once_and_builds_the_same_wheel(
-    tree: Path, wheel: Path
-) -> None:
+def test_the_source_archive_holds_each_file_once_and_builds_the_same_wheel(tree, wheel):
     run(*BUILD, "-t", "sdist", "-d", tree.parent / "sdist", cwd=tree)
     with tarfile.open(next((tree.parent / "sdist").glob("*.tar.gz"))) as archive:
         members = archive.getmembers()
@@ -77,13 +73,13 @@ def test_the_source_archive_holds_each_file_once_and_builds_the_same_wheel(
     assert again == record(wheel)
 
 
-def test_the_wheel_holds_every_file_of_the_packages(wheel: Path) -> None:
+def test_the_wheel_holds_every_file_of_the_packages(wheel):
     expected = {f"undulog/{path.relative_to(ROOT)}" for path in tracked(*FOLDERS)}
     expected |= {"undulog/__init__.py", "undulog/__main__.py"}
     assert {name for name in record(wheel) if not name.startswith("undulog-")} == expected
 
 
-def test_a_tree_without_links_is_refused_when_it_is_built(tree: Path, tmp_path: Path) -> None:
+def test_a_tree_without_links_is_refused_when_it_is_built(tree, tmp_path):
     folder = tmp_path / "flat"
     shutil.copytree(tree, folder, symlinks=True)
     for name in FOLDERS:  # what git writes where links are not allowed
@@ -94,9 +90,7 @@ def test_a_tree_without_links_is_refused_when_it_is_built(tree: Path, tmp_path: 
     assert "symbolic link" in said
 
 
-def test_an_installed_wheel_leaves_one_name_beside_modules_of_the_user(
-    wheel: Path, tmp_path: Path
-) -> None:
+def test_an_installed_wheel_leaves_one_name_beside_modules_of_the_user(wheel, tmp_path):
     place, work = tmp_path / "site", tmp_path / "work"
     pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--quiet"]
     run(*pip, "--no-compile", "--target", place, wheel)
@@ -120,9 +114,7 @@ def test_an_installed_wheel_leaves_one_name_beside_modules_of_the_user(
 
 @pytest.mark.parametrize("name", FOLDERS)
 @pytest.mark.parametrize("how", [("-c",), ("-m", "pytest", "-q", "-p", "no:cacheprovider")])
-def test_a_package_by_another_name_is_an_error(
-    name: str, how: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_package_by_another_name_is_an_error(name, how, tmp_path):
     if how == ("-c",):
         said = run(sys.executable, "-c", f"import {name}", fails=True)
         assert f"ImportError: import undulog.{name} instead of {name}" in said
@@ -135,7 +127,7 @@ def test_a_package_by_another_name_is_an_error(
     run(sys.executable, *how, test)
 
 
-def test_results_cross_to_a_spawned_process(tmp_path: Path) -> None:
+def test_results_cross_to_a_spawned_process(tmp_path):
     script = tmp_path / "spawned.py"
     script.write_text(
         "import json, multiprocessing\n"
@@ -155,7 +147,7 @@ def test_results_cross_to_a_spawned_process(tmp_path: Path) -> None:
     assert same == [True, True]
 
 
-def _imports(tree: ast.AST) -> list[str]:
+def _imports(tree):
     names = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -165,7 +157,7 @@ def _imports(tree: ast.AST) -> list[str]:
     return names
 
 
-def test_no_file_names_a_package_without_undulog_or_its_own_package_with_it() -> None:
+def test_no_file_names_a_package_without_undulog_or_its_own_package_with_it():
     found = []
     for path in tracked("*.py"):
         name = path.relative_to(ROOT)
@@ -183,7 +175,7 @@ MODULE = re.compile(
 )
 
 
-def test_no_text_or_string_names_a_module_without_undulog() -> None:
+def test_no_text_or_string_names_a_module_without_undulog():
     found = []
     for path in tracked("*.py", "*.md", "*.ipynb", "*.toml", "*.service", ".ci", "Makefile"):
         if path.name == "CHANGELOG.md":

@@ -1,12 +1,9 @@
 """Every command and snippet of the README does what it says."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -29,7 +26,7 @@ TRACE = "".join(
 )
 
 
-def test_the_readme_shows_a_picture_before_anything_else() -> None:
+def test_the_readme_shows_a_picture_before_anything_else():
     picture = README.index("![")
     assert picture < README.index("```")
     for path in re.findall(r"!\[[^]]*\]\(([^)]+)\)", README):
@@ -37,14 +34,14 @@ def test_the_readme_shows_a_picture_before_anything_else() -> None:
 
 
 @pytest.mark.parametrize("command", [c for c in COMMANDS if c.startswith("make ")])
-def test_make_targets_exist_and_are_run_by_the_integration(command: str) -> None:
+def test_make_targets_exist_and_are_run_by_the_integration(command):
     done = processes.run(*shlex.split(command), "-n", cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert command in (ROOT / ".ci" / "run").read_text()
 
 
 @pytest.mark.slow
-def test_the_verbs_in_order_then_the_snippets(tmp_path: Path) -> None:
+def test_the_verbs_in_order_then_the_snippets(tmp_path):
     (tmp_path / "trace.log").write_text(TRACE)
     verbs = [command for command in COMMANDS if not command.startswith("make ")]
     assert len(verbs) >= 8
@@ -58,7 +55,7 @@ def test_the_verbs_in_order_then_the_snippets(tmp_path: Path) -> None:
         assert "joint01" in run([sys.executable, "-c", snippet], tmp_path)
 
 
-def run(command: list[str], folder: Path) -> str:
+def run(command, folder):
     done = processes.run(*command, cwd=folder, env=dict(os.environ))
     assert done.returncode == 0, f"{command}: {done.stderr}"
     return done.stdout

@@ -1,9 +1,6 @@
 """A real robot's CAN trace through the commands, as its owner would type them."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import pytest
 
@@ -11,9 +8,7 @@ import undulog
 from support.paths import TRACE
 
 
-def test_a_ramp_is_imported_exported_and_has_no_gait(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_ramp_is_imported_exported_and_has_no_gait(tmp_path, capsys):
     if not TRACE.is_file():
         pytest.skip(f"the real recording {TRACE.name} is not beside this checkout")
     log, back = tmp_path / "arcsnake.mcap", tmp_path / "back.log"

@@ -1,24 +1,22 @@
 """Rules of the house that no linter holds."""
 
-from __future__ import annotations
-
 import pytest
 
 from support.paths import ROOT
 from support.processes import run
 
 
-def _tracked() -> list[str]:
+def _tracked():
     done = run("git", "ls-files", cwd=ROOT)
     if done.returncode:
         pytest.skip("not a git checkout: the list of tracked files is unknown")
     return done.stdout.splitlines()
 
 
-def test_no_package_folder_of_the_tests_shadows_ours() -> None:
+def test_no_package_folder_of_the_tests_shadows_ours():
     assert [str(p) for p in (ROOT / "tests").rglob("__init__.py")] == []
 
 
-def test_no_recording_or_output_is_tracked_but_the_one_that_pictures_are_held_to() -> None:
+def test_no_recording_or_output_is_tracked_but_the_one_that_pictures_are_held_to():
     recordings = [name for name in _tracked() if name.endswith((".mcap", ".rrd", ".candump.log"))]
     assert recordings == ["tests/replay/golden/session.mcap"]

@@ -1,7 +1,5 @@
 """Names in a log are untrusted: none reaches a terminal, a spreadsheet or a page as it is."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -12,7 +10,6 @@ import subprocess
 import sys
 import unicodedata
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
 from mcap.writer import Writer
@@ -66,7 +63,7 @@ COMMANDS = (
 )
 
 
-def write_hostile(path: Path, *, seconds: float = 12.0, session_id: str = f"s{CLEAR}") -> Path:
+def write_hostile(path, *, seconds=12.0, session_id=f"s{CLEAR}"):
     """Write the session: joints that follow their commands, with the names above.
 
     Args:
@@ -113,14 +110,14 @@ def write_hostile(path: Path, *, seconds: float = 12.0, session_id: str = f"s{CL
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("hostile")
     write_hostile(place / "a.mcap")
     write_hostile(place / "b.mcap", session_id="b")
     return place
 
 
-def words(command: str) -> list[str]:
+def words(command):
     named = {"A": "a.mcap", "B": "b.mcap"}
     return [
         sys.executable,
@@ -133,7 +130,7 @@ def words(command: str) -> list[str]:
     ]
 
 
-def run(folder: Path, command: str, *more: str) -> subprocess.CompletedProcess[str]:
+def run(folder, command, *more):
     done = subprocess.run(
         [*words(command), *more], cwd=folder, capture_output=True, check=False, env=environment()
     )
@@ -142,11 +139,11 @@ def run(folder: Path, command: str, *more: str) -> subprocess.CompletedProcess[s
     return subprocess.CompletedProcess(done.args, done.returncode, out, err)
 
 
-def environment() -> dict[str, str]:
+def environment():
     return os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm"}
 
 
-def raw(text: str) -> set[str]:
+def raw(text):
     return {c for c in text if unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp")} - {"\n"}
 
 
@@ -217,7 +214,7 @@ def test_entities_and_documents_of_rerun_are_as_meant(folder):
 
 
 class _Tags(HTMLParser):
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.found: list[tuple[str, dict[str, str | None]]] = []
 

@@ -12,10 +12,10 @@ values = {values}
 """
 
 
-def write_plan(folder, values=(0.2, 0.3), seeds=1, top="", name="plan.toml"):
+def write_plan(folder, values=(0.2, 0.3), seeds=1, top="", name="plan.toml", joints=3):
     """Write a plan over the servos' strength, with its scenario and robot; return its path."""
     servo = {"stall_torque": 0.3, "gear_stiffness": 12.0, "gear_damping": 0.008}
-    robot = twin_chains.chain(3, planes=["horizontal"], **servo)
+    robot = twin_chains.chain(joints, planes=["horizontal"], **servo)
     scenario = twin_chains.wave(
         duration_s=2.0,
         settle_s=0.5,
