@@ -37,87 +37,61 @@ def driven_joint(name, place, plane="horizontal", flags=()):
     inside = math.sin(math.pi * place)
     lag = math.radians(7.46 + 6.2 * inside)
     net = -0.016 + 0.424 * inside
-    return JointResult(
-        name=name,
-        plane=plane,
-        command_amplitude_rad=0.4,
-        gain=around(1.07 - 0.14 * inside + 0.01 * math.cos(9 * place), 0.0042),
-        lag_rad=around(lag, math.radians(0.21)),
-        energy_net_j=net,
-        energy_plus_j=max(net, 0) + 0.05,
-        energy_abs_j=abs(net) + 0.11,
-        energy_el_j=net * 1.9 + 0.2,
-        energy_el_clipped_j=max(net, 0) * 2.1 + 0.25,
-        coverage=0.998,
-        samples=800,
-        flags=tuple(flags),
-    )
+    gain = around(1.07 - 0.14 * inside + 0.01 * math.cos(9 * place), 0.0042)
+    plus = max(net, 0)
+    energies = (net, plus + 0.05, abs(net) + 0.11, net * 1.9 + 0.2, plus * 2.1 + 0.25)
+    fit = (0.4, gain, around(lag, math.radians(0.21)))
+    return JointResult(name, plane, *fit, *energies, 0.998, 800, flags=tuple(flags))
 
 
 def passive_joint(name, plane="vertical"):
-    return JointResult(
-        name=name,
-        plane=plane,
-        command_amplitude_rad=None,
-        gain=Estimate(),
-        lag_rad=Estimate(),
-        energy_net_j=0.0021,
-        energy_plus_j=0.004,
-        energy_abs_j=0.0059,
-        energy_el_j=None,
-        energy_el_clipped_j=None,
-        coverage=1.0,
-        samples=800,
-    )
+    energies = (0.0021, 0.004, 0.0059, None, None)
+    return JointResult(name, plane, None, Estimate(), Estimate(), *energies, 1.0, 800)
 
 
 def provenance(path):
-    return Provenance(
-        command=f"undulog analyse {path}",
-        versions={"undulog": "0.1.0", "numpy": "2.4.6"},
-        inputs={path: "9f" * 32},
-        options={"harmonics": 1, "settle_s": None},
+    versions, options = {"undulog": "0.1.0", "numpy": "2.4.6"}, {"harmonics": 1, "settle_s": None}
+    return Provenance(f"undulog analyse {path}", versions, {path: "9f" * 32}, options)
+
+
+PLACES = (("head", "link01"), ("middle", "link13"), ("tail", "link26"))
+
+
+def points(values, name):
+    """Points of the body from amplitude [mm] and phase [degrees], with intervals."""
+    return tuple(
+        BodyPoint(place, name(link), around(mm * 1e-3, 0.6e-3), around(math.radians(deg), 0.03))
+        for (place, link), (mm, deg) in zip(PLACES, values, strict=True)
     )
 
 
-def point(place, link, mm, deg):
-    return BodyPoint(place, link, around(mm * 1e-3, 0.6e-3), around(math.radians(deg), 0.03))
-
-
-def exact(place, link, mm, deg):
-    return BodyPoint(place, link, Estimate(mm * 1e-3), Estimate(math.radians(deg)))
+def exact(one):
+    return dataclasses.replace(
+        one, amplitude_m=Estimate(one.amplitude_m.value), phase_rad=Estimate(one.phase_rad.value)
+    )
 
 
 def make_snake(path="weak.mcap", rename=None, session_id="weak-servo-pi3-7f3a"):
     name = rename or (lambda text: text)
-    joints = []
-    for i in range(25):
-        label = name(f"joint{i + 1:02d}")
-        if i % 2 == 0:
-            joints.append(driven_joint(label, i / 24, flags=("saturated",) if i == 12 else ()))
-        else:
-            joints.append(passive_joint(label))
+    labels = [name(f"joint{i + 1:02d}") for i in range(25)]
+    joints = [
+        passive_joint(label)
+        if i % 2
+        else driven_joint(label, i / 24, flags=("saturated",) if i == 12 else ())
+        for i, label in enumerate(labels)
+    ]
     body = BodyResult(
         plane="horizontal",
-        observed=(
-            point("head", name("link01"), 52, 0),
-            point("middle", name("link13"), 35, -128),
-            point("tail", name("link26"), 30, 97),
-        ),
+        observed=points(((52, 0), (35, -128), (30, 97)), name),
         null={
-            "viscous": (
-                exact("head", name("link01"), 55, 0),
-                exact("middle", name("link13"), 41, -117),
-                exact("tail", name("link26"), 38, 110),
-            ),
+            "viscous": tuple(map(exact, points(((55, 0), (41, -117), (38, 110)), name))),
         },
     )
+    contrast = (-0.1082, (-0.1134, -0.1030))
     indices = {
         "gain_cv": Index(0.0412, (0.0387, 0.0440), 0.0004, "1", "coefficient of variation of gain"),
         "lag_sd": Index(0.0371, (0.0352, 0.0391), 1e-7, "rad", "circular sd of lag"),
-        "boundary_contrast_lag": Index(
-            -0.1082, (-0.1134, -0.1030), None, "rad", "lag, ends minus middle"
-        ),
+        "boundary_contrast_lag": Index(*contrast, None, "rad", "lag, ends minus middle"),
         "energy_gini": Index(0.44, None, None, "1", "Gini coefficient of E_abs"),
     }
     return answered(
@@ -151,7 +125,7 @@ def make_snake(path="weak.mcap", rename=None, session_id="weak-servo-pi3-7f3a"):
             ),
             provenance=provenance(path),
         ),
-        [Shape("ends", "lag", "horizontal", 0, -0.1082, (-0.1134, -0.1030))],
+        [Shape("ends", "lag", "horizontal", 0, *contrast)],
     )
 
 
@@ -167,9 +141,7 @@ def make_still():
             gait=GaitFacts(nothing),
             joints=joints,
             body=None,
-            heterogeneity={
-                "gain_cv": Index(None, None, None, "1", "coefficient of variation of gain")
-            },
+            heterogeneity={"gain_cv": Index(*[None] * 3, "1", "coefficient of variation of gain")},
             coupling=Coupling(False, "no gait was found", "a periodic gait of at least 5 cycles"),
             warnings=("No gait: the commands are a ramp, no line stands out of their spectrum.",),
             provenance=provenance("ramp.mcap"),

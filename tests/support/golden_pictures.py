@@ -50,15 +50,9 @@ def convert(path):
 
 def alone(view):
     """The layout that shows one view and nothing else."""
-    return rrb.Blueprint(
-        view,
-        rrb.TopPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.TimePanel(state="hidden"),
-        auto_views=False,
-        auto_layout=False,
-    )
+    panels = (rrb.TopPanel, rrb.BlueprintPanel, rrb.SelectionPanel, rrb.TimePanel)
+    hidden = [panel(state="hidden") for panel in panels]
+    return rrb.Blueprint(view, *hidden, auto_views=False, auto_layout=False)
 
 
 def take(viewer, recording, view):
@@ -112,14 +106,10 @@ def differing(found, golden, reach=1):
 
 
 def _lost(one, other, reach):
-    height, width, _ = one.shape
     around = np.pad(other, ((reach, reach), (reach, reach), (0, 0)), mode="edge")
-    nearest = np.full((height, width), 255)
-    for down in range(2 * reach + 1):
-        for right in range(2 * reach + 1):
-            there = around[down : down + height, right : right + width]
-            nearest = np.minimum(nearest, np.abs(one - there).max(axis=-1))
-    return nearest > FAR
+    size = (2 * reach + 1,) * 2
+    there = np.lib.stride_tricks.sliding_window_view(around, size, axis=(0, 1))
+    return np.abs(one[..., None, None] - there).max(axis=2).min(axis=(-2, -1)) > FAR
 
 
 def worst_tile(found, golden, reach=1):

@@ -1,4 +1,6 @@
-"""Joints with play or dry friction, sample by sample, and what is found of their dead bands."""
+"""Joints with play or dry friction, sample by sample, and the detection of their dead bands."""
+
+import dataclasses
 
 import numpy as np
 
@@ -86,17 +88,8 @@ def found_in(joints, *, effort=None, second=None):
         pairs = zip(names, values or (), strict=False)
         return {name: Signal(name, "", t_ns, one) for name, one in pairs}
 
-    columns = Columns(
-        names=tuple(names),
-        command={},
-        position={},
-        velocity={},
-        effort=signals(effort),
-        current={},
-        voltage={},
-        reference=signals(second),
-        topics={},
-        powers={},
-    )
+    empty = {field.name: {} for field in dataclasses.fields(Columns)}
+    known = {"names": tuple(names), "effort": signals(effort), "reference": signals(second)}
+    columns = Columns(**empty | known)
     found = dead_bands(columns, commands, responses, gait, 0)
     return {int(name.removeprefix("joint")): one for name, one in found.items()}, gait

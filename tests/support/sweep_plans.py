@@ -12,7 +12,7 @@ values = {values}
 """
 
 
-def write_plan(folder, values=(0.2, 0.3), seeds=1, top="", name="plan.toml", joints=3):
+def write_plan(folder, values=(0.2, 0.3), seeds=1, top="", name="plan.toml", *, joints=3):
     """Write a plan over the servos' strength, with its scenario and robot; return its path."""
     servo = {"stall_torque": 0.3, "gear_stiffness": 12.0, "gear_damping": 0.008}
     robot = twin_chains.chain(joints, planes=["horizontal"], **servo)
