@@ -242,7 +242,7 @@ def main():
     print(f"\n| rounded to steps | {' | '.join(columns)} |")
     print("|---|---|---|---|---|---|---|")
     for name, case in ROUNDED.items():
-        covered, alone, width = rounded(**case)
+        covered, alone, width = rounded(**case, **draws)
         both, few = (" | ".join(f"{100 * one:.1f} %" for one in part) for part in (covered, alone))
         print(f"| {name} | {both} | {width[0]:.2f} | {width[1]:.2f} | {few} |")
 

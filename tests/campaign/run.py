@@ -104,12 +104,10 @@ def run_all(
     jobs: Sequence[tuple[str, int]], workers: int
 ) -> Iterator[tuple[str, int, Result, float]]:
     """Run cases: parts that need the machine alone one by one, then the others side by side."""
-    alone = [job for job in jobs if PARTS[job[0]].alone]
+    for job in jobs:
+        if PARTS[job[0]].alone:
+            yield _work(*job)
     beside = [job for job in jobs if not PARTS[job[0]].alone]
-    for job in alone:
-        yield _work(*job)
-    if not beside:
-        return
     context = multiprocessing.get_context("fork")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
         for start in range(0, len(beside), 2000):
@@ -145,38 +143,33 @@ class Records:
 
 def summary(records: Records) -> list[str]:
     """A table by part, then the failures by kind with a seed each."""
-    rows: dict[str, list[dict]] = defaultdict(list)
-    for row in records.cases:
-        rows[row["part"]].append(row)
     lines = [
         "| part | cases | failed | skipped | most processor time [s] | most memory [MiB] | other |",
         "|---|---|---|---|---|---|---|",
     ]
-    for part, own in rows.items():
-        most: dict[str, float] = defaultdict(float)
-        total: dict[str, float] = defaultdict(float)
+    for part in dict.fromkeys(row["part"] for row in records.cases):
+        own = [row for row in records.cases if row["part"] == part]
+        figures = defaultdict(list)
         for row in own:
             for name, value in row["figures"].items():
-                most[name] = max(most[name], value)
-                total[name] += value
+                figures[name].append(value)
+        most = {name: max(values) for name, values in figures.items()}
         other = ", ".join(
-            f"{name} {total[name]:g}" if name.startswith("n_") else f"{name} {value:g}"
-            for name, value in most.items()
+            f"{name} {sum(values) if name.startswith('n_') else most[name]:g}"
+            for name, values in figures.items()
             if name not in {"cpu_s", "peak_mib"}
         )
         failed = sum(bool(row["failures"]) for row in own)
         skipped = sum(bool(row["skipped"]) for row in own)
         lines.append(
-            f"| {part} | {len(own)} | {failed} | {skipped} | {most['cpu_s']:.1f} "
-            f"| {most['peak_mib']:.0f} | {other} |"
+            f"| {part} | {len(own)} | {failed} | {skipped} | {most.get('cpu_s', 0):.1f} "
+            f"| {most.get('peak_mib', 0):.0f} | {other} |"
         )
     kinds: dict[tuple[str, str], list[tuple[int, str, str]]] = defaultdict(list)
     for row in records.cases:
         for failure in row["failures"]:
-            verb = " ".join(row["case"].split()[:2])
-            kinds[row["part"], f"{verb}: {kind_of(failure)}"].append(
-                (row["seed"], row["case"], failure)
-            )
+            kind = f"{' '.join(row['case'].split()[:2])}: {kind_of(failure)}"
+            kinds[row["part"], kind].append((row["seed"], row["case"], failure))
     lines.append("")
     for (part, kind), found in sorted(kinds.items(), key=lambda item: -len(item[1])):
         seed, case, failure = found[0]
@@ -229,9 +222,8 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
     began = time.monotonic()
     for part, number, result, took_s in run_all(left, options.jobs):
         records.add({"part": part, "seed": number, **asdict(result), "took_s": round(took_s, 3)})
-        said = "; ".join(result.failures) or (
-            f"skipped: {result.skipped}" if result.skipped else "ok"
-        )
+        skipped = result.skipped and f"skipped: {result.skipped}"
+        said = "; ".join(result.failures) or skipped or "ok"
         print(f"{part}:{number} {took_s:.2f} s `{result.case}` {said}", flush=True)
     lines = summary(records)
     (options.output / "summary.md").write_text("\n".join(lines) + "\n")

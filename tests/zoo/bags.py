@@ -32,23 +32,10 @@ uint32 nanosec
 
 
 def write_bag(log: Log, path: Path) -> Path:
-    """Write what was recorded.
-
-    Args:
-        log: The log.
-        path: A file, replaced if it exists.
-
-    Returns:
-        The file.
-    """
+    """Write a log to a file, replaced if it exists; return the file."""
     robot = log.robot
-    rows: list[tuple[int, int, bytes]] = []
-    topics = [
-        "/joint_commands",
-        "/joint_states",
-        *([SECOND_TOPIC] if log.second is not None else []),
-    ]
-    rows += _messages(0, robot.names, robot.sent_s, [robot.sent(), None, None])
+    topics = ["/joint_commands", "/joint_states"] + [SECOND_TOPIC] * (log.second is not None)
+    rows = _messages(0, robot.names, robot.sent_s, [robot.sent(), None, None])
     for number, position, others in (
         (1, log.position, (log.velocity, log.effort)),
         (2, log.second, (None, None)),
@@ -68,9 +55,8 @@ def write_bag(log: Log, path: Path) -> Path:
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.LZ4)
         writer.start(profile="ros2", library="fault zoo")
-        schema = writer.register_schema(
-            "sensor_msgs/msg/JointState", "ros2msg", JOINT_STATE.encode()
-        )
+        kind = ("sensor_msgs/msg/JointState", "ros2msg", JOINT_STATE.encode())
+        schema = writer.register_schema(*kind)
         channels = [writer.register_channel(topic, "cdr", schema) for topic in topics]
         for t_ns, number, data in rows:
             writer.add_message(channels[number], t_ns, data, t_ns)

@@ -26,10 +26,8 @@ def lines() -> Iterator[str]:
         if name.startswith("two at once") or (fault.plant in shown_before):
             continue
         shown_before.append(fault.plant)
-        cells = [_cell(fault, channels) for channels in COLUMNS.values()]
-        shown = cells[:1] + [
-            "same" if cell == cells[0] and cell != "-" else cell for cell in cells[1:]
-        ]
+        first, *cells = [_cell(fault, channels) for channels in COLUMNS.values()]
+        shown = [first, *("same" if cell == first and cell != "-" else cell for cell in cells)]
         looks = str(fault.plant.__doc__).rstrip(".")
         yield " | ".join([f"| {name.split(', head')[0]}", looks, *shown]) + " |"
 
@@ -46,10 +44,8 @@ def _cell(fault: Fault, channels: Channels) -> str:
 
 def _kinds(truth: JointTruth) -> str:
     kinds = ", ".join(f"`{kind}`" for kind in sorted(truth.allowed))
-    outside = " or ".join(sorted(truth.stands_out))
-    return "; or ".join(
-        [*([kinds] if kinds else []), *([f"stands out by {outside}"] * bool(outside))]
-    )
+    outside = truth.stands_out and f"stands out by {' or '.join(sorted(truth.stands_out))}"
+    return "; or ".join(filter(None, (kinds, outside)))
 
 
 if __name__ == "__main__":

@@ -317,16 +317,7 @@ class Log:
 
 
 def record(robot: Robot, changes: tuple[Change, ...] = (), seed: int = 0) -> Log:
-    """Let a robot run, and log it.
-
-    Args:
-        robot: The robot.
-        changes: Faults.
-        seed: Of the sensor noise.
-
-    Returns:
-        What is logged.
-    """
+    """Return the log of a robot with some faults; the seed is that of the sensor noise."""
     rng = np.random.default_rng([seed, 2])
     n, m = robot.t_s.shape
     noise, other_noise = (_noise(robot, rng) for _ in range(2))
@@ -360,13 +351,8 @@ def record(robot: Robot, changes: tuple[Change, ...] = (), seed: int = 0) -> Log
         position[:, j], velocity[:, j], effort[:, j] = channels
         second[:, j] = other
     logged = robot.channels
-    return Log(
-        robot,
-        position,
-        velocity if logged.velocity else None,
-        effort if logged.effort else None,
-        second if logged.second else None,
-    )
+    pairs = ((velocity, logged.velocity), (effort, logged.effort), (second, logged.second))
+    return Log(robot, position, *(values if is_logged else None for values, is_logged in pairs))
 
 
 def _noise(robot: Robot, rng: np.random.Generator) -> np.ndarray:
@@ -374,5 +360,5 @@ def _noise(robot: Robot, rng: np.random.Generator) -> np.ndarray:
     n, m = robot.t_s.shape
     drawn = (1 - robot.shared) ** 0.5 * rng.normal(size=(n + 100, m))
     drawn += robot.shared**0.5 * rng.normal(size=(n + 100, 1))
-    color = robot.color
-    return robot.sigma * lfilter([(1 - color**2) ** 0.5], [1.0, -color], drawn, axis=0)[100:]
+    share = (1 - robot.color**2) ** 0.5
+    return robot.sigma * lfilter([share], [1.0, -robot.color], drawn, axis=0)[100:]
