@@ -21,6 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from measuring import wait_for
 
 from undulog.capture import load_robot
 from undulog.capture.common.strict_table import Faults
@@ -72,15 +73,7 @@ class UnixPeer:
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         if buffer:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, buffer)  # cut to the limit
-        deadline = time.monotonic() + 60
-        while True:
-            try:
-                self.socket.connect(path)
-                break
-            except OSError:
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(0.05)
+        wait_for(lambda: self.socket.connect_ex(path) == 0, 0.05)
         self.socket.setblocking(False)
         self.refused = 0
 

@@ -27,7 +27,6 @@ from pathlib import Path
 import numpy as np
 from live_view import Message, connect, relay, start_viewer
 from mcap.reader import make_reader
-from mcap.records import Metadata
 from measuring import arguments
 from rerun.experimental import ViewerClient
 
@@ -76,7 +75,7 @@ class Watch(threading.Thread):
 
 
 def read(path: Path) -> tuple[list[Description], list[Message], int]:
-    """What explains a session, its messages, and the Unix time of its zero [ns]."""
+    """Return the definitions of a session, its messages, and the Unix time of its zero [ns]."""
     with path.open("rb") as stream:
         reader = make_reader(stream)
         summary = reader.get_summary()
@@ -92,15 +91,8 @@ def read(path: Path) -> tuple[list[Description], list[Message], int]:
             (m.channel_id, m.log_time, m.publish_time, m.sequence, m.data)
             for _, _, m in reader.iter_messages()
         ]
-    return definitions, messages, epoch_of(facts, messages[0][1])
-
-
-def epoch_of(facts: list[Metadata], first_ns: int) -> int:
-    """The Unix time of a session's zero [ns]."""
-    for one in facts:
-        if one.name == "undulog" and one.metadata.get("epoch_ns", "").isdecimal():
-            return int(one.metadata["epoch_ns"])
-    return first_ns
+    (epoch_ns,) = [one.metadata["epoch_ns"] for one in facts if one.name == "undulog"]
+    return definitions, messages, int(epoch_ns)
 
 
 def send(feed: LiveFeed, messages: list[Message], epoch_ns: int, start_ns: int) -> None:

@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import rerun as rr
@@ -99,21 +100,15 @@ def main(minutes: float) -> None:
         count = rows(recordings)
         print(f"two sessions of {minutes:g} min, {sizes} MB of .rrd, {count} rows in all")
         target = folder / "merged.rrd"
-        merges = [
-            timed(
-                "merge", lambda: write(target, lambda rec: send(rec, streams(recordings))), target
-            )
-            for _ in range(3)
-        ]
+
+        def merge() -> None:
+            write(target, lambda rec: send(rec, streams(recordings)))
+
+        merges = [timed("merge", merge, target) for _ in range(3)]
         subprocess.run([viewer_binary(), "rrd", "verify", target], check=True, capture_output=True)
-        whole = [
-            timed(
-                "merge with views, differences and comparison",
-                lambda: write_overlay(converted, target, Align.PHASE),
-                target,
-            )
-            for _ in range(3)
-        ]
+        overlay = partial(write_overlay, converted, target, Align.PHASE)
+        title = "merge with views, differences and comparison"
+        whole = [timed(title, overlay, target) for _ in range(3)]
         best, with_views = (min(wall for wall, _ in times) for times in (merges, whole))
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
         print(
@@ -130,11 +125,8 @@ def main(minutes: float) -> None:
         print(f"all rows would take {PART * slow:.0f} s of CPU, {PART * slow / quick:.0f} times")
         own = folder / "own.rrd"
         command = [viewer_binary(), "rrd", "merge", *recordings, "-o", own]
-        timed(
-            "rerun rrd merge (its CPU isn't ours)",
-            lambda: subprocess.run(command, check=True, capture_output=True),
-            own,
-        )
+        merge_by_rerun = partial(subprocess.run, command, check=True, capture_output=True)
+        timed("rerun rrd merge (its CPU isn't ours)", merge_by_rerun, own)
         if best > BAR_S:
             sys.exit(f"slower than {BAR_S:g} s")
 

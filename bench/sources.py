@@ -22,6 +22,7 @@ import tempfile
 import threading
 import time
 import tty
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -234,7 +235,7 @@ def main() -> None:
     given = parser.parse_args()
     count, rate = given.frames, given.rate
     can.set_logging_level("error")  # it warns of each message that two reads share
-    rows: dict[str, list[tuple[float, float | None]]] = {}
+    rows: dict[str, list[tuple[float, float | None]]] = defaultdict(list)
     with tempfile.TemporaryDirectory() as folder:
         path = f"{folder}/frames.sock"
         epoch_ns = time.time_ns()
@@ -242,27 +243,22 @@ def main() -> None:
             context = SourceContext(time.time_ns, writer)
             has_serial = importlib.util.find_spec("serial") is not None
             with process(adapter, count, rate) as tty_path, process(server, count, rate) as port:
+                slcan = {"interface": "slcan", "channel": tty_path, "sleep_after_open": 0.1}
+                tcp = {"interface": "socketcand", "host": "127.0.0.1", "port": port}
+                few = min(count, 5000)  # slcan of python-can is slow
                 for _ in range(given.runs):
                     mine = ours(f"can:slcan:{tty_path}?bitrate=1000000", count, context)
-                    other = None
-                    if has_serial:
-                        few = min(count, 5000)  # it is slow
-                        other = theirs(
-                            few, interface="slcan", channel=tty_path, sleep_after_open=0.1
-                        )
-                    rows.setdefault("slcan over a pty", []).append((mine, other))
+                    other = theirs(few, **slcan) if has_serial else None
+                    rows["slcan over a pty"].append((mine, other))
                     mine = ours(f"can:socketcand:can0?host=127.0.0.1&port={port}", count, context)
-                    other = theirs(
-                        count, interface="socketcand", host="127.0.0.1", port=port, channel="can0"
-                    )
-                    rows.setdefault("socketcand over TCP", []).append((mine, other))
-                    rows.setdefault("virtual (generic path)", []).append(virtual(count, context))
+                    other = theirs(count, **tcp, channel="can0")
+                    rows["socketcand over TCP"].append((mine, other))
+                    rows["virtual (generic path)"].append(virtual(count, context))
             for per_packet in (1, 16, 256):
                 with process(sender, count, rate, path, per_packet):
                     for _ in range(given.runs):
                         mine = ours(f"unix:{path}", count, context)
-                        name = f"unix, {per_packet} a packet"
-                        rows.setdefault(name, []).append((mine, None))
+                        rows[f"unix, {per_packet} a packet"].append((mine, None))
     print(f"{'path':26}{'ours':>10}{'python-can':>14}   [us of processor time a frame, best run]")
     for name, figures in rows.items():
         mine = min(figure for figure, _ in figures)

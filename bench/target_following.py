@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from measuring import arguments
 from scipy.stats import binom
 
@@ -71,43 +72,32 @@ def run(name: str, seed: int, limit_s: float, kernels: str = "numpy") -> dict[st
 
 
 def median_interval(values: list[float], level: float = 0.95) -> tuple[float, float, float]:
-    """A median with the interval of the sign test, from order statistics.
+    """Return the median and the ends of its interval by the sign test, from order statistics.
 
-    Returns:
-        Median, and the ends of an interval that covers the true one at least so often; the whole
-        range where there are too few values for that.
+    The interval is the whole range where there are too few values for the level.
     """
     ordered = sorted(values)
-    n = len(ordered)
-    k = int(binom.ppf((1 - level) / 2, n, 0.5))  # P(X < k) <= (1 - level) / 2
-    k = max(k, 1)
-    return float(np.median(ordered)), ordered[k - 1], ordered[n - k]
+    k = max(int(binom.ppf((1 - level) / 2, len(ordered), 0.5)), 1)  # P(X < k) <= (1 - level) / 2
+    return float(np.median(ordered)), ordered[k - 1], ordered[-k]
 
 
 def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
     """What the runs say, seed by seed."""
-    by = {
-        name: {r["seed"]: r for r in results if r["controller"] == name} for name in (FOLLOW, WALK)
-    }
+    names = (FOLLOW, WALK)
+    by = {name: {r["seed"]: r for r in results if r["controller"] == name} for name in names}
     seeds = sorted(by[FOLLOW].keys() & by[WALK].keys())
-    both = [(by[FOLLOW][seed], by[WALK][seed]) for seed in seeds]
-    told: dict[str, Any] = {"seeds": seeds}
-    for name in (FOLLOW, WALK):
-        runs = [by[name][seed] for seed in seeds]
-        told[name] = {"met": sum(one["met"] for one in runs)} | {
-            key: median_interval([one[key] for one in runs])
-            for key in ("time_s", "electrical_j", "contact_s", "path_m")
-        }
+    runs = {name: pd.DataFrame([by[name][seed] for seed in seeds]) for name in names}
+    found: dict[str, Any] = {"seeds": seeds}
+    for name, one in runs.items():
+        keys = ("time_s", "electrical_j", "contact_s", "path_m")
+        found[name] = {"met": int(one["met"].sum())}
+        found[name] |= {key: median_interval(one[key].tolist()) for key in keys}
     for key in ("time_s", "electrical_j"):
-        told[f"{key}_ratio"] = median_interval([walk[key] / follow[key] for follow, walk in both])
-    told["contact_share"] = {
-        name: float(
-            sum(by[name][seed]["contact_s"] for seed in seeds)
-            / sum(by[name][seed]["time_s"] for seed in seeds)
-        )
-        for name in (FOLLOW, WALK)
+        found[f"{key}_ratio"] = median_interval((runs[WALK][key] / runs[FOLLOW][key]).tolist())
+    found["contact_share"] = {
+        name: float(one["contact_s"].sum() / one["time_s"].sum()) for name, one in runs.items()
     }
-    return told
+    return found
 
 
 def text(told: dict[str, Any], limits_s: dict[str, float]) -> str:
@@ -115,18 +105,14 @@ def text(told: dict[str, Any], limits_s: dict[str, float]) -> str:
     n = len(told["seeds"])
     faster, less = told["time_s_ratio"], told["electrical_j_ratio"]
     censored = n - told[WALK]["met"]
-    lines = [
-        (
-            f"target following met the target in {told[FOLLOW]['met']} of {n} runs, "
-            f"{faster[0]:.1f} times as fast as the random walk (95 % interval {faster[1]:.1f} to "
-            f"{faster[2]:.1f}), for 1/{less[0]:.1f} of its electrical energy (1/{less[1]:.1f} to "
-            f"1/{less[2]:.1f}): medians of paired ratios"
-        ),
-        (
-            f"{'':18} {'met':>7} {'time s':>22} {'electrical J':>22} {'contact s':>22} "
-            f"{'share in contact':>17}"
-        ),
-    ]
+    answer = (
+        f"target following met the target in {told[FOLLOW]['met']} of {n} runs, "
+        f"{faster[0]:.1f} times as fast as the random walk (95 % interval {faster[1]:.1f} to "
+        f"{faster[2]:.1f}), for 1/{less[0]:.1f} of its electrical energy (1/{less[1]:.1f} to "
+        f"1/{less[2]:.1f}): medians of paired ratios"
+    )
+    heads = [f"{head:>22}" for head in ("time s", "electrical J", "contact s")]
+    lines = [answer, f"{'':18} {'met':>7} {' '.join(heads)} {'share in contact':>17}"]
     for name in (FOLLOW, WALK):
         row = told[name]
         cells = [
@@ -144,12 +130,10 @@ def text(told: dict[str, Any], limits_s: dict[str, float]) -> str:
 
 
 def study(
-    seeds: list[int], limits_s: dict[str, float], jobs: int, kernels: str, output: Path | None
+    seeds: list[int], limits_s: dict[str, float], jobs: int, kernels: str, output: Path
 ) -> list[dict[str, Any]]:
     """Run what the output file does not hold yet, keeping it up to date."""
-    results: list[dict[str, Any]] = []
-    if output is not None and output.exists():
-        results = json.loads(output.read_text())["runs"]
+    results = json.loads(output.read_text())["runs"] if output.exists() else []
     wanted = [(name, seed) for name in limits_s for seed in seeds]
     ids = {(name, seed): load_scenario(name).changed(seed=seed).session_id for name, seed in wanted}
     results = [
@@ -164,9 +148,8 @@ def study(
         runs = [pool.submit(run, name, seed, limits_s[name], kernels) for name, seed in left]
         for done in as_completed(runs):
             results.append(done.result())
-            if output is not None:
-                output.parent.mkdir(parents=True, exist_ok=True)
-                output.write_text(json.dumps({"runs": results}, indent=1) + "\n")
+            output.parent.mkdir(parents=True, exist_ok=True)
+            output.write_text(json.dumps({"runs": results}, indent=1) + "\n")
     return results
 
 

@@ -18,6 +18,7 @@ import math
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 
 import pybullet
 from measuring import arguments
@@ -60,14 +61,8 @@ def step_builtin(scenario: Scenario) -> float:
         start = time.process_time()
         for tick in range(ticks):
             command = gait.step(tick / CONTROL_RATE_HZ, nothing).command.tolist()
-            pybullet.setJointMotorControlArray(
-                body,
-                joints,
-                pybullet.POSITION_CONTROL,
-                targetPositions=command,
-                forces=forces,
-                physicsClientId=client,
-            )
+            motor = {"targetPositions": command, "forces": forces, "physicsClientId": client}
+            pybullet.setJointMotorControlArray(body, joints, pybullet.POSITION_CONTROL, **motor)
             for _ in range(steps):
                 pybullet.stepSimulation(physicsClientId=client)
                 # What a log needs of every step, as the twin reads it too.
@@ -161,14 +156,11 @@ def main() -> None:
     step_twin(flat.changed(duration_s=0.05), Kernels.NUMBA)  # compiles, the first time
     each = least(
         {
-            NUMPY: lambda: step_twin(flat, Kernels.NUMPY),
-            NUMBA: lambda: step_twin(flat, Kernels.NUMBA),
-            f"{NUMPY}, MuJoCo": lambda: step_twin(mujoco, Kernels.NUMPY),
-            f"{NUMBA}, MuJoCo": lambda: step_twin(mujoco, Kernels.NUMBA),
-            f"{NUMPY}, all sensors": lambda: step_twin(whole, Kernels.NUMPY),
-            f"{NUMBA}, all sensors": lambda: step_twin(whole, Kernels.NUMBA),
-            BUILT_IN: lambda: step_builtin(flat),
-        },
+            f"{name}{more}": partial(step_twin, scenario, kernels)
+            for more, scenario in (("", flat), (", MuJoCo", mujoco), (", all sensors", whole))
+            for name, kernels in ((NUMPY, Kernels.NUMPY), (NUMBA, Kernels.NUMBA))
+        }
+        | {BUILT_IN: partial(step_builtin, flat)},
         options.runs,
     )
     theirs = each[BUILT_IN]
@@ -185,15 +177,12 @@ def main() -> None:
         scenario = dataclasses.replace(
             flat.changed(duration_s=options.seconds / 4), robot=chain(flat.robot, n)
         )
-        found = least(
-            {
-                NUMPY: lambda one=scenario: step_twin(one, Kernels.NUMPY),
-                NUMBA: lambda one=scenario: step_twin(one, Kernels.NUMBA),
-                BUILT_IN: lambda one=scenario: step_builtin(one),
-            },
-            options.runs,
-        )
-        for name, step_us in found.items():
+        ways = {
+            NUMPY: partial(step_twin, scenario, Kernels.NUMPY),
+            NUMBA: partial(step_twin, scenario, Kernels.NUMBA),
+            BUILT_IN: partial(step_builtin, scenario),
+        }
+        for name, step_us in least(ways, options.runs).items():
             rows[name].append(step_us)
     for name, costs in rows.items():
         print(f"{name:<27}" + "".join(f"{cost:9.0f}" for cost in costs))
