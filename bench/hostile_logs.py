@@ -18,7 +18,8 @@ import lz4.frame
 import numpy as np
 import zstandard
 
-from undulog.capture.log.messages.definitions import schema_text
+from undulog.capture.log.messages.cdr import encode
+from undulog.capture.log.messages.definitions import message_type, schema_text
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NS = 1_000_000_000
@@ -27,6 +28,7 @@ HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = ra
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA = 9, 10, 11, 12
 DATA_END = 15
 
+_JOINT_STATE = message_type("sensor_msgs/msg/JointState")
 Message = tuple[int, int, bytes]
 """Channel, log time [Unix ns], message."""
 
@@ -166,25 +168,9 @@ def joint_state(
 ) -> bytes:
     """A JointState in CDR, its velocity and effort empty."""
     seconds, rest = divmod(t_ns if stamp_ns is None else stamp_ns, NS)
-    made = bytearray(b"\x00\x01\x00\x00" + struct.pack("<iI", seconds, rest))
-    made += struct.pack("<I", 1) + b"\0"
-
-    def align(size: int) -> None:
-        made.extend(bytes(-(len(made) - 4) % size))
-
-    align(4)
-    made += struct.pack("<I", len(names))
-    for name in names:
-        align(4)
-        made += struct.pack("<I", len(name.encode()) + 1) + name.encode() + b"\0"
-    align(4)
-    values = np.array([*position], "<f8")
-    made += struct.pack("<I", len(values))
-    if len(values):
-        align(8)
-    made += values.tobytes()
-    made += struct.pack("<II", 0, 0)
-    return bytes(made)
+    stamp = {"sec": seconds, "nanosec": rest}
+    values = {"header": {"stamp": stamp}, "name": list(names), "position": [*position]}
+    return encode(_JOINT_STATE, values)
 
 
 @cache
