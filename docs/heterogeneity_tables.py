@@ -26,7 +26,7 @@ from undulog.analysis.experiment.reversal.mirror import (
 from undulog.analysis.experiment.reversal.modules import ordered_pairs
 from undulog.capture import Session
 from undulog.sim import load_scenario
-from undulog.sim.scenario.scenario import Modules
+from undulog.sim.scenario.scenario import Kernels, Modules
 from undulog.sim.twin.recording import record
 
 LEVEL = 0.05
@@ -89,10 +89,10 @@ def _p(forward, reverse, labels):
     return family_wise_p(np.abs(label_scores(runs, labels))).min(axis=-1)
 
 
-def twin_profile(scenario, weakened, folder):
+def twin_profile(scenario, weakened, folder, kernels):
     """Return the responses of the 25-joint twin's yaw joints, one servo weakened by a share."""
     path = Path(folder) / f"{scenario}-{weakened:g}.mcap"
-    record(with_weak_servo(load_scenario(scenario), WEAK, weakened), path)
+    record(with_weak_servo(load_scenario(scenario), WEAK, weakened), path, kernels=kernels)
     return responses(path)
 
 
@@ -154,7 +154,10 @@ def main():
     print(f"{WEAK} weakened; scatter of a run; difference found; {WEAK} named")
     with tempfile.TemporaryDirectory() as folder:
         for weakened in (0.2,) if quick else (0.0, 0.05, 0.1, 0.2):
-            (names, forward), (_, reverse) = (twin_profile(way, weakened, folder) for way in WAYS)
+            kernels = Kernels.NUMBA if quick else Kernels.NUMPY
+            (names, forward), (_, reverse) = (
+                twin_profile(way, weakened, folder, kernels) for way in WAYS
+            )
             for scatter in (0.05, 0.1, 0.3, 1.0):
                 found, named = power(
                     names, forward, reverse, np.radians(scatter), sets=20 if quick else 500

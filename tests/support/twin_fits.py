@@ -14,9 +14,10 @@ def room_for(folder, joints, duration, hidden, *, noise=0.005, gait=(0.4, 1.0), 
 
     The checks whether a twin fits have a level of 5 %: one noise in twenty is taken for a misfit.
     """
-    servo = {"stall_torque": 0.3, "gear_stiffness": 12.0, "gear_damping": 0.008}  # data sheet
+    servo = {"stall_torque": 0.3, "gear_stiffness": 12.0, "gear_damping": 0.008}
     robot = twin_chains.chain(joints, planes=["horizontal"], **servo)
-    (folder / "robot.toml").write_text(robot)
+    noted = robot.replace("[defaults.servo]", "[defaults.servo]  # of the data sheet")
+    (folder / "robot.toml").write_text(noted)
     amplitude, frequency_hz = gait
     world = twin_chains.wave(
         robot="robot.toml",
