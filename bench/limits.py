@@ -161,8 +161,8 @@ def main() -> int:
                 judged = twice >= LEAST_S
                 ratio = (twice - nothing) / max(once - nothing, 1e-3)
                 worst = max(worst, ratio if judged else 0.0)
-                told = f"{ratio:6.2f}" if judged else "     -"
-                print(f"{dimension:<20} {verb:<8} {once:7.2f} {twice:8.2f} {told} {peak:6.0f}")
+                shown = f"{ratio:6.2f}" if judged else "     -"
+                print(f"{dimension:<20} {verb:<8} {once:7.2f} {twice:8.2f} {shown} {peak:6.0f}")
     print(f"twice as much costs at most {worst:.2f} times the time; bar {MOST}")
     return int(worst > MOST)
 

@@ -198,8 +198,8 @@ def _status(key: str) -> int:
 
 def make(path: Path, seconds: int, *, can: bool) -> None:
     """Write a session, with a progress bar."""
-    with progress(f"Writing {path.name}", total=float(seconds)) as told:
-        write_session(path, seconds, can=can, progress=lambda done: told.update(float(done)))
+    with progress(f"Writing {path.name}", total=float(seconds)) as bar:
+        write_session(path, seconds, can=can, progress=lambda done: bar.update(float(done)))
 
 
 def measure(path: Path, without: Path, seconds: int, runs: int) -> bool:
@@ -226,10 +226,10 @@ def measure(path: Path, without: Path, seconds: int, runs: int) -> bool:
     print(f"      load the raw frames, one thread: {frames / reference:.2f} x that")
     threads = threads_or_default(None)
     command = [sys.executable, __file__, "--memory", str(path)]
-    told = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
-    print(f"      arrays: {told['arrays'] / 1e6:.0f} MB")
+    figures = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+    print(f"      arrays: {figures['arrays'] / 1e6:.0f} MB")
     what = f"beyond arrays and mapped file, {threads} threads"
-    good.append(verdict(what, told["over"] / MIB, 64, "MiB"))
+    good.append(verdict(what, figures["over"] / MIB, 64, "MiB"))
     _, alone = window_ms(path, seconds // 3, 1)
     first, later = window_ms(path, seconds // 3, threads)
     print(f"      first window of an open session: {first:.1f} ms; later, 1 thread: {alone:.1f} ms")

@@ -1,8 +1,8 @@
 """Target following against the random walk, on seeds that no parameter was tuned on.
 
 Both controllers cross the same yard: ten cylinders at places drawn with the seed, a target 3.6 m
-away. A run ends when the middle of the head is within the target's radius (the controllers are not
-told), or at the limit; then time and energy of the walk are at least what was seen, and so are the
+away. A run ends when the middle of the head is within the target's radius, without notice to the
+controller, or at the limit; then time and energy of the walk are lower bounds, and so are the
 ratios. Ratios are paired by seed: random walk over target following. Their medians' intervals are
 those of the sign test, which needs no assumption on how they are spread.
 
@@ -100,13 +100,13 @@ def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def text(told: dict[str, Any], limits_s: dict[str, float]) -> str:
+def text(found: dict[str, Any], limits_s: dict[str, float]) -> str:
     """The answer first, then the table."""
-    n = len(told["seeds"])
-    faster, less = told["time_s_ratio"], told["electrical_j_ratio"]
-    censored = n - told[WALK]["met"]
+    n = len(found["seeds"])
+    faster, less = found["time_s_ratio"], found["electrical_j_ratio"]
+    censored = n - found[WALK]["met"]
     answer = (
-        f"target following met the target in {told[FOLLOW]['met']} of {n} runs, "
+        f"target following met the target in {found[FOLLOW]['met']} of {n} runs, "
         f"{faster[0]:.1f} times as fast as the random walk (95 % interval {faster[1]:.1f} to "
         f"{faster[2]:.1f}), for 1/{less[0]:.1f} of its electrical energy (1/{less[1]:.1f} to "
         f"1/{less[2]:.1f}): medians of paired ratios"
@@ -114,12 +114,12 @@ def text(told: dict[str, Any], limits_s: dict[str, float]) -> str:
     heads = [f"{head:>22}" for head in ("time s", "electrical J", "contact s")]
     lines = [answer, f"{'':18} {'met':>7} {' '.join(heads)} {'share in contact':>17}"]
     for name in (FOLLOW, WALK):
-        row = told[name]
+        row = found[name]
         cells = [
             f"{row[key][0]:8.1f} ({row[key][1]:.1f} to {row[key][2]:.1f})".rjust(22)
             for key in ("time_s", "electrical_j", "contact_s")
         ]
-        share = f"{100 * told['contact_share'][name]:.1f} %"
+        share = f"{100 * found['contact_share'][name]:.1f} %"
         lines.append(f"{name:18} {row['met']:3}/{n:3} {' '.join(cells)} {share:>17}")
     lines.append(
         f"medians with 95 % intervals of the sign test, over {n} seeds; {censored} random walks "
@@ -167,10 +167,10 @@ def main() -> None:
     seeds = list(range(int(first), int(last or first) + 1))
     limits_s = {FOLLOW: options.follow_limit, WALK: options.walk_limit}
     results = study(seeds, limits_s, options.jobs, options.kernels, options.output)
-    told = summary(results)
-    kept = {"summary": told, "runs": sorted(results, key=lambda r: (r["controller"], r["seed"]))}
+    found = summary(results)
+    kept = {"summary": found, "runs": sorted(results, key=lambda r: (r["controller"], r["seed"]))}
     options.output.write_text(json.dumps(kept, indent=1) + "\n")
-    print(text(told, limits_s))
+    print(text(found, limits_s))
     print(f"{options.output} has every run")
 
 

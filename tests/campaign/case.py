@@ -214,8 +214,8 @@ def last_line(err: bytes) -> str:
     at = ":".join(places[-1]) if places else "?"
     after = text[text.rfind("Traceback (most recent call last)") :]
     raised = [line for line in after.splitlines() if re.match(r"[A-Za-z_][\w.]*(:|$)", line)]
-    said = raised[-1] if raised else text.strip().splitlines()[-1:]
-    return f"{str(said)[:160]} [{at}]"
+    last = raised[-1] if raised else text.strip().splitlines()[-1:]
+    return f"{str(last)[:160]} [{at}]"
 
 
 def control_characters(data: bytes) -> list[str]:

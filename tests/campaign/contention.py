@@ -22,7 +22,7 @@ BUSY = "while True: pass"
 def run(seed: int, stage: Stage) -> Result:
     """Two buses of 9,000 frames/s, all cores and the disk busy: each accepted frame is there.
 
-    What the kernel refused is a figure, not a failure: the sender was told.
+    Frames that the kernel refused are a figure, not a failure: the sender gets the refusal.
     """
     rng = random.Random(seed)
     per_packet = (1, 9)[seed % 2]
@@ -35,15 +35,15 @@ def run(seed: int, stage: Stage) -> Result:
             recorder(folder, ("a", "b")) as running,
             senders(folder, ("a", "b"), **load) as sending,
         ):
-            ends = [one.result() for one in sending]
+            reports = [one.result() for one in sending]
             time.sleep(1.0)
             code = end(running)
-        said = (folder / "recorder.err").read_text(errors="replace")
-        if code != 0 or "Traceback" in said:
-            result.failures.append(f"recorder: exit code {code}: {said[-300:]}")
-        for one, told in zip(sending, ends, strict=True):
-            result.failures += check_kept(folder, one, told["accepted"])
-        accepted, refused = (sum(told[key] for told in ends) for key in ("accepted", "refused"))
+        errors = (folder / "recorder.err").read_text(errors="replace")
+        if code != 0 or "Traceback" in errors:
+            result.failures.append(f"recorder: exit code {code}: {errors[-300:]}")
+        for one, report in zip(sending, reports, strict=True):
+            result.failures += check_kept(folder, one, report["accepted"])
+        accepted, refused = (sum(one[key] for one in reports) for key in ("accepted", "refused"))
         result.figures = {
             "n_accepted": accepted,
             "n_refused": refused,

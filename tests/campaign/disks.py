@@ -130,14 +130,14 @@ def _recorder(kind: str, folder: Path, rng: random.Random) -> Result:
                     os.kill(running.pid, signal.SIGTERM)
             code = running.wait(80)
             accepted = sending[0].rows()[-1][1]
-        said = (folder / "recorder.err").read_bytes()
+        errors = (folder / "recorder.err").read_bytes()
         if code < 0:
             result.failures.append(f"signal: ended by {signal.Signals(-code).name}")
-        if b"Traceback" in said:
-            result.failures.append(f"traceback: {said.decode(errors='replace').splitlines()[-1]}")
+        if b"Traceback" in errors:
+            result.failures.append(f"traceback: {errors.decode(errors='replace').splitlines()[-1]}")
         if kind.endswith("small"):
-            if code != 1 or b"error:" not in said:
-                result.failures.append(f"full disk: exit code {code}, {said[-200:]!r}")
+            if code != 1 or b"error:" not in errors:
+                result.failures.append(f"full disk: exit code {code}, {errors[-200:]!r}")
             (folder / "kept").mkdir()
             words = ["log", "recover", output, "-o", folder / "kept" / "r.mcap"]
             outcome = run_command(words, folder)

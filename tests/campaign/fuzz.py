@@ -254,8 +254,8 @@ def warm(cases: Sequence[Case], fresh: Callable[[], AbstractContextManager[Path]
             if listing.exists():
                 wanted |= dict.fromkeys(listing.read_text().split("\n"))
         if outcome.code:
-            said = outcome.err.decode(errors="replace")[-300:]
-            failures.append(f"exit code {outcome.code}: {said}")
+            errors = outcome.err.decode(errors="replace")[-300:]
+            failures.append(f"exit code {outcome.code}: {errors}")
         found += [f"{' '.join(case.words)}: {fault}" for fault in failures]
     for name in wanted:
         if name not in sys.modules and not name.startswith("__"):

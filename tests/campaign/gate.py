@@ -215,11 +215,11 @@ def run(seed: int, stage: Stage) -> Result:
         result.failures += failures
         result.at_most("steps_beyond_rate_polled" if polled else "steps_beyond_rate_unasked", worst)
         result.figures["n_commands"] = sum(map(len, far.commands.values()))
-        said = outcome.err.decode(errors="replace")[-200:]
+        errors = outcome.err.decode(errors="replace")[-200:]
         if not far.commands:
-            result.failures.append(f"drive: nothing was sent: {said}")
+            result.failures.append(f"drive: nothing was sent: {errors}")
         elif healthy and outcome.code != 0:
-            result.failures.append(f"drive: a healthy bus, and exit code {outcome.code}: {said}")
+            result.failures.append(f"drive: a healthy bus, and exit code {outcome.code}: {errors}")
         elif any(length > 1.5 and begin < 1.5 for begin, length in stalls) and outcome.code == 0:
             result.failures.append("drive: exit code 0 though the bus stood still")
     return result

@@ -40,8 +40,8 @@ def _evil_session(path: Path, rng: random.Random) -> None:
     favourite = rng.choice(EVIL)
 
     def evil(name: str) -> str:
-        said = rng.choice([favourite, rng.choice(EVIL)])
-        return rng.choice([name, name + said, said + name])
+        evil_text = rng.choice([favourite, rng.choice(EVIL)])
+        return rng.choice([name, name + evil_text, evil_text + name])
 
     names = [evil(name) for name in JOINTS]
     kind, log = "sensor_msgs/msg/JointState", "rcl_interfaces/msg/Log"
@@ -81,12 +81,12 @@ def _spoil(text: str, rng: random.Random) -> str:
     def worse(found: re.Match[str]) -> str:
         if rng.random() > 0.15:
             return found.group()
-        said = found.group(1) + rng.choice(EVIL)
+        evil_text = found.group(1) + rng.choice(EVIL)
         if rng.random() < 0.5:  # raw control characters are no TOML: escaped ones are
-            said = "".join(
-                f"\\u{ord(c):04x}" if ord(c) < 0xA0 and not c.isalnum() else c for c in said
+            evil_text = "".join(
+                f"\\u{ord(c):04x}" if ord(c) < 0xA0 and not c.isalnum() else c for c in evil_text
             )
-        return f'"{said}"'
+        return f'"{evil_text}"'
 
     return re.sub(r'"([^"\n]*)"', worse, text)
 

@@ -98,8 +98,8 @@ def run(seed: int, stage: Stage) -> Result:
         again = run_command(words, folder)
         result.failures += [f"again: {fault}" for fault in judge(again)]
         if again.code and not leaves_a_log:
-            said = again.err.decode(errors="replace")[-200:]
-            result.failures.append(f"again: exit code {again.code}: {said}")
+            errors = again.err.decode(errors="replace")[-200:]
+            result.failures.append(f"again: exit code {again.code}: {errors}")
     return result
 
 

@@ -223,8 +223,8 @@ def _run(options: argparse.Namespace, folder: Path) -> int:
     for part, number, result, took_s in run_all(left, options.jobs):
         records.add({"part": part, "seed": number, **asdict(result), "took_s": round(took_s, 3)})
         skipped = result.skipped and f"skipped: {result.skipped}"
-        said = "; ".join(result.failures) or skipped or "ok"
-        print(f"{part}:{number} {took_s:.2f} s `{result.case}` {said}", flush=True)
+        verdict = "; ".join(result.failures) or skipped or "ok"
+        print(f"{part}:{number} {took_s:.2f} s `{result.case}` {verdict}", flush=True)
     lines = summary(records)
     (options.output / "summary.md").write_text("\n".join(lines) + "\n")
     print("\n".join(lines))

@@ -140,19 +140,19 @@ def _watched(
     before = _descriptors(pid)
     with _closing() as links:
         attack(address, rng, links)
-        said = good()
-        result.at_most("n_locked_out", float(bool(said)))
-        if said and not foreign:
-            result.failures.append(f"locked out: beside {len(links)} clients: {said}")
-    said = good()
-    if said and foreign:
+        fault = good()
+        result.at_most("n_locked_out", float(bool(fault)))
+        if fault and not foreign:
+            result.failures.append(f"locked out: beside {len(links)} clients: {fault}")
+    fault = good()
+    if fault and foreign:
         # It may close one connection more while it drops the bad ones: a browser asks again.
         result.at_most("n_closed_after", 1.0)
         with suppress(TimeoutError):
             _wait(lambda: not good())
-        said = good()
-    if said:
-        result.failures.append(f"locked out: after the attack: {said}")
+        fault = good()
+    if fault:
+        result.failures.append(f"locked out: after the attack: {fault}")
     _check_descriptors(result, pid, before)
 
 
@@ -226,8 +226,8 @@ def control(result: Result, folder: Path, rng: random.Random) -> None:
                     with suppress(OSError):
                         link.send(rng.randbytes(rng.choice([1, 31, 33, 48, 8192])))
                     silent.append(link)
-            if said := good():
-                result.failures.append(f"locked out: beside {len(silent)} senders: {said}")
+            if fault := good():
+                result.failures.append(f"locked out: beside {len(silent)} senders: {fault}")
         _check_descriptors(result, pid, before, " senders")
 
     words = ["record", f"unix:{source}", "--quiet", "--floor", "1MB"]

@@ -46,30 +46,30 @@ def named_in(text: str, names: Sequence[str]) -> list[str]:
     return sorted(found, key=found.__getitem__)
 
 
-def judge(output: str, said: Statement, truth: Truth, robot: Robot) -> Judgement:
+def judge(output: str, statement: Statement, truth: Truth, robot: Robot) -> Judgement:
     """Judge the statement of an output against the planted truth."""
-    if said.error:
-        return Judgement((f"error: {said.error}",))
+    if statement.error:
+        return Judgement((f"error: {statement.error}",))
     planted = {robot.names[one.joint]: one for one in truth.joints}
     expected = [name for name, one in planted.items() if _must_name(output, one)]
-    first = named_in(said.text, robot.names)
-    listed = [*(said.not_following or ()), *(said.stands_out or ())]
+    first = named_in(statement.text, robot.names)
+    listed = [*(statement.not_following or ()), *(statement.stands_out or ())]
     sound = tuple(dict.fromkeys(n for n in [*listed, *first] if n not in planted))
     if truth.undecided and output != "compare":
-        return _undecided(said, [*listed, *first])
+        return _undecided(statement, [*listed, *first])
     missing = [f"{name} not in its sentence" for name in expected[:MOST_NAMED] if name not in first]
     if len(expected) > MOST_NAMED:  # any of them will do: the worst come first
         short = len([name for name in expected if name in first]) < MOST_NAMED
         missing = [f"names fewer than {MOST_NAMED} of {len(expected)} joints"] if short else []
     if output == "compare" and expected and first and first[0] not in planted:
         missing.append(f"names {first[0]} first")
-    if expected and output != "log check" and said.alike:
+    if expected and output != "log check" and statement.alike:
         missing.append("claims alike")
-    if not planted and output == "log check" and not said.alike:
+    if not planted and output == "log check" and not statement.alike:
         missing.append("calls a healthy bag less than good")
     narrow = False
-    for name, one in planted.items() if said.not_following is not None else ():
-        wrong, few = _of_joint(name, one, said, robot)
+    for name, one in planted.items() if statement.not_following is not None else ():
+        wrong, few = _of_joint(name, one, statement, robot)
         missing += wrong
         narrow |= few
     return Judgement(tuple(missing), sound, narrow)
@@ -84,22 +84,22 @@ def _must_name(output: str, truth: JointTruth) -> bool:
     return output != "detection" or not truth.stands_out
 
 
-def _undecided(said: Statement, named: Sequence[str]) -> Judgement:
+def _undecided(statement: Statement, named: Sequence[str]) -> Judgement:
     """Of too few joints none may be named; any that is may as well be sound."""
-    missing = ["does not say that no joint can be named"] if said.undecided is False else []
+    missing = ["does not say that no joint can be named"] if statement.undecided is False else []
     if named:
         missing.append(f"names {named[0]} although none can be named")
     return Judgement(tuple(missing))
 
 
 def _of_joint(
-    name: str, truth: JointTruth, said: Statement, robot: Robot
+    name: str, truth: JointTruth, statement: Statement, robot: Robot
 ) -> tuple[list[str], bool]:
     """What is wrong in the lists about one planted joint; whether its kinds are too few."""
-    stated = (said.not_following or {}).get(name)
-    outside = (said.stands_out or {}).get(name, frozenset())
+    stated = (statement.not_following or {}).get(name)
+    outside = (statement.stands_out or {}).get(name, frozenset())
     if stated is None:
-        if said.stands_out is None and (truth.stands_out or not truth.names):
+        if statement.stands_out is None and (truth.stands_out or not truth.names):
             return [], False  # left to another output
         if outside & truth.stands_out:
             return [], False

@@ -1,8 +1,8 @@
 """The fault zoo as a table: ``make zoo``.
 
 Every fault is planted with many seeds into foreign bags; undulog's outputs are judged against the
-truth. Prints a table, one line a fault when it is done, below it the seeds that fail with what was
-said.
+truth. Prints a table, one line a fault when it is done, below it the seeds that fail with the
+outputs.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Case:
     seed: int
     robot: Robot
     truth: Truth
-    said: dict[str, Statement]
+    statements: dict[str, Statement]
     judged: dict[str, Judgement]
 
 
@@ -69,16 +69,16 @@ def run_case(
     changes, truth = plant(fault, robot, own)
     log = record(robot, changes, own)
     if outputs == (DETECTION,):  # on arrays, so without a file
-        said = {DETECTION: detected(log)}
+        by_output = {DETECTION: detected(log)}
     else:
         with tempfile.TemporaryDirectory() as folder:
             bag = write_bag(log, Path(folder) / "faulty.mcap")
             healthy = None
             if "compare" in outputs:
                 healthy = write_bag(record(robot, (), own + 10**6), Path(folder) / "healthy.mcap")
-            said = statements(bag, healthy, second=robot.channels.second, outputs=outputs)
-    judged = {output: judge(output, one, truth, robot) for output, one in said.items()}
-    return Case(name, seed, robot, truth, said, judged)
+            by_output = statements(bag, healthy, second=robot.channels.second, outputs=outputs)
+    judged = {output: judge(output, one, truth, robot) for output, one in by_output.items()}
+    return Case(name, seed, robot, truth, by_output, judged)
 
 
 def _work(name: str, seed: int, *, small: bool, outputs: tuple[str, ...]) -> Case:
@@ -133,7 +133,7 @@ def failures(cases: Sequence[Case]) -> Iterator[str]:
                 robot = case.robot
                 yield (
                     f"{case.fault!r} seed {case.seed} ({robot.m} joints, {robot.channels}), "
-                    f"{output}: {'; '.join(why)}\n    said: {case.said[output].text[:300]!r}"
+                    f"{output}: {'; '.join(why)}\n    said: {case.statements[output].text[:300]!r}"
                 )
 
 
@@ -164,9 +164,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if sys.stderr.isatty():
                 done = k * len(seeds) + len(cases)
                 print(f"\r{done} of {len(names) * len(seeds)}\r", end="", file=sys.stderr)
-        said = line(cases, width, outputs)
-        all_fine &= not said.endswith("FAILS")
-        print(said, flush=True)
+        row = line(cases, width, outputs)
+        all_fine &= not row.endswith("FAILS")
+        print(row, flush=True)
         if not chosen.quiet:
             for failure in failures(cases):
                 print(failure, flush=True)

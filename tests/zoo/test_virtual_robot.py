@@ -121,11 +121,11 @@ def healthy_on_the_bus(scenario):
 
 def problems(path, healthy, truth):
     """What is wrong with any output, a line each; where a neighbour differs it does so indeed."""
-    said = statements(path, healthy, second=False)
-    assert set(said) == set(OUTPUTS)
+    found = statements(path, healthy, second=False)
+    assert set(found) == set(OUTPUTS)
     return "\n".join(
-        f"{output}: {reason}; said: {one.text!r}"
-        for output, one in said.items()
+        f"{output}: {reason}; found: {one.text!r}"
+        for output, one in found.items()
         for reason in judge(output, one, truth, SnakeOfTheBus).missing
     )
 
