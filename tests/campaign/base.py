@@ -127,7 +127,7 @@ class Base:
 
 
 def gait_session(path: Path, ticks: int = 200, sink: DurableSink | None = None) -> None:
-    """Four joints that follow sines, with frames, events and a reading of every kind."""
+    """Write four joints that follow sines, with frames, events and a reading of every kind."""
     robot = load_robot(str(path.parent / "snake4.toml"))
     with SessionWriter(
         path, session_id="s", epoch_ns=EPOCH_NS, robot=robot, metadata={"operator": "x"}, sink=sink
@@ -159,7 +159,7 @@ def gait_session(path: Path, ticks: int = 200, sink: DurableSink | None = None) 
 
 
 def foreign_session(path: Path, ticks: int = 240) -> None:
-    """A bag of mcap-ros2-support: one message a servo, without a robot."""
+    """Write a bag by mcap-ros2-support: one message a servo, without a robot."""
     with path.open("wb") as stream:
         writer = RosWriter(stream, chunk_size=4000)
         kind = "sensor_msgs/msg/JointState"
@@ -177,7 +177,7 @@ def foreign_session(path: Path, ticks: int = 240) -> None:
 
 
 def rewrite(source: Path, path: Path, **options: object) -> None:
-    """The same records as another make writes them."""
+    """Write the same records as another make does."""
     with source.open("rb") as stream, path.open("wb") as out:
         reader = make_reader(stream)
         writer = Writer(out, **options)
@@ -212,7 +212,7 @@ def write_logs(folder: Path, ticks: int = 200) -> dict[str, bytes]:
 
 
 def can_messages(count: int = 160) -> Iterator[can.Message]:
-    """Commands and states of the small robot, a servo at a time."""
+    """Yield commands and states of the small robot, a servo at a time."""
     for number in range(count):
         joint, state = number // 2 % 4, number % 2
         raw = round(1500 * np.sin(0.1 * number)) & 0xFFFF
@@ -235,7 +235,7 @@ def _trace(path: Path) -> Path:
 
 
 def write_texts(folder: Path) -> dict[str, bytes]:
-    """Robot, scenario, plan, settings and table: name to content."""
+    """Write robot, scenario, plan, settings and table; return name to content."""
     rows = "".join(f"{k / 100},{k % 360},{0.1 * k}\n" for k in range(80))
     texts = {
         "snake4.toml": ROBOT,

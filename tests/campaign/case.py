@@ -42,7 +42,7 @@ CONTROL = re.compile(
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a command.
+    """The end of a command.
 
     Attributes:
         code: Exit code; None if a signal ended it.
@@ -67,7 +67,7 @@ class Outcome:
 
 @dataclass
 class Result:
-    """What a case of any part showed.
+    """The result of a case of any part.
 
     Attributes:
         case: What was done, in a few words.
@@ -208,7 +208,7 @@ def run_command(words: Sequence[str], folder: Path, **options: object) -> Outcom
 
 
 def last_line(err: bytes) -> str:
-    """The last line of a traceback, with the last place in the product that it names."""
+    """Return the last line of a traceback, with its last line of code in the product."""
     text = err.decode("utf-8", "replace")
     places = re.findall(r'File "[^"]*/((?:capture|sim|analysis|replay)/[^"]+)", line (\d+)', text)
     at = ":".join(places[-1]) if places else "?"
@@ -219,12 +219,12 @@ def last_line(err: bytes) -> str:
 
 
 def control_characters(data: bytes) -> list[str]:
-    """The characters in some output that act on a terminal."""
+    """Return the characters of an output that act on a terminal."""
     return sorted(set(CONTROL.findall(data.decode("utf-8", "replace"))))
 
 
 def judge(outcome: Outcome) -> list[str]:
-    """What is wrong with a command's run; each failure begins with its kind."""
+    """Return the failures of a command's run; each begins with its kind."""
     found = []
     if outcome.hung:
         found.append(f"hang: no end within {WALL_S:.0f} s")

@@ -20,7 +20,7 @@ BUSY = "while True: pass"
 
 
 def run(seed: int, stage: Stage) -> Result:
-    """Two buses of 9,000 frames/s, all cores and the disk busy: each accepted frame is there.
+    """Record two buses of 9,000 frames/s, all cores and the disk busy: no accepted frame is lost.
 
     Frames that the kernel refused are a figure, not a failure: the sender gets the refusal.
     """
@@ -53,6 +53,6 @@ def run(seed: int, stage: Stage) -> Result:
 
 
 def _syncing(folder: Path) -> list[str]:
-    """Writes 1 MB blocks and syncs, over and over."""
+    """Return a command that writes 1 MB blocks and syncs, over and over."""
     dd = f"dd if=/dev/zero of={folder / 'dd'} bs=1M count=64 conv=fsync"
     return ["bash", "-c", f"while kill -0 {os.getpid()}; do {dd}; done"]

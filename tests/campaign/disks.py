@@ -27,7 +27,7 @@ TEXTS = (
 
 @contextmanager
 def disk(place: Path, size: str, *, read_only: bool = False) -> Iterator[bool]:
-    """A file system of a size at a folder; gives whether mounting is permitted here."""
+    """Mount a file system of a size at a folder; yield whether mounting is permitted here."""
     place.mkdir(exist_ok=True)
     command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
     mounted = subprocess.run(command, capture_output=True, check=False).returncode == 0
@@ -41,7 +41,7 @@ def disk(place: Path, size: str, *, read_only: bool = False) -> Iterator[bool]:
 
 
 def run(seed: int, stage: Stage) -> Result:
-    """One command, or the recorder, on a bad disk."""
+    """Run one command, or the recorder, on a bad disk."""
     rng = random.Random(seed)
     kinds = {"small": 8, "text": 4, "read-only": 2, "vanish": 4}
     kinds |= {"recorder small": 1, "recorder vanish": 1}
@@ -100,7 +100,7 @@ def _command(kind: str, folder: Path, rng: random.Random, stage: Stage) -> Resul
 
 
 def _fill(place: Path, spare: int) -> None:
-    """Take what a disk has, but for so many bytes."""
+    """Fill a disk, but for a number of bytes."""
     state = os.statvfs(place)
     with contextlib.suppress(OSError), (place / "other").open("wb", buffering=0) as stream:
         for _ in range((state.f_bavail * state.f_frsize - spare) // 4096):

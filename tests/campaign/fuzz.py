@@ -44,14 +44,14 @@ class Case:
     ended_after_s: float | None = None
 
     def as_json(self) -> str:
-        """The case as one text, for a file."""
+        """Return the case as one text, for a file."""
         files = {name: base64.b64encode(data).decode() for name, data in self.files.items()}
         fields = {"words": self.words, "ended_after_s": self.ended_after_s, "files": files}
         return json.dumps(fields, indent=1) + "\n"
 
     @classmethod
     def from_json(cls, text: str) -> Case:
-        """A case from such a text."""
+        """Return a case from such a text."""
         fields = json.loads(text)
         files = {name: base64.b64decode(data) for name, data in fields["files"].items()}
         return cls(tuple(fields["words"]), files, fields["ended_after_s"])
@@ -80,7 +80,7 @@ class Case:
 
 
 def make_case(seed: int, bases: list[Base], scratch: Path) -> Case:
-    """The case that a seed stands for."""
+    """Return the case of a seed."""
     rng = random.Random(seed)
     kind = rng.choices(list(WEIGHTS), list(WEIGHTS.values()))[0]
     base = rng.choice([one for one in bases if one.kind == kind])
@@ -151,7 +151,7 @@ def session_parts(session: Session) -> Iterator[Callable[[], object]]:
 
 
 def check_output(folder: Path) -> list[str]:
-    """Each output that a command left under its final name is whole, by mcap's own reader."""
+    """Return faults of the outputs under their final names, by mcap's own reader."""
     found = []
     for path in [
         one for name in ("new*", "new/*", "frames") for one in folder.glob(f"{name}.mcap")
@@ -171,7 +171,7 @@ def check_output(folder: Path) -> list[str]:
 
 
 def run_case(case: Case, folder: Path, modules: Path | None = None) -> tuple[list[str], Outcome]:
-    """Run a case in an empty folder: (failures, what became of the command)."""
+    """Run a case in an empty folder; return failures and outcome."""
     outcome = case.run(folder, modules)
     return [*judge(outcome), *check_output(folder)], outcome
 
@@ -186,7 +186,7 @@ def run_seed(seed: int, bases: list[Base], folder: Path) -> tuple[Result, Case]:
 
 
 def kind_of(failure: str) -> str:
-    """What failures of one cause share: the kind, and for a traceback its error and its place."""
+    """Return the kind of a failure; for a traceback its error and its line of code, too."""
     if failure.startswith("traceback: "):
         error, _, place = failure.removeprefix("traceback: ").rpartition(" [")
         return f"traceback {error.split(':')[0]} {place.rstrip(']')}"

@@ -49,7 +49,7 @@ POLLED = 0x14B
 
 @dataclass
 class FarEnd:
-    """Servos at a socketcand server; the connection stalls when told.
+    """Servos at a socketcand server; the connection stalls at given times.
 
     Attributes:
         polled: Whether a servo speaks only when it is asked.
@@ -79,7 +79,7 @@ class FarEnd:
         self._outbox: deque[tuple[float, bytes]] = deque()
 
     def serve(self, child: int) -> None:
-        """Be the far end, one client after the other, until a process ends."""
+        """Serve one client after the other until a process ends."""
         deadline = time.monotonic() + DRIVE_S
         self.server.settimeout(0.05)
         while time.monotonic() < deadline and _alive(child):
@@ -158,12 +158,12 @@ class FarEnd:
 
     @property
     def steps_allowed(self) -> int:
-        """Steps that may be on their way, by the rule above."""
+        """Return the number of steps that may be on their way, by the rule above."""
         ticks = max(3, math.ceil(3 * self.interval_s / PERIOD_S - 1e-9))
         return 1 if self.polled else ticks + 1
 
     def check(self, limit: float) -> tuple[list[str], float]:
-        """(What is wrong, the largest number of steps beyond the rate)."""
+        """Return the failures, and the largest number of steps beyond the rate."""
         found, worst = [], 0.0
         for joint, rows in self.commands.items():
             if (most := max(abs(angle) for _, angle in rows)) > limit + ROUNDING:
@@ -184,7 +184,7 @@ class FarEnd:
 
 
 def run(seed: int, stage: Stage) -> Result:
-    """One armed drive; every fifth is over a healthy bus, which it must finish."""
+    """Run one armed drive; every fifth is over a healthy bus and must finish."""
     rng = random.Random(seed)
     polled, healthy = rng.random() < 0.5, seed % 5 == 0
     interval_s = rng.choice([0.01, 0.01, 0.05])
@@ -246,5 +246,5 @@ def _lay_out(folder: Path, polled: bool) -> None:
 
 
 def _alive(child: int) -> bool:
-    """Whether a child process still runs; it is not taken from whoever waits for it."""
+    """Return whether a child process still runs; it stays to be awaited."""
     return os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None

@@ -57,7 +57,7 @@ PAIR = schema() + channel(1, "/joint_commands") + channel(2, "/joint_states")
 
 
 def sines(ticks: int, jump_ns: int = 0) -> Iterator[bytes]:
-    """Commands and states; the clock jumps once, in the middle."""
+    """Yield commands and states; the clock jumps once, in the middle."""
     rng = random.Random(1)
     for tick in range(ticks):
         t_ns = EPOCH_NS + tick * PERIOD_NS + (jump_ns if tick >= ticks // 2 else 0)
@@ -68,7 +68,7 @@ def sines(ticks: int, jump_ns: int = 0) -> Iterator[bytes]:
 
 
 def zeros(size: int, *, stated: bool = True) -> bytes:
-    """So many zero bytes in one zstd frame."""
+    """Return a number of zero bytes in one zstd frame."""
     packer = zstandard.ZstdCompressor(level=1, write_content_size=stated)
     stream = packer.compressobj(size=size if stated else -1)
     block = bytes(1 << 24)
@@ -265,7 +265,7 @@ COUNT = len(LOGS) + len(WORDS)
 
 
 def run(seed: int, stage: Stage) -> Result:
-    """A hostile log, or hostile words, through one command; each log comes with each in turn."""
+    """Run one command on a hostile log, or hostile words; each log gets each command in turn."""
     number = seed % 1_000_000
     name = [*LOGS, *WORDS][number % COUNT]
     lines = LOGS[name][1] if name in LOGS else WORDS[name]
@@ -294,7 +294,7 @@ def run(seed: int, stage: Stage) -> Result:
 
 
 def _kept(stage: Stage, name: str) -> bytes:
-    """A log, made once."""
+    """Return a log, made once."""
     path = Path(stage.folder) / f"hostile-{list(LOGS).index(name)}"
     if not path.exists():
         part = path.with_suffix(".part")

@@ -35,7 +35,7 @@ TEXTS = ("toml", "dbc", "scenario", "plan", "trace", "columns")
 
 
 def _evil_session(path: Path, rng: random.Random) -> None:
-    """A foreign bag with such names of joints and topics, texts of events, and metadata."""
+    """Write a foreign bag with such names of joints and topics, texts of events, and metadata."""
 
     favourite = rng.choice(EVIL)
 
@@ -76,7 +76,7 @@ def _evil_session(path: Path, rng: random.Random) -> None:
 
 
 def _spoil(text: str, rng: random.Random) -> str:
-    """Some strings of a TOML or DBC text become evil ones."""
+    """Return a TOML or DBC text in which some strings are evil."""
 
     def worse(found: re.Match[str]) -> str:
         if rng.random() > 0.15:
@@ -92,7 +92,7 @@ def _spoil(text: str, rng: random.Random) -> str:
 
 
 def run(seed: int, stage: Stage) -> Result:
-    """Evil names in one of the files that commands read, through one command."""
+    """Run one command on evil names in one of the files that it reads."""
     rng = random.Random(seed)
     with stage.fresh() as folder:
         (folder / "snake4.toml").write_text(ROBOT)
@@ -112,7 +112,7 @@ def run(seed: int, stage: Stage) -> Result:
 
 
 def _lay_out(kind: str, folder: Path, rng: random.Random, stage: Stage) -> str:
-    """Write the spoilt file; the command line to run on it."""
+    """Write the spoilt file; return the command line to run on it."""
     trace = folder / "trace.log"
     with trace.open("w") as stream:
         for m in can_messages():
@@ -158,7 +158,7 @@ def _lay_out(kind: str, folder: Path, rng: random.Random, stage: Stage) -> str:
 
 
 def _check_pages(folder: Path) -> list[str]:
-    """No markup from names in a page; no cell of a table that a spreadsheet computes."""
+    """Return markup from names in pages, and cells of tables that a spreadsheet computes."""
     found = [
         f"page: {hit.group()!r} in {path.name}"
         for path in folder.glob("new*.html")

@@ -42,7 +42,7 @@ END = {".html": b"</html>", ".rrd": b""}
 
 
 def lay_out(folder: Path, stage: Stage) -> None:
-    """The inputs of all command lines."""
+    """Write the inputs of all command lines."""
     path = stage.folder / "bases" / "long.mcap"
     if not path.exists():
         part = path.with_name(f"part{os.getpid()}.mcap")
@@ -60,7 +60,7 @@ def lay_out(folder: Path, stage: Stage) -> None:
 
 
 def whole_outputs(folder: Path) -> list[str]:
-    """Whatever lies under its final name is whole."""
+    """Return faults of the files under their final names."""
     found = check_output(folder)
     for suffix, end in END.items():
         for path in folder.glob(f"new*{suffix}"):
@@ -71,7 +71,7 @@ def whole_outputs(folder: Path) -> list[str]:
 
 
 def run(seed: int, stage: Stage) -> Result:
-    """One command is ended at a random moment, then run again to its end."""
+    """End one command at a random moment, then run it again to its end."""
     rng = random.Random(seed)
     line = rng.choice(LINES)
     words = shlex.split(line)
@@ -104,7 +104,7 @@ def run(seed: int, stage: Stage) -> Result:
 
 
 def run_recorder(seed: int, stage: Stage) -> Result:
-    """The recorder is killed under the load of two senders; what was accepted is there.
+    """Kill the recorder under the load of two senders; accepted frames are kept.
 
     What may be missing is what the kernel had accepted in the last 50 ms.
     """

@@ -39,7 +39,7 @@ JUMPS = [-(10**9), 10**9, 3600 * 10**9, DAY_NS, 365 * DAY_NS, 10**18]
 
 
 def mutate_bytes(data: bytes, rng: random.Random) -> bytes:
-    """Bytes with one to four faults."""
+    """Return bytes with one to four faults."""
     changed = bytearray(data)
     for _ in range(rng.choice([1, 1, 1, 2, 4])):
         if len(changed) < 16:
@@ -84,14 +84,14 @@ def _swap(data, rng):
 
 
 def _set_number(data, rng):
-    """A number anywhere, of any width, aligned or not."""
+    """Set a number anywhere, of any width, aligned or not."""
     size = rng.choice([2, 4, 8, 8])
     at = rng.randrange(len(data) - size)
     data[at : at + size] = (rng.choice(HUGE) & ((1 << 8 * size) - 1)).to_bytes(size, "little")
 
 
 def _set_length(data, rng):
-    """The length, or a number in the first bytes, of a record of an MCAP."""
+    """Set the length, or a number in the first bytes, of a record of an MCAP."""
     places, at = [], 8
     while at + 9 <= len(data) and len(places) < 10_000:
         places.append(at)
@@ -114,7 +114,7 @@ FAULTS = [
 
 
 def mutate_text(data: bytes, rng: random.Random) -> bytes:
-    """Text with one to four faults: in bytes, in words, in numbers, in whole lines."""
+    """Return text with one to four faults: in bytes, in words, in numbers, in whole lines."""
     text = data.decode("utf-8", "surrogateescape")
     for _ in range(rng.choice([1, 1, 2, 4])):
         kind = rng.random()
@@ -181,7 +181,7 @@ class _Remake:
     def add(
         self, number: int, schema: Schema, channel: Channel, message: Message, *, hit: bool
     ) -> None:
-        """One message; ``hit`` says whether it gets the faults of single messages."""
+        """Add one message; ``hit`` is whether it gets the faults of single messages."""
         rng, own = self.rng, self.faults if hit else self.faults & {"time"}
         if schema.id not in self.schemas:
             self._add_schema(schema)
@@ -272,7 +272,7 @@ def remake_log(data: bytes, rng: random.Random, scratch: Path) -> bytes:
 
 
 def remake_database(data: bytes, rng: random.Random, scratch: Path) -> bytes:
-    """An SQLite file with faults in rows, columns or the layout."""
+    """Return an SQLite file with faults in rows, columns or the layout."""
     path = scratch.with_suffix(".db")
     path.write_bytes(data)
     with contextlib.closing(sqlite3.connect(path)) as base:

@@ -33,7 +33,7 @@ def recorder(
     options: Sequence[str] = (),
     output: Path | None = None,
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """A recording of what other processes send; what it prints goes to ``recorder.err``."""
+    """Record frames of other processes; errors of the recorder go to ``recorder.err``."""
     sources = [f"{name}=unix:{folder / name}.sock" for name in buses]
     command = [*UNDULOG, "record", *sources, *options, "--quiet", "--floor", "0"]
     command += ["--socket", folder / "control.sock", "-o", output or folder / "run.mcap"]
@@ -52,28 +52,28 @@ def start(stack: ExitStack, *command: object, **options: object) -> subprocess.P
 
 @dataclass
 class Sending:
-    """A sender: its process and the log that it keeps of what the kernel accepted."""
+    """A sender: its process and its log of the frames that the kernel accepted."""
 
     bus: str
     process: subprocess.Popen[bytes]
     log: Path
 
     def rows(self) -> list[tuple[int, int]]:
-        """(Monotonic time [ns], frames accepted by then)."""
+        """Return pairs of monotonic time [ns] and frames accepted by then."""
         data = self.log.read_bytes() if self.log.exists() else b""
         return list(struct.iter_unpack("<QQ", data[: len(data) // 16 * 16]))
 
     def accepted_before(self, t_ns: int) -> int:
-        """Frames that were accepted before a moment."""
+        """Return the number of frames accepted before a time."""
         return max((count for at_ns, count in self.rows() if at_ns < t_ns), default=0)
 
     def lost_tail_ms(self, kept: int, killed_ns: int) -> float:
-        """How long before a kill the first frame was accepted that is not kept; 0 if all are."""
+        """Return the age of the first accepted frame that is not kept at a kill [ms]; 0 if none."""
         first = next((at_ns for at_ns, count in self.rows() if count > kept), killed_ns)
         return max(0, killed_ns - first) / 1e6
 
     def wait_for(self, packets: int) -> None:
-        """Wait until so many packets were accepted."""
+        """Wait until a number of packets was accepted."""
         until = time.monotonic() + PATIENCE_S
         while len(self.rows()) < packets:
             if time.monotonic() > until or self.process.poll() is not None:
@@ -81,7 +81,7 @@ class Sending:
             time.sleep(0.02)
 
     def result(self) -> dict[str, int]:
-        """What it reports at its end."""
+        """Return the report of the sender at its end."""
         out, _ = self.process.communicate(timeout=PATIENCE_S)
         return json.loads(out)
 
@@ -90,7 +90,7 @@ class Sending:
 def senders(
     folder: Path, buses: Sequence[str], *, rate: float, per_packet: int, seconds: float
 ) -> Iterator[list[Sending]]:
-    """Senders to a recorder, one a bus."""
+    """Start senders to a recorder, one a bus."""
     with ExitStack() as stack:
         found = []
         for name in buses:
@@ -102,7 +102,7 @@ def senders(
 
 
 def numbers_in(paths: Sequence[Path], bus: str) -> list[int]:
-    """The sequence numbers of a bus's frames, in the order of the files, by mcap's own reader."""
+    """Return the sequence numbers of a bus in the order of the files, by mcap's own reader."""
     found = []
     for path in paths:
         with path.open("rb") as stream:
@@ -121,7 +121,7 @@ def numbers_in(paths: Sequence[Path], bus: str) -> list[int]:
 
 
 def check_kept(folder: Path, sending: Sending, least: int) -> list[str]:
-    """Whether each accepted frame is there once, in order, and none that was never sent."""
+    """Return failures unless each accepted frame is there once, in order, and no other."""
     paths = sorted(folder.glob("*.mcap"))
     if not paths:
         return ["lost: no session"]
@@ -139,6 +139,6 @@ def check_kept(folder: Path, sending: Sending, least: int) -> list[str]:
 
 
 def end(running: subprocess.Popen[bytes], by: int = signal.SIGTERM) -> int:
-    """Ask a process to end; its exit code."""
+    """End a process by a signal; return its exit code."""
     os.kill(running.pid, by)
     return running.wait(PATIENCE_S)

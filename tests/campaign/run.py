@@ -49,7 +49,7 @@ class Part:
 
 
 def mutated(seed: int, stage: Stage) -> Result:
-    """A mutated file through a command; a failure is minimised and stored, once for each kind."""
+    """Run a command on a mutated file; minimise and store one failure of each kind."""
     with stage.fresh() as folder:
         result, case = run_seed(seed, stage.bases, folder)
     for kind in dict.fromkeys(map(kind_of, result.failures)):
@@ -89,7 +89,7 @@ def _work(part: str, seed: int) -> tuple[str, int, Result, float]:
 def plan(
     names: Sequence[str], seed: int, cases: int | None, *, short: bool
 ) -> list[tuple[str, int]]:
-    """Every case: (part, seed), those that need the machine for themselves first."""
+    """Return every case as (part, seed), those that need the machine alone first."""
     jobs: list[tuple[str, int]] = []
     for name in sorted(names, key=lambda one: not PARTS[one].alone):
         part = PARTS[name]
@@ -117,7 +117,7 @@ def run_all(
 
 
 class Records:
-    """The results of a campaign, a line of JSON each, in a file that a later run goes on with."""
+    """The results of a campaign, a line of JSON each, in a file that a later run continues."""
 
     def __init__(self, path: Path) -> None:
         """Read what is there."""
@@ -142,7 +142,7 @@ class Records:
 
 
 def summary(records: Records) -> list[str]:
-    """A table by part, then the failures by kind with a seed each."""
+    """Return a table by part, then the failures by kind with a seed each."""
     lines = [
         "| part | cases | failed | skipped | most processor time [s] | most memory [MiB] | other |",
         "|---|---|---|---|---|---|---|",
@@ -180,7 +180,7 @@ def summary(records: Records) -> list[str]:
 
 
 def main() -> int:
-    """Run what the command line asks for; exit code 1 where a case failed."""
+    """Run the command line; return 1 where a case failed."""
     parser = argparse.ArgumentParser(prog="campaign", description=__doc__)
     parser.add_argument("--seed", type=int, help="of the campaign; a new one by default")
     parser.add_argument("--cases", type=int, help=f"in all; {LONG} in the long form")

@@ -60,7 +60,7 @@ def _closing() -> Iterator[list[socket.socket]]:
 
 
 def attack(address: tuple[str, int] | str, rng: random.Random, links: list[socket.socket]) -> None:
-    """Forty clients: some garbage, some silence, some half-open, some that are gone at once."""
+    """Connect forty clients: some send garbage, some nothing, some leave half-way or at once."""
     for _ in range(40):
         kind = rng.choice(["garbage", "silent", "half", "gone", "deaf"])
         with suppress(OSError):
@@ -102,7 +102,7 @@ def _wait(condition: Callable[[], object]) -> object:
 
 
 def _answer(address: tuple[str, int] | str, words: bytes, is_good: Callable[[bytes], bool]) -> str:
-    """What is wrong with the answer that a client gets; empty where it is good."""
+    """Return the fault of the answer that a client gets; empty where it is good."""
     with suppress(OSError), _connect(address) as link:
         link.settimeout(0.5)
         link.sendall(words)
@@ -116,7 +116,7 @@ def _descriptors(pid: int) -> int:
 
 
 def _check_descriptors(result: Result, pid: int, before: int, of: str = "") -> None:
-    """Once the clients have gone, no more descriptors are open than before them."""
+    """Check that after the clients no more descriptors are open than before."""
     with suppress(TimeoutError):
         _wait(lambda: _descriptors(pid) <= before + MORE)
     if (left := _descriptors(pid)) > before + MORE:
@@ -262,7 +262,7 @@ ATTACKS = ("sim serve", "record", "view --web")
 
 
 def run(seed: int, stage: Stage) -> Result:
-    """One server under attack."""
+    """Attack one server."""
     rng = random.Random(seed)
     name = ATTACKS[seed % len(ATTACKS)]
     result = Result(f"{name}: forty bad clients")

@@ -65,7 +65,7 @@ class Stage:
 
     @contextmanager
     def fresh(self) -> Iterator[Path]:
-        """An empty folder, gone afterwards."""
+        """Yield an empty folder that is removed afterwards."""
         with tempfile.TemporaryDirectory(prefix="c", dir=self.folder) as name:
             folder = Path(name) / "w"
             folder.mkdir()
@@ -78,7 +78,7 @@ class Stage:
             (self.failing / f"{name}.json").write_text(case.as_json())
 
     def files_of(self, name: str) -> dict[str, bytes]:
-        """The files of a base."""
+        """Return the files of a base."""
         return next(one for one in self.bases if one.name == name and one.kind == "log").files
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ def analysed(path, options=None):
 
 
 def experiment(paths):
-    """One session at a time is open."""
+    """Analyse sessions as one experiment; one session at a time is open."""
 
     def opened():
         for path in paths:

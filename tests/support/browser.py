@@ -1,4 +1,4 @@
-"""A headless Chromium, spoken to by the DevTools protocol."""
+"""A headless Chromium, controlled by the DevTools protocol."""
 
 import json
 import os
@@ -17,7 +17,7 @@ WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshad
 
 
 class Browser:
-    """One headless Chromium, spoken to by the DevTools protocol over a pair of pipes."""
+    """A headless Chromium, controlled by the DevTools protocol over a pair of pipes."""
 
     def __init__(self, path, profile, patience_s=60.0, flags=FLAGS):
         self.patience_s = patience_s
@@ -81,7 +81,7 @@ class Browser:
         self.evaluate("new Promise(r => requestAnimationFrame(() => requestAnimationFrame(r)))")
 
     def evaluate(self, script):
-        """Value of a script, awaited; it runs beside the page, whatever the page's policy."""
+        """Return the awaited value of a script; it runs whatever the page's policy."""
         result = self.call(
             "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True
         )
@@ -89,7 +89,7 @@ class Browser:
         return result["result"].get("value")
 
     def requests(self):
-        """Addresses asked for since ``open``."""
+        """Return the addresses requested since ``open``."""
         return [
             e["params"]["request"]["url"]
             for e in self.events
@@ -97,7 +97,7 @@ class Browser:
         ]
 
     def complaints(self):
-        """Console messages, log entries and exceptions since ``open``."""
+        """Return console messages, log entries and exceptions since ``open``."""
         said = ("Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded")
         return [e for e in self.events if e.get("method") in said]
 

@@ -21,7 +21,7 @@ from undulog.analysis.segments.examine import Findings
 
 
 def answered(analysis, shape=()):
-    """The result with the answer that its numbers give."""
+    """Return the result with the answer to its numbers."""
     known = tuple(j.name for j in analysis.joints if j.gain.value is not None)
     findings = Findings(shape=tuple(shape), compared=known)
     facts = Facts(analysis.gait, analysis.joints, known, (), findings, analysis.warnings)
@@ -58,7 +58,7 @@ PLACES = (("head", "link01"), ("middle", "link13"), ("tail", "link26"))
 
 
 def points(values, name):
-    """Points of the body from amplitude [mm] and phase [degrees], with intervals."""
+    """Return points of the body from amplitude [mm] and phase [degrees], with intervals."""
     return tuple(
         BodyPoint(place, name(link), around(mm * 1e-3, 0.6e-3), around(math.radians(deg), 0.03))
         for (place, link), (mm, deg) in zip(PLACES, values, strict=True)

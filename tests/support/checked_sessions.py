@@ -1,4 +1,4 @@
-"""What the tests of `undulog log check` share: a clean session, and faults planted in it."""
+"""A clean session, and faults planted in it, for the tests of `undulog log check`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def gait(tick: int) -> np.ndarray:
 
 
 def write(path: Path, edit: Edit | None = None, verdict: str | None = None) -> Path:
-    """20 s of 25 joints at 100 Hz, with a fault planted by ``edit``."""
+    """Write 20 s of 25 joints at 100 Hz, with a fault planted by ``edit``."""
     noise = np.random.default_rng(3).normal(0.0, 1e-3, (TICKS, len(NAMES)))
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
         commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
@@ -58,7 +58,7 @@ def timing_of(health: SessionHealth, topic: str = "/joint_states") -> Timing:
 
 
 def write_raw(path: Path, sequences: list[int], **options: object) -> Path:
-    """JointState messages of three joints with sequence numbers of our choice."""
+    """Write JointState messages of three joints with given sequence numbers."""
     with path.open("wb") as stream:
         writer = McapWriter(stream, **options)
         writer.start(profile="ros2", library="test")

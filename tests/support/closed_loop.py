@@ -47,7 +47,7 @@ class Sines:
         self._phasors = phasors
 
     def step(self, time_s, readings):
-        """Command what the phasors say, growing from nothing over 2 s."""
+        """Return the command by the phasors, growing from zero over 2 s."""
         x = min(time_s / 2.0, 1.0)
         wave = x * x * (3.0 - 2.0 * x) * np.imag(np.exp(1j * OMEGA * time_s) * self._phasors)
         command = np.zeros(2 * wave.size - 1)
@@ -57,7 +57,7 @@ class Sines:
 
 @dataclass(frozen=True)
 class Relaxation:
-    """What m oscillators did after a kick, and what P and R said, over k times.
+    """Phases of m oscillators after a kick, and those predicted by P and R, at k times.
 
     Attributes:
         t_s: After the kick [s], shape (k,).
@@ -71,22 +71,22 @@ class Relaxation:
 
     @property
     def moved(self):
-        """How far they have come from where the kick put them, in shares of it, shape (k,)."""
+        """Return the distance from the kicked phases, in shares of the kick, shape (k,)."""
         return _share(self.off - self.off[0], self.off[0])
 
     @property
     def error(self):
-        """How far the prediction is off, in shares of the kick, shape (k,)."""
+        """Return the error of the prediction, in shares of the kick, shape (k,)."""
         return _share(self.off - self.predicted, self.off[0])
 
 
 def write_chain(folder, m, stall):
-    """The robot with m yaw joints, for the runs in a folder."""
+    """Write the robot with m yaw joints, for the runs in a folder."""
     (folder / "chain.toml").write_text(twin_chains.chain(2 * m - 1, stall_torque=stall))
 
 
 def open_loop(folder, m, held_out=()):
-    """The experiment of kicks around the gait, analysed.
+    """Run and analyse the experiment of kicks around the gait.
 
     Args:
         folder: Has the robot.
@@ -105,7 +105,7 @@ def open_loop(folder, m, held_out=()):
 
 
 def closed_loop(folder, experiment: Experiment):
-    """The kicked generators, and the prediction from the open loop, without a fitted parameter."""
+    """Run kicked generators, and predict them from the open loop without a fitted parameter."""
     P, R = (np.array(one.value) for one in (experiment.coupling.P, experiment.coupling.R))
     yaw = [one for one in experiment.sessions[0].joints if one.gain.value is not None]
     ratio = np.array([one.gain.value * np.exp(-1j * one.lag_rad.value) for one in yaw])
@@ -131,7 +131,7 @@ def _deviations(m, held_out):
 
 
 def _phases(folder, label, bias, **kicks):
-    """Phases of generators that feel their servos, ten a second from the kick on."""
+    """Return phases of generators with feedback, ten a second from the kick on."""
     alone = {"forward": 0.0, "backward": 0.0}
     feedback = {"feedback": EPS, "feedback_bias": bias.tolist()}
     scenario = _scenario(

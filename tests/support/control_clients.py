@@ -1,4 +1,4 @@
-"""What the tests of the control socket share: raw clients, patience and other recorders."""
+"""Raw clients of the control socket, and other recorders."""
 
 import contextlib
 import json
@@ -32,7 +32,7 @@ while True:
 
 
 def echo(request):
-    """A handler that says what it got; some words have effects."""
+    """Return the request; some requests have effects."""
     if request.get("do") == "refuse":
         raise DataError("not now")
     if request.get("do") == "big":
@@ -46,7 +46,7 @@ def echo(request):
 
 @contextlib.contextmanager
 def polled(server, pause_s=0.001):
-    """A server polled by a thread, as by the recorder's loop."""
+    """Poll a server in a thread, as the recorder's loop does."""
     ended = threading.Event()
 
     def loop():  # an exception in here fails the test: pytest warns of it
@@ -64,7 +64,7 @@ def polled(server, pause_s=0.001):
 
 
 def connected(server):
-    """A raw client that doesn't block for ever."""
+    """Connect a raw client with a timeout."""
     client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     client.connect(str(server.path))
     client.settimeout(PATIENCE_S)
@@ -77,7 +77,7 @@ def polls(server, until):
 
 
 def replies(data):
-    """Reply lines, each read as JSON."""
+    """Return the reply lines, each read as JSON."""
     assert data.endswith(b"\n")
     return [json.loads(line) for line in data.splitlines()]
 
@@ -99,7 +99,7 @@ def drain(server, client, count):
 
 
 def start_recorder(path, extra=""):
-    """A process that serves the socket until it is killed; says 'ready' or why not."""
+    """Start a process that serves the socket until it is killed; it prints 'ready' or the error."""
     code = RECORDER.format(extra=extra, path=str(path))
     return start(sys.executable, "-c", code, stdin=subprocess.PIPE, stderr=None)
 

@@ -22,7 +22,7 @@ TOPICS = ("/a", "/b", "/rare")
 
 
 def message(number):
-    """Channel, sequence, log time, publish time and payload of the message with that number."""
+    """Return channel, sequence, log time, publish time and payload of a message by its number."""
     rng = random.Random(number)
     if number % 50 == 49:
         channel, sequence = 3, number // 50
@@ -37,13 +37,13 @@ def message(number):
 
 
 def truth(count):
-    """All messages of a session, as a reader tells them."""
+    """Return all messages of a session, as a reader returns them."""
     found = (message(number) for number in range(count))
     return [(TOPICS[c - 1], s, t, p, data) for c, s, t, p, data in found]
 
 
 def open_sink(path, **options):
-    """A sink with its channels."""
+    """Open a sink and define its channels."""
     sink = DurableSink(path, **options)
     sink.define(Metadata("undulog", {"session_id": "killed", "epoch_ns": str(EPOCH_NS)}))
     sink.define(Schema(1, schema_text(STRING).encode(), "ros2msg", STRING))
@@ -59,7 +59,7 @@ def write(sink, number):
 
 
 def run(path, count=1 << 40, splits=(), split_every=0, close=False, **options):
-    """Write, tell each number after it was accepted, and die of a kill.
+    """Write messages, report each number after it was accepted, and kill the process.
 
     Args:
         path: The session.

@@ -1,4 +1,4 @@
-"""What the tests of edits share: logs of several makes, and other readers of them."""
+"""Logs of several makes, and other readers of them, for the tests of edits."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def text(value: str) -> bytes:
 
 
 def write_log(path: Path, messages, *, attachments=(), metadata=(), units=None, **options) -> Path:
-    """A foreign log of Strings: (topic, log time [ns after the epoch], text)."""
+    """Write a foreign log of Strings: (topic, log time [ns after the epoch], text)."""
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=512, **options)
         writer.start(profile="ros2", library="elsewhere")
@@ -78,7 +78,7 @@ def entry(schema, channel, message):
 
 
 def read(path: Path, **window):
-    """Every message as mcap's own reader gives it, by log time."""
+    """Return every message by mcap's own reader, by log time."""
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         return [entry(*item) for item in reader.iter_messages(**window)]

@@ -28,7 +28,7 @@ FRAME = re.compile(rb"< send ([0-9A-Fa-f]+) (\d+) ([0-9A-Fa-f ]+)>")
 
 
 class Robot:
-    """Servos that are where they were told to be; they report unasked, or answer requests.
+    """Servos at their commanded angles; they report unasked, or answer requests.
 
     ``unasked``: 25 joints report every ``period_s``. ``polled``: one servo answers each request,
     ``latency_s`` later. ``slow``: it looks at its bus every ``period_s`` only, takes all commands
@@ -62,7 +62,7 @@ class Robot:
         self.angles[joint] = raw
 
     def log_event(self):
-        """What is due by now, and when more will be."""
+        """Return the data that are due, and the time until the next are [s]."""
         now, text = time.monotonic(), b""
         while self.due and self.due[0][0] <= now:
             kind = heapq.heappop(self.due)[1]
@@ -90,13 +90,13 @@ class Robot:
 
 
 def frame(identifier, data):
-    """A frame with the robot's own time, whose clock is set every 0.7 s, a day to and fro."""
+    """Return a frame with the robot's time, whose clock is set every 0.7 s, a day to and fro."""
     jump_s = 86400 * (int(time.monotonic() / 0.7) % 2)
     return b"< frame %X %.6f %s >" % (identifier, time.time() + jump_s, data.hex().encode())
 
 
 def serve_robot(robot):
-    """One client of socketcand; ends with standard input."""
+    """Serve one client of socketcand; end with standard input."""
     listener = socket.create_server(("127.0.0.1", 0))
     print(listener.getsockname()[1], flush=True)
     client = listener.accept()[0]
@@ -139,7 +139,7 @@ def serve_robot(robot):
 
 
 class Way:
-    """One direction of the router: what came, and when it goes on."""
+    """One direction of the router: received data, and when they are sent."""
 
     def __init__(self, source, target):
         self.source, self.target, self.queue = source, target, []
@@ -147,7 +147,7 @@ class Way:
         self.held = False
 
     def take(self):
-        """Read what came; False at its end."""
+        """Read received data; return False at the end."""
         try:
             chunk = self.source.recv(65536)
         except ConnectionResetError:
@@ -159,7 +159,7 @@ class Way:
         return bool(chunk)
 
     def pass_on(self):
-        """Write what is due; an end is passed on, too."""
+        """Write the data that are due; an end is passed on, too."""
         while self.queue and not self.held and self.queue[0][0] <= time.monotonic():
             chunk = self.queue.pop(0)[1]
             try:
@@ -172,7 +172,7 @@ class Way:
 
 
 def route(port):
-    """Between one client and the robot."""
+    """Route between one client and the robot."""
     listener = socket.create_server(("127.0.0.1", 0))
     print(listener.getsockname()[1], flush=True)
     client = listener.accept()[0]
@@ -199,7 +199,7 @@ def route(port):
 
 
 def largest_burst(arrivals, within_s=0.005):
-    """The largest change of one joint's command by arrivals within a short time [rad].
+    """Return the largest change of one joint's command by arrivals within a short time [rad].
 
     A change counts from the command that was in force before the first of them.
     """

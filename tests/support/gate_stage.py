@@ -1,4 +1,4 @@
-"""What the tests of the armed gate share: a small robot, its process, a listener, and the checks.
+"""A small robot, its process, a listener, and checks, for the tests of the armed gate.
 
 Robot, listener and controller are processes of their own. What was on the bus is judged by what the
 listener wrote, with python-can and cantools; sessions are read by the ``mcap`` package itself.
@@ -66,7 +66,7 @@ lag = 1.0
 
 
 def robot_files(folder, *, safety=SAFETY):
-    """Write the small robot and a scenario for it; returns (robot file, scenario file)."""
+    """Write the small robot and a scenario for it; return both files."""
     folder.mkdir(exist_ok=True)
     (folder / "snake25.dbc").write_text(dict(load_robot("snake25").databases)["snake25.dbc"])
     text = snake4("snake25.dbc", SIGNALS)
@@ -79,13 +79,13 @@ def robot_files(folder, *, safety=SAFETY):
 
 
 def wave(times_s):
-    """What is recorded: four sines that do not begin at zero [rad], shape (n, 4)."""
+    """Return four sines that do not begin at zero [rad], shape (n, 4)."""
     turns = 0.25 * times_s[:, None] + np.array([0.2, 0.0, 0.6, 0.35])
     return np.array([0.3, 0.15, 0.45, 0.1]) * np.sin(2 * np.pi * turns)
 
 
 def commanded(path, robot, duration_s, *, names=JOINTS, commands=wave):
-    """A session of commands for a robot (its name or file)."""
+    """Write a session of commands for a robot (its name or file)."""
     given = commands(np.arange(round(duration_s * RATE_HZ) + 1) / RATE_HZ)
     facts = {"robot": load_robot(robot), "clock": {"computer": "host"}}
     return write_commands(path, names, given[:, : len(names)], **facts)
@@ -109,25 +109,25 @@ class Stage:
 
     @property
     def lines(self):
-        """Everything that was heard by now."""
+        """Return all frames received so far."""
         text = self._heard.read_text() if self._heard.exists() else ""
         return [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
 
     @property
     def command_lines(self):
-        """The commands among it."""
+        """Return the commands among the received frames."""
         return [one for one in self.lines if (one["name"] or "").endswith("_command")]
 
     def words(self, session, output, *more):
-        """The command line of the controller, armed."""
+        """Return the command line of the armed controller."""
         return (*UNDULOG, "replay", session, "--on", self.on, "--arm", "-o", output, *more)
 
     def replay(self, session, output, *more, **options):
-        """The controller, armed, as a process."""
+        """Run the armed controller as a process."""
         return process(*self.words(session, output, *more), **options)
 
     def wait_for_commands(self, controller, count=150):
-        """Until so many ticks were commanded."""
+        """Wait until a number of ticks was commanded."""
         wait_for(
             lambda: len(self.command_lines) >= count * len(JOINTS),
             "no commands on the bus",
@@ -135,7 +135,7 @@ class Stage:
         )
 
     def settle(self, quiet_s=0.3):
-        """Wait for a while in which something could still be sent, and until all of it is heard.
+        """Wait while frames may still be sent, and until all of them are received.
 
         A frame of our own is sent then: once the listener has it, it has all that came before.
         """
@@ -158,7 +158,7 @@ class Stage:
 
 @contextmanager
 def staged(folder, scenario, *faults, pace="--wait"):
-    """A virtual robot with faults to come, and a listener on its bus.
+    """Run a virtual robot with planned faults, and a listener on its bus.
 
     Times of faults are after the first command: the robot waits for it, and tells its pose.
     """
@@ -177,7 +177,7 @@ def staged(folder, scenario, *faults, pace="--wait"):
 
 
 def commands_of(lines):
-    """Each joint's commands: name to (monotonic times [s], angles [rad])."""
+    """Return each joint's commands: name to (monotonic times [s], angles [rad])."""
     found = {}
     for one in lines:
         if (one["name"] or "").endswith("_command"):
@@ -238,13 +238,13 @@ class Written:
                     self.sent_ns += ours["t_host_ns"].tolist()
 
     def time_of(self, words):
-        """When the first event with these words was written [s]."""
+        """Return when the first event with these words was written [s]."""
         found = [at_s for at_s, _, text in self.said if words in text]
         assert found, (words, self.said)
         return found[0]
 
     def after(self, words):
-        """Commands from that event on, each joint's in a row: joint to angles [rad]."""
+        """Return commands from an event on: joint to angles [rad]."""
         since_s = self.time_of(words)
         rows = [row for at_s, row in self.commands if at_s >= since_s - 1e-9]
         names = self.commands[0][1]

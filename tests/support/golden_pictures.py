@@ -42,21 +42,21 @@ FAR = 48
 
 
 def convert(path):
-    """Write the session's recording; returns its views by name."""
+    """Write the session's recording; return its views by name."""
     with Session.open(SESSION) as session:
         written = write_recording(session, path, analysis=analyse_session(session))
     return {str(view.name): view for view in build_views(written.content).all}
 
 
 def alone(view):
-    """The layout that shows one view and nothing else."""
+    """Return the layout that shows one view and nothing else."""
     panels = (rrb.TopPanel, rrb.BlueprintPanel, rrb.SelectionPanel, rrb.TimePanel)
     hidden = [panel(state="hidden") for panel in panels]
     return rrb.Blueprint(view, *hidden, auto_views=False, auto_layout=False)
 
 
 def take(viewer, recording, view):
-    """The PNG of one view of a recording, by a viewer of the right size.
+    """Return the PNG of one view of a recording, by a viewer of the right size.
 
     ``recording`` is a file, or a stream of chunks.
     """
@@ -78,13 +78,13 @@ def take(viewer, recording, view):
 
 
 def slug(view):
-    """File name of a view: its name without the numbers and units that come after it."""
+    """Return the file name of a view: its name without numbers and units after it."""
     words = re.split(r"[:\[]|, [^a-z]", view)[0]
     return re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")
 
 
 def load(path):
-    """A picture as integers, shape (height, width, 3)."""
+    """Load a picture as integers, shape (height, width, 3)."""
     with Image.open(path) as picture:
         return np.asarray(picture.convert("RGB")).astype(int)
 
@@ -96,12 +96,12 @@ def glowing(picture):
 
 
 def marked(picture):
-    """How many pixels stand out from the ground."""
+    """Return the number of pixels that stand out from the ground."""
     return int((np.abs(picture - np.median(picture, axis=(0, 1))).max(axis=-1) > 60).sum())
 
 
 def differing(found, golden, reach=1):
-    """Which pixels of either picture have no like within ``reach`` in the other, shape (h, w)."""
+    """Return which pixels of either picture have no like within ``reach`` in the other, (h, w)."""
     return _lost(found, golden, reach) | _lost(golden, found, reach)
 
 
@@ -113,7 +113,7 @@ def _lost(one, other, reach):
 
 
 def worst_tile(found, golden, reach=1):
-    """The most differing pixels in any tile; all of a tile's where the sizes differ."""
+    """Return the most differing pixels in any tile; all of a tile's where the sizes differ."""
     if found.shape != golden.shape:
         return TILE * TILE
     differs = differing(found, golden, reach)

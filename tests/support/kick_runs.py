@@ -9,7 +9,7 @@ from undulog.analysis.experiment.kicks.runs import KickExperiment, Kind, sort_ki
 
 
 def kicked(random, H, c, kicks, scatter, *, bend=0.0, size=1.0, late=0.0, noise=None):
-    """Sessions of kicks as phasors; ``late`` turns a kicked run's responses towards the kick."""
+    """Return kicks as phasors; ``late`` turns a kicked run's responses towards the kick."""
     noise = kick_tables.NOISE if noise is None else noise
     off = np.zeros((len(kicks), len(c)), dtype=complex)
     for k, kick in enumerate(kicks):

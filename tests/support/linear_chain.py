@@ -17,7 +17,7 @@ MODULE[1] = 0.97 * np.exp(-0.02j)
 
 
 def write_run(path, command, answer, seed, sigma):
-    """Six cycles at 50 Hz."""
+    """Write six cycles at 50 Hz."""
     noise = np.random.default_rng(seed).normal(0.0, sigma, (300, M))
     epoch_ns = EPOCH_NS + seed * 10_000_000_000
     with SessionWriter(path, session_id=path.stem, epoch_ns=epoch_ns) as writer:
@@ -32,7 +32,7 @@ def write_run(path, command, answer, seed, sigma):
 
 
 def both_ways(folder):
-    """Six runs each way, in turn; the second joint is weak."""
+    """Write six runs each way, in turn; the second joint is weak."""
     paths = []
     for k in range(6):
         for way, name in ((1, "forward"), (-1, "reverse")):
@@ -43,7 +43,7 @@ def both_ways(folder):
 
 
 def kicked(folder):
-    """Every joint's command kicked in phase and amplitude, and a pattern held out."""
+    """Write runs with every joint's command kicked in phase and amplitude, and one held out."""
     off = [np.zeros(M, dtype=complex)]
     for step in (0.05j, -0.05j, 0.05, -0.05):
         off += [np.where(joint == PLACE, step, 0) for joint in range(M)]
@@ -61,7 +61,7 @@ def kicked(folder):
 
 
 def swept(folder):
-    """A lag sweep: the commands of the runs are the columns of a DFT."""
+    """Write a lag sweep: the commands of the runs are the columns of a DFT."""
     dft = 0.02 * np.exp(2j * np.pi * np.outer(PLACE, PLACE) / M)
     return [
         write_run(folder / f"run{k}.mcap", dft[:, k], CHAIN @ dft[:, k], k, 1e-5) for k in PLACE

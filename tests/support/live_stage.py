@@ -1,4 +1,4 @@
-"""What the tests of the live view share: recorders that send sessions, and relays."""
+"""Recorders that send sessions, and relays, for the tests of the live view."""
 
 import json
 import sys
@@ -39,7 +39,7 @@ class Recorder:
         wait_for(lambda: self.feed.connected, each=self.feed.pump)
 
     def send(self, start_s=0.0, stop_s=np.inf, *, wait=True):
-        """Messages of a stretch of time; returns how many ticks there were."""
+        """Send the messages of a time interval; return the number of ticks."""
         ticks, at_ns = 0, EPOCH_NS
         for message in self.messages:
             if not start_s <= (message[1] - EPOCH_NS) * 1e-9 < stop_s:
@@ -56,14 +56,14 @@ class Recorder:
         return ticks
 
     def send_all(self):
-        """All messages, and the end."""
+        """Send all messages, and end."""
         self.connect()
         self.send()
         self.feed.close()
 
 
 def seen_live(session, folder):
-    """A session recorded and relayed to a file: what the relay reports, and the file."""
+    """Record and relay a session to a file; return the report of the relay, and the file."""
     relay = Relay(folder / "live.sock", folder / "live.rrd")
     try:
         Recorder(session, folder / "live.sock").send_all()

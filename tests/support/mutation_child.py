@@ -34,7 +34,7 @@ GROWTH = 192 * MIB
 
 
 def make_corpus(folder):
-    """Whole files as those of the campaign, but shorter: name to path and content of each."""
+    """Write whole files as the campaign does, but shorter; return name to path and content."""
     folder.mkdir()
     write_texts(folder)
     unfinished, _ = of_recorder(folder)
@@ -67,7 +67,7 @@ def read_log(folder):
 
 
 def parse_mutated(rng):
-    """A robot description, or its bus database, with faults."""
+    """Parse a robot description, or its bus database, with faults."""
     robot = load_robot(rng.choice(["snake25", "arcsnake-joint"]))
     databases = dict(robot.databases)
     text = robot.toml
@@ -85,7 +85,7 @@ def parse_mutated(rng):
 
 
 def try_seed(seed, corpus, folder):
-    """Read the file that a seed stands for; gives what came of it."""
+    """Read the mutated file of a seed; return the result in words."""
     rng = random.Random(seed)
     kind = seed % 10
     try:
@@ -105,7 +105,7 @@ def try_seed(seed, corpus, folder):
 
 
 def in_use():
-    """Most memory in use so far [byte]."""
+    """Return the peak of memory in use [byte]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 

@@ -36,21 +36,21 @@ class Snake:
         self.effort = 0.1 * np.cos(phase - 0.3) + rng.normal(0, 0.002, rate.shape)
 
     def told(self, angle):
-        """What the encoders tell of an angle."""
+        """Return the angles as the encoders report them."""
         return np.round(angle / self.step) * self.step if self.step else angle
 
     def joint(self):
-        """A driven joint, as an index."""
+        """Draw a driven joint, as an index."""
         return int(self.rng.choice(DRIVEN))
 
     def span(self, shortest=1.0, longest=6.0):
-        """First sample and one past the last of a stretch inside the session."""
+        """Draw an interval inside the session: first sample and one past the last."""
         length = self.rng.uniform(shortest, longest)
         start = self.rng.uniform(2.0, DURATION_S - 2.0 - length)
         return round(start * RATE_HZ), round((start + length) * RATE_HZ)
 
     def write(self, path):
-        """As a session with the robot's description."""
+        """Write a session with the robot's description."""
         names = self.robot.joint_names
         with SessionWriter(path, session_id="planted", epoch_ns=EPOCH_NS, robot=self.robot) as w:
             w.attach("scenario.toml", "application/toml", b"[servo]\nstall_torque = 1.5\n")
@@ -64,13 +64,13 @@ class Snake:
 
 
 def artefacts(path):
-    """What is found in a session."""
+    """Return the artefacts that are found in a session."""
     with Session.open(path) as session:
         columns = read_columns(session, "/joint_commands", "/joint_states", lambda _: None)
         return find_artefacts(session, columns)
 
 
 def overlap(spans, start_s, stop_s):
-    """Intersection over union of stretches with one stretch."""
+    """Return the intersection over union of time intervals with one interval."""
     inner = sum(max(0.0, min(b, stop_s) - max(a, start_s)) for a, b in spans)
     return inner / (sum(b - a for a, b in spans) + stop_s - start_s - inner)

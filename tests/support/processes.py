@@ -35,7 +35,7 @@ def start(*words, **options):
 
 @contextmanager
 def process(*words, **options):
-    """A process that is ended with the block."""
+    """Start a process that is ended with the block."""
     running = start(*words, **options)
     try:
         yield running
@@ -52,7 +52,7 @@ def process(*words, **options):
 
 @contextmanager
 def serving(scenario, *words, place="0", **options):
-    """A virtual robot's process, and what it says when it is ready."""
+    """Run a virtual robot; yield its process and its report when it is ready."""
     serve = (*UNDULOG, "sim", "serve", scenario, "--socketcand", place, "--json", *words)
     with process(*serve, **options) as robot:
         line = robot.stdout.readline()
@@ -61,7 +61,7 @@ def serving(scenario, *words, place="0", **options):
 
 
 def wait_for(condition, what="", seconds=90.0, *, each=lambda: None, alive=()):
-    """What a condition gives as soon as it holds; the processes ``alive`` must live meanwhile."""
+    """Return the value of a condition as soon as it holds; the processes ``alive`` must run."""
     deadline = time.monotonic() + seconds
     while not (found := condition()):
         for one in alive:
@@ -73,7 +73,7 @@ def wait_for(condition, what="", seconds=90.0, *, each=lambda: None, alive=()):
 
 
 def freeze(pid):
-    """Stop a process, and wait until all its threads stand."""
+    """Stop a process, and wait until all its threads are stopped."""
     os.kill(pid, signal.SIGSTOP)
     threads = Path(f"/proc/{pid}/task")
 
@@ -87,7 +87,7 @@ def freeze(pid):
 
 @contextmanager
 def served_page(file, scratch):
-    """``undulog view --web`` once its page answers: the process and the address."""
+    """Run ``undulog view --web``; yield the process and the address once the page answers."""
     with process(
         *UNDULOG, "view", file, "--web", env={**os.environ, "TMPDIR": str(scratch)}
     ) as one:
@@ -109,7 +109,7 @@ def _answers(page):
 
 
 def listening(*ports):
-    """Address, as the kernel prints it, and port of all sockets that listen at some ports."""
+    """Return address, as the kernel prints it, and port of sockets that listen at some ports."""
     tables = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
     lines = [line for one in tables if one.exists() for line in one.read_text().splitlines()[1:]]
     local = [line.split()[1].split(":") for line in lines if line.split()[3] == "0A"]

@@ -6,7 +6,7 @@ from undulog.capture.log.edit.raw_messages import RawLog
 
 
 def read(path):
-    """All messages of a log in the order they were written, and what the reader warns of."""
+    """Return all messages of a log in the order they were written, and the reader's warnings."""
     with RawLog(Path(path)) as log:
         topics = {key: channel.topic for key, channel in log.file.channels.items()}
         found = [

@@ -19,7 +19,7 @@ def command(output, *arguments):
 
 @contextmanager
 def recording(output, *arguments, env=None, floor="0"):
-    """A recorder in another process; it is running when the block begins."""
+    """Run a recorder in another process; it is running when the block begins."""
     process = processes.start(
         *command(output, *arguments), "--floor", floor, "--json", cwd=ROOT, env=env
     )
@@ -34,7 +34,7 @@ def recording(output, *arguments, env=None, floor="0"):
 
 
 def events(path):
-    """Who said what on ``/rosout``."""
+    """Return (source, text) of each event on ``/rosout``."""
     with Session.open(path) as session:
         return [(message.name, message.msg) for _, message in session.messages("/rosout")]
 

@@ -16,7 +16,7 @@ FINE = 20
 
 
 def play(u, width):
-    """The play operator, as its definition has it."""
+    """Return the output of the play operator by its definition."""
     z, found = 0.0, np.empty_like(u)
     for k, value in enumerate(u):
         z = max(value - width / 2, min(value + width / 2, z))
@@ -25,7 +25,7 @@ def play(u, width):
 
 
 def stick(u, static, kinetic, lag_s, dt):
-    """A first-order follower under dry friction, static and kinetic in rad of the command."""
+    """Return a first-order follower under dry friction, static and kinetic [rad of command]."""
     z, moving, found = float(u[0]), 0, np.empty_like(u)
     for k, value in enumerate(u):
         error = value - z
@@ -76,7 +76,7 @@ class Joint:
 
 
 def found_in(joints, *, effort=None, second=None):
-    """Dead bands of joints that were sampled together, by index."""
+    """Return the dead bands of joints that were sampled together, by index."""
     t_s = joints[0].t_s
     names = [f"joint{k}" for k in range(len(joints))]
     commands = {n: Series(n, t_s, j.command) for n, j in zip(names, joints, strict=True)}

@@ -31,7 +31,7 @@ def write_plan(folder, values=(0.2, 0.3), seeds=1, top="", name="plan.toml", *, 
 
 
 def comparable(rows):
-    """Key to text of each row, without what depends on the machine."""
+    """Return key to text of each row, without the columns that depend on the machine."""
     return {
         row["key"]: json.dumps(
             {

@@ -10,7 +10,7 @@ LINK = {"length": 0.06, "radius": 0.025, "mass": 0.1, "inertia": [4e-5, 5e-5, 5e
 
 
 def toml(table, path=()):
-    """A table of plain values and of tables as TOML text; JSON writes plain values alike."""
+    """Return a table as TOML text; JSON writes plain values alike."""
     plain = {key: value for key, value in table.items() if not isinstance(value, dict)}
     text = f"[{'.'.join(path)}]\n" if path and (plain or not table) else ""
     text += "".join(f"{key} = {json.dumps(value)}\n" for key, value in plain.items())
@@ -21,7 +21,7 @@ def toml(table, path=()):
 
 
 def chain(joints, *, assumed=("links", "servo"), planes=("horizontal", "vertical"), **servo):
-    """A robot with a yaw joint first and last, and a pitch joint between each two."""
+    """Return a robot with a yaw joint first and last, and a pitch joint between each two."""
     return toml(
         {
             "name": f"chain{joints}",
@@ -35,7 +35,7 @@ def chain(joints, *, assumed=("links", "servo"), planes=("horizontal", "vertical
 
 
 def wave(*, duration_s, settle_s, gait=None, horizontal=None, **tables):
-    """A wave of the yaw joints of the robot in ``chain.toml``: 0.4 rad, 1 Hz, lag pi/3."""
+    """Return a wave of the yaw joints of the robot in ``chain.toml``: 0.4 rad, 1 Hz, lag pi/3."""
     plane = {"amplitude": 0.4, "frequency_hz": 1.0, "lag": math.pi / 3, **(horizontal or {})}
     return toml(
         {

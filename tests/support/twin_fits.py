@@ -10,7 +10,7 @@ from undulog.capture import Session, SessionWriter
 
 
 def room_for(folder, joints, duration, hidden, *, noise=0.005, gait=(0.4, 1.0), seed=2):
-    """A nominal world, and a session of one whose parameters are others.
+    """Write a nominal world, and record a session of one with other parameters.
 
     The checks whether a twin fits have a level of 5 %: one noise in twenty is taken for a misfit.
     """
@@ -43,7 +43,7 @@ def fitted(room, capsys, *words, source="run.mcap"):
 
 
 def rewritten(source, target, change):
-    """Commands and states of a session once more; of states ``change`` gives times and rows."""
+    """Write commands and states of a session again; ``change`` returns times and rows of states."""
     with Session.open(source) as session:
         commands, states = (session.joints(t) for t in ("/joint_commands", "/joint_states"))
         robot = session.robot

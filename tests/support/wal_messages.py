@@ -1,4 +1,4 @@
-"""What the tests of the write-ahead log share: messages that can be told by their position."""
+"""Messages that follow from their position, for the tests of the write-ahead log."""
 
 import functools
 
@@ -22,7 +22,7 @@ message = functools.cache(_space["message"])
 
 
 def filled(folder, count, *, segment_size=4096):
-    """A log with so many messages that nobody released; closed."""
+    """Write and close a log with a number of messages, none released."""
     with WriteAheadLog(folder, segment_size=segment_size) as wal:
         for channel in (1, 2, 3):
             wal.define(Channel(channel, f"/{channel}", "cdr", {}, 0))
@@ -32,7 +32,7 @@ def filled(folder, count, *, segment_size=4096):
 
 
 def check_messages(found):
-    """Every message is what was appended at its position, and they are in order."""
+    """Check that every message is the one appended at its position, and that they are in order."""
     for item in found:
         assert tuple(item[i] for i in (1, 3, 4, 2, 5)) == message(item.position)
     positions = [item.position for item in found]

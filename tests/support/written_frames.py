@@ -7,7 +7,7 @@ T0 = 1_700_000_003_250_000_000
 
 
 def write_frames(path, topics, batch=37, **metadata):
-    """``topics``: topic to frames, classic or CAN FD by its name."""
+    """Write frames by topic, classic or CAN FD by its name."""
     with SessionWriter(path, session_id="s-1", epoch_ns=T0, metadata=metadata) as writer:
         messages = [
             (int(frames["t_host_ns"][start : start + batch].max()), topic, start)
@@ -24,7 +24,7 @@ def write_frames(path, topics, batch=37, **metadata):
 
 
 def imported(trace, folder, topic="/can/can0"):
-    """The report of an import, and the frames of a topic of the session."""
+    """Import a trace; return the report, and the frames of a topic of the session."""
     run = folder / "back.mcap"
     report = import_can(trace, run, load_robot("snake13"), force=True)
     with Session.open(run) as session:

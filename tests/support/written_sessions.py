@@ -1,4 +1,4 @@
-"""What the tests of sessions share: one of ours, and one as mcap-ros2-support writes it."""
+"""Sessions by the session writer and by mcap-ros2-support."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def write_commands(
     plan: dict[str, str] | None = None,
     **options: object,
 ) -> Path:
-    """A session of joint commands and nothing else.
+    """Write a session of joint commands and nothing else.
 
     Args:
         commands: Angles of each tick [rad].
@@ -72,7 +72,7 @@ def write_commands(
 def write_foreign(
     path: Path, messages: list[tuple[str, int, dict]], type_name: str = JOINT_STATE
 ) -> None:
-    """Messages (topic, log time, content) as mcap-ros2-support writes them."""
+    """Write messages (topic, log time, content) by mcap-ros2-support."""
     with path.open("wb") as stream:
         writer = RosWriter(stream)
         schema = writer.register_msgdef(type_name, schema_text(type_name))

@@ -1,4 +1,4 @@
-"""Right or wrong: what an output says against the truth."""
+"""Right or wrong: statements of outputs against the truth."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Judgement:
 
 
 def named_in(text: str, names: Sequence[str]) -> list[str]:
-    """Joints whose names a text contains as whole words, in order of their first place."""
+    """Return the joints whose names a text contains as whole words, in order."""
     found: dict[str, int] = {}
     for name in names:
         if match := re.search(rf"(?<![\w/]){re.escape(name)}(?![\w/])", text):

@@ -44,7 +44,7 @@ class Named:
 
 @dataclass(frozen=True)
 class Statement:
-    """What one output says.
+    """The statement of one output.
 
     Attributes:
         text: Its first statement; of ``log check`` the reasons.

@@ -18,7 +18,7 @@ COLUMNS = {
 
 
 def lines() -> Iterator[str]:
-    """The table, as Markdown; a fault that is planted at several places has one line."""
+    """Yield the table as Markdown; a fault that is planted at several joints has one line."""
     yield "| fault | what it looks like | " + " | ".join(COLUMNS) + " |"
     yield "|---|---|" + "---|" * len(COLUMNS)
     shown_before: list[object] = []

@@ -35,7 +35,7 @@ NAMINGS: tuple[Callable[[int, int], str], ...] = (
 
 @dataclass(frozen=True)
 class Channels:
-    """What of the joints is logged besides their positions.
+    """Channels that are logged besides the positions.
 
     Attributes:
         velocity: ``true`` (a sensor of its own), ``derived`` (differences of the reported
@@ -49,7 +49,7 @@ class Channels:
     second: bool = False
 
     def __str__(self) -> str:
-        """The names, joined."""
+        """Return the names, joined."""
         names = [f"{self.velocity} velocity"] if self.velocity else []
         names += [name for name in ("effort", "second") if getattr(self, name)]
         return " + ".join(["position", *names])
@@ -63,7 +63,7 @@ CHANNELS = (
 
 @dataclass(frozen=True)
 class Robot:
-    """A healthy robot and what it is asked to do.
+    """A healthy robot and its commands.
 
     Attributes:
         names: Joint names, shape (m,).
@@ -114,11 +114,11 @@ class Robot:
 
     @property
     def m(self) -> int:
-        """Joints."""
+        """Number of joints."""
         return len(self.names)
 
     def sent(self) -> np.ndarray:
-        """Commands as the controller sends them [rad], shape (k, m)."""
+        """Return the commands as the controller sends them [rad], shape (k, m)."""
         t = self.sent_s[:, None]
         return self.bias + self.amplitude * self._wave(t, self.omega * t + self.phase)
 
@@ -131,7 +131,7 @@ class Robot:
     def moved(
         self, joint: int, gain: float | np.ndarray = 1.0, more_lag: float = 0.0, of: int = -1
     ) -> np.ndarray:
-        """Where a joint is [rad], shape (n,).
+        """Return the true position of a joint [rad], shape (n,).
 
         Args:
             joint: The joint.
@@ -151,11 +151,11 @@ class Robot:
         return grows * (np.sin(angle) + self.second * np.sin(2 * angle + 0.7))
 
     def swing(self, joint: int) -> float:
-        """Amplitude of the motion of a joint [rad]."""
+        """Return the amplitude of the motion of a joint [rad]."""
         return float(self.gain[joint] * self.amplitude[joint])
 
     def half(self, joint: int, count: float | None = None) -> tuple[float, float]:
-        """Half widths of simultaneous 95 % intervals of a joint's deviation from the others.
+        """Return half widths of simultaneous 95 % intervals of a joint's deviation from the others.
 
         Bonferroni over 3 m deviations; each from what a common value, a trend and a parabola
         through the other joints predict (as many of them as m allows).
@@ -186,7 +186,7 @@ class Robot:
 
 
 def leverage(m: int, joint: int) -> float:
-    """Variance of what the other joints predict for one, in variances of one joint.
+    """Return the variance of the others' prediction for a joint, in variances of one joint.
 
     Args:
         m: Joints.
@@ -274,7 +274,7 @@ def draw(
 
 @dataclass(frozen=True)
 class Change:
-    """What a fault changes of one joint; what is None stays as it is.
+    """Changes of one joint by a fault; None: no change.
 
     Attributes:
         joint: The joint.
@@ -299,7 +299,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Log:
-    """What is recorded of a robot; NaN where a sample was lost.
+    """Recorded signals of a robot; NaN where a sample was lost.
 
     Attributes:
         robot: The robot.

@@ -55,7 +55,7 @@ def robot_for(fault: Fault, seed: int, *, small: bool = False) -> Robot:
 
 
 def seed_of(name: str, seed: int) -> int:
-    """A seed that differs from fault to fault."""
+    """Return a seed that differs from fault to fault."""
     return seed + zlib.crc32(name.encode())
 
 
@@ -96,7 +96,7 @@ def run_all(
     outputs: tuple[str, ...] = OUTPUTS,
     jobs: int = 1,
 ) -> Iterator[Case]:
-    """Every fault with every seed, in order."""
+    """Run every fault with every seed, in order."""
     work = partial(_work, small=small, outputs=outputs)
     pairs = zip(*product(names, seeds), strict=True)
     if jobs == 1:
@@ -107,12 +107,12 @@ def run_all(
 
 
 def header(width: int, outputs: tuple[str, ...] = OUTPUTS) -> str:
-    """The head of the table."""
+    """Return the head of the table."""
     return f"{'fault':<{width}}  " + "  ".join(f"{o:>9}" for o in outputs) + "    sound  narrow"
 
 
 def line(cases: Sequence[Case], width: int, outputs: tuple[str, ...] = OUTPUTS) -> str:
-    """The share right of each output, and the share that names a sound joint, of one fault."""
+    """Return the table's line of one fault: shares right, and naming a sound joint."""
     shares = [np.mean([case.judged[o].right for case in cases]) for o in outputs]
     sound = np.mean([any(one.sound for one in case.judged.values()) for case in cases])
     narrow = np.mean([any(one.narrow for one in case.judged.values()) for case in cases])
@@ -125,7 +125,7 @@ def line(cases: Sequence[Case], width: int, outputs: tuple[str, ...] = OUTPUTS) 
 
 
 def failures(cases: Sequence[Case]) -> Iterator[str]:
-    """What is wrong, case by case."""
+    """Yield the failures, case by case."""
     for case in cases:
         for output, one in case.judged.items():
             if one.missing or one.sound:

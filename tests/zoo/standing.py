@@ -118,7 +118,7 @@ def _(robot, rng, j):
 
 
 def again(kinds):
-    """Kinds of a joint that stands and follows again; a sensor that does so repeats old values."""
+    """Return kinds of a joint that stands and follows again; a sensor repeats old values then."""
     return kinds | PAUSED | ({"stale_sensor"} if "frozen_sensor" in kinds else frozenset())
 
 

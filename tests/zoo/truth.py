@@ -1,4 +1,4 @@
-"""What is right to say of a planted fault: the joints, since when, and which kinds.
+"""Right statements about a planted fault: the joints, since when, and which kinds.
 
 The kinds follow from physics and from what is logged, never from what the code under test does.
 ``docs/faults.md`` gives the same table with the reasons.
@@ -25,7 +25,7 @@ PAUSED = frozenset({"intermittent"})
 
 @dataclass(frozen=True)
 class JointTruth:
-    """What is right to say of one joint.
+    """Right statements about one joint.
 
     Attributes:
         joint: Its place in the chain.
@@ -48,7 +48,7 @@ class JointTruth:
 
 @dataclass(frozen=True)
 class Truth:
-    """What is right to say of a session.
+    """Right statements about a session.
 
     Attributes:
         joints: Of the faulty joints.
@@ -60,7 +60,7 @@ class Truth:
 
 
 def standing(channels: Channels, cause: str) -> frozenset[str]:
-    """Kinds of a joint whose position stands still while its command moves.
+    """Return kinds of a joint whose position stands still while its command moves.
 
     Args:
         channels: What is logged.
@@ -83,7 +83,7 @@ def standing(channels: Channels, cause: str) -> frozenset[str]:
 def either(
     channels: Channels, mechanics: str, sensor: str, *, cause: str, fast: bool = False
 ) -> frozenset[str]:
-    """Kinds of a fault that mechanics and sensor show alike, effort included.
+    """Return kinds of a fault that mechanics and sensor show alike, effort included.
 
     Args:
         channels: What is logged.
