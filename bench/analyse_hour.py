@@ -32,7 +32,7 @@ ANALYSE_S, ANALYSE_MIB, REPORT_S, PAGE_MIB = 10.0, 1.5e9 / MIB, 30.0, 3e6 / MIB
 
 
 class Cost(NamedTuple):
-    """What a command took.
+    """Cost of a command.
 
     Attributes:
         wall_s: From start to exit.

@@ -36,7 +36,7 @@ NS = 1_000_000_000
 
 
 def cycle_frames() -> np.ndarray:
-    """One polling cycle: each servo's command and answer, then the sensors."""
+    """Return one polling cycle: each servo's command and answer, then the sensors."""
     robot = load_robot("snake25")
     assert robot.bus is not None
     messages = database_messages(dict(robot.databases), Faults()) or {}
@@ -51,7 +51,7 @@ def cycle_frames() -> np.ndarray:
 
 
 def payloads(cycle: np.ndarray, first: int, count: int, rate: float, t0_ns: int) -> np.ndarray:
-    """Frames number ``first`` to ``first + count``: angles are sines, the rest a counter."""
+    """Return frames number ``first`` to ``first + count``: angles are sines, the rest a counter."""
     number = np.arange(first, first + count)
     frames = cycle[number % len(cycle)]
     t_s = number / rate
@@ -78,7 +78,7 @@ class UnixPeer:
         self.refused = 0
 
     def send(self, frames: np.ndarray, first: int, sent_ns: np.ndarray) -> int:
-        """Offer frames; notes when each was taken and returns how many were."""
+        """Offer frames; note when each was taken and return their number."""
         sent = 0
         for start in range(0, len(frames), self.per_packet):
             part = frames[start : start + self.per_packet]
@@ -168,7 +168,7 @@ class SocketcandPeer:
 
 
 def main() -> None:
-    """Send, and say what was sent."""
+    """Send frames and print the counts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("kind", choices=["unix", "socketcand"])
     parser.add_argument("where")

@@ -36,7 +36,7 @@ REFUSED_PRIORITY = ("setpriv", "--bounding-set=-sys_nice")
 
 @dataclass
 class Shares:
-    """What became of the frames of one run, start-up apart.
+    """Counts of the frames of one run, start-up apart.
 
     Attributes:
         name: The recorder and how it was started.
@@ -60,7 +60,7 @@ class Shares:
     cpu: float
 
     def line(self) -> str:
-        """One line of the table."""
+        """Return one line of the table."""
         late = "-" if self.late is None else f"{self.late / max(self.offered, 1):.3%}"
         return (
             f"{self.name:<46} {self.offered:>8} {self.refused / max(self.offered, 1):>8.3%} "
@@ -196,7 +196,7 @@ def loaded(
 
 
 def undulog(kind: str, folder: Path, seconds: float, per_packet: int, *, granted: bool) -> Shares:
-    """Our recorder."""
+    """Measure our recorder."""
     places = [folder / f"{name}.sock" if kind == "unix" else 0 for name in BUSES]
     before = () if granted else REFUSED_PRIORITY
     with ExitStack() as stack:
@@ -219,7 +219,7 @@ def undulog(kind: str, folder: Path, seconds: float, per_packet: int, *, granted
 
 
 def numbered(session: Session, name: str, sent: Path) -> dict[int, int]:
-    """Time of arrival of each recorded frame by the sender's number [Unix ns]."""
+    """Return time of arrival of each recorded frame by the sender's number [Unix ns]."""
     frames = session.frames(f"/can/{name}")
     with np.load(sent) as noted:
         apart_ns = frames["t_device_ns"].astype(np.int64) - int(noted["t0_ns"])

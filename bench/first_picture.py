@@ -121,7 +121,7 @@ def of_command(session: Path) -> tuple[float, float, float]:
 
 
 def of_viewer(file: Path) -> tuple[float, float]:
-    """Rerun's viewer on a file: view and whole picture, each after so many seconds."""
+    """Open a file in Rerun's viewer: view and whole picture, each after so many seconds."""
     start = time.monotonic()
     with ExitStack() as stack:
         _, address = start_viewer(stack, file, "--headless", SIZE)

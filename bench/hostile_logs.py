@@ -34,17 +34,17 @@ Message = tuple[int, int, bytes]
 
 
 def record(opcode: int, body: bytes) -> bytes:
-    """A record of the container."""
+    """Return a record of the container."""
     return struct.pack("<BQ", opcode, len(body)) + body
 
 
 def text(value: str) -> bytes:
-    """A string of the container."""
+    """Return a string of the container."""
     return struct.pack("<I", len(value.encode())) + value.encode()
 
 
 def array(body: bytes) -> bytes:
-    """A map or an array of the container."""
+    """Return a map or an array of the container."""
     return struct.pack("<I", len(body)) + body
 
 
@@ -166,7 +166,7 @@ class HostileLog:
 def joint_state(
     t_ns: int, names: Sequence[str], position: Iterable[float], *, stamp_ns: int | None = None
 ) -> bytes:
-    """A JointState in CDR, its velocity and effort empty."""
+    """Return a JointState in CDR, its velocity and effort empty."""
     seconds, rest = divmod(t_ns if stamp_ns is None else stamp_ns, NS)
     stamp = {"sec": seconds, "nanosec": rest}
     values = {"header": {"stamp": stamp}, "name": list(names), "position": [*position]}
@@ -175,7 +175,7 @@ def joint_state(
 
 @cache
 def zeros(size: int, *, stated: bool = True, opening: bytes = b"") -> bytes:
-    """A zstd frame of zeros after some bytes; gigabytes take a few hundred kilobytes.
+    """Return a zstd frame of zeros after some bytes; gigabytes take a few hundred kilobytes.
 
     Args:
         size: Of all of it [byte].
@@ -193,7 +193,7 @@ def zeros(size: int, *, stated: bool = True, opening: bytes = b"") -> bytes:
 
 @cache
 def lz4_zeros(size: int) -> bytes:
-    """The same as an lz4 frame."""
+    """Return the same as an lz4 frame."""
     packer = lz4.frame.LZ4FrameCompressor(block_size=lz4.frame.BLOCKSIZE_MAX4MB)
     made = [packer.begin()]
     made += [packer.compress(bytes(min(1 << 24, size - at))) for at in range(0, size, 1 << 24)]
@@ -216,7 +216,7 @@ def gait(
     log_jumps: Mapping[int, int] | None = None,
     rate_hz: int = 100,
 ) -> Path:
-    """Joints that follow a sine of 1 Hz; the clock jumps before some ticks.
+    """Write joints that follow a sine of 1 Hz; the clock jumps before some ticks.
 
     Args:
         path: The file.

@@ -94,7 +94,7 @@ class Block:
     field: IntArray
 
     def frames(self) -> FrameArray:
-        """All frames in order, shape (ticks * 80,)."""
+        """Return all frames in order, shape (ticks * 80,)."""
         ticks = len(self.device_ns)
         frames = np.zeros((ticks, CYCLE), FRAME_DTYPE)
         frames["t_device_ns"], frames["t_host_ns"] = self.device_ns, self.host_ns
@@ -116,7 +116,7 @@ class Block:
 
 
 def _packed(values: IntArray) -> IntArray:
-    """Up to four 16-bit values along the last axis, little-endian in one word."""
+    """Return up to four 16-bit values along the last axis, little-endian in one word."""
     shifts = 16 * np.arange(values.shape[-1])
     return ((values & 0xFFFF) << shifts).sum(axis=-1)
 
@@ -212,7 +212,7 @@ def blocks(seconds: int, seed: int = 1, *, adaptive: bool = False) -> Iterator[B
 
 
 def _ranges(rng: np.random.Generator, t: FloatArray) -> IntArray:
-    """Infrared distances by way of a 10-bit converter, and the sonar [mm]."""
+    """Return infrared distances by way of a 10-bit converter, and the sonar [mm]."""
     way = 0.8 + 0.5 * np.sin(0.11 * t + np.arange(16)) + 0.03 * np.sin(_OMEGA * t + np.arange(16))
     counts = np.rint(1023 / 5.0 * (0.6 / way + 0.1) + rng.normal(0, 0.7, way.shape))
     metres = 0.6 / np.maximum(counts * 5.0 / 1023 - 0.1, 0.05)
@@ -316,7 +316,7 @@ class Recording:
         self._seconds += 1
 
     def _motion(self) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray, FloatArray]:
-        """Gait parameters, the tracked head, and the links' poses over the next second."""
+        """Return gait parameters, the tracked head, and the links' poses over the next second."""
         t = (self._seconds * TICKS + np.arange(TICKS)) * 0.01
         noise = self._random.normal
         gait = np.zeros((TICKS, 10))

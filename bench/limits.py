@@ -38,7 +38,7 @@ VERBS: dict[str, list[str]] = {
 
 
 def base() -> HostileLog:
-    """A log with commands and states of two joints."""
+    """Return a log with commands and states of two joints."""
     log = HostileLog()
     kind = log.schema()
     for topic in ("/joint_commands", "/joint_states"):
@@ -130,7 +130,7 @@ def cost(arguments: list[str]) -> tuple[float, float]:
 
 
 def main() -> int:
-    """Write, read, print; 1 if any dimension costs more than it may."""
+    """Write, read, print; return 1 if any dimension costs more than it may."""
     parser = arguments(__doc__)
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("dimensions", nargs="*", metavar="DIMENSION")

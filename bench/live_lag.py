@@ -42,7 +42,7 @@ LOOK_S = 0.003
 
 
 class Watch(threading.Thread):
-    """Asks the viewer how far it is."""
+    """Polls the viewer for its position."""
 
     def __init__(self, client: ViewerClient, start_ns: int) -> None:
         """Begin to ask.

@@ -40,7 +40,7 @@ Message = tuple[int, int, int, int, bytes]
 
 
 def define(feed: LiveFeed) -> None:
-    """Tell a feed what the messages are."""
+    """Define the messages of a feed."""
     name = "sensor_msgs/msg/JointState"
     facts = {"session_id": f"bench-{os.urandom(4).hex()}", "epoch_ns": "1735689600000000000"}
     feed.define(Metadata(name="undulog", metadata=facts))

@@ -54,7 +54,7 @@ OWN_TIMES = tuple(sorted({*OFFSET_TOPICS.values()}))
 
 
 def sensor_fields(session: Session) -> dict[str, list[str]]:
-    """What the sensors measure, by topic."""
+    """Return the fields of the sensors by topic."""
     fields = {topic: ["range"] for topic in session.channels if topic.startswith(("/ir/", "/son"))}
     fields["/imu"] = [f"linear_acceleration.{axis}" for axis in AXES]
     fields["/compass"] = [f"magnetic_field.{axis}" for axis in AXES]
@@ -73,7 +73,7 @@ wall_s = partial(took_s, clock=time.perf_counter)
 
 
 def topics_loaded(path: Path) -> set[str]:
-    """The topics that :func:`load` reads."""
+    """Return the topics that :func:`load` reads."""
     with Session.open(path) as session:
         return {*JOINT_TOPICS, *OWN_TIMES, *sensor_fields(session)}
 
@@ -104,13 +104,13 @@ def inflate_s(path: Path, topics: Collection[str]) -> float:
 
 
 def load(path: Path, threads: int | None) -> Loaded:
-    """All columns but those of the bus and of what is only looked at."""
+    """Return all columns but those of the bus and of what is only looked at."""
     with Session.open(path, threads=threads) as session:
         return session.columns(JOINT_TOPICS, sensor_fields(session))
 
 
 def load_frames(path: Path) -> object:
-    """All raw frames."""
+    """Return all raw frames."""
     with Session.open(path, threads=1) as session:
         return session.frames(BUS)
 
@@ -148,7 +148,7 @@ def message_times(
 
 
 def window_ms(path: Path, start_s: int, threads: int) -> tuple[float, float]:
-    """Ten seconds of joint states from an open session: wall-clock, first and later windows."""
+    """Return wall-clock times of the first and later windows of ten seconds [ms]."""
     took: list[float] = []
     with Session.open(path, threads=threads) as session:
         for k in range(LATER_WINDOWS + 1):
@@ -182,7 +182,7 @@ def memory(path: Path) -> dict[str, int]:
 
 
 def _sizes(found: Loaded) -> dict[int, int]:
-    """Memory of the arrays that were loaded, each counted once, by address."""
+    """Return memory of the arrays that were loaded, each counted once, by address."""
     joints, tables = found
     arrays = [array for one in joints.values() for array in (*one.t_ns, *one.values)]
     for table in tables.values():
@@ -191,7 +191,7 @@ def _sizes(found: Loaded) -> dict[int, int]:
 
 
 def _status(key: str) -> int:
-    """A figure of this process's memory [byte]."""
+    """Return a figure of this process's memory [byte]."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{key}:"))
 

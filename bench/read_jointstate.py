@@ -56,14 +56,14 @@ def write_session(path: Path, minutes: float) -> int:
 
 
 def read_ours(path: Path, threads: int) -> dict[str, FloatArray]:
-    """All columns through the session reader."""
+    """Return all columns through the session reader."""
     with Session.open(path, threads=threads) as session:
         found = session.joint_columns(TOPICS)
     return {f"{topic}.{field}": np.array(found[topic, field].values) for topic, field in found}
 
 
 def read_peer(path: Path) -> dict[str, FloatArray]:
-    """The same columns through mcap and mcap-ros2-support, message by message."""
+    """Return the same columns through mcap and mcap-ros2-support, message by message."""
     rows: dict[str, list[list[float]]] = {
         f"{topic}.{field}": [] for topic, fields in TOPICS.items() for field in fields
     }
@@ -78,7 +78,7 @@ def read_peer(path: Path) -> dict[str, FloatArray]:
 def timed(
     read: Callable[[Path], dict[str, FloatArray]], path: Path
 ) -> tuple[float, dict[str, FloatArray]]:
-    """Seconds of wall-clock time and what was read."""
+    """Return seconds of wall-clock time and what was read."""
     start = time.perf_counter()
     columns = read(path)
     return time.perf_counter() - start, columns

@@ -42,7 +42,7 @@ SETTLE_S = 3.0
 
 @dataclass
 class Outcome:
-    """What one run gave."""
+    """The figures of one run."""
 
     name: str
     offered: int = 0
@@ -60,7 +60,7 @@ class Outcome:
         return self.offered - self.in_file + self.lost_by_sender
 
     def line(self) -> str:
-        """One line of the table."""
+        """Return one line of the table."""
         rss = f"{self.rss_mb[0]:.0f} -> {self.rss_mb[-1]:.0f}" if self.rss_mb else "-"
         tick = f"{self.tick_p99_ms:.2f}" if self.tick_p99_ms is not None else "-"
         return (
@@ -76,7 +76,7 @@ HEAD = (
 
 
 def rss_mb(pid: int) -> float:
-    """Resident memory [MB]."""
+    """Return resident memory [MB]."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
 
 
@@ -118,7 +118,7 @@ def finish(outcome: Outcome, recorder: subprocess.Popen[str], folder: Path) -> O
 def over_unix(
     folder: Path, seconds: float, rate: float = RATE, name: str = "undulog, AF_UNIX"
 ) -> Outcome:
-    """Our recorder, frames by packets."""
+    """Measure our recorder, frames by packets."""
     outcome = Outcome(name)
     paths = [folder / f"{name}.sock" for name in BUSES]
     with ExitStack() as stack:
@@ -130,7 +130,7 @@ def over_unix(
 
 
 def over_socketcand(folder: Path, seconds: float) -> Outcome:
-    """Our recorder, frames as text over TCP."""
+    """Measure our recorder, frames as text over TCP."""
     outcome = Outcome("undulog, socketcand")
     with ExitStack() as stack:
         senders = start_senders(stack, "socketcand", (0, 0), seconds)
@@ -141,7 +141,7 @@ def over_socketcand(folder: Path, seconds: float) -> Outcome:
 
 
 def peer(folder: Path, seconds: float, kind: str, name: str) -> Outcome:
-    """A recorder of another make on the same buses."""
+    """Measure a recorder of another make on the same buses."""
     outcome = Outcome(name)
     with ExitStack() as stack:
         senders = start_senders(stack, "socketcand", (0, 0), seconds)

@@ -55,7 +55,7 @@ print(json.dumps([took, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1
 
 
 class Figures(NamedTuple):
-    """What a conversion took.
+    """Cost of a conversion.
 
     Attributes:
         wall_s: From start to end, imports included.

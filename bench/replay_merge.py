@@ -39,7 +39,7 @@ PART = 100
 
 
 def streams(recordings: list[Path]) -> list[LazyChunkStream]:
-    """The recordings' chunks under their names; the second one is moved."""
+    """Return the recordings' chunks under their names; the second one is moved."""
     return [
         chunks_of(path, f"/{name}", later_ns=k * 1_234_567_890, more_cycles=7 * k)
         for k, (name, path) in enumerate(zip(("robot", "twin"), recordings, strict=True))
@@ -63,7 +63,7 @@ def some_rows(recordings: list[LazyChunkStream]) -> Iterable[Chunk]:
 
 
 def rows(recordings: list[Path]) -> int:
-    """How many rows there are in all."""
+    """Return how many rows there are in all."""
     return sum(chunk.num_rows for stream in streams(recordings) for chunk in stream.to_chunks())
 
 

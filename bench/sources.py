@@ -42,7 +42,7 @@ STREAM_S = 60.0
 
 
 def traffic(count: int) -> np.ndarray[Any, np.dtype[np.void]]:
-    """Frames of eight bytes, as a robot's bus has them."""
+    """Return frames of eight bytes, as a robot's bus has them."""
     frames = empty_frames(count)
     number = np.arange(count, dtype=np.uint64)
     frames["t_device_ns"] = 1_700_000_000_000_000_000 + number * np.uint64(125_000)
@@ -53,7 +53,7 @@ def traffic(count: int) -> np.ndarray[Any, np.dtype[np.void]]:
 
 
 def slcan_text(count: int) -> bytes:
-    """The frames as an adapter sends them."""
+    """Return the frames as an adapter sends them."""
     return b"".join(
         b"t%03X8%s\r" % (frame["id_flags"], bytes(frame["data"]).hex().upper().encode())
         for frame in traffic(count)
@@ -61,7 +61,7 @@ def slcan_text(count: int) -> bytes:
 
 
 def socketcand_text(count: int) -> bytes:
-    """The frames as a server sends them."""
+    """Return the frames as a server sends them."""
     return b"".join(
         b"< frame %03X %d.%06d %s >"
         % (
@@ -161,7 +161,7 @@ def process(target: Callable[..., None], *args: object) -> Iterator[Any]:
 
 
 def ours(address: str, count: int, context: SourceContext) -> float:
-    """Processor time a frame of one of our sources [us], polled each tick."""
+    """Return processor time a frame of one of our sources [us], polled each tick."""
     source = open_source(parse_address(address))
     source.start(context)
     got, start = 0, None
@@ -181,7 +181,7 @@ def ours(address: str, count: int, context: SourceContext) -> float:
 
 
 def theirs(count: int, **options: Any) -> float:
-    """Processor time a frame of python-can's client [us]: recv, stamp, keep."""
+    """Return processor time a frame of python-can's client [us]: recv, stamp, keep."""
     bus = can.Bus(ignore_config=True, **options)
     kept: list[tuple[int, can.Message]] = []
     start = None

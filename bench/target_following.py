@@ -101,7 +101,7 @@ def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def text(found: dict[str, Any], limits_s: dict[str, float]) -> str:
-    """The answer first, then the table."""
+    """Return the answer, then the table."""
     n = len(found["seeds"])
     faster, less = found["time_s_ratio"], found["electrical_j_ratio"]
     censored = n - found[WALK]["met"]

@@ -36,7 +36,7 @@ NUMPY, NUMBA = "twin, NumPy", "twin, numba"
 
 
 def step_twin(scenario: Scenario, kernels: Kernels) -> float:
-    """Seconds of processor time a step, through the twin."""
+    """Return seconds of processor time a step, through the twin."""
     with Twin(scenario, kernels=kernels) as twin:
         samples = twin.samples()
         next(samples)  # the start: what is compiled is there from here on
@@ -48,7 +48,7 @@ def step_twin(scenario: Scenario, kernels: Kernels) -> float:
 
 
 def step_builtin(scenario: Scenario) -> float:
-    """Seconds of processor time a step, with the engine's own contacts and motors."""
+    """Return seconds of processor time a step, with the engine's own contacts and motors."""
     client = pybullet.connect(pybullet.DIRECT)
     try:
         body = built_in_body(scenario.robot, client)
@@ -75,7 +75,7 @@ def step_builtin(scenario: Scenario) -> float:
 
 
 def built_in_body(robot: Robot, client: int) -> int:
-    """The same chain with capsules that collide, on a plane."""
+    """Return the same chain with capsules that collide, on a plane."""
     pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
     pybullet.setTimeStep(1e-3, physicsClientId=client)
     ground = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
@@ -120,7 +120,7 @@ def built_in_body(robot: Robot, client: int) -> int:
 
 
 def chain(robot: Robot, joints: int) -> Robot:
-    """A robot of another length, of the same modules, without sensors."""
+    """Return a robot of another length, of the same modules, without sensors."""
     last, (one, other) = robot.links[-1], robot.joints[:2]
     return dataclasses.replace(
         robot,
@@ -136,7 +136,7 @@ def chain(robot: Robot, joints: int) -> Robot:
 
 
 def least(ways: dict[str, Callable[[], float]], runs: int) -> dict[str, float]:
-    """Microseconds a step of each way, the least of some runs in turn."""
+    """Return microseconds a step of each way, the least of some runs in turn."""
     found = dict.fromkeys(ways, math.inf)
     for _ in range(runs):
         for name, step in ways.items():

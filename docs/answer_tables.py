@@ -106,7 +106,7 @@ def session(random, noise, planes, *, odd=None, quantity="gain"):
 
 
 def noise_of(random, noise, m, n):
-    """Noise of the positions [rad], shape (m, n)."""
+    """Return noise of the positions [rad], shape (m, n)."""
     if noise == "quantised":  # of the encoder alone
         return np.zeros((m, n))
     if noise == "AR(0.9)":
@@ -119,7 +119,7 @@ def noise_of(random, noise, m, n):
 
 
 def half_width(noise, planes, joint, t, *, omega, response):
-    """Half width of the simultaneous 95 % interval of one joint's log gain or lag [rad].
+    """Return half width of the simultaneous 95 % interval of one joint's log gain or lag [rad].
 
     Of its deviation from what a common value, a trend and a parabola through the plane's other
     joints predict; Bonferroni over all joints and three quantities. In closed form from the
@@ -182,7 +182,7 @@ def identical(sessions, seed=1):
 
 
 def identical_cell(sessions, seed, noise, planes):
-    """The shares of one cell of :func:`identical`."""
+    """Return the shares of one cell of :func:`identical`."""
     random = np.random.default_rng([seed, NOISES.index(noise), planes])
     found = np.zeros(len(STATEMENTS) + 1)
     for _ in range(sessions):
@@ -201,7 +201,7 @@ def one_off(sessions, seed=2):
 
 
 def one_off_cell(sessions, seed, noise, planes, quantity):
-    """The shares of one cell of :func:`one_off`."""
+    """Return the shares of one cell of :func:`one_off`."""
     k = QUANTITIES.index(quantity)
     random = np.random.default_rng([seed, NOISES.index(noise), planes, k])
     found = np.zeros(2)

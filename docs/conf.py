@@ -32,7 +32,7 @@ napoleon_numpy_docstring = False
 
 
 def _command_line_page() -> str:
-    """The help of every command, as the terminal shows it."""
+    """Return the help of every command, as the terminal shows it."""
     import os
     from contextlib import redirect_stdout
     from io import StringIO
@@ -60,7 +60,7 @@ def _command_line_page() -> str:
 
 
 def _notebook_page() -> str:
-    """The example notebook, run anew."""
+    """Return the example notebook, run anew."""
     sys.path.insert(0, str(Path(__file__).parent))
     from notebook_page import executed_page
 

@@ -39,7 +39,7 @@ def contrasts():
 
 
 def coloured(random, runs, count, correlation):
-    """AR(1) noise of unit variance, (runs, count)."""
+    """Return AR(1) noise of unit variance, (runs, count)."""
     white = random.normal(size=(runs, count + 200 * bool(correlation)))
     if not correlation:
         return white
@@ -48,7 +48,7 @@ def coloured(random, runs, count, correlation):
 
 
 def simulated(shared, correlation, *, runs, apart_s=8e-4, duration_s=10.3, every=(1, 1, 1), seed=3):
-    """Responses of identical joints that are polled in turn.
+    """Return responses of identical joints that are polled in turn.
 
     Coloured noise lies on a grid that is finer than the samples, so that joints see the same
     course of it at their own times; of white noise they share the samples.
@@ -133,7 +133,7 @@ def judged(shared, correlation, *, runs=300, **more):
 
 
 def _holds(values, judge):
-    """Whether each interval holds zero, (2, 11)."""
+    """Return whether each interval holds zero, (2, 11)."""
     factors = [[t_factor(one) for one in dof] for _, dof in judge]
     return np.abs(values) <= np.array(factors) * np.sqrt([variance for variance, _ in judge])
 

@@ -81,7 +81,7 @@ def run(name, folder):
 
 
 def row(name, found):
-    """One row of the table."""
+    """Return one row of the table."""
     booked = (found.booked[one] for one in TITLES)
     cells = [f"{one:.3g}" if abs(one) < 1000 else f"{one:.0f}" for one in booked]
     cells += [f"{100 * max(abs(one) for one in found.errors.values()):.4f}"]
@@ -90,7 +90,7 @@ def row(name, found):
 
 
 def table(rows):
-    """The table as Markdown."""
+    """Return the table as Markdown."""
     heads = ["scenario", *(f"{one} [J]" for one in TITLES.values()), "largest error [%]"]
     heads += [f"{one} by samples [%]" for one in TITLES.values()]
     ruler = "|---|" + "---:|" * (len(heads) - 1)

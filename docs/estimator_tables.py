@@ -57,7 +57,7 @@ def sampled(
     ar=0.0,
     amplitude=0.5,
 ):
-    """An exact command and noisy responses, each on its own times.
+    """Return an exact command and noisy responses, each on its own times.
 
     Args:
         random: Generator.
@@ -110,21 +110,21 @@ def by_hilbert(command, response):
 
 
 def by_correlation(t, command, response, omega):
-    """Lag of the largest cross-correlation (scipy.signal.correlate), ratio of deviations."""
+    """Return lag of the largest cross-correlation (scipy.signal.correlate), ratio of deviations."""
     lags = correlation_lags(response.size, command.size)
     best = lags[np.argmax(correlate(response, command))]
     return float(omega * best * (t[1] - t[0])), float(response.std() / command.std())
 
 
 def by_fft(t, command, response, omega):
-    """The FFT bin nearest to the gait's frequency (scipy.fft by way of numpy)."""
+    """Return the FFT bin nearest to the gait's frequency (scipy.fft by way of numpy)."""
     c, a = np.fft.rfft(command), np.fft.rfft(response)
     k = round(omega / (2 * np.pi) * t.size * (t[1] - t[0]))
     return float(np.angle(c[k] / a[k])), float(abs(a[k]) / abs(c[k]))
 
 
 def compared(*, frequency=0.97, duration=7.3, rate=100.0, sigma=0.01, draws=2000, seed=1):
-    """Bias, standard deviation, RMSE over bound and time of the four ways.
+    """Return bias, standard deviation, RMSE over bound and time of the four ways.
 
     Returns:
         Name to (lag bias, lag sd, lag RMSE / bound, gain RMSE / bound, seconds an estimate).
@@ -154,13 +154,13 @@ def compared(*, frequency=0.97, duration=7.3, rate=100.0, sigma=0.01, draws=2000
 
 
 def _figures(lag, gain, bound):
-    """Bias and sd of lag [degrees], RMSE over bound of lag and gain."""
+    """Return bias and sd of lag [degrees], RMSE over bound of lag and gain."""
     degrees = np.degrees([lag.mean(), lag.std()])
     return (*degrees, *(np.sqrt(np.mean(one**2)) / bound for one in (lag, gain)))
 
 
 def coverage(cycles, ar, *, draws=4000, seed=1, **more):
-    """Share of 95 % intervals that hold the truth: of lag and of gain."""
+    """Return share of 95 % intervals that hold the truth: of lag and of gain."""
     random = np.random.default_rng(seed)
     data = sampled(random, draws=draws, cycles=cycles, rate=100.0, sigma=0.01, ar=ar, **more)
     lag, gain, half = fitted(*data, 2 * np.pi * 1.002)
@@ -172,7 +172,7 @@ def rounded(
     *, draws=1000, seed=1, frequency=0.5, rate=50.0, cycles=10.0, step=STEP, mean=None,
     phase=None, sigma=0.0, fifth=0.0, command_too=False,
 ):  # fmt: skip
-    """Coverage and width of 95 % intervals where position is rounded to steps.
+    """Return coverage and width of 95 % intervals where position is rounded to steps.
 
     Args:
         draws: Responses, each with its own amplitude (0.2 to 0.8 rad), phase and lag.

@@ -60,7 +60,7 @@ class Snake:
         self.names = [f"joint{k + 1:02d}" for k in range(joints)]
 
     def fit(self, noise=0.0, command_noise=0.0, warn=None):
-        """The gait, with noise on responses and commands."""
+        """Return the gait, with noise on responses and commands."""
         later = self.t + self.skew_s
         commands, responses = self.command + command_noise, self.response + noise
         return fit_gait(
@@ -71,7 +71,7 @@ class Snake:
         )
 
     def estimates(self, gait):
-        """Lags and gains with both ends of their intervals, by joint, shape (2, 3, m)."""
+        """Return lags and gains with both ends of their intervals, by joint, shape (2, 3, m)."""
         found = np.full((2, 3, self.joints), np.nan)
         for group in gait.groups:
             for k, name in enumerate(group.answered):
@@ -81,7 +81,7 @@ class Snake:
         return found
 
     def bound(self, sigma):
-        """Cramér-Rao bound of each lag, all tones and the shared frequencies unknown [rad].
+        """Return Cramér-Rao bound of each lag, all tones and the shared frequencies unknown [rad].
 
         The Fisher information of all parameters of all channels, inverted as one dense matrix.
         """

@@ -38,7 +38,7 @@ SETS = 100
 
 
 def drawn(seed, folder):
-    """Two scenarios, a wave and its reverse, with a gait, servos and ground of their own."""
+    """Return two scenarios, a wave and its reverse, with a gait, servos and ground of their own."""
     random = np.random.default_rng(seed)
     frequency = random.uniform(0.4, 1.0)
     amplitude, lag = random.uniform(0.25, 0.45), random.uniform(np.pi / 6, np.pi / 2)

@@ -59,7 +59,7 @@ class Case:
 
     @property
     def file(self) -> str:
-        """Name of the file that keeps its profile."""
+        """Return name of the file that keeps its profile."""
         way = "reverse" if self.reverse else "forward"
         module = f"{self.joint}{self.share:+g}" if self.joint else "identical"
         return f"{way}-{self.tilt_deg:g}-{self.direction}-{self.heading_deg}-{module}.npy"
@@ -92,12 +92,12 @@ def is_run(case):
 
 
 def other_way(case, folder):
-    """The profile of the reversed wave, joints from head to tail."""
+    """Return the profile of the reversed wave, joints from head to tail."""
     return profile(replace(case, reverse=True), folder) if is_run(case) else mirrored(case, folder)
 
 
 def mirrored(case, folder):
-    """The profile of the reversed wave by the relation, joints from head to tail."""
+    """Return the profile of the reversed wave by the relation, joints from head to tail."""
     falls_along = case.tilt_deg and case.direction == "fore-aft"
     heading = 180 - case.heading_deg if falls_along else case.heading_deg
     mirror = YAW[-1 - YAW.index(case.joint)] if case.joint else ""

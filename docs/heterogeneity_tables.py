@@ -66,7 +66,7 @@ def sensed(random, ratio, *, sets, runs, ar=0.0, sigma=0.01, noisy=None):
 
 
 def false_positives(joints, *, runs=6, sets=5000, seed=1, **noise):
-    """Share of experiments with identical modules in which a difference is claimed."""
+    """Return share of experiments with identical modules in which a difference is claimed."""
     random = np.random.default_rng(seed)
     forward = boundary_pattern(joints)
     one = np.zeros(runs, dtype=np.int64)
@@ -80,7 +80,7 @@ def false_positives(joints, *, runs=6, sets=5000, seed=1, **noise):
 
 
 def _p(forward, reverse, labels):
-    """Family-wise p of each of many experiments, shape (sets,)."""
+    """Return the family-wise p of each of many experiments, shape (sets,)."""
     both = np.concatenate([forward, reverse[..., ::-1]], axis=1)
     half = both.shape[-1] // 2
     odd, even = (both - both[..., ::-1]) / 2, (both + both[..., ::-1]) / 2

@@ -25,7 +25,7 @@ KICK = 0.05
 
 
 def chain(m, *, coupled=True):
-    """A response matrix and the commands of a wave.
+    """Return a response matrix and the commands of a wave.
 
     Args:
         m: Joints.
@@ -42,7 +42,7 @@ def chain(m, *, coupled=True):
 
 
 def plan(m, base_runs=6):
-    """The kicks of an experiment, None for a run of the gait as it is."""
+    """Return the kicks of an experiment, None for a run of the gait as it is."""
     kinds = (Kind.PHASE, Kind.AMPLITUDE)
     each = [Kick(j, kind, s * KICK) for kind in kinds for j in range(m) for s in (1, -1)]
     return [None] * base_runs + each
@@ -87,7 +87,7 @@ def experiments(random, count, kicks, H, c, *, scatter, how="each"):
 
 
 def row(random, count, m, scatter_deg, *, coupled=True, base_runs=6, how="each", index=True):
-    """Shares of experiments, or of elements of their matrices.
+    """Return shares of experiments, or of elements of their matrices.
 
     Returns:
         ``P``, ``R``, ``G``, ``S``: elements whose interval holds the truth; ``worst``: of P's rows

@@ -48,7 +48,7 @@ ABOVE = {"frameon": False, "fontsize": 8, "loc": "lower left", "bbox_to_anchor":
 
 @dataclass(frozen=True)
 class Run:
-    """What is drawn of a session.
+    """The drawn signals of a session.
 
     Attributes:
         t_s: Times of the samples [s], shape (n,).
@@ -81,12 +81,12 @@ class Runs:
         folder.mkdir(parents=True, exist_ok=True)
 
     def __call__(self, name: str) -> Run:
-        """The run of a shipped scenario."""
+        """Return the run of a shipped scenario."""
         with Session.open(self._session(name)) as session:
             return _read(session, load_scenario(name).world)
 
     def analysis(self, name: str) -> Analysis:
-        """The numbers of a shipped scenario's run."""
+        """Return the numbers of a shipped scenario's run."""
         with Session.open(self._session(name)) as session:
             return analyse_session(session)
 
@@ -162,7 +162,7 @@ def shade_modes(ax: Axes, run: Run) -> None:
 
 
 def laws_figure(_: Runs) -> mpl.figure.Figure:
-    """Three laws of the distance."""
+    """Draw three laws of the distance."""
     figure, axes = plt.subplots(1, 3, figsize=(9, 2.8))
     d = np.linspace(0, 1.5, 301)
     for k in (1.0, 2.0, 4.0):
@@ -179,7 +179,7 @@ def laws_figure(_: Runs) -> mpl.figure.Figure:
 
 
 def paths_figure(runs: Runs) -> mpl.figure.Figure:
-    """Random walk and target following, from above."""
+    """Draw random walk and target following, from above."""
     figure, axes = plt.subplots(1, 2, figsize=(9, 4), sharex=True, sharey=True)
     for ax, name in zip(axes, ("random-walk", "target-following"), strict=True):
         run = runs(name)
@@ -198,7 +198,7 @@ def paths_figure(runs: Runs) -> mpl.figure.Figure:
 
 
 def course_figure(name: str, times: Sequence[float]) -> Callable[[Runs], mpl.figure.Figure]:
-    """Bodies at some times from above; commands and modes over time."""
+    """Draw bodies at some times from above; commands and modes over time."""
 
     def draw(runs: Runs) -> mpl.figure.Figure:
         run = runs(name)
@@ -222,7 +222,7 @@ def course_figure(name: str, times: Sequence[float]) -> Callable[[Runs], mpl.fig
 
 
 def gaits_figure(runs: Runs) -> mpl.figure.Figure:
-    """Bodies of the three gaits of the paper and of the 3D gaits, over one cycle."""
+    """Draw bodies of the three gaits of the paper and of the 3D gaits, over one cycle."""
     names = ("horizontal", "vertical", "combined", "sidewinding", "rolling", "caterpillar")
     figure, axes = plt.subplots(2, 6, figsize=(12, 4))
     for (top, side), name in zip(axes.T, names, strict=True):
@@ -262,7 +262,7 @@ def delay_figure(runs: Runs) -> mpl.figure.Figure:
 
 
 def places_figure(runs: Runs) -> mpl.figure.Figure:
-    """Head, middle and tail of 13 links, and what perfect tracking alone would give."""
+    """Draw head, middle and tail of 13 links, and what perfect tracking alone would give."""
     cases = [f"snake13-{plane}-{lag}" for plane in ("horizontal", "vertical") for lag in LAGS]
     figure, axes = plt.subplots(2, 4, figsize=(10, 4), sharex=True, sharey="row")
     colors = [joint_hex(13)[link] for link in (0, 6, 12)]
