@@ -95,7 +95,7 @@ def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
     for key in ("time_s", "electrical_j"):
         found[f"{key}_ratio"] = median_interval((runs[WALK][key] / runs[FOLLOW][key]).tolist())
     found["contact_share"] = {
-        name: float(one["contact_s"].sum() / one["time_s"].sum()) for name, one in runs.items()
+        name: float(sum(one["contact_s"]) / sum(one["time_s"])) for name, one in runs.items()
     }
     return found
 
@@ -130,10 +130,11 @@ def text(found: dict[str, Any], limits_s: dict[str, float]) -> str:
 
 
 def study(
-    seeds: list[int], limits_s: dict[str, float], jobs: int, kernels: str, output: Path
+    seeds: list[int], limits_s: dict[str, float], jobs: int, kernels: str, output: Path | None
 ) -> list[dict[str, Any]]:
     """Run what the output file does not hold yet, keeping it up to date."""
-    results = json.loads(output.read_text())["runs"] if output.exists() else []
+    stored = output is not None and output.exists()
+    results = json.loads(output.read_text())["runs"] if stored else []
     wanted = [(name, seed) for name in limits_s for seed in seeds]
     ids = {(name, seed): load_scenario(name).changed(seed=seed).session_id for name, seed in wanted}
     results = [
@@ -148,8 +149,9 @@ def study(
         runs = [pool.submit(run, name, seed, limits_s[name], kernels) for name, seed in left]
         for done in as_completed(runs):
             results.append(done.result())
-            output.parent.mkdir(parents=True, exist_ok=True)
-            output.write_text(json.dumps({"runs": results}, indent=1) + "\n")
+            if output is not None:
+                output.parent.mkdir(parents=True, exist_ok=True)
+                output.write_text(json.dumps({"runs": results}, indent=1) + "\n")
     return results
 
 
