@@ -1,19 +1,12 @@
 """The example notebook of the manual runs from the first cell to the last."""
 
-import importlib.util
 import json
 import tempfile
 
+import notebook_page
 import pytest
 
 from support.paths import DOCS
-
-
-def page_module():
-    spec = importlib.util.spec_from_file_location("notebook_page", DOCS / "notebook_page.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_the_notebook_is_one_to_the_format_and_holds_no_outputs():
@@ -26,7 +19,7 @@ def test_the_notebook_is_one_to_the_format_and_holds_no_outputs():
 
 
 def test_a_cell_shows_what_it_prints_and_its_last_expression():
-    run_cell, names = page_module().run_cell, {}
+    run_cell, names = notebook_page.run_cell, {}
     assert run_cell("x = 2\nprint(x)", names) == ("2\n", None)
     assert run_cell("x += 1\nx * 2", names) == ("", 6)
     assert run_cell("", names) == ("", None)
@@ -35,7 +28,7 @@ def test_a_cell_shows_what_it_prints_and_its_last_expression():
 @pytest.mark.slow
 def test_the_notebook_runs_says_what_its_text_says_and_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    page = page_module().executed_page()
+    page = notebook_page.executed_page()
     assert "B differs from A: joint03 most" in page
     assert "scenario.toml: servo_of.joint03.stall_torque: not set -> 0.2" in page
     assert page.count("<figure") == 3
