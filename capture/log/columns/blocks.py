@@ -33,7 +33,7 @@ from ...common.arrays import IntArray
 from ...common.errors import LogError
 from ..file.log_file import LogFile, keep_freed, new_pages
 from ..mcap.chunk import LAST_NS, PREFIX_SIZE, Block, Buffer
-from ..mcap.records import BODY_AT, FIXED_SIZE, HEAD, Places, gather
+from ..mcap.records import BODY_AT, FIXED_SIZE, Places, gather, read_message_heads
 
 _T = TypeVar("_T")
 
@@ -178,7 +178,7 @@ def _runs(log_file: LogFile, blocks: Sequence[Block]) -> Iterator[list[Placed] |
     run: list[Placed] = []
     at, former = 0, None
     for block in blocks:
-        shares = log_file.inflates(block, ARENA_SIZE)
+        shares = log_file.source_of(block).inflates(block, ARENA_SIZE)
         only = next(iter(block.index_at)) if len(block.index_at) == 1 else None
         most = ARENA_SIZE if only is None else min(SAME_SIZE, ARENA_SIZE)
         if run and not (shares and only == former and at + block.size <= most):
@@ -210,7 +210,7 @@ def _begun(
 def _inflated(log_file: LogFile, arena: mmap.mmap, placed: Placed) -> _Found:
     try:
         with memoryview(arena) as whole, whole[placed.base : placed.stop] as room:
-            log_file.inflate_into(placed.block, room)
+            log_file.source_of(placed.block).inflate_into(placed.block, room)
     except LogError as error:
         return error
     return arena, placed
@@ -218,7 +218,7 @@ def _inflated(log_file: LogFile, arena: mmap.mmap, placed: Placed) -> _Found:
 
 def _alone(log_file: LogFile, block: Block) -> _Found:
     try:
-        data, base, stop = log_file.payload_once(block)
+        data, base, stop = log_file.source_of(block).payload_once(block)
     except LogError as error:
         return error
     return data, Placed(block, base, stop)
@@ -335,7 +335,11 @@ def _records(
         at = starts.offsets
         records = _alike(data, starts) if len(at) else Records(at, at, None, Places(data, at))
         if records is None:
-            _check_each(log_file, data, starts)
+            ends = np.repeat(starts.ends, starts.counts)
+            if read_message_heads(data, at, ends) is None:
+                raise LogError(
+                    log_file.path, "a message index points to something that is not a message"
+                )
             log_ns = _readable(gather(data, at, _LOG_TIME_KIND, _LOG_TIME_AT))
             records = Records(at, log_ns, None, Places(data, at + BODY_AT))
         found.append(records)
@@ -399,16 +403,6 @@ def _alike(data: Buffer, starts: _Starts) -> Records | None:
     return _records_at(offsets, places, length)
 
 
-def _check_each(log_file: LogFile, data: Buffer, starts: _Starts) -> None:
-    """Raise LogError where a record is not a whole message."""
-    stop = np.repeat(starts.ends, starts.counts)
-    heads = gather(data, starts.offsets, HEAD)
-    lengths, room = heads["length"], (stop - starts.offsets - PREFIX_SIZE).astype(np.uint64)
-    whole = (heads["opcode"] == Opcode.MESSAGE) & (lengths >= FIXED_SIZE) & (lengths <= room)
-    if not whole.all():
-        raise LogError(log_file.path, "a message index points to something that is not a message")
-
-
 @dataclass(frozen=True)
 class _Starts:
     """Where the records of a topic start in a buffer; all heads lie in their blocks.
@@ -431,7 +425,7 @@ def _indexed(
 ) -> list[_Starts]:
     """Where the records of each topic start, by the blocks' indexes."""
     ids = list(itertools.chain.from_iterable(wanted))
-    indexes = [log_file.indexed(one.block, ids) for one in placed]
+    indexes = [log_file.source_of(one.block).indexed(one.block, ids) for one in placed]
     pieces: list[IntArray] = []
     blocks: list[int] = []
     limits = [0]  # of the topics, in pieces

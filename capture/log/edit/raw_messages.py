@@ -156,7 +156,7 @@ class RawLog:
         if block.index_at and not any(key in channel_ids for key in block.index_at):
             return
         try:
-            data, start, stop = self.file.payload_once(block)
+            data, start, stop = self.file.source_of(block).payload_once(block)
         except LogError as error:
             self.warn(f"{error}; its messages are missing")
             return

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import weakref
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,11 +22,10 @@ import numpy as np
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 from numpy.typing import NDArray
 
-from ...common.arrays import IntArray
 from ...common.errors import LogError, NotALogError
-from ..mcap.chunk import LAST_NS, Block, Buffer
+from ..mcap.chunk import LAST_NS, Block
 from ..mcap.file import McapFile
-from ..mcap.records import BlockSource, read_message_heads
+from ..mcap.records import read_message_heads
 from ..wal.tail import MessageKey, WalContents, WalTail, beyond, read_wal
 from .parts import PART_RECORD, PartFiles, first_part, open_parts
 
@@ -205,7 +204,7 @@ class LogFile:
         self.appendices: list[Attachment | Metadata] = []  # as stored; names may repeat
         self.recovered: Recovered | None = None
         self.foreign_wal = ""  # what to say of a write-ahead log of another session
-        self._sources: list[BlockSource] = []
+        self._sources: list[McapFile | WalTail] = []
         self.scratch: list[mmap.mmap] = []  # memory that was used before: it costs no page faults
         self.pages = None if column_folder is None else FilePages(column_folder)
         first = first_part(path)
@@ -262,29 +261,9 @@ class LogFile:
         if self.pages is not None:
             self.pages.release()
 
-    def payload(self, block: Block) -> tuple[Buffer, int]:
-        """See :meth:`BlockSource.payload`."""
-        return self._sources[block.part].payload(block)
-
-    def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
-        """See :meth:`BlockSource.payload_once`."""
-        return self._sources[block.part].payload_once(block)
-
-    def offsets(self, block: Block, channel_id: int) -> IntArray:
-        """See :meth:`BlockSource.offsets`."""
-        return self._sources[block.part].offsets(block, channel_id)
-
-    def inflates(self, block: Block, limit: int) -> bool:
-        """See :meth:`BlockSource.inflates`."""
-        return self._sources[block.part].inflates(block, limit)
-
-    def inflate_into(self, block: Block, room: memoryview) -> None:
-        """See :meth:`BlockSource.inflate_into`."""
-        self._sources[block.part].inflate_into(block, room)
-
-    def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
-        """See :meth:`BlockSource.indexed`."""
-        return self._sources[block.part].indexed(block, channel_ids)
+    def source_of(self, block: Block) -> McapFile | WalTail:
+        """Return the file, or the part of the write-ahead log, that holds a block."""
+        return self._sources[block.part]
 
     # -- putting together ------------------------------------------------------------------
 
@@ -303,14 +282,14 @@ class LogFile:
         self.channels |= file.channels
         for item in file.appendices:
             self._keep(item)
-        self._add(file, file.blocks, file.counts)
+        self._add(file)
 
-    def _add(self, source: BlockSource, blocks: list[Block], counts: dict[int, int]) -> None:
-        for block in blocks:
+    def _add(self, source: McapFile | WalTail) -> None:
+        for block in source.blocks:
             block.part = len(self._sources)
         self._sources.append(source)
-        self.blocks += blocks
-        for channel_id, count in counts.items():
+        self.blocks += source.blocks
+        for channel_id, count in source.counts.items():
             self.counts[channel_id] = self.counts.get(channel_id, 0) + count
 
     def _keep(self, item: Attachment | Metadata) -> None:
@@ -348,8 +327,7 @@ class LogFile:
         in_files = sum(self.counts.values())
         rest = beyond(wal.messages, keys)
         if rest:
-            tail = WalTail(rest)
-            self._add(tail, tail.blocks, tail.counts)
+            self._add(WalTail(rest))
         if not (rest or wal.live) and self.parts.finalised and wal.accepted <= in_files:
             return  # the recorder died when all was done but the tidying up
         accepted = wal.accepted if wal.messages else None
@@ -427,9 +405,9 @@ class LogFile:
     def _heads(self, block: Block) -> NDArray[np.void]:
         """The heads of all messages of a block."""
         ids = block.offsets if block.offsets is not None else block.index_at
-        offsets = [self.offsets(block, channel_id) for channel_id in ids]
-        data, base = self.payload(block)
-        stop = len(data) if block.compression else block.stop
+        source = self.source_of(block)
+        offsets = [source.offsets(block, channel_id) for channel_id in ids]
+        data, base, stop = source.payload(block)
         places = np.concatenate([np.empty(0, dtype=np.int64), *offsets])
         heads = read_message_heads(data, places + base, stop)
         if heads is None:
@@ -442,7 +420,7 @@ class LogFile:
         self.blocks = [other for other in self.blocks if other is not block]
         for channel_id in block.offsets if block.offsets is not None else block.index_at:
             try:
-                count = len(self.offsets(block, channel_id))
+                count = len(self.source_of(block).offsets(block, channel_id))
             except LogError:  # then the sum stays too high, and is not called sure
                 continue
             self.counts[channel_id] = max(0, self.counts.get(channel_id, 0) - count)

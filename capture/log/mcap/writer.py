@@ -38,14 +38,13 @@ from mcap.records import (
 )
 
 from .chunk import MAGIC
+from .records import FIXED_SIZE, MESSAGE
 
 CHUNK_SIZE = 1 << 20
 """Bytes of messages after which a chunk is written."""
 
 _LONGEST_WAIT_NS = 10 * 10**9  # of log time, once a chunk of other channels is full
 _COMPRESSION = "zstd"
-_MESSAGE = struct.Struct("<BQHIQQ")
-_MESSAGE_BODY = _MESSAGE.size - 9  # without opcode and length
 _CHUNK = struct.Struct("<BQQQQII4sQ")
 _INDEX = struct.Struct("<BQHI")
 _OPCODE = int(Opcode.MESSAGE)
@@ -200,8 +199,8 @@ class McapWriter:
             struct.error: If a number is out of range; the message is not in the chunk then.
         """
         chunk = self._chunk_of[channel_id]
-        head = _MESSAGE.pack(
-            _OPCODE, _MESSAGE_BODY + len(data), channel_id, sequence, log_time, publish_time
+        head = MESSAGE.pack(
+            _OPCODE, FIXED_SIZE + len(data), channel_id, sequence, log_time, publish_time
         )
         index = chunk.index.get(channel_id)
         if index is None:

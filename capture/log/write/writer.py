@@ -37,7 +37,6 @@ from .channels import (
     TransformChannel,
 )
 
-
 CONTRACT_VERSION = "1"
 """Version of the log contract that this writer follows."""
 
