@@ -49,12 +49,13 @@ from .format import (
     MESSAGES,
     RECORD_SIZE,
     Definition,
+    SegmentHeader,
     WalLock,
     pack_definition,
     segment_files,
     segment_name,
 )
-from .segment import SEGMENT_OVERHEAD, Segment, new_header, sync_folder
+from .segment import SEGMENT_OVERHEAD, Segment, sync_folder
 
 _MESSAGE = int(Opcode.MESSAGE)
 _DEFINITIONS_SIZE = 1 << 18
@@ -326,7 +327,8 @@ class WriteAheadLog:
     def _reserve(self, stream: int, size: int) -> Segment:
         number = self._numbers[stream] + 1
         path = self.folder / segment_name(stream, number)
-        segment = Segment(path, new_header(stream, number, size, self._log_id))
+        salt, size = secrets.randbits(32), (size + 7) & -8
+        segment = Segment(path, SegmentHeader(stream, salt, number, size, self._log_id))
         self._numbers[stream] = number
         return segment
 
