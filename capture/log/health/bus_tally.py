@@ -12,8 +12,7 @@ from ...common.strict_table import Faults
 from ...robot.bus_map import database_messages
 from ...robot.model import Robot
 from ..messages.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray, holds_fd
-from .measures import BusHealth
-from .tallies import NS, TimingTally
+from .tallies import NS, BusHealth, TimingTally
 
 LEAST_DECODED = 0.1
 """The map names at least this part of the data frames, or every joint has samples: other devices

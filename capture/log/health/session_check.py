@@ -14,7 +14,6 @@ import numpy as np
 from ...common.errors import DataError, LogError
 from ...common.process import threads_or_default
 from ...following.session import faults_in_session
-from ..edit.edited_log import Finding
 from ..file.parts import check_chain
 from ..mcap.chunk import Block
 from ..mcap.container_check import check_container
@@ -22,9 +21,9 @@ from ..mcap.file import McapFile
 from ..mcap.records import read_message_heads
 from ..read.open_log import OpenLog
 from ..read.session import SessionView
-from .measures import FileHealth
-from .rules import judge_file, judge_following, verdict_of
+from .rules import Finding, judge_file, judge_following, verdict_of
 from .session_scan import SessionMeasures, SessionScan
+from .tallies import FileHealth
 
 
 @dataclass(frozen=True)

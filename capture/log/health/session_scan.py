@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from ...common.arrays import IntArray
 from ...robot.model import Robot
-from ..edit.edited_log import Finding, joined
 from ..mcap.chunk import Buffer
 from ..messages.definitions import JOINT_STATE, MessageType
 from ..messages.frames import identifier_text
 from .bus_tally import named_identifiers, undecoded
 from .channel_scan import ChannelScan, Limits, Series
 from .freeze import FreezeTally
-from .measures import BusHealth, ChannelHealth, JointHealth, SeriesHealth
 from .rules import (
+    Finding,
+    joined,
     judge_body,
     judge_bus,
     judge_channel,
@@ -35,7 +35,7 @@ from .rules import (
     verdict_of,
 )
 from .sources import SourceHealth, judge_source, measure_sources
-from .tallies import NS
+from .tallies import NS, BusHealth, ChannelHealth, JointHealth, SeriesHealth
 
 _MOST_PAIRS = 4096
 """Pairs of joint sets, measured and commanded, that are looked at for joints that stand still."""

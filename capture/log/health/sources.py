@@ -11,10 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ...common.errors import DataError
-from ..edit.edited_log import Finding
 from ..messages.cdr import layout_of
 from ..messages.definitions import NO_VALUES, DiagnosticStatus, MessageType
-from .rules import BAD_LOSS, GOOD_LOSS
+from .rules import BAD_LOSS, GOOD_LOSS, Finding
 
 SOURCE_PREFIX = "source "
 """Start of the name of a source's status."""

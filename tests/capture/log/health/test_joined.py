@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from undulog.capture.log.edit.edited_log import Fault, joined, listed
+from undulog.capture.log.health.rules import Fault, joined, listed
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.cdr import encode
 from undulog.capture.log.messages.definitions import message_type, schema_text
