@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from hostile_logs import EPOCH_NS, NS, HostileLog, joint_state
-from mcap.reader import make_reader
 
 import undulog
+from support.read_back import messages_of
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.common.errors import UsageError
 from undulog.capture.log.edit.merge import merge_logs
@@ -31,11 +31,6 @@ def session(path: Path, robot: str) -> Path:
     return path
 
 
-def count(path: Path) -> int:
-    with path.open("rb") as stream:
-        return sum(1 for _ in make_reader(stream).iter_messages())
-
-
 def test_logs_two_months_apart_are_merged_on_request(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -51,7 +46,7 @@ def test_logs_two_months_apart_are_merged_on_request(
     assert undulog.run([*command, "--apart"]) == 0
     assert "warning: " in (said := capsys.readouterr().out)
     assert "62.0 days" in said
-    assert count(out) == 22
+    assert len(messages_of(out)) == 22
 
 
 def test_an_hour_between_logs_is_warned_of_and_a_second_is_not(tmp_path: Path) -> None:
