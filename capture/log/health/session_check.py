@@ -222,10 +222,10 @@ class _Check:
         if file.damage or file.truncated or not file.indexed:
             return file  # messages are missing, for a known reason
         wrong = [
-            f"the summary counts {count} messages of {self._scan.topic(key)}, "
+            f"the summary counts {count} messages of {self._file.channels[key].topic}, "
             f"{self._scan.count(key)} are in the file"
             for key, count in self._file.counts.items()
-            if self._scan.has(key) and count != self._scan.count(key)
+            if key in self._file.channels and count != self._scan.count(key)
         ]
         return replace(file, damage=tuple(wrong))
 
@@ -249,7 +249,7 @@ class _Check:
             raise LogError(path, f"{where} does not list its messages")
         begin = 0
         for key, offsets in zip(keys, found, strict=True):
-            if len(offsets) and self._scan.has(key):
+            if len(offsets) and key in self._file.channels:
                 self._scan.add(key, data, offsets, heads[begin : begin + len(offsets)])
             begin += len(offsets)
 

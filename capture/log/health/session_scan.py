@@ -117,15 +117,6 @@ class SessionScan:
         self._scans: dict[int, ChannelScan] = {}
         self._types: dict[int, str] = {}
 
-    @property
-    def keys(self) -> tuple[int, ...]:
-        """The channels defined so far."""
-        return tuple(self._scans)
-
-    def has(self, key: int) -> bool:
-        """Whether a channel is defined."""
-        return key in self._scans
-
     def define(
         self,
         key: int,
@@ -166,10 +157,6 @@ class SessionScan:
         """Messages of a channel so far."""
         self._scans[key].flush()
         return self._scans[key].count
-
-    def topic(self, key: int) -> str:
-        """Topic of a channel."""
-        return self._scans[key].topic
 
     def measure(self, key: int) -> ChannelMeasures:
         """What a channel's messages say so far."""
