@@ -1,7 +1,7 @@
-"""A session as blocks of messages: one file, the parts of a split one, or what a crash left.
+"""A session as blocks of messages: one file, the parts of a split one, or an unfinished one.
 
-Naming any part opens the whole. What only the write-ahead log of a recorder has follows the
-files' blocks as one more block, in memory; nothing on the disk is changed.
+The path of any part opens the whole. Messages that only the write-ahead log of a recorder has are
+one more block, in memory, after the files' blocks; nothing on the disk is changed.
 """
 
 from __future__ import annotations
@@ -34,19 +34,16 @@ _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linu
 
 
 def new_pages(size: int) -> mmap.mmap:
-    """Memory of small pages, each of which comes when it is first written.
+    """Return zeroed memory of small pages, which are allocated when they are first written.
 
-    numpy would ask for huge pages, and in a virtual machine a new one costs milliseconds; a
+    numpy would request huge pages, and in a virtual machine a new one costs milliseconds; a
     bytearray would write all of it at once.
 
     Args:
-        size: How much [byte], more than 0.
-
-    Returns:
-        Zeros, given back when nothing refers to them any more.
+        size: Size [byte], more than 0.
 
     Raises:
-        MemoryError: If there is not as much.
+        MemoryError: If there is not enough memory.
     """
     try:
         return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
@@ -55,46 +52,38 @@ def new_pages(size: int) -> mmap.mmap:
 
 
 def keep_freed(size: int) -> None:
-    """Have pieces of memory that come and go use the same pages again.
+    """Make the allocator reuse the pages of freed memory.
 
-    glibc gives a large piece back to the system as soon as it is freed, up to the size of the
-    largest that it has seen freed: from then on it keeps them (mallopt(3), M_MMAP_THRESHOLD). Other
-    allocators take no notice.
+    glibc returns a large piece to the system when it is freed, unless one of its size was freed
+    before (mallopt(3), M_MMAP_THRESHOLD). Other allocators are not affected.
 
     Args:
-        size: Of the largest such piece [byte].
+        size: Size of the largest such piece [byte].
     """
     np.empty(size, dtype=np.uint8)  # freed at once, never written
 
 
 class FilePages:
-    """Memory that lies in a file, so that what is not looked at need not be in memory.
+    """Memory backed by a file, so that unused pages can be released.
 
-    The file has no name and is gone with what refers to it. What was written stays when its pages
-    are let go of: the system writes it to the disk when it needs the room, and not before.
+    The file has no name and is deleted with the last reference to it. Contents stay when the pages
+    are released: the system writes them to the disk when it needs the memory.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Choose where the files go.
-
-        Args:
-            folder: On a disk; in a file system in memory nothing is gained.
-        """
+        """Set the folder of the files, which should be on a disk."""
         self._folder = folder
         self._held: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
         self._used = False
 
     def new(self, size: int) -> mmap.mmap:
-        """Memory in a file of its own; where there is no room for one, memory as it usually is.
+        """Return zeroed memory in a new file, or ordinary memory if the disk has no room.
 
         Args:
-            size: How much [byte], more than 0.
-
-        Returns:
-            Zeros, given back when nothing refers to them any more.
+            size: Size [byte], more than 0.
 
         Raises:
-            MemoryError: If there is not as much, neither on the disk nor in memory.
+            MemoryError: If there is not enough memory either.
         """
         if sys.platform != "linux":
             return new_pages(size)
@@ -110,29 +99,26 @@ class FilePages:
         return found
 
     def release(self) -> None:
-        """Let go of the pages, and of memory that was freed but kept.
-
-        What the pages hold is read again when it is looked at.
-        """
+        """Release the pages, which are read again when needed, and freed memory."""
         held = list(self._held)
         for each in held:
             each.madvise(mmap.MADV_DONTNEED)
         if self._used and _TRIM is not None:
             _TRIM(0)
-        self._used = bool(held)  # once more when all are gone: it takes milliseconds
+        self._used = bool(held)  # once more after the last one: it takes milliseconds
 
 
 @dataclass(frozen=True)
 class Recovered:
-    """What was put together of a session that was not finalised.
+    """Contents of a session that was not finalised.
 
     Attributes:
         live: Whether its recorder is still writing.
-        in_files: Messages that the files have.
-        from_wal: Messages that only the write-ahead log has.
-        accepted: Messages that the recorder accepted; None where nothing tells.
-        looked: Whether all was read to count them; else summaries were believed, or something of
-            the write-ahead log can't be read.
+        in_files: Number of messages in the files.
+        from_wal: Number of messages that only the write-ahead log has.
+        accepted: Number of messages that the recorder accepted; None if unknown.
+        looked: Whether all messages were counted by reading; if not, summaries were used, or a part
+            of the write-ahead log can't be read.
     """
 
     folder: Path
@@ -144,19 +130,19 @@ class Recovered:
 
     @property
     def missing(self) -> int | None:
-        """Messages that were accepted and are in neither; None where nothing tells."""
+        """Number of accepted messages that are lost; None if unknown."""
         if self.accepted is None:
             return None
         return max(0, self.accepted - self.in_files - self.from_wal)
 
     @property
     def warning(self) -> str:
-        """One sentence, and what to do."""
+        """One sentence, with the fix."""
         advice = "" if self.live else "; 'undulog log recover' writes a whole file"
         return f"{self}{advice}"
 
     def __str__(self) -> str:
-        """One sentence."""
+        """Return one sentence."""
         total = self.in_files + self.from_wal
         if self.live:
             return (
@@ -181,11 +167,11 @@ class LogFile:
     """A session's blocks, channels, schemas, metadata and attachments, over all its files."""
 
     def __init__(self, path: Path, column_folder: Path | None = None) -> None:
-        """Open a session and find what it holds.
+        """Open a session.
 
         Args:
             path: Its file, any of its parts, or a folder that holds it and no other.
-            column_folder: Where large columns lie in files; None for memory.
+            column_folder: Folder for large columns in files; None for memory.
 
         Raises:
             NotALogError: If it is empty, not MCAP, or nothing in it can be read.
@@ -203,12 +189,12 @@ class LogFile:
         self.attachments: dict[str, Attachment] = {}
         self.appendices: list[Attachment | Metadata] = []  # as stored; names may repeat
         self.recovered: Recovered | None = None
-        self.foreign_wal = ""  # what to say of a write-ahead log of another session
+        self.foreign_wal = ""  # warning of a write-ahead log of another session
         self._sources: list[McapFile | WalTail] = []
-        self.scratch: list[mmap.mmap] = []  # memory that was used before: it costs no page faults
+        self.scratch: list[mmap.mmap] = []  # used memory, which costs no page faults
         self.pages = None if column_folder is None else FilePages(column_folder)
         first = first_part(path)
-        wal = read_wal(first)  # before the files: what it lets go of meanwhile is in them
+        wal = read_wal(first)  # before the files: segments released meanwhile are in the files
         self.parts: PartFiles = open_parts(first, bare=wal is not None)
         try:
             for file in self.files:
@@ -255,7 +241,7 @@ class LogFile:
         self.parts.close()
 
     def forget(self) -> None:
-        """Let go of what was read; it is read again when needed."""
+        """Release the data read; it is read again when needed."""
         for file in self.files:
             file.forget()
         if self.pages is not None:
@@ -293,7 +279,7 @@ class LogFile:
             self.counts[channel_id] = self.counts.get(channel_id, 0) + count
 
     def _keep(self, item: Attachment | Metadata) -> None:
-        """Note a metadata record or attachment; each part repeats those of the session."""
+        """Add a metadata record or attachment once; each part repeats those of the session."""
         if item.name == PART_RECORD or (len(self._sources) and item in self.appendices):
             return
         self.appendices.append(item)
@@ -303,7 +289,7 @@ class LogFile:
             self.metadata.setdefault(item.name, {}).update(item.metadata)
 
     def _leave_foreign(self, wal: WalContents) -> None:
-        """Find out whether a write-ahead log belongs to another session: a copy left it behind."""
+        """Warn of a write-ahead log of another session, left by a copy."""
         facts = [i for i in wal.definitions if isinstance(i, Metadata) and i.name == "undulog"]
         ids = {item.metadata["session_id"] for item in facts if "session_id" in item.metadata}
         own = self.metadata.get("undulog", {}).get("session_id")
@@ -318,8 +304,8 @@ class LogFile:
     def _join_wal(self, wal: WalContents) -> None:
         self._define(wal)
         self._leave_cut_chunk(wal)
-        # The log may begin before the files' end, and they may have grown beyond its own since.
-        # What it let go of while it was being read is a hole in it, of channels it can't tell.
+        # The log may begin before the files' end, and the files may have grown beyond the log.
+        # Segments released while the log was read are a hole in it, of unknown channels.
         grown = max(0, sum(self.counts.values()) - wal.accepted)
         hole = wal.accepted - wal.before - len(wal.messages)
         listed = Counter(message.channel_id for message in wal.messages)
@@ -329,19 +315,19 @@ class LogFile:
         if rest:
             self._add(WalTail(rest))
         if not (rest or wal.live) and self.parts.finalised and wal.accepted <= in_files:
-            return  # the recorder died when all was done but the tidying up
+            return  # the recorder died after everything was written
         accepted = wal.accepted if wal.messages else None
         looked = looked and not wal.damaged
         self.recovered = Recovered(wal.folder, wal.live, in_files, len(rest), accepted, looked)
         told = list(wal.warnings)
-        if self.recovered.missing == 0:  # then what was only begun held nothing
+        if self.recovered.missing == 0:  # then a part that was only begun had no messages
             gone = [text for text in self.parts.missing if "can't be read" in text]
             self.parts.missing = [text for text in self.parts.missing if text not in gone]
             told = [text for text in told if "no readable header" not in text]
         self.warnings += [self.recovered.warning, *told]
 
     def _define(self, wal: WalContents) -> None:
-        """Take from a write-ahead log what the files don't explain themselves."""
+        """Add definitions of a write-ahead log that the files don't have."""
         for item in wal.definitions:
             if isinstance(item, Header):
                 self.profile = self.profile or item.profile
@@ -354,7 +340,7 @@ class LogFile:
                 self._keep(item)
 
     def _leave_cut_chunk(self, wal: WalContents) -> None:
-        """Leave out a chunk that the file's end cuts short where the log has all of it, whole."""
+        """Leave out a chunk that is cut short if the log has all its messages."""
         last = self.files[-1] if self.files else None
         if last is None or not last.cut:
             return
@@ -369,11 +355,10 @@ class LogFile:
             self._leave_out(block)
 
     def _last_keys(self, least: Mapping[int, int]) -> tuple[set[MessageKey], bool]:
-        """The keys of the files' last messages of some channels.
+        """Return the keys of the files' last messages of some channels.
 
-        A channel's messages are in the files in the order they came, while those of others may be
-        in a later chunk though they came before. A chunk that can't be read is left out: the
-        write-ahead log may have its messages.
+        The messages of one channel are in order, while older ones of other channels may be in a
+        later chunk. An unreadable chunk is left out: the write-ahead log may have its messages.
         """
         keys: set[MessageKey] = set()
         left = dict(least)
@@ -403,7 +388,7 @@ class LogFile:
         return keys, not unread
 
     def _heads(self, block: Block) -> NDArray[np.void]:
-        """The heads of all messages of a block."""
+        """Return the heads of all messages of a block."""
         ids = block.offsets if block.offsets is not None else block.index_at
         source = self.source_of(block)
         offsets = [source.offsets(block, channel_id) for channel_id in ids]
@@ -416,18 +401,18 @@ class LogFile:
         return heads
 
     def _leave_out(self, block: Block) -> None:
-        """Forget a block; its messages are no longer counted, as far as its index tells them."""
+        """Remove a block and the messages in its index from the counts."""
         self.blocks = [other for other in self.blocks if other is not block]
         for channel_id in block.offsets if block.offsets is not None else block.index_at:
             try:
                 count = len(self.source_of(block).offsets(block, channel_id))
-            except LogError:  # then the sum stays too high, and is not called sure
+            except LogError:  # then the sum stays too high and is not final
                 continue
             self.counts[channel_id] = max(0, self.counts.get(channel_id, 0) - count)
 
 
 def _is_of_the_end(warning: str) -> bool:
-    """Whether a warning only says that a file was not finalised."""
+    """Whether a warning only means that a file was not finalised."""
     return (
         warning.startswith(("the file is cut short", "the last ", "nothing of the last"))
         or "cut record" in warning
