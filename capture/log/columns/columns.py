@@ -16,15 +16,15 @@ import numpy as np
 from ...common.arrays import IntArray
 from ...common.errors import DataError
 from ..file.log_file import FilePages, LogFile
-from ..mcap.chunk import Buffer
-from ..mcap.records import BODY_AT, FIXED_SIZE, Places
+from ..mcap.chunk import PREFIX_SIZE, Buffer
+from ..mcap.records import BODY_AT, FIXED_SIZE, MESSAGE, Places
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import JOINT_STATE, MessageType
 from .blocks import Records, Window, blocks_in, record_batches
 from .buffers import TimeStore
 from .layouts import MOST_JOINT_LISTS, MOST_LAYOUTS, Group, LayoutSorter, Stamping
 
-_LENGTH_AT, _LOG_TIME_AT = 1, 15  # in a message record
+_LENGTH_AT = 1  # in a message record
 _MAX_SHARED = 8
 _HELD = 8
 """Batches after which memory is released, if columns are in files."""
@@ -164,9 +164,8 @@ def message_blocks(
 
 def message_bytes(data: Buffer, offset: int) -> tuple[int, bytes]:
     """Return the log time [Unix ns] and the bytes of the message of a record."""
-    length = int.from_bytes(data[offset + _LENGTH_AT : offset + 9], "little") - FIXED_SIZE
-    log_ns = int.from_bytes(data[offset + _LOG_TIME_AT : offset + 23], "little")
-    return log_ns, bytes(data[offset + BODY_AT : offset + BODY_AT + length])
+    _, length, _, _, log_ns, _ = MESSAGE.unpack_from(data, offset)
+    return log_ns, bytes(data[offset + BODY_AT : offset + PREFIX_SIZE + length])
 
 
 class _GroupReader:
@@ -241,19 +240,17 @@ class _GroupReader:
                 f"{self._topic} has more than {self._most} different lists of joints or frame "
                 "ids; give each robot a topic of its own"
             )
-        if self.groups:
-            return self._new_group(layout, capacity)
-        group = self._new_group(layout, capacity, tuple(self._shared))
-        if len(self._shared) < _MAX_SHARED:
+        group = Group(
+            layout,
+            self._paths,
+            capacity,
+            () if self.groups else tuple(self._shared),
+            stamping=self._stamping,
+            pages=self._pages,
+        )
+        if not self.groups and len(self._shared) < _MAX_SHARED:
             self._shared.append(group.kept_times)
         return group
-
-    def _new_group(
-        self, layout: Layout, capacity: int, others: tuple[TimeStore, ...] = ()
-    ) -> Group:
-        return Group(
-            layout, self._paths, capacity, others, stamping=self._stamping, pages=self._pages
-        )
 
     def _capacity(self, length: int, seen: int) -> int:
         """Return the capacity of a group: for the first one all expected messages of the topic."""

@@ -1,7 +1,7 @@
-"""The health of a recorded session: measures in, a verdict with its reasons out.
+"""Rules for the health of a session: findings and a verdict from the measures.
 
-The measures come from :mod:`.health.tallies`, so the same rules judge a file or the last
-seconds of a live recording. Every threshold stands here by name, with why it is what it is.
+The measures come from :mod:`.health.tallies`, so the same rules apply to a file and to a live
+recording. Every threshold has a name and a reason.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ GOOD_LOSS = 1e-3
 than one in a gait cycle of ten seconds at 100 Hz."""
 
 BAD_LOSS = 0.1
-"""From a tenth on the losses are seldom random: they follow bus load and hence the motion, and
-what is left is a biased picture of it."""
+"""Losses above a tenth are rarely random: they follow bus load and hence the motion, so the
+remaining samples are biased."""
 
 LONG_GAP_S = 0.1
-"""A gap that a good session doesn't have. Linear interpolation across T misses up to
+"""Shortest gap that makes a session degraded. Linear interpolation across T misses up to
 1 - cos(pi f T) of the amplitude: 5 % for 0.1 s at 1 Hz, the quickest gaits of such robots."""
 
 BAD_PAUSE = 0.5
@@ -46,7 +46,7 @@ FROZEN_SECONDS = 2
 """Consecutive seconds that make a frozen joint; one alone may be a slow start of the motion."""
 
 LIMIT_RAD = 1e-3
-"""Nearer to a limit than this is at it: below one step of a 12-bit encoder (1.5 mrad)."""
+"""Distance at which a joint is at a limit: below one step of a 12-bit encoder (1.5 mrad)."""
 
 MAX_AT_LIMIT = 0.1
 """A sine that just touches both limits of 30 degrees is within 1 mrad of them for
@@ -65,8 +65,8 @@ VIEW_AIDS = ("/tf", "/tf_static", "/robot_description")
 """Never analysed, so never judged."""
 
 RECORDER_TOPICS = ("/rosout", "/diagnostics", "/clock/")
-"""What a recorder says of itself, many voices on one topic: an event may be told late, and a clock
-that was not read again repeats its last stamp. It has no rhythm that could be disturbed."""
+"""Topics of a recorder's own messages, which have no steady rate: an event may be logged late, and
+a clock that was not read again repeats its last stamp."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ def listed(names: Sequence[str], most: int = _MOST_LISTED) -> str:
 
 
 def judge_file(health: FileHealth) -> list[Finding]:
-    """Findings on the container."""
+    """Return findings on the container."""
     found = [Finding(2, sentence) for sentence in health.damage]
     if health.unfinished:
         found.append(Finding(0 if health.running else 1, health.unfinished))
@@ -216,7 +216,7 @@ def judge_channel(health: ChannelHealth) -> list[Fault]:
 
 
 def has_rhythm(topic: str) -> bool:
-    """Whether a topic is one whose rhythm is judged."""
+    """Whether the rhythm of a topic is judged."""
     return topic not in VIEW_AIDS and not topic.startswith(RECORDER_TOPICS)
 
 
@@ -228,7 +228,7 @@ def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Fault
         end_ns: Log time of its last message [Unix ns].
 
     Returns:
-        The faults; none for view aids and for what a recorder says of itself.
+        The faults; none for view aids and for the recorder's own topics.
     """
     timing = health.timing
     if timing.median_s is None or not has_rhythm(health.topic):
@@ -264,7 +264,7 @@ def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Fault
 
 
 def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Fault:
-    """The gaps of a series."""
+    """Return the fault of the gaps of a series."""
     timing = health.timing
     long = timing.longest_s > LONG_GAP_S and timing.longest_s > 2.5 * (timing.median_s or 0.0)
     scattered = timing.scattered / (timing.count + timing.scattered)
@@ -282,7 +282,7 @@ def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Fault:
 
 
 def _edges_and_jitter(health: SeriesHealth, start_ns: int, end_ns: int) -> Iterator[str]:
-    """What is wrong with the beginning, the end and the intervals of a regular series."""
+    """Describe faults of the start, the end and the intervals of a regular series."""
     timing, median_s = health.timing, health.timing.median_s or 0.0
     edge_s = max(PAUSE_S, PAUSE_PERIODS * median_s)
     late_s, early_s = (health.first_log_ns - start_ns) / NS, (end_ns - health.last_log_ns) / NS
@@ -303,27 +303,21 @@ def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> list[Fault]:
     """
     found: list[Fault] = []
     for joint in joints:
-
-        def add(weight: int, text: str, joint: JointHealth = joint) -> None:
-            found.append(Fault(weight, joint.topic, joint.name, text))
-
+        texts: list[tuple[int, str]] = []
         if joint.nan:
             weight = int(joint.nan > GOOD_LOSS * joint.samples)
-            add(weight, f"{joint.nan} of {joint.samples} samples are not a number")
+            texts.append((weight, f"{joint.nan} of {joint.samples} samples are not a number"))
         if _is_frozen(joint):
             when = _at(joint.frozen_at_ns, start_ns)
-            add(1, f"frozen for {joint.frozen_s} s while its command moved, {when}")
+            texts.append((1, f"frozen for {joint.frozen_s} s while its command moved, {when}"))
         if joint.at_limit is not None and joint.at_limit > MAX_AT_LIMIT:
-            add(1, f"at the robot's limits in {joint.at_limit:.0%} of the samples")
+            texts.append((1, f"at the robot's limits in {joint.at_limit:.0%} of the samples"))
+        found += [Fault(weight, joint.topic, joint.name, text) for weight, text in texts]
     return found
 
 
 def judge_body(joints: Sequence[JointHealth]) -> list[Finding]:
-    """Findings on the joints together.
-
-    Args:
-        joints: Measures of all joints of all topics.
-    """
+    """Return findings on all joints together."""
     measured = [joint for joint in joints if joint.topic == "/joint_states"]
     names = {joint.name for joint in measured}
     dead = {
@@ -341,14 +335,7 @@ def _is_frozen(joint: JointHealth) -> bool:
 
 
 def judge_following(fault: JointFault) -> Finding:
-    """Finding on a joint that does not follow its command.
-
-    Args:
-        fault: The fault, times from the session's start.
-
-    Returns:
-        The finding, with the kinds that fit.
-    """
+    """Return the finding on a joint that does not follow its command."""
     when = "" if fault.since_s is None else f" from {fault.since_s:.3g} s"
     when += "" if fault.until_s is None else f" to {fault.until_s:.3g} s"
     kinds = " or ".join(fault.kinds)
@@ -356,7 +343,7 @@ def judge_following(fault: JointFault) -> Finding:
 
 
 def judge_bus(health: BusHealth) -> list[Finding]:
-    """Findings on a bus."""
+    """Return findings on a bus."""
     found: list[Finding] = []
     if health.error_frames:
         part = health.error_frames / health.frames
@@ -370,9 +357,9 @@ def judge_bus(health: BusHealth) -> list[Finding]:
 
 
 def judge_silences(buses: Iterable[BusHealth], start_ns: int) -> list[Finding]:
-    """Findings on times without any frame of a bus, classic or CAN FD.
+    """Return findings on times without any frame of a bus, classic or CAN FD.
 
-    Of a bus that has both kinds, the longest silences of the two are held against each other.
+    Of a bus with both kinds, the overlap of their longest silences counts.
 
     Args:
         buses: Measures of all topics of frames.
@@ -397,16 +384,14 @@ def judge_topics(
     seen: Iterable[str],
     undecoded: str | None = None,
 ) -> list[Finding]:
-    """Findings on what the log contract asks for and the session lacks.
+    """Return findings on topics of the log contract that the session lacks.
 
     Args:
         types: Topic with messages to type.
         joints: The robot's joints; empty without a robot.
         seen: Joints that ``/joint_states`` carries.
-        undecoded: Why the raw CAN frames brought nothing, or hardly anything; None if they did.
-
-    Returns:
-        The findings; where frames brought nothing, that is the one reason for what is missing.
+        undecoded: Why almost no raw CAN frame could be decoded, which then is the only reason for
+            missing topics; None otherwise.
     """
     found = [] if undecoded is None else [Finding(1, undecoded)]
     framed = any(topic.startswith(FRAME_TOPIC_PREFIXES) for topic in types)
@@ -432,11 +417,7 @@ def judge_topics(
 
 
 def verdict_of(findings: Iterable[Finding]) -> str:
-    """The verdict: that of the heaviest finding, ``good`` without any.
-
-    Returns:
-        One of :data:`VERDICTS`.
-    """
+    """Return the verdict of the heaviest finding, ``good`` without findings."""
     return VERDICTS[max((finding.weight for finding in findings), default=0)]
 
 

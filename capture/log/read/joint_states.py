@@ -19,7 +19,7 @@ from ..columns.columns import Messages
 from ..columns.layouts import Group, names_of
 from ..columns.topics import Topics
 from ..messages.definitions import JOINT_STATE, MessageType
-from .sample_times import Series, StampClock, own_times
+from .sample_times import Series, StampClock, cut, own_times
 from .signals import JointSignals
 
 _EARLY_OR_LATE = 0.1
@@ -172,20 +172,6 @@ def covers(found: Mapping[str, Messages], window_ns: Window) -> bool:
         if (stamps[1:] < stamps[:-1]).any():
             return False
     return True
-
-
-def cut(t_ns: IntArray, window_ns: Window) -> tuple[slice, IntArray]:
-    """Return the range of the samples in a window, and a view of their times.
-
-    Args:
-        t_ns: Sampling times [Unix ns], not decreasing, shape (n,).
-        window_ns: Half-open window of them [Unix ns]; None for open ends.
-    """
-    start, stop = window_ns
-    first = 0 if start is None else int(t_ns.searchsorted(start))
-    last = len(t_ns) if stop is None else int(t_ns.searchsorted(stop))
-    inside = slice(first, last)
-    return inside, t_ns[inside]
 
 
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}

@@ -17,6 +17,7 @@ import numpy as np
 
 from ...common.arrays import FloatArray, IntArray
 from ...common.errors import DataError
+from ..columns.blocks import Window
 from ..columns.layouts import stamps_of
 from ..columns.topics import Topics
 from ..messages.cdr import layout_of
@@ -75,7 +76,7 @@ def longest_unbroken(
     runs = [
         run
         for t_ns in {id(each): each for each in times_ns}.values()
-        for run in _runs(_within(t_ns, start_ns, stop_ns))
+        for run in _runs(cut(t_ns, (start_ns, stop_ns))[1])
     ]
     joined: list[tuple[int, int]] = []
     for first, last in sorted(runs):
@@ -91,10 +92,18 @@ def longest_unbroken(
     return Unbroken(*longest, len(joined) - 1, left / _NS, max(gaps, default=0) / _NS)
 
 
-def _within(t_ns: IntArray, start_ns: int | None, stop_ns: int | None) -> IntArray:
-    first = 0 if start_ns is None else int(np.searchsorted(t_ns, start_ns))
-    stop = t_ns.size if stop_ns is None else int(np.searchsorted(t_ns, stop_ns))
-    return t_ns[first:stop]
+def cut(t_ns: IntArray, window_ns: Window) -> tuple[slice, IntArray]:
+    """Return the range of the samples in a window, and a view of their times.
+
+    Args:
+        t_ns: Sampling times [Unix ns], not decreasing, shape (n,).
+        window_ns: Half-open window of them [Unix ns]; None for open ends.
+    """
+    start, stop = window_ns
+    first = 0 if start is None else int(t_ns.searchsorted(start))
+    last = len(t_ns) if stop is None else int(t_ns.searchsorted(stop))
+    inside = slice(first, last)
+    return inside, t_ns[inside]
 
 
 def _runs(t_ns: IntArray) -> list[tuple[int, int]]:

@@ -170,8 +170,8 @@ def test_every_mark_explains_itself_and_opens_as_a_session(tmp_path):
                 session.joints("/joint_states").values, np.stack([wanted, -wanted])
             )
             assert [m.data for _, m in session.messages("/gait/mode")] == ["walk"]
-            events = [m.msg for _, m in session.messages("/rosout")]
-    assert events == ["late channel"]
+    with Session(path) as session:
+        assert [m.msg for _, m in session.messages("/rosout")] == ["late channel"]
 
 
 def test_nothing_is_overwritten_and_numbers_go_on(tmp_path):
