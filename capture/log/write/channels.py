@@ -11,7 +11,7 @@ written.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -96,10 +96,10 @@ class _Stamped:
     def _emit(self, t_ns: int, log_time_ns: int | None) -> None:
         self._template.emit(t_ns, log_time_ns, self._stamps)
 
-    def _emit_numbers(self, t_ns: int, log_time_ns: int | None, *values: float) -> None:
+    def _emit_numbers(self, t_ns: int, log_time_ns: int | None, values: Iterable[float]) -> None:
         for view, value in zip(self._views, values, strict=True):
             view[0] = value
-        self._emit(t_ns, log_time_ns)
+        self._template.emit(t_ns, log_time_ns, self._stamps)
 
 
 class JointStateChannel(_Stamped):
@@ -126,8 +126,10 @@ class JointStateChannel(_Stamped):
         Raises:
             ValueError: If a shape doesn't fit the channel.
         """
-        for view, values in zip(self._views, (position, velocity, effort), strict=True):
-            view[...] = values
+        positions, velocities, efforts = self._views
+        positions[...] = position
+        velocities[...] = velocity
+        efforts[...] = effort
         self._emit(t_ns, log_time_ns)
 
 
@@ -160,7 +162,7 @@ class OdometryChannel(_Stamped):
             angular_velocity: In the head's frame [rad/s], shape (3,).
         """
         values = (*position, *quaternion, *linear_velocity, *angular_velocity)
-        self._emit_numbers(t_ns, log_time_ns, *values)
+        self._emit_numbers(t_ns, log_time_ns, values)
 
 
 class TransformChannel:
@@ -208,7 +210,8 @@ class RangeChannel(_Stamped):
         Args:
             value: Distance [m]; +inf if nothing is in range (REP 117).
         """
-        self._emit_numbers(t_ns, log_time_ns, value)
+        self._views[0][0] = value
+        self._emit(t_ns, log_time_ns)
 
 
 class MagneticFieldChannel(_Stamped):
@@ -222,7 +225,7 @@ class MagneticFieldChannel(_Stamped):
         Args:
             vector: In the sensor's frame [T], shape (3,).
         """
-        self._emit_numbers(t_ns, log_time_ns, *vector)
+        self._emit_numbers(t_ns, log_time_ns, vector)
 
 
 class ImuChannel(_Stamped):
@@ -251,7 +254,7 @@ class ImuChannel(_Stamped):
         """
         gyro = (0.0, 0.0, 0.0) if angular_velocity is None else angular_velocity
         covariance = -1.0 if angular_velocity is None else 0.0
-        self._emit_numbers(t_ns, log_time_ns, *acceleration, *gyro, covariance)
+        self._emit_numbers(t_ns, log_time_ns, (*acceleration, *gyro, covariance))
 
 
 class TimeReferenceChannel(_Stamped):
