@@ -19,8 +19,10 @@ from undulog.capture.log.messages.frames import DIR_TX, EXTENDED_FLAG, empty_fra
 # -- writing -----------------------------------------------------------------------------------
 
 
-def test_a_foreign_reader_finds_every_number(tmp_path: Path) -> None:
-    data = write_session(tmp_path / "s.mcap")
+def test_foreign_readers_find_every_number_and_the_description(tmp_path: Path) -> None:
+    path, robot = tmp_path / "s.mcap", load_robot("snake13")
+    facts = {"operator": "a person"}
+    data = write_session(path, robot=robot, clock={"twin": "simulated"}, metadata=facts)
     with AnyReader([tmp_path / "s.mcap"]) as reader:
         rows = [
             reader.deserialize(raw, connection.msgtype)
@@ -35,12 +37,6 @@ def test_a_foreign_reader_finds_every_number(tmp_path: Path) -> None:
     assert stamps == [EPOCH_NS + k * STEP_NS for k in range(len(data))]
     assert tuple(rows[0].name) == NAMES
     assert topics["/odom"] == "nav_msgs/msg/Odometry"
-
-
-def test_the_file_explains_itself_to_any_mcap_reader(tmp_path: Path) -> None:
-    robot = load_robot("snake13")
-    facts = {"operator": "a person"}
-    write_session(tmp_path / "s.mcap", robot=robot, clock={"twin": "simulated"}, metadata=facts)
     metadata = metadata_of(tmp_path / "s.mcap")
     with (tmp_path / "s.mcap").open("rb") as stream:
         reader = make_reader(stream)
