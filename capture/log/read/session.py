@@ -368,20 +368,10 @@ class SessionView:
     def fd_frames(
         self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
     ) -> FrameArray:
-        """Return raw CAN FD frames of a bus, in the order they were logged.
-
-        Args:
-            topic: E.g. ``/can_fd/can0``.
-            start_ns: First log time of a message of frames wanted [Unix ns]; None for the
-                session's start.
-            stop_ns: One past the last such log time wanted [Unix ns]; None for the end.
+        """Return raw CAN FD frames of a bus, e.g. of ``/can_fd/can0``; see :meth:`frames`.
 
         Returns:
             Records of :data:`.capture.log.messages.frames.FD_FRAME_DTYPE`, shape (n,).
-
-        Raises:
-            MissingChannelError: If the session has no such topic.
-            DataError: If the topic holds something else.
         """
         return self._frames(topic, (start_ns, stop_ns), FD_FRAME_DTYPE, FD_FRAME_LAYOUT)
 
