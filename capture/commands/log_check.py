@@ -11,9 +11,9 @@ from ..common.console import echo, emit_json, progress
 from ..log.messages.frames import FD_TOPIC_PREFIX
 
 if TYPE_CHECKING:
-    from ..log.health.measures import BusHealth, SeriesHealth
     from ..log.health.session_check import SessionHealth
     from ..log.health.sources import SourceHealth
+    from ..log.health.tallies import BusHealth, SeriesHealth
 
 
 def log_check(file: Path, /, *, json: bool = False) -> int:

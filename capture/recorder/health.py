@@ -15,9 +15,9 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from ..common.errors import DataError
-from ..log.health.measures import BusHealth, JointHealth
 from ..log.health.rules import FROZEN_SECONDS, MAX_AT_LIMIT
 from ..log.health.session_scan import ChannelMeasures, SessionMeasures, SessionScan
+from ..log.health.tallies import BusHealth, JointHealth
 from ..log.mcap.records import BODY_AT, FIXED_SIZE, HEAD
 from ..log.messages.definitions import parse_message_type
 from ..log.messages.frames import FRAME_TOPIC_PREFIX, FRAME_TOPIC_PREFIXES

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from mcap.writer import Writer as McapWriter
 
+from support.foreign_logs import foreign_log
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.log.health.session_check import SessionHealth
 from undulog.capture.log.health.tallies import Timing
 from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.definitions import message_type, schema_text
+from undulog.capture.log.messages.definitions import message_type
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
@@ -52,6 +52,11 @@ def at(tick: int) -> int:
     return EPOCH_NS + tick * STEP_NS
 
 
+def without(is_lost: Callable[[int], bool]) -> Edit:
+    """Leave out the states of some ticks."""
+    return lambda tick, command, angles: None if is_lost(tick) else at(tick)
+
+
 def timing_of(health: SessionHealth, topic: str = "/joint_states") -> Timing:
     (found,) = [each.timing for each in health.series if each.topic == topic]
     return found
@@ -59,10 +64,7 @@ def timing_of(health: SessionHealth, topic: str = "/joint_states") -> Timing:
 
 def write_raw(path: Path, sequences: list[int], **options: object) -> Path:
     """Write JointState messages of three joints with given sequence numbers."""
-    with path.open("wb") as stream:
-        writer = McapWriter(stream, **options)
-        writer.start(profile="ros2", library="test")
-        schema = writer.register_schema(JOINT_STATE, "ros2msg", schema_text(JOINT_STATE).encode())
+    with foreign_log(path, JOINT_STATE, **options) as (writer, schema):
         for topic in ("/joint_commands", "/joint_states"):
             channel = writer.register_channel(topic, "cdr", schema)
             for k, sequence in enumerate(sequences):
@@ -70,5 +72,4 @@ def write_raw(path: Path, sequences: list[int], **options: object) -> Path:
                 values = {"header": {"stamp": stamp}, "name": list("abc"), "position": gait(k)[:3]}
                 message = encode(message_type(JOINT_STATE), values)
                 writer.add_message(channel, at(k), message, at(k), sequence)
-        writer.finish()
     return path

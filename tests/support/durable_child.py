@@ -58,6 +58,15 @@ def write(sink, number):
     sink.write(channel, log_ns, publish_ns, sequence, payload)
 
 
+def record(path, numbers, **options):
+    """Write the messages with these numbers and close; returns the sink."""
+    sink = open_sink(path, **options)
+    for number in numbers:
+        write(sink, number)
+    sink.close(())
+    return sink
+
+
 def run(path, count=1 << 40, splits=(), split_every=0, close=False, **options):
     """Write messages, report each number after it was accepted, and kill the process.
 

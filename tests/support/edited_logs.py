@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
 
+from support.foreign_logs import foreign_log
+from support.read_back import messages_of
 from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.definitions import message_type, schema_text
+from undulog.capture.log.messages.definitions import message_type
 
 EPOCH_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
@@ -36,14 +38,11 @@ def text(value: str) -> bytes:
 
 def write_log(path: Path, messages, *, attachments=(), metadata=(), units=None, **options) -> Path:
     """Write a foreign log of Strings: (topic, log time [ns after the epoch], text)."""
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=512, **options)
-        writer.start(profile="ros2", library="elsewhere")
+    with foreign_log(path, chunk_size=512, **options) as (writer, schema):
         for name, facts in metadata:
             writer.add_metadata(name, facts)
         for name, data in attachments:
             writer.add_attachment(11, 22, name, "text/plain", data)
-        schema = writer.register_schema(STRING, "ros2msg", schema_text(STRING).encode())
         channels: dict[str, int] = {}
         for k, (topic, t_ns, said) in enumerate(messages):
             if topic not in channels:
@@ -51,7 +50,6 @@ def write_log(path: Path, messages, *, attachments=(), metadata=(), units=None, 
                 channels[topic] = writer.register_channel(topic, "cdr", schema, facts)
             log_ns = EPOCH_NS + t_ns
             writer.add_message(channels[topic], log_ns, text(said), log_ns - 5, 7 * k)
-        writer.finish()
     return path
 
 
@@ -79,15 +77,11 @@ def entry(schema, channel, message):
 
 def read(path: Path, **window):
     """Return every message by mcap's own reader, by log time."""
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        return [entry(*item) for item in reader.iter_messages(**window)]
+    return [entry(*item) for item in messages_of(path, **window)]
 
 
 def in_file_order(path: Path):
-    with path.open("rb") as stream:
-        reader = make_reader(stream)
-        return [entry(*item) for item in reader.iter_messages(log_time_order=False)]
+    return read(path, log_time_order=False)
 
 
 def records(path: Path):

@@ -1,6 +1,8 @@
-"""What a log holds, message by message, with its parts and its write-ahead log."""
+"""Contents of a log: by our reader with its parts and its write-ahead log, or by mcap's reader."""
 
 from pathlib import Path
+
+from mcap.reader import make_reader
 
 from undulog.capture.log.edit.raw_messages import RawLog
 
@@ -14,3 +16,30 @@ def read(path):
             for m in log.messages(topics, 0, 1 << 64)
         ]
         return found, log.warnings
+
+
+def messages_of(path, **options):
+    """Schema, channel and message of all messages of one file, by mcap's reader."""
+    with path.open("rb") as stream:
+        return list(make_reader(stream, validate_crcs=True).iter_messages(**options))
+
+
+def summary_of(path):
+    with path.open("rb") as stream:
+        return make_reader(stream).get_summary()
+
+
+def metadata_of(path):
+    """Metadata records of one file by name; records of one name are merged."""
+    found = {}
+    with path.open("rb") as stream:
+        for record in make_reader(stream).iter_metadata():
+            found.setdefault(record.name, {}).update(record.metadata)
+    return found
+
+
+def chunks_of(path, topic):
+    """Chunk indexes of one file that list messages of a topic."""
+    summary = summary_of(path)
+    (key,) = (key for key, channel in summary.channels.items() if channel.topic == topic)
+    return [each for each in summary.chunk_indexes if key in each.message_index_offsets]

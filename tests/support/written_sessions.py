@@ -71,7 +71,7 @@ def write_commands(
 
 def write_foreign(
     path: Path, messages: list[tuple[str, int, dict]], type_name: str = JOINT_STATE
-) -> None:
+) -> Path:
     """Write messages (topic, log time, content) by mcap-ros2-support."""
     with path.open("wb") as stream:
         writer = RosWriter(stream)
@@ -79,6 +79,7 @@ def write_foreign(
         for topic, t_ns, content in messages:
             writer.write_message(topic, schema, content, log_time=t_ns, publish_time=t_ns)
         writer.finish()
+    return path
 
 
 def joint_state(t_ns: int, names: list[str], position: list[float], **more: object) -> dict:

@@ -1,15 +1,9 @@
-"""Message records in bulk: those of many blocks are found and checked together.
+"""Message records in bulk: the records of many blocks are found and checked together.
 
-Blocks of a log decompressed side by side, in memory that is used again and again.
-
-A chunk holds about a hundred messages of a topic, and a look at so few costs more than what is
-seen. So the blocks of a few megabytes go into one buffer, which is used again for later ones:
-memory that is written for the first time costs a page fault each 4 KiB, as much as decompression.
-While one buffer is looked at, threads fill another.
-
-Work done ahead on threads, its results in order: bounded, and over when its user is done.
-
-Decompression lets go of Python's lock, so threads of one process share it among the cores.
+A chunk holds about a hundred messages of a topic, and reading so few at a time is slow. So blocks
+of a few megabytes are decompressed into one buffer, which is used again for later blocks: memory
+that is written for the first time costs a page fault each 4 KiB, as much as decompression. Threads
+fill one buffer while another one is read; decompression releases Python's lock.
 """
 
 from __future__ import annotations
@@ -33,49 +27,41 @@ from ...common.arrays import IntArray
 from ...common.errors import LogError
 from ..file.log_file import LogFile, keep_freed, new_pages
 from ..mcap.chunk import LAST_NS, PREFIX_SIZE, Block, Buffer
-from ..mcap.records import BODY_AT, FIXED_SIZE, HEAD, Places, gather
+from ..mcap.records import BODY_AT, FIXED_SIZE, Places, gather, read_message_heads
 
 _T = TypeVar("_T")
 
 
 class Piece(Generic[_T]):
-    """A piece of work: who comes first does it, a helper or the one who needs the result."""
+    """A piece of work that is done by a helper thread, or by the caller if none has begun it."""
 
     def __init__(self, work: Callable[[], _T], helpers: ThreadPoolExecutor | None) -> None:
-        """Offer it to the helpers.
-
-        Args:
-            helpers: Threads; None where there are none.
-        """
+        """Submit it to the helper threads, if any."""
         self._work = work
         self._taken = None if helpers is None else helpers.submit(work)
         self._done: list[_T] = []
 
     def hurry(self) -> None:
-        """Do it now unless a helper has begun it."""
+        """Do the work now unless a helper has begun it."""
         if not self._done and (self._taken is None or self._taken.cancel()):
             self._taken = None
             self._done.append(self._work())
 
     def result(self) -> _T:
-        """What the work gave; waits for it.
-
-        Returns:
-            The result; what the work raises is raised here, or where it was done in a hurry.
-        """
+        """Return the result, or raise the error of the work; waits for it."""
         self.hurry()
         return self._done[0] if self._taken is None else self._taken.result()
 
 
 @contextmanager
 def helpers(threads: int) -> Generator[ThreadPoolExecutor | None]:
-    """The threads that help a caller; at the end of the block none is left.
+    """Start helper threads, which end with the block.
 
     Args:
-        threads: How many work, the caller's own among them.
+        threads: Number of threads, with the caller's own.
 
     Yields:
-        The others; None where there are none.
+        The other threads; None if there are none.
     """
     if threads == 1:
         yield None
@@ -83,19 +69,16 @@ def helpers(threads: int) -> Generator[ThreadPoolExecutor | None]:
     pool = ThreadPoolExecutor(threads - 1, thread_name_prefix="undulog-read")
     try:
         yield pool
-    finally:  # also when the caller stops half-way: what hasn't begun never will
+    finally:  # also when the caller stops early: pending work is cancelled
         pool.shutdown(cancel_futures=True)
 
 
 def ahead(items: Iterable[_T], count: int) -> Iterator[_T]:
-    """Items in order, each taken from where they come from some time before it is needed.
+    """Yield items in order, each taken from the iterable before it is needed.
 
     Args:
-        items: Whose making starts some work.
-        count: How many are taken beyond the one that is given.
-
-    Yields:
-        The items. When the next is asked for, the one before is taken as done with.
+        items: Iterable that starts work for each item.
+        count: Number of items taken beyond the one that is yielded.
     """
     waiting: deque[_T] = deque()
     for item in items:
@@ -107,8 +90,8 @@ def ahead(items: Iterable[_T], count: int) -> Iterator[_T]:
 
 ARENA_SIZE = 8 << 20
 SAME_SIZE = 9 << 18
-"""Bytes of blocks of one channel that share a buffer: about what a core's own cache holds. They
-have so many messages of a topic that more would save nothing."""
+"""Bytes of blocks of one channel that share a buffer: about the size of a core's own cache. More
+would save nothing, since they have many messages of one topic."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +99,7 @@ class Placed:
     """A block's payload in a buffer.
 
     Attributes:
-        base: What its message offsets count from.
+        base: Start of the payload: offset 0 of its messages.
         stop: One past its last byte.
     """
 
@@ -126,7 +109,7 @@ class Placed:
 
 
 _Found: TypeAlias = tuple[Buffer, Placed] | LogError
-"""A buffer and what is in it, or why the block can't be read."""
+"""A buffer and a block in it, or why the block can't be read."""
 
 
 def filled_arenas(
@@ -136,15 +119,15 @@ def filled_arenas(
     warn: Callable[[str], None],
     threads: int,
 ) -> Iterator[tuple[Buffer, list[Placed]]]:
-    """Buffers full of payloads, in file order; one that can't share a buffer comes alone.
+    """Decompress blocks into buffers, in file order; some blocks have a buffer of their own.
 
     Args:
-        channel_ids: Blocks whose index has none of these channels are passed over.
-        warn: Takes one sentence for each block that couldn't be read.
-        threads: How many decompress, the caller's among them; others do so ahead of what is used.
+        channel_ids: Blocks whose index has none of these channels are skipped.
+        warn: Called with one sentence for each unreadable block.
+        threads: Number of decompressing threads, with the caller's.
 
     Yields:
-        A buffer, which is overwritten when the next is asked for, and what is in it.
+        A buffer, which is overwritten by the next iteration, and the blocks in it.
     """
     ids = set(channel_ids)
     wanted = [
@@ -160,7 +143,7 @@ def filled_arenas(
     with helpers(max(min(threads, len(wanted)), 1)) as pool:
         for pieces in ahead(_begun(log_file, runs, arenas, pool), spare):
             if pool is not None:
-                for piece in reversed(pieces):  # the helpers come from the other end
+                for piece in reversed(pieces):  # the helpers begin at the other end
                     piece.hurry()
             found = [piece.result() for piece in pieces]
             for each in found:
@@ -174,11 +157,11 @@ def filled_arenas(
 
 
 def _runs(log_file: LogFile, blocks: Sequence[Block]) -> Iterator[list[Placed] | Block]:
-    """Blocks that share a buffer, with their places in it, or one that comes alone."""
+    """Yield blocks that share a buffer, with their ranges, or a block with a buffer of its own."""
     run: list[Placed] = []
     at, former = 0, None
     for block in blocks:
-        shares = log_file.inflates(block, ARENA_SIZE)
+        shares = log_file.source_of(block).inflates(block, ARENA_SIZE)
         only = next(iter(block.index_at)) if len(block.index_at) == 1 else None
         most = ARENA_SIZE if only is None else min(SAME_SIZE, ARENA_SIZE)
         if run and not (shares and only == former and at + block.size <= most):
@@ -199,18 +182,18 @@ def _begun(
     arenas: Sequence[mmap.mmap],
     pool: ThreadPoolExecutor | None,
 ) -> Iterator[list[Piece[_Found]]]:
-    """The work on each run; it is offered to the helpers when it is taken from here."""
+    """Yield the work on each run, submitted to the helpers."""
     for run, arena in zip(runs, cycle(arenas), strict=False):
         if isinstance(run, list):
             yield [Piece(partial(_inflated, log_file, arena, placed), pool) for placed in run]
-        else:  # two at once that are larger than a buffer are too much
+        else:  # of those larger than a buffer only one at a time
             yield [Piece(partial(_alone, log_file, run), pool if run.size <= ARENA_SIZE else None)]
 
 
 def _inflated(log_file: LogFile, arena: mmap.mmap, placed: Placed) -> _Found:
     try:
         with memoryview(arena) as whole, whole[placed.base : placed.stop] as room:
-            log_file.inflate_into(placed.block, room)
+            log_file.source_of(placed.block).inflate_into(placed.block, room)
     except LogError as error:
         return error
     return arena, placed
@@ -218,7 +201,7 @@ def _inflated(log_file: LogFile, arena: mmap.mmap, placed: Placed) -> _Found:
 
 def _alone(log_file: LogFile, block: Block) -> _Found:
     try:
-        data, base, stop = log_file.payload_once(block)
+        data, base, stop = log_file.source_of(block).payload_once(block)
     except LogError as error:
         return error
     return data, Placed(block, base, stop)
@@ -232,8 +215,8 @@ _LOG_TIME_AT = 15
 _LOG_TIME_KIND = np.dtype("<i8")
 _FAR = 1 << 62
 _LARGEST_COPIED = 2048
-"""Records up to this many bytes are copied whole, before anything of them is looked at: then they
-lie side by side in the cache."""
+"""Records up to this many bytes are copied whole before they are read: then they are side by side
+in the cache."""
 
 Window = tuple[int | None, int | None]
 
@@ -243,10 +226,10 @@ class Records:
     """Message records of one topic in a buffer, in file order; all whole.
 
     Attributes:
-        offsets: Where they start in the buffer, shape (n,).
-        log_ns: Their log times [Unix ns], shape (n,).
-        length: Bytes of each message, if all have as many; otherwise None.
-        bodies: Where the messages start, in the buffer or in a copy.
+        offsets: Offsets in the buffer, shape (n,).
+        log_ns: Log times [Unix ns], shape (n,).
+        length: Common length of the messages [byte]; None if it differs.
+        bodies: Positions of the messages, in the buffer or in a copy.
     """
 
     offsets: IntArray
@@ -256,13 +239,10 @@ class Records:
 
 
 def blocks_in(log_file: LogFile, window_ns: Window) -> list[Block]:
-    """The blocks that may hold messages of a window.
+    """Return the blocks that may hold messages of a window, in file order.
 
     Args:
         window_ns: Half-open window of log times [Unix ns]; None for open ends.
-
-    Returns:
-        Those that are not wholly outside, in file order.
     """
     start, stop = window_ns
     first_ns, last_ns = log_file.spans
@@ -281,21 +261,21 @@ def record_batches(
     warn: Callable[[str], None],
     threads: int = 1,
 ) -> Iterator[tuple[Buffer, list[Records]]]:
-    """The message records of some topics, many blocks at a time.
+    """Yield the message records of some topics, many blocks at a time.
 
     Args:
-        wanted: Channel ids, one sequence a topic.
-        warn: Takes one sentence for each block that couldn't be read.
-        threads: How many decompress the blocks.
+        wanted: Channel ids, one sequence per topic.
+        warn: Called with one sentence for each unreadable block.
+        threads: Number of decompressing threads.
 
     Yields:
-        A buffer, which is overwritten when the next is asked for, and the records of each topic.
+        A buffer, which is overwritten by the next iteration, and the records of each topic.
     """
     ids = list(itertools.chain.from_iterable(wanted))
     for data, placed in filled_arenas(log_file, ids, _in_groups(blocks, wanted), warn, threads):
         try:
             found = _records(log_file, data, placed, wanted)
-        except LogError:  # which block is it? the others are read
+        except LogError:  # of one of the blocks: the others are read
             for one in placed:
                 try:
                     alone = _records(log_file, data, [one], wanted)
@@ -308,10 +288,9 @@ def record_batches(
 
 
 def _in_groups(blocks: Sequence[Block], wanted: Sequence[Sequence[int]]) -> Sequence[Block]:
-    """Blocks in an order that has those of one topic together, where topics don't share blocks.
+    """Order blocks by topic, if topics don't share blocks; those of a topic stay in file order.
 
-    Their records then come many at a time, and evenly spaced. The blocks of each topic stay in
-    file order.
+    Their records are then many at a time and evenly spaced.
     """
     topic_of = {channel_id: k for k, ids in enumerate(wanted) for channel_id in ids}
     if not all(block.index_at for block in blocks):  # one without an index may have any of them
@@ -326,7 +305,7 @@ def _in_groups(blocks: Sequence[Block], wanted: Sequence[Sequence[int]]) -> Sequ
 def _records(
     log_file: LogFile, data: Buffer, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
 ) -> list[Records]:
-    """The checked records of each topic."""
+    """Return the checked records of each topic."""
     tiled = _tiled(data, placed, wanted)
     if tiled is not None:
         return tiled
@@ -335,7 +314,11 @@ def _records(
         at = starts.offsets
         records = _alike(data, starts) if len(at) else Records(at, at, None, Places(data, at))
         if records is None:
-            _check_each(log_file, data, starts)
+            ends = np.repeat(starts.ends, starts.counts)
+            if read_message_heads(data, at, ends) is None:
+                raise LogError(
+                    log_file.path, "a message index points to something that is not a message"
+                )
             log_ns = _readable(gather(data, at, _LOG_TIME_KIND, _LOG_TIME_AT))
             records = Records(at, log_ns, None, Places(data, at + BODY_AT))
         found.append(records)
@@ -345,7 +328,7 @@ def _records(
 def _tiled(
     data: Buffer, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
 ) -> list[Records] | None:
-    """The records of a topic that has the blocks for itself, found without the index."""
+    """Find the records of a topic that shares no block, without the index; None if impossible."""
     only = {key for one in placed for key in one.block.index_at}
     base, stop = placed[0].base, placed[-1].stop
     filled = sum(one.stop - one.base for one in placed)
@@ -368,21 +351,21 @@ def _tiled(
 
 
 def _records_at(offsets: IntArray, places: Places, length: int) -> Records:
-    """Records of whole messages of one length: where they are in the buffer, and in a copy."""
+    """Return records of whole messages of one length, from their offsets and their positions."""
     log_ns = _readable(places.field(_LOG_TIME_KIND, _LOG_TIME_AT).copy())
     bodies = Places(places.data, places.at + BODY_AT, places.step)
     return Records(offsets, log_ns, length - FIXED_SIZE, bodies)
 
 
 def _readable(log_ns: IntArray) -> IntArray:
-    """Log times of 64 bits without a sign, as far as a signed number holds them."""
+    """Limit unsigned log times of 64 bits to signed numbers."""
     if log_ns.min(initial=0) < 0:
         log_ns[log_ns < 0] = LAST_NS
     return log_ns
 
 
 def _alike(data: Buffer, starts: _Starts) -> Records | None:
-    """Records that are whole messages of one length; None where something doesn't fit."""
+    """Return records that are whole messages of one length; None if any is not."""
     offsets = starts.offsets
     first = int(offsets[0])
     start = bytes(data[first : first + _START.size])
@@ -399,25 +382,15 @@ def _alike(data: Buffer, starts: _Starts) -> Records | None:
     return _records_at(offsets, places, length)
 
 
-def _check_each(log_file: LogFile, data: Buffer, starts: _Starts) -> None:
-    """Raise LogError where a record is not a whole message."""
-    stop = np.repeat(starts.ends, starts.counts)
-    heads = gather(data, starts.offsets, HEAD)
-    lengths, room = heads["length"], (stop - starts.offsets - PREFIX_SIZE).astype(np.uint64)
-    whole = (heads["opcode"] == Opcode.MESSAGE) & (lengths >= FIXED_SIZE) & (lengths <= room)
-    if not whole.all():
-        raise LogError(log_file.path, "a message index points to something that is not a message")
-
-
 @dataclass(frozen=True)
 class _Starts:
-    """Where the records of a topic start in a buffer; all heads lie in their blocks.
+    """Offsets of the records of a topic in a buffer; all heads are within their blocks.
 
     Attributes:
-        offsets: The starts in file order, shape (n,).
+        offsets: In file order, shape (n,).
         room: Bytes from the last start in a block to the block's end, in the block with the least.
-        counts: How many records each piece of the index lists, shape (k,), in file order.
-        ends: Where the payload of that piece's block ends, shape (k,).
+        counts: Number of records in each piece of the index, shape (k,), in file order.
+        ends: End of the payload of that piece's block, shape (k,).
     """
 
     offsets: IntArray
@@ -429,9 +402,9 @@ class _Starts:
 def _indexed(
     log_file: LogFile, placed: Sequence[Placed], wanted: Sequence[Sequence[int]]
 ) -> list[_Starts]:
-    """Where the records of each topic start, by the blocks' indexes."""
+    """Find the records of each topic in the blocks' indexes."""
     ids = list(itertools.chain.from_iterable(wanted))
-    indexes = [log_file.indexed(one.block, ids) for one in placed]
+    indexes = [log_file.source_of(one.block).indexed(one.block, ids) for one in placed]
     pieces: list[IntArray] = []
     blocks: list[int] = []
     limits = [0]  # of the topics, in pieces

@@ -17,28 +17,25 @@ from ..file.log_file import FilePages, new_pages
 _SHORT_NS = 2**31
 _LARGE = 4 << 20
 _STEPS = 16
-"""Pages of a large column are asked for in so many steps: a fault for each costs twice as much."""
+"""Steps in which pages of a large column are requested; page faults cost twice as much."""
 _STEP_SIZE = 1 << 18
-"""Bytes of a column that are asked for at once, at least: each call costs as much as some pages."""
+"""Fewest bytes of a column that are requested at once: a call costs as much as some pages."""
 _POPULATE_WRITE = 23
 """Linux's MADV_POPULATE_WRITE (5.14), which Python has no name for."""
 
 
 class ColumnStore:
-    """Rows of numbers, kept column by column: what is read of a log is used a column at a time.
-
-    Single bytes are kept row by row: they are text or records, not columns.
-    """
+    """Rows of numbers, stored column by column; single bytes (text, records) row by row."""
 
     def __init__(
         self, dtype: str, width: int, capacity: int, pages: FilePages | None = None
     ) -> None:
-        """Reserve memory; little of it is used before rows come.
+        """Reserve memory, which is used only as rows are added.
 
         Args:
             dtype: numpy type string of a number.
-            capacity: Rows to expect; more may come, at the price of a copy.
-            pages: Where a large column lies; None for memory.
+            capacity: Expected number of rows; more cost a copy.
+            pages: Storage of a large column in a file; None for memory.
         """
         self._pages = pages
         self._dtype = np.dtype(dtype)
@@ -95,7 +92,7 @@ class ColumnStore:
         return np.frombuffer(memory, dtype=self._dtype).reshape(shape)
 
     def _make_ready(self, stop: int) -> None:
-        """Ask for the pages of the next rows, ``stop`` of them and some more."""
+        """Request the pages of the rows up to ``stop`` and some more."""
         memory = self._memory
         if memory is None:
             return
@@ -109,7 +106,7 @@ class ColumnStore:
             start -= start % mmap.PAGESIZE
             try:
                 memory.madvise(_POPULATE_WRITE, start, end - start)
-            except OSError:  # an older kernel: then they come one by one, when they are used
+            except OSError:  # an older kernel: then each page is a fault
                 self._memory = None
                 return
 
@@ -118,10 +115,9 @@ class ColumnStore:
 
 
 class EchoColumn:
-    """A column that takes no memory as long as it repeats another one, row by row.
+    """A column that takes no memory as long as it is equal to another one.
 
-    All topics that one tick of a recorder writes have the same stamps, and an hour of a topic's
-    stamps takes 3 MB.
+    All topics of one tick of a recorder have the same stamps; an hour of stamps takes 3 MB.
     """
 
     def __init__(self, dtype: str, capacity: int, others: Sequence[EchoColumn] = ()) -> None:
@@ -129,7 +125,7 @@ class EchoColumn:
 
         Args:
             dtype: numpy type string of a number.
-            others: What it may repeat, if they have the same rows before it gets them.
+            others: Columns that it may be equal to, if they get the rows first.
         """
         self._dtype = dtype
         self._capacity = capacity
@@ -162,21 +158,14 @@ class EchoColumn:
         self._count, self._last = stop, (start, rows)
 
     def has(self, rows: NDArray[Any], start: int) -> bool:
-        """Whether some of its rows are these.
-
-        Args:
-            rows: Shape (n,).
-
-        Returns:
-            False where it has fewer rows, too.
-        """
+        """Whether its rows from ``start`` on are equal to ``rows``, shape (n,)."""
         if self._last is not None and self._last[1] is rows and self._last[0] == start:
             return True
         stop = start + len(rows)
         return self._count >= stop and np.array_equal(self.column()[start:stop], rows)
 
     def column(self) -> NDArray[Any]:
-        """All rows, shape (n,): a view, perhaps of the leader's."""
+        """All rows, shape (n,): a view, perhaps of another column."""
         if self._leader is not None:
             return self._leader.column()[: self._count]
         return np.empty(0, self._dtype) if self._own is None else self._own.column()
@@ -189,11 +178,11 @@ class EchoColumn:
 
 @dataclass(frozen=True)
 class Times:
-    """Times of some messages; nobody writes to the arrays.
+    """Times of some messages; the arrays are not written to.
 
     Attributes:
         log_ns: Log times [Unix ns], shape (n,).
-        stamp_ns: Stamps [ns], shape (n,); None where they have none.
+        stamp_ns: Stamps [ns], shape (n,); None without stamps.
         behind_ns: Log times minus stamps [ns], shape (n,); None without stamps.
         is_short: Whether those fit into 32 bits.
     """
@@ -205,7 +194,7 @@ class Times:
 
     @classmethod
     def of(cls, log_ns: IntArray, stamp_ns: IntArray) -> Self:
-        """Times of stamped messages.
+        """Return the times of stamped messages.
 
         Args:
             log_ns: Log times [Unix ns], shape (n,).
@@ -219,54 +208,46 @@ class Times:
 class TimeStore:
     """Stamps and log times of messages.
 
-    Log times are seldom wanted, so they are kept as their distance from the stamps, in 32 bits as
-    long as it is below 2 s.
+    Log times are rarely used, so they are stored as their difference from the stamps, in 32 bits
+    as long as it is below 2 s.
     """
 
     def __init__(self, capacity: int, *, stamped: bool, others: Sequence[TimeStore] = ()) -> None:
         """Start empty.
 
         Args:
-            stamped: Whether the messages have stamps; without, the log times stand for them.
-            others: Times of other topics, which may be the same.
+            stamped: Whether the messages have stamps; if not, log times are used for them.
+            others: Times of other topics, which may be equal.
         """
         self.is_stamped = stamped
-        self._stamps = EchoColumn("<i8", capacity, [other.stamp_column for other in others])
-        self._behind = EchoColumn("<i4", capacity, [other.behind_column for other in others])
+        self.stamp_column = EchoColumn("<i8", capacity, [other.stamp_column for other in others])
+        """Stamps, or log times without stamps."""
+        self.behind_column = EchoColumn("<i4", capacity, [other.behind_column for other in others])
+        """Log times minus stamps; empty without stamps."""
         self._is_short = True
-
-    @property
-    def stamp_column(self) -> EchoColumn:
-        """Where the stamps are."""
-        return self._stamps
-
-    @property
-    def behind_column(self) -> EchoColumn:
-        """Where log times minus stamps are; empty without stamps."""
-        return self._behind
 
     def append(self, times: Times) -> None:
         """Add messages."""
         if not self.is_stamped or times.stamp_ns is None or times.behind_ns is None:
-            self._stamps.append(times.log_ns)
+            self.stamp_column.append(times.log_ns)
             return
         if self._is_short and not times.is_short:
-            wide = EchoColumn("<i8", len(self._behind) + len(times.behind_ns))
-            wide.append(self._behind.column())
-            self._behind, self._is_short = wide, False
-        self._stamps.append(times.stamp_ns)
-        self._behind.append(times.behind_ns)
+            wide = EchoColumn("<i8", len(self.behind_column) + len(times.behind_ns))
+            wide.append(self.behind_column.column())
+            self.behind_column, self._is_short = wide, False
+        self.stamp_column.append(times.stamp_ns)
+        self.behind_column.append(times.behind_ns)
 
     def __len__(self) -> int:
         """Number of messages."""
-        return len(self._stamps)
+        return len(self.stamp_column)
 
     def stamps(self) -> IntArray:
         """Stamps [ns], shape (n,), or log times where there are none: a view."""
-        return self._stamps.column()
+        return self.stamp_column.column()
 
     def log(self) -> IntArray:
         """Log times [Unix ns], shape (n,)."""
         if not self.is_stamped:
-            return self._stamps.column()
-        return self._stamps.column() + self._behind.column()
+            return self.stamp_column.column()
+        return self.stamp_column.column() + self.behind_column.column()

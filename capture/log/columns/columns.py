@@ -1,10 +1,9 @@
 """Messages in bulk: all messages of a channel as columns, without a Python loop over them.
 
-Messages that share their length, strings and sequence lengths (:class:`.Layout`)
-have every number at the same place, so one numpy call takes one field of hundreds of them out of
-the payload, and another holds their strings against the layout's. So a bag with one message per
-servo costs as many layouts as servos, and a message of any other layout is still read right, only
-slower.
+Messages that share their length, strings and sequence lengths (:class:`.Layout`) have every number
+at the same offset, so one numpy call takes one field of hundreds of them out of the payload, and
+another compares their strings with the layout's. A bag with one message per servo has as many
+layouts as servos; many different layouts are read correctly, but slower.
 """
 
 from __future__ import annotations
@@ -17,20 +16,20 @@ import numpy as np
 from ...common.arrays import IntArray
 from ...common.errors import DataError
 from ..file.log_file import FilePages, LogFile
-from ..mcap.chunk import Buffer
-from ..mcap.records import BODY_AT, FIXED_SIZE, Places
+from ..mcap.chunk import PREFIX_SIZE, Buffer
+from ..mcap.records import BODY_AT, FIXED_SIZE, MESSAGE, Places
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import JOINT_STATE, MessageType
 from .blocks import Records, Window, blocks_in, record_batches
 from .buffers import TimeStore
 from .layouts import MOST_JOINT_LISTS, MOST_LAYOUTS, Group, LayoutSorter, Stamping
 
-_LENGTH_AT, _LOG_TIME_AT = 1, 15  # in a message record
+_LENGTH_AT = 1  # in a message record
 _MAX_SHARED = 8
 _HELD = 8
-"""Batches after which what was read is let go of, where columns lie in files."""
+"""Batches after which memory is released, if columns are in files."""
 _EXPANSION = 64
-"""No more memory is reserved than this many times the bytes in the file; more may be used."""
+"""Memory is reserved for at most this many times the bytes in the file; more may be used."""
 
 
 @dataclass
@@ -44,12 +43,12 @@ class Unread:
 
 @dataclass(frozen=True)
 class Request:
-    """What to read of one topic.
+    """A request to read one topic.
 
     Attributes:
         channel_ids: The topic's channels.
         paths: Leaf paths to keep; None for all.
-        layouts: One of each length that was seen before, by length; new ones are noted.
+        layouts: A known layout of each message length; new ones are added.
     """
 
     topic: str
@@ -59,10 +58,10 @@ class Request:
     layouts: dict[int, Layout] = field(default_factory=dict[int, Layout])
 
     def layout(self, message: bytes) -> Layout:
-        """Return the layout of a message, found anew unless it is that of an earlier reading.
+        """Return the layout of a message, a known one if it fits.
 
         Raises:
-            DataError: If it has none.
+            DataError: If it has no layout.
         """
         known = self.layouts.get(len(message))
         if known is not None and known.fits(message):
@@ -79,7 +78,7 @@ class Messages:
 
     Attributes:
         groups: By layout, in order of first appearance.
-        unread: Those that have no layout.
+        unread: Messages without a layout.
     """
 
     groups: list[Group]
@@ -97,13 +96,13 @@ def read_messages(
     """Read several topics in one pass over the file: each chunk is decompressed once.
 
     Args:
-        requests: What to read, one a topic.
+        requests: One per topic.
         window_ns: Half-open window of log times [Unix ns]; None for open ends.
-        warn: Takes one sentence for each block that couldn't be read.
-        threads: How many decompress the blocks.
+        warn: Called with one sentence for each unreadable block.
+        threads: Number of decompressing threads.
 
     Returns:
-        The messages, one entry a request.
+        The messages, one entry per request.
 
     Raises:
         DataError: If a topic of JointStates has more than :data:`MOST_JOINT_LISTS` lists of joints.
@@ -135,7 +134,7 @@ def read_messages(
 
 
 def _expected(log_file: LogFile, request: Request, blocks: int) -> int:
-    """How many messages to expect of so many blocks."""
+    """Return the expected number of messages in a number of blocks."""
     counted = sum(log_file.counts.get(channel_id, 0) for channel_id in request.channel_ids)
     part = blocks / max(len(log_file.blocks), 1)
     return int(counted * min(part, 1.0)) + 1
@@ -147,31 +146,26 @@ def message_blocks(
     window_ns: Window,
     warn: Callable[[str], None],
 ) -> Iterator[tuple[Buffer, IntArray]]:
-    """The payloads that hold messages of one topic, with the offsets of their records.
+    """Yield the payloads that hold messages of one topic, with the offsets of their records.
 
     Args:
         channel_ids: The topic's channels.
-        window_ns: Blocks wholly outside this window of log times are passed over.
-        warn: Takes one sentence for each block that couldn't be read.
+        window_ns: Blocks wholly outside this window of log times are skipped.
+        warn: Called with one sentence for each unreadable block.
 
     Yields:
-        Payload, to be used before the next is asked for, and checked record offsets, shape (n,).
+        Payload, valid until the next iteration, and checked record offsets, shape (n,).
     """
-    for block in blocks_in(log_file, window_ns):  # one by one: who wants the first wants no more
+    for block in blocks_in(log_file, window_ns):  # one by one, since often only the first is used
         for data, (records,) in record_batches(log_file, [channel_ids], [block], warn):
             if len(records.offsets):
                 yield data, records.offsets
 
 
 def message_bytes(data: Buffer, offset: int) -> tuple[int, bytes]:
-    """One message record's log time and message.
-
-    Returns:
-        Log time [Unix ns] and the message's bytes.
-    """
-    length = int.from_bytes(data[offset + _LENGTH_AT : offset + 9], "little") - FIXED_SIZE
-    log_ns = int.from_bytes(data[offset + _LOG_TIME_AT : offset + 23], "little")
-    return log_ns, bytes(data[offset + BODY_AT : offset + BODY_AT + length])
+    """Return the log time [Unix ns] and the bytes of the message of a record."""
+    _, length, _, _, log_ns, _ = MESSAGE.unpack_from(data, offset)
+    return log_ns, bytes(data[offset + BODY_AT : offset + PREFIX_SIZE + length])
 
 
 class _GroupReader:
@@ -226,7 +220,7 @@ class _GroupReader:
             self._sort_in(length, places.take(rows), log_ns[rows], first + rows)
 
     def _sort_in(self, length: int, places: Places, log_ns: IntArray, order: IntArray) -> None:
-        """Take messages of one length, whatever their layouts."""
+        """Add messages of one length and any layouts."""
         matrix = places.rows(np.dtype(np.uint8), length, 0)
         for rows, layout, number, _ in self._sorter.sort(matrix):
             if isinstance(layout, DataError):
@@ -240,28 +234,26 @@ class _GroupReader:
             self.groups[number].take(places.take(rows), log_ns[rows], order[rows])
 
     def _group(self, layout: Layout, capacity: int) -> Group:
-        """A new group; the first of a topic may have the times of another topic's first."""
+        """Return a new group; the first one of a topic may share the times of another topic."""
         if self._most is not None and len(self.groups) >= self._most:
             raise DataError(
                 f"{self._topic} has more than {self._most} different lists of joints or frame "
                 "ids; give each robot a topic of its own"
             )
-        if self.groups:
-            return self._new_group(layout, capacity)
-        group = self._new_group(layout, capacity, tuple(self._shared))
-        if len(self._shared) < _MAX_SHARED:
+        group = Group(
+            layout,
+            self._paths,
+            capacity,
+            () if self.groups else tuple(self._shared),
+            stamping=self._stamping,
+            pages=self._pages,
+        )
+        if not self.groups and len(self._shared) < _MAX_SHARED:
             self._shared.append(group.kept_times)
         return group
 
-    def _new_group(
-        self, layout: Layout, capacity: int, others: tuple[TimeStore, ...] = ()
-    ) -> Group:
-        return Group(
-            layout, self._paths, capacity, others, stamping=self._stamping, pages=self._pages
-        )
-
     def _capacity(self, length: int, seen: int) -> int:
-        """Room for a group: all that is expected for the first, and what a file of its size has."""
+        """Return the capacity of a group: for the first one all expected messages of the topic."""
         if self.groups:
             return 2 * seen
         return max(seen, min(self._expected, self._reserve // max(length, 1)))

@@ -1,8 +1,8 @@
 """Messages of one type sorted by layout, and the fields that a layout has in many of them.
 
 Messages that share their length, strings and sequence lengths (:class:`.Layout`) have every number
-at the same place. So they are sorted with one comparison for each layout, and one numpy call takes
-a field of all of them.
+at the same offset. So one comparison for each layout sorts them, and one numpy call reads a field
+of all of them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .buffers import ColumnStore, Times, TimeStore
 
 MOST_LAYOUTS = 64
 MOST_JOINT_LISTS = 256
-"""Lists of joints (with frame id) of one topic: each takes the time of many usual messages."""
+"""Most lists of joints (with frame id) of one topic: each costs as much as many messages."""
 
 TIME = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
 """A ``builtin_interfaces/msg/Time`` in a message."""
@@ -37,10 +37,10 @@ class Part(NamedTuple):
     """Messages of one layout.
 
     Attributes:
-        rows: Which of the messages, shape (k,), in their order.
-        layout: Their layout; of a message that has none (big-endian, ``wstring``, damaged), the
+        rows: Rows of the messages, shape (k,), increasing.
+        layout: Their layout; for a message without one (big-endian, ``wstring``, damaged), the
             reason.
-        number: How many layouts were found before this one.
+        number: Number of layouts found before this one.
         is_kept: Whether later messages are compared with the layout.
     """
 
@@ -63,8 +63,8 @@ class LayoutSorter:
         """Start without layouts.
 
         Args:
-            find: Finds the layout of a message, or raises DataError.
-            most: How many layouts are kept.
+            find: Returns the layout of a message, or raises DataError.
+            most: Largest number of layouts that are kept.
             in_all: Whether ``most`` counts all layouts, instead of those of each length.
         """
         self.is_full = False
@@ -80,9 +80,9 @@ class LayoutSorter:
             matrix: The messages, shape (n, length).
 
         Yields:
-            Parts that have each message once: those of known layouts in the order in which these
-            were found, then the others. A message without a layout is a part of its own, and so is
-            one whose layout is not kept, since text may have as many layouts as messages.
+            Parts with each message once: those of known layouts in the order in which these were
+            found, then the others. A message without a layout is a part of its own, and so is one
+            whose layout is not kept, since text may have as many layouts as messages.
         """
         kept = self._kept.setdefault(matrix.shape[1], [])
         rows = np.arange(len(matrix))
@@ -116,7 +116,7 @@ class LayoutSorter:
 
 
 def _fits(matrix: Matrix, layout: Layout) -> NDArray[np.bool_]:
-    """Which messages of a layout's length have its strings and sequence lengths, shape (n,)."""
+    """Whether each message has the strings and sequence lengths of a layout, shape (n,)."""
     example = np.frombuffer(layout.example, dtype=np.uint8)
     equal = [matrix[:, start:stop] == example[start:stop] for start, stop in layout.hull]
     fits = np.ones(len(matrix), dtype=bool)
@@ -155,7 +155,7 @@ def values_of(layout: Layout, path: str, matrix: Matrix) -> NDArray[Any]:
 
 
 def stamp_leaves(layout: Layout) -> tuple[Leaf, Leaf] | None:
-    """Return where a layout has its stamp: seconds and nanoseconds; None without a stamp."""
+    """Return the leaves of a layout's stamp: seconds and nanoseconds; None without a stamp."""
     leaves = layout.leaves
     for sec, nanosec in _STAMPS:
         if sec in leaves and nanosec in leaves:
@@ -188,31 +188,26 @@ def time_ns(sec: NDArray[Any], nanosec: NDArray[Any]) -> IntArray:
 
 
 _COMPARED = 1 << 17
-"""Bytes of constant parts that are compared at once: few enough to stay in the cache."""
+"""Bytes of constant parts that are compared at once: they stay in the cache."""
 
 
 class Stamping:
-    """Times of messages by their stamps; those of the last messages are kept.
+    """Computes times of messages from their stamps, and caches the last ones.
 
-    All topics that one tick of a recorder writes have the same stamps and log times: then nothing
-    is to be worked out, and who has them twice need not compare them.
+    All topics of one tick of a recorder have the same stamps and log times, and share the result.
     """
 
     def __init__(self) -> None:
-        """Start with no messages."""
+        """Start with an empty cache."""
         self._raw: NDArray[Any] = np.empty(0, dtype="<i8")
         self._times: Times | None = None
 
     def times(self, places: Places, log_ns: IntArray, stamp: tuple[Leaf, Leaf]) -> Times:
-        """Times of messages.
+        """Return the times of n messages; the cached object if they are equal.
 
         Args:
-            places: Where they start, n of them.
-            log_ns: Their log times [Unix ns], shape (n,); never written to afterwards.
-            stamp: Where their stamps are: seconds and nanoseconds.
-
-        Returns:
-            The times; the very same as before if they are equal.
+            log_ns: Log times [Unix ns], shape (n,); must not be written to afterwards.
+            stamp: Leaves of the stamps: seconds and nanoseconds.
         """
         seconds, rest = stamp
         pair = (seconds.dtype, rest.dtype, rest.offset - seconds.offset)
@@ -238,7 +233,7 @@ class Group:
 
     Attributes:
         is_stamped: Whether they have a stamp.
-        strings: The strings that are wanted, by path.
+        strings: The requested strings, by path.
     """
 
     def __init__(
@@ -255,9 +250,9 @@ class Group:
 
         Args:
             paths: Leaf paths to keep; None for all. A stamp is kept as a time, not as a leaf.
-            others: Times of other topics, which may be the same.
-            stamping: What works out the times, of other topics too; None for one of its own.
-            pages: Where large columns lie; None for memory.
+            others: Times of other topics, which may be equal.
+            stamping: Shared with other topics; None for a new one.
+            pages: Storage of large columns in files; None for memory.
         """
         self.layout = layout
         self._stamping = stamping or Stamping()
@@ -287,41 +282,37 @@ class Group:
 
     @property
     def paths(self) -> tuple[str, ...]:
-        """Leaf paths that are kept, in wire order, without the stamp's."""
+        """Leaf paths in wire order, without the stamp."""
         return tuple(self._columns)
 
     def times(self) -> IntArray:
-        """Log times of all its messages [Unix ns], shape (n,)."""
+        """Return the log times of all messages [Unix ns], shape (n,)."""
         return self.kept_times.log()
 
     def stamps(self) -> IntArray:
-        """Stamps of all its messages [ns], shape (n,), or log times where they have none."""
+        """Return the stamps of all messages [ns], shape (n,), or log times without stamps."""
         return self.kept_times.stamps()
 
     def order(self) -> IntArray:
-        """Place of each message among all of the topic, in file order, shape (n,)."""
+        """Return the position of each message among the topic's in file order, shape (n,)."""
         return np.concatenate([np.arange(0), *(np.asarray(part) for part in self._order)])
 
     def values(self, path: str) -> NDArray[Any]:
-        """All values of one field.
+        """Return all values of one field.
 
         Args:
             path: Leaf path, e.g. ``position``.
 
         Returns:
-            Shape (n, count), each column contiguous (bytes: each row); (n, 0) where the layout has
-            no such leaf.
+            Shape (n, count), each column contiguous (bytes: each row); (n, 0) if the layout has no
+            such leaf.
         """
         if path not in self._columns:
             return np.empty((len(self), 0), dtype=np.float64)
         return self._columns[path].values()
 
     def holds(self, places: Places) -> bool:
-        """Whether messages have this layout: the quick check, for messages of its length.
-
-        Returns:
-            True if all do; False if some don't, or differ in padding.
-        """
+        """Whether all messages, which have its length, have this layout and equal padding."""
         for k, (start, run) in enumerate(self._hull):
             count = _COMPARED // run.itemsize + 1
             if not self._tiles[k]:
@@ -333,12 +324,11 @@ class Group:
         return True
 
     def take(self, places: Places, log_ns: IntArray, order: IntArray | range) -> None:
-        """Copy messages of this layout.
+        """Copy n messages of this layout.
 
         Args:
-            places: Where they start, n of them.
-            log_ns: Their log times [Unix ns], shape (n,).
-            order: Their places in the topic, n of them.
+            log_ns: Log times [Unix ns], shape (n,).
+            order: Positions in the topic, n of them.
         """
         self._order.append(order)
         if self._stamp:

@@ -32,7 +32,7 @@ class Channel:
         topic: E.g. ``/joint_states``.
         type_name: E.g. ``sensor_msgs/msg/JointState``.
         metadata: Of the channel, e.g. ``unit``.
-        encoding: Of its messages, e.g. ``cdr``; ``json``, ``protobuf`` or ``ros1`` in other makes.
+        encoding: Of its messages, e.g. ``cdr``, ``json`` or ``protobuf``.
         schema_encoding: E.g. ``ros2msg``; empty without a schema.
     """
 
@@ -45,7 +45,7 @@ class Channel:
 
     @property
     def is_ros2(self) -> bool:
-        """Whether its messages are of ROS 2, which can be read."""
+        """Whether its messages are of ROS 2 and can be read."""
         return (self.encoding, self.schema_encoding) == (_ENCODING, _SCHEMA_ENCODING)
 
 
@@ -56,8 +56,8 @@ class Topics:
         """Sort the file's channels by topic.
 
         Args:
-            warn: Takes one sentence for each irregularity.
-            threads: How many decompress what is read.
+            warn: Called with one sentence for each irregularity.
+            threads: Number of decompressing threads.
         """
         self._file = log_file
         self._threads = threads
@@ -105,11 +105,11 @@ class Topics:
 
     @property
     def is_ours(self) -> bool:
-        """Whether undulog wrote the file: then its log times follow the stamps closely."""
+        """Whether undulog wrote the file, so that its log times are close to the stamps."""
         return self._file.library.startswith("undulog/")
 
     def message_type(self, topic: str) -> MessageType:
-        """The type of a topic's messages.
+        """Return the type of a topic's messages.
 
         Raises:
             MissingChannelError: If the log has no such topic.
@@ -128,10 +128,7 @@ class Topics:
         return kind
 
     def first(self, topic: str) -> tuple[int, bytes, MessageType] | None:
-        """The first message of a topic.
-
-        Returns:
-            Log time [Unix ns], bytes and type; None where there is none.
+        """Return the first message of a topic: log time [Unix ns], bytes and type; None if empty.
 
         Raises:
             MissingChannelError: If the log has no such topic.
@@ -143,7 +140,7 @@ class Topics:
         return None
 
     def raw(self, topic: str, window_ns: Window = (None, None)) -> Iterator[tuple[int, bytes]]:
-        """The messages of a topic as bytes, in the order of the file.
+        """Yield the messages of a topic as bytes, in the order of the file.
 
         Args:
             window_ns: Half-open window of log times [Unix ns]; None for open ends.
@@ -166,7 +163,7 @@ class Topics:
                     yield log_ns, message
 
     def decoder(self, topic: str) -> Callable[[bytes], Any]:
-        """The general decoder of a topic, for messages of any shape.
+        """Return the general decoder of a topic, for messages of any shape.
 
         Returns:
             A function from bytes to a message with fields as attributes; it raises DataError for a
@@ -179,7 +176,7 @@ class Topics:
         from mcap_ros2.decoder import DecoderFactory
 
         schema = self._schema(topic)
-        self.message_type(topic)  # ours says more of a damaged schema, and says it once
+        self.message_type(topic)  # its error for a damaged schema is more precise
         where = f"{self._file.path}: {topic}"
         try:
             with redirect_stderr(StringIO()):  # its parser prints what it raises

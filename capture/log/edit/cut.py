@@ -1,9 +1,9 @@
-"""Cut a log: the messages of a window and some topics, and everything that explains them.
+"""Cut a log: the messages of a window and some topics, with all definitions and records.
 
-A topic that speaks only when something changes (``/gait/mode``, ``/robot_description``,
-``/tf_static``) has often said its last word before the window. A cut holds the window and nothing
-else, so that cuts laid side by side make the whole again; it says which words are missing, and
-copies them to its start on request, as ROS hands a latched message to a late subscriber.
+The last message of a latched topic (``/gait/mode``, ``/robot_description``, ``/tf_static``) is
+often before the window. A cut holds only the messages of the window, so that consecutive cuts can
+be merged to the whole again. It lists the latched messages before it and copies them to its start
+on request, as ROS sends a latched message to a late subscriber.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from pathlib import Path
 
 from mcap.records import Channel
 
-from ...common.console import progress
 from ...common.errors import DataError, MissingChannelError, UsageError
 from ...common.process import StopRequest
 from ..messages.definitions import adds_up, is_latched
@@ -31,12 +30,10 @@ from .edited_log import (
     edited_log,
     portable,
     refuse_output,
-    refuse_stopped,
 )
 from .raw_messages import RawLog, RawMessage
 
 _FOREVER_NS = 2**64
-_LOOK_EVERY = 1024
 
 
 def cut_log(
@@ -60,11 +57,11 @@ def cut_log(
         carry_state: Copy the last earlier message of each latched topic to the start.
 
     Raises:
-        UsageError: If the window is empty, or the output can't be that.
+        UsageError: If the window is empty, or the output is not possible.
         MissingChannelError: If the log has no such topic.
         DataError: If no message is in the window.
         LogError: If the log can't be read or the new one can't be written.
-        UndulogError: If a stop was requested; nothing is left behind then.
+        UndulogError: If a stop was requested; no file is left then.
     """
     _check_window(start_s, stop_s)
     refuse_output(output, [path], force=force)
@@ -80,7 +77,13 @@ def cut_log(
             _copy_records(source, log)
             for message in state if carry_state else []:
                 log.write(ids[message.channel_id], message, start_ns)
-            copied = _copy_window(source, log, ids, (start_ns, stop_ns), stop)
+            messages = source.messages(ids, start_ns, stop_ns)
+            copied = log.write_all(
+                f"cutting {path.name}",
+                ((ids[message.channel_id], message) for message in messages),
+                (start_ns, min(stop_ns, source.end_ns)),
+                stop,
+            )
             if log.first_ns is None or not copied:
                 raise DataError(_nothing(source, topics, start_s, stop_s))
             carried = {source.file.channels[m.channel_id].topic: m.log_time_ns for m in state}
@@ -99,12 +102,9 @@ def cut_log(
                 "warnings": portable(source.warnings, [source]),
             }
             log.note(EDIT_RECORD, facts)
-            for record in source.metadata:
-                if record.name == HEALTH_RECORD:  # last, as the contract has it
-                    log.note(record.name, record.metadata)
+            log.copy_health(source)
     notes = [] if carry_state else _left_behind(source, state, start_ns)
     return EditReport(
-        verb="cut",
         output=output,
         sources=[{"path": str(path), "session_id": source.session_id, "sha256": source.sha256}],
         start_ns=log.first_ns,
@@ -133,7 +133,7 @@ def _nothing(source: RawLog, topics: Sequence[str], start_s: float, stop_s: floa
 
 
 def _channels(source: RawLog, topics: Sequence[str]) -> list[Channel]:
-    """The channels whose topics are wanted, in the order of the file."""
+    """Return the channels of the requested topics, in the order of the file."""
     every = list(source.file.channels.values())
     for pattern in topics:
         if not any(fnmatchcase(channel.topic, pattern) for channel in every):
@@ -147,9 +147,9 @@ def _channels(source: RawLog, topics: Sequence[str]) -> list[Channel]:
 
 
 def _state_before(source: RawLog, latched: Collection[Channel], start_ns: int) -> list[RawMessage]:
-    """The last message of each latched channel before a time, in order of time.
+    """Return the last message of each latched channel before a time, in order of time.
 
-    Static transforms add up, each message holding some of them: every different one counts.
+    Of static transforms every different message, since each holds some of them.
     """
     if start_ns <= source.start_ns:
         return []
@@ -170,12 +170,12 @@ def _left_behind(source: RawLog, state: Sequence[RawMessage], start_ns: int) -> 
         source.file.channels[message.channel_id].topic: (start_ns - message.log_time_ns) / NS
         for message in state
     }
-    said = (f"{topic} ({before:.2f} s earlier)" for topic, before in earlier_s.items())
-    return [f"left before the cut, though in force: {', '.join(said)}; --carry-state copies them"]
+    texts = (f"{topic} ({before:.2f} s earlier)" for topic, before in earlier_s.items())
+    return [f"left before the cut, though in force: {', '.join(texts)}; --carry-state copies them"]
 
 
 def _copy_records(source: RawLog, log: EditedLog) -> None:
-    """Copy metadata and attachments; an earlier edit's record steps aside for the new one."""
+    """Copy metadata and attachments; an earlier edit's record is renamed."""
     records = source.metadata
     taken = {record.name for record in records} | {EDIT_RECORD}
     for record in records:
@@ -188,24 +188,3 @@ def _copy_records(source: RawLog, log: EditedLog) -> None:
         log.note(name, record.metadata)
     for attachment in source.attachments:
         log.attach(attachment, attachment.name)
-
-
-def _copy_window(
-    source: RawLog,
-    log: EditedLog,
-    ids: dict[int, int],
-    window_ns: tuple[int, int],
-    stop: StopRequest,
-) -> int:
-    """Copy the messages of the window; returns how many."""
-    start_ns, stop_ns = window_ns
-    copied = 0
-    total_s = (min(stop_ns, source.end_ns) - start_ns) / NS
-    with progress(f"cutting {source.path.name}", total_s) as bar:
-        for message in source.messages(ids, start_ns, stop_ns):
-            log.write(ids[message.channel_id], message)
-            copied += 1
-            if copied % _LOOK_EVERY == 1:
-                refuse_stopped(stop)
-                bar.update((message.log_time_ns - start_ns) / NS)
-    return copied

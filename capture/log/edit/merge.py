@@ -1,16 +1,13 @@
 """Merge logs: all messages of several logs in one, interleaved by log time.
 
-A topic of the same type in several logs becomes one topic. Of what explains the logs, the same is
-kept once and the different under different names; the sources' ids and hashes are kept.
+A topic of the same type in several logs becomes one topic. Equal metadata records and attachments
+are kept once, different ones under different names; the sources' ids and hashes are kept. The
+record ``undulog`` keeps the facts that are equal in all logs (those of each log are in
+``undulog.source.N``), ``undulog.health`` the worst verdict.
 
-The order: by log time, and of equal times the log that was named first. A log whose own messages
-are not in order of time keeps its order, so that memory holds one chunk a log; readers of MCAP
-sort by log time anyway.
-
-What explains merged logs: metadata and attachments, the same once, the different apart.
-
-The records that have a meaning here are merged by it: ``undulog`` keeps the facts that all logs
-agree on (each log's own are then in ``undulog.source.N``), ``undulog.health`` the worst verdict.
+Messages are ordered by log time, those of equal times by the order of the logs. A log whose own
+messages are not in order of time keeps its order, so that memory holds one chunk per log; readers
+of MCAP sort by log time.
 """
 
 from __future__ import annotations
@@ -28,7 +25,6 @@ from typing import cast
 
 from mcap.records import Schema
 
-from ...common.console import progress
 from ...common.errors import DataError, UsageError
 from ...common.process import StopRequest
 from ..columns.layouts import names_of
@@ -46,7 +42,6 @@ from .edited_log import (
     free_name,
     portable,
     refuse_output,
-    refuse_stopped,
 )
 from .raw_messages import RawLog, RawMessage
 
@@ -62,11 +57,11 @@ def copy_records(
     """Copy metadata and attachments.
 
     Args:
-        robot: The robot that the merged session is of; empty where no log says one.
-        warnings: Takes one sentence for each thing that had to be renamed.
+        robot: The robot of the merged session; empty if no log names one.
+        warnings: Gets one sentence for each renamed record.
 
     Returns:
-        The records to be written at the end, with name and entries.
+        The records for the end, with name and entries.
     """
     # The records of the robot that the session is of come first: they keep their names.
     ordered = sorted(sources, key=lambda source: bool(robot) and source.robot != robot)
@@ -119,7 +114,7 @@ def _merged_metadata(
 
 
 def _merged_session(sources: Sequence[RawLog], robot: str) -> dict[str, str]:
-    """The facts that the logs agree on; an id of their own where they are of several sessions."""
+    """Return the facts that are equal in all logs, with a new id for logs of several sessions."""
     stated = [facts for s in sources if (facts := s.file.metadata.get(_SESSION_RECORD))]
     every = {key: [f[key] for f in stated if key in f] for f in stated for key in f}
     facts = {key: values[0] for key, values in every.items() if len(set(values)) == 1}
@@ -134,7 +129,7 @@ def _merged_session(sources: Sequence[RawLog], robot: str) -> dict[str, str]:
 
 
 def _merged_health(sources: Sequence[RawLog]) -> dict[str, str]:
-    """The worst verdict, and everybody's reasons."""
+    """Return the worst verdict, and the reasons of all logs."""
     stated = {
         source: facts for source in sources if (facts := source.file.metadata.get(HEALTH_RECORD))
     }
@@ -171,7 +166,6 @@ day's session, or a clock was wrong."""
 
 _LATER_S = 60.0
 _FOREVER_NS = 2**64
-_LOOK_EVERY = 1024
 
 
 def merge_logs(
@@ -187,16 +181,16 @@ def merge_logs(
 
     Args:
         paths: The logs, two or more.
-        robot: The robot that the merged session is of, where the logs are of different ones.
+        robot: The robot of the merged session, for logs of different robots.
         apart: Merge logs with more than :data:`LONGEST_MERGE_GAP_S` between them.
 
     Raises:
         UsageError: If there are fewer than two logs, one is given twice, they are of different
             robots and ``robot`` names none of them, they lie far apart in time and ``apart`` is
-            not given, or the output can't be that.
+            not given, or the output is not possible.
         DataError: If a topic has different types or units in two logs, or there is no message.
         LogError: If a log can't be read or the new one can't be written.
-        UndulogError: If a stop was requested; nothing is left behind then.
+        UndulogError: If a stop was requested; no file is left then.
     """
     if len(paths) < 2:
         raise UsageError("a merge needs two logs or more")
@@ -211,7 +205,15 @@ def merge_logs(
         warnings += _mixed(sources)
         with edited_log(sources, output, force=force, stop=stop) as log:
             last = copy_records(sources, log, of_robot, warnings)
-            _copy_messages(sources, log, stop)
+            merged = heapq.merge(
+                *(_in_order(source, log) for source in sources), key=lambda entry: entry[0]
+            )
+            log.write_all(
+                f"merging {len(sources)} logs",
+                ((channel_id, message) for _, channel_id, message in merged),
+                (min(each.start_ns for each in sources), max(each.end_ns for each in sources)),
+                stop,
+            )
             if log.first_ns is None:
                 raise DataError(f"there is no message in {', '.join(map(str, paths))}")
             warnings += [sentence for source in sources for sentence in source.warnings]
@@ -227,7 +229,6 @@ def merge_logs(
             for name, entries in [(EDIT_RECORD, facts), *last]:
                 log.note(name, entries)
     return EditReport(
-        verb="merge",
         output=output,
         sources=[
             {"path": str(source.path), "session_id": source.session_id, "sha256": source.sha256}
@@ -246,14 +247,14 @@ def _refuse_twice(sources: Sequence[RawLog]) -> None:
             raise UsageError(f"{one.path} and {other.path} are the same log, byte for byte")
 
 
-def _common_robot(sources: Sequence[RawLog], told: str | None) -> str:
-    """The robot that the merged session is of; empty where no log says one."""
+def _common_robot(sources: Sequence[RawLog], chosen: str | None) -> str:
+    """Return the robot of the merged session; empty if no log names one."""
     robots = {source.robot: source.path for source in reversed(sources) if source.robot}
-    if told is not None:
-        if told not in robots:
+    if chosen is not None:
+        if chosen not in robots:
             there = ", ".join(sorted(robots)) or "none"
-            raise UsageError(f"--robot {told}: the logs' robots are: {there}")
-        return told
+            raise UsageError(f"--robot {chosen}: the logs' robots are: {there}")
+        return chosen
     if len(robots) > 1:
         listed = ", ".join(f"{name} ({path})" for name, path in reversed(robots.items()))
         raise UsageError(
@@ -264,7 +265,7 @@ def _common_robot(sources: Sequence[RawLog], told: str | None) -> str:
 
 
 def _refuse_other_types(sources: Sequence[RawLog]) -> None:
-    """Refuse topics whose messages would be read wrong under one name."""
+    """Refuse topics of one name with different types or units."""
     faults: list[str] = []
     for (one, kinds), (other, others) in combinations(
         [(each, _kinds(each)) for each in sources], 2
@@ -288,10 +289,10 @@ def _refuse_other_types(sources: Sequence[RawLog]) -> None:
 
 @dataclass
 class _Kind:
-    """How a topic's messages are to be read; one entry each, unless the log itself is at odds.
+    """Types and units of a topic; one entry each, unless the log is inconsistent.
 
     Attributes:
-        names: Types, with their encoding where it is not that of ROS 2.
+        names: Types, with their encoding if it is not that of ROS 2.
     """
 
     names: set[str] = field(default_factory=set[str])
@@ -315,7 +316,7 @@ def _kinds(source: RawLog) -> dict[str, _Kind]:
 
 
 def _definition(schema: Schema) -> object:
-    """A message definition that can be compared: comments and spaces don't matter."""
+    """Return a message definition for comparison, without comments and spaces."""
     if schema.encoding == "ros2msg":
         with suppress(DataError):  # what can't be parsed is compared as bytes
             return parse_message_type(schema.name, schema.data.decode("utf-8", "replace"))
@@ -323,8 +324,8 @@ def _definition(schema: Schema) -> object:
 
 
 def _other_robots(sources: Sequence[RawLog], robot: str) -> list[str]:
-    """Warn of logs that are not, or seem not to be, of the merged session's robot."""
-    said = [
+    """Warn of logs that are not, or probably not, of the merged session's robot."""
+    warnings = [
         f"{source.path} is of {source.robot}, not of {robot}: its messages are merged all the same"
         for source in sources
         if source.robot and source.robot != robot
@@ -333,19 +334,19 @@ def _other_robots(sources: Sequence[RawLog], robot: str) -> list[str]:
     for (one, names), (other, others) in combinations(joints, 2):
         unstated = not one.robot or not other.robot
         if unstated and names and others and names.isdisjoint(others):
-            said.append(
+            warnings.append(
                 f"{one.path} has {_listed(names)}, {other.path} has {_listed(others)}: no joint "
                 "is in both, are they of one robot?"
             )
-    return said
+    return warnings
 
 
 def _joint_names(source: RawLog) -> set[str]:
-    """The joints that the first message of each JointState topic names."""
+    """Return the joints in the first message of each JointState topic."""
     topics, found = Topics(source.file, source.warn), set[str]()
     for topic, channel in topics.channels.items():
         if channel.type_name == JOINT_STATE and channel.is_ros2 and channel.count:
-            with suppress(DataError):  # damage has no names; whoever reads the topic is told
+            with suppress(DataError):  # of a damaged message
                 first = topics.first(topic)
                 found.update(() if first is None else names_of(layout_of(first[2], first[1])))
     return found
@@ -358,7 +359,7 @@ def _listed(names: set[str]) -> str:
 
 def _apart(sources: Sequence[RawLog], *, allowed: bool) -> list[str]:
     """Warn of logs with time between them, and refuse those that are far apart."""
-    said: list[str] = []
+    warnings: list[str] = []
     ordered = sorted((each for each in sources if each.end_ns), key=lambda each: each.start_ns)
     for k, later in enumerate(ordered[1:], start=1):
         earlier = max(ordered[:k], key=lambda each: each.end_ns)
@@ -367,8 +368,8 @@ def _apart(sources: Sequence[RawLog], *, allowed: bool) -> list[str]:
         if gap_s > LONGEST_MERGE_GAP_S and not allowed:
             raise UsageError(f"{sentence}: not one session; --apart merges them all the same")
         if gap_s > _LATER_S:
-            said.append(sentence)
-    return said
+            warnings.append(sentence)
+    return warnings
 
 
 def _span(seconds: float) -> str:
@@ -380,37 +381,23 @@ def _span(seconds: float) -> str:
 
 def _mixed(sources: Sequence[RawLog]) -> list[str]:
     """Warn of logs that hold the same topics at the same times."""
-    said: list[str] = []
+    warnings: list[str] = []
     for one, other in combinations(sources, 2):
         start, stop = max(one.start_ns, other.start_ns), min(one.end_ns, other.end_ns)
         topics = {c.topic for c in one.file.channels.values() if one.file.counts.get(c.id)} & {
             c.topic for c in other.file.channels.values() if other.file.counts.get(c.id)
         }
         if start <= stop and topics:
-            said.append(
+            warnings.append(
                 f"{one.path} and {other.path} overlap by {(stop - start) / NS:.2f} s and share "
                 f"{len(topics)} topics ({', '.join(sorted(topics)[:3])}"
                 f"{', ...' if len(topics) > 3 else ''}): their messages are mixed"
             )
-    return said
-
-
-def _copy_messages(sources: Sequence[RawLog], log: EditedLog, stop: StopRequest) -> None:
-    start_ns = min(source.start_ns for source in sources)
-    total_s = (max(source.end_ns for source in sources) - start_ns) / NS
-    merged = heapq.merge(
-        *(_in_order(source, log) for source in sources), key=lambda entry: entry[0]
-    )
-    with progress(f"merging {len(sources)} logs", total_s) as bar:
-        for k, (t_ns, channel_id, message) in enumerate(merged):
-            log.write(channel_id, message)
-            if k % _LOOK_EVERY == 0:
-                refuse_stopped(stop)
-                bar.update((t_ns - start_ns) / NS)
+    return warnings
 
 
 def _in_order(source: RawLog, log: EditedLog) -> Iterator[tuple[int, int, RawMessage]]:
-    """Latest log time so far, new channel id and message, in the order of the file."""
+    """Yield latest log time so far, new channel id and message, in the order of the file."""
     ids = {c.id: log.channel(source, c) for c in source.file.channels.values()}
     latest_ns = 0
     for message in source.messages(ids, 0, _FOREVER_NS):

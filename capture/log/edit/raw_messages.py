@@ -1,6 +1,6 @@
-"""A log as messages of bytes: nothing is decoded, block after block, one chunk in memory.
+"""A log as undecoded messages, block after block, with one chunk in memory.
 
-What can't be read is left out and said in the log's warnings.
+Unreadable parts are left out and listed in the log's warnings.
 
 Format: https://mcap.dev/spec.
 """
@@ -20,7 +20,7 @@ from mcap.records import Attachment, Channel, Metadata
 from ...common.errors import LogError
 from ...common.strict_table import read_toml
 from ..file.log_file import LogFile
-from ..mcap.chunk import PREFIX_SIZE, Block, Buffer
+from ..mcap.chunk import PREFIX_SIZE, Block, Buffer, walk_records
 
 _LENGTH = struct.Struct("<Q")
 _FIXED = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time
@@ -48,7 +48,7 @@ class RawLog:
     """A log opened for its bytes; ``with`` releases it."""
 
     def __init__(self, path: Path) -> None:
-        """Open a log and find what an edit must know of it.
+        """Open a log.
 
         Args:
             path: The MCAP file; of a split session any part, or the folder.
@@ -60,7 +60,7 @@ class RawLog:
         self.path = path
         self.file = LogFile(path)
         self.warnings = list(self.file.warnings)
-        self._said = set(self.warnings)
+        self._warned = set(self.warnings)
         self.paths = [file.path for file in self.file.files]
         self.sha256 = _hash(self.paths)
         filled = [block for block in self.file.blocks if block.end_ns]
@@ -70,7 +70,7 @@ class RawLog:
         self.robot = _robot_name(self.file)
 
     def __enter__(self) -> RawLog:
-        """Nothing to do: the file is open."""
+        """Return the log."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -88,31 +88,20 @@ class RawLog:
         return [item for item in self.file.appendices if isinstance(item, Attachment)]
 
     def warn(self, sentence: str) -> None:
-        """Note an irregularity, once.
-
-        Args:
-            sentence: What is missing or doubtful.
-        """
-        if sentence not in self._said:
-            self._said.add(sentence)
+        """Add a warning, once."""
+        if sentence not in self._warned:
+            self._warned.add(sentence)
             self.warnings.append(sentence)
 
     def type_name(self, channel: Channel) -> str:
-        """A channel's message type.
-
-        Args:
-            channel: One of the file's channels.
-
-        Returns:
-            E.g. ``sensor_msgs/msg/Imu``; empty where the channel has no schema.
-        """
+        """Return a channel's message type; empty if the channel has no schema."""
         schema = self.file.schemas.get(channel.schema_id)
         return schema.name if schema is not None else ""
 
     def messages(
         self, channel_ids: Collection[int], start_ns: int, stop_ns: int
     ) -> Iterator[RawMessage]:
-        """Messages of some channels in a window, in the order of the file.
+        """Yield messages of some channels in a window, in the order of the file.
 
         Args:
             start_ns: First log time [Unix ns].
@@ -124,15 +113,15 @@ class RawLog:
                 yield from self._block_messages(block, channel_ids, start_ns, stop_ns)
 
     def last_messages(self, channel_ids: Collection[int], before_ns: int) -> list[RawMessage]:
-        """The last message of each channel before a time, in order of log time.
+        """Return the last message of each channel before a time, in order of log time.
 
-        It looks backward, and no further than it must.
+        The blocks are read backward until all are found.
 
         Args:
             before_ns: One past the last log time [Unix ns].
 
         Returns:
-            At most one message a channel; of equal log times, the later in the file.
+            At most one message per channel; of equal log times, the later one in the file.
         """
         # With log time, and file and place of its block.
         last: dict[int, tuple[tuple[int, int, int], RawMessage]] = {}
@@ -156,7 +145,7 @@ class RawLog:
         if block.index_at and not any(key in channel_ids for key in block.index_at):
             return
         try:
-            data, start, stop = self.file.payload_once(block)
+            data, start, stop = self.file.source_of(block).payload_once(block)
         except LogError as error:
             self.warn(f"{error}; its messages are missing")
             return
@@ -183,19 +172,15 @@ class RawLog:
             )
 
     def _places(self, block: Block, data: Buffer, start: int, stop: int) -> Iterator[int]:
-        """Where the whole message records of a chunk begin."""
-        at = start
-        while at + PREFIX_SIZE <= stop and data[at]:
-            (length,) = _LENGTH.unpack_from(data, at + 1)
-            end = at + PREFIX_SIZE + length
-            if end > stop:
-                break
-            if data[at] == Opcode.MESSAGE:
-                yield at
-            at = end
-        if block.complete and at != stop:
+        """Yield the offsets of the whole message records of a chunk."""
+        end = start
+        for opcode, body, body_stop in walk_records(data, start, stop):
+            if opcode == Opcode.MESSAGE:
+                yield body - PREFIX_SIZE
+            end = body_stop
+        if block.complete and end != stop:
             self.warn(
-                f"{self.path}: the last {stop - at} bytes of the chunk at byte {block.start} "
+                f"{self.path}: the last {stop - end} bytes of the chunk at byte {block.start} "
                 "are no whole record: left out"
             )
 
@@ -205,7 +190,7 @@ def _loose_places(block: Block) -> Iterator[int]:
 
 
 def _hash(paths: list[Path]) -> str:
-    """SHA-256 of one file, or of all parts one after the other."""
+    """Return the SHA-256 of one file, or of all parts one after the other."""
     total = hashlib.sha256()
     for path in paths:
         with path.open("rb") as stream:
@@ -215,7 +200,7 @@ def _hash(paths: list[Path]) -> str:
 
 
 def _robot_name(log_file: LogFile) -> str:
-    """The robot that a log is of; empty where it doesn't say."""
+    """Return the robot of a log; empty if it is not stated."""
     stated = log_file.metadata.get("undulog", {}).get("robot")
     if stated:
         return stated

@@ -1,4 +1,4 @@
-"""A whole file from what a crash left: chunks of the MCAP, and the write-ahead log beyond them."""
+"""Recover a whole file after a crash from chunks of the MCAP and the write-ahead log."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from ...common.console import progress
 from ...common.errors import DataError, LogError
 from ...common.process import StopRequest
 from ..file.parts import first_part
@@ -20,44 +19,37 @@ from .edited_log import (
     edited_log,
     portable,
     refuse_output,
-    refuse_stopped,
 )
 from .raw_messages import RawLog
 
 RECOVERED_RECORD = "undulog.recovered"
-"""Metadata record that says what a recovered log was made from."""
+"""Metadata record of the sources of a recovered log."""
 
 _ALL_NS = (0, 1 << 64)
-_LOOK_EVERY = 4096
 
 
 @dataclass
 class RecoverReport(EditReport):
-    """What a recovery found.
+    """Result of a recovery.
 
     Attributes:
         from_wal: Messages that only the write-ahead log had.
-        missing: Messages that the recorder accepted and that are nowhere; None where nothing
-            tells.
+        missing: Messages that the recorder accepted and that are lost; None if unknown.
     """
 
     from_wal: int = 0
     missing: int | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """The report as plain JSON values."""
-        found = {"from_wal": self.from_wal, "missing": self.missing}
-        return super().as_json() | found
+        """Return the report as plain JSON values."""
+        return super().as_json() | {"from_wal": self.from_wal, "missing": self.missing}
 
 
 def recovered_path(path: Path) -> Path:
-    """Where a recovery writes by default.
+    """Return the default output of a recovery, e.g. ``run.recovered.mcap``.
 
     Args:
         path: Any part of the session, or its folder.
-
-    Returns:
-        E.g. ``run.recovered.mcap`` beside ``run.mcap``.
 
     Raises:
         LogError: If a folder holds no session, or several.
@@ -69,18 +61,18 @@ def recovered_path(path: Path) -> Path:
 def recover_log(
     path: Path, output: Path, *, force: bool = False, stop: StopRequest | None = None
 ) -> RecoverReport:
-    """Write all that can be read of a session to one new, whole file.
+    """Write the readable part of a session to one new, whole file.
 
     Args:
-        path: The damaged or unfinished log; of a split one any part, or the folder. Nothing of
-            it is changed.
+        path: The damaged or unfinished log; of a split one any part, or the folder. It is not
+            changed.
 
     Raises:
-        UsageError: If the output can't be that.
+        UsageError: If the output is not possible.
         DataError: If no message can be read.
         LogError: If the log can't be read, its recorder is still writing it, or the new file
             can't be written.
-        UndulogError: If a stop was requested; nothing is left behind then.
+        UndulogError: If a stop was requested; no file is left then.
     """
     refuse_output(output, [path], force=force)
     stop = stop or StopRequest()
@@ -88,18 +80,28 @@ def recover_log(
         found = source.file.recovered
         if found is not None and found.live:
             raise LogError(path, "this recording is running; end it first")
-        if found is not None:  # without the advice to do what is being done
+        if found is not None:  # without the advice to recover it
             source.warnings = [
                 str(found) if text == found.warning else text for text in source.warnings
             ]
         with edited_log([source], output, force=force, stop=stop) as log:
             for attachment in source.attachments:
                 log.attach(attachment, attachment.name)
-            _copy(source, log, stop)
+            for record in source.metadata:
+                if record.name != HEALTH_RECORD:
+                    log.note(record.name, record.metadata)
+            channels = source.file.channels.values()
+            ids = {channel.id: log.channel(source, channel) for channel in channels}
+            messages = source.messages(ids, *_ALL_NS)
+            log.write_all(
+                f"recovering {path.name}",
+                ((ids[message.channel_id], message) for message in messages),
+                (source.start_ns, source.end_ns),
+                stop,
+            )
             if log.first_ns is None:
                 raise DataError(f"{path}: no message of it can be read")
             report = RecoverReport(
-                verb="recover",
                 output=output,
                 sources=[
                     {"path": str(each), "session_id": source.session_id, "sha256": source.sha256}
@@ -126,23 +128,8 @@ def recover_log(
     return report
 
 
-def _copy(source: RawLog, log: EditedLog, stop: StopRequest) -> None:
-    """Copy metadata and messages; all but the health, which comes last."""
-    for record in source.metadata:
-        if record.name != HEALTH_RECORD:
-            log.note(record.name, record.metadata)
-    ids = {channel.id: log.channel(source, channel) for channel in source.file.channels.values()}
-    total = sum(source.file.counts.values())
-    with progress(f"recovering {source.path.name}", total) as bar:
-        for done, message in enumerate(source.messages(ids, *_ALL_NS)):
-            log.write(ids[message.channel_id], message)
-            if done % _LOOK_EVERY == 0:
-                refuse_stopped(stop)
-                bar.update(done)
-
-
 def _missing(source: RawLog, log: EditedLog) -> int | None:
-    """How many messages that were accepted are not in the new file; None where nothing tells."""
+    """Count the accepted messages that are not in the new file; None if unknown."""
     found = source.file.recovered
     if found is None or found.accepted is None:
         return None
@@ -160,6 +147,4 @@ def _note(source: RawLog, log: EditedLog, report: RecoverReport) -> None:
         "warnings": portable(source.warnings, [source]),
     }
     log.note(RECOVERED_RECORD, facts)
-    for record in source.metadata:
-        if record.name == HEALTH_RECORD:
-            log.note(record.name, record.metadata)
+    log.copy_health(source)

@@ -1,7 +1,7 @@
-"""A session as blocks of messages: one file, the parts of a split one, or what a crash left.
+"""A session as blocks of messages: one file, the parts of a split one, or an unfinished one.
 
-Naming any part opens the whole. What only the write-ahead log of a recorder has follows the
-files' blocks as one more block, in memory; nothing on the disk is changed.
+The path of any part opens the whole. Messages that only the write-ahead log of a recorder has are
+one more block, in memory, after the files' blocks; nothing on the disk is changed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import sys
 import tempfile
 import weakref
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,11 +22,10 @@ import numpy as np
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 from numpy.typing import NDArray
 
-from ...common.arrays import IntArray
 from ...common.errors import LogError, NotALogError
-from ..mcap.chunk import LAST_NS, Block, Buffer
+from ..mcap.chunk import LAST_NS, Block
 from ..mcap.file import McapFile
-from ..mcap.records import BlockSource, read_message_heads
+from ..mcap.records import read_message_heads
 from ..wal.tail import MessageKey, WalContents, WalTail, beyond, read_wal
 from .parts import PART_RECORD, PartFiles, first_part, open_parts
 
@@ -35,19 +34,16 @@ _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linu
 
 
 def new_pages(size: int) -> mmap.mmap:
-    """Memory of small pages, each of which comes when it is first written.
+    """Return zeroed memory of small pages, which are allocated when they are first written.
 
-    numpy would ask for huge pages, and in a virtual machine a new one costs milliseconds; a
+    numpy would request huge pages, and in a virtual machine a new one costs milliseconds; a
     bytearray would write all of it at once.
 
     Args:
-        size: How much [byte], more than 0.
-
-    Returns:
-        Zeros, given back when nothing refers to them any more.
+        size: Size [byte], more than 0.
 
     Raises:
-        MemoryError: If there is not as much.
+        MemoryError: If there is not enough memory.
     """
     try:
         return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
@@ -56,46 +52,38 @@ def new_pages(size: int) -> mmap.mmap:
 
 
 def keep_freed(size: int) -> None:
-    """Have pieces of memory that come and go use the same pages again.
+    """Make the allocator reuse the pages of freed memory.
 
-    glibc gives a large piece back to the system as soon as it is freed, up to the size of the
-    largest that it has seen freed: from then on it keeps them (mallopt(3), M_MMAP_THRESHOLD). Other
-    allocators take no notice.
+    glibc returns a large piece to the system when it is freed, unless one of its size was freed
+    before (mallopt(3), M_MMAP_THRESHOLD). Other allocators are not affected.
 
     Args:
-        size: Of the largest such piece [byte].
+        size: Size of the largest such piece [byte].
     """
     np.empty(size, dtype=np.uint8)  # freed at once, never written
 
 
 class FilePages:
-    """Memory that lies in a file, so that what is not looked at need not be in memory.
+    """Memory backed by a file, so that unused pages can be released.
 
-    The file has no name and is gone with what refers to it. What was written stays when its pages
-    are let go of: the system writes it to the disk when it needs the room, and not before.
+    The file has no name and is deleted with the last reference to it. Contents stay when the pages
+    are released: the system writes them to the disk when it needs the memory.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Choose where the files go.
-
-        Args:
-            folder: On a disk; in a file system in memory nothing is gained.
-        """
+        """Set the folder of the files, which should be on a disk."""
         self._folder = folder
         self._held: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
         self._used = False
 
     def new(self, size: int) -> mmap.mmap:
-        """Memory in a file of its own; where there is no room for one, memory as it usually is.
+        """Return zeroed memory in a new file, or ordinary memory if the disk has no room.
 
         Args:
-            size: How much [byte], more than 0.
-
-        Returns:
-            Zeros, given back when nothing refers to them any more.
+            size: Size [byte], more than 0.
 
         Raises:
-            MemoryError: If there is not as much, neither on the disk nor in memory.
+            MemoryError: If there is not enough memory either.
         """
         if sys.platform != "linux":
             return new_pages(size)
@@ -111,29 +99,26 @@ class FilePages:
         return found
 
     def release(self) -> None:
-        """Let go of the pages, and of memory that was freed but kept.
-
-        What the pages hold is read again when it is looked at.
-        """
+        """Release the pages, which are read again when needed, and freed memory."""
         held = list(self._held)
         for each in held:
             each.madvise(mmap.MADV_DONTNEED)
         if self._used and _TRIM is not None:
             _TRIM(0)
-        self._used = bool(held)  # once more when all are gone: it takes milliseconds
+        self._used = bool(held)  # once more after the last one: it takes milliseconds
 
 
 @dataclass(frozen=True)
 class Recovered:
-    """What was put together of a session that was not finalised.
+    """Contents of a session that was not finalised.
 
     Attributes:
         live: Whether its recorder is still writing.
-        in_files: Messages that the files have.
-        from_wal: Messages that only the write-ahead log has.
-        accepted: Messages that the recorder accepted; None where nothing tells.
-        looked: Whether all was read to count them; else summaries were believed, or something of
-            the write-ahead log can't be read.
+        in_files: Number of messages in the files.
+        from_wal: Number of messages that only the write-ahead log has.
+        accepted: Number of messages that the recorder accepted; None if unknown.
+        looked: Whether all messages were counted by reading; if not, summaries were used, or a part
+            of the write-ahead log can't be read.
     """
 
     folder: Path
@@ -145,19 +130,19 @@ class Recovered:
 
     @property
     def missing(self) -> int | None:
-        """Messages that were accepted and are in neither; None where nothing tells."""
+        """Number of accepted messages that are lost; None if unknown."""
         if self.accepted is None:
             return None
         return max(0, self.accepted - self.in_files - self.from_wal)
 
     @property
     def warning(self) -> str:
-        """One sentence, and what to do."""
+        """One sentence, with the fix."""
         advice = "" if self.live else "; 'undulog log recover' writes a whole file"
         return f"{self}{advice}"
 
     def __str__(self) -> str:
-        """One sentence."""
+        """Return one sentence."""
         total = self.in_files + self.from_wal
         if self.live:
             return (
@@ -182,11 +167,11 @@ class LogFile:
     """A session's blocks, channels, schemas, metadata and attachments, over all its files."""
 
     def __init__(self, path: Path, column_folder: Path | None = None) -> None:
-        """Open a session and find what it holds.
+        """Open a session.
 
         Args:
             path: Its file, any of its parts, or a folder that holds it and no other.
-            column_folder: Where large columns lie in files; None for memory.
+            column_folder: Folder for large columns in files; None for memory.
 
         Raises:
             NotALogError: If it is empty, not MCAP, or nothing in it can be read.
@@ -204,12 +189,12 @@ class LogFile:
         self.attachments: dict[str, Attachment] = {}
         self.appendices: list[Attachment | Metadata] = []  # as stored; names may repeat
         self.recovered: Recovered | None = None
-        self.foreign_wal = ""  # what to say of a write-ahead log of another session
-        self._sources: list[BlockSource] = []
-        self.scratch: list[mmap.mmap] = []  # memory that was used before: it costs no page faults
+        self.foreign_wal = ""  # warning of a write-ahead log of another session
+        self._sources: list[McapFile | WalTail] = []
+        self.scratch: list[mmap.mmap] = []  # used memory, which costs no page faults
         self.pages = None if column_folder is None else FilePages(column_folder)
         first = first_part(path)
-        wal = read_wal(first)  # before the files: what it lets go of meanwhile is in them
+        wal = read_wal(first)  # before the files: segments released meanwhile are in the files
         self.parts: PartFiles = open_parts(first, bare=wal is not None)
         try:
             for file in self.files:
@@ -256,35 +241,15 @@ class LogFile:
         self.parts.close()
 
     def forget(self) -> None:
-        """Let go of what was read; it is read again when needed."""
+        """Release the data read; it is read again when needed."""
         for file in self.files:
             file.forget()
         if self.pages is not None:
             self.pages.release()
 
-    def payload(self, block: Block) -> tuple[Buffer, int]:
-        """See :meth:`BlockSource.payload`."""
-        return self._sources[block.part].payload(block)
-
-    def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
-        """See :meth:`BlockSource.payload_once`."""
-        return self._sources[block.part].payload_once(block)
-
-    def offsets(self, block: Block, channel_id: int) -> IntArray:
-        """See :meth:`BlockSource.offsets`."""
-        return self._sources[block.part].offsets(block, channel_id)
-
-    def inflates(self, block: Block, limit: int) -> bool:
-        """See :meth:`BlockSource.inflates`."""
-        return self._sources[block.part].inflates(block, limit)
-
-    def inflate_into(self, block: Block, room: memoryview) -> None:
-        """See :meth:`BlockSource.inflate_into`."""
-        self._sources[block.part].inflate_into(block, room)
-
-    def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
-        """See :meth:`BlockSource.indexed`."""
-        return self._sources[block.part].indexed(block, channel_ids)
+    def source_of(self, block: Block) -> McapFile | WalTail:
+        """Return the file, or the part of the write-ahead log, that holds a block."""
+        return self._sources[block.part]
 
     # -- putting together ------------------------------------------------------------------
 
@@ -303,18 +268,18 @@ class LogFile:
         self.channels |= file.channels
         for item in file.appendices:
             self._keep(item)
-        self._add(file, file.blocks, file.counts)
+        self._add(file)
 
-    def _add(self, source: BlockSource, blocks: list[Block], counts: dict[int, int]) -> None:
-        for block in blocks:
+    def _add(self, source: McapFile | WalTail) -> None:
+        for block in source.blocks:
             block.part = len(self._sources)
         self._sources.append(source)
-        self.blocks += blocks
-        for channel_id, count in counts.items():
+        self.blocks += source.blocks
+        for channel_id, count in source.counts.items():
             self.counts[channel_id] = self.counts.get(channel_id, 0) + count
 
     def _keep(self, item: Attachment | Metadata) -> None:
-        """Note a metadata record or attachment; each part repeats those of the session."""
+        """Add a metadata record or attachment once; each part repeats those of the session."""
         if item.name == PART_RECORD or (len(self._sources) and item in self.appendices):
             return
         self.appendices.append(item)
@@ -324,7 +289,7 @@ class LogFile:
             self.metadata.setdefault(item.name, {}).update(item.metadata)
 
     def _leave_foreign(self, wal: WalContents) -> None:
-        """Find out whether a write-ahead log belongs to another session: a copy left it behind."""
+        """Warn of a write-ahead log of another session, left by a copy."""
         facts = [i for i in wal.definitions if isinstance(i, Metadata) and i.name == "undulog"]
         ids = {item.metadata["session_id"] for item in facts if "session_id" in item.metadata}
         own = self.metadata.get("undulog", {}).get("session_id")
@@ -339,8 +304,8 @@ class LogFile:
     def _join_wal(self, wal: WalContents) -> None:
         self._define(wal)
         self._leave_cut_chunk(wal)
-        # The log may begin before the files' end, and they may have grown beyond its own since.
-        # What it let go of while it was being read is a hole in it, of channels it can't tell.
+        # The log may begin before the files' end, and the files may have grown beyond the log.
+        # Segments released while the log was read are a hole in it, of unknown channels.
         grown = max(0, sum(self.counts.values()) - wal.accepted)
         hole = wal.accepted - wal.before - len(wal.messages)
         listed = Counter(message.channel_id for message in wal.messages)
@@ -348,22 +313,21 @@ class LogFile:
         in_files = sum(self.counts.values())
         rest = beyond(wal.messages, keys)
         if rest:
-            tail = WalTail(rest)
-            self._add(tail, tail.blocks, tail.counts)
+            self._add(WalTail(rest))
         if not (rest or wal.live) and self.parts.finalised and wal.accepted <= in_files:
-            return  # the recorder died when all was done but the tidying up
+            return  # the recorder died after everything was written
         accepted = wal.accepted if wal.messages else None
         looked = looked and not wal.damaged
         self.recovered = Recovered(wal.folder, wal.live, in_files, len(rest), accepted, looked)
         told = list(wal.warnings)
-        if self.recovered.missing == 0:  # then what was only begun held nothing
+        if self.recovered.missing == 0:  # then a part that was only begun had no messages
             gone = [text for text in self.parts.missing if "can't be read" in text]
             self.parts.missing = [text for text in self.parts.missing if text not in gone]
             told = [text for text in told if "no readable header" not in text]
         self.warnings += [self.recovered.warning, *told]
 
     def _define(self, wal: WalContents) -> None:
-        """Take from a write-ahead log what the files don't explain themselves."""
+        """Add definitions of a write-ahead log that the files don't have."""
         for item in wal.definitions:
             if isinstance(item, Header):
                 self.profile = self.profile or item.profile
@@ -376,7 +340,7 @@ class LogFile:
                 self._keep(item)
 
     def _leave_cut_chunk(self, wal: WalContents) -> None:
-        """Leave out a chunk that the file's end cuts short where the log has all of it, whole."""
+        """Leave out a chunk that is cut short if the log has all its messages."""
         last = self.files[-1] if self.files else None
         if last is None or not last.cut:
             return
@@ -391,11 +355,10 @@ class LogFile:
             self._leave_out(block)
 
     def _last_keys(self, least: Mapping[int, int]) -> tuple[set[MessageKey], bool]:
-        """The keys of the files' last messages of some channels.
+        """Return the keys of the files' last messages of some channels.
 
-        A channel's messages are in the files in the order they came, while those of others may be
-        in a later chunk though they came before. A chunk that can't be read is left out: the
-        write-ahead log may have its messages.
+        The messages of one channel are in order, while older ones of other channels may be in a
+        later chunk. An unreadable chunk is left out: the write-ahead log may have its messages.
         """
         keys: set[MessageKey] = set()
         left = dict(least)
@@ -425,11 +388,11 @@ class LogFile:
         return keys, not unread
 
     def _heads(self, block: Block) -> NDArray[np.void]:
-        """The heads of all messages of a block."""
+        """Return the heads of all messages of a block."""
         ids = block.offsets if block.offsets is not None else block.index_at
-        offsets = [self.offsets(block, channel_id) for channel_id in ids]
-        data, base = self.payload(block)
-        stop = len(data) if block.compression else block.stop
+        source = self.source_of(block)
+        offsets = [source.offsets(block, channel_id) for channel_id in ids]
+        data, base, stop = source.payload(block)
         places = np.concatenate([np.empty(0, dtype=np.int64), *offsets])
         heads = read_message_heads(data, places + base, stop)
         if heads is None:
@@ -438,18 +401,18 @@ class LogFile:
         return heads
 
     def _leave_out(self, block: Block) -> None:
-        """Forget a block; its messages are no longer counted, as far as its index tells them."""
+        """Remove a block and the messages in its index from the counts."""
         self.blocks = [other for other in self.blocks if other is not block]
         for channel_id in block.offsets if block.offsets is not None else block.index_at:
             try:
-                count = len(self.offsets(block, channel_id))
-            except LogError:  # then the sum stays too high, and is not called sure
+                count = len(self.source_of(block).offsets(block, channel_id))
+            except LogError:  # then the sum stays too high and is not final
                 continue
             self.counts[channel_id] = max(0, self.counts.get(channel_id, 0) - count)
 
 
 def _is_of_the_end(warning: str) -> bool:
-    """Whether a warning only says that a file was not finalised."""
+    """Whether a warning only means that a file was not finalised."""
     return (
         warning.startswith(("the file is cut short", "the last ", "nothing of the last"))
         or "cut record" in warning

@@ -1,9 +1,7 @@
 """The files of a session, from any of its parts or their folder.
 
-Names of the parts of a split session: ``run.mcap``, ``run_0002.mcap``, ``run_0003.mcap``, ...
-
-The first part has the name that was asked for, so that a session need not know beforehand whether
-it will be split.
+The parts of a split session are ``run.mcap``, ``run_0002.mcap``, ``run_0003.mcap``, ... The first
+part has the requested name, whether the session will be split or not.
 """
 
 from __future__ import annotations
@@ -26,29 +24,18 @@ _NUMBERED = re.compile(r"(.+)_(\d{4,})")
 
 
 def part_path(first: Path, number: int) -> Path:
-    """The file of a part.
-
-    Args:
-        first: The first part, e.g. ``run.mcap``.
-        number: The part, from 1.
-
-    Returns:
-        E.g. ``run_0002.mcap``.
-    """
+    """Return the file of a part, e.g. ``run_0002.mcap``; parts are numbered from 1."""
     if number == 1:
         return first
     return first.with_name(f"{first.stem}_{number:04d}{first.suffix}")
 
 
 def split_part_path(path: Path) -> tuple[Path, int]:
-    """What the name of a file says of its place, if it is a part.
-
-    Args:
-        path: E.g. ``run_0002.mcap``.
+    """Split the name of a part into the first part and the number.
 
     Returns:
-        The first part and the number, e.g. ``run.mcap`` and 2; the path itself and 1 where the
-        name has no number. Only the file's own record tells whether it is a part at all.
+        E.g. ``run.mcap`` and 2 for ``run_0002.mcap``; the path itself and 1 for a name without
+        number. Whether the file is a part is stated only in its own record.
     """
     match = _NUMBERED.fullmatch(path.stem)
     if match is None or int(match[2]) < 2:
@@ -57,13 +44,10 @@ def split_part_path(path: Path) -> tuple[Path, int]:
 
 
 def later_parts(first: Path) -> list[Path]:
-    """Files that have the name of a later part.
+    """Return the files beside a first part that have the name of a later part, by number.
 
     Args:
-        first: The first part; it need not be there.
-
-    Returns:
-        Those beside it, by number.
+        first: The first part; it need not exist.
 
     Raises:
         OSError: If the folder can't be listed.
@@ -81,12 +65,12 @@ _MOST_LISTED = 20
 
 @dataclass
 class PartFiles:
-    """The files of a session that are there, opened, in order.
+    """The existing files of a session, opened, in order.
 
     Attributes:
         files: By number of the part.
-        missing: What is missing or left out, one sentence each.
-        paths: All files that were looked at, those that held nothing too.
+        missing: Missing parts or parts left out, one sentence each.
+        paths: All files that were tried, also empty ones.
     """
 
     files: dict[int, McapFile] = field(default_factory=dict[int, McapFile])
@@ -95,7 +79,7 @@ class PartFiles:
 
     @property
     def finalised(self) -> bool:
-        """Whether the last file has its end and says of no other to follow."""
+        """Whether the last file is complete and names no next one."""
         if not self.files:
             return False
         last = self.files[max(self.files)]
@@ -108,13 +92,10 @@ class PartFiles:
 
 
 def first_part(path: Path) -> Path:
-    """The first part of the session that a path names.
+    """Return the first part of a session, which need not exist.
 
     Args:
         path: Any part, or the folder of one session.
-
-    Returns:
-        The first part's file, which need not be there.
 
     Raises:
         LogError: If a folder holds no session, or several.
@@ -132,8 +113,8 @@ def open_parts(first: Path, *, bare: bool) -> PartFiles:
 
     Args:
         first: Its first part.
-        bare: Whether a write-ahead log can explain files that don't explain themselves, and
-            stand in for one that is missing.
+        bare: Whether there is a write-ahead log, which has the definitions and messages that files
+            lack.
 
     Raises:
         NotALogError: If the only file is no log.
@@ -149,14 +130,7 @@ def open_parts(first: Path, *, bare: bool) -> PartFiles:
 
 
 def check_chain(parts: PartFiles) -> list[str]:
-    """Hold each part against the hash that the next one has of it.
-
-    Args:
-        parts: The files of a session.
-
-    Returns:
-        What doesn't fit, one sentence each.
-    """
+    """Compare each part with its hash in the next one; return the faults, one sentence each."""
     wrong: list[str] = []
     for number, file in parts.files.items():
         stated = _part_record(file).get("previous_sha256")
@@ -188,7 +162,7 @@ def _open_parts(found: PartFiles, first: Path, *, bare: bool) -> None:
         found.files |= sorted(opened.items())
         found.paths += paths.values()
     for number, file in sorted(opened.items()):
-        begun = bare and file.cut and not file.blocks  # died before anything of worth was in it
+        begun = bare and file.cut and not file.blocks  # died before the first message
         reason = "" if begun else _stranger(opened, number)
         if reason:
             found.missing.append(f"{file.path.name} {reason}: left out")
@@ -201,10 +175,7 @@ def _open_parts(found: PartFiles, first: Path, *, bare: bool) -> None:
 def _open_all(
     opened: dict[int, McapFile], paths: dict[int, Path], missing: list[str], *, bare: bool
 ) -> None:
-    """Open files, the last first.
-
-    Of a recording that runs, what is written meanwhile leaves no gap before a part then.
-    """
+    """Open files, the last first, so that a running recording leaves no gap before a part."""
     alone = not bare and len(paths) == 1
     for number, path in reversed(paths.items()):
         try:
@@ -217,7 +188,7 @@ def _open_all(
 
 
 def _later(first: Path) -> dict[int, Path]:
-    """The files that have the name of a later part, by number."""
+    """Return the files that have the name of a later part, by number."""
     if not first.parent.is_dir():
         return {}
     try:
@@ -227,7 +198,7 @@ def _later(first: Path) -> dict[int, Path]:
 
 
 def _stranger(opened: dict[int, McapFile], number: int) -> str:
-    """Why a file does not belong to those before it; empty if it does."""
+    """Return why a file does not belong to those before it; empty if it does."""
     file = opened[number]
     if number > 1 and _part_record(file).get("part") != str(number):
         return f"is not marked as part {number}"
@@ -240,7 +211,7 @@ def _stranger(opened: dict[int, McapFile], number: int) -> str:
 
 
 def _gaps(found: PartFiles, first: Path, there: set[int], *, bare: bool) -> list[str]:
-    """The parts that must have been and are not there."""
+    """Describe the parts that are missing."""
     if not found.files:
         return []
     last = max(found.files)
@@ -280,7 +251,7 @@ def _session_id(file: McapFile) -> str:
 
 
 def _is_part(path: Path, head: Path) -> bool:
-    """Whether a file with the name of a later part is one: it says so, or it says nothing."""
+    """Whether a file with the name of a later part is one: by its record, or if it is empty."""
     known = head.exists() or wal_folder(head).is_dir()
     try:
         file = McapFile(path, bare=True)
@@ -293,7 +264,7 @@ def _is_part(path: Path, head: Path) -> bool:
 
 
 def _session_in(folder: Path) -> Path:
-    """The first part of the only session in a folder."""
+    """Return the first part of the only session in a folder."""
     try:
         names = sorted(folder.iterdir())
     except OSError as error:

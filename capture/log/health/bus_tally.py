@@ -12,12 +12,11 @@ from ...common.strict_table import Faults
 from ...robot.bus_map import database_messages
 from ...robot.model import Robot
 from ..messages.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray, holds_fd
-from .measures import BusHealth
-from .tallies import NS, TimingTally
+from .tallies import NS, BusHealth, TimingTally
 
 LEAST_DECODED = 0.1
-"""The map names at least this part of the data frames, or every joint has samples: other devices
-may well fill most of a bus."""
+"""Least part of the data frames that the bus map names, unless every joint has samples: other
+devices may send most frames of a bus."""
 
 _MOST_LISTED = 8
 
@@ -25,7 +24,7 @@ _MOST_LISTED = 8
 def undecoded(
     robot: str, decoded: int, frames: int, others: Mapping[str, int], *, all_joints: bool
 ) -> str | None:
-    """Return what is wrong where nothing, or hardly anything, could be decoded.
+    """Return the fault if almost no frame could be decoded.
 
     Args:
         robot: Name of the robot whose bus map was used.
@@ -34,7 +33,7 @@ def undecoded(
         all_joints: Whether every joint has samples.
 
     Returns:
-        A sentence with the identifiers and the fix; None where enough was decoded.
+        A sentence with the identifiers and the fix; None if enough was decoded.
     """
     enough = LEAST_DECODED * frames if not all_joints else 0
     if not frames or (decoded and decoded >= enough):
@@ -48,22 +47,14 @@ def undecoded(
 
 
 def counts_text(counts: Mapping[str, int], most: int = _MOST_LISTED) -> str:
-    """Return counted things as text, most frequent first.
-
-    Returns:
-        E.g. ``101 (20), 102 (10) and 3 more``.
-    """
+    """Return counts as text, largest first, e.g. ``101 (20), 102 (10) and 3 more``."""
     parts = [f"{name} ({count})" for name, count in Counter(counts).most_common(most)]
     more = len(counts) - len(parts)
     return ", ".join(parts) + (f" and {more} more" if more else "")
 
 
 def named_identifiers(robot: Robot) -> frozenset[int]:
-    """Return the identifiers that a robot's bus map names, :data:`EXTENDED_FLAG` included.
-
-    Args:
-        robot: The robot; without a bus there are none.
-    """
+    """Return the identifiers that a robot's bus map names, with :data:`EXTENDED_FLAG`."""
     if robot.bus is None:
         return frozenset()
     messages = database_messages(dict(robot.databases), Faults()) or {}
@@ -77,7 +68,7 @@ class IdentifierTally:
     """Data frames by identifier; memory is bounded, however many identifiers there are."""
 
     MOST = 4096
-    """Identifiers that are counted each."""
+    """Largest number of identifiers."""
 
     def __init__(self) -> None:
         """Start empty."""
@@ -88,7 +79,7 @@ class IdentifierTally:
         """Count frames.
 
         Args:
-            frames: Of any kind, shape (n,); error frames and remote frames carry no data.
+            frames: Of any kind, shape (n,); error frames and remote frames are not counted.
         """
         id_flags = frames["id_flags"]
         data = id_flags[(id_flags & np.uint32(ERROR_FLAG | REMOTE_FLAG)) == 0]
@@ -100,7 +91,7 @@ class IdentifierTally:
 
 
 def frame_bits(frames: FrameArray) -> tuple[IntArray, IntArray]:
-    """Length of classic CAN frames on the wire, interframe space included.
+    """Return the length of classic CAN frames on the wire, with interframe space.
 
     Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis:
     refuted, revisited and revised" (2007): C = g + 8 s + 13 + floor((g + 8 s - 1) / 4), with
@@ -110,8 +101,7 @@ def frame_bits(frames: FrameArray) -> tuple[IntArray, IntArray]:
         frames: Records of :data:`.capture.log.messages.frames.FRAME_DTYPE`, shape (n,).
 
     Returns:
-        Fewest and most bits, each of shape (n,); 0 for error frames, which report what happened
-        on the bus and are not on it themselves.
+        Fewest and most bits, each of shape (n,); 0 for error frames, which are not sent on the bus.
     """
     flags = frames["id_flags"]
     g = np.where(flags & EXTENDED_FLAG, 54, 34)
@@ -124,8 +114,8 @@ def frame_bits(frames: FrameArray) -> tuple[IntArray, IntArray]:
 class BusTally:
     """Frames of one bus and one kind.
 
-    CAN FD frames are counted and timed. How long they are on the wire is not estimated: their data
-    may have a bit rate of their own, which no session tells.
+    CAN FD frames are counted and timed. Their length on the wire is not estimated: their data may
+    have another bit rate, which is unknown.
 
     Attributes:
         identifiers: The data frames by identifier.
@@ -135,8 +125,8 @@ class BusTally:
         """Start empty.
 
         Args:
-            horizon_s: Sum up seconds that are older than this against the newest [s]; None to
-                keep them all.
+            horizon_s: Sum up seconds that are older than this before the newest [s]; None to keep
+                all of them.
         """
         self.identifiers = IdentifierTally()
         self._timing = TimingTally()
@@ -146,7 +136,7 @@ class BusTally:
         self._closed = self._peak = (0, 0)  # of the seconds that were summed up
 
     def add(self, frames: FrameArray) -> None:
-        """Take the next frames.
+        """Add the next frames.
 
         Args:
             frames: In the order of the log, shape (n,).
@@ -169,15 +159,7 @@ class BusTally:
             self._close(max(self._bits) - self._horizon_s)
 
     def result(self, topic: str, bitrate: int | None) -> BusHealth:
-        """What the frames so far say.
-
-        Args:
-            topic: The bus's topic.
-            bitrate: [bit/s], None where unknown.
-
-        Returns:
-            The bus's health.
-        """
+        """Return the health of the bus so far; ``bitrate`` is in bit/s, None if unknown."""
         timing = self._timing.result()
         span_s = (timing.last_ns - timing.first_ns) / NS
         load = peak = None
@@ -200,13 +182,13 @@ class BusTally:
         )
 
     def last_second(self, bitrate: int | None) -> tuple[float, float] | None:
-        """Load of the last whole second.
+        """Return the load of the last whole second.
 
         Args:
-            bitrate: [bit/s], None where unknown.
+            bitrate: [bit/s], None if unknown.
 
         Returns:
-            Part of the bitrate without and with the most stuff bits; None where unknown.
+            Part of the bitrate without and with the most stuff bits; None if unknown.
         """
         if not bitrate or not self._bits:
             return None

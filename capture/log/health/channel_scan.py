@@ -1,7 +1,7 @@
-"""The messages of one channel into tallies, many at a time.
+"""Tallies of the messages of one channel, many at a time.
 
-Messages are gathered to batches of a few thousand before they are looked at, so that the cost
-of a look is shared, and memory holds one batch a channel however long the session is.
+Messages are processed in batches of a few thousand, for speed, and memory holds one batch per
+channel.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ class Series:
         names: Joints or values; empty for other types.
         first_log_ns: First log time [Unix ns].
         last_log_ns: Last log time [Unix ns].
-        nan_of: NaN among them, and how many there were, by field.
+        nan_of: Number of NaN and number of values, by field.
         joint_nan: Samples that are NaN in some field, shape (k,).
         at_limit: Angles at the joint's limits, shape (k,).
-        ranges: Angles by the second.
+        ranges: Smallest and largest angles in each second.
     """
 
     names: tuple[str, ...]
@@ -79,16 +79,15 @@ class Series:
     ranges: RangeTally = field(default_factory=RangeTally)
 
     def __post_init__(self) -> None:
-        """Size the counters."""
+        """Create the counters."""
         self.joint_nan = np.zeros(len(self.names), np.int64)
         self.at_limit = np.zeros(len(self.names), np.int64)
 
     @property
     def nan(self) -> int:
-        """NaN where a number should be.
+        """Number of NaN, without axes of a vector that are not measured.
 
-        An axis of a vector that never has a number while another one has is not measured, and says
-        so as sensor_msgs/MagneticField has it.
+        Such an axis is always NaN while another one is not, see sensor_msgs/MagneticField.
         """
         return sum(
             count
@@ -103,7 +102,7 @@ class Series:
 
 
 class ChannelScan:
-    """One channel."""
+    """Tallies of one channel; ``ends`` are the first and last message of diagnostics."""
 
     def __init__(
         self,
@@ -116,14 +115,12 @@ class ChannelScan:
     ) -> None:
         """Start empty.
 
-        ``ends`` are the first and the last message of a topic of diagnostics, None elsewhere.
-
         Args:
-            kind: Its message type; None where it can't be read: log times are looked at then.
+            kind: Its message type; None if it can't be read: then only log times are used.
             joints: Whether its messages are JointStates.
-            limits: Joint name to limits [rad]; None where its positions are not angles.
-            horizon_s: How far stamps may go back in a session that is still being recorded [s];
-                memory is bounded by it. None for a file, which ends.
+            limits: Joint name to limits [rad]; None if its positions are not angles.
+            horizon_s: How far stamps may go back in a running recording [s], which bounds memory.
+                None for a file.
         """
         self.topic = topic
         self.count = 0
@@ -145,11 +142,11 @@ class ChannelScan:
         self._rows = self._bytes = 0
 
     def add(self, data: Buffer, offsets: IntArray, heads: NDArray[np.void]) -> None:
-        """Take the channel's messages of one block.
+        """Add the channel's messages of one block.
 
         Args:
             data: The block's payload.
-            offsets: Where their records start, in file order, shape (n,).
+            offsets: Offsets of their records, in file order, shape (n,).
             heads: The records' heads, of :data:`HEAD`, shape (n,).
         """
         # Few large messages at a time: each is copied.
@@ -179,10 +176,10 @@ class ChannelScan:
             self.flush()
 
     def _take(self, data: Buffer, offsets: IntArray, rows: IntArray, size: int) -> None:
-        """Copy messages of one length; ``rows`` are their places in the block."""
+        """Copy messages of one length; ``rows`` are their positions in the block."""
         if not size:
             matrix = np.empty((len(rows), 0), np.uint8)
-        elif len(rows) == 1 and size >= _BATCH_BYTES:  # looked at before the payload is gone
+        elif len(rows) == 1 and size >= _BATCH_BYTES:  # processed before the payload is released
             matrix = np.frombuffer(data, np.uint8, size, int(offsets[0]) + BODY_AT)[None]
         else:
             records = gather(data, offsets + BODY_AT, np.dtype(f"V{size}"))
@@ -191,7 +188,7 @@ class ChannelScan:
         self._bytes += matrix.size
 
     def flush(self) -> None:
-        """Look at the messages gathered so far."""
+        """Process the messages collected so far."""
         if not self._rows:
             return
         log_ns = np.minimum(np.concatenate(self._log), LAST_NS).astype(np.int64)
@@ -232,7 +229,7 @@ class ChannelScan:
         return self.series[names]
 
     def _keep_ends(self, whole: list[tuple[IntArray, Matrix]]) -> None:
-        """Remember the first and the last message."""
+        """Keep the first and the last message."""
         if not whole:
             return
         first = min(whole, key=lambda part: int(part[0].min()))
@@ -307,14 +304,14 @@ class ChannelScan:
         bus.add(frames)
 
     def _by_layout(self, matrix: Matrix) -> Iterator[tuple[Layout, IntArray, Matrix]]:
-        """Sort messages of one length; of each layout, the rows and the messages."""
+        """Sort messages of one length; yield layout, rows and messages."""
         left = len(matrix)
         for rows, layout, _, is_kept in () if self._sorter is None else self._sorter.sort(matrix):
             if isinstance(layout, DataError):
                 self.unread += 1
             elif is_kept:
                 yield layout, rows, matrix if len(rows) == len(matrix) else matrix[rows]
-            else:  # a layout a message, and no numbers worth a look
+            else:  # too many layouts
                 self.unread += left if self._joints else 0
                 return
             left -= len(rows)
@@ -329,7 +326,7 @@ def _sorter(kind: MessageType, *, joints: bool) -> LayoutSorter:
 def _records_in(
     kind: MessageType, message: bytes, dtype: np.dtype[np.void], label: str
 ) -> tuple[int, int]:
-    """Offset and number of the frames in a message."""
+    """Return offset and number of the frames in a message."""
     found = records_at(message, label, dtype)
     if found is not None:
         return found
@@ -356,7 +353,7 @@ def _count_nan(series: Series, layout: Layout, part: Matrix) -> None:
 
 
 def _stamp(stamps: IntArray, rows: IntArray, matrix: Matrix) -> None:
-    """Put header stamps in place of log times, where a message has one that is not zero."""
+    """Replace log times by header stamps that are not zero."""
     if matrix.shape[1] < _STAMP_AT + TIME.itemsize:
         return
     times = np.ascontiguousarray(matrix[:, _STAMP_AT : _STAMP_AT + TIME.itemsize]).view(TIME)[:, 0]

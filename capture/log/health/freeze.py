@@ -1,4 +1,4 @@
-"""Joints that stand, to the bit, while their commands move: by the second, in bounded memory."""
+"""Joints whose angle is exactly constant while their command moves, per second."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ...common.arrays import BoolArray, FloatArray, IntArray
 NS = 1_000_000_000
 
 FROZEN_COMMAND_RAD = 0.05
-"""A joint is frozen in a second if its angle keeps one value, to the bit, while its command moves
-by more than this: ten steps of the coarsest common servo (0.29 degrees)."""
+"""A joint is frozen in a second if its angle is exactly constant while its command moves by more
+than this: ten steps of the coarsest common servo (0.29 degrees)."""
 
 FROZEN_SAMPLES = 5
-"""A second with fewer samples can't tell."""
+"""A second with fewer samples is not judged."""
 
 KEPT_S = 600
-"""Seconds that a live tally keeps for a partner whose stamps lag behind, at most."""
+"""Most seconds that a live tally keeps for another series whose stamps lag behind."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Ranges:
     Attributes:
         second: Unix seconds, increasing, shape (s,).
         count: Samples in each, shape (s,).
-        low: Shape (s, k); NaN where a second has nothing else.
+        low: Shape (s, k); NaN for a second without other values.
         high: Shape (s, k).
     """
 
@@ -40,21 +40,21 @@ class Ranges:
 
 
 class RangeTally:
-    """Ranges by the second: what tells a frozen joint from a still one. 16 byte a joint-second."""
+    """Smallest and largest values per second, in 16 bytes per joint and second."""
 
     def __init__(self, horizon_s: int | None = None) -> None:
         """Start empty.
 
         Args:
-            horizon_s: Leave out samples older than this against the newest before them [s], so
-                that seconds further back are complete and can be forgotten; None for never.
+            horizon_s: Leave out samples older than this before the newest one [s], so that earlier
+                seconds are complete and can be dropped; None for never.
         """
         self._horizon_s = horizon_s
         self._newest: int | None = None
         self._parts: list[Ranges] = []
 
     def add(self, t_ns: IntArray, values: FloatArray) -> None:
-        """Take the next samples.
+        """Add the next samples.
 
         Args:
             t_ns: Their times [Unix ns], shape (n,).
@@ -75,13 +75,10 @@ class RangeTally:
             self._parts.append(_by_second(second, np.ones(len(second), int), values, values))
 
     def result(self, width: int) -> Ranges:
-        """The ranges so far.
+        """Return the ranges of all seconds that have samples and were not dropped.
 
         Args:
             width: Number of joints k, for a stream without samples.
-
-        Returns:
-            One row a second that has samples and was not forgotten.
         """
         if not self._parts:
             none = np.empty((0, width))
@@ -136,13 +133,13 @@ def _by_second(second: IntArray, count: IntArray, low: FloatArray, high: FloatAr
 
 
 class FreezeTally:
-    """The longest time that joints of one series stood while a series of commands moved."""
+    """The longest time that joints of one series were frozen while their commands moved."""
 
     def __init__(self, names: tuple[str, ...], commanded: tuple[str, ...]) -> None:
-        """Start with nothing seen."""
+        """Start empty."""
         place = {name: k for k, name in reversed([*enumerate(commanded)])}
         self.columns = tuple(k for k, name in enumerate(names) if name in place)
-        """Places in ``names`` of the joints of both, m of them."""
+        """Indices in ``names`` of the joints of both, m of them."""
         self._measured = list(self.columns)
         self._commanded = [place[names[k]] for k in self.columns]
         self._runs = _Runs(len(self.columns))
@@ -150,16 +147,17 @@ class FreezeTally:
     def result(
         self, measured: Ranges, command: Ranges, closed: int | None
     ) -> tuple[IntArray, IntArray]:
-        """Take the seconds that have come and say what is known.
+        """Add the next seconds and return the longest runs.
 
         Args:
-            measured: Of the measured angles [rad]; every second since ``closed`` of the last call.
-            command: Of the commands [rad], the same.
-            closed: Seconds before this one will never change; None where any may.
+            measured: Ranges of the angles [rad], with every second since ``closed`` of the last
+                call.
+            command: Ranges of the commands [rad], likewise.
+            closed: Seconds before this one will not change; None if any may.
 
         Returns:
             Longest run of frozen seconds [s] and its first second [Unix s], each of shape (m,);
-            0 where a joint never froze.
+            0 for a joint that never froze.
         """
         found = np.intersect1d(
             measured.second, command.second, assume_unique=True, return_indices=True
@@ -181,7 +179,7 @@ class FreezeTally:
 
 
 class _Runs:
-    """Runs of flagged, consecutive seconds: the one that goes on, and the longest."""
+    """Runs of flagged, consecutive seconds: the current and the longest one."""
 
     def __init__(self, width: int) -> None:
         self.second = -(2**62)
@@ -190,7 +188,7 @@ class _Runs:
         self.longest_at = np.zeros(width, np.int64)
 
     def after(self, seconds: IntArray, flags: BoolArray) -> _Runs:
-        """The same with more seconds, shape (s,), and flags, shape (s, m)."""
+        """Return the runs with more seconds, shape (s,), and flags, shape (s, m)."""
         if not len(seconds):
             return self
         runs = _Runs(len(self.run))

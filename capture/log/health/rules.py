@@ -1,30 +1,38 @@
-"""The health of a recorded session: measures in, a verdict with its reasons out.
+"""Rules for the health of a session: findings and a verdict from the measures.
 
-The measures come from :mod:`.health.tallies`, so the same rules judge a file or the last
-seconds of a live recording. Every threshold stands here by name, with why it is what it is.
+The measures come from :mod:`.health.tallies`, so the same rules apply to a file and to a live
+recording. Every threshold has a name and a reason.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 from ...following.fault import Fault as JointFault
-from ..edit.edited_log import Fault, Finding
 from ..messages.frames import FRAME_TOPIC_PREFIXES, bus_of
 from .freeze import FROZEN_SAMPLES
-from .measures import BusHealth, ChannelHealth, FileHealth, JointHealth, SeriesHealth
-from .tallies import NS, PAUSE_PERIODS, PAUSE_S
+from .tallies import (
+    NS,
+    PAUSE_PERIODS,
+    PAUSE_S,
+    BusHealth,
+    ChannelHealth,
+    FileHealth,
+    JointHealth,
+    SeriesHealth,
+)
 
 GOOD_LOSS = 1e-3
 """Up to one sample in a thousand may be missing, not finite or repeated in a good session: less
 than one in a gait cycle of ten seconds at 100 Hz."""
 
 BAD_LOSS = 0.1
-"""From a tenth on the losses are seldom random: they follow bus load and hence the motion, and
-what is left is a biased picture of it."""
+"""Losses above a tenth are rarely random: they follow bus load and hence the motion, so the
+remaining samples are biased."""
 
 LONG_GAP_S = 0.1
-"""A gap that a good session doesn't have. Linear interpolation across T misses up to
+"""Shortest gap that makes a session degraded. Linear interpolation across T misses up to
 1 - cos(pi f T) of the amplitude: 5 % for 0.1 s at 1 Hz, the quickest gaits of such robots."""
 
 BAD_PAUSE = 0.5
@@ -38,7 +46,7 @@ FROZEN_SECONDS = 2
 """Consecutive seconds that make a frozen joint; one alone may be a slow start of the motion."""
 
 LIMIT_RAD = 1e-3
-"""Nearer to a limit than this is at it: below one step of a 12-bit encoder (1.5 mrad)."""
+"""Distance at which a joint is at a limit: below one step of a 12-bit encoder (1.5 mrad)."""
 
 MAX_AT_LIMIT = 0.1
 """A sine that just touches both limits of 30 degrees is within 1 mrad of them for
@@ -50,17 +58,121 @@ MAX_BUS_LOAD = 0.8
 BAD_JOINTS = 0.5
 """With half of the joints dead the session no longer shows the robot's motion."""
 
+_MOST_LISTED = 8
+
 VERDICTS = ("good", "degraded", "bad")
 VIEW_AIDS = ("/tf", "/tf_static", "/robot_description")
 """Never analysed, so never judged."""
 
 RECORDER_TOPICS = ("/rosout", "/diagnostics", "/clock/")
-"""What a recorder says of itself, many voices on one topic: an event may be told late, and a clock
-that was not read again repeats its last stamp. It has no rhythm that could be disturbed."""
+"""Topics of a recorder's own messages, which have no steady rate: an event may be logged late, and
+a clock that was not read again repeats its last stamp."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A finding of the health check.
+
+    Attributes:
+        weight: Index into :data:`VERDICTS`; 0 is a note and no fault.
+    """
+
+    weight: int
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of one channel, or of one joint of it.
+
+    Attributes:
+        weight: See :class:`Finding`.
+        topic: The topic, or a label that begins with it.
+        name: The joint; empty for all joints of the topic.
+        gaps: Number of gaps; 0 for a fault of another kind.
+        lost_ns: Begin and end of the longest gap [Unix ns].
+        part: Share of the samples that are missing in the gaps.
+    """
+
+    weight: int
+    topic: str
+    name: str
+    text: str
+    gaps: int = 0
+    lost_ns: tuple[int, int] = (0, 0)
+    part: float = 0.0
+
+
+def joined(faults: Iterable[Fault]) -> list[Finding]:
+    """Join equal faults of several channels and joints to one finding each.
+
+    A lost bus cycle, for instance, is missing in every joint and on every topic of the cycle.
+    Faults of the same text are joined, and gaps of the same number whose longest ones overlap; the
+    figures of joined gaps are those of the channel with the most missing samples.
+
+    Args:
+        faults: In the order in which they are named.
+
+    Returns:
+        The findings, in the order of the first fault of each.
+    """
+    groups: list[list[Fault]] = []
+    by_text: dict[tuple[int, str], list[Fault]] = {}
+    for fault in faults:
+        if fault.gaps:
+            found = (known for known in groups if _one_loss(known[0], fault))
+            group = next(found, list[Fault]())
+        else:
+            group = by_text.setdefault((fault.weight, fault.text), [])
+        if not group:
+            groups.append(group)
+        group.append(fault)
+    return [_finding(group) for group in groups]
+
+
+def _one_loss(one: Fault, other: Fault) -> bool:
+    """Whether the gaps of two channels are of one loss: equal in number, the longest overlap."""
+    if not one.gaps or (one.weight, one.gaps) != (other.weight, other.gaps):
+        return False
+    (begin, end), (start, stop) = one.lost_ns, other.lost_ns
+    return 2 * (min(end, stop) - max(begin, start)) > min(end - begin, stop - start)
+
+
+def _finding(group: Sequence[Fault]) -> Finding:
+    worst = max(group, key=lambda fault: fault.part)
+    where = _where(group)
+    if len(group) == 1:
+        return Finding(worst.weight, f"{where}: {worst.text}")
+    each = "lost together: at most" if worst.gaps else "each:"
+    return Finding(worst.weight, f"{where}, {each} {worst.text}")
+
+
+def _where(group: Sequence[Fault]) -> str:
+    """Name the channels and joints; topics of the same joints together."""
+    names: dict[str, list[str]] = {}
+    for fault in group:
+        names.setdefault(fault.topic, []).append(fault.name)
+    topics: dict[tuple[str, ...], list[str]] = {}
+    for topic, found in names.items():
+        topics.setdefault(tuple(found), []).append(topic)
+    parts: list[str] = []
+    for found, where in topics.items():
+        label = listed(where)
+        if found != ("",):
+            label += f", {listed(found)}"
+        parts.append(label)
+    return "; ".join(parts)
+
+
+def listed(names: Sequence[str], most: int = _MOST_LISTED) -> str:
+    """Return a list as text, e.g. ``a, b and c`` or ``a, b and 7 more``."""
+    if len(names) > most:
+        return f"{', '.join(names[: most - 1])} and {len(names) - most + 1} more"
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def judge_file(health: FileHealth) -> list[Finding]:
-    """Findings on the container."""
+    """Return findings on the container."""
     found = [Finding(2, sentence) for sentence in health.damage]
     if health.unfinished:
         found.append(Finding(0 if health.running else 1, health.unfinished))
@@ -104,7 +216,7 @@ def judge_channel(health: ChannelHealth) -> list[Fault]:
 
 
 def has_rhythm(topic: str) -> bool:
-    """Whether a topic is one whose rhythm is judged."""
+    """Whether the rhythm of a topic is judged."""
     return topic not in VIEW_AIDS and not topic.startswith(RECORDER_TOPICS)
 
 
@@ -116,7 +228,7 @@ def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Fault
         end_ns: Log time of its last message [Unix ns].
 
     Returns:
-        The faults; none for view aids and for what a recorder says of itself.
+        The faults; none for view aids and for the recorder's own topics.
     """
     timing = health.timing
     if timing.median_s is None or not has_rhythm(health.topic):
@@ -152,7 +264,7 @@ def judge_series(health: SeriesHealth, start_ns: int, end_ns: int) -> list[Fault
 
 
 def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Fault:
-    """The gaps of a series."""
+    """Return the fault of the gaps of a series."""
     timing = health.timing
     long = timing.longest_s > LONG_GAP_S and timing.longest_s > 2.5 * (timing.median_s or 0.0)
     scattered = timing.scattered / (timing.count + timing.scattered)
@@ -170,7 +282,7 @@ def _gaps(health: SeriesHealth, when: str, *, mostly_paused: bool) -> Fault:
 
 
 def _edges_and_jitter(health: SeriesHealth, start_ns: int, end_ns: int) -> Iterator[str]:
-    """What is wrong with the beginning, the end and the intervals of a regular series."""
+    """Describe faults of the start, the end and the intervals of a regular series."""
     timing, median_s = health.timing, health.timing.median_s or 0.0
     edge_s = max(PAUSE_S, PAUSE_PERIODS * median_s)
     late_s, early_s = (health.first_log_ns - start_ns) / NS, (end_ns - health.last_log_ns) / NS
@@ -191,27 +303,21 @@ def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> list[Fault]:
     """
     found: list[Fault] = []
     for joint in joints:
-
-        def add(weight: int, text: str, joint: JointHealth = joint) -> None:
-            found.append(Fault(weight, joint.topic, joint.name, text))
-
+        texts: list[tuple[int, str]] = []
         if joint.nan:
             weight = int(joint.nan > GOOD_LOSS * joint.samples)
-            add(weight, f"{joint.nan} of {joint.samples} samples are not a number")
+            texts.append((weight, f"{joint.nan} of {joint.samples} samples are not a number"))
         if _is_frozen(joint):
             when = _at(joint.frozen_at_ns, start_ns)
-            add(1, f"frozen for {joint.frozen_s} s while its command moved, {when}")
+            texts.append((1, f"frozen for {joint.frozen_s} s while its command moved, {when}"))
         if joint.at_limit is not None and joint.at_limit > MAX_AT_LIMIT:
-            add(1, f"at the robot's limits in {joint.at_limit:.0%} of the samples")
+            texts.append((1, f"at the robot's limits in {joint.at_limit:.0%} of the samples"))
+        found += [Fault(weight, joint.topic, joint.name, text) for weight, text in texts]
     return found
 
 
 def judge_body(joints: Sequence[JointHealth]) -> list[Finding]:
-    """Findings on the joints together.
-
-    Args:
-        joints: Measures of all joints of all topics.
-    """
+    """Return findings on all joints together."""
     measured = [joint for joint in joints if joint.topic == "/joint_states"]
     names = {joint.name for joint in measured}
     dead = {
@@ -229,14 +335,7 @@ def _is_frozen(joint: JointHealth) -> bool:
 
 
 def judge_following(fault: JointFault) -> Finding:
-    """Finding on a joint that does not follow its command.
-
-    Args:
-        fault: The fault, times from the session's start.
-
-    Returns:
-        The finding, with the kinds that fit.
-    """
+    """Return the finding on a joint that does not follow its command."""
     when = "" if fault.since_s is None else f" from {fault.since_s:.3g} s"
     when += "" if fault.until_s is None else f" to {fault.until_s:.3g} s"
     kinds = " or ".join(fault.kinds)
@@ -244,7 +343,7 @@ def judge_following(fault: JointFault) -> Finding:
 
 
 def judge_bus(health: BusHealth) -> list[Finding]:
-    """Findings on a bus."""
+    """Return findings on a bus."""
     found: list[Finding] = []
     if health.error_frames:
         part = health.error_frames / health.frames
@@ -258,9 +357,9 @@ def judge_bus(health: BusHealth) -> list[Finding]:
 
 
 def judge_silences(buses: Iterable[BusHealth], start_ns: int) -> list[Finding]:
-    """Findings on times without any frame of a bus, classic or CAN FD.
+    """Return findings on times without any frame of a bus, classic or CAN FD.
 
-    Of a bus that has both kinds, the longest silences of the two are held against each other.
+    Of a bus with both kinds, the overlap of their longest silences counts.
 
     Args:
         buses: Measures of all topics of frames.
@@ -285,16 +384,14 @@ def judge_topics(
     seen: Iterable[str],
     undecoded: str | None = None,
 ) -> list[Finding]:
-    """Findings on what the log contract asks for and the session lacks.
+    """Return findings on topics of the log contract that the session lacks.
 
     Args:
         types: Topic with messages to type.
         joints: The robot's joints; empty without a robot.
         seen: Joints that ``/joint_states`` carries.
-        undecoded: Why the raw CAN frames brought nothing, or hardly anything; None if they did.
-
-    Returns:
-        The findings; where frames brought nothing, that is the one reason for what is missing.
+        undecoded: Why almost no raw CAN frame could be decoded, which then is the only reason for
+            missing topics; None otherwise.
     """
     found = [] if undecoded is None else [Finding(1, undecoded)]
     framed = any(topic.startswith(FRAME_TOPIC_PREFIXES) for topic in types)
@@ -320,11 +417,7 @@ def judge_topics(
 
 
 def verdict_of(findings: Iterable[Finding]) -> str:
-    """The verdict: that of the heaviest finding, ``good`` without any.
-
-    Returns:
-        One of :data:`VERDICTS`.
-    """
+    """Return the verdict of the heaviest finding, ``good`` without findings."""
     return VERDICTS[max((finding.weight for finding in findings), default=0)]
 
 

@@ -1,10 +1,9 @@
-"""One pass over a recorded session: every chunk, every message, to one statement of health."""
+"""Check of a recorded session: one pass over every chunk and every message."""
 
 from __future__ import annotations
 
 import json
 import re
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -12,22 +11,19 @@ from typing import Any, cast
 
 import numpy as np
 
-from ...common.errors import DataError, LogError, RobotFileError
+from ...common.errors import DataError, LogError
+from ...common.process import threads_or_default
 from ...following.session import faults_in_session
-from ...robot.description import robot_in_session
-from ...robot.model import Robot
-from ..columns.topics import Topics
-from ..edit.edited_log import Finding
-from ..file.log_file import LogFile
 from ..file.parts import check_chain
 from ..mcap.chunk import Block
-from ..mcap.container_check import Container, check_chunk, check_container
+from ..mcap.container_check import check_container
 from ..mcap.file import McapFile
 from ..mcap.records import read_message_heads
-from ..read.session import Session
-from .measures import FileHealth
-from .rules import judge_file, judge_following, verdict_of
+from ..read.open_log import OpenLog
+from ..read.session import SessionView
+from .rules import Finding, judge_file, judge_following, verdict_of
 from .session_scan import SessionMeasures, SessionScan
+from .tallies import FileHealth
 
 
 @dataclass(frozen=True)
@@ -36,10 +32,10 @@ class SessionHealth(SessionMeasures):
 
     Attributes:
         session_id: Its id, or the file's name.
-        stored: The verdict stored by whoever recorded it, or None.
+        stored: The verdict stored in the file, or None.
         stored_reasons: The reasons stored with it.
-        following: Joints that do not follow their command: only the whole file shows them, so a
-            recorder's verdict is without.
+        following: Joints that do not follow their command. Only the whole file shows them, so the
+            recorder's verdict does not include them.
     """
 
     path: Path
@@ -67,34 +63,31 @@ def check_session(
 
     Args:
         path: An MCAP file, of any make; of a split session any part, or the folder.
-        on_part: Told how much has been read, 0 to 1.
+        on_part: Called with the part that has been read, 0 to 1.
 
     Raises:
         NotALogError: If it is not an MCAP file or nothing in it can be read.
         LogError: If it can't be opened.
     """
-    path = Path(path)
-    log_file = LogFile(path)
+    log = OpenLog(Path(path), None, threads_or_default(None))
     try:
-        return _Check(log_file).run(on_part or (lambda _: None))
+        return _Check(log).run(on_part or (lambda _: None))
     finally:
-        log_file.close()
+        log.file.close()
 
 
 class _Check:
     """The pass over one open file."""
 
-    def __init__(self, log_file: LogFile) -> None:
-        self._file = log_file
-        self._notes: list[str] = []
-        self._topics = Topics(log_file, self._notes.append)
-        self._robot = self._read_robot()
-        self._scan = SessionScan(self._robot)
-        for key in log_file.channels:
+    def __init__(self, log: OpenLog) -> None:
+        self._log = log
+        self._file = log.file
+        self._scan = SessionScan(log.robot)
+        self._notes = log.warnings[len(log.file.warnings) :]
+        for key in log.file.channels:
             self._define(key)
 
     def run(self, on_part: Callable[[float], None]) -> SessionHealth:
-        """Read, then judge."""
         file = self._against_summary(self._read(on_part))
         found = self._scan.result(*self._file.limits, judge_file(file))
         stored = self._file.metadata.get("undulog.health", {})
@@ -109,23 +102,23 @@ class _Check:
             following=tuple(self._judge_following(file, found.reasons)),
         )
 
-    def _judge_following(self, file: FileHealth, said: Sequence[str]) -> list[Finding]:
-        """Joints that do not follow their command; none of a file with damage.
+    def _judge_following(self, file: FileHealth, reasons: Sequence[str]) -> list[Finding]:
+        """Find joints that do not follow their command, unless the file is damaged.
 
-        Lost samples have rules of their own; what these say of a joint is not said twice.
+        Lost samples have rules of their own, whose reasons are not repeated.
         """
         if file.damage:
             return []
         try:
-            with Session(self._file.path) as session:
-                faults = faults_in_session(session)
+            faults = faults_in_session(SessionView(self._log))
         except DataError as error:
             why = str(error).removeprefix(f"{self._file.path}: ")
             return [Finding(0, f"whether joints follow their command is not known: {why}")]
         return [
             judge_following(fault)
             for fault in faults
-            if fault.kinds != ("lost_samples",) or not any(_names(one, fault.joint) for one in said)
+            if fault.kinds != ("lost_samples",)
+            or not any(_names(one, fault.joint) for one in reasons)
         ]
 
     # -- reading ---------------------------------------------------------------------------
@@ -147,12 +140,12 @@ class _Check:
         ]
         for block in log_file.blocks:
             if block.part >= len(found):  # from the write-ahead log, checked when it was read
-                self._read_block(block, Container(), log_file.path)
+                self._read_block(block, log_file.path)
                 step()
         recovered = log_file.recovered
-        told = [*log_file.parts.missing, *check_chain(log_file.parts)]
+        missing = [*log_file.parts.missing, *check_chain(log_file.parts)]
         if recovered is not None and recovered.missing:
-            told.append(
+            missing.append(
                 f"{recovered.missing} of {recovered.accepted} messages that the recorder accepted "
                 "are missing"
             )
@@ -160,7 +153,7 @@ class _Check:
             chunks=sum(one.chunks for one in found),
             checked=sum(one.checked for one in found),
             without_crc=sum(one.without_crc for one in found),
-            damage=(*(text for one in found for text in one.damage), *told),
+            damage=(*(text for one in found for text in one.damage), *missing),
             truncated=any(one.truncated for one in found),
             indexed=all(one.indexed for one in found),
             notes=(
@@ -179,24 +172,26 @@ class _Check:
         loose = [block for block in blocks if block.complete]
         indexed = not container.truncated and all(b.index_at for b in loose if b.end_ns)
         skipped = [note for note in file.warnings if note.startswith("the record at byte")]
-        # Of what was not finalised, the write-ahead log knows more than the file's end.
+        # Of an unfinished recording, the write-ahead log has more than the file's end.
         notes = [note for note in file.warnings if note not in skipped and not self._file.recovered]
         damage = [*container.damage, *skipped]
         read = {block.start for block in blocks}
         known = {note.split(" ", 5)[4] for note in skipped}  # after "the record at byte"
-        for place in container.chunks.values():
-            if place.start in read or str(place.record_at) in known:
-                continue
-            wrong = check_chunk(path, place)
-            damage.append(wrong or f"the chunk at byte {place.start} is missing in the index")
+        damage += [
+            _unlisted(file, chunk)
+            for chunk in container.chunks.values()
+            if chunk.start not in read and str(chunk.record_at) not in known
+        ]
         checked = without_crc = 0
         for block in blocks:
             try:
-                crc = self._read_block(block, container, path)
-                checked += crc
-                without_crc += not crc and block.start in container.chunks
+                self._read_block(block, path)
             except LogError as error:
                 damage.append(str(error).removeprefix(f"{path}: ") + self._lost_with(block))
+            else:
+                chunk = container.chunks.get(block.start)
+                checked += chunk is not None and chunk.crc != 0
+                without_crc += chunk is not None and chunk.crc == 0
             step()
         return FileHealth(
             chunks=len(container.chunks),
@@ -209,9 +204,10 @@ class _Check:
         )
 
     def _lost_with(self, block: Block) -> str:
-        """What a chunk that can't be read held, as its index has it."""
+        """Describe the messages of an unreadable chunk, as listed in its index."""
         try:
-            held = {key: len(self._file.offsets(block, key)) for key in block.index_at}
+            source = self._file.source_of(block)
+            held = {key: len(source.offsets(block, key)) for key in block.index_at}
         except LogError:
             return ""
         channels = self._file.channels
@@ -222,34 +218,29 @@ class _Check:
         return f"; it held {sum(held.values())} messages: {', '.join(listed)}" if listed else ""
 
     def _against_summary(self, file: FileHealth) -> FileHealth:
-        """The file's health with the summary's counts held against the messages read."""
+        """Compare the summary's counts with the messages read."""
         if file.damage or file.truncated or not file.indexed:
-            return file  # then messages are missing anyway, and the reason is known
+            return file  # messages are missing, for a known reason
         wrong = [
-            f"the summary counts {count} messages of {self._scan.topic(key)}, "
+            f"the summary counts {count} messages of {self._file.channels[key].topic}, "
             f"{self._scan.count(key)} are in the file"
             for key, count in self._file.counts.items()
-            if self._scan.has(key) and count != self._scan.count(key)
+            if key in self._file.channels and count != self._scan.count(key)
         ]
         return replace(file, damage=tuple(wrong))
 
-    def _read_block(self, block: Block, container: Container, path: Path) -> bool:
-        """Read one block; whether a CRC was there and fits."""
-        data, base = self._file.payload(block)  # its CRC is checked where it is compressed
-        chunk = container.chunks.get(block.start)
-        stop = len(data) if block.compression else block.stop
-        plain = chunk is not None and not block.compression and chunk.crc
-        if plain and zlib.crc32(data[block.start : block.stop]) != block.crc:
-            where = f"the chunk at byte {block.start}"
-            raise LogError(path, f"{where} is corrupt (its CRC doesn't fit)")
+    def _read_block(self, block: Block, path: Path) -> None:
+        """Read and scan one block, its CRC and its index checked."""
+        source = self._file.source_of(block)
+        data, base, stop = source.payload_once(block)
         if block.is_empty and not block.index_at:
-            return chunk is not None and bool(chunk.crc)
-        if block.offsets is None and not block.index_at:  # looked for once, for all channels
-            self._file.offsets(block, 0)
+            return
+        if block.offsets is None and not block.index_at:  # found once, for all channels
+            source.offsets(block, 0)
         keys = list(block.offsets if block.offsets is not None else block.index_at)
         if not keys:
-            return chunk is not None and bool(chunk.crc)
-        found = [np.sort(self._file.offsets(block, key)) + base for key in keys]
+            return
+        found = [np.sort(source.offsets(block, key)) + base for key in keys]
         heads = read_message_heads(data, np.concatenate(found), stop)
         owners = np.repeat(keys, [len(offsets) for offsets in found])
         twice = any((np.diff(offsets) == 0).any() for offsets in found)
@@ -258,23 +249,14 @@ class _Check:
             raise LogError(path, f"{where} does not list its messages")
         begin = 0
         for key, offsets in zip(keys, found, strict=True):
-            if len(offsets) and self._scan.has(key):
+            if len(offsets) and key in self._file.channels:
                 self._scan.add(key, data, offsets, heads[begin : begin + len(offsets)])
             begin += len(offsets)
-        return chunk is not None and bool(chunk.crc)
-
-    def _read_robot(self) -> Robot | None:
-        stored = {name: item.data for name, item in self._file.attachments.items()}
-        try:
-            return robot_in_session(stored, self._file.path)
-        except RobotFileError as error:
-            self._notes.append(f"the attached robot description can't be used: {error}")
-            return None
 
     def _define(self, key: int) -> None:
         channel = self._file.channels[key]
         try:
-            kind = self._topics.message_type(channel.topic)
+            kind = self._log.topics.message_type(channel.topic)
         except DataError as error:
             self._notes.append(str(error).removeprefix(f"{self._file.path}: "))
             kind = None
@@ -285,8 +267,17 @@ class _Check:
         self._scan.define(key, channel.topic, type_name, kind, channel.metadata)
 
 
+def _unlisted(file: McapFile, chunk: Block) -> str:
+    """Describe what is wrong with a chunk that is in no index."""
+    try:
+        file.payload_once(chunk)
+    except LogError as error:
+        return str(error).removeprefix(f"{file.path}: ")
+    return f"the chunk at byte {chunk.start} is missing in the index"
+
+
 def _with_name(health: FileHealth, name: str) -> FileHealth:
-    """The health of one part, its sentences beginning with its name."""
+    """Prefix the sentences of one part with its name."""
     if not name:
         return health
     return replace(

@@ -1,7 +1,6 @@
-"""A session's messages to one statement of health, wherever they come from.
+"""The health of a session from its messages, of a file or of a running recording.
 
-The same scan is fed from the chunks of a file (:mod:`.health.session_check`) and from the
-messages of a running recording, so both come to the same verdict.
+Chunks of a file (:mod:`.health.session_check`) and messages of a recording get the same verdict.
 """
 
 from __future__ import annotations
@@ -16,15 +15,15 @@ from numpy.typing import NDArray
 
 from ...common.arrays import IntArray
 from ...robot.model import Robot
-from ..edit.edited_log import Finding, joined
 from ..mcap.chunk import Buffer
 from ..messages.definitions import JOINT_STATE, MessageType
 from ..messages.frames import identifier_text
 from .bus_tally import named_identifiers, undecoded
 from .channel_scan import ChannelScan, Limits, Series
 from .freeze import FreezeTally
-from .measures import BusHealth, ChannelHealth, JointHealth, SeriesHealth
 from .rules import (
+    Finding,
+    joined,
     judge_body,
     judge_bus,
     judge_channel,
@@ -35,25 +34,25 @@ from .rules import (
     verdict_of,
 )
 from .sources import SourceHealth, judge_source, measure_sources
-from .tallies import NS
+from .tallies import NS, BusHealth, ChannelHealth, JointHealth, SeriesHealth
 
 _MOST_PAIRS = 4096
-"""Pairs of joint sets, measured and commanded, that are looked at for joints that stand still."""
+"""Most pairs of measured and commanded joint sets that are checked for frozen joints."""
 
 COMMANDS, STATES = "/joint_commands", "/joint_states"
 
 
 @dataclass(frozen=True)
 class SessionMeasures:
-    """What the messages of a session say of its health.
+    """Measures and findings of a session's messages.
 
     Attributes:
         robot: Name of the robot; None without a usable description.
         start_ns: Log time of the first message [Unix ns]; 0 without messages.
         end_ns: Log time of the last.
-        findings: All that was found, heaviest first.
+        findings: Heaviest first.
         joints: By topic, in the order of the messages.
-        sources: As the recorder counted them, by name.
+        sources: Counts of the recorder, by name.
     """
 
     robot: str | None
@@ -78,18 +77,18 @@ class SessionMeasures:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why it is not better, heaviest first."""
+        """Reasons of the verdict, heaviest first."""
         return tuple(finding.sentence for finding in self.findings if finding.weight)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is worth knowing and no fault."""
+        """Findings that are no fault."""
         return tuple(finding.sentence for finding in self.findings if not finding.weight)
 
 
 @dataclass(frozen=True)
 class ChannelMeasures:
-    """What one channel's messages say.
+    """Measures of one channel's messages.
 
     Attributes:
         series: One for each set of names.
@@ -106,25 +105,16 @@ class SessionScan:
         """Start without channels.
 
         Args:
-            robot: The robot that the session describes; None without a usable description.
-            horizon_s: For a session that is still being recorded: how far stamps may go back [s].
-                What is older is summed up, so that memory is bounded; samples that come later
-                still are left out where joints are looked at for standing still. None for a file.
+            robot: The robot of the session; None without a usable description.
+            horizon_s: How far stamps may go back in a running recording [s]. Older samples are
+                summed up, so that memory is bounded, and later ones are not checked for frozen
+                joints. None for a file.
         """
         self._robot = robot
         self._horizon_s = horizon_s
         self._freezes: dict[tuple[int, tuple[str, ...], int, tuple[str, ...]], FreezeTally] = {}
         self._scans: dict[int, ChannelScan] = {}
         self._types: dict[int, str] = {}
-
-    @property
-    def keys(self) -> tuple[int, ...]:
-        """The channels defined so far."""
-        return tuple(self._scans)
-
-    def has(self, key: int) -> bool:
-        """Whether a channel is defined."""
-        return key in self._scans
 
     def define(
         self,
@@ -134,12 +124,11 @@ class SessionScan:
         kind: MessageType | None,
         metadata: Mapping[str, str],
     ) -> None:
-        """Take a channel, before its messages.
+        """Add a channel, before its messages.
 
         Args:
             key: The channel's id.
-            type_name: Its type, by name.
-            kind: Its type; None where it can't be read: only times are looked at then.
+            kind: Its type; None if it can't be read: then only times are used.
             metadata: Of the channel, e.g. ``unit``.
         """
         angles = topic in (COMMANDS, STATES) and metadata.get("unit", "rad") == "rad"
@@ -153,26 +142,22 @@ class SessionScan:
         self._types[key] = type_name
 
     def add(self, key: int, data: Buffer, offsets: IntArray, heads: NDArray[np.void]) -> None:
-        """Take messages of one channel.
+        """Add messages of one channel.
 
         Args:
             data: Bytes that hold their records.
-            offsets: Where the records start, in the order of the session, shape (n,).
+            offsets: Offsets of the records, in the order of the session, shape (n,).
             heads: The records' heads, of :data:`.capture.log.mcap.records.HEAD`, shape (n,).
         """
         self._scans[key].add(data, offsets, heads)
 
     def count(self, key: int) -> int:
-        """Messages of a channel so far."""
+        """Return the number of messages of a channel so far."""
         self._scans[key].flush()
         return self._scans[key].count
 
-    def topic(self, key: int) -> str:
-        """Topic of a channel."""
-        return self._scans[key].topic
-
     def measure(self, key: int) -> ChannelMeasures:
-        """What a channel's messages say so far."""
+        """Return the measures of a channel so far."""
         scan, type_name = self._scans[key], self._types[key]
         scan.flush()
         return ChannelMeasures(
@@ -187,16 +172,13 @@ class SessionScan:
         before: Iterable[Finding] = (),
         measured: Mapping[int, ChannelMeasures] | None = None,
     ) -> SessionMeasures:
-        """Judge what has come so far.
+        """Judge the messages so far.
 
         Args:
             start_ns: Log time of the first message [Unix ns]; 0 without messages.
             end_ns: Log time of the last.
-            before: Findings of another kind, e.g. on the container.
-            measured: Measures of channels that were taken already.
-
-        Returns:
-            The measures and what they mean.
+            before: Other findings, e.g. on the container.
+            measured: Existing measures of channels.
         """
         taken = measured or {}
         found = [
@@ -254,7 +236,7 @@ class SessionScan:
         return frozenset() if self._robot is None else named_identifiers(self._robot)
 
     def _undecoded(self, scans: list[ChannelScan], *, all_joints: bool) -> str | None:
-        """Why the frames brought nothing or hardly anything; None if they did, or without a map."""
+        """Return why almost no frame could be decoded; None if enough were, or without a map."""
         tallies = [scan.bus.identifiers for scan in scans if scan.bus is not None]
         robot = self._robot
         if all_joints or robot is None or robot.bus is None or not tallies:
@@ -296,7 +278,7 @@ class SessionScan:
     def _frozen(
         self, key: int, series: Series, scans: list[tuple[int, ChannelScan]]
     ) -> dict[int, list[tuple[int, int]]]:
-        """Frozen seconds and their first one, for each joint with a command, by its place."""
+        """Return frozen seconds and the first one, for each joint with a command, by its index."""
         measured = series.ranges.result(len(series.names))
         runs: dict[int, list[tuple[int, int]]] = {}
         closed = _closed(scans)
@@ -317,14 +299,7 @@ class SessionScan:
         return runs
 
     def last_load(self, topic: str) -> tuple[float, float] | None:
-        """Load of a bus in its last whole second.
-
-        Args:
-            topic: The bus's topic.
-
-        Returns:
-            Part of the bitrate without and with the most stuff bits; None where unknown.
-        """
+        """Return the load of a bus in its last whole second; see :meth:`.BusTally.last_second`."""
         buses = [scan for scan in self._scans.values() if scan.bus is not None and scan.count]
         for scan in buses:
             if scan.topic == topic and scan.bus is not None:
@@ -332,7 +307,7 @@ class SessionScan:
         return None
 
     def _bitrate(self, buses: list[ChannelScan]) -> int | None:
-        """The described bus's bitrate, where it is clear which one that is."""
+        """Return the described bus's bitrate; None if there are several buses."""
         if self._robot is None or self._robot.bus is None or len(buses) != 1:
             return None
         return self._robot.bus.bitrate
@@ -352,7 +327,7 @@ def _series(topic: str, type_name: str, tally: Series) -> SeriesHealth:
 
 
 def _closed(scans: list[tuple[int, ChannelScan]]) -> int | None:
-    """Seconds before this one will not change in any series of angles."""
+    """Return the second before which no series of angles will change."""
     every = [
         series.ranges.closed
         for _, scan in scans

@@ -1,8 +1,8 @@
-"""What a recorder says of its sources: losses that the frames alone can't prove.
+"""Counts of a recorder's sources: losses that are not visible in the frames.
 
 A recorder writes one ``/diagnostics`` message a second, with a status ``source NAME`` for each
-source and its counts since the start as key-values. The last one of a file counts, less the first
-where the file doesn't begin with the recording (a cut, a later part).
+source and its counts since the start as key-values. The counts of a file are those of its last
+message, minus the first if the file doesn't begin with the recording (a cut, a later part).
 """
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ...common.errors import DataError
-from ..edit.edited_log import Finding
 from ..messages.cdr import layout_of
 from ..messages.definitions import NO_VALUES, DiagnosticStatus, MessageType
-from .rules import BAD_LOSS, GOOD_LOSS
+from .rules import BAD_LOSS, GOOD_LOSS, Finding
 
 SOURCE_PREFIX = "source "
 """Start of the name of a source's status."""
@@ -37,8 +36,8 @@ class SourceHealth:
 
     Attributes:
         name: E.g. ``can0``.
-        dropped: Frames that the source's own counters prove lost before the recorder; None where
-            it has none.
+        dropped: Frames lost before the recorder, by the source's own counters; None without
+            counters.
         malformed: Packets or lines that could not be read.
         error_frames: Frames that report a bus error.
         reconnects: How often the connection came back.
@@ -55,13 +54,7 @@ class SourceHealth:
 
 
 def read_statuses(kind: MessageType, message: bytes) -> tuple[DiagnosticStatus, ...]:
-    """The statuses of one ``diagnostic_msgs/DiagnosticArray``.
-
-    Args:
-        kind: The message's type.
-
-    Returns:
-        The statuses in the message's order.
+    """Return the statuses of one ``diagnostic_msgs/DiagnosticArray``, in its order.
 
     Raises:
         DataError: If the message can't be decoded.
@@ -81,24 +74,24 @@ def read_statuses(kind: MessageType, message: bytes) -> tuple[DiagnosticStatus, 
 
 
 def measure_sources(kind: MessageType, first: bytes, last: bytes) -> tuple[SourceHealth, ...]:
-    """The sources of a recording between its first and its last diagnostics.
+    """Return the sources of a recording between its first and its last diagnostics.
 
     Args:
         first: The first message of ``/diagnostics`` in the file.
         last: The last one.
 
     Returns:
-        The sources of frames by name; none where the messages are not a recorder's, or can't be
+        The sources of frames by name; none if the messages are not a recorder's, or can't be
         decoded.
     """
     try:
         before = {status.name: status.values for status in read_statuses(kind, first)}
         after = read_statuses(kind, last)
     except DataError:
-        return ()  # counted as unread where the channel is judged
+        return ()  # counted as unread of the channel
     late = _number(before.get(RECORDER, NO_VALUES), ELAPSED) > FIRST_S
     if late and first == last:
-        return ()  # one moment of a recording says nothing of what happened in the file
+        return ()  # one message has no counts of the time of the file
     found: list[SourceHealth] = []
     for status in after:
         if not status.name.startswith(SOURCE_PREFIX) or "frames" not in status.values:
@@ -124,7 +117,7 @@ def measure_sources(kind: MessageType, first: bytes, last: bytes) -> tuple[Sourc
 
 
 def judge_source(source: SourceHealth) -> list[Finding]:
-    """Findings on one source."""
+    """Return findings on one source."""
     found: list[Finding] = []
     label = f"source {source.name}"
     if not source.frames:

@@ -37,6 +37,7 @@ LARGEST_CHUNK_VARIABLE = "UNDULOG_MAX_CHUNK_MIB"
 _LARGEST_CHUNK_MIB = 256
 _LEAST_WINDOW = 1 << 23
 
+_CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, size, CRC, length of the compression's name
 _NAME_AT = PREFIX_SIZE + 8 + 8 + 8 + 4  # of the compression's name in a chunk's record
 
 _COMPRESSION_NAME = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
@@ -45,7 +46,7 @@ Buffer = bytes | bytearray | mmap.mmap
 
 
 class _Own(threading.local):
-    """Each thread's decompressor and compressed bytes, for one chunk after the other."""
+    """A decompressor and a buffer of compressed bytes for each thread."""
 
     def __init__(self) -> None:
         self.decompressor = zstandard.ZstdDecompressor()
@@ -57,20 +58,21 @@ _own = _Own()
 
 @dataclass
 class Block:
-    """A stretch of messages: one chunk, or the unchunked messages of a file.
+    """A block of messages: one chunk, or the unchunked messages of a file.
 
     Attributes:
         start: First payload byte in the file.
         stop: One past the last payload byte in the file.
         compression: ``zstd``, ``lz4`` or empty.
         size: Uncompressed size [byte].
-        crc: CRC-32 of the uncompressed payload, 0 where there is none.
+        crc: CRC-32 of the uncompressed payload, 0 for none.
         start_ns: Earliest log time in it [ns].
         end_ns: Latest log time in it [ns].
         index_at: Channel id to the file offset of its MessageIndex record.
-        offsets: Channel id to message offsets in the payload; filled where there is no index.
-        complete: False for a chunk that the end of the file cuts short.
+        offsets: Channel id to message offsets in the payload, of a block without index.
+        complete: False for a chunk that is cut short by the end of the file.
         part: Which file of the session it is in, from 0.
+        record_at: File offset of its chunk record.
     """
 
     start: int
@@ -84,18 +86,19 @@ class Block:
     offsets: dict[int, IntArray] | None = None
     complete: bool = True
     part: int = 0
+    record_at: int = 0
 
     @property
     def is_empty(self) -> bool:
-        """Whether it declares to have no bytes."""
+        """Whether its declared size is 0."""
         return self.size == 0 if self.compression else self.start == self.stop
 
 
 def largest_chunk() -> int:
-    """Largest uncompressed size of a chunk that is read [byte].
+    """Return the largest uncompressed size of a chunk that is read [byte].
 
     Raises:
-        UsageError: If the environment sets something else than a positive whole number of MiB.
+        UsageError: If the environment variable is not a positive whole number of MiB.
     """
     text = os.environ.get(LARGEST_CHUNK_VARIABLE, str(_LARGEST_CHUNK_MIB))
     if not text.isascii() or not text.isdecimal() or not 0 < int(text[:9]) < 1 << 24:
@@ -146,14 +149,14 @@ def inflate(compression: str, raw: bytes, size: int, *, whole: bool) -> bytes:
 
 
 def inflate_zstd_into(raw: memoryview, room: memoryview) -> int:
-    """Decompress a zstd frame into memory that is there already: no page of it is new.
+    """Decompress a zstd frame into existing memory, which costs no page faults.
 
     Args:
         raw: The compressed bytes, one frame.
-        room: As much memory as the frame should need.
+        room: Memory of the frame's expected size.
 
     Returns:
-        Bytes that the frame has; at most one more than there is room for is found out.
+        Size of the frame [byte]; of a larger frame, the size of ``room`` plus 1.
 
     Raises:
         zstandard.ZstdError: If the frame is damaged.
@@ -164,15 +167,15 @@ def inflate_zstd_into(raw: memoryview, room: memoryview) -> int:
 
 
 def read_at(descriptor: int, start: int, stop: int) -> memoryview:
-    """Read a stretch of a file that is looked at once.
+    """Read bytes of a file that are used once.
 
-    Through a mapping its pages would stay in this process's memory, and each costs a fault.
+    Through a mapping the pages would stay in this process's memory, and each costs a fault.
 
     Args:
         stop: One past the last byte.
 
     Returns:
-        The bytes, until this thread reads again; fewer than asked for where the file ends before.
+        The bytes, valid until this thread reads again; fewer if the file ends before ``stop``.
 
     Raises:
         OSError: If it can't be read.
@@ -187,11 +190,7 @@ def read_at(descriptor: int, start: int, stop: int) -> memoryview:
 
 
 def checks_itself(raw: memoryview) -> bool:
-    """Whether a zstd frame has a checksum of its content: decompression verifies it.
-
-    Returns:
-        Whether it has; False for what is no zstd frame.
-    """
+    """Whether a zstd frame has a checksum of its content, which decompression verifies."""
     try:
         return zstandard.get_frame_parameters(raw).has_checksum
     except zstandard.ZstdError:
@@ -199,14 +198,14 @@ def checks_itself(raw: memoryview) -> bool:
 
 
 def walk_records(data: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]]:
-    """Walk records back to back.
+    """Walk consecutive records.
 
     Args:
         start: Offset of the first record's opcode.
-        stop: One past the last byte to look at.
+        stop: One past the last byte.
 
     Yields:
-        Opcode, body start and body stop of each whole record in [start, stop), up to zeros.
+        Opcode, body start and body stop of each whole record in [start, stop), until an opcode 0.
     """
     at = start
     while at + PREFIX_SIZE <= stop:
@@ -221,11 +220,40 @@ def walk_records(data: Buffer, start: int, stop: int) -> Iterator[tuple[int, int
         at = body + length
 
 
-def next_chunk(data: Buffer, start: int, stop: int) -> int | None:
-    """Search for a whole compressed chunk where the chain of records is broken.
+def chunk_at(data: Buffer, start: int, stop: int) -> Block | None:
+    """Return the block of a chunk record, possibly cut short; None if its header is cut.
 
     Args:
-        start: First place to look at.
+        start: First byte of the record's body.
+        stop: One past the last byte of the body.
+    """
+    if stop - start < _CHUNK_HEAD.size + 8:
+        return None
+    begin, end, size, crc, name_size = _CHUNK_HEAD.unpack_from(data, start)
+    name_at = start + _CHUNK_HEAD.size
+    data_at = name_at + name_size + 8
+    if data_at > stop:
+        return None
+    name = data[name_at : data_at - 8].decode("ascii", "replace")
+    (data_size,) = struct.unpack_from("<Q", data, data_at - 8)
+    return Block(
+        start=data_at,
+        stop=min(data_at + data_size, stop),
+        compression=name,
+        size=size,
+        crc=crc,
+        start_ns=begin,
+        end_ns=end,
+        complete=data_at + data_size <= stop,
+        record_at=start - PREFIX_SIZE,
+    )
+
+
+def next_chunk(data: Buffer, start: int, stop: int) -> int | None:
+    """Search for a whole compressed chunk behind a break in the chain of records.
+
+    Args:
+        start: Offset of the first byte.
         stop: One past the last byte.
 
     Returns:

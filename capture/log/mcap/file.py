@@ -1,13 +1,9 @@
-"""MCAP as blocks of messages: what the file holds and where, without decoding it.
+"""MCAP as blocks of messages: the contents of a file and their positions, without decoding.
 
 A :class:`Block` is one chunk (or the unchunked part of a file) with the offsets of each
 channel's messages. An indexed file is opened from its summary alone; a file without one
-(truncated, or written without an index) is walked record by record, and what could not be read
-is said in ``warnings``.
-
-Format: https://mcap.dev/spec.
-
-How an MCAP file is opened: from its summary, or from the first record to the last whole one.
+(truncated, or written without an index) is read record by record, and ``warnings`` lists the parts
+that could not be read.
 
 Format: https://mcap.dev/spec.
 """
@@ -15,8 +11,7 @@ Format: https://mcap.dev/spec.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TypeVar
@@ -38,46 +33,271 @@ from mcap.records import (
 
 from ...common.arrays import IntArray, frozen
 from ...common.errors import LogError, NotALogError
-from .chunk import MAGIC, PREFIX_SIZE, Block, Buffer, next_chunk, walk_records
+from .chunk import MAGIC, PREFIX_SIZE, Block, Buffer, chunk_at, next_chunk, walk_records
 from .payloads import McapPayloads
 
 _Record = TypeVar("_Record")
 
 
-@dataclass
-class McapContents:
-    """What is known of an MCAP file; grows while its records are walked.
+_FOOTER_SIZE = 1 + 8 + 20
+_CHUNK_INDEX = struct.Struct("<16xQQI")  # after the times: the chunk's place and length, offsets
+_INDEX_OFFSET = struct.Struct("<HQ")  # channel, place of its message index
+
+
+_INDEXED: dict[int, tuple[Opcode, Callable[[ReadDataStream], AttachmentIndex | MetadataIndex]]] = {
+    Opcode.ATTACHMENT_INDEX: (Opcode.ATTACHMENT, AttachmentIndex.read),
+    Opcode.METADATA_INDEX: (Opcode.METADATA, MetadataIndex.read),
+}
+
+
+class _NoSummaryError(Exception):
+    """The file can't be opened from its summary."""
+
+
+class _Summary:
+    """Reads the summary of a file; of the rest, only the heads of its chunks."""
+
+    def __init__(self, file: McapFile) -> None:
+        self._file = file
+        self._buffer = file.buffer
+
+    def read(self) -> None:
+        buffer, file = self._buffer, self._file
+        summary_start, footer = self._range()
+        indexes: list[tuple[int, int]] = []  # opcode of the indexed record, its offset
+        statistics: Statistics | None = None
+        try:
+            for opcode, start, stop in walk_records(buffer, len(MAGIC), footer):
+                file.take(opcode, buffer, start, stop)
+                break  # the header is the first record
+            for opcode, start, stop in walk_records(buffer, summary_start, footer):
+                if opcode == Opcode.CHUNK_INDEX:
+                    file.blocks.append(self._block(start, stop))
+                elif opcode == Opcode.STATISTICS:
+                    statistics = file.parse(Statistics.read, buffer, start, stop)
+                elif opcode in _INDEXED:
+                    indexed, read = _INDEXED[opcode]
+                    indexes.append((indexed, file.parse(read, buffer, start, stop).offset))
+                else:
+                    file.take(opcode, buffer, start, stop)
+            self._check_places(summary_start)
+            before = 0
+            for opcode, offset in sorted(indexes, key=lambda index: index[1]):  # file order
+                start, before = self._record_at(offset, before)
+                file.take(opcode, buffer, start, before)
+        except (LogError, McapError, struct.error, ValueError) as error:
+            raise _NoSummaryError(f"the summary is damaged ({error})") from error
+        if statistics is None or not file.channels:
+            raise _NoSummaryError("the summary does not list the channels")
+        if statistics.message_count and not file.blocks:
+            raise _NoSummaryError("the file has no chunk index")
+        if statistics.attachment_count + statistics.metadata_count != len(indexes):
+            raise _NoSummaryError("the summary does not list all attachments and metadata")
+        file.counts = dict(statistics.channel_message_counts)
+
+    def _range(self) -> tuple[int, int]:
+        """Return the first byte of the summary and of the footer."""
+        buffer = self._buffer
+        footer = len(buffer) - len(MAGIC) - _FOOTER_SIZE
+        if footer < len(MAGIC) or buffer[-len(MAGIC) :] != MAGIC or buffer[footer] != Opcode.FOOTER:
+            raise _NoSummaryError("the file is cut short (no footer)")
+        (summary_start,) = struct.unpack_from("<Q", buffer, footer + PREFIX_SIZE)
+        if not len(MAGIC) <= summary_start < footer:
+            raise _NoSummaryError("the file has no summary")
+        return summary_start, footer
+
+    def _block(self, start: int, stop: int) -> Block:
+        """Return the block of a chunk index; an hour has thousands of them, so little is read."""
+        path, buffer = self._file.path, self._buffer
+        entries_at = start + _CHUNK_INDEX.size
+        if entries_at > stop:
+            raise LogError(path, "a chunk index is cut short")
+        at, length, size = _CHUNK_INDEX.unpack_from(buffer, start)
+        if size % _INDEX_OFFSET.size or entries_at + size > stop:
+            raise LogError(path, "a chunk index is damaged")
+        if not len(MAGIC) <= at <= at + length <= len(buffer):
+            raise LogError(path, f"a chunk index points to byte {at}, outside the file")
+        block = _chunk_at(self._file, at + PREFIX_SIZE, at + length)
+        block.index_at = dict(_INDEX_OFFSET.iter_unpack(buffer[entries_at : entries_at + size]))
+        return block
+
+    def _check_places(self, summary_start: int) -> None:
+        """Refuse chunks and message indexes that share bytes."""
+        blocks = self._file.blocks
+        blocks.sort(key=lambda block: block.start)
+        starts = [block.start for block in blocks]
+        for block, bound in zip(blocks, [*starts, summary_start][1:], strict=True):
+            places = block.index_at.values()
+            if block.stop > bound or (
+                places and not block.stop <= min(places) <= max(places) < bound
+            ):
+                where = f"the chunk at byte {block.start}"
+                raise LogError(self._file.path, f"the indexes of {where} and of another overlap")
+
+    def _record_at(self, offset: int, before: int) -> tuple[int, int]:
+        """Return the range of an indexed record's body, which begins at ``before`` or later."""
+        if offset < before:
+            raise LogError(self._file.path, f"indexes overlap at byte {offset}")
+        for _, start, stop in walk_records(self._buffer, offset, len(self._buffer)):
+            return start, stop
+        raise LogError(self._file.path, f"an index points to byte {offset}, where no record is")
+
+
+class _Scan:
+    """Reads the records of a file without a whole summary, one after the other."""
+
+    def __init__(self, file: McapFile) -> None:
+        self._file = file
+        end = len(file.buffer)
+        self._loose = Block(0, end, "", end, 0, 2**63 - 1, 0, offsets={})
+        self._loose_at: dict[int, list[int]] = {}
+
+    def read(self) -> None:
+        """Read from the first record to the last whole one."""
+        file, buffer, end = self._file, self._file.buffer, len(self._file.buffer)
+        former = at = len(MAGIC)
+        while at + PREFIX_SIZE <= end:
+            opcode = buffer[at]
+            (length,) = struct.unpack_from("<Q", buffer, at + 1)
+            start, stop = at + PREFIX_SIZE, at + PREFIX_SIZE + length
+            if stop > end or opcode == 0:
+                # The break may be a wrong length in the record before, too.
+                following = next_chunk(buffer, former + 1, end)
+                if following is None:
+                    self._salvage(opcode, start, end)
+                    break
+                file.warnings.append(
+                    f"the record at byte {at} is damaged and was skipped: the next whole chunk is "
+                    f"at byte {following}"
+                )
+                former = at = following
+                continue
+            try:
+                self._record(opcode, start, stop)
+            except (McapError, struct.error, ValueError, LogError) as error:
+                file.warnings.append(f"the record at byte {at} is damaged and was skipped: {error}")
+            if opcode == Opcode.DATA_END:
+                break
+            former, at = at, stop
+        if self._loose_at:
+            file.add_unindexed(self._loose, _arrays(self._loose_at))
+
+    def _record(self, opcode: int, start: int, stop: int) -> None:
+        buffer, loose = self._file.buffer, self._loose
+        if opcode == Opcode.CHUNK:
+            self._chunk(_chunk_at(self._file, start, stop))
+        elif opcode == Opcode.MESSAGE:
+            channel_id, _, log_time = struct.unpack_from("<HIQ", buffer, start)
+            self._loose_at.setdefault(channel_id, []).append(start - PREFIX_SIZE)
+            loose.start_ns = min(loose.start_ns, log_time)
+            loose.end_ns = max(loose.end_ns, log_time)
+        else:
+            self._file.take(opcode, buffer, start, stop)
+
+    def _chunk(self, block: Block) -> None:
+        self._file.add_unindexed(block, self._file.walk(block))
+
+    def _salvage(self, opcode: int, start: int, end: int) -> None:
+        """Read the beginning of the last record, which is cut short by the end of the file."""
+        warnings = self._file.warnings
+        if opcode == Opcode.CHUNK:
+            try:
+                block = _chunk_at(self._file, start, end)
+                block.complete = False
+                self._chunk(block)
+            except (McapError, struct.error, ValueError, LogError) as error:
+                warnings.append(f"nothing of the last, cut chunk could be read: {error}")
+                return
+            found = sum(len(at) for at in (block.offsets or {}).values())
+            data, _, _ = self._file.payload(block)
+            warnings.append(
+                f"the last chunk is cut short: {found} messages of it could be read "
+                f"({len(data)} of {block.size} bytes)"
+            )
+        else:
+            warnings.append(f"the last {end - start + PREFIX_SIZE} bytes are a cut record")
+
+
+def _arrays(offsets: dict[int, list[int]]) -> dict[int, IntArray]:
+    return {channel_id: np.array(at, dtype=np.int64) for channel_id, at in offsets.items()}
+
+
+def _chunk_at(file: McapPayloads, start: int, stop: int) -> Block:
+    block = chunk_at(file.buffer, start, stop)
+    if block is None:
+        raise LogError(file.path, f"the chunk at byte {start} is cut in its header")
+    return block
+
+
+_INDEX_HEAD = struct.Struct("<BQHI")  # of a message index: opcode, length, channel, entries' size
+_NO_OFFSETS: IntArray = frozen(np.empty(0, dtype=np.int64))
+
+
+class McapFile(McapPayloads):
+    """An MCAP file as blocks, channels, schemas, metadata and attachments.
 
     Attributes:
-        profile: As its header has it, and so is ``library``.
+        profile: As stated in the header, like ``library``.
         counts: Channel id to number of messages.
-        metadata: By name; records of one name are put together.
-        attachments: By name, of several the last.
+        metadata: By name; records of one name are merged.
+        attachments: By name; of several the last.
         appendices: Both, as stored; names may repeat.
-        warnings: What could not be read, one sentence each.
-        cut: Why the file was read record by record; empty where its summary told all.
+        warnings: Parts that could not be read, one sentence each.
+        cut: Why the file was read record by record; empty if the summary was enough.
     """
 
-    path: Path
-    profile: str = ""
-    library: str = ""
-    schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
-    channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
-    blocks: list[Block] = field(default_factory=list[Block])
-    counts: dict[int, int] = field(default_factory=dict[int, int])
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
-    attachments: dict[str, Attachment] = field(default_factory=dict[str, Attachment])
-    appendices: list[Attachment | Metadata] = field(default_factory=list["Attachment | Metadata"])
-    warnings: list[str] = field(default_factory=list[str])
-    cut: str = ""
-
-    def take(self, opcode: int, data: Buffer, start: int, stop: int) -> None:
-        """Note a record that reads alike in the data section, in a chunk and in the summary.
+    def __init__(self, path: Path, *, bare: bool = False) -> None:
+        """Open a file and find its contents.
 
         Args:
-            opcode: Its kind; others than those below are passed over.
-            data: The bytes that it is in.
-            stop: One past its body's last byte.
+            bare: Accept a file without channels: a write-ahead log or another part has them.
+
+        Raises:
+            NotALogError: If it is empty, not MCAP, or nothing in it can be read.
+            LogError: If the operating system can't open it.
+        """
+        super().__init__(path)
+        self.profile = self.library = self.cut = ""
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.blocks: list[Block] = []
+        self.counts: dict[int, int] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: dict[str, Attachment] = {}
+        self.appendices: list[Attachment | Metadata] = []
+        self.warnings: list[str] = []
+        try:
+            self._find_contents(bare=bare)
+        except BaseException:
+            self.close()
+            raise
+
+    def _find_contents(self, *, bare: bool) -> None:
+        if self.buffer[: len(MAGIC)] != MAGIC:
+            found = bytes(self.buffer[: len(MAGIC)]).hex(" ")
+            raise NotALogError(
+                self.path,
+                f"not an MCAP file (it starts with {found}); "
+                "'undulog import' reads CAN logs and CSV files",
+            )
+        try:
+            _Summary(self).read()
+        except _NoSummaryError as why:
+            self.blocks.clear()
+            self.counts.clear()
+            self.appendices.clear()
+            _Scan(self).read()
+            self.cut = str(why)
+            self.warnings.append(f"{why}; read record by record")
+        if not self.channels and not bare:
+            raise NotALogError(self.path, "an MCAP file without any channel that could be read")
+        self.blocks.sort(key=lambda block: block.start)
+
+    def take(self, opcode: int, data: Buffer, start: int, stop: int) -> None:
+        """Store a record of the data section, a chunk or the summary; ignore other kinds.
+
+        Args:
+            data: Buffer that holds the record's body, [start, stop).
 
         Raises:
             LogError: If it is damaged; mcap, struct and codecs raise errors of their own, too.
@@ -103,12 +323,7 @@ class McapContents:
     def parse(
         self, read: Callable[[ReadDataStream], _Record], data: Buffer, start: int, stop: int
     ) -> _Record:
-        """Read one record's body.
-
-        Args:
-            read: The reader of its kind.
-            data: The bytes that it is in.
-            stop: One past its body's last byte.
+        """Parse the body of one record, [start, stop) of ``data``, with the reader of its kind.
 
         Raises:
             LogError: If it claims more bytes than there is memory for.
@@ -118,12 +333,8 @@ class McapContents:
         except OverflowError as error:  # a length beyond all memory
             raise LogError(self.path, f"the record at byte {start} is damaged") from error
 
-    def walk(self, block: Block, data: Buffer, base: int) -> dict[int, IntArray]:
-        """Walk a block without index; its schemas and channels are noted.
-
-        Args:
-            data: The bytes that its payload is in.
-            base: Where in them the payload begins.
+    def walk(self, block: Block) -> dict[int, IntArray]:
+        """Walk a block without index and store its schemas and channels.
 
         Returns:
             Channel id to the offsets of its messages in the payload.
@@ -132,307 +343,32 @@ class McapContents:
             LogError: If a record is damaged; as for :meth:`take`.
         """
         found: dict[int, list[int]] = {}
-        end = len(data) if block.compression else block.stop
+        data, base, end = self.payload(block)
         for opcode, start, stop in walk_records(data, base, end):
             if opcode == Opcode.MESSAGE:
                 (channel_id,) = struct.unpack_from("<H", data, start)
                 found.setdefault(channel_id, []).append(start - PREFIX_SIZE - base)
             else:
                 self.take(opcode, data, start, stop)
-        return {channel_id: np.array(at, dtype=np.int64) for channel_id, at in found.items()}
+        return _arrays(found)
 
-    def count(self, offsets: Mapping[int, IntArray]) -> None:
-        """Count the messages of a block.
-
-        Args:
-            offsets: Of each channel's messages, by id.
-        """
+    def add_unindexed(self, block: Block, offsets: dict[int, IntArray]) -> None:
+        """Add a block whose messages were found by reading it."""
+        block.offsets = offsets
         for channel_id, at in offsets.items():
             self.counts[channel_id] = self.counts.get(channel_id, 0) + len(at)
-
-
-_FOOTER_SIZE = 1 + 8 + 20
-_CHUNK_INDEX = struct.Struct("<16xQQI")  # after the times: the chunk's place and length, offsets
-_CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, size, CRC, length of the compression's name
-_INDEX_OFFSET = struct.Struct("<HQ")  # channel, place of its message index
-
-
-_INDEXED: dict[int, tuple[Opcode, Callable[[ReadDataStream], AttachmentIndex | MetadataIndex]]] = {
-    Opcode.ATTACHMENT_INDEX: (Opcode.ATTACHMENT, AttachmentIndex.read),
-    Opcode.METADATA_INDEX: (Opcode.METADATA, MetadataIndex.read),
-}
-
-
-class _NoSummaryError(Exception):
-    """The file can't be opened from its summary."""
-
-
-def read_contents(file: McapPayloads, *, bare: bool) -> McapContents:
-    """Find what a file holds.
-
-    Args:
-        bare: Take it without any channel too: a write-ahead log or another part has them.
-
-    Returns:
-        What it holds; what could not be read is among its warnings.
-
-    Raises:
-        NotALogError: If it is no MCAP file, or nothing in it can be read.
-    """
-    if file.buffer[: len(MAGIC)] != MAGIC:
-        found = bytes(file.buffer[: len(MAGIC)]).hex(" ")
-        raise NotALogError(
-            file.path,
-            f"not an MCAP file (it starts with {found}); "
-            "'undulog import' reads CAN logs and CSV files",
-        )
-    held = McapContents(file.path)
-    try:
-        _Summary(file, held).read()
-    except _NoSummaryError as why:
-        held.blocks.clear()
-        held.counts.clear()
-        held.appendices.clear()
-        _Scan(file, held).read()
-        held.cut = str(why)
-        held.warnings.append(f"{why}; read record by record")
-    if not held.channels and not bare:
-        raise NotALogError(file.path, "an MCAP file without any channel that could be read")
-    held.blocks.sort(key=lambda block: block.start)
-    return held
-
-
-class _Summary:
-    """A file that has a whole summary: nothing else of it is looked at but its chunks' heads."""
-
-    def __init__(self, file: McapPayloads, held: McapContents) -> None:
-        self._file = file
-        self._buffer = file.buffer
-        self._held = held
-
-    def read(self) -> None:
-        """Fill in everything."""
-        buffer, held = self._buffer, self._held
-        summary_start, footer = self._range()
-        indexes: list[tuple[int, int]] = []  # opcode of the indexed record, its offset
-        statistics: Statistics | None = None
-        try:
-            for opcode, start, stop in walk_records(buffer, len(MAGIC), footer):
-                held.take(opcode, buffer, start, stop)
-                break  # the header is the first record
-            for opcode, start, stop in walk_records(buffer, summary_start, footer):
-                if opcode == Opcode.CHUNK_INDEX:
-                    held.blocks.append(self._block(start, stop))
-                elif opcode == Opcode.STATISTICS:
-                    statistics = held.parse(Statistics.read, buffer, start, stop)
-                elif opcode in _INDEXED:
-                    indexed, read = _INDEXED[opcode]
-                    indexes.append((indexed, held.parse(read, buffer, start, stop).offset))
-                else:
-                    held.take(opcode, buffer, start, stop)
-            self._check_places(summary_start)
-            before = 0
-            for opcode, offset in sorted(indexes, key=lambda index: index[1]):  # file order
-                start, before = self._record_at(offset, before)
-                held.take(opcode, buffer, start, before)
-        except (LogError, McapError, struct.error, ValueError) as error:
-            raise _NoSummaryError(f"the summary is damaged ({error})") from error
-        if statistics is None or not held.channels:
-            raise _NoSummaryError("the summary does not list the channels")
-        if statistics.message_count and not held.blocks:
-            raise _NoSummaryError("the file has no chunk index")
-        if statistics.attachment_count + statistics.metadata_count != len(indexes):
-            raise _NoSummaryError("the summary does not list all attachments and metadata")
-        held.counts = dict(statistics.channel_message_counts)
-
-    def _range(self) -> tuple[int, int]:
-        """First byte of the summary, and of the footer."""
-        buffer = self._buffer
-        footer = len(buffer) - len(MAGIC) - _FOOTER_SIZE
-        if footer < len(MAGIC) or buffer[-len(MAGIC) :] != MAGIC or buffer[footer] != Opcode.FOOTER:
-            raise _NoSummaryError("the file is cut short (no footer)")
-        (summary_start,) = struct.unpack_from("<Q", buffer, footer + PREFIX_SIZE)
-        if not len(MAGIC) <= summary_start < footer:
-            raise _NoSummaryError("the file has no summary")
-        return summary_start, footer
-
-    def _block(self, start: int, stop: int) -> Block:
-        """The block of a chunk index; the chunk's own header is checked against it.
-
-        An hour has thousands of them, so only what is used is read.
-        """
-        path, buffer = self._file.path, self._buffer
-        entries_at = start + _CHUNK_INDEX.size
-        if entries_at > stop:
-            raise LogError(path, "a chunk index is cut short")
-        at, length, size = _CHUNK_INDEX.unpack_from(buffer, start)
-        if size % _INDEX_OFFSET.size or entries_at + size > stop:
-            raise LogError(path, "a chunk index is damaged")
-        if not len(MAGIC) <= at <= at + length <= len(buffer):
-            raise LogError(path, f"a chunk index points to byte {at}, outside the file")
-        block = _chunk_at(self._file, at + PREFIX_SIZE, at + length)
-        block.index_at = dict(_INDEX_OFFSET.iter_unpack(buffer[entries_at : entries_at + size]))
-        return block
-
-    def _check_places(self, summary_start: int) -> None:
-        """Refuse chunks and message indexes that share bytes: each byte is to be read once."""
-        blocks = self._held.blocks
-        blocks.sort(key=lambda block: block.start)
-        starts = [block.start for block in blocks]
-        for block, bound in zip(blocks, [*starts, summary_start][1:], strict=True):
-            places = block.index_at.values()
-            if block.stop > bound or (
-                places and not block.stop <= min(places) <= max(places) < bound
-            ):
-                where = f"the chunk at byte {block.start}"
-                raise LogError(self._file.path, f"the indexes of {where} and of another overlap")
-
-    def _record_at(self, offset: int, before: int) -> tuple[int, int]:
-        """Where the body of an indexed record lies, which begins after all bytes read before."""
-        if offset < before:
-            raise LogError(self._file.path, f"indexes overlap at byte {offset}")
-        for _, start, stop in walk_records(self._buffer, offset, len(self._buffer)):
-            return start, stop
-        raise LogError(self._file.path, f"an index points to byte {offset}, where no record is")
-
-
-class _Scan:
-    """A file without a whole summary: its records, one after the other."""
-
-    def __init__(self, file: McapPayloads, held: McapContents) -> None:
-        self._file = file
-        self._held = held
-        end = len(file.buffer)
-        self._loose = Block(0, end, "", end, 0, 2**63 - 1, 0, offsets={})
-        self._loose_at: dict[int, list[int]] = {}
-
-    def read(self) -> None:
-        """Fill in everything, from the first record to the last whole one."""
-        buffer, end, held = self._file.buffer, len(self._file.buffer), self._held
-        former = at = len(MAGIC)
-        while at + PREFIX_SIZE <= end:
-            opcode = buffer[at]
-            (length,) = struct.unpack_from("<Q", buffer, at + 1)
-            start, stop = at + PREFIX_SIZE, at + PREFIX_SIZE + length
-            if stop > end or opcode == 0:
-                # The break may be a wrong length in the record before, too.
-                following = next_chunk(buffer, former + 1, end)
-                if following is None:
-                    self._salvage(opcode, start, end)
-                    break
-                held.warnings.append(
-                    f"the record at byte {at} is damaged and was skipped: the next whole chunk is "
-                    f"at byte {following}"
-                )
-                former = at = following
-                continue
-            try:
-                self._record(opcode, start, stop)
-            except (McapError, struct.error, ValueError, LogError) as error:
-                held.warnings.append(f"the record at byte {at} is damaged and was skipped: {error}")
-            if opcode == Opcode.DATA_END:
-                break
-            former, at = at, stop
-        if self._loose_at:
-            loose = self._loose
-            loose.offsets = {k: np.array(v, dtype=np.int64) for k, v in self._loose_at.items()}
-            held.count(loose.offsets)
-            held.blocks.append(loose)
-
-    def _record(self, opcode: int, start: int, stop: int) -> None:
-        buffer, loose = self._file.buffer, self._loose
-        if opcode == Opcode.CHUNK:
-            self._chunk(_chunk_at(self._file, start, stop))
-        elif opcode == Opcode.MESSAGE:
-            channel_id, _, log_time = struct.unpack_from("<HIQ", buffer, start)
-            self._loose_at.setdefault(channel_id, []).append(start - PREFIX_SIZE)
-            loose.start_ns = min(loose.start_ns, log_time)
-            loose.end_ns = max(loose.end_ns, log_time)
-        else:
-            self._held.take(opcode, buffer, start, stop)
-
-    def _chunk(self, block: Block) -> None:
-        block.offsets = self._held.walk(block, *self._file.payload(block))
-        self._held.count(block.offsets)
-        self._held.blocks.append(block)
-
-    def _salvage(self, opcode: int, start: int, end: int) -> None:
-        """Read what there is of the last record, which the end of the file cuts short."""
-        told = self._held.warnings
-        if opcode == Opcode.CHUNK:
-            try:
-                block = _chunk_at(self._file, start, end)
-                block.complete = False
-                self._chunk(block)
-            except (McapError, struct.error, ValueError, LogError) as error:
-                told.append(f"nothing of the last, cut chunk could be read: {error}")
-                return
-            found = sum(len(at) for at in (block.offsets or {}).values())
-            got = len(self._file.payload(block)[0])
-            told.append(
-                f"the last chunk is cut short: {found} messages of it could be read "
-                f"({got} of {block.size} bytes)"
-            )
-        else:
-            told.append(f"the last {end - start + PREFIX_SIZE} bytes are a cut record")
-
-
-def _chunk_at(file: McapPayloads, start: int, stop: int) -> Block:
-    """The block of the chunk record whose body is [start, stop), possibly cut short."""
-    buffer = file.buffer
-    begin, end, size, crc, name_size = _CHUNK_HEAD.unpack_from(buffer, start)
-    name_at = start + _CHUNK_HEAD.size
-    data_at = name_at + name_size + 8
-    if data_at > stop:
-        raise LogError(file.path, f"the chunk at byte {start} is cut in its header")
-    name = buffer[name_at : data_at - 8].decode("ascii", "replace")
-    (data_size,) = struct.unpack_from("<Q", buffer, data_at - 8)
-    data_stop = min(data_at + data_size, stop)
-    complete = data_at + data_size <= stop
-    return Block(data_at, data_stop, name, size, crc, begin, end, complete=complete)
-
-
-_INDEX_HEAD = struct.Struct("<BQHI")  # of a message index: opcode, length, channel, entries' size
-_NO_OFFSETS: IntArray = frozen(np.empty(0, dtype=np.int64))
-
-
-class McapFile(McapPayloads):
-    """An MCAP file as blocks, channels, schemas, metadata and attachments.
-
-    Its attributes are those of :class:`.capture.log.mcap.file.McapContents`.
-    """
-
-    def __init__(self, path: Path, *, bare: bool = False) -> None:
-        """Open a file and find what it holds.
-
-        Args:
-            bare: Take it without any channel too: a write-ahead log or another part has them.
-
-        Raises:
-            NotALogError: If it is empty, not MCAP, or nothing in it can be read.
-            LogError: If the operating system can't open it.
-        """
-        super().__init__(path)
-        try:
-            held = read_contents(self, bare=bare)
-        except BaseException:
-            self.close()
-            raise
-        self._held = held
-        self.warnings = held.warnings
-        self.profile = held.profile
-        self.library = held.library
-        self.schemas = held.schemas
-        self.channels = held.channels
-        self.blocks = held.blocks
-        self.counts = held.counts
-        self.metadata = held.metadata
-        self.attachments = held.attachments
-        self.appendices = held.appendices
-        self.cut = held.cut
+        self.blocks.append(block)
 
     def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
-        """See :meth:`BlockSource.indexed`."""
+        """Return the offsets of some channels' message records in a block's payload, unchecked.
+
+        Returns:
+            For each channel the offsets of its records' opcode bytes, shape (n,), in the order of
+            the index. They may be views of the file and must be dropped before it is closed.
+
+        Raises:
+            LogError: If the index or the payload is damaged.
+        """
         if block.offsets is not None or not block.index_at:
             return [self.offsets(block, channel_id) for channel_id in channel_ids]
         buffer, end = self.buffer, len(self.buffer)
@@ -455,11 +391,18 @@ class McapFile(McapPayloads):
         return found
 
     def offsets(self, block: Block, channel_id: int) -> IntArray:
-        """See :meth:`BlockSource.offsets`."""
+        """Return the offsets of a channel's message records in a block's payload, checked.
+
+        Returns:
+            Offsets of the records' opcode bytes, shape (n,), in the order of the index.
+
+        Raises:
+            LogError: If the index or the payload is damaged.
+        """
         if block.offsets is None and block.index_at:
             return self._message_index(block, channel_id)
         if block.offsets is None:  # a chunk that was written without a message index
-            block.offsets = self._held.walk(block, *self.payload(block))
+            block.offsets = self.walk(block)
         return block.offsets.get(channel_id, np.empty(0, dtype=np.int64))
 
     def _message_index(self, block: Block, channel_id: int) -> IntArray:

@@ -1,4 +1,4 @@
-"""The bytes of an MCAP file and the payloads of its blocks, decompressed and checked."""
+"""The bytes of an MCAP file, and the payloads of its blocks decompressed and checked."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from ...common.errors import LogError, NotALogError
 from .chunk import Block, Buffer, checks_itself, inflate, inflate_zstd_into, read_at
 
 _CACHE_SIZE = 64 << 20
+_CORRUPT = "is corrupt (its CRC doesn't fit)"
 
 
 class _Cache:
     """Payloads that were decompressed last, of all open files together.
 
     Attributes:
-        abandoned: Those that nothing uses any more. The garbage collector adds to it in the middle
-            of anything, also of what holds the lock, which it therefore must not take.
+        abandoned: Files that nothing refers to. The garbage collector adds to it at any moment,
+            also while the lock is held, so it must not take the lock.
     """
 
     def __init__(self) -> None:
@@ -43,7 +44,7 @@ class _Cache:
             return data
 
     def put(self, key: tuple[int, int], data: bytes) -> None:
-        """Keep a payload; one that is larger than all room is not kept."""
+        """Keep a payload, unless it is larger than the cache."""
         with suppress(IndexError):  # empty, perhaps since another thread was faster
             while True:
                 self.drop(self.abandoned.popleft())
@@ -57,7 +58,7 @@ class _Cache:
                 self._size -= len(dropped)
 
     def drop(self, owner: int) -> None:
-        """Let go of all payloads of one file."""
+        """Drop all payloads of one file."""
         with self._lock:
             for key in [key for key in self._held if key[0] == owner]:
                 self._size -= len(self._held.pop(key))
@@ -67,7 +68,7 @@ _cache = _Cache()
 
 
 class McapPayloads:
-    """An MCAP file, memory-mapped; what lies in a block of it."""
+    """A memory-mapped MCAP file and the payloads of its blocks."""
 
     def __init__(self, path: Path) -> None:
         """Map a file.
@@ -91,77 +92,94 @@ class McapPayloads:
         self._close_descriptor()
 
     def forget(self) -> None:
-        """Let go of the file's pages and of what was decompressed; it is read again when needed."""
+        """Release the file's pages and decompressed payloads; they are read again when needed."""
         _cache.drop(self._owner)
-        if hasattr(mmap, "MADV_DONTNEED"):  # what is mapped counts as this process's memory
+        if hasattr(mmap, "MADV_DONTNEED"):  # mapped pages count as this process's memory
             self.buffer.madvise(mmap.MADV_DONTNEED)
 
-    def payload(self, block: Block) -> tuple[Buffer, int]:
-        """See :meth:`BlockSource.payload`."""
+    def payload(self, block: Block) -> tuple[Buffer, int, int]:
+        """Return the uncompressed bytes of a block and keep them in a cache.
+
+        Returns:
+            A buffer, and the first and one past the last byte of the payload in it.
+
+        Raises:
+            LogError: If the payload can't be decompressed or its CRC is wrong.
+        """
         if not block.compression:
-            return self.buffer, block.start
+            return self.buffer, block.start, block.stop
         key = self._owner, block.start
         data = _cache.get(key)
         if data is None:
             data = self._decompress(block)
             _cache.put(key, data)
-        return data, 0
+        return data, 0, len(data)
 
     def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
-        """See :meth:`BlockSource.payload_once`."""
+        """Return the uncompressed bytes of a block without keeping them.
+
+        Unlike :meth:`payload` it checks the CRC of an uncompressed chunk, too.
+        """
         if block.compression:
             data = self._decompress(block)
             return data, 0, len(data)
         if block.crc and block.complete:
             with memoryview(self.buffer) as whole, whole[block.start : block.stop] as payload:
                 if zlib.crc32(payload) != block.crc:
-                    where = f"the chunk at byte {block.start}"
-                    raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
+                    raise self._error(block, _CORRUPT)
         return self.buffer, block.start, block.stop
 
     def inflates(self, block: Block, limit: int) -> bool:
-        """See :meth:`BlockSource.inflates`."""
+        """Whether :meth:`inflate_into` can be used: a whole zstd chunk up to ``limit`` bytes."""
         return block.compression == "zstd" and block.complete and 0 < block.size <= limit
 
     def inflate_into(self, block: Block, room: memoryview) -> None:
-        """See :meth:`BlockSource.inflate_into`.
+        """Decompress a block into existing memory and check it; may be used by several threads.
 
-        A frame that has a checksum of its own is not held against the chunk's CRC as well: both
-        are 32 bits of the same bytes, and decompression has verified the one.
+        The chunk's CRC is not checked if the frame has a checksum of its own: both are 32 bits of
+        the same bytes, and decompression has verified the one.
+
+        Args:
+            block: One for which :meth:`inflates` is true.
+            room: Memory of the block's size.
+
+        Raises:
+            LogError: If it can't be decompressed or its CRC is wrong.
         """
-        where = f"the chunk at byte {block.start}"
         try:
             with read_at(self._descriptor, block.start, block.stop) as raw:
                 size = inflate_zstd_into(raw, room)
                 checked = not block.crc or checks_itself(raw)
         except zstandard.ZstdError as error:
-            raise LogError(self.path, f"{where} can't be decompressed: {error}") from error
+            raise self._error(block, f"can't be decompressed: {error}") from error
         except OSError as error:
-            raise LogError(self.path, f"{where} can't be read: {error.strerror}") from error
+            raise self._error(block, f"can't be read: {error.strerror}") from error
         if size != block.size:
-            raise LogError(self.path, f"{where} has {size} bytes, not {block.size}")
+            raise self._error(block, f"has {size} bytes, not {block.size}")
         if not checked and zlib.crc32(room) != block.crc:
-            raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
+            raise self._error(block, _CORRUPT)
 
     def _decompress(self, block: Block) -> bytes:
-        where = f"the chunk at byte {block.start}"
         raw = self.buffer[block.start : block.stop]
         try:
             data = inflate(block.compression, raw, block.size, whole=block.complete)
         except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
-            told = str(error) or "it claims more bytes than there is memory"
-            raise LogError(self.path, f"{where} can't be decompressed: {told}") from error
+            reason = str(error) or "it claims more bytes than there is memory"
+            raise self._error(block, f"can't be decompressed: {reason}") from error
         if not block.complete:
             return data
         if len(data) != block.size:
-            raise LogError(self.path, f"{where} has {len(data)} bytes, not {block.size}")
+            raise self._error(block, f"has {len(data)} bytes, not {block.size}")
         if block.crc and zlib.crc32(data) != block.crc:
-            raise LogError(self.path, f"{where} is corrupt (its CRC doesn't fit)")
+            raise self._error(block, _CORRUPT)
         return data
+
+    def _error(self, block: Block, text: str) -> LogError:
+        return LogError(self.path, f"the chunk at byte {block.start} {text}")
 
 
 def _mapped(path: Path) -> tuple[mmap.mmap, int]:
-    """The file in memory, and a descriptor of it."""
+    """Map a file; return also a descriptor of it."""
     try:
         with path.open("rb") as stream:
             if not stream.read(1):

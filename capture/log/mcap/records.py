@@ -1,125 +1,49 @@
-"""Message records of a block, many at a time: their heads, and copies of what follows.
+"""Message records of a block, many at a time: their heads, and copies of their fields.
 
 Format: https://mcap.dev/spec#message-op0x05.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import struct
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from ...common.arrays import IntArray
-from .chunk import Block, Buffer
-
-
-class BlockSource(Protocol):
-    """Gives out the payloads of its blocks, and where in them the messages are."""
-
-    def payload(self, block: Block) -> tuple[Buffer, int]:
-        """The uncompressed bytes of a block, and where in them the message offsets count from.
-
-        Returns:
-            A buffer and the base offset (0 unless the block is unchunked).
-
-        Raises:
-            LogError: If the payload can't be decompressed or its CRC doesn't fit.
-        """
-        ...
-
-    def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
-        """The uncompressed bytes of a block, checked, and not kept in memory for later.
-
-        Returns:
-            A buffer, and the first and one past the last byte of the payload in it.
-
-        Raises:
-            LogError: If the payload can't be decompressed or its CRC doesn't fit.
-        """
-        ...
-
-    def inflates(self, block: Block, limit: int) -> bool:
-        """Whether :meth:`inflate_into` can be used: a whole zstd chunk of no more than ``limit``.
-
-        Args:
-            limit: Largest size wanted [byte].
-
-        Returns:
-            False for a block that only :meth:`payload` can read.
-        """
-        ...
-
-    def inflate_into(self, block: Block, room: memoryview) -> None:
-        """Decompress a block into memory that is there already, and check it.
-
-        Several threads may do so at once, each with a block and room of its own.
-
-        Args:
-            block: One for which :meth:`inflates` holds.
-            room: As many bytes as it has.
-
-        Raises:
-            LogError: If it can't be decompressed or its CRC doesn't fit.
-        """
-        ...
-
-    def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
-        """Where the message records of some channels start in a block's payload, unchecked.
-
-        Returns:
-            For each channel the offsets of its records' opcode bytes, shape (n,), in the order of
-            the index; they may be views of the file, to be let go of before it is closed.
-
-        Raises:
-            LogError: If the index or the payload is damaged.
-        """
-        ...
-
-    def offsets(self, block: Block, channel_id: int) -> IntArray:
-        """Where a channel's message records start in a block's payload.
-
-        Returns:
-            Offsets of the records' opcode bytes, shape (n,), in the order of the index.
-
-        Raises:
-            LogError: If the index or the payload is damaged.
-        """
-        ...
-
-    def close(self) -> None:
-        """Release what it holds."""
-        ...
-
+from .chunk import PREFIX_SIZE, Buffer
 
 HEAD = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8")]
 )
 """Start of a message record; the publish time and the message follow."""
 
-BODY_AT = 31
-"""Where the message starts in its record."""
-FIXED_SIZE = 22
-"""What a record's length counts before the message itself."""
+MESSAGE = struct.Struct("<BQHIQQ")
+"""Message record before the message: opcode, length, channel, sequence, log and publish time."""
+
+BODY_AT = MESSAGE.size
+"""Offset of the message in its record."""
+FIXED_SIZE = BODY_AT - PREFIX_SIZE
+"""Part of a record's length before the message."""
 
 
-def read_message_heads(data: Buffer, offsets: IntArray, stop: int) -> NDArray[np.void] | None:
-    """The heads of message records, if whole messages lie where an index says.
+def read_message_heads(
+    data: Buffer, offsets: IntArray, stop: int | IntArray
+) -> NDArray[np.void] | None:
+    """Return the heads of message records, if whole messages are at the offsets.
 
     Args:
-        data: A block's payload.
+        data: The payloads of one or more blocks.
         offsets: Where they should start, shape (n,).
-        stop: One past the payload's last byte.
+        stop: One past the last byte of the payload; for several, of each record's, shape (n,).
 
     Returns:
         Of :data:`HEAD`, shape (n,); None if any is not a whole message.
     """
-    if not len(offsets):
-        return np.empty(0, HEAD)
-    if offsets.min() < 0 or offsets.max() + BODY_AT > stop:
+    if (offsets < 0).any() or (offsets + BODY_AT > stop).any():
         return None
     heads = gather(data, offsets, HEAD)
     room = (stop - offsets - 9).astype(np.uint64)
@@ -131,11 +55,11 @@ def read_message_heads(data: Buffer, offsets: IntArray, stop: int) -> NDArray[np
 def gather(
     data: Buffer | NDArray[np.uint8], at: IntArray, kind: np.dtype[Any] | str, shift: int = 0
 ) -> NDArray[Any]:
-    """Records of one type at any offsets: an overlapping view with a stride of one byte.
+    """Return items of one type at any offsets, through a view with a stride of one byte.
 
     Args:
-        at: Where to count from, shape (n,).
-        shift: Where the records start, from there; all are whole.
+        at: Offsets, shape (n,).
+        shift: Offset of the items from there; all are whole.
 
     Returns:
         A copy, shape (n,).
@@ -147,7 +71,7 @@ def gather(
 
 @dataclass(frozen=True)
 class Places:
-    """Where messages start in a buffer.
+    """Offsets of messages in a buffer.
 
     Attributes:
         at: Offsets, shape (n,).
@@ -163,21 +87,14 @@ class Places:
         return len(self.at)
 
     def take(self, rows: NDArray[Any] | slice) -> Places:
-        """Some of them.
-
-        Args:
-            rows: Which, as numpy chooses, in order.
-
-        Returns:
-            Their places; evenly spaced if none between them is left out.
-        """
+        """Return some of them, in order; evenly spaced if none between them is left out."""
         at, step = self.at[rows], self.step
         if step is not None and len(at) and int(at[-1] - at[0]) != step * (len(at) - 1):
             step = None
         return Places(self.data, at, step)
 
     def field(self, kind: np.dtype[Any] | str, shift: int) -> NDArray[Any]:
-        """What lies at the same place in each.
+        """Return one field of each message.
 
         Args:
             shift: Offset from the message's start, not negative.
@@ -191,7 +108,7 @@ class Places:
         return np.ndarray((len(self.at),), kind, self.data, first, (self.step,))
 
     def rows(self, kind: np.dtype[Any], count: int, shift: int) -> NDArray[Any]:
-        """Runs of numbers that lie at the same place in each.
+        """Return an array field of each message.
 
         Args:
             shift: Offset from the message's start.

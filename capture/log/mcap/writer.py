@@ -1,10 +1,11 @@
-"""Writing MCAP: what the mcap library writes, at a fraction of its cost a message.
+"""Writer of MCAP files, with the output of the mcap library at a fraction of its cost per message.
 
-A message is packed once, straight into the chunk, and its index entry into an array that is the
-index record's own content. Everything that is written once a chunk or once a file is left to the
-library's records. Channels may be kept apart, in chunks of their own: who reads one of them then
-decompresses nothing else, and its messages lie side by side. Each zstd frame has a checksum of its
-own beside the chunk's CRC: a reader gets it checked for a tenth of the time that the CRC takes.
+A message is packed once, directly into the chunk, and its index entry into an array that is the
+content of the index record. Records that are written once per chunk or per file are those of the
+library. Groups of channels may have separate chunks, so that reading one of them decompresses
+nothing else. Each zstd frame has a checksum besides the chunk's CRC, which a reader checks in a
+tenth of the time.
+
 Format: https://mcap.dev/spec.
 """
 
@@ -38,43 +39,42 @@ from mcap.records import (
 )
 
 from .chunk import MAGIC
+from .records import FIXED_SIZE, MESSAGE
 
 CHUNK_SIZE = 1 << 20
 """Bytes of messages after which a chunk is written."""
 
 _LONGEST_WAIT_NS = 10 * 10**9  # of log time, once a chunk of other channels is full
 _COMPRESSION = "zstd"
-_MESSAGE = struct.Struct("<BQHIQQ")
-_MESSAGE_BODY = _MESSAGE.size - 9  # without opcode and length
 _CHUNK = struct.Struct("<BQQQQII4sQ")
 _INDEX = struct.Struct("<BQHI")
 _OPCODE = int(Opcode.MESSAGE)
 
 
 class Stream(Protocol):
-    """Where the bytes go."""
+    """A stream of bytes."""
 
     def write(self, data: bytes, /) -> int:
-        """Take bytes; returns how many."""
+        """Write bytes; return their number."""
         ...
 
     def tell(self) -> int:
-        """How many bytes were taken so far."""
+        """Return the number of bytes so far."""
         ...
 
     def flush(self) -> None:
-        """Pass on what is buffered."""
+        """Flush buffered bytes."""
         ...
 
 
 @dataclass(slots=True)
 class _OpenChunk:
-    """What one group of channels has that is not written yet."""
+    """The unwritten chunk of one group of channels."""
 
     group: str
     data: bytearray = field(default_factory=bytearray)
     index: dict[int, array[int]] = field(default_factory=dict[int, "array[int]"])
-    began: int = 0  # how many messages the file had when its first one came
+    began: int = 0  # messages of the file before its first one
     schemas: set[int] = field(default_factory=set[int])  # that a chunk of this group has
 
 
@@ -94,8 +94,8 @@ class McapWriter:
 
         Args:
             chunk_size: A chunk is written when it has more bytes than this.
-            group_of: Topic and name of the type to the group of a channel: those of one group
-                share chunks. None for one group, named "".
+            group_of: Topic and type name to the group of a channel; channels of one group share
+                chunks. None for one group, named "".
         """
         self._stream = stream
         self._chunk_size = chunk_size
@@ -105,7 +105,8 @@ class McapWriter:
         self._open = {"": self._shared}
         self._chunk_of: dict[int, _OpenChunk] = {}
         self._begun: dict[str, _OpenChunk] = {}  # those with messages, in the order they began
-        self._messages = 0
+        self.messages = 0
+        """Number of messages added."""
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._chunks: list[ChunkIndex] = []
@@ -116,13 +117,8 @@ class McapWriter:
 
     @property
     def settled(self) -> int:
-        """How many messages, counted from the first, are all in chunks that are written."""
-        return next((chunk.began for chunk in self._begun.values()), self._messages)
-
-    @property
-    def messages(self) -> int:
-        """How many messages were added."""
-        return self._messages
+        """Number of first messages that are all in written chunks."""
+        return next((chunk.began for chunk in self._begun.values()), self.messages)
 
     def start(self, profile: str, library: str) -> None:
         """Write the beginning of the file.
@@ -200,13 +196,13 @@ class McapWriter:
             struct.error: If a number is out of range; the message is not in the chunk then.
         """
         chunk = self._chunk_of[channel_id]
-        head = _MESSAGE.pack(
-            _OPCODE, _MESSAGE_BODY + len(data), channel_id, sequence, log_time, publish_time
+        head = MESSAGE.pack(
+            _OPCODE, FIXED_SIZE + len(data), channel_id, sequence, log_time, publish_time
         )
         index = chunk.index.get(channel_id)
         if index is None:
             if not chunk.index:
-                chunk.began = self._messages
+                chunk.began = self.messages
                 self._begun[chunk.group] = chunk
             index = chunk.index[channel_id] = array("Q")
         records = chunk.data
@@ -214,7 +210,7 @@ class McapWriter:
         index.append(len(records))
         records += head
         records += data
-        self._messages += 1
+        self.messages += 1
         if len(records) > self._chunk_size:
             self._finish_chunk(chunk)
             if self._begun:
@@ -223,10 +219,10 @@ class McapWriter:
     def add_attachment(
         self, create_time: int, log_time: int, name: str, media_type: str, data: bytes
     ) -> None:
-        """Write a file into the file.
+        """Write an attachment.
 
         Args:
-            create_time: When it was made [Unix ns], 0 if unknown.
+            create_time: Time of its creation [Unix ns], 0 if unknown.
             log_time: When it was recorded [Unix ns].
 
         Raises:
@@ -265,14 +261,14 @@ class McapWriter:
         Raises:
             OSError: If the stream can't take it.
         """
-        self.settle(self._messages)
+        self.settle(self.messages)
         self._stream.flush()
 
     def settle(self, count: int) -> None:
         """Write the chunks that have any of the file's first messages.
 
         Args:
-            count: How many messages are to be in chunks that are written.
+            count: Number of messages that must be in written chunks.
 
         Raises:
             OSError: If the stream can't take it.
@@ -287,7 +283,7 @@ class McapWriter:
         Raises:
             OSError: If the stream can't take it.
         """
-        self.settle(self._messages)
+        self.settle(self.messages)
         self._put(DataEnd(0))
         start = self._stream.tell()
         summary, offsets = RecordBuilder(), list[SummaryOffset]()
@@ -328,7 +324,7 @@ class McapWriter:
             self._finish_chunk(chunk)
 
     def _finish_behind(self, log_time: int) -> None:
-        """Write the chunks that have waited for long: a file that is cut lacks no more of them."""
+        """Write the chunks that have been open for long, which a truncated file would lack."""
         for other in list(self._begun.values()):
             if log_time - next(iter(other.index.values()))[0] > _LONGEST_WAIT_NS:
                 self._finish_chunk(other)

@@ -1,8 +1,8 @@
 """CDR, the wire format of ROS 2 messages, as fixed layouts.
 
-A message whose strings and sequence lengths don't change (a JointState with constant names) has
-every number at a constant offset. :func:`layout_of` walks one example and finds those offsets;
-then a template encodes a message with a few writes, and numpy decodes thousands at once.
+A message with constant strings and sequence lengths (a JointState with constant names) has every
+number at a constant offset. :func:`layout_of` finds those offsets in one example; then a template
+encodes a message with a few writes, and numpy decodes thousands at once.
 
 Format: OMG Data Distribution Service Interoperability Wire Protocol (DDSI-RTPS 2.5, section 10),
 plain CDR version 1: a four-byte encapsulation header, then each primitive aligned to its size
@@ -28,7 +28,7 @@ LITTLE_ENDIAN_HEADER = b"\x00\x01\x00\x00"
 _HEADER_SIZE = 4
 _MAX_ELEMENTS = 1_000_000
 _ELEMENTS_A_BYTE = 4
-"""Nested messages for each byte, at most: those without a byte of their own would have no end."""
+"""Most nested messages per byte: messages without a byte could be endless."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Leaf:
         path: Dotted field path, e.g. ``pose.pose.position.x`` or ``transforms[3].child_frame_id``.
         dtype: numpy type string of one number.
         offset: Byte offset from the start of the message, encapsulation header included.
-        count: How many numbers; 1 unless an array.
+        count: Number of values; 1 unless an array.
         is_array: Whether the field is an array or sequence.
     """
 
@@ -52,14 +52,14 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where everything lies in messages of one fixed layout.
+    """Offsets of all fields in messages of one fixed layout.
 
     Attributes:
         length: Message length [byte].
         leaves: All numbers, by path.
         strings: All strings of the example, by path.
-        hull: Byte ranges outside the leaves, as (start, stop), half-open; padding included.
-        static: Indices of the bytes that every message of the layout has in common: strings and
+        hull: Byte ranges outside the leaves, as (start, stop), half-open, with padding.
+        static: Indices of the bytes that are equal in every message of the layout: strings and
             sequence lengths, without padding (which a foreign writer may leave undefined).
     """
 
@@ -71,11 +71,7 @@ class Layout:
     static: IntArray
 
     def fits(self, message: bytes) -> bool:
-        """Whether a message surely has this layout.
-
-        Returns:
-            False also where it differs in padding alone.
-        """
+        """Whether a message has this layout and equal padding."""
         return len(message) == self.length and all(
             message[start:stop] == self.example[start:stop] for start, stop in self.hull
         )
@@ -111,7 +107,7 @@ def layout_of(message_type: MessageType, message: bytes) -> Layout:
 
 
 def _complement(leaves: dict[str, Leaf], length: int) -> tuple[tuple[int, int], ...]:
-    """Byte ranges that no leaf covers, zero-length ones left out."""
+    """Return the byte ranges that no leaf covers, without empty ones."""
     ranges: list[tuple[int, int]] = []
     at = 0
     for leaf in leaves.values():  # in wire order
@@ -124,7 +120,7 @@ def _complement(leaves: dict[str, Leaf], length: int) -> tuple[tuple[int, int], 
 
 
 class _Walker:
-    """Walks one message along its type and notes where things lie."""
+    """Finds the offsets of the fields of one message."""
 
     def __init__(self, name: str, message: bytes) -> None:
         self._name = name
@@ -191,13 +187,13 @@ def encode(message_type: MessageType, values: Mapping[str, Any]) -> bytes:
 
     Args:
         values: Field name to value: numbers, strings, mappings for nested messages, sequences for
-            arrays. A field left out is zero, empty, or (fixed array) zeros.
+            arrays. A missing field is zero, empty, or (fixed array) zeros.
 
     Returns:
         The CDR message, encapsulation header included.
 
     Raises:
-        DataError: If ``values`` has a name that the type has not, or a value of a wrong kind.
+        DataError: If ``values`` has an unknown name, or a value of a wrong kind.
     """
     out = bytearray(LITTLE_ENDIAN_HEADER)
     _encode_message(out, message_type, values)

@@ -4,17 +4,8 @@ Grammar: https://docs.ros.org/en/rolling/Concepts/Basic/About-Interfaces.html, c
 the MCAP registry has it (https://mcap.dev/spec/registry#ros2msg): the main definition, then each
 dependency after a line of ``=`` and a line ``MSG: package/Type``.
 
-Definitions of the ROS 2 messages that the log contract uses.
-
-Fields as in ros2/common_interfaces and ros2/rcl_interfaces (Rolling); comments are left out.
-
-Topics that are latched, the powers of joints, diagnostics.
-
-Topics of the joints' powers, accumulated by whoever works the joints.
-
-A mean torque times a mean velocity is not the mean of their product: what the two do within a
-sampling interval is lost, and so is a change of sign there. A robot, or the twin, that multiplies
-at the rate of its own control loop and logs the means loses neither.
+The definitions of the messages of the log contract have the fields of ros2/common_interfaces and
+ros2/rcl_interfaces (Rolling), without comments.
 """
 
 from __future__ import annotations
@@ -50,13 +41,13 @@ PRIMITIVES: dict[str, str] = {
 _FLOATS = ("float32", "float64")
 
 _DEEPEST = 64
-"""Types nested in each other, at most; those of ROS are seldom deeper than five."""
+"""Deepest nesting of types; those of ROS are rarely deeper than five."""
 
 _MOST_FIELDS = 4096
-"""Fields of a type and of all nested ones, at most: twenty short lines can spell a million."""
+"""Most fields of a type and of all nested ones: twenty short lines can define a million."""
 
 _LONGEST_NUMBER = 9
-"""Digits of an array's length, at most."""
+"""Most digits of an array's length."""
 
 _SEPARATOR = re.compile(r"^=+\s*$", re.MULTILINE)
 _FIELD = re.compile(
@@ -123,7 +114,7 @@ def parse_message_type(name: str, text: str) -> MessageType:
 
 
 def _short(name: str) -> str:
-    """``package/msg/Type`` or ``package/Type`` as ``package/Type``."""
+    """Return ``package/msg/Type`` or ``package/Type`` as ``package/Type``."""
     return name.replace("/msg/", "/")
 
 
@@ -249,18 +240,12 @@ _BODIES: dict[str, str] = {
 
 @cache
 def schema_text(name: str) -> str:
-    """The ``ros2msg`` schema of a message type, dependencies appended.
-
-    Args:
-        name: Full name, e.g. ``sensor_msgs/msg/JointState``.
-
-    Returns:
-        The text for an MCAP schema record.
+    """Return the ``ros2msg`` schema of a message type, dependencies appended.
 
     Raises:
         DataError: If the log contract doesn't use that type.
     """
-    short = name.replace("/msg/", "/")
+    short = _short(name)
     if short not in _BODIES:
         listed = ", ".join(sorted(_BODIES))
         raise DataError(f"no definition of {name}; there are {listed}")
@@ -272,10 +257,7 @@ def schema_text(name: str) -> str:
 
 @cache
 def message_type(name: str) -> MessageType:
-    """The parsed type of the same name.
-
-    Args:
-        name: Full name, e.g. ``sensor_msgs/msg/JointState``.
+    """Return the parsed message type of a name.
 
     Raises:
         DataError: If the log contract doesn't use that type.
@@ -297,8 +279,6 @@ def _collect(short: str, order: list[str]) -> None:
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of ``diagnostic_msgs/DiagnosticStatus``."""
-
-LEVEL_NAMES = ("ok", "warn", "error", "stale")
 
 NO_VALUES: Mapping[str, str] = MappingProxyType({})
 
@@ -324,7 +304,9 @@ class DiagnosticStatus:
 class PowerTopic(StrEnum):
     """A JointState whose ``position`` is a mean power [W] over the interval about its stamp.
 
-    The interval is as long as the topic's sampling interval; one that is lost is a gap.
+    The interval is as long as the topic's sampling interval. The product of a mean torque and a
+    mean velocity is not the mean power, so a robot, or the twin, multiplies at the rate of its
+    control loop and logs the means.
     """
 
     MECHANICAL = "/joint_power/mechanical"
@@ -341,9 +323,9 @@ _LATCHED = re.compile(r"durability:\s*(1\b|transient_local)")
 
 
 def is_latched(type_name: str, channel: Channel) -> bool:
-    """Whether a topic's last message stays in force until the next.
+    """Whether a topic's last message stays valid until the next.
 
-    A String, static transforms, or what a ROS 2 recorder noted as durability transient local
+    True for Strings, static transforms, and topics of durability transient local in a ROS 2 bag
     (``offered_qos_profiles``, https://github.com/ros2/rosbag2).
     """
     if type_name == "std_msgs/msg/String":
@@ -353,9 +335,8 @@ def is_latched(type_name: str, channel: Channel) -> bool:
 
 
 def adds_up(channel: Channel) -> bool:
-    """Whether every different message stays in force, not only the last.
+    """Whether every different message stays valid, not only the last.
 
-    Returns:
-        True for static transforms: each message holds some of them.
+    True for static transforms: each message holds some of them.
     """
     return channel.topic.endswith("/tf_static")

@@ -1,20 +1,16 @@
 """Raw CAN frames as the log keeps them: 32 bytes a classic frame, 88 a CAN FD frame.
 
 ``id_flags`` holds the identifier with the flag bits of Linux SocketCAN (``linux/can.h``). The two
-kinds have topics of their own, ``/can/BUS`` and ``/can_fd/BUS``: a name of a bus may end in
-anything, and so no ending could tell them apart.
+kinds have separate topics, ``/can/BUS`` and ``/can_fd/BUS``.
 
-Messages of raw frames: a head that is the same but for three numbers, then the records.
-
-They are ``std_msgs/msg/UInt8MultiArray`` like any other, and are written and read as such; but a
-recorder writes hundreds a second, so the head is encoded once.
+A message of raw frames is a ``std_msgs/msg/UInt8MultiArray``: a head with three variable numbers,
+then the records. A recorder writes hundreds of them a second, so the head is encoded once.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -94,49 +90,27 @@ DIR_TX = 1
 
 
 def bus_of(topic: str) -> str:
-    """The bus whose frames a topic holds.
-
-    Args:
-        topic: A topic that begins with one of :data:`FRAME_TOPIC_PREFIXES`.
-
-    Returns:
-        Its name, e.g. ``can0``.
-    """
+    """Return the name of the bus of a topic that begins with one of the prefixes above."""
     return topic.removeprefix(FRAME_TOPIC_PREFIX).removeprefix(FD_TOPIC_PREFIX)
 
 
 def empty_frames(count: int) -> FrameArray:
-    """An array of zeroed frame records.
-
-    Returns:
-        Shape (count,), every byte zero, padding included.
-    """
+    """Return zeroed frame records, shape (count,), padding included."""
     return np.zeros(count, dtype=FRAME_DTYPE)
 
 
 def empty_fd_frames(count: int) -> FrameArray:
-    """An array of zeroed records of CAN FD frames.
-
-    Returns:
-        Records of :data:`FD_FRAME_DTYPE`, shape (count,), every byte zero, padding included.
-    """
+    """Return zeroed records of :data:`FD_FRAME_DTYPE`, shape (count,), padding included."""
     return np.zeros(count, dtype=FD_FRAME_DTYPE)
 
 
 def holds_fd(frames: FrameArray) -> bool:
-    """Whether records have the layout of CAN FD frames.
-
-    Args:
-        frames: Records of :data:`FRAME_DTYPE` or :data:`FD_FRAME_DTYPE`, shape (n,).
-
-    Returns:
-        True for :data:`FD_FRAME_DTYPE`.
-    """
+    """Whether records are of :data:`FD_FRAME_DTYPE`."""
     return frames.dtype == FD_FRAME_DTYPE
 
 
 def data_lengths(frames: FrameArray) -> NDArray[np.uint8]:
-    """How many data bytes frames have.
+    """Return the number of data bytes of frames.
 
     Args:
         frames: Records of :data:`FRAME_DTYPE` or :data:`FD_FRAME_DTYPE`, shape (n,).
@@ -148,7 +122,7 @@ def data_lengths(frames: FrameArray) -> NDArray[np.uint8]:
 
 
 def widened(frames: FrameArray) -> FrameArray:
-    """Frames with room for 64 data bytes, so that both kinds can stand in one array.
+    """Return frames with room for 64 data bytes, so that one array can hold both kinds.
 
     Args:
         frames: Records of :data:`FRAME_DTYPE` or :data:`FD_FRAME_DTYPE`, shape (n,).
@@ -167,13 +141,13 @@ def widened(frames: FrameArray) -> FrameArray:
 
 
 def in_one(arrays: Sequence[FrameArray]) -> FrameArray:
-    """One array of frames of one or both kinds.
+    """Return one array of frames of one or both kinds.
 
     Args:
         arrays: Records of :data:`FRAME_DTYPE` or :data:`FD_FRAME_DTYPE`, at least one array.
 
     Returns:
-        A copy; records of :data:`FD_FRAME_DTYPE` where any array has them.
+        A copy; records of :data:`FD_FRAME_DTYPE` if any array has them.
     """
     if any(holds_fd(frames) for frames in arrays):
         arrays = [widened(frames) for frames in arrays]
@@ -196,14 +170,14 @@ def join_batches(
     batches: Sequence[tuple[IntArray, IntArray, FrameArray]],
     dtype: np.dtype[np.void] = FRAME_DTYPE,
 ) -> FrameArray:
-    """One array of frames from messages of different sizes.
+    """Return one array of the frames of messages of different sizes.
 
     Args:
-        batches: For messages of one size: their log times [Unix ns], shape (n,), their places in
-            the file, shape (n,), and their frames, shape (n, frames a message).
+        batches: For messages of one size: their log times [Unix ns], shape (n,), their order in
+            the file, shape (n,), and their frames, shape (n, frames per message).
 
     Returns:
-        The frames of all messages, by log time and then place, shape (total,).
+        The frames of all messages by log time, then file order, shape (total,).
     """
     if not batches:
         return np.zeros(0, dtype=dtype)
@@ -243,71 +217,52 @@ _PAIR = struct.Struct("<II")
 _COUNT = struct.Struct("<I")
 
 
-@dataclass(frozen=True)
-class _Head:
-    """What stands before the records.
-
-    Attributes:
-        before: Bytes before the number and the length of the records.
-        between: Bytes from there to the length of the data.
-    """
-
-    before: bytes
-    between: bytes
-
-    @property
-    def size(self) -> int:
-        return len(self.before) + _PAIR.size + len(self.between) + _COUNT.size
-
-
 @lru_cache(maxsize=4)
-def _head(label: str, record_size: int) -> _Head:
+def _head(label: str, record_size: int) -> tuple[bytes, bytes]:
+    """Return the bytes before number and length of the records, and from there to the length."""
     dimensions = [
         {"label": "frame", "size": 0, "stride": 0},
         {"label": label, "size": record_size, "stride": record_size},
     ]
     kind = message_type(FRAMES_TYPE)
     empty = encode(kind, {"layout": {"dim": dimensions}, "data": np.empty(0, np.uint8)})
-    leaves = layout_of(kind, empty).leaves
-    at = leaves["layout.dim[0].size"].offset
-    return _Head(empty[:at], empty[at + _PAIR.size : -_COUNT.size])
+    at = layout_of(kind, empty).leaves["layout.dim[0].size"].offset
+    return empty[:at], empty[at + _PAIR.size : -_COUNT.size]
 
 
 def frame_message(
     frames: FrameArray, label: str = FRAME_LAYOUT, dtype: np.dtype[Any] = FRAME_DTYPE
 ) -> bytes:
-    """Encode frames.
-
-    Args:
-        frames: Records of ``dtype``, shape (n,).
-        label: What the message says of a record's layout.
-    """
-    head, size = _head(label, dtype.itemsize), len(frames) * dtype.itemsize
+    """Encode frames, records of ``dtype``, shape (n,), with the label of their layout."""
+    (before, between), size = _head(label, dtype.itemsize), len(frames) * dtype.itemsize
     pair, count = _PAIR.pack(len(frames), size), _COUNT.pack(size)
-    return b"".join((head.before, pair, head.between, count, frames.tobytes()))
+    return b"".join((before, pair, between, count, frames.tobytes()))
 
 
 def records_at(
     message: bytes, label: str = FRAME_LAYOUT, dtype: np.dtype[Any] = FRAME_DTYPE
 ) -> tuple[int, int] | None:
-    """Where the records are in a message that :func:`frame_message` would write.
+    """Find the records in a message of the form of :func:`frame_message`.
 
     Args:
-        message: A CDR message, or its beginning and all that follows of it.
-        label: What it has to say of a record's layout.
+        message: A CDR message.
+        label: Required label of the records' layout.
 
     Returns:
-        Offset of the first record and number of records; None for any other message, also where
-        it could mean the same.
+        Offset of the first record and number of records; None for a message of another form.
     """
-    head = _head(label, dtype.itemsize)
-    at = len(head.before)
-    count, size = (len(message) - head.size) // dtype.itemsize, len(message) - head.size
+    before, between = _head(label, dtype.itemsize)
+    pair_at = len(before)
+    between_at = pair_at + _PAIR.size
+    start = between_at + len(between) + _COUNT.size
+    size = len(message) - start
+    count = size // dtype.itemsize
     if size < 0 or count * dtype.itemsize != size:
         return None
-    same = message.startswith(head.before) and message.startswith(head.between, at + _PAIR.size)
-    if not same or _PAIR.unpack_from(message, at) != (count, size):
+    if not message.startswith(before) or not message.startswith(between, between_at):
         return None
-    if _COUNT.unpack_from(message, head.size - _COUNT.size) != (size,):
+    if _PAIR.unpack_from(message, pair_at) != (count, size):
         return None
-    return head.size, count
+    if _COUNT.unpack_from(message, start - _COUNT.size) != (size,):
+        return None
+    return start, count

@@ -1,9 +1,7 @@
-"""Reads JointState topics of any make: fields, clocks and sampling times put right.
+"""Reads JointState topics of any make as one series per joint.
 
-JointState messages of any make into one series a joint.
-
-Foreign logs carry all joints in one message, one joint a message, or change the set on the way;
-each joint gets the samples that were logged for it, at its own sampling times.
+Foreign logs have all joints in one message, or one joint per message, or a set that changes; each
+joint gets its own samples at its own sampling times.
 """
 
 from __future__ import annotations
@@ -21,11 +19,11 @@ from ..columns.columns import Messages
 from ..columns.layouts import Group, names_of
 from ..columns.topics import Topics
 from ..messages.definitions import JOINT_STATE, MessageType
-from .sample_times import Series, StampClock, own_times
+from .sample_times import Series, StampClock, cut, own_times
 from .signals import JointSignals
 
 _EARLY_OR_LATE = 0.1
-"""A joint that is missing for more than this part of the topic's span is worth a warning."""
+"""A joint that is missing for more than this part of the topic's span causes a warning."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class JointRows:
         names: The joints, k of them.
         stamp_ns: header.stamp [ns], shape (n,).
         log_ns: Log time [Unix ns], shape (n,).
-        values: Shape (n, k), or (n, 0) where these messages leave the field empty.
+        values: Shape (n, k), or (n, 0) if these messages leave the field empty.
     """
 
     names: tuple[str, ...]
@@ -46,12 +44,7 @@ class JointRows:
 
 
 def rows_of(group: Group, field: str) -> JointRows:
-    """The rows of one layout group.
-
-    Args:
-        group: JointState messages of one layout.
-        field: ``position``, ``velocity`` or ``effort``.
-    """
+    """Return the rows of JointState messages of one layout, in log order."""
     log_ns = group.times()
     stamp_ns = group.stamps() if group.is_stamped else np.zeros_like(log_ns)
     values = group.values(field).astype(np.float64, copy=False)
@@ -64,14 +57,14 @@ def rows_of(group: Group, field: str) -> JointRows:
 def merge_rows(
     rows: Sequence[JointRows], topic: str, field: str, warn: Callable[[str], None]
 ) -> tuple[tuple[str, ...], list[IntArray], list[FloatArray]]:
-    """One series a joint from messages of all layouts.
+    """Merge messages of all layouts to one series per joint.
 
     Args:
         rows: The messages, by layout.
-        warn: Takes one sentence for each irregularity.
+        warn: Called with one sentence for each irregularity.
 
     Returns:
-        Joint names in order of first appearance, times [Unix ns] and values, one array a joint;
+        Joint names in order of first appearance, times [Unix ns] and values, one array per joint;
         joints sampled together share one array of times.
     """
     filled = [row for row in rows if row.names and row.values.shape[1] == len(row.names)]
@@ -109,7 +102,7 @@ def merge_rows(
 def _in_time(
     t_ns: IntArray, where: str, warn: Callable[[str], None]
 ) -> tuple[IntArray, IntArray | None]:
-    """Times in order, and the order if they had to be sorted; duplicates are only told."""
+    """Sort times; return also the order if they were unsorted. Duplicates cause a warning."""
     steps = np.diff(t_ns)
     backward, repeated = int((steps < 0).sum()), int((steps == 0).sum())
     order: IntArray | None = None
@@ -126,7 +119,7 @@ def _in_time(
 def _warn_changed_set(
     names: Sequence[str], times: Sequence[IntArray], topic: str, warn: Callable[[str], None]
 ) -> None:
-    """Say which joints are missing at the start or end of the topic."""
+    """Warn of joints that are missing at the start or end of the topic."""
     filled = [t for t in times if len(t)]
     if not filled:
         return
@@ -146,34 +139,28 @@ def _warn_changed_set(
 
 _NS = 1_000_000_000
 SLACK_NS = 5 * _NS
-"""How far a sampling time may lie from its log time before a window could miss it."""
+"""Largest difference between sampling time and log time for which a window is complete."""
 
 NEAR_NS = _NS // 4
-"""The same for logs of our own, as long as the window turns out to be covered."""
+"""The same for logs of undulog, if the samples read cover the window."""
 
 
 def widened(window_ns: Window, slack_ns: int) -> Window:
-    """A window of log times for one of sampling times.
+    """Return a window of log times for one of sampling times.
 
     Args:
         window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
-        slack_ns: How far log times may lie from them [ns].
-
-    Returns:
-        The window of log times, half-open.
+        slack_ns: Largest difference of log times [ns].
     """
     start, stop = window_ns
     return None if start is None else start - slack_ns, None if stop is None else stop + slack_ns
 
 
 def covers(found: Mapping[str, Messages], window_ns: Window) -> bool:
-    """Whether what was read goes beyond a window at both ends, in order, so nothing is missing.
+    """Whether messages surely extend beyond a window at both ends and are in order.
 
     Args:
         window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
-
-    Returns:
-        False where that isn't sure.
     """
     start, stop = window_ns
     for messages in found.values():
@@ -187,25 +174,8 @@ def covers(found: Mapping[str, Messages], window_ns: Window) -> bool:
     return True
 
 
-def cut(t_ns: IntArray, window_ns: Window) -> tuple[slice, IntArray]:
-    """The samples in a window.
-
-    Args:
-        t_ns: Sampling times [Unix ns], not decreasing, shape (n,).
-        window_ns: Half-open window of them [Unix ns]; None for open ends.
-
-    Returns:
-        Which they are, and their times; a view.
-    """
-    start, stop = window_ns
-    first = 0 if start is None else int(t_ns.searchsorted(start))
-    last = len(t_ns) if stop is None else int(t_ns.searchsorted(stop))
-    inside = slice(first, last)
-    return inside, t_ns[inside]
-
-
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
-"""Field of a JointState to its unit, where the channel doesn't say otherwise."""
+"""Field of a JointState to its unit, if the channel states no other."""
 _MEASURED = (
     "/joint_states",
     "/joint_velocity",
@@ -217,7 +187,7 @@ _MEASURED = (
 OFFSET_TOPICS = dict.fromkeys(_MEASURED, "/joint_sample_offset") | {
     "/joint_commands": "/joint_command_offset"
 }
-"""Topic to the topic with its joints' times relative to the stamp: a bus goes joint by joint."""
+"""Topic to the topic of its joints' sampling times relative to the stamp."""
 
 
 class JointReader:
@@ -226,11 +196,7 @@ class JointReader:
     def __init__(
         self, path: Path, topics: Topics, clock: StampClock, warn: Callable[[str], None]
     ) -> None:
-        """Keep what reading needs.
-
-        Args:
-            warn: Takes one sentence for each irregularity.
-        """
+        """Set up a reader; ``warn`` is called with one sentence for each irregularity."""
         self._path = path
         self._topics = topics
         self._clock = clock
@@ -263,13 +229,10 @@ class JointReader:
         return self.signals(wanted, found, window_ns, chain)
 
     def requests(self, wanted: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str]]:
-        """What has to be read of the file for some fields.
+        """Return the topics and leaf paths to read for some fields, with the offset topics.
 
         Args:
             wanted: Topic to fields: ``position``, ``velocity``, ``effort``.
-
-        Returns:
-            Topic to leaf paths; the offset topics are among them.
 
         Raises:
             MissingChannelError: If the session has no such topic.
@@ -290,10 +253,10 @@ class JointReader:
         window_ns: Window,
         chain: Sequence[str],
     ) -> dict[tuple[str, str], JointSignals]:
-        """Make signals of what was read.
+        """Return the signals of messages that were read.
 
         Args:
-            found: What was read for :meth:`requests`.
+            found: The messages of :meth:`requests`.
             window_ns: Half-open window of sampling times [Unix ns]; None for open ends.
             chain: Joint names head to tail; joints not in it come after it.
 
@@ -335,7 +298,7 @@ class JointReader:
         stamped: Sequence[Series],
         window_ns: Window,
     ) -> Series:
-        """The offsets of a topic, from before the first stamp on; free to be overwritten."""
+        """Return the offsets of a topic from before the first stamp on; may be overwritten."""
         if topic in self._offsets:
             return _copied(self._offsets[topic])
         offsets = self._series(topic, "position", found[topic])
@@ -344,7 +307,7 @@ class JointReader:
         if known or window_ns[0] is None:
             return offsets
         whole = self._topics.read({topic: ["position"]}, (None, None))[topic]
-        self._offsets[topic] = self._series(topic, "position", whole)  # such topics say little
+        self._offsets[topic] = self._series(topic, "position", whole)  # such topics are small
         return _copied(self._offsets[topic])
 
     def _check(self, wanted: Mapping[str, Sequence[str]]) -> None:
@@ -362,7 +325,7 @@ class JointReader:
                     raise DataError(f"a JointState has no {field!r}; it has {', '.join(UNITS)}")
 
     def _series(self, topic: str, field: str, found: Messages) -> Series:
-        """One field of a topic, at message stamps on the log's clock."""
+        """Return one field of a topic at message stamps on the log's clock."""
         rows = [rows_of(group, field) for group in found.groups]
         rows.extend(self._general_rows(topic, field, found))
         if rows and not any(row.values.size for row in rows):
@@ -397,7 +360,7 @@ class JointReader:
         return signals if order == names else signals.select(order)
 
     def _general_rows(self, topic: str, field: str, found: Messages) -> list[JointRows]:
-        """Rows of messages without a layout, through the general decoder."""
+        """Read messages without a layout by the general decoder."""
         if not found.unread:
             return []
         decode = self._topics.decoder(topic)
@@ -419,7 +382,7 @@ class JointReader:
         return rows
 
     def _filled(self, topic: str) -> list[str]:
-        """The fields that the topic does carry."""
+        """Return the fields that the topic has."""
         found = self._topics.read({topic: list(UNITS)}, (None, None))[topic]
         return [name for name in UNITS if any(name in group.paths for group in found.groups)]
 
@@ -434,7 +397,7 @@ class JointReader:
 
 
 def _is_joint_state(found: MessageType) -> bool:
-    """Whether a type has all that a JointState has, whatever else it has."""
+    """Whether a type has all fields of a JointState."""
     fields = {field.name: field for field in found.fields}
     arrays = [fields.get(name) for name in UNITS]
     header = fields["header"].nested if "header" in fields else None

@@ -33,7 +33,7 @@ class OpenLog:
 
     Attributes:
         path: The file, or the folder of a split session.
-        warnings: What is missing or doubtful, one sentence each; grows while columns are read.
+        warnings: Missing or doubtful parts, one sentence each; grows while columns are read.
     """
 
     def __init__(self, path: Path, column_folder: Path | None, threads: int) -> None:
@@ -58,7 +58,7 @@ class OpenLog:
 
     @cached_property
     def run(self) -> Run | None:
-        """What a twin ran: its servos, contact and physics rate; None of any other session."""
+        """Servos, contact and physics rate of a twin's run; None for other sessions."""
         facts = self.file.metadata.get(RUN_RECORD)
         if facts is not None:
             try:
@@ -126,7 +126,7 @@ class OpenLog:
     def _as_tables(
         self, wanted: Mapping[str, Sequence[str] | None], found: dict[str, Messages]
     ) -> dict[str, pd.DataFrame]:
-        """Tables of some of the messages that were read, which are let go of one by one."""
+        """Return tables of some messages, which are removed from ``found`` one by one."""
         read: dict[str, pd.DataFrame] = {}
         for topic in wanted:
             read[topic] = self._table(topic, found.pop(topic))
@@ -147,7 +147,7 @@ class OpenLog:
 
 
 def _frame(group: Group, shift_ns: int) -> pd.DataFrame:
-    """One layout group as a table."""
+    """Return one layout group as a table."""
     import pandas as pd
 
     columns: dict[str, Any] = {}

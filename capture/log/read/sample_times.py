@@ -1,14 +1,10 @@
-"""Sampling times of joints that a bus asks in turn: message stamps plus logged offsets.
+"""Sampling times: stamps plus logged offsets, on the log's clock, and breaks of a session.
 
-Which clock the header stamps of a log are on.
+A log of a simulation may have simulated time in its headers and wall time in the container.
+Windows, plots and alignment need one clock, so such stamps are shifted to the log's.
 
-A log recorded from a simulation may carry simulated time in its headers and wall time in the
-container. Windows, plots and alignment need one clock, so such stamps are shifted to the log's.
-
-Where a session was recorded without a break.
-
-A clock that jumps (set by NTP when the network comes, or by hand) leaves a hole of hours or years
-in the stamps, and nothing tells how the motion before it joins that after it.
+A clock that jumps (set by NTP when the network comes, or by hand) leaves a gap of hours or years in
+the stamps; how the motion continues over the gap is unknown.
 """
 
 from __future__ import annotations
@@ -21,30 +17,31 @@ import numpy as np
 
 from ...common.arrays import FloatArray, IntArray
 from ...common.errors import DataError
+from ..columns.blocks import Window
 from ..columns.layouts import stamps_of
 from ..columns.topics import Topics
 from ..messages.cdr import layout_of
 
 BREAK_S = 10.0
-"""A session breaks where none of its channels has a sample for longer than this [s]; shorter gaps
-are losses, which the estimators stand."""
+"""A session breaks if none of its channels has a sample for longer than this [s]; shorter gaps are
+losses, which the estimators allow."""
 
 BREAK_INTERVALS = 10
-"""Median intervals that a break has at least: slow channels sample less often than that."""
+"""Shortest break in median intervals, for slow channels."""
 
 _NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
 class Unbroken:
-    """The longest stretch without a break.
+    """The longest interval without a break.
 
     Attributes:
         start_ns: Its first sample [Unix ns].
         last_ns: Its last sample [Unix ns].
-        others: How many stretches are left out.
-        left_s: Their length together, without the gaps [s].
-        gap_s: The longest gap between stretches [s]; 0 where there is none.
+        others: Number of other intervals.
+        left_s: Their total length without the gaps [s].
+        gap_s: The longest gap between intervals [s]; 0 without gaps.
     """
 
     start_ns: int
@@ -54,7 +51,7 @@ class Unbroken:
     gap_s: float = 0.0
 
     def __str__(self) -> str:
-        """One sentence; what is left out, and why."""
+        """Return one sentence: the part that is left out, and why."""
         stretches = "1 other stretch" if self.others == 1 else f"{self.others} other stretches"
         return (
             f"the recording has a gap of {_length(self.gap_s)}: its longest unbroken stretch, "
@@ -66,20 +63,20 @@ class Unbroken:
 def longest_unbroken(
     times_ns: Iterable[IntArray], start_ns: int | None = None, stop_ns: int | None = None
 ) -> Unbroken | None:
-    """Find the longest stretch in which the samples of some channels follow each other.
+    """Find the longest interval without a break in the samples of some channels.
 
     Args:
         times_ns: Sampling times of each channel [Unix ns], not decreasing.
-        start_ns: First time to look at [Unix ns], or None.
+        start_ns: First time [Unix ns], or None.
         stop_ns: One past the last time [Unix ns], or None.
 
     Returns:
-        The stretch; of equal ones the first; None without samples.
+        The interval; of equal ones the first; None without samples.
     """
     runs = [
         run
         for t_ns in {id(each): each for each in times_ns}.values()
-        for run in _runs(_within(t_ns, start_ns, stop_ns))
+        for run in _runs(cut(t_ns, (start_ns, stop_ns))[1])
     ]
     joined: list[tuple[int, int]] = []
     for first, last in sorted(runs):
@@ -95,14 +92,22 @@ def longest_unbroken(
     return Unbroken(*longest, len(joined) - 1, left / _NS, max(gaps, default=0) / _NS)
 
 
-def _within(t_ns: IntArray, start_ns: int | None, stop_ns: int | None) -> IntArray:
-    first = 0 if start_ns is None else int(np.searchsorted(t_ns, start_ns))
-    stop = t_ns.size if stop_ns is None else int(np.searchsorted(t_ns, stop_ns))
-    return t_ns[first:stop]
+def cut(t_ns: IntArray, window_ns: Window) -> tuple[slice, IntArray]:
+    """Return the range of the samples in a window, and a view of their times.
+
+    Args:
+        t_ns: Sampling times [Unix ns], not decreasing, shape (n,).
+        window_ns: Half-open window of them [Unix ns]; None for open ends.
+    """
+    start, stop = window_ns
+    first = 0 if start is None else int(t_ns.searchsorted(start))
+    last = len(t_ns) if stop is None else int(t_ns.searchsorted(stop))
+    inside = slice(first, last)
+    return inside, t_ns[inside]
 
 
 def _runs(t_ns: IntArray) -> list[tuple[int, int]]:
-    """First and last time of each stretch of one channel."""
+    """Return the first and last time of each interval of one channel."""
     if not t_ns.size:
         return []
     step = np.diff(t_ns)
@@ -126,32 +131,24 @@ _FAR_STAMP_NS = 3600 * _NS
 """Stamps further than this from the log time are on another clock."""
 
 _NEVER_NS = 2**62
-"""No log time lies beyond this [Unix ns], the year 2116: such a one is damage."""
+"""A log time beyond this [Unix ns], the year 2116, is damage."""
 
 
 class StampClock:
-    """The shift from header stamps to the log's clock, found once for a session."""
+    """The shift from header stamps to the log's clock, found once per session."""
 
     def __init__(self, topics: Topics, warn: Callable[[str], None]) -> None:
-        """Look at nothing yet.
-
-        Args:
-            topics: The log's topics.
-            warn: Takes one sentence if the stamps are on another clock.
-        """
+        """Set up; ``warn`` is called with one sentence if the stamps are on another clock."""
         self._topics = topics
         self._warn = warn
         self._shift_ns: int | None = None
 
     def shift_ns(self, topic: str) -> int:
-        """What must be added to the header stamps of the log [ns]; 0 on the log's own clock.
+        """Return the shift to add to the header stamps [ns]; 0 if they are on the log's clock.
 
         Args:
-            topic: Where to look if the shift isn't known yet: its first message decides for all
-                topics, in whole seconds, so that they stay aligned.
-
-        Returns:
-            The shift [ns].
+            topic: Topic whose first message determines the shift, if it isn't known yet. It holds
+                for all topics and is a whole number of seconds, so that they stay aligned.
 
         Raises:
             MissingChannelError: If the log has no such topic.
@@ -186,7 +183,7 @@ class StampClock:
 
 
 def clock_shift_ns(stamp_ns: int, log_ns: int) -> int:
-    """Return what must be added to a stamp [ns], in whole seconds, if it is on another clock."""
+    """Return the shift to add to a stamp [ns], in whole seconds; 0 on the same clock."""
     apart_ns = log_ns - stamp_ns
     return round(apart_ns / _NS) * _NS if abs(apart_ns) > _FAR_STAMP_NS else 0
 
@@ -199,9 +196,9 @@ class Series:
     """Samples of some joints.
 
     Attributes:
-        t_ns: Message stamps [Unix ns], not decreasing, one array a joint; joints that were
+        t_ns: Message stamps [Unix ns], not decreasing, one array per joint; joints that were
             sampled together share one array.
-        values: One array of shape (n_j,) a joint.
+        values: One array of shape (n_j,) per joint.
     """
 
     names: tuple[str, ...]
@@ -210,17 +207,16 @@ class Series:
 
 
 def own_times(stamped: Sequence[Series], offsets: Series) -> list[list[IntArray]]:
-    """Sampling times of several series whose joints have the same offsets.
+    """Return the sampling times of several series whose joints have the same offsets.
 
     Args:
-        offsets: Sample time minus stamp [s]. Its memory may be used for the times: don't look at
-            it afterwards.
+        offsets: Sample time minus stamp [s]. Its memory may be overwritten by the times.
 
     Returns:
-        For each series one array a joint [Unix ns]: its stamps plus the offset that was logged
-        with each stamp, or last before it (the first offset for stamps before that). Series that
-        were stamped alike share them, and so do joints without offsets. Joints that ``offsets``
-        doesn't have keep their stamps.
+        For each series one array per joint [Unix ns]: its stamps plus the offset that was logged
+        with each stamp, or last before it (the first offset for earlier stamps). Series with equal
+        stamps share them, and so do joints without offsets. Joints that are not in ``offsets`` keep
+        their stamps.
     """
     if all(_stamped_alike(series, offsets) for series in stamped):  # the usual case
         own = [
@@ -267,7 +263,7 @@ def moved(t_ns: IntArray, stamp_ns: IntArray, offset_s: FloatArray) -> IntArray:
 
 
 def _steps(offset_s: FloatArray) -> IntArray:
-    """Offsets [ns]; those that are not finite, or beyond all reason, count as zero."""
+    """Return offsets in ns; those that are not finite or far too large are zero."""
     with np.errstate(over="ignore", invalid="ignore"):
         steps = offset_s * _NS
         np.rint(steps, out=steps)

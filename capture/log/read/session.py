@@ -1,11 +1,7 @@
-"""The session reader: any log to the contract, and any ROS 2 bag with JointStates, as columns.
+"""The session reader: any log of the log contract, and any ROS 2 bag with JointStates, as columns.
 
-Opening reads the summary only; :mod:`.capture.log.read.session` has what is read then.
-
-A session as its readers see it: all of an open one, a window of it, or with renamed topics.
-
-Columns are read when asked for, over a time window if given; whatever could not be read is said in
-``warnings``.
+Opening reads the summary only. Columns are read on request, for a time window if given;
+``warnings`` lists the parts that could not be read.
 """
 
 from __future__ import annotations
@@ -40,7 +36,7 @@ _NO_NAMES: Mapping[str, str] = MappingProxyType({})
 class SessionView:
     """A session, or a view of it that reads through the same open file; see :meth:`view`.
 
-    Everything that reads a session takes either. Only the session itself can be closed.
+    Functions that read a session accept either. Only the session itself can be closed.
     """
 
     def __init__(
@@ -51,11 +47,11 @@ class SessionView:
         names: Mapping[str, str] = _NO_NAMES,
         on_read: Callable[[], None] = lambda: None,
     ) -> None:
-        """Keep what is seen of a log; :meth:`.Session.open` and :meth:`view` call this.
+        """Create a view of a log; :meth:`.Session.open` and :meth:`view` call this.
 
         Args:
-            window_ns: Half-open window of what is read [Unix ns]; None for open ends.
-            names: Name of a topic to the name that it was logged by, where these differ.
+            window_ns: Half-open time window [Unix ns]; None for open ends.
+            names: Name of a topic in the view to its name in the log, if they differ.
             on_read: Called before each read.
         """
         self._log = log
@@ -71,17 +67,17 @@ class SessionView:
         rename: Mapping[str, str] = _NO_NAMES,
         on_read: Callable[[], None] | None = None,
     ) -> SessionView:
-        """Look at the session through a time window, with other topic names, or until stopped.
+        """Return a view with a time window, with other topic names, or with a stop check.
 
         Nothing is read or copied by this. A view of a view narrows it further.
 
         Args:
             start_ns: First time that is read [Unix ns]; None for the session's start.
             stop_ns: One past the last time that is read [Unix ns]; None for the end.
-            rename: Name in the view to the topic that it stands for. Other topics that have one
-                of these names are left out of the view.
-            on_read: Called before each read and each message, and free to raise, e.g. where a
-                stop was requested.
+            rename: Name in the view to the topic. Other topics that have one of these names are
+                left out of the view.
+            on_read: Called before each read and each message; may raise, e.g. after a request to
+                stop.
 
         Returns:
             The view, usable as long as the session is open. Signals are limited by their sampling
@@ -103,11 +99,11 @@ class SessionView:
         )
 
     def forget(self) -> None:
-        """Let go of the memory of what was read so far.
+        """Release memory of the data read so far, e.g. between parts of a long session.
 
-        For who goes through a long session stretch by stretch: the pages of a mapped file count as
-        this process's memory as long as they are. What is read next is the same. Columns that lie
-        in files are let go of, too, and keep their values; those in memory stay.
+        The pages of a mapped file count as this process's memory until they are released; they are
+        read again when needed. Columns in files are released, too, and keep their values; those in
+        memory stay.
         """
         self._on_read()
         self._log.file.forget()
@@ -137,19 +133,19 @@ class SessionView:
 
     @property
     def warnings(self) -> list[str]:
-        """What is missing or doubtful, one sentence each; grows while columns are read."""
+        """Missing or doubtful parts, one sentence each; grows while columns are read."""
         return list(self._log.warnings)
 
     @property
     def start_ns(self) -> int:
-        """Log time of the first message [Unix ns]; 0 where there is none."""
+        """Log time of the first message [Unix ns]; 0 without messages."""
         start_ns = self._window_ns[0]
         first_ns = self._log.file.limits[0]
         return first_ns if start_ns is None else max(first_ns, start_ns)
 
     @property
     def end_ns(self) -> int:
-        """Log time of the last message [Unix ns], or the window's end; 0 where there is none."""
+        """Log time of the last message [Unix ns], or the window's end; 0 without messages."""
         stop_ns = self._window_ns[1]
         last_ns = self._log.file.limits[1]
         return last_ns if stop_ns is None else min(last_ns, stop_ns)
@@ -161,7 +157,7 @@ class SessionView:
 
     @property
     def chunk_times_ns(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
-        """First and last log time of each chunk [Unix ns], as it states them, shape (n,) each."""
+        """First and last log time stated in each chunk [Unix ns], shape (n,) each."""
         return self._log.file.spans
 
     @property
@@ -177,12 +173,12 @@ class SessionView:
 
     @property
     def session_id(self) -> str:
-        """The session's id, or the file's name for a log that has none."""
+        """The session's id; the file's name if it has none."""
         return self._log.file.metadata.get("undulog", {}).get("session_id") or self.path.stem
 
     @property
     def settle_s(self) -> float | None:
-        """The first part that is not fit for steady-state analysis [s], None if it doesn't say."""
+        """Settling time to leave out of a steady-state analysis [s]; None if not stated."""
         stated = self._log.file.metadata.get("undulog", {}).get("settle_s", "")
         try:
             seconds = float(stated)
@@ -197,12 +193,12 @@ class SessionView:
 
     @property
     def run(self) -> Run | None:
-        """What a twin ran: its servos, contact and physics rate; None of any other session."""
+        """Servos, contact and physics rate of a twin's run; None for other sessions."""
         return self._log.run
 
     @property
     def robot_as_run(self) -> Robot | None:
-        """The robot with the servos and masses that a twin ran with; else as described."""
+        """The robot with the servos and masses of a twin's run; else as described."""
         if self.robot is None or self.run is None:
             return self.robot
         return self.robot.with_modules(self.run.servo_of, self.run.mass_factor)
@@ -219,7 +215,7 @@ class SessionView:
 
     @property
     def profile(self) -> str:
-        """The MCAP profile, ``ros2`` for a log to the contract."""
+        """The MCAP profile, ``ros2`` for a log of the log contract."""
         return self._log.file.profile
 
     # -- columns ---------------------------------------------------------------------------
@@ -232,7 +228,7 @@ class SessionView:
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> JointSignals:
-        """One quantity of all joints of a JointState topic.
+        """Return one quantity of all joints of a JointState topic.
 
         Args:
             topic: E.g. ``/joint_states``.
@@ -241,7 +237,7 @@ class SessionView:
             stop_ns: One past the last sampling time wanted [Unix ns]; None for the end.
 
         Returns:
-            The samples, in the robot's chain order where the session has a robot, at their own
+            The samples, in chain order if the session has a robot, at their own
             sampling times: header.stamp plus the logged sample offset.
 
         Raises:
@@ -259,7 +255,7 @@ class SessionView:
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> dict[tuple[str, str], JointSignals]:
-        """Several quantities in one pass over the file.
+        """Return several quantities in one pass over the file.
 
         Args:
             wanted: Topic to fields, e.g. ``{"/joint_states": ["position", "velocity"]}``.
@@ -287,7 +283,7 @@ class SessionView:
     def table(
         self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
     ) -> pd.DataFrame:
-        """All numbers and strings of a topic, one row a message.
+        """Return all numbers and strings of a topic, one row per message.
 
         Args:
             topic: Any topic whose type has a ``ros2msg`` schema.
@@ -295,10 +291,9 @@ class SessionView:
             stop_ns: One past the last log time wanted [Unix ns]; None for the end.
 
         Returns:
-            Index ``t_ns``: header.stamp [Unix ns] on the log's clock, or the log time where the
-            type has none or the stamp is zero.
-            Columns by field path, e.g. ``pose.pose.position.x`` or ``position[3]``, units as the
-            message type has them.
+            Index ``t_ns``: header.stamp [Unix ns] on the log's clock, or the log time if the type
+            has no stamp or it is zero. Columns by field path, e.g. ``pose.pose.position.x`` or
+            ``position[3]``, in the units of the message type.
 
         Raises:
             MissingChannelError: If the session has no such topic.
@@ -311,7 +306,7 @@ class SessionView:
         joints: Mapping[str, Sequence[str]],
         tables: Mapping[str, Sequence[str] | None],
     ) -> tuple[dict[tuple[str, str], JointSignals], dict[str, pd.DataFrame]]:
-        """Joint signals and tables of all of the session, in one pass over the file.
+        """Return joint signals and tables of the whole session, in one pass over the file.
 
         Args:
             joints: JointState topic to fields, as for :meth:`joint_columns`.
@@ -323,7 +318,7 @@ class SessionView:
 
         Raises:
             MissingChannelError: If the session has no such topic, or it never carries the field.
-            DataError: If a topic can't be read as asked, or is asked for both ways.
+            DataError: If a topic can't be read, or is requested both ways.
         """
         if self._names or self._window_ns != (None, None):
             # A window of sampling times isn't one of log times: two passes.
@@ -353,7 +348,7 @@ class SessionView:
     def frames(
         self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
     ) -> FrameArray:
-        """Raw CAN frames of a bus, in the order they were logged.
+        """Return raw CAN frames of a bus, in the order they were logged.
 
         Args:
             topic: E.g. ``/can/can0``.
@@ -373,20 +368,10 @@ class SessionView:
     def fd_frames(
         self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
     ) -> FrameArray:
-        """Raw CAN FD frames of a bus, in the order they were logged.
-
-        Args:
-            topic: E.g. ``/can_fd/can0``.
-            start_ns: First log time of a message of frames wanted [Unix ns]; None for the
-                session's start.
-            stop_ns: One past the last such log time wanted [Unix ns]; None for the end.
+        """Return raw CAN FD frames of a bus, e.g. of ``/can_fd/can0``; see :meth:`frames`.
 
         Returns:
             Records of :data:`.capture.log.messages.frames.FD_FRAME_DTYPE`, shape (n,).
-
-        Raises:
-            MissingChannelError: If the session has no such topic.
-            DataError: If the topic holds something else.
         """
         return self._frames(topic, (start_ns, stop_ns), FD_FRAME_DTYPE, FD_FRAME_LAYOUT)
 
@@ -410,14 +395,14 @@ class SessionView:
         return self._names.get(topic, topic)
 
     def _within(self, start_ns: int | None, stop_ns: int | None) -> Window:
-        """The part of a window that the view sees."""
+        """Return the part of a window that is in the view."""
         starts = [one for one in (start_ns, self._window_ns[0]) if one is not None]
         stops = [one for one in (stop_ns, self._window_ns[1]) if one is not None]
         return max(starts, default=None), min(stops, default=None)
 
 
 class Session(SessionView):
-    """A recorded session, opened for reading: a view of all of it, which can be closed."""
+    """A recorded session, opened for reading: a view of the whole, which can be closed."""
 
     def __init__(
         self, path: Path | str, *, threads: int | None = None, column_folder: Path | None = None
@@ -433,10 +418,10 @@ class Session(SessionView):
 
         Args:
             path: The MCAP file; of a split session any part, or the folder that holds it.
-            threads: How many decompress what is read; None for one a core that this process may
-                use, at most four. What is read is the same.
-            column_folder: A folder on a disk: large columns lie there, in files without names, and
-                :meth:`forget` lets go of their memory (Linux). None for memory.
+            threads: Number of decompressing threads; None for one per core that this process may
+                use, at most four.
+            column_folder: A folder on a disk for large columns, in files without names, so that
+                :meth:`forget` can release their memory (Linux). None for memory.
 
         Returns:
             The session, usable in a ``with`` block.
@@ -453,7 +438,7 @@ class Session(SessionView):
         self._log.file.close()
 
     def __enter__(self) -> Self:
-        """Nothing to do: the file is open."""
+        """Return the session."""
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,4 +1,4 @@
-"""Joint signals: what every consumer of a session gets, one series a joint, each with own times."""
+"""Joint signals: one series per joint, each with its own sampling times."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LARGEST = 1e100
-"""A value above it counts as missing: no sensor sends it, and its powers have no finite value."""
+"""A larger value counts as missing: no sensor sends it, and its powers are not finite."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class JointSignals:
     Attributes:
         topic: Where it was read from.
         field: ``position``, ``velocity`` or ``effort`` of the JointState.
-        t_ns: Sampling times [Unix ns], one array of shape (n_j,) a joint. Joints that were sampled
+        t_ns: Sampling times [Unix ns], one array of shape (n_j,) per joint. Joints sampled
             together share one array.
-        values: One array of shape (n_j,) a joint; NaN samples are kept.
+        values: One array of shape (n_j,) per joint; NaN samples are kept.
     """
 
     topic: str
@@ -59,7 +59,7 @@ class JointSignals:
         return {name: j for j, name in reversed([*enumerate(self.names)])}
 
     def signal(self, name: str) -> Signal:
-        """The samples of one joint.
+        """Return the samples of one joint.
 
         Raises:
             DataError: If there is no such joint.
@@ -70,10 +70,7 @@ class JointSignals:
         return Signal(name, self.unit, self.t_ns[j], self.values[j])
 
     def select(self, names: Iterable[str]) -> JointSignals:
-        """The same quantity of some joints.
-
-        Args:
-            names: Joint names, in the order wanted.
+        """Return the same quantity of some joints, in the order of ``names``.
 
         Raises:
             DataError: If there is no such joint.
@@ -89,11 +86,11 @@ class JointSignals:
         )
 
     def frame(self) -> pd.DataFrame:
-        """All samples in long form.
+        """Return all samples in long form.
 
         Returns:
             Columns ``joint`` (categorical, in chain order), ``t_ns`` and the field's name with its
-            unit, e.g. ``position [rad]``; one row a sample.
+            unit, e.g. ``position [rad]``; one row per sample.
         """
         import pandas as pd
 

@@ -1,4 +1,4 @@
-"""The thread that brings finished chunks to the disk and then releases the write-ahead log."""
+"""The thread that writes finished chunks to the disk and then releases the write-ahead log."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from .mcap_sink import write_description, write_error
 
 
 class FileDeletedError(LogWriteError):
-    """Somebody deleted the file that is being written."""
+    """The file that is being written was deleted."""
 
 
 class PartStream:
-    """A file whose writing is put off: the MCAP writer never waits for the disk.
+    """A file that is written later, so that the MCAP writer never waits for the disk.
 
     Attributes:
         number: The part, from 1.
@@ -38,10 +38,10 @@ class PartStream:
 
         Args:
             number: The part, from 1.
-            force: Put it in the place of an existing one, which whoever reads it goes on reading.
+            force: Replace an existing file; processes that have it open keep the old one.
 
         Raises:
-            OutputExistsError: If it is there and ``force`` is not given.
+            OutputExistsError: If it exists and ``force`` is not given.
             LogWriteError: If it can't be created.
         """
         self.path = path
@@ -74,10 +74,10 @@ class PartStream:
         return self.size
 
     def flush(self) -> None:
-        """Nothing to do: the disk's thread writes."""
+        """Do nothing: the disk thread writes."""
 
     def take(self) -> list[bytes]:
-        """What was queued since the last call."""
+        """Return the bytes queued since the last call."""
         pieces, self._pieces = self._pieces, []
         return pieces
 
@@ -87,17 +87,17 @@ class PartStream:
         """Write bytes to the file.
 
         Raises:
-            OSError: If none were.
+            OSError: If no byte was written.
         """
         written = os.write(self._file, data)
         self._hash.update(data[:written])
         return written
 
     def sync(self) -> None:
-        """Bring what was written to the disk.
+        """Sync the written bytes to the disk.
 
         Raises:
-            FileDeletedError: If the file has no name any more: all that is in it will be gone.
+            FileDeletedError: If the file has no name any more, so that its contents will be lost.
             OSError: If the disk fails.
         """
         try:
@@ -112,30 +112,26 @@ class PartStream:
                 raise FileDeletedError(self.path, "was deleted while it was being written")
 
     def close(self) -> str:
-        """Close the file.
-
-        Returns:
-            SHA-256 of all that was written.
-        """
-        with suppress(OSError):  # it was synced before; what close could say comes too late
+        """Close the file and return the SHA-256 of its contents."""
+        with suppress(OSError):  # it was synced before; an error of close comes too late
             os.close(self._file)
         return self._hash.hexdigest()
 
     def discard(self) -> None:
-        """Close and delete the file: nothing of worth is in it."""
+        """Close and delete the file."""
         self.close()
         with suppress(OSError):
             self.path.unlink()
 
 
-_PATIENCE_S = 2.0  # file systems give deleted space back when they get round to it
+_PATIENCE_S = 2.0  # file systems free deleted space with a delay
 _PAUSE_S = 0.1
 _MOST_UNSYNCED = 32 << 20
 
 
 @dataclass(frozen=True)
 class _Bytes:
-    """Bytes of a part, and the last message that is wholly in it with them."""
+    """Bytes of a part, and the position of the last message that they complete."""
 
     part: PartStream
     pieces: list[bytes]
@@ -144,7 +140,7 @@ class _Bytes:
 
 @dataclass(frozen=True)
 class _Finish:
-    """The end of a part; from here on its writer belongs to the thread."""
+    """The end of a part; from here on the thread uses its writer."""
 
     part: PartStream
     writer: McapWriter
@@ -153,13 +149,13 @@ class _Finish:
 
 
 class DiskThread:
-    """Writes, hashes and syncs what it is given, in order."""
+    """Writes, hashes and syncs parts, in order."""
 
     def __init__(self, wal: WriteAheadLog, ballast: ReservedSpace) -> None:
         """Start the thread.
 
         Args:
-            wal: Released as far as the files have its messages.
+            wal: Released up to the last message in the files.
             ballast: Freed when the disk is full.
         """
         self._wal = wal
@@ -178,17 +174,17 @@ class DiskThread:
 
     @property
     def failure(self) -> LogWriteError | None:
-        """Why nothing is written any more: what is not in the files is in the write-ahead log."""
+        """Why nothing is written any more; the remaining messages are in the write-ahead log."""
         return self._failure
 
     @property
     def trouble(self) -> LogWriteError | None:
-        """Why recording must end: the failure, or a disk so full that the ballast had to go."""
+        """Why recording must end: the failure, or a disk so full that the ballast was freed."""
         return self._failure or self._shortage
 
     @property
     def backlog(self) -> int:
-        """Bytes given and not yet written."""
+        """Bytes queued and not yet written."""
         return self.bytes_given - self._written
 
     @property
@@ -197,10 +193,10 @@ class DiskThread:
         return self._queued + self._ends
 
     def write(self, part: PartStream, covered: int) -> None:
-        """Hand over what a part has queued.
+        """Queue the bytes of a part.
 
         Args:
-            covered: Position of the last message that is in it then.
+            covered: Position of the last message that they complete.
         """
         pieces = part.take()
         self._queued += sum(map(len, pieces))
@@ -209,20 +205,18 @@ class DiskThread:
     def finish(
         self, part: PartStream, writer: McapWriter, last: tuple[Metadata, ...], covered: int
     ) -> None:
-        """Hand over a part to be finalised.
+        """Queue a part for finalising.
 
         Args:
-            writer: Its writer; not to be used any more.
-            last: Metadata that belong at its end.
+            writer: Its writer, which must not be used any more.
+            last: Metadata for its end.
             covered: Position of its last message.
         """
-        pieces = part.take()
-        self._queued += sum(map(len, pieces))
-        self._queue.put(_Bytes(part, pieces, 0))
+        self.write(part, 0)
         self._queue.put(_Finish(part, writer, last, covered))
 
     def close(self) -> None:
-        """Do all that was handed over, and end; safe to call twice."""
+        """Finish the queue and end the thread; safe to call twice."""
         self._queue.put(None)
         self._thread.join()
 
@@ -239,7 +233,7 @@ class DiskThread:
                     self._write(item)
                 else:
                     self._finish(item)
-        except BaseException as error:  # without this thread nothing would be written any more
+        except BaseException as error:  # without this thread nothing is written any more
             self._failure = LogWriteError(path, f"can't be written: {error!r}")
             raise
 
@@ -251,7 +245,7 @@ class DiskThread:
             if self._queue.empty() or self._unsynced > _MOST_UNSYNCED:
                 self._sync(item.part)
         except OSError as error:
-            self._fail(item.part.path, error)
+            self._failure = write_error(item.part.path, error)
 
     def _sync(self, part: PartStream) -> None:
         part.sync()
@@ -273,7 +267,7 @@ class DiskThread:
             self._covered = max(self._covered, item.covered)
             self._sync(part)
         except OSError as error:
-            self._fail(part.path, error)
+            self._failure = write_error(part.path, error)
             part.close()
             return
         self._hash = part.close()
@@ -303,10 +297,3 @@ class DiskThread:
             return False
         time.sleep(_PAUSE_S)
         return True
-
-    def _fail(self, path: Path, error: OSError) -> None:
-        if isinstance(error, LogWriteError):
-            self._failure = error
-            return
-        reason = os.strerror(error.errno) if error.errno else str(error)
-        self._failure = LogWriteError(path, f"can't be written: {reason}")

@@ -1,9 +1,9 @@
 """The recorder's sink: an MCAP file, or several, with a write-ahead log beside them.
 
-A message is in the write-ahead log before :meth:`DurableSink.write` returns, so the death of the
-process loses none. The MCAP file gets whole chunks; a thread of its own writes, hashes and syncs
-them, and then lets the write-ahead log forget them. When all is well at the end the write-ahead
-log goes; when it is left, ``Session`` and ``undulog log recover`` put the two together.
+A message is in the write-ahead log before :meth:`DurableSink.write` returns, so a crash of the
+process loses none. A separate thread writes whole chunks to the MCAP file, hashes and syncs them,
+and then releases them from the write-ahead log. At a regular end the write-ahead log is deleted; if
+it is left, ``Session`` and ``undulog log recover`` combine the two.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _NEVER_NS = 1 << 63
 
 
 class DurableSink:
-    """Keeps what was accepted through kills, full disks and lost power.
+    """Keeps accepted messages through kills, full disks and lost power.
 
     One thread defines, writes, splits and closes; the properties may be read from any.
     """
@@ -58,7 +58,7 @@ class DurableSink:
 
         Args:
             path: The first part, e.g. ``run.mcap``; the next is ``run_0002.mcap``.
-            force: Replace existing files, and what a former recorder left in its write-ahead log.
+            force: Replace existing files and the write-ahead log of an earlier recorder.
             segment_size: Bytes of a segment of the write-ahead log; two are reserved at any time.
             split_size: Bytes of a part at which the next one begins; None for never. A part is
                 longer by the chunks that are open then.
@@ -68,12 +68,11 @@ class DurableSink:
                 write-ahead log has everything.
             sync_interval_s: What power loss costs at most, about [s].
             ballast: Bytes kept in reserve for finalising on a full disk.
-            last_words: Bytes of messages that are accepted even when the ballast had to go, for
-                what has yet to be brought to a safe end; well below the ballast. The caller
-                looks at :attr:`shortage`.
+            last_words: Bytes of messages that are accepted after the ballast was freed, for a safe
+                stop of the robot; well below the ballast. The caller checks :attr:`shortage`.
 
         Raises:
-            OutputExistsError: If a file or a write-ahead log is there and ``force`` is not given.
+            OutputExistsError: If a file or a write-ahead log exists and ``force`` is not given.
             LogWriteError: If there is no room, a file can't be created, or another recorder
                 writes it.
             DataError: If a size or time makes no sense.
@@ -137,7 +136,7 @@ class DurableSink:
 
     @property
     def bytes_written(self) -> int:
-        """Bytes of MCAP so far, over all parts; the open chunks are not in it."""
+        """Bytes of MCAP so far, over all parts, without the open chunks."""
         return self._disk.bytes_given
 
     @property
@@ -147,12 +146,12 @@ class DurableSink:
 
     @property
     def split_trouble(self) -> UndulogError | None:
-        """Why the last split that was due didn't happen: the part that is open goes on."""
+        """Why the last split failed; the open part is continued."""
         return self._split_trouble
 
     @property
     def unsynced(self) -> int:
-        """Messages that power loss would cost at the moment."""
+        """Messages that would be lost by power loss now."""
         return self._wal.position - self._wal.synced
 
     @property
@@ -163,10 +162,7 @@ class DurableSink:
     # -- writing ---------------------------------------------------------------------------
 
     def define(self, record: Description) -> None:
-        """Take what explains later messages; every later part repeats it.
-
-        Args:
-            record: A schema, channel, attachment or metadata record.
+        """See :meth:`MessageSink.define`; every later part repeats the definition.
 
         Raises:
             LogWriteError: If it can't be kept.
@@ -176,7 +172,7 @@ class DurableSink:
         self._wal.define(record)
         write_description(self._writer, record)
         self._known.append(record)
-        self._hand_over()
+        self._disk.write(self._part, 0)
 
     def write(
         self,
@@ -186,11 +182,11 @@ class DurableSink:
         sequence: int,
         payload: bytes,
     ) -> None:
-        """See :meth:`MessageSink.write`; from then on the death of the process doesn't lose it.
+        """See :meth:`MessageSink.write`; after the call, a crash of the process does not lose it.
 
         Raises:
-            LogWriteError: If it can't be kept: the disk is full or fails. It was not accepted;
-                all before it were.
+            LogWriteError: If the disk is full or fails; this message is not accepted, all earlier
+                ones are.
             DataError: If a number is out of range.
         """
         if self._disk.trouble is not None or self._refused is not None or not self._open:
@@ -212,7 +208,7 @@ class DurableSink:
             self._flush()
 
     def tick(self) -> None:
-        """Look at the clock, for sessions in which nothing may come for long; about once a second.
+        """Flush if due; call it once a second for sessions with long pauses.
 
         Raises:
             LogWriteError: If the session is closed.
@@ -225,12 +221,12 @@ class DurableSink:
         """Begin the next part; the former is finalised in the background.
 
         Returns:
-            The file of the part that is being written now: the same as before where it has no
+            The file of the part that is being written now: the same as before if it has no
             message yet.
 
         Raises:
-            OutputExistsError: If the next file is there and ``force`` was not given; the recording
-                goes on in the part that it is in.
+            OutputExistsError: If the next file exists and ``force`` was not given; the open part is
+                continued.
             LogWriteError: If it can't be created; likewise.
         """
         self._refuse_closed()
@@ -252,7 +248,7 @@ class DurableSink:
         self._writer = self._new_writer()
         for record in (*self._known, begin):
             write_description(self._writer, record)
-        self._hand_over()
+        self._disk.write(self._part, 0)
         self._mark = 0
         return following.path
 
@@ -260,11 +256,10 @@ class DurableSink:
         """Finalise; safe to call twice.
 
         Args:
-            last: Metadata that belong at the end.
+            last: Metadata for the end.
 
         Raises:
-            LogWriteError: If not everything reached the file. It is not lost: the write-ahead log
-                is kept then, and the error says where.
+            LogWriteError: If not everything reached the file. The write-ahead log is kept then.
         """
         if not self._open:
             return
@@ -308,17 +303,13 @@ class DurableSink:
         writer.start(profile=PROFILE, library=library_name())
         return writer
 
-    def _hand_over(self) -> None:
-        """Let the disk's thread have what is queued, none of it messages."""
-        self._disk.write(self._part, 0)
-
     def _chunk_done(self) -> None:
         self._disk.write(self._part, self._part_began + self._writer.settled)
         if self._split_size is not None and self._part.size >= self._split_size:
             self._try_split()
 
     def _flush(self) -> None:
-        """Write the chunks that were begun before the last time: busy ones are not cut short."""
+        """Write the chunks begun before the last call, so that busy ones are not cut short."""
         size = self._part.size
         self._writer.settle(self._mark)
         self._mark = self._writer.messages
@@ -336,7 +327,7 @@ class DurableSink:
         self._try_split()
 
     def _try_split(self) -> None:
-        """Split, unless that fails: what is recorded matters more than in which file."""
+        """Split; on failure continue the open part."""
         try:
             self.split()
             self._split_trouble = None
@@ -348,7 +339,7 @@ class DurableSink:
             raise LogWriteError(self.path, "the session is closed")
 
     def _refuse(self, size: int) -> None:
-        """Refuse a message, unless its bytes are among the last words."""
+        """Refuse a message, unless it fits into the reserve of ``last_words``."""
         self._refuse_closed()
         if self._disk.failure is None and self._refused is None and size <= self._last_words:
             self._last_words -= size
@@ -364,7 +355,7 @@ def _reason(error: LogWriteError) -> str:
 
 
 def _refuse_existing(path: Path) -> None:
-    """Refuse a session of which a file is there already."""
+    """Refuse a session that has a file already."""
     if path.exists():
         raise OutputExistsError(path)
     try:

@@ -1,10 +1,8 @@
-"""A session file without a write-ahead log: for what can be made again (twin, imports).
+"""A session file without a write-ahead log, for data that can be made again (twin, imports).
 
-Which channels of a session share chunks.
-
-The topics that carry nearly all of a session's bytes have chunks of their own: to read the joint
-states of ten seconds, nothing else is decompressed, and messages of one type side by side compress
-better. The rest is so little that it shares chunks: each on its own, it would be written in crumbs.
+The topics that carry nearly all of a session's bytes have chunks of their own: reading ten seconds
+of joint states decompresses nothing else, and messages of one type compress better side by side.
+The other topics are small and share chunks.
 """
 
 from __future__ import annotations
@@ -25,33 +23,30 @@ _BULKY = frozenset(
 
 
 def chunk_group(topic: str, type_name: str) -> str:
-    """The group of a channel; those of one group share chunks.
+    """Return the group of a channel: channels of one group share chunks.
 
     Args:
         type_name: Its message type, e.g. ``sensor_msgs/msg/Imu``.
-
-    Returns:
-        A name; empty for the channels that share what is left.
     """
     return topic if type_name in _BULKY else ""
 
 
 Description: TypeAlias = Schema | Channel | Attachment | Metadata
-"""What explains the messages: it comes before them."""
+"""Definitions, which come before the messages that need them."""
 
 
 class MessageSink(Protocol):
-    """Takes what a session writer encodes, in order; one thread calls it."""
+    """Stores the records of a session writer, in order; called by one thread."""
 
     def define(self, record: Description) -> None:
-        """Take what explains later messages.
+        """Store a definition.
 
         Args:
-            record: Schemas before their channels, channels before their messages; the ids are
-                given by the session writer, from 1.
+            record: Schemas come before their channels, channels before their messages; the
+                session writer numbers them from 1.
 
         Raises:
-            LogWriteError: If it can't be kept.
+            LogWriteError: If it can't be stored.
         """
         ...
 
@@ -63,7 +58,7 @@ class MessageSink(Protocol):
         sequence: int,
         payload: bytes,
     ) -> None:
-        """Take one message.
+        """Store one message.
 
         Args:
             log_time_ns: When it was recorded [Unix ns].
@@ -71,7 +66,7 @@ class MessageSink(Protocol):
             sequence: The channel's own counter.
 
         Raises:
-            LogWriteError: If it can't be kept; it is not in the log then.
+            LogWriteError: If it can't be stored.
         """
         ...
 
@@ -79,7 +74,7 @@ class MessageSink(Protocol):
         """Finalise; safe to call twice.
 
         Args:
-            last: Metadata that belong at the end, e.g. the health verdict.
+            last: Metadata for the end, e.g. the health verdict.
 
         Raises:
             LogWriteError: If it can't be finalised.
@@ -98,7 +93,7 @@ class McapSink:
         """Create the file.
 
         Raises:
-            OutputExistsError: If the file is there and ``force`` is not given.
+            OutputExistsError: If the file exists and ``force`` is not given.
             LogWriteError: If it can't be created or written.
         """
         self.path = Path(path)
@@ -108,10 +103,7 @@ class McapSink:
         self._writer.start(profile=PROFILE, library=library_name())
 
     def define(self, record: Description) -> None:
-        """Write what explains later messages.
-
-        Args:
-            record: A schema, channel, attachment or metadata record.
+        """See :meth:`MessageSink.define`.
 
         Raises:
             DataError: If the id of a schema or channel is not the next one.
@@ -131,14 +123,7 @@ class McapSink:
         self._writer.add_message(channel_id, log_time_ns, payload, publish_time_ns, sequence)
 
     def close(self, last: tuple[Metadata, ...]) -> None:
-        """Write the summary and close; safe to call twice.
-
-        Args:
-            last: Metadata that belong at the end.
-
-        Raises:
-            LogWriteError: If the summary can't be written.
-        """
+        """See :meth:`MessageSink.close`."""
         if not self._open:
             return
         self._open = False
@@ -148,22 +133,19 @@ class McapSink:
             self._writer.finish()
             self._stream.flush()
         except OSError as error:
-            with suppress(OSError):  # closing would say the same again
+            with suppress(OSError):  # closing raises the same error
                 self._stream.close()
             raise write_error(self.path, error) from error
         self._stream.close()
 
 
 def library_name() -> str:
-    """What a file says of the library that wrote it."""
+    """Return the name and version of this library, for the header of a file."""
     return f"undulog/{version('undulog')}"
 
 
 def write_description(writer: McapWriter, record: Description) -> None:
-    """Write a record that explains messages.
-
-    Args:
-        record: A schema, channel, attachment or metadata record.
+    """Write a definition.
 
     Raises:
         DataError: If the id of a schema or channel is not the next one: the library numbers them
@@ -188,14 +170,7 @@ def write_description(writer: McapWriter, record: Description) -> None:
 
 
 def write_error(path: Path, error: OSError) -> LogWriteError:
-    """An error of the operating system as ours.
-
-    Args:
-        path: The file that can't be written.
-
-    Returns:
-        The error to raise; the same one where it is ours already.
-    """
+    """Return a LogWriteError for an error of the operating system; keep one that is one."""
     if isinstance(error, LogWriteError):
         return error
     return LogWriteError(path, f"can't be written: {error.strerror or error}")
@@ -205,7 +180,7 @@ def create_file(path: Path, *, force: bool) -> BinaryIO:
     """Create a file to write.
 
     Raises:
-        OutputExistsError: If it is there and ``force`` is not given.
+        OutputExistsError: If it exists and ``force`` is not given.
         LogWriteError: If it can't be created.
     """
     try:

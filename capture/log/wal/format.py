@@ -11,11 +11,11 @@ A log is a folder beside its MCAP file, ``X.mcap.wal/``. Messages are in ``00000
     record  = CRC-32, length u32, position u64, kind u8, mark u8, channel u16, sequence u32,
               log time u64, publish time u64, payload (length bytes), zeros to a multiple of 8
 
-The header stands at either end, since all hangs on it. ``position`` counts the records of a
-stream from 1, so that a gap says how many are missing. ``kind`` is the opcode of the MCAP record
-that it becomes, and the payload of a definition is that record's body (https://mcap.dev/spec).
-A record's CRC covers all that follows it and starts from the segment's random salt, so that
-bytes of another log, inside a payload or on a disk block used before, are never taken for records.
+The header is stored at both ends for safety. ``position`` counts the records of a stream from 1,
+so that the number of missing records is known. ``kind`` is the opcode of the corresponding MCAP
+record, and the payload of a definition is that record's body (https://mcap.dev/spec). A record's
+CRC covers all following bytes and starts from the segment's random salt, so that bytes of another
+log, in a payload or on a reused disk block, are never taken for records.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LOCK_NAME = "recorder.lock"
 
 
 class WalLock:
-    """Held by a recorder from the creation of its log to the end."""
+    """A lock that a recorder holds from the creation of its log to the end."""
 
     def __init__(self, folder: Path) -> None:
         """Take the lock.
@@ -63,18 +63,14 @@ class WalLock:
             raise LogWriteError(folder, f"can't be locked: {error.strerror}") from error
 
     def release(self) -> None:
-        """Give the lock back."""
-        with suppress(OSError):  # someone else may have tidied up
+        """Release the lock."""
+        with suppress(OSError):  # another program may have removed it
             self._path.unlink()
         os.close(self._file)
 
 
 def is_live(folder: Path) -> bool:
-    """Whether a recorder is writing a log at the moment.
-
-    Returns:
-        True while the recorder lives; on a file system without locks, False.
-    """
+    """Whether a recorder is writing a log now; always False on a file system without locks."""
     try:
         opened = os.open(folder / LOCK_NAME, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
@@ -89,11 +85,11 @@ def is_live(folder: Path) -> bool:
 
 
 Definition = Header | Schema | Channel | Metadata | Attachment
-"""What explains a file, as the MCAP library has it."""
+"""A definition, as a record of the MCAP library."""
 
 MAGIC = b"\x89UWAL1\r\n"
 MARK = 0xA5
-"""Stands in every record, so that a search for the next whole record is quick."""
+"""Mark in every record for a quick search for the next whole record."""
 
 HEADER_SIZE = 64
 RECORD_SIZE = 40
@@ -130,7 +126,7 @@ _NAME = re.compile(r"(def-)?(\d{6,19})\.seg")
 
 
 class RecordHead(NamedTuple):
-    """What stands before a payload.
+    """Head of a record.
 
     Attributes:
         position: Running number in its stream, from 1.
@@ -153,13 +149,13 @@ class RecordHead(NamedTuple):
 
 @dataclass(frozen=True)
 class SegmentHeader:
-    """What a segment says of itself.
+    """Header of a segment.
 
     Attributes:
         stream: :data:`MESSAGES` or :data:`DEFINITIONS`.
-        salt: Where the CRC of its records starts.
-        number: Its place in the stream, from 1; in its name too.
-        size: Bytes reserved for it, both headers included.
+        salt: Start value of the CRC of its records.
+        number: Its number in the stream, from 1, as in its name.
+        size: Reserved bytes, both headers included.
         log_id: The same 16 random bytes in all segments of a log.
     """
 
@@ -170,20 +166,13 @@ class SegmentHeader:
     log_id: bytes
 
     def pack(self) -> bytes:
-        """Its 64 bytes."""
+        """Return its 64 bytes."""
         body = _HEADER_BODY.pack(MAGIC, self.stream, self.salt, self.number, self.size, self.log_id)
         return (body + RECORD_CRC.pack(zlib.crc32(body))).ljust(HEADER_SIZE, b"\0")
 
     @classmethod
     def unpack(cls, data: bytes) -> Self | None:
-        """Read a header.
-
-        Args:
-            data: The bytes where it should be.
-
-        Returns:
-            The header, or None where there is no whole one.
-        """
+        """Read a header; None if the bytes are no whole header."""
         if len(data) != HEADER_SIZE:
             return None
         body, rest = data[: _HEADER_BODY.size], data[_HEADER_BODY.size :]
@@ -194,23 +183,12 @@ class SegmentHeader:
 
 
 def segment_name(stream: int, number: int) -> str:
-    """File name of a segment.
-
-    Args:
-        stream: :data:`MESSAGES` or :data:`DEFINITIONS`.
-        number: Its place in the stream, from 1.
-
-    Returns:
-        E.g. ``000001.seg`` or ``def-000001.seg``.
-    """
+    """Return the file name of a segment, e.g. ``000001.seg`` or ``def-000001.seg``."""
     return f"{'def-' if stream == DEFINITIONS else ''}{number:06d}.seg"
 
 
 def segment_files(folder: Path) -> list[tuple[int, int, Path]]:
-    """The segments in a folder.
-
-    Returns:
-        Stream, number and path of each, sorted by stream and number.
+    """Return stream, number and path of the segments in a folder, sorted.
 
     Raises:
         OSError: If the folder can't be listed.
@@ -224,24 +202,14 @@ def segment_files(folder: Path) -> list[tuple[int, int, Path]]:
 
 
 def pack_definition(record: Definition) -> tuple[int, bytes]:
-    """A definition as kind and payload.
-
-    Args:
-        record: E.g. a channel.
-
-    Returns:
-        The MCAP opcode and the body of the MCAP record.
-    """
+    """Return a definition as MCAP opcode and body of the MCAP record."""
     builder = RecordBuilder()
     record.write(builder)
     return _KINDS[type(record)], builder.end()[_MCAP_PREFIX:]
 
 
 def unpack_definition(kind: int, payload: bytes) -> Definition:
-    """Read a definition.
-
-    Args:
-        payload: The body of the MCAP record.
+    """Read a definition from the body of the MCAP record.
 
     Raises:
         McapError: If the body ends too early.

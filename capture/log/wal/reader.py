@@ -1,9 +1,8 @@
-"""What a write-ahead log still holds: read-only, and tolerant of whatever a crash left.
+"""Reader of a write-ahead log, which tolerates any damage and changes nothing.
 
-Records are taken only where length, CRC and running number fit; from damage on, the next whole
-record is searched for. What is missing in between is counted by the running numbers. What was
-torn off at the end can only be told in bytes: after a kill it is at most the one record that was
-being written, and was not accepted yet.
+A record is accepted only if length, CRC and running number fit; after damage, the next whole record
+is searched. Missing records are counted by the running numbers. At the end only damaged bytes can
+be counted: after a kill they are at most the record being written, which was not accepted yet.
 """
 
 from __future__ import annotations
@@ -44,10 +43,10 @@ _ZEROS = bytes(_PIECE + RECORD_SIZE)
 
 
 class WalMessage(NamedTuple):
-    """A message as it was accepted.
+    """An accepted message.
 
     Attributes:
-        position: Its place among all messages of the session, from 1.
+        position: Its number among all messages of the session, from 1.
         log_time_ns: When it was recorded [Unix ns].
         publish_time_ns: When it was sampled [Unix ns].
     """
@@ -74,11 +73,11 @@ class Recovery(Iterator[WalMessage]):
 
     Attributes:
         definitions: Headers, schemas, channels, metadata, attachments, in the order given.
-        found: Messages given out so far.
-        before: Messages before the first one found: released to the MCAP, or lost with their
-            segment; the MCAP tells which.
-        missing: Messages missing between those found.
-        warnings: What was damaged, one sentence each; complete when the iteration has ended.
+        found: Number of messages returned so far.
+        before: Number of messages before the first one: released to the MCAP, or lost with their
+            segment.
+        missing: Number of messages missing between those found.
+        warnings: Damage, one sentence each; complete when the iteration has ended.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -101,11 +100,11 @@ class Recovery(Iterator[WalMessage]):
         self._messages = self._read_messages()
 
     def __iter__(self) -> Iterator[WalMessage]:
-        """The same, once: a second loop goes on where the first one stopped."""
+        """Return self: a second loop continues where the first one stopped."""
         return self
 
     def __next__(self) -> WalMessage:
-        """The next whole message.
+        """Return the next whole message.
 
         Raises:
             StopIteration: At the end.
@@ -206,7 +205,7 @@ class Recovery(Iterator[WalMessage]):
                     reader = _SegmentReader(segment, segment.path.open("rb"), last)
                     for head, payload in reader.records():
                         if former is not None and head.position > last + 1:
-                            # Of a log in use: it went on in the former while that was read.
+                            # A log in use: the former segment has grown while it was read.
                             yield from former.later()
                         last = head.position
                         former = _closed(former)
@@ -231,10 +230,10 @@ class Recovery(Iterator[WalMessage]):
 
 
 class _SegmentReader:
-    """Goes through one segment.
+    """Reads one segment.
 
-    ``damaged`` counts the bytes from a place where a record should start to the next whole
-    record, or to the last byte that isn't zero.
+    ``damaged`` counts the bytes from the expected start of a record to the next whole record, or to
+    the last byte that isn't zero.
     """
 
     def __init__(self, segment: _Found, file: BinaryIO, last: int) -> None:
@@ -252,8 +251,8 @@ class _SegmentReader:
             head = self._whole(at)
             if head is None:
                 following, stop = self._search(at)
-                # Of a log in use, this one was being written when it was looked at: a later one
-                # is there, so now it is whole.
+                # A log in use: this record was being written; a later one exists, so now it is
+                # whole.
                 head = self._again(at) if following is not None else None
                 if head is not None:
                     following, stop = (at, head), at
@@ -270,9 +269,9 @@ class _SegmentReader:
             yield head, payload
 
     def later(self) -> Iterator[tuple[RecordHead, bytes]]:
-        """Records that were put since the end was reached; damage isn't counted again."""
+        """Yield records written since the end was reached, without counting damage again."""
         damage = self.damaged, self.first_damage
-        self._file.seek(0, os.SEEK_END)  # what was read ahead is old
+        self._file.seek(0, os.SEEK_END)  # drops the read buffer
         yield from self.records()
         self.damaged, self.first_damage = damage
 
@@ -280,13 +279,13 @@ class _SegmentReader:
         self._file.close()
 
     def _again(self, at: int) -> RecordHead | None:
-        self._file.seek(0, os.SEEK_END)  # what was read ahead is old
+        self._file.seek(0, os.SEEK_END)  # drops the read buffer
         return self._whole(at)
 
     def _whole(self, at: int) -> RecordHead | None:
-        """The head of the record at a place, if one is there and its CRC fits.
+        """Return the head of the record at an offset, if its CRC fits.
 
-        The CRC is taken piece by piece: no memory is given to a length before it is vouched for.
+        The CRC is computed in pieces, so that a wrong length allocates no memory.
         """
         left = self._end - at - RECORD_SIZE
         if left < 0:
@@ -305,12 +304,12 @@ class _SegmentReader:
         return head if crc == RECORD_CRC.unpack_from(raw)[0] else None
 
     def _search(self, at: int) -> tuple[tuple[int, RecordHead] | None, int]:
-        """The next whole record behind a place where none is."""
+        """Find the next whole record behind an offset, and the end of the damage."""
         damage_stop = at
         start, size = at, _FIRST_LOOK
         while start < self._end:
             self._file.seek(start)
-            # A look reaches a head's length into the next one, so that none falls between two.
+            # Reads overlap by the length of a head, so that none is split.
             data = self._file.read(min(size + RECORD_SIZE, self._end - start))
             if not data:
                 break
@@ -325,7 +324,7 @@ class _SegmentReader:
         return None, damage_stop
 
     def _candidates(self, data: bytes) -> list[int]:
-        """Offsets, multiples of 8, where kind, mark and running number may be a record's."""
+        """Return offsets, multiples of 8, with kind, mark and running number of a record."""
         words = np.frombuffer(data[: len(data) & -8], dtype="<u8")
         if words.size < RECORD_SIZE // 8:
             return []
@@ -342,7 +341,7 @@ def _closed(reader: _SegmentReader | None) -> None:
 
 
 def recover(folder: Path | str) -> Recovery:
-    """Read what a write-ahead log holds, without changing it.
+    """Read a write-ahead log without changing it.
 
     ::
 
@@ -355,7 +354,7 @@ def recover(folder: Path | str) -> Recovery:
         folder: The log, see :func:`.capture.log.wal.writer.wal_folder`.
 
     Returns:
-        The messages, with the definitions and a count of what is missing. One message is in
+        The messages, with the definitions and the number of missing messages. One message is in
         memory at a time.
 
     Raises:

@@ -3,17 +3,15 @@
 A store to a mapped page is in the kernel's page cache at once, so a process that is killed loses
 nothing of it; only power loss does, until :meth:`Segment.sync`.
 
-The first store to a page, and the first after a sync has protected it, is a page fault that the
-file system may hold up for as long as the disk is busy: a journal's commit, 60 ms and more beside
-other writers. So another thread takes the faults ahead of the writing (:meth:`Segment.hold`), and a
-sync of a busy segment leaves out the page that is being written.
+The first store to a page, and the first after a sync has protected it, is a page fault, which the
+file system may delay while the disk is busy (60 ms and more for a journal's commit). So another
+thread takes the faults ahead of the writing (:meth:`Segment.hold`), and a sync of a busy segment
+leaves out the page that is being written.
 
-Files that another program cuts short while they are mapped here.
-
-A store behind the end of such a file is SIGBUS, which ends the process: everything that is only in
-its memory would be lost to somebody's ``truncate``. So the signal's handler puts ordinary memory in
-the place of the pages that are gone and notes it; the store then succeeds, and whoever writes the
-file ends in good order.
+If another program truncates a mapped file, a store behind its end raises SIGBUS, which ends the
+process and loses everything that is only in its memory. So a signal handler replaces the missing
+pages by ordinary memory and marks the segment as cut; the store then succeeds, and the recorder can
+finish.
 """
 
 from __future__ import annotations
@@ -22,7 +20,6 @@ import ctypes
 import errno
 import mmap
 import os
-import secrets
 import signal
 import struct
 import sys
@@ -44,9 +41,9 @@ from .format import (
     SegmentHeader,
 )
 
-_LIBC_MAPPING = ctypes.CDLL(None, use_errno=True)
-_LIBC_MAPPING.mmap.restype = ctypes.c_void_p
-_LIBC_MAPPING.mmap.argtypes = (
+_LIBC = ctypes.CDLL(None, use_errno=True)
+_LIBC.mmap.restype = ctypes.c_void_p
+_LIBC.mmap.argtypes = (
     ctypes.c_void_p,
     ctypes.c_size_t,
     ctypes.c_int,
@@ -79,7 +76,7 @@ class _Mapping:
     """One mapped file.
 
     Attributes:
-        cut: Called when a store found it cut short; must not store to the mapping.
+        cut: Called in the storing thread if the file was truncated; must not store to the mapping.
     """
 
     address: int
@@ -106,7 +103,7 @@ class _Watch:
             self._mappings = tuple(each for each in self._mappings if each is not mapping)
 
     def _set_handler(self) -> None:
-        """Where the system allows no callbacks from C, SIGBUS ends the process as it always did."""
+        """Set the handler; if the system allows no callbacks from C, SIGBUS ends the process."""
         if sys.platform != "linux" or sys.maxsize < 2**32:
             return
         try:
@@ -114,11 +111,11 @@ class _Watch:
         except MemoryError:
             return
         action = _Action(ctypes.cast(handler, ctypes.c_void_p), flags=_SA_SIGINFO)
-        if not _LIBC_MAPPING.sigaction(int(signal.SIGBUS), ctypes.byref(action), None):
+        if not _LIBC.sigaction(int(signal.SIGBUS), ctypes.byref(action), None):
             self._handler = handler
 
     def _on_signal(self, number: int, info: int, context: int) -> None:
-        """Runs in the thread whose store failed, in the middle of that store."""
+        """Run in the thread whose store failed, during that store."""
         del context
         code = ctypes.c_int.from_address(info + 8).value
         address = ctypes.c_size_t.from_address(info + _ADDRESS_AT).value
@@ -129,13 +126,11 @@ class _Watch:
                 left = mapping.address + mapping.size - page
                 access = mmap.PROT_READ | mmap.PROT_WRITE
                 kind = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | _MAP_FIXED
-                if _LIBC_MAPPING.mmap(page, left, access, kind, -1, 0) == page:
+                if _LIBC.mmap(page, left, access, kind, -1, 0) == page:
                     mapping.cut()
                     return
-        default = _Action(None)
-        _LIBC_MAPPING.sigaction(
-            number, ctypes.byref(default), None
-        )  # the store fails again, and ends us
+        default = _Action(None)  # the store fails again and ends the process
+        _LIBC.sigaction(number, ctypes.byref(default), None)
         if code != _BUS_ADRERR:
             signal.raise_signal(number)
 
@@ -143,25 +138,9 @@ class _Watch:
 _WATCH = _Watch()
 
 
-def watch_mapping(address: int, size: int, cut: Callable[[], None]) -> Callable[[], None]:
-    """Keep a mapped file's process alive when the file is cut short.
-
-    Args:
-        cut: Called, in the thread that stored, when a store found the file too short; must not
-            store to the mapping. What is stored there from then on is only in memory.
-
-    Returns:
-        Ends the watch; to be called before the mapping goes.
-    """
-    mapping = _Mapping(address, size, cut)
-    _WATCH.add(mapping)
-    return lambda: _WATCH.remove(mapping)
-
-
 SEGMENT_OVERHEAD = 2 * HEADER_SIZE
 """Bytes of a segment that hold no records."""
 
-_LIBC = ctypes.CDLL(None, use_errno=True)
 _MS_SYNC = 4
 _MADV_POPULATE_WRITE = 23  # Linux 5.14; Python's mmap.madvise() keeps the interpreter's lock
 _PAGE = mmap.PAGESIZE
@@ -169,33 +148,30 @@ _BUSY = 8 * _PAGE  # so many bytes between two syncs: the last page is young eno
 
 
 def free_bytes(path: Path) -> int:
-    """Space left for ordinary users on a file's disk.
+    """Return the space left for ordinary users on the disk of a file [byte].
 
     Args:
-        path: The file or folder; where it isn't there yet, its nearest parent counts.
-
-    Returns:
-        Free space [byte].
+        path: The file or folder; if it doesn't exist, its nearest existing parent is used.
 
     Raises:
-        OSError: If the file system doesn't answer.
+        OSError: If the file system can't be queried.
     """
-    place = path.absolute()
-    while not place.exists() and place != place.parent:
-        place = place.parent
-    found = os.statvfs(place)
+    existing = path.absolute()
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    found = os.statvfs(existing)
     return found.f_bavail * found.f_frsize
 
 
 def require_space(path: Path, needed: int) -> None:
-    """Refuse to start what the disk has no room for.
+    """Check that a disk has enough free space.
 
     Args:
         path: The file or folder to be written.
-        needed: How much it will take [byte].
+        needed: Required size [byte].
 
     Raises:
-        LogWriteError: If less is free; names the file and the missing bytes.
+        LogWriteError: If less is free.
     """
     try:
         free = free_bytes(path)
@@ -214,7 +190,7 @@ class Segment:
         A sparse mapping would do until the disk is full, and then end the process with SIGBUS.
 
         Args:
-            header: What it says of itself; ``size`` is a multiple of 8.
+            header: Its header; ``size`` is a multiple of 8.
 
         Raises:
             LogWriteError: If it can't be created or reserved; then no file is left.
@@ -223,14 +199,14 @@ class Segment:
         self.size = header.size
         self.last = 0
         self.cut = False
-        """Whether somebody cut the file short: what was put since is not in it."""
+        """Whether another program truncated the file: later records are not in it."""
         self._at = HEADER_SIZE
         self._end = header.size - HEADER_SIZE
         self._salt = header.salt
         self._synced_at = 0
         self._durable = 0
         self._page_end = _PAGE
-        self._whole = 0, 0  # where the page begins that is written, last record wholly before it
+        self._whole = 0, 0  # start of the page that is being written, last record wholly before it
         try:
             flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
             self._file = os.open(path, flags, 0o666)
@@ -240,7 +216,8 @@ class Segment:
             os.posix_fallocate(self._file, 0, header.size)
             self._view = mmap.mmap(self._file, header.size)
             self._address = ctypes.addressof(ctypes.c_char.from_buffer(self._view))
-            self._unwatch = watch_mapping(self._address, header.size, self._note_cut)
+            self._mapping = _Mapping(self._address, header.size, self._note_cut)
+            _WATCH.add(self._mapping)
         except OSError as error:
             os.close(self._file)
             path.unlink(missing_ok=True)
@@ -253,10 +230,10 @@ class Segment:
         """Write one record, if it fits.
 
         Args:
-            fields: What stands before the payload, from the running number on.
+            fields: The head of the record, from the running number on.
 
         Returns:
-            Whether there was room; where there wasn't, nothing is written.
+            Whether there was room; if not, nothing is written.
 
         Raises:
             DataError: If a number doesn't fit its field; nothing is written.
@@ -286,17 +263,15 @@ class Segment:
 
     @property
     def synced(self) -> bool:
-        """Whether it ever was; before, the folder has to be synced too, for its name."""
+        """Whether it was ever synced; before, the folder must be synced too, for its name."""
         return self._synced_at > 0
 
     def sync(self, *, whole: bool = True) -> int:
-        """Bring what was put so far to the disk; nothing to do if nothing was put since.
-
-        Lets other threads run.
+        """Write the records to the disk; lets other threads run.
 
         Args:
-            whole: With the page that is being written, even where much was put since the last
-                sync. The next store to it is a page fault.
+            whole: Include the page that is being written, even after much was written since the
+                last sync. The next store to it is a page fault.
 
         Returns:
             Number of the last record that is on the disk; 0 for none.
@@ -320,16 +295,16 @@ class Segment:
         return last
 
     def hold(self, ahead: int) -> int:
-        """Take the page faults of what is written next; lets other threads run.
+        """Take the page faults of the next bytes; lets other threads run.
 
         Args:
-            ahead: Bytes from where the next record goes.
+            ahead: Number of bytes from the next record on.
 
         Returns:
             How many of these bytes are beyond this segment.
 
         Raises:
-            OSError: If the kernel can't (before Linux 5.14), or the file was cut short.
+            OSError: If the kernel can't (before Linux 5.14), or the file was truncated.
         """
         start = self._at & -_PAGE
         stop = min(start + ahead, self.size)
@@ -339,11 +314,11 @@ class Segment:
     def close(self, *, remove: bool) -> None:
         """Release the mapping."""
         self._end = 0
-        self._unwatch()
+        _WATCH.remove(self._mapping)
         self._view.close()
         os.close(self._file)
         if remove:
-            with suppress(OSError):  # someone else may have tidied up
+            with suppress(OSError):  # another program may have removed it
                 self.path.unlink()
 
     def _note_cut(self) -> None:
@@ -358,20 +333,8 @@ def _call(function: Callable[..., int], address: int, size: int, flag: int) -> N
         raise OSError(code, os.strerror(code))
 
 
-def new_header(stream: int, number: int, size: int, log_id: bytes) -> SegmentHeader:
-    """Header of a new segment, with a salt of its own.
-
-    Args:
-        stream: ``MESSAGES`` or ``DEFINITIONS``.
-        number: Its place in the stream, from 1.
-        size: Bytes wanted; rounded up to a multiple of 8.
-        log_id: The log's 16 bytes.
-    """
-    return SegmentHeader(stream, secrets.randbits(32), number, (size + 7) & -8, log_id)
-
-
 def sync_folder(folder: Path) -> None:
-    """Bring a folder's entries to the disk, so that a new file's name survives power loss.
+    """Write a folder's entries to the disk, so that a new file's name survives power loss.
 
     Raises:
         OSError: If the disk fails.
@@ -401,21 +364,21 @@ def _reservation_error(path: Path, size: int, error: OSError) -> LogWriteError:
 RESERVED_SPACE_NAME = "ballast"
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
-"""Error numbers that more free space would mend."""
+"""Error numbers of a lack of free space."""
 
 
 class ReservedSpace:
-    """A file that is there only to be deleted."""
+    """A file that reserves disk space and is deleted when the space is needed."""
 
     def __init__(self, folder: Path, size: int) -> None:
         """Reserve the space.
 
         Args:
-            folder: Where to; an old one is replaced.
-            size: How much [byte]; nothing is reserved for 0.
+            folder: Its folder; an old file is replaced.
+            size: Size [byte]; no file is created for 0.
 
         Raises:
-            LogWriteError: If there is no room; no file is left then.
+            LogWriteError: If there is no room; then no file is left.
         """
         self.path = folder / RESERVED_SPACE_NAME
         self._there = size > 0
@@ -435,9 +398,9 @@ class ReservedSpace:
             ) from error
 
     def free(self) -> bool:
-        """Give the space back."""
+        """Free the space; return whether it was reserved."""
         there, self._there = self._there, False
         if there:
-            with suppress(OSError):  # someone else may have tidied up
+            with suppress(OSError):  # another program may have removed it
                 self.path.unlink()
         return there

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +11,11 @@ from mcap.opcode import Opcode
 
 from ...common.arrays import IntArray
 from ...common.errors import LogError, NotALogError
-from ..mcap.chunk import Block, Buffer
+from ..mcap.chunk import Block
+from ..mcap.records import FIXED_SIZE, MESSAGE
 from .format import Definition, is_live
 from .reader import WalMessage, recover
 from .writer import wal_folder
-
-_RECORD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
-_FIXED_SIZE = 22
 
 MessageKey = tuple[int, int, int]
 """Channel, sequence number and log time: no two messages of a session share all three."""
@@ -26,7 +23,7 @@ MessageKey = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class WalContents:
-    """All that a write-ahead log holds.
+    """Contents of a write-ahead log.
 
     Attributes:
         definitions: Headers, schemas, channels, metadata, attachments, in the order given.
@@ -43,17 +40,17 @@ class WalContents:
 
     @property
     def accepted(self) -> int:
-        """How many messages the recorder accepted, as far as the log tells; 0 if it doesn't."""
+        """Number of messages that the recorder accepted; 0 if unknown."""
         return self.messages[-1].position if self.messages else 0
 
     @property
     def before(self) -> int:
-        """How many messages were accepted before the first that the log still has."""
+        """Number of messages accepted before the first one in the log."""
         return self.messages[0].position - 1 if self.messages else 0
 
     @property
     def damaged(self) -> bool:
-        """Whether something of it can't be read: then it may have had more messages."""
+        """Whether a part can't be read, so that it may have had more messages."""
         return any("header" not in text for text in self.warnings)
 
 
@@ -64,8 +61,7 @@ def read_wal(first: Path) -> WalContents | None:
         first: The session's first file; it need not be there.
 
     Returns:
-        What it holds; None where there is none, or nothing of it can be read and no recorder
-        has it open.
+        Its contents; None if there is no log.
 
     Raises:
         LogError: If its folder can't be listed.
@@ -78,13 +74,13 @@ def read_wal(first: Path) -> WalContents | None:
         recovery = recover(folder)
         messages = tuple(recovery)
     except NotALogError as error:
-        told = () if live else (str(error),)
-        return WalContents(folder, (), (), live, told)
+        warnings = () if live else (str(error),)
+        return WalContents(folder, (), (), live, warnings)
     except LogError:
         if not folder.is_dir():  # its recorder has just finished
             return None
         raise
-    # Whether one is missing, only log and file together tell.
+    # Only log and file together show whether a message is missing.
     warnings = [text for text in recovery.warnings if "messages are missing" not in text]
     return WalContents(folder, recovery.definitions, messages, live, tuple(warnings))
 
@@ -103,9 +99,9 @@ class WalTail:
         start_ns, end_ns = 1 << 63, 0
         for item in messages:
             places.setdefault(item.channel_id, []).append(len(data))
-            data += _RECORD.pack(
+            data += MESSAGE.pack(
                 Opcode.MESSAGE,
-                _FIXED_SIZE + len(item.payload),
+                FIXED_SIZE + len(item.payload),
                 item.channel_id,
                 item.sequence,
                 item.log_time_ns,
@@ -120,42 +116,34 @@ class WalTail:
         size = len(self._data)
         self.blocks = [Block(0, size, "", size, 0, start_ns, end_ns, offsets=offsets)]
 
-    def payload(self, block: Block) -> tuple[Buffer, int]:
-        """See :meth:`BlockSource.payload`."""
-        return self._data, block.start
-
-    def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
-        """See :meth:`BlockSource.payload_once`."""
+    def payload(self, block: Block) -> tuple[bytes, int, int]:
+        """See :meth:`.McapPayloads.payload`."""
         return self._data, block.start, block.stop
 
+    payload_once = payload
+
     def offsets(self, block: Block, channel_id: int) -> IntArray:
-        """See :meth:`BlockSource.offsets`."""
+        """See :meth:`.McapFile.offsets`."""
         return (block.offsets or {}).get(channel_id, np.empty(0, dtype=np.int64))
 
+    def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
+        """See :meth:`.McapFile.indexed`."""
+        return [self.offsets(block, channel_id) for channel_id in channel_ids]
+
     def inflates(self, block: Block, limit: int) -> bool:  # noqa: ARG002 (as a file has it)
-        """See :meth:`BlockSource.inflates`; never: nothing is compressed."""
+        """Return False: nothing is compressed."""
         return False
 
     def inflate_into(self, block: Block, room: memoryview) -> None:
-        """See :meth:`BlockSource.inflate_into`."""
+        """See :meth:`.McapPayloads.inflate_into`."""
         room[:] = self._data[block.start : block.stop]
-
-    def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
-        """See :meth:`BlockSource.indexed`."""
-        return [self.offsets(block, channel_id) for channel_id in channel_ids]
-
-    def close(self) -> None:
-        """Nothing to release."""
 
 
 def beyond(messages: Iterable[WalMessage], known: Collection[MessageKey]) -> list[WalMessage]:
-    """The messages that a file lacks.
+    """Return the messages that a file lacks.
 
     Args:
-        known: Of the file: at least its last ones, as many as the log has.
-
-    Returns:
-        Those that are not among them.
+        known: Keys of the file's messages: at least of the last ones, as many as the log has.
     """
     return [
         item for item in messages if (item.channel_id, item.sequence, item.log_time_ns) not in known

@@ -1,10 +1,10 @@
-"""The write-ahead log: what was accepted survives the death of the recorder.
+"""The write-ahead log: accepted messages survive a crash of the recorder.
 
 MCAP messages reach the disk chunk by chunk, so a killed recorder would lose the last seconds.
-Each message goes first into a memory-mapped segment file beside the MCAP: a few plain memory
-stores, after which the kernel has it, whatever becomes of the process. A background thread
-brings the pages to the disk once a second (power loss costs about that) and reserves the next
-segment ahead of need. How a session writer uses it::
+Each message goes first into a memory-mapped segment file beside the MCAP: after a few memory stores
+the kernel has it, even if the process dies. A background thread syncs the pages to the disk once a
+second (power loss costs about that) and reserves the next segment in advance. Use by a session
+writer::
 
     wal = WriteAheadLog(wal_folder(path))
     wal.define(Schema(...)), wal.define(Channel(...))  # at registration, before the MCAP writer
@@ -18,14 +18,14 @@ segment ahead of need. How a session writer uses it::
     ...
     mcap_writer.finish(), os.fdatasync(mcap_file)
     wal.release(wal.position)
-    wal.close()                                        # all is in the MCAP: the folder goes
+    wal.close()                                        # all is in the MCAP: deletes the folder
 
-If a folder is left, the recorder died: an MCAP file cut short holds the first m messages, and
+If the folder exists later, the recorder died: the truncated MCAP file has the first m messages, and
 those of :func:`.capture.log.wal.reader.recover` with a position above m are the rest.
 
-Segments are deleted, never written again: a new one is all zeros, so what stands behind the last
-record is nothing or damage, and on a copy-on-write file system only the first write to reserved
-blocks is sure of its space.
+Segments are deleted, not reused: a new one is all zeros, so any other bytes behind the last record
+are damage, and on a copy-on-write file system only the first write to reserved blocks is sure of
+its space.
 """
 
 from __future__ import annotations
@@ -49,12 +49,13 @@ from .format import (
     MESSAGES,
     RECORD_SIZE,
     Definition,
+    SegmentHeader,
     WalLock,
     pack_definition,
     segment_files,
     segment_name,
 )
-from .segment import SEGMENT_OVERHEAD, Segment, new_header, sync_folder
+from .segment import SEGMENT_OVERHEAD, Segment, sync_folder
 
 _MESSAGE = int(Opcode.MESSAGE)
 _DEFINITIONS_SIZE = 1 << 18
@@ -64,17 +65,13 @@ _HELD = 2 << 20  # bytes ahead of the writing: a second of two saturated buses
 
 
 def wal_folder(path: Path | str) -> Path:
-    """Where the write-ahead log of a session file is.
-
-    Returns:
-        The folder beside it, e.g. ``run.mcap.wal``.
-    """
+    """Return the folder of the write-ahead log of a session file, e.g. ``run.mcap.wal``."""
     path = Path(path)
     return path.with_name(f"{path.name}.wal")
 
 
 class WriteAheadLog:
-    """Keeps messages safe until the MCAP has them.
+    """Stores messages until the MCAP has them.
 
     One thread appends and defines; any thread may release.
     """
@@ -92,12 +89,12 @@ class WriteAheadLog:
         Args:
             folder: The folder to create, see :func:`wal_folder`.
             segment_size: Bytes of a segment file; two are reserved at any time.
-            sync_interval_s: Time between two writes to the disk [s]; power loss costs about that.
-            force: Delete the segments that a former log left in the folder.
+            sync_interval_s: Time between two syncs [s]; power loss costs about that.
+            force: Delete the segments of an earlier log in the folder.
 
         Raises:
-            OutputExistsError: If there are segments and ``force`` is not given: they hold what
-                a recorder that died did not finish.
+            OutputExistsError: If there are segments of an unfinished recording and ``force`` is not
+                given.
             LogWriteError: If there is no room, the folder can't be written, or another recorder
                 is writing it.
             DataError: If a size or time makes no sense.
@@ -145,11 +142,11 @@ class WriteAheadLog:
         self._holder.start()
 
     def __enter__(self) -> Self:
-        """Nothing to do: the log is open."""
+        """Return the log."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close; keeps what was not released."""
+        """Close; messages that were not released are kept."""
         self.close()
 
     # -- facts -----------------------------------------------------------------------------
@@ -161,7 +158,7 @@ class WriteAheadLog:
 
     @property
     def synced(self) -> int:
-        """Position up to which power loss costs nothing."""
+        """Position up to which messages survive power loss."""
         return self._synced
 
     @property
@@ -179,7 +176,7 @@ class WriteAheadLog:
         sequence: int,
         payload: bytes,
     ) -> int:
-        """Accept one message: when this returns, the death of the process doesn't lose it.
+        """Accept one message: after the call, a crash of the process does not lose it.
 
         Args:
             channel_id: MCAP channel, defined before.
@@ -205,10 +202,7 @@ class WriteAheadLog:
         return position
 
     def define(self, record: Definition) -> None:
-        """Accept what explains the messages; kept until the log is closed.
-
-        Args:
-            record: Header, schema, channel, metadata or attachment, as the MCAP library has it.
+        """Accept a definition, which is kept until the log is closed.
 
         Raises:
             LogWriteError: If there is no room for it or the log is closed.
@@ -229,12 +223,12 @@ class WriteAheadLog:
         self._defined += 1
 
     def release(self, position: int) -> None:
-        """Say that the MCAP holds all messages up to a position, and that its bytes are synced.
+        """Release all messages up to a position, after the MCAP has them and is synced.
 
-        Segments of which nothing else is left are deleted, in the background.
+        Segments without other messages are deleted, in the background.
 
         Args:
-            position: What :meth:`append` returned for the last of them, or 0 for none.
+            position: Position of the last of them, or 0 for none.
 
         Raises:
             DataError: If there is no such message.
@@ -256,7 +250,7 @@ class WriteAheadLog:
         recovery.
 
         Raises:
-            LogWriteError: If what is kept can't be synced.
+            LogWriteError: If the log is kept and can't be synced.
         """
         if self._closed:
             return
@@ -278,7 +272,7 @@ class WriteAheadLog:
                 segment.close(remove=done)
             self._lock.release()
             if done:
-                with suppress(OSError):  # not empty: something of someone else is in it
+                with suppress(OSError):  # not empty: other files are in it
                     self.folder.rmdir()
         if not done and self._failure is not None:
             raise self._failure
@@ -296,7 +290,7 @@ class WriteAheadLog:
             )
 
     def _make_room(self, payload: bytes) -> None:
-        """Go to the next segment; changes nothing where that fails."""
+        """Go to the next segment; changes nothing if that fails."""
         self._check(payload)
         if self._current.cut:
             self._failure = _cut_error(self._current.path)
@@ -326,7 +320,8 @@ class WriteAheadLog:
     def _reserve(self, stream: int, size: int) -> Segment:
         number = self._numbers[stream] + 1
         path = self.folder / segment_name(stream, number)
-        segment = Segment(path, new_header(stream, number, size, self._log_id))
+        salt, size = secrets.randbits(32), (size + 7) & -8
+        segment = Segment(path, SegmentHeader(stream, salt, number, size, self._log_id))
         self._numbers[stream] = number
         return segment
 
@@ -343,7 +338,7 @@ class WriteAheadLog:
                     due = time.monotonic() + self._interval_s
                 self._wake.wait(max(0.0, due - time.monotonic()))
                 self._wake.clear()
-        except BaseException as error:  # without this thread nothing would be synced any more
+        except BaseException as error:  # without this thread nothing is synced any more
             self._failure = LogWriteError(self.folder, f"the log can't be looked after: {error!r}")
             raise
 
@@ -369,7 +364,7 @@ class WriteAheadLog:
         return bool(gone)
 
     def _sync(self, *, whole: bool = False) -> None:
-        """Bring what was accepted so far to the disk; notes a failure for the next append."""
+        """Sync the accepted messages; a failure is raised by the next append."""
         with self._disk:
             position = self._position
             with self._files:
@@ -385,7 +380,7 @@ class WriteAheadLog:
                 reached = current.sync(whole=whole)
                 for segment in sealed:
                     path = segment.path
-                    if segment.last > self._released:  # looked at again: it goes on meanwhile
+                    if segment.last > self._released:  # checked again: it may be released meanwhile
                         segment.sync()
                 if not named:
                     sync_folder(self.folder)
@@ -399,7 +394,7 @@ class WriteAheadLog:
             self._synced = min(position, max(before, reached))
 
     def _hold(self) -> None:
-        """Take the page faults ahead of the appending thread, which they would hold up."""
+        """Take the page faults ahead of the appending thread, which they would delay."""
         while not self._ended.wait(_HOLD_S):
             with self._files:
                 current, spare = self._current, self._spare

@@ -1,13 +1,12 @@
-"""The session writer: samples in, a log to the contract out.
+"""The session writer: writes samples as a log that follows the log contract.
 
-Where the records go is a sink's business; without one they go straight to an MCAP file, which is
-finalised when the ``with`` block is left, however it is left.
+A sink stores the records. Without one they go straight to an MCAP file, which is finalised when the
+``with`` block is left, also by an exception.
 """
 
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -28,6 +27,7 @@ from .channels import (
     ImuChannel,
     JointStateChannel,
     LogChannel,
+    MagneticFieldChannel,
     OdometryChannel,
     RangeChannel,
     Send,
@@ -35,266 +35,18 @@ from .channels import (
     Template,
     TimeReferenceChannel,
     TransformChannel,
-    VectorChannel,
 )
-
-
-class ChannelOpeners(ABC):
-    """Opens channels, at any time; a subclass says where their messages go."""
-
-    def __init__(self) -> None:
-        """Start without channels."""
-        self._logs: dict[str, LogChannel] = {}
-
-    @abstractmethod
-    def _sender(
-        self, topic: str, type_name: str, metadata: Mapping[str, str] | None = None
-    ) -> Send:
-        """Register a channel; returns what writes one message of it."""
-
-    def joint_state(
-        self,
-        topic: str,
-        names: Sequence[str],
-        *,
-        unit: str,
-        velocity: bool = False,
-        effort: bool = False,
-    ) -> JointStateChannel:
-        """Open a JointState channel.
-
-        Args:
-            topic: E.g. ``/joint_states``.
-            names: Joint (or value) names, m of them, in chain order.
-            unit: Unit of ``position``; kept in the channel's metadata.
-            velocity: Whether samples carry velocities [rad/s].
-            effort: Whether samples carry efforts [N m].
-
-        Raises:
-            DataError: If the topic is open already.
-        """
-        zeros = [0.0] * len(names)
-        values: dict[str, Any] = {"name": list(names), "position": zeros}
-        if velocity:
-            values["velocity"] = zeros
-        if effort:
-            values["effort"] = zeros
-        return JointStateChannel(
-            self._template(topic, "sensor_msgs/msg/JointState", values, {"unit": unit})
-        )
-
-    def odometry(self, topic: str, *, frame: str, child: str) -> OdometryChannel:
-        """Open an Odometry channel for the head's pose and velocity.
-
-        Args:
-            topic: E.g. ``/odom``.
-            frame: Frame of the pose, e.g. ``world``.
-            child: The moving link; the velocity is given in its frame.
-
-        Raises:
-            DataError: If the topic is open already.
-        """
-        values = {"header": {"frame_id": frame}, "child_frame_id": child}
-        return OdometryChannel(self._template(topic, "nav_msgs/msg/Odometry", values))
-
-    def transforms(self, topic: str, *, parent: str, children: Sequence[str]) -> TransformChannel:
-        """Open a TFMessage channel: poses of many frames, rounded to 2^-14, for viewers only.
-
-        Args:
-            topic: E.g. ``/tf``.
-            children: Names of the moving frames, k of them.
-
-        Raises:
-            DataError: If the topic is open already.
-        """
-        header = {"frame_id": parent}
-        items = [{"header": header, "child_frame_id": child} for child in children]
-        return TransformChannel(
-            self._template(topic, "tf2_msgs/msg/TFMessage", {"transforms": items}), len(children)
-        )
-
-    def range(
-        self,
-        topic: str,
-        *,
-        frame: str,
-        min_range: float,
-        max_range: float,
-        field_of_view: float,
-        infrared: bool = True,
-    ) -> RangeChannel:
-        """Open a Range channel (IR or sonar).
-
-        Args:
-            topic: E.g. ``/ir/01``.
-            frame: The sensor's frame.
-            min_range: Shortest distance it can tell [m].
-            max_range: Longest distance it can tell [m].
-            field_of_view: Full cone angle [rad].
-
-        Raises:
-            DataError: If the topic is open already.
-        """
-        values = {
-            "header": {"frame_id": frame},
-            "radiation_type": int(infrared),
-            "field_of_view": field_of_view,
-            "min_range": min_range,
-            "max_range": max_range,
-        }
-        return RangeChannel(
-            self._template(topic, "sensor_msgs/msg/Range", values, {"unit": "m"}), "range"
-        )
-
-    def imu(self, topic: str, *, frame: str) -> ImuChannel:
-        """Open an Imu channel; its orientation is marked as not estimated, as REP 145 has it.
-
-        Args:
-            topic: E.g. ``/imu``.
-            frame: The sensor's frame.
-
-        Raises:
-            DataError: If the topic is open already.
-        """
-        unknown = [-1.0] + [0.0] * 8
-        values = {"header": {"frame_id": frame}, "orientation_covariance": unknown}
-        return ImuChannel(self._template(topic, "sensor_msgs/msg/Imu", values))
-
-    def magnetic_field(self, topic: str, *, frame: str) -> VectorChannel:
-        """Open a MagneticField channel [T].
-
-        Args:
-            topic: E.g. ``/compass``.
-            frame: The sensor's frame.
-
-        Raises:
-            DataError: If the topic is open already.
-        """
-        values = {"header": {"frame_id": frame}}
-        template = self._template(topic, "sensor_msgs/msg/MagneticField", values, {"unit": "T"})
-        return VectorChannel(template, "magnetic_field")
-
-    def string(self, topic: str) -> StringChannel:
-        """Open a String channel.
-
-        Args:
-            topic: E.g. ``/gait/mode``.
-
-        Raises:
-            DataError: If the topic is open already.
-        """
-        return StringChannel(self._sender(topic, "std_msgs/msg/String"))
-
-    def log(self, topic: str = "/rosout") -> LogChannel:
-        """Open a Log channel for events and faults; asked for again, it is the same one.
-
-        Args:
-            topic: E.g. ``/rosout``.
-
-        Returns:
-            The channel, shared by all that have events to tell.
-
-        Raises:
-            DataError: If the topic is open already with another type.
-        """
-        if topic not in self._logs:
-            self._logs[topic] = LogChannel(self._sender(topic, "rcl_interfaces/msg/Log"))
-        return self._logs[topic]
-
-    def frames(self, topic: str) -> FrameChannel:
-        """Open a channel of raw CAN frames, many frames a message.
-
-        Args:
-            topic: E.g. ``/can/can0``.
-
-        Raises:
-            DataError: If the topic is open already.
-        """
-        return FrameChannel(self._sender(topic, "std_msgs/msg/UInt8MultiArray"))
-
-    def fd_frames(self, topic: str) -> FrameChannel:
-        """Open a channel of raw CAN FD frames, many frames a message.
-
-        Args:
-            topic: E.g. ``/can_fd/can0``.
-
-        Raises:
-            DataError: If the topic is open already.
-        """
-        return FrameChannel(self._sender(topic, "std_msgs/msg/UInt8MultiArray"), fd=True)
-
-    def time_reference(self, topic: str, *, source: str) -> TimeReferenceChannel:
-        """Open a TimeReference channel: a device's clock against the host's.
-
-        Args:
-            topic: E.g. ``/clock/can0``.
-            source: Whose clock ``time_ref`` is on, e.g. ``can0``.
-
-        Raises:
-            DataError: If the topic is open already.
-        """
-        values = {"source": source}
-        return TimeReferenceChannel(self._template(topic, "sensor_msgs/msg/TimeReference", values))
-
-    def diagnostics(self, topic: str = "/diagnostics") -> DiagnosticsChannel:
-        """Open a DiagnosticArray channel: what the recorder says of itself.
-
-        Args:
-            topic: E.g. ``/diagnostics``.
-
-        Raises:
-            DataError: If the topic is open already.
-        """
-        return DiagnosticsChannel(self._sender(topic, "diagnostic_msgs/msg/DiagnosticArray"))
-
-    # -- inside ----------------------------------------------------------------------------
-
-    def _template(
-        self,
-        topic: str,
-        type_name: str,
-        values: Mapping[str, Any],
-        metadata: Mapping[str, str] | None = None,
-    ) -> Template:
-        kind = message_type(type_name)
-        example = encode(kind, values)
-        leaves = layout_of(kind, example).leaves
-        return Template(bytearray(example), leaves, self._sender(topic, type_name, metadata))
-
-
-SensorWrite: TypeAlias = Callable[[FloatArray, int, int], None]
-"""Writes a distance, shape (1,), or a vector, shape (3,), with sampling and log time [Unix ns]."""
-
-
-def open_sensor(writer: ChannelOpeners, sensor: Sensor) -> SensorWrite:
-    """Open a sensor's channel on the topic of its description; its frame has its name.
-
-    Raises:
-        DataError: If the topic is open already.
-    """
-    if sensor.kind is SensorKind.ACCELEROMETER:
-        imu = writer.imu(sensor.topic, frame=sensor.name)
-        return lambda values, t_ns, log_ns: imu.write(t_ns, values, log_time_ns=log_ns)
-    if sensor.kind is SensorKind.COMPASS:
-        compass = writer.magnetic_field(sensor.topic, frame=sensor.name)
-        return lambda values, t_ns, log_ns: compass.write(t_ns, values, log_time_ns=log_ns)
-    distance = writer.range(
-        sensor.topic,
-        frame=sensor.name,
-        min_range=sensor.range_min or 0.0,
-        max_range=sensor.range_max or 0.0,
-        field_of_view=sensor.field_of_view or 0.0,
-        infrared=sensor.kind is SensorKind.IR,
-    )
-    return lambda values, t_ns, log_ns: distance.write(t_ns, float(values[0]), log_time_ns=log_ns)
-
 
 CONTRACT_VERSION = "1"
 """Version of the log contract that this writer follows."""
 
 
-class SessionWriter(ChannelOpeners):
-    """Writes one session."""
+class SessionWriter:
+    """Writes one session.
+
+    A method that opens a channel raises DataError if its topic is open already; the channel may be
+    opened at any time.
+    """
 
     def __init__(
         self,
@@ -308,22 +60,21 @@ class SessionWriter(ChannelOpeners):
         force: bool = False,
         sink: MessageSink | None = None,
     ) -> None:
-        """Open the session and write what explains it.
+        """Open the session and write its metadata and the robot's description.
 
         Args:
             session_id: Names the session; the same for all its parts.
             epoch_ns: Unix time of the session's start [ns].
-            robot: Its description travels as attachments ``robot.toml`` and its DBC files.
+            robot: Stored as the attachment ``robot.toml`` with its DBC files and meshes.
             clock: Source name to clock domain.
             metadata: Further facts, e.g. ``operator``; all values are strings.
-            sink: Where the records go, and who opens the file then: ``path`` only names the
-                session in errors and ``force`` has no meaning. The session closes it.
+            sink: Stores the records and is closed with the session. With a sink, ``path`` only
+                names the session in errors and ``force`` has no effect.
 
         Raises:
             OutputExistsError: If the file is there and ``force`` is not given.
             LogWriteError: If it can't be created or written.
         """
-        super().__init__()
         self.path = Path(path)
         self._epoch_ns = epoch_ns
         self._open = True
@@ -331,6 +82,7 @@ class SessionWriter(ChannelOpeners):
         self._schemas: dict[str, int] = {}
         self._topics: set[str] = set()
         self._last: dict[str, Metadata] = {}
+        self._logs: dict[str, LogChannel] = {}
         facts = {
             "session_id": session_id,
             "contract": CONTRACT_VERSION,
@@ -349,12 +101,157 @@ class SessionWriter(ChannelOpeners):
                 self.attach(name, mesh_type(name) or "application/octet-stream", data)
 
     def __enter__(self) -> Self:
-        """Nothing to do: the session is open."""
+        """Return the session."""
         return self
 
     def __exit__(self, *_: object) -> None:
         """Finalise the session, also when the block is left by an exception."""
         self.close()
+
+    # -- channels --------------------------------------------------------------------------
+
+    def joint_state(
+        self,
+        topic: str,
+        names: Sequence[str],
+        *,
+        unit: str,
+        velocity: bool = False,
+        effort: bool = False,
+    ) -> JointStateChannel:
+        """Open a JointState channel.
+
+        Args:
+            topic: E.g. ``/joint_states``.
+            names: Joint (or value) names, m of them, in chain order.
+            unit: Unit of ``position``; kept in the channel's metadata.
+            velocity: Whether samples carry velocities [rad/s].
+            effort: Whether samples carry efforts [N m].
+        """
+        zeros = [0.0] * len(names)
+        values = {
+            "name": list(names),
+            "position": zeros,
+            "velocity": zeros if velocity else [],
+            "effort": zeros if effort else [],
+        }
+        return JointStateChannel(
+            self._template(topic, "sensor_msgs/msg/JointState", values, {"unit": unit})
+        )
+
+    def odometry(self, topic: str, *, frame: str, child: str) -> OdometryChannel:
+        """Open an Odometry channel for the head's pose and velocity.
+
+        Args:
+            topic: E.g. ``/odom``.
+            frame: Frame of the pose, e.g. ``world``.
+            child: The moving link; the velocity is given in its frame.
+        """
+        values = {"header": {"frame_id": frame}, "child_frame_id": child}
+        return OdometryChannel(self._template(topic, "nav_msgs/msg/Odometry", values))
+
+    def transforms(self, topic: str, *, parent: str, children: Sequence[str]) -> TransformChannel:
+        """Open a TFMessage channel: poses of many frames, rounded to 2^-14, for viewers only.
+
+        Args:
+            topic: E.g. ``/tf``.
+            children: Names of the moving frames, k of them.
+        """
+        header = {"frame_id": parent}
+        items = [{"header": header, "child_frame_id": child} for child in children]
+        return TransformChannel(
+            self._template(topic, "tf2_msgs/msg/TFMessage", {"transforms": items})
+        )
+
+    def range(
+        self,
+        topic: str,
+        *,
+        frame: str,
+        min_range: float,
+        max_range: float,
+        field_of_view: float,
+        infrared: bool = True,
+    ) -> RangeChannel:
+        """Open a Range channel (IR or sonar).
+
+        Args:
+            topic: E.g. ``/ir/01``.
+            frame: The sensor's frame.
+            min_range: Shortest distance that it measures [m].
+            max_range: Longest distance that it measures [m].
+            field_of_view: Full cone angle [rad].
+        """
+        values = {
+            "header": {"frame_id": frame},
+            "radiation_type": int(infrared),
+            "field_of_view": field_of_view,
+            "min_range": min_range,
+            "max_range": max_range,
+        }
+        return RangeChannel(self._template(topic, "sensor_msgs/msg/Range", values, {"unit": "m"}))
+
+    def imu(self, topic: str, *, frame: str) -> ImuChannel:
+        """Open an Imu channel; its orientation is marked as not estimated, see REP 145.
+
+        Args:
+            topic: E.g. ``/imu``.
+            frame: The sensor's frame.
+        """
+        unknown = [-1.0] + [0.0] * 8
+        values = {"header": {"frame_id": frame}, "orientation_covariance": unknown}
+        return ImuChannel(self._template(topic, "sensor_msgs/msg/Imu", values))
+
+    def magnetic_field(self, topic: str, *, frame: str) -> MagneticFieldChannel:
+        """Open a MagneticField channel [T].
+
+        Args:
+            topic: E.g. ``/compass``.
+            frame: The sensor's frame.
+        """
+        values = {"header": {"frame_id": frame}}
+        template = self._template(topic, "sensor_msgs/msg/MagneticField", values, {"unit": "T"})
+        return MagneticFieldChannel(template)
+
+    def string(self, topic: str) -> StringChannel:
+        """Open a String channel."""
+        return StringChannel(self._sender(topic, "std_msgs/msg/String"))
+
+    def log(self, topic: str = "/rosout") -> LogChannel:
+        """Open a Log channel for events and faults, or return the open one."""
+        if topic not in self._logs:
+            self._logs[topic] = LogChannel(self._sender(topic, "rcl_interfaces/msg/Log"))
+        return self._logs[topic]
+
+    def frames(self, topic: str) -> FrameChannel:
+        """Open a channel of raw CAN frames, many frames a message.
+
+        Args:
+            topic: E.g. ``/can/can0``.
+        """
+        return FrameChannel(self._sender(topic, "std_msgs/msg/UInt8MultiArray"))
+
+    def fd_frames(self, topic: str) -> FrameChannel:
+        """Open a channel of raw CAN FD frames, many frames a message.
+
+        Args:
+            topic: E.g. ``/can_fd/can0``.
+        """
+        return FrameChannel(self._sender(topic, "std_msgs/msg/UInt8MultiArray"), fd=True)
+
+    def time_reference(self, topic: str, *, source: str) -> TimeReferenceChannel:
+        """Open a TimeReference channel: a device's clock against the host's.
+
+        Args:
+            topic: E.g. ``/clock/can0``.
+            source: Whose clock ``time_ref`` is on, e.g. ``can0``.
+        """
+        values = {"source": source}
+        return TimeReferenceChannel(self._template(topic, "sensor_msgs/msg/TimeReference", values))
+
+    def diagnostics(self, topic: str = "/diagnostics") -> DiagnosticsChannel:
+        """Open a DiagnosticArray channel for the states of the recorder's components."""
+        return DiagnosticsChannel(self._sender(topic, "diagnostic_msgs/msg/DiagnosticArray"))
 
     # -- whole session ---------------------------------------------------------------------
 
@@ -371,10 +268,7 @@ class SessionWriter(ChannelOpeners):
         self._sink.define(Attachment(self._epoch_ns, self._epoch_ns, name, media_type, data))
 
     def note(self, name: str, facts: Mapping[str, str]) -> None:
-        """Write a metadata record now; a reader puts records of one name together.
-
-        Args:
-            name: Its name, e.g. ``undulog``.
+        """Write a metadata record now; a reader merges records of one name.
 
         Raises:
             LogWriteError: If the session can't be written.
@@ -382,7 +276,7 @@ class SessionWriter(ChannelOpeners):
         self._sink.define(Metadata(name, dict(facts)))
 
     def explain(self, texts: Mapping[str, bytes], records: Mapping[str, Mapping[str, str]]) -> None:
-        """Store what a session was made from.
+        """Store the inputs of a session.
 
         Args:
             texts: File name to TOML text, e.g. ``plan.toml``.
@@ -431,7 +325,7 @@ class SessionWriter(ChannelOpeners):
     def _sender(
         self, topic: str, type_name: str, metadata: Mapping[str, str] | None = None
     ) -> Send:
-        """Register a channel; returns what writes one message of it."""
+        """Register a channel and return the function that writes one message."""
         if topic in self._topics:
             raise DataError(f"{topic} is open already; a topic has one channel")
         if type_name not in self._schemas:
@@ -454,3 +348,42 @@ class SessionWriter(ChannelOpeners):
             sequence = (sequence + 1) & 0xFFFF_FFFF
 
         return send
+
+    def _template(
+        self,
+        topic: str,
+        type_name: str,
+        values: Mapping[str, Any],
+        metadata: Mapping[str, str] | None = None,
+    ) -> Template:
+        kind = message_type(type_name)
+        example = encode(kind, values)
+        leaves = layout_of(kind, example).leaves
+        return Template(bytearray(example), leaves, self._sender(topic, type_name, metadata))
+
+
+SensorWrite: TypeAlias = Callable[[FloatArray, int, int], None]
+"""Writes a distance, shape (1,), or a vector, shape (3,), with sampling and log time [Unix ns]."""
+
+
+def open_sensor(writer: SessionWriter, sensor: Sensor) -> SensorWrite:
+    """Open a sensor's channel on the topic of its description; its frame has its name.
+
+    Raises:
+        DataError: If the topic is open already.
+    """
+    if sensor.kind is SensorKind.ACCELEROMETER:
+        imu = writer.imu(sensor.topic, frame=sensor.name)
+        return lambda values, t_ns, log_ns: imu.write(t_ns, values, log_time_ns=log_ns)
+    if sensor.kind is SensorKind.COMPASS:
+        compass = writer.magnetic_field(sensor.topic, frame=sensor.name)
+        return lambda values, t_ns, log_ns: compass.write(t_ns, values, log_time_ns=log_ns)
+    distance = writer.range(
+        sensor.topic,
+        frame=sensor.name,
+        min_range=sensor.range_min or 0.0,
+        max_range=sensor.range_max or 0.0,
+        field_of_view=sensor.field_of_view or 0.0,
+        infrared=sensor.kind is SensorKind.IR,
+    )
+    return lambda values, t_ns, log_ns: distance.write(t_ns, float(values[0]), log_time_ns=log_ns)

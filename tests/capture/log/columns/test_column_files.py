@@ -54,16 +54,15 @@ def test_columns_in_files_leave_memory_and_come_back(session_path, values, tmp_p
     assert_true(found, values)  # a closed session's columns stay, too
 
 
-def test_columns_in_memory_stay(session_path, values):
-    with Session.open(session_path) as session:
+@pytest.mark.parametrize("disk", [None, "1m"])
+def test_columns_in_memory_stay_as_those_without_room_on_the_disk(
+    session_path, values, disk, request
+):
+    folder = None if disk is None else request.getfixturevalue("disk_of")(disk)
+    with Session.open(session_path, column_folder=folder) as session:
         found = session.joint_columns(WANTED)
         session.forget()
     assert_true(found, values)
-
-
-def test_without_room_on_the_disk_columns_lie_in_memory(session_path, values, disk_of):
-    with Session.open(session_path, column_folder=disk_of("1m")) as session:
-        assert_true(session.joint_columns(WANTED), values)
 
 
 def test_columns_in_files_can_be_written_to(session_path, tmp_path):

@@ -6,6 +6,7 @@ import zstandard
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from support.read_back import chunks_of
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.columns.buffers import ColumnStore, EchoColumn, Times, TimeStore
@@ -63,16 +64,12 @@ def test_offsets_that_are_asked_for_are_not_overwritten(tmp_path):
     wanted = {"/joint_states": ["position"], "/joint_sample_offset": ["position"]}
     with Session(tmp_path / "s.mcap") as session:
         found = session.joint_columns(wanted)
+        with pytest.raises(DataError, match="not for both"):
+            session.columns({"/joint_states": ["position"]}, {"/joint_sample_offset": None})
     stamps = EPOCH_NS + np.arange(50) * STEP_NS
     offsets = np.array(found["/joint_sample_offset", "position"].values)
     np.testing.assert_allclose(offsets, (t_ns.T - stamps) * 1e-9, atol=1e-9)
     np.testing.assert_array_equal(np.array(found["/joint_states", "position"].t_ns).T, t_ns)
-
-
-def test_a_topic_is_asked_for_one_way(tmp_path):
-    write_session(tmp_path / "s.mcap", 5)
-    with Session(tmp_path / "s.mcap") as session, pytest.raises(DataError, match="not for both"):
-        session.columns({"/joint_states": ["position"]}, {"/joint_sample_offset": None})
 
 
 @pytest.mark.parametrize("stall", [None, 1500])
@@ -150,10 +147,7 @@ def test_echoes_keep_their_own_rows_whatever_the_others_get(seed):
 def test_a_damaged_frame_is_found_by_its_own_checksum(tmp_path):
     path = tmp_path / "s.mcap"
     write_session(path, 20)
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    (imu,) = (key for key, channel in summary.channels.items() if channel.topic == "/imu")
-    (chunk,) = (each for each in summary.chunk_indexes if imu in each.message_index_offsets)
+    (chunk,) = chunks_of(path, "/imu")
     data = bytearray(path.read_bytes())
     at = data.index(b"\x28\xb5\x2f\xfd", chunk.chunk_start_offset)
     assert zstandard.get_frame_parameters(bytes(data[at : at + 64])).has_checksum

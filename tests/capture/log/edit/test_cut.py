@@ -26,6 +26,8 @@ from support.edited_logs import (
     ticks,
     write_log,
 )
+from support.foreign_logs import foreign_log
+from support.read_back import summary_of
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.log.edit.cut import cut_log
 from undulog.capture.log.messages.definitions import schema_text
@@ -72,7 +74,7 @@ def test_a_cut_keeps_what_explains_the_log_and_says_what_it_is(tmp_path: Path):
     stored, attached = records(tmp_path / "one.mcap")
     assert attached == records(whole)[1]
     assert stored["undulog"] == {"session_id": "s7"}
-    with (tmp_path / "one.mcap").open("rb") as stream:
+    with (tmp_path / "one.mcap").open("rb") as stream:  # with the records of one name apart
         names = [(r.name, r.metadata) for r in make_reader(stream).iter_metadata()]
     assert names[:3] == metadata
     edit = stored["undulog.edit"]
@@ -140,10 +142,7 @@ def test_latched_topics_of_ros_are_known(tmp_path: Path):
     path = tmp_path / "bag.mcap"
     kind = "sensor_msgs/msg/Range"
     latched = "- history: 3\n  depth: 0\n  reliability: 1\n  durability: 1\n"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2")
-        schema = writer.register_schema(kind, "ros2msg", schema_text(kind).encode())
+    with foreign_log(path, kind) as (writer, schema):
         quality = {"offered_qos_profiles": latched}
         ids = [
             writer.register_channel("/map", "cdr", schema, quality),
@@ -155,7 +154,6 @@ def test_latched_topics_of_ros_are_known(tmp_path: Path):
         for k, channel in enumerate([*ids, *ids, *ids]):
             writer.add_message(channel, EPOCH_NS + k * MS, bytes([k // 6]), 0, k)
         writer.add_message(ids[2], EPOCH_NS + 100 * MS, b"z", 0, 9)
-        writer.finish()
     cut_log(path, tmp_path / "cut.mcap", start_s=0.05, carry_state=True)
     # /map: the last one; /tf_static: each different one; /scan is volatile.
     found = [(m[1], m[3]) for m in in_file_order(tmp_path / "cut.mcap")]
@@ -181,8 +179,7 @@ def test_a_truncated_log_is_cut_as_far_as_it_goes(tmp_path: Path, capsys):
 def test_a_corrupt_chunk_is_not_passed_on(tmp_path: Path, make: str):
     whole = write_log(tmp_path / "whole.mcap", ticks(), **MAKES[make])
     data = bytearray(whole.read_bytes())
-    with whole.open("rb") as stream:
-        index = make_reader(stream).get_summary().chunk_indexes[3]
+    index = summary_of(whole).chunk_indexes[3]
     data[index.chunk_start_offset + index.chunk_length - 5] ^= 0xFF
     (tmp_path / "bad.mcap").write_bytes(data)
     report = cut_log(tmp_path / "bad.mcap", tmp_path / "cut.mcap")

@@ -9,24 +9,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 from support.edited_logs import (
     EPOCH_NS,
     MS,
-    STRING,
     in_file_order,
     in_window,
     read,
     ticks,
     write_log,
 )
+from support.foreign_logs import foreign_log
 from support.processes import python, start
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.edit.cut import cut_log
 from undulog.capture.log.edit.merge import merge_logs
-from undulog.capture.log.messages.definitions import schema_text
 
 # -- both ------------------------------------------------------------------------------------
 
@@ -55,14 +53,10 @@ def test_memory_holds_a_few_chunks_however_long_the_log(tmp_path: Path):
     logs = []
     for k in range(3):
         logs.append(tmp_path / f"{k}.mcap")
-        with logs[-1].open("wb") as stream:
-            writer = Writer(stream, chunk_size=1 << 20)
-            writer.start(profile="ros2")
-            schema = writer.register_schema(STRING, "ros2msg", schema_text(STRING).encode())
+        with foreign_log(logs[-1], chunk_size=1 << 20) as (writer, schema):
             channel = writer.register_channel(f"/{k}", "cdr", schema)
             for tick in range(500):
                 writer.add_message(channel, EPOCH_NS + tick * MS, bytes(1 << 16), 0)
-            writer.finish()
     tracemalloc.start()
     cut_log(logs[0], tmp_path / "cut.mcap")
     cut_peak = tracemalloc.get_traced_memory()[1]
@@ -79,10 +73,9 @@ def test_a_stop_leaves_nothing(tmp_path: Path):
     stop = StopRequest()
     stop.signal = signal.SIGTERM
     said = "stopped by SIGTERM; nothing was written"
-    with pytest.raises(UndulogError, match=said):
-        cut_log(logs[0], tmp_path / "x.mcap", stop=stop)
-    with pytest.raises(UndulogError, match=said):
-        merge_logs(logs, tmp_path / "x.mcap", stop=stop)
+    for edit, source in ((cut_log, logs[0]), (merge_logs, logs)):
+        with pytest.raises(UndulogError, match=said):
+            edit(source, tmp_path / "x.mcap", stop=stop)
     assert sorted(tmp_path.iterdir()) == logs
 
 

@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import random
-import select
 import shutil
 import subprocess
 import sys
@@ -12,14 +11,15 @@ import time
 from pathlib import Path
 
 import pytest
-from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 import undulog
 from support import durable_child as recorder
 from support import processes
+from support.damage import damaged_bytes
+from support.kills import killed_after, last_number
 from support.processes import wait_for
-from support.read_back import read
+from support.read_back import messages_of, read, summary_of
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import (
     LogError,
@@ -45,8 +45,8 @@ def fingerprint(folder):
     }
 
 
-def start(path, **options):
-    """A recorder in a process of its own."""
+def command(path, **options):
+    """The command of a recorder in a process of its own."""
     options = {
         "segment_size": 1 << 16,
         "ballast": 1 << 16,
@@ -54,41 +54,19 @@ def start(path, **options):
         "flush_interval_s": 0.2,
         **options,
     }
-    command = [sys.executable, str(CHILD), str(path), json.dumps(options)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE)
+    return [sys.executable, CHILD, str(path), json.dumps(options)]
 
 
-def last_told(told):
-    """How many messages a recorder told as accepted."""
-    whole = len(told) // 8 * 8
-    return int.from_bytes(told[whole - 8 : whole], "little")
-
-
-def kill_at(path, seconds, **options):
-    """Run a recorder and kill it that long after its first message; messages told as accepted."""
-    with start(path, **options) as child:
-        try:
-            pipe = child.stdout.fileno()
-            told = os.read(pipe, 1 << 16)
-            deadline = time.monotonic() + seconds
-            while (left := deadline - time.monotonic()) > 0:
-                if select.select([pipe], [], [], left)[0]:
-                    told += os.read(pipe, 1 << 16)
-        finally:
-            child.kill()
-        while rest := os.read(pipe, 1 << 16):
-            told += rest
-    assert child.returncode == -9
-    assert told, "the child did not start"
-    return last_told(told)
+def start(path, **options):
+    return subprocess.Popen(command(path, **options), stdout=subprocess.PIPE)
 
 
 def unfinished(path, count, **options):
     """A session whose recorder died after so many messages, the disk having what it could."""
     with start(path, count=count, flush_interval_s=60.0, **options) as child:
-        told, _ = child.communicate(timeout=120)
+        reported, _ = child.communicate(timeout=120)
     assert child.returncode == -9
-    assert last_told(told) == count
+    assert last_number(reported) == count
     return path
 
 
@@ -113,7 +91,7 @@ def check_killed(path, accepted):
 def test_a_killed_session_reads_as_if_it_had_been_closed(tmp_path, run, split_size, split_every):
     seconds = random.Random(run).uniform(0.1, 0.8)
     path = tmp_path / "run.mcap"
-    accepted = kill_at(path, seconds, split_size=split_size, split_every=split_every)
+    accepted = killed_after(command(path, split_size=split_size, split_every=split_every), seconds)
     warnings = check_killed(path, accepted)
     assert "the recorder did not finish" in warnings[0]
     assert "none is missing" in warnings[0]
@@ -133,7 +111,7 @@ def test_thirty_kills_lose_no_accepted_message(tmp_path):
         path.parent.mkdir()
         options = {"split_size": rng.choice([None, 1 << 17, 1 << 19])}
         options["split_every"] = rng.choice([0, 0, 300])
-        accepted = kill_at(path, rng.uniform(0.0, 1.5), **options)
+        accepted = killed_after(command(path, **options), rng.uniform(0.0, 1.5))
         warnings = check_killed(path, accepted)
         assert any("none is missing" in text for text in warnings)
         output = path.with_name("whole.mcap")
@@ -300,8 +278,9 @@ def test_what_is_in_neither_is_counted(tmp_path):
     assert f"{lost} of 6000 messages that the recorder accepted are missing" in health.reasons
 
 
-def test_a_session_that_nothing_is_missing_of_is_degraded_at_most(tmp_path):
-    health = check_session(unfinished(tmp_path / "run.mcap", 6000))
+def test_a_complete_session_is_degraded_at_most_and_a_cut_file_without_its_log(tmp_path):
+    path = unfinished(tmp_path / "run.mcap", 6000)
+    health = check_session(path)
     assert health.file.truncated
     assert health.file.damage == ()
     assert any(
@@ -309,10 +288,6 @@ def test_a_session_that_nothing_is_missing_of_is_degraded_at_most(tmp_path):
         for text in health.reasons
     )
     assert not any("cut short" in text for text in (*health.reasons, *health.notes))
-
-
-def test_without_its_write_ahead_log_a_cut_file_is_what_it_was(tmp_path):
-    path = unfinished(tmp_path / "run.mcap", 6000)
     shutil.rmtree(tmp_path / "run.mcap.wal")
     found, warnings = read(path)
     assert found == recorder.truth(len(found))
@@ -361,12 +336,10 @@ def test_a_recovered_file_opens_in_foreign_readers(tmp_path):
     output = recovered_path(path)
     recover_log(path, output)
     truth = recorder.truth(500)
-    with output.open("rb") as stream:
-        read_by_mcap = [
-            (channel.topic, m.sequence, m.log_time, m.publish_time, m.data)
-            for _, channel, m in make_reader(stream, validate_crcs=True).iter_messages()
-        ]
-    assert read_by_mcap == truth
+    assert [
+        (channel.topic, m.sequence, m.log_time, m.publish_time, m.data)
+        for _, channel, m in messages_of(output)
+    ] == truth
     with AnyReader([output]) as reader:
         read_by_rosbags = [
             (connection.topic, t_ns, reader.deserialize(data, connection.msgtype).data)
@@ -374,25 +347,16 @@ def test_a_recovered_file_opens_in_foreign_readers(tmp_path):
         ]
     assert read_by_rosbags == [(m[0], m[2], m[4][8:-1].decode()) for m in truth]
 
-
-@pytest.mark.slow
-def test_rerun_finds_nothing_wrong_with_a_recovered_file(tmp_path):
     rerun = Path(sys.executable).with_name("rerun")
     if not rerun.exists():
         pytest.skip("rerun is not installed")
-    path = unfinished(tmp_path / "run.mcap", 500)
-    output = recovered_path(path)
-    recover_log(path, output)
     done = processes.run(rerun, "mcap", "check", output)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_a_damaged_file_without_a_write_ahead_log_gives_what_is_readable(tmp_path):
     path = tmp_path / "run.mcap"
-    sink = recorder.open_sink(path)
-    for number in range(6000):
-        recorder.write(sink, number)
-    sink.close(())
+    recorder.record(path, range(6000))
     raw = bytearray(path.read_bytes())
     third = len(raw) // 3
     raw[third : third + 100_000] = bytes(100_000)
@@ -463,38 +427,31 @@ def test_a_recovery_gives_no_advice_to_recover_and_asks_for_what_a_copy_left_beh
 
 def test_a_whole_file_needs_no_recovery(tmp_path):
     path = tmp_path / "run.mcap"
-    sink = recorder.open_sink(path)
-    recorder.write(sink, 0)
-    sink.close(())
+    recorder.record(path, range(1))
     report = recover_log(path, tmp_path / "out.mcap")
     assert report.notes == ["the log was whole: nothing had to be recovered"]
 
 
-def test_a_recovery_refuses_to_write_over_its_sources(tmp_path):
-    path = unfinished(tmp_path / "run.mcap", 300, splits=(100,))
-    before = fingerprint(tmp_path)
-    for output in (path, tmp_path / "run_0002.mcap"):
-        with pytest.raises(UsageError, match="is a source"):
-            recover_log(tmp_path / "run.mcap", output, force=True)
-    (tmp_path / "out.mcap").write_bytes(b"mine")
-    with pytest.raises(OutputExistsError):
-        recover_log(path, tmp_path / "out.mcap")
-    (tmp_path / "out.mcap").unlink()
-    assert fingerprint(tmp_path) == before
-
-
-def test_where_nothing_is_left_that_is_told(tmp_path):
+def test_an_empty_write_ahead_log_and_an_empty_file_are_no_log(tmp_path):
     (tmp_path / "run.mcap").touch()
     (tmp_path / "run.mcap.wal").mkdir()
-    with pytest.raises(NotALogError):
-        Session(tmp_path / "run.mcap")
-    with pytest.raises(NotALogError):
-        recover_log(tmp_path / "run.mcap", tmp_path / "out.mcap")
+    for use in (Session, lambda path: recover_log(path, tmp_path / "out.mcap")):
+        with pytest.raises(NotALogError):
+            use(tmp_path / "run.mcap")
     assert not (tmp_path / "out.mcap").exists()
 
 
 def test_edits_take_an_unfinished_session_as_it_is(tmp_path):
     path = unfinished(tmp_path / "run.mcap", 1000, splits=(400,))
+    before = fingerprint(tmp_path)
+    for output in (path, tmp_path / "run_0002.mcap"):
+        with pytest.raises(UsageError, match="is a source"):
+            recover_log(path, output, force=True)
+    (tmp_path / "out.mcap").write_bytes(b"mine")
+    with pytest.raises(OutputExistsError):
+        recover_log(path, tmp_path / "out.mcap")
+    (tmp_path / "out.mcap").unlink()
+    assert fingerprint(tmp_path) == before
     cut_log(path, tmp_path / "cut.mcap", start_s=0.3, stop_s=0.9)
     assert read(tmp_path / "cut.mcap")[0] == recorder.truth(1000)[300:900]
     with Session(tmp_path / "cut.mcap") as session:
@@ -506,13 +463,9 @@ def test_edits_take_an_unfinished_session_as_it_is(tmp_path):
 
 def test_behind_a_broken_chain_of_records_the_next_chunks_are_found(tmp_path):
     path = tmp_path / "run.mcap"
-    sink = recorder.open_sink(path)
-    for number in range(12_000):
-        recorder.write(sink, number)
-    sink.close(())
+    recorder.record(path, range(12_000))
     raw = path.read_bytes()
-    with path.open("rb") as stream:
-        chunks = make_reader(stream).get_summary().chunk_indexes
+    chunks = summary_of(path).chunk_indexes
     assert len(chunks) > 4
     truth = recorder.truth(12_000)
     for broken in (1, 2, len(chunks) - 2):  # the first one has the channels
@@ -535,24 +488,12 @@ def damage(rng, folder):
     """Damage up to three files of a session in one of several ways each."""
     files = [path for path in sorted(folder.rglob("*")) if path.suffix in (".mcap", ".seg")]
     for path in rng.sample(files, rng.randint(1, 3)):
-        raw = bytearray(path.read_bytes())
-        at, length = rng.randrange(len(raw) + 1), rng.choice([1, 8, 64, 4096])
-        kind = rng.randrange(6)
-        if kind == 0:  # some bytes
-            for _ in range(rng.randint(1, 20) if raw else 0):  # a part may have no byte yet
-                raw[rng.randrange(len(raw))] = rng.randrange(256)
-        elif kind == 1:
-            raw[at : at + length] = rng.choice([bytes(length), b"\xff" * length])
-        elif kind == 2:
-            del raw[at:]
-        elif kind == 3:
-            del raw[at : at + length]
-        elif kind == 4:
-            raw[at:at] = rng.randbytes(length)
-        else:
+        raw = path.read_bytes()
+        damaged = damaged_bytes(rng, raw, rng.choice([1, 8, 64, 4096]))
+        if damaged is None:
             path.unlink()
-            continue
-        path.write_bytes(raw)
+        else:
+            path.write_bytes(damaged)
 
 
 @pytest.mark.parametrize("runs", [40, pytest.param(1000, marks=pytest.mark.slow)])

@@ -6,11 +6,10 @@ import time
 from pathlib import Path
 
 import pytest
-from mcap.reader import make_reader
 
 import undulog
 from support import durable_child as recorder
-from support.read_back import read
+from support.read_back import messages_of, metadata_of, read
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import LogError, LogWriteError, NotALogError, OutputExistsError
 from undulog.capture.log.edit.cut import cut_log
@@ -33,13 +32,8 @@ def split_session(path, count=900, parts=3, **options):
     return path
 
 
-def records(path, name):
-    with path.open("rb") as stream:
-        found = {}
-        for record in make_reader(stream).iter_metadata():
-            if record.name == name:
-                found |= record.metadata
-        return found
+def part_record(path):
+    return metadata_of(path).get("undulog.part", {})
 
 
 # -- names ---------------------------------------------------------------------------------------
@@ -68,7 +62,7 @@ def test_each_part_explains_itself_and_names_its_neighbours(tmp_path):
     split_session(tmp_path / "run.mcap")
     names = ["run.mcap", "run_0002.mcap", "run_0003.mcap"]
     assert sorted(p.name for p in tmp_path.iterdir()) == names
-    found = [records(tmp_path / name, "undulog.part") for name in names]
+    found = [part_record(tmp_path / name) for name in names]
     digests = [hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() for name in names]
     assert found == [
         {"part": "1", "next": "run_0002.mcap"},
@@ -80,26 +74,17 @@ def test_each_part_explains_itself_and_names_its_neighbours(tmp_path):
         },
         {"part": "3", "previous": "run_0002.mcap", "previous_sha256": digests[1], "parts": "3"},
     ]
-    assert [records(tmp_path / n, "undulog")["session_id"] for n in names] == ["killed"] * 3
+    assert [metadata_of(tmp_path / n)["undulog"]["session_id"] for n in names] == ["killed"] * 3
     for part, name in enumerate(names):
-        with (tmp_path / name).open("rb") as stream:  # a foreign reader, one file at a time
-            messages = [
-                (channel.topic, m.sequence, m.log_time, m.publish_time, m.data)
-                for _, channel, m in make_reader(stream, validate_crcs=True).iter_messages()
-            ]
+        messages = [  # by a foreign reader, one file at a time
+            (channel.topic, m.sequence, m.log_time, m.publish_time, m.data)
+            for _, channel, m in messages_of(tmp_path / name)
+        ]
         assert messages == recorder.truth(900)[300 * part : 300 * (part + 1)]
 
 
-def test_a_session_that_was_never_split_says_nothing_of_parts(tmp_path):
-    path = split_session(tmp_path / "run.mcap", parts=1)
-    assert records(path, "undulog.part") == {}
-
-
 def test_parts_by_size(tmp_path):
-    sink = recorder.open_sink(tmp_path / "run.mcap", split_size=200_000)
-    for number in range(8000):
-        recorder.write(sink, number)
-    sink.close(())
+    sink = recorder.record(tmp_path / "run.mcap", range(8000), split_size=200_000)
     sizes = [path.stat().st_size for path in sorted(tmp_path.iterdir())]
     assert len(sizes) == sink.part > 2
     assert all(200_000 <= size < 200_000 + 600_000 for size in sizes[:-1])  # and one chunk
@@ -108,14 +93,11 @@ def test_parts_by_size(tmp_path):
 
 
 def test_parts_by_time_hold_equal_times(tmp_path):
-    sink = recorder.open_sink(tmp_path / "run.mcap", split_ns=250_000_000)  # a message a ms
-    for number in [*range(1000), *range(1600, 2000)]:  # then a pause longer than a part
-        recorder.write(sink, number)
-    sink.close(())
+    numbers = [*range(1000), *range(1600, 2000)]  # a message a ms, and a pause longer than a part
+    recorder.record(tmp_path / "run.mcap", numbers, split_ns=250_000_000)
     spans = []
     for path in [tmp_path / "run.mcap", *later_parts(tmp_path / "run.mcap")]:
-        with path.open("rb") as stream:
-            times = [m.log_time - EPOCH_NS for _, _, m in make_reader(stream).iter_messages()]
+        times = [m.log_time - EPOCH_NS for _, _, m in messages_of(path)]
         spans.append((min(times) // 10**6, max(times) // 10**6))
     assert spans == [(0, 249), (250, 499), (500, 749), (750, 999), (1600, 1749), (1750, 1999)]
 
@@ -148,10 +130,7 @@ def test_channels_opened_late_have_the_same_number_in_all_parts(tmp_path):
         writer.set_verdict("degraded", ["because"])
     with Session(path) as session:
         assert [m.data for _, m in session.messages("/early")] == ["0", "1", "2"]
-        assert [float(v[0]) for v in session.table("/late")[["position[0]"]].to_numpy()] == [
-            1.5,
-            2.5,
-        ]
+        assert session.table("/late")["position[0]"].tolist() == [1.5, 2.5]
         assert session.verdict == "degraded"
         assert session.attachments == {"scenario.toml": b"x = 1\n"}
         assert session.warnings == []
@@ -241,7 +220,7 @@ def test_a_folder_with_other_sessions_is_refused_and_part_names_are_not_enough(t
     (tmp_path / "x").mkdir()
     with pytest.raises(NotALogError, match="no session"):
         Session(tmp_path / "x")
-    split_session(tmp_path / "other.mcap", parts=1)
+    assert part_record(split_session(tmp_path / "other.mcap", parts=1)) == {}
     with pytest.raises(LogError, match=r"2 sessions .* name one: other\.mcap, run\.mcap"):
         Session(tmp_path)
     # A file that only looks like a part is a session of its own.
@@ -272,8 +251,18 @@ def test_a_missing_part_is_told(tmp_path, gone, told):
     assert told in health.reasons
 
 
-def test_a_part_of_another_session_is_left_out(tmp_path):
-    split_session(tmp_path / "run.mcap")
+def test_an_exchanged_part_is_found_and_one_of_another_session_is_left_out(tmp_path):
+    path = split_session(tmp_path / "run.mcap")
+    split_session(tmp_path / "x.mcap", count=1200)
+    (tmp_path / "x_0002.mcap").replace(tmp_path / "run_0002.mcap")
+    health = check_session(path)
+    assert health.verdict == "bad"
+    reason = (
+        "run_0002.mcap is not the file that run_0003.mcap was recorded after: its hash is another"
+    )
+    assert reason in health.reasons
+    for part in ("x.mcap", "x_0003.mcap"):
+        (tmp_path / part).unlink()
     with SessionWriter(
         tmp_path / "x.mcap",
         session_id="other",
@@ -290,20 +279,13 @@ def test_a_part_of_another_session_is_left_out(tmp_path):
     assert warnings == ["run_0002.mcap is of another session: left out"]
 
 
-def test_a_part_that_was_exchanged_is_told_by_log_check(tmp_path):
+def test_edits_take_all_parts_and_damage_names_its_part(tmp_path):
     path = split_session(tmp_path / "run.mcap")
-    split_session(tmp_path / "x.mcap", count=1200)
-    (tmp_path / "x_0002.mcap").replace(tmp_path / "run_0002.mcap")
-    health = check_session(path)
-    assert health.verdict == "bad"
-    assert (
-        "run_0002.mcap is not the file that run_0003.mcap was recorded after: its hash is another"
-        in health.reasons
-    )
-
-
-def test_damage_in_a_part_names_it(tmp_path):
-    path = split_session(tmp_path / "run.mcap")
+    cut_log(tmp_path / "run_0003.mcap", tmp_path / "cut.mcap", start_s=0.25, stop_s=0.65)
+    assert read(tmp_path / "cut.mcap") == (recorder.truth(900)[250:650], [])
+    assert part_record(tmp_path / "cut.mcap") == {}
+    merge_logs([path, tmp_path / "cut.mcap"], tmp_path / "merged.mcap")
+    assert len(read(tmp_path / "merged.mcap")[0]) == 1300
     second = tmp_path / "run_0002.mcap"
     raw = bytearray(second.read_bytes())
     raw[len(raw) // 2] ^= 1
@@ -313,12 +295,3 @@ def test_damage_in_a_part_names_it(tmp_path):
     found, warnings = read(path)
     assert len(found) == 600
     assert any("run_0002.mcap" in text for text in warnings)
-
-
-def test_edits_take_all_parts(tmp_path):
-    path = split_session(tmp_path / "run.mcap")
-    cut_log(tmp_path / "run_0003.mcap", tmp_path / "cut.mcap", start_s=0.25, stop_s=0.65)
-    assert read(tmp_path / "cut.mcap") == (recorder.truth(900)[250:650], [])
-    assert records(tmp_path / "cut.mcap", "undulog.part") == {}
-    merge_logs([path, tmp_path / "cut.mcap"], tmp_path / "merged.mcap")
-    assert len(read(tmp_path / "merged.mcap")[0]) == 1300

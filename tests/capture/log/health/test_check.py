@@ -17,9 +17,9 @@ from support.checked_sessions import (
     ROBOT,
     STEP_NS,
     TICKS,
-    Edit,
     at,
     timing_of,
+    without,
     write,
     write_raw,
 )
@@ -36,7 +36,9 @@ def joint_of(health: SessionHealth, name: str, topic: str = "/joint_states"):
 # -- the clean twin ----------------------------------------------------------------------------
 
 
-def test_a_clean_session_is_good_without_a_word(clean: Path) -> None:
+def test_a_clean_session_is_good_without_a_word(
+    clean: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     health = check_session(clean)
     assert health.verdict == "good"
     assert health.findings == ()
@@ -49,11 +51,6 @@ def test_a_clean_session_is_good_without_a_word(clean: Path) -> None:
     assert {each.sequence.kind for each in health.channels} == {"counted"}
     assert {each.sequence.dropped for each in health.channels} == {0}
     assert joint_of(health, "joint07").frozen_s == 0
-
-
-def test_the_verb_says_the_verdict_first_and_exits_0(
-    clean: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
     assert undulog.run(["log", "check", str(clean)]) == 0
     said = capsys.readouterr().out
     assert said.startswith("good: s, snake25, 19.99 s\n")
@@ -68,11 +65,8 @@ def test_json_is_one_object_and_says_whether_the_stored_verdict_differs(
     assert undulog.run(["log", "check", str(tmp_path / "s.mcap"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["verdict"] == "good"
-    assert found["stored"] == {
-        "verdict": "bad",
-        "reasons": ["so said the recorder"],
-        "differs": True,
-    }
+    stored = {"verdict": "bad", "reasons": ["so said the recorder"], "differs": True}
+    assert found["stored"] == stored
     assert len(found["joints"]) == 2 * len(NAMES)
     assert found["series"][0]["timing"]["rate_hz"] == pytest.approx(100.0)
 
@@ -83,10 +77,7 @@ def test_json_is_one_object_and_says_whether_the_stored_verdict_differs(
 def test_gaps_are_counted_measured_and_placed(tmp_path: Path) -> None:
     lost = {*range(300, 303), 900, *range(1500, 1530)}
 
-    def edit(tick: int, command: np.ndarray, angles: np.ndarray) -> int | None:
-        return None if tick in lost else at(tick)
-
-    health = check_session(write(tmp_path / "s.mcap", edit))
+    health = check_session(write(tmp_path / "s.mcap", without(lambda tick: tick in lost)))
     timing = timing_of(health)
     assert (timing.gaps, timing.missing) == (3, len(lost))
     assert timing.longest_s == pytest.approx(0.31)
@@ -99,39 +90,28 @@ def test_gaps_are_counted_measured_and_placed(tmp_path: Path) -> None:
 
 
 def test_one_short_gap_is_told_and_no_fault(tmp_path: Path) -> None:
-    def edit(tick: int, command: np.ndarray, angles: np.ndarray) -> int | None:
-        return None if tick == 700 else at(tick)
-
-    health = check_session(write(tmp_path / "s.mcap", edit))
+    health = check_session(write(tmp_path / "s.mcap", without(lambda tick: tick == 700)))
     assert health.verdict == "good"
     assert "1 gaps, 1 samples missing" in health.notes[0]
 
 
 def test_a_tenth_lost_is_bad_and_exits_1(tmp_path: Path) -> None:
-    def edit(tick: int, command: np.ndarray, angles: np.ndarray) -> int | None:
-        return None if tick % 8 == 1 else at(tick)
-
-    path = write(tmp_path / "s.mcap", edit)
+    path = write(tmp_path / "s.mcap", without(lambda tick: tick % 8 == 1))
     assert check_session(path).verdict == "bad"
     assert undulog.run(["log", "check", str(path)]) == 1
 
 
 def test_a_pause_can_be_cut_out_unless_it_is_most_of_the_session(tmp_path: Path) -> None:
-    def edit(until: int) -> Edit:
-        return lambda tick, command, angles: None if 400 <= tick < until else at(tick)
-
-    once = check_session(write(tmp_path / "once.mcap", edit(900)))
+    once = check_session(write(tmp_path / "once.mcap", without(lambda tick: 400 <= tick < 900)))
     assert once.verdict == "degraded"
     assert timing_of(once).paused_s == pytest.approx(5.01)
     assert (timing_of(once).missing, timing_of(once).scattered) == (500, 0)
-    assert check_session(write(tmp_path / "most.mcap", edit(1500))).verdict == "bad"
+    most = write(tmp_path / "most.mcap", without(lambda tick: 400 <= tick < 1500))
+    assert check_session(most).verdict == "bad"
 
 
 def test_a_series_that_ends_early_is_told(tmp_path: Path) -> None:
-    def edit(tick: int, command: np.ndarray, angles: np.ndarray) -> int | None:
-        return None if tick >= 1500 else at(tick)
-
-    health = check_session(write(tmp_path / "s.mcap", edit))
+    health = check_session(write(tmp_path / "s.mcap", without(lambda tick: tick >= 1500)))
     assert health.reasons == ("/joint_states: ends 5 s before the session",)
 
 

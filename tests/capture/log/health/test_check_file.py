@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
-from mcap_ros2.writer import Writer as RosWriter
 
 import undulog
 from support.checked_sessions import (
     EPOCH_NS,
-    JOINT_STATE,
     NAMES,
     ROBOT,
     TICKS,
@@ -24,30 +22,30 @@ from support.checked_sessions import (
     timing_of,
     write_raw,
 )
+from support.read_back import chunks_of
+from support.written_sessions import joint_state, write_foreign
 from undulog.capture import SessionWriter
-from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.health.session_check import SessionHealth, check_session
 from undulog.capture.log.mcap.chunk import walk_records
-from undulog.capture.log.messages.definitions import schema_text
 
 
-def chunk_spans(path: Path, topic: str) -> list[tuple[int, int]]:
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    (key,) = (key for key, channel in summary.channels.items() if channel.topic == topic)
-    return [
-        (index.chunk_start_offset, index.chunk_length)
-        for index in summary.chunk_indexes
-        if key in index.message_index_offsets
-    ]
+def flip(data: bytearray, at_byte: int) -> None:
+    data[at_byte] ^= 0x10
+
+
+def changed(path: Path, source: Path, change: Callable[[bytearray], object]) -> SessionHealth:
+    """The health of a copy of a file with changed bytes."""
+    data = bytearray(source.read_bytes())
+    change(data)
+    path.write_bytes(data)
+    return check_session(path)
 
 
 @pytest.mark.parametrize("part", [0.02, 0.5, 0.9])
 def test_a_flipped_bit_is_found_and_bad(clean: Path, tmp_path: Path, part: float) -> None:
-    start, length = chunk_spans(clean, "/joint_states")[0]
-    data = bytearray(clean.read_bytes())
-    data[start + 60 + int(part * (length - 60))] ^= 0x10
-    (tmp_path / "s.mcap").write_bytes(data)
-    health = check_session(tmp_path / "s.mcap")
+    chunk = chunks_of(clean, "/joint_states")[0]
+    at_byte = chunk.chunk_start_offset + 60 + int(part * (chunk.chunk_length - 60))
+    health = changed(tmp_path / "s.mcap", clean, lambda data: flip(data, at_byte))
     assert health.verdict == "bad"
     assert health.file.checked == health.file.chunks - 1
     assert len(health.file.damage) == 1
@@ -68,13 +66,11 @@ def test_a_flipped_bit_is_found_however_the_chunk_is_stored(
     kinds = IndexType.ALL if indexed else IndexType.NONE
     options = {"compression": compression, "chunk_size": 20_000, "index_types": kinds}
     path = write_raw(tmp_path / "s.mcap", list(range(500)), **options)
-    data = bytearray(path.read_bytes())
-    chunks = [span for span in walk_records(bytes(data), 8, len(data)) if span[0] == 6]
+    data = path.read_bytes()
+    chunks = [span for span in walk_records(data, 8, len(data)) if span[0] == 6]
     assert check_session(path).file.damage == ()
     _, start, stop = chunks[2]
-    data[(start + stop) // 2] ^= 0x10
-    path.write_bytes(data)
-    health = check_session(path)
+    health = changed(path, path, lambda data: flip(data, (start + stop) // 2))
     assert health.verdict == "bad"
     assert len(health.file.damage) == 1
     assert health.file.indexed is indexed
@@ -105,17 +101,17 @@ def test_a_summary_that_counts_more_than_there_is_is_found(tmp_path: Path) -> No
 
 
 def test_a_flipped_bit_in_an_attachment_is_found(clean: Path, tmp_path: Path) -> None:
-    data = bytearray(clean.read_bytes())
-    data[data.index(b"+-30 degrees")] ^= 1
-    (tmp_path / "s.mcap").write_bytes(data)
-    health = check_session(tmp_path / "s.mcap")
+    at_byte = clean.read_bytes().index(b"+-30 degrees")
+    health = changed(tmp_path / "s.mcap", clean, lambda data: flip(data, at_byte))
     assert health.verdict == "bad"
     assert "the attachment" in health.file.damage[0]
 
 
 def test_a_cut_file_is_degraded_and_says_what_is_left(clean: Path, tmp_path: Path) -> None:
-    start, length = chunk_spans(clean, "/joint_states")[0]
-    (tmp_path / "s.mcap").write_bytes(clean.read_bytes()[: start + length // 2])
+    chunk = chunks_of(clean, "/joint_states")[0]
+    (tmp_path / "s.mcap").write_bytes(
+        clean.read_bytes()[: chunk.chunk_start_offset + chunk.chunk_length // 2]
+    )
     health = check_session(tmp_path / "s.mcap")
     assert health.file.truncated
     assert health.verdict == "degraded"
@@ -141,24 +137,19 @@ def test_an_uncovered_chunk_is_told(tmp_path: Path) -> None:
 # -- foreign bags ----------------------------------------------------------------------------------
 
 
-def write_foreign(path: Path, topic: str, names: list[list[str]]) -> Path:
+def foreign(path: Path, topic: str, names: list[list[str]]) -> Path:
     """Each tick one message a list of names, as mcap-ros2-support writes them."""
-    with path.open("wb") as stream:
-        writer = RosWriter(stream)
-        schema = writer.register_msgdef(JOINT_STATE, schema_text(JOINT_STATE))
-        for tick in range(400):
-            for k, group in enumerate(names):
-                t_ns = at(tick) + k * 200_000
-                stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
-                position = [float(np.sin(tick / 20 + k))] * len(group)
-                message = {"header": {"stamp": stamp}, "name": group, "position": position}
-                writer.write_message(topic, schema, message, log_time=t_ns, publish_time=t_ns)
-        writer.finish()
-    return path
+    messages = [
+        (topic, t_ns, joint_state(t_ns, group, [float(np.sin(tick / 20 + k))] * len(group)))
+        for tick in range(400)
+        for k, group in enumerate(names)
+        for t_ns in [at(tick) + k * 200_000]
+    ]
+    return write_foreign(path, messages)
 
 
 def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path: Path) -> None:
-    path = write_foreign(tmp_path / "s.mcap", "/joint_states", [["a"], ["b"], ["c"]])
+    path = foreign(tmp_path / "s.mcap", "/joint_states", [["a"], ["b"], ["c"]])
     health = check_session(path)
     assert {each.label: each.timing.gaps for each in health.series} == {
         "/joint_states (a)": 0,
@@ -170,7 +161,7 @@ def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path: Path) -> None:
 
 
 def test_missing_contract_topics_are_named(tmp_path: Path) -> None:
-    health = check_session(write_foreign(tmp_path / "s.mcap", "/arm/state", [["a", "b"]]))
+    health = check_session(foreign(tmp_path / "s.mcap", "/arm/state", [["a", "b"]]))
     assert health.verdict == "degraded"
     assert "/joint_states is missing; JointStates are on /arm/state" in health.reasons
     with SessionWriter(tmp_path / "t.mcap", session_id="t", epoch_ns=EPOCH_NS) as writer:
@@ -193,12 +184,3 @@ def test_what_is_no_log_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixtur
     (tmp_path / "x.mcap").write_bytes(b"no log at all")
     assert undulog.run(["log", "check", str(tmp_path / "x.mcap")]) == 1
     assert "not an MCAP file" in capsys.readouterr().err
-
-
-def test_struct_of_the_chunk_header_is_that_of_the_spec(clean: Path) -> None:
-    start, _ = chunk_spans(clean, "/joint_states")[0]
-    head = clean.read_bytes()[start + 9 : start + 9 + 32]
-    begin, end, _, crc, size = struct.unpack("<QQQII", head)
-    assert EPOCH_NS <= begin <= end <= at(TICKS)
-    assert crc
-    assert size == len("zstd")

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 from hostile_logs import EPOCH_NS, NS, HostileLog, joint_state, lz4_zeros, zeros
-from mcap.reader import make_reader
 
 import undulog
 from support.processes import python
+from support.read_back import messages_of
 
 GIB = 1 << 30
 MIB = 1 << 20
@@ -111,8 +111,7 @@ def test_chunks_that_expand_beyond_their_size_are_refused_and_the_rest_is_kept(
     wanted = [t_ns for start in starts for _, t_ns, _ in ticks(start)]
     for k, (path, at) in enumerate(places.items()):
         assert "chunk" in said[k], path
-        with recovered[k].open("rb") as stream:
-            kept = [message.log_time for _, _, message in make_reader(stream).iter_messages()]
+        kept = [message.log_time for _, _, message in messages_of(recovered[k])]
         assert kept == wanted, path
         health = json.loads(said[count + k])
         if whole:

@@ -10,6 +10,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
+from support.read_back import metadata_of
 from support.written_sessions import EPOCH_NS, NAMES, STEP_NS, write_session
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError, LogWriteError, OutputExistsError
@@ -18,8 +19,10 @@ from undulog.capture.log.messages.frames import DIR_TX, EXTENDED_FLAG, empty_fra
 # -- writing -----------------------------------------------------------------------------------
 
 
-def test_a_foreign_reader_finds_every_number(tmp_path: Path) -> None:
-    data = write_session(tmp_path / "s.mcap")
+def test_foreign_readers_find_every_number_and_the_description(tmp_path: Path) -> None:
+    path, robot = tmp_path / "s.mcap", load_robot("snake13")
+    facts = {"operator": "a person"}
+    data = write_session(path, robot=robot, clock={"twin": "simulated"}, metadata=facts)
     with AnyReader([tmp_path / "s.mcap"]) as reader:
         rows = [
             reader.deserialize(raw, connection.msgtype)
@@ -34,21 +37,13 @@ def test_a_foreign_reader_finds_every_number(tmp_path: Path) -> None:
     assert stamps == [EPOCH_NS + k * STEP_NS for k in range(len(data))]
     assert tuple(rows[0].name) == NAMES
     assert topics["/odom"] == "nav_msgs/msg/Odometry"
-
-
-def test_the_file_explains_itself_to_any_mcap_reader(tmp_path: Path) -> None:
-    robot = load_robot("snake13")
-    facts = {"operator": "a person"}
-    write_session(tmp_path / "s.mcap", robot=robot, clock={"twin": "simulated"}, metadata=facts)
+    metadata = metadata_of(tmp_path / "s.mcap")
     with (tmp_path / "s.mcap").open("rb") as stream:
         reader = make_reader(stream)
         assert reader.get_header().profile == "ros2"
-        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
         attached = {record.name: record.data for record in reader.iter_attachments()}
-        units = {
-            channel.topic: channel.metadata.get("unit")
-            for channel in reader.get_summary().channels.values()
-        }
+        channels = reader.get_summary().channels.values()
+    units = {channel.topic: channel.metadata.get("unit") for channel in channels}
     assert metadata["undulog"]["session_id"] == "s1"
     assert metadata["undulog"]["operator"] == "a person"
     assert metadata["undulog"]["clock.twin"] == "simulated"
@@ -67,11 +62,9 @@ def test_the_other_channels_read_back_elsewhere(tmp_path: Path) -> None:
         ir.write(EPOCH_NS, 0.75)
         writer.imu("/imu", frame="a").write(EPOCH_NS, np.array([0.1, 0.2, 9.8]))
         writer.magnetic_field("/compass", frame="a").write(EPOCH_NS, np.array([2e-5, 0, -4e-5]))
-    found = {}
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        for _, channel, _, message in reader.iter_decoded_messages():
-            found[channel.topic] = message
+        found = {channel.topic: data for _, channel, _, data in reader.iter_decoded_messages()}
     assert [t.child_frame_id for t in found["/tf"].transforms] == ["a", "b"]
     assert abs(found["/tf"].transforms[0].transform.translation.z - 3.00001) <= 2**-15
     assert found["/tf"].transforms[1].transform.rotation.w == 0.5
@@ -137,19 +130,14 @@ def test_columns_come_back_bit_for_bit(tmp_path: Path) -> None:
         assert session.duration_s == pytest.approx(29.99)
         assert session.verdict == "good"
         assert session.warnings == []
-
-
-def test_a_window_is_half_open(tmp_path: Path) -> None:
-    data = write_session(tmp_path / "s.mcap", 3000)
-    start, stop = EPOCH_NS + 1000 * STEP_NS, EPOCH_NS + 1500 * STEP_NS
-    with Session.open(tmp_path / "s.mcap") as session:
+        start, stop = EPOCH_NS + 1000 * STEP_NS, EPOCH_NS + 1500 * STEP_NS  # half-open
         signals = session.joints("/joint_states", start_ns=start, stop_ns=stop)
     assert signals.t_ns[0][0] == start
     assert signals.t_ns[0][-1] == stop - STEP_NS
     np.testing.assert_array_equal(np.array(signals.values).T, data[1000:1500, 0])
 
 
-def test_tables_events_and_messages(tmp_path: Path) -> None:
+def test_tables_events_messages_and_a_long_frame(tmp_path: Path) -> None:
     data = write_session(tmp_path / "s.mcap")
     with Session.open(tmp_path / "s.mcap") as session:
         odometry = session.table("/odom")
@@ -158,11 +146,6 @@ def test_tables_events_and_messages(tmp_path: Path) -> None:
         assert session.table("/gait/mode")["data"].tolist() == ["walk"]
         (_, event), *_ = session.messages("/rosout")
         assert (event.level, event.msg) == (30, "clamped")
-
-
-def test_a_long_frame_has_one_row_a_sample(tmp_path: Path) -> None:
-    data = write_session(tmp_path / "s.mcap", 5)
-    with Session.open(tmp_path / "s.mcap") as session:
         frame = session.joints("/joint_states", "velocity").frame()
     second = frame[frame["joint"] == "joint02"]
     np.testing.assert_array_equal(second["velocity [rad/s]"], data[:, 1, 1])

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.records import Schema
 from mcap.writer import CompressionType, IndexType
-from mcap.writer import Writer as McapWriter
 from mcap_ros2.decoder import DecoderFactory
 
+from support.foreign_logs import foreign_log
 from support.written_sessions import (
     EPOCH_NS,
     JOINT_STATE,
@@ -24,19 +25,19 @@ from undulog.capture.common.errors import MissingChannelError
 from undulog.capture.log.messages.cdr import encode
 from undulog.capture.log.messages.definitions import message_type, schema_text
 
-# -- reading logs of other makes ---------------------------------------------------------------
+
+def states(t_ns: int, names: list, position: list, *, log_ns: int = 0, **more: object) -> tuple:
+    return "/joint_states", log_ns or t_ns, joint_state(t_ns, names, position, **more)
 
 
 def test_one_message_per_servo_is_read_right(tmp_path: Path) -> None:
     data = samples(200)
-    messages = []
-    for tick in range(200):
-        for j, name in enumerate(NAMES):
-            t_ns = EPOCH_NS + tick * STEP_NS + j * 1_000_000
-            values = [float(data[tick, 0, j])]
-            messages.append(("/joint_states", t_ns, joint_state(t_ns, [name], values)))
-    write_foreign(tmp_path / "f.mcap", messages)
-    with Session.open(tmp_path / "f.mcap") as session:
+    messages = [
+        states(EPOCH_NS + tick * STEP_NS + j * 1_000_000, [name], [float(data[tick, 0, j])])
+        for tick in range(200)
+        for j, name in enumerate(NAMES)
+    ]
+    with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         signals = session.joints("/joint_states")
         assert signals.names == NAMES
         for j in range(3):
@@ -47,13 +48,11 @@ def test_one_message_per_servo_is_read_right(tmp_path: Path) -> None:
 
 
 def test_a_changed_joint_set_is_told_and_read(tmp_path: Path) -> None:
-    messages = []
-    for tick in range(100):
-        t_ns = EPOCH_NS + tick * STEP_NS
-        names = ["a", "b"] if tick < 50 else ["a", "c"]
-        messages.append(("/joint_states", t_ns, joint_state(t_ns, names, [float(tick), 1.0])))
-    write_foreign(tmp_path / "f.mcap", messages)
-    with Session.open(tmp_path / "f.mcap") as session:
+    messages = [
+        states(EPOCH_NS + tick * STEP_NS, ["a", "b" if tick < 50 else "c"], [float(tick), 1.0])
+        for tick in range(100)
+    ]
+    with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         signals = session.joints("/joint_states")
         assert [len(t) for t in signals.t_ns] == [100, 50, 50]
         np.testing.assert_array_equal(signals.values[0], np.arange(100.0))
@@ -61,13 +60,12 @@ def test_a_changed_joint_set_is_told_and_read(tmp_path: Path) -> None:
 
 
 def test_a_later_window_is_not_read_with_the_names_of_an_earlier_one(tmp_path: Path) -> None:
-    messages, step_ns = [], 100_000_000
-    for tick in range(600):
-        t_ns = EPOCH_NS + tick * step_ns
-        names = ["a", "b"] if tick < 300 else ["b", "c"]  # messages of one length
-        messages.append(("/joint_states", t_ns, joint_state(t_ns, names, [tick, -tick])))
-    write_foreign(tmp_path / "f.mcap", messages)
-    with Session.open(tmp_path / "f.mcap") as session:
+    step_ns = 100_000_000
+    messages = [  # of one length
+        states(EPOCH_NS + tick * step_ns, list("ab" if tick < 300 else "bc"), [tick, -tick])
+        for tick in range(600)
+    ]
+    with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         for first in (100, 450, 100, 295, 450, 295):
             start_ns = EPOCH_NS + first * step_ns
             found = session.joints(
@@ -84,17 +82,11 @@ def test_a_later_window_is_not_read_with_the_names_of_an_earlier_one(tmp_path: P
 
 
 def test_duplicate_and_backward_stamps_are_told(tmp_path: Path) -> None:
-    ticks = [0, 1, 2, 2, 4, 3, 5]
     messages = [
-        (
-            "/joint_states",
-            EPOCH_NS + k * STEP_NS,
-            joint_state(EPOCH_NS + tick * STEP_NS, ["a"], [float(tick)]),
-        )
-        for k, tick in enumerate(ticks)
+        states(EPOCH_NS + tick * STEP_NS, ["a"], [float(tick)], log_ns=EPOCH_NS + k * STEP_NS)
+        for k, tick in enumerate([0, 1, 2, 2, 4, 3, 5])
     ]
-    write_foreign(tmp_path / "f.mcap", messages)
-    with Session.open(tmp_path / "f.mcap") as session:
+    with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         signals = session.joints("/joint_states")
         assert signals.values[0].tolist() == [0, 1, 2, 2, 3, 4, 5]
         text = " ".join(session.warnings)
@@ -103,10 +95,9 @@ def test_duplicate_and_backward_stamps_are_told(tmp_path: Path) -> None:
 
 
 def test_a_field_that_is_never_filled_is_missing_not_zero(tmp_path: Path) -> None:
-    messages = [("/joint_states", EPOCH_NS, joint_state(EPOCH_NS, ["a"], [1.0], velocity=[]))]
-    write_foreign(tmp_path / "f.mcap", messages)
+    messages = [states(EPOCH_NS, ["a"], [1.0], velocity=[])]
     with (
-        Session.open(tmp_path / "f.mcap") as session,
+        Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session,
         pytest.raises(
             MissingChannelError, match=r"has no effort in /joint_states; it has position"
         ),
@@ -116,28 +107,23 @@ def test_a_field_that_is_never_filled_is_missing_not_zero(tmp_path: Path) -> Non
 
 def test_values_that_do_not_match_the_names_are_left_out_with_a_warning(tmp_path: Path) -> None:
     messages = [
-        ("/joint_states", EPOCH_NS, joint_state(EPOCH_NS, ["a", "b"], [1.0])),
-        ("/joint_states", EPOCH_NS + 1, joint_state(EPOCH_NS + 1, ["a", "b"], [1.0, 2.0])),
+        states(EPOCH_NS, ["a", "b"], [1.0]),
+        states(EPOCH_NS + 1, ["a", "b"], [1.0, 2.0]),
     ]
-    write_foreign(tmp_path / "f.mcap", messages)
-    with Session.open(tmp_path / "f.mcap") as session:
+    with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         assert session.joints("/joint_states").values[1].tolist() == [2.0]
         assert "2 names but 1 values of position" in session.warnings[0]
 
 
 def test_nan_samples_are_kept(tmp_path: Path) -> None:
-    messages = [("/joint_states", EPOCH_NS, joint_state(EPOCH_NS, ["a"], [float("nan")]))]
-    write_foreign(tmp_path / "f.mcap", messages)
-    with Session.open(tmp_path / "f.mcap") as session:
+    messages = [states(EPOCH_NS, ["a"], [float("nan")])]
+    with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         assert np.isnan(session.joints("/joint_states").values[0]).all()
 
 
 def test_zero_stamps_fall_back_to_log_times(tmp_path: Path) -> None:
-    messages = [
-        ("/joint_states", EPOCH_NS + k, joint_state(0, ["a"], [float(k)])) for k in range(3)
-    ]
-    write_foreign(tmp_path / "f.mcap", messages)
-    with Session.open(tmp_path / "f.mcap") as session:
+    messages = [states(0, ["a"], [float(k)], log_ns=EPOCH_NS + k) for k in range(3)]
+    with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         assert session.joints("/joint_states").t_ns[0].tolist() == [EPOCH_NS + k for k in range(3)]
         assert "header stamps are zero" in session.warnings[0]
 
@@ -152,8 +138,7 @@ def test_simulated_time_is_shifted_to_the_log_clock(tmp_path: Path) -> None:
         for k in range(50)
         for topic in ("/joint_states", "/joint_commands")
     ]
-    write_foreign(tmp_path / "f.mcap", messages)
-    with Session.open(tmp_path / "f.mcap") as session:
+    with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         states = session.joints("/joint_states", start_ns=EPOCH_NS, stop_ns=EPOCH_NS + 10**9)
         commands = session.joints("/joint_commands")
         assert len(states.t_ns[0]) == 50
@@ -177,16 +162,13 @@ def test_simulated_time_is_shifted_to_the_log_clock(tmp_path: Path) -> None:
 def test_any_kind_of_mcap_reads_the_same(tmp_path: Path, options: dict, warned: bool) -> None:
     kind = message_type(JOINT_STATE)
     data = samples(500)
-    with (tmp_path / "f.mcap").open("wb") as stream:
-        writer = McapWriter(stream, chunk_size=20_000, **options)
-        writer.start(profile="ros2")
-        schema = writer.register_schema(JOINT_STATE, "ros2msg", schema_text(JOINT_STATE).encode())
+    path = tmp_path / "f.mcap"
+    with foreign_log(path, JOINT_STATE, chunk_size=20_000, **options) as (writer, schema):
         channel = writer.register_channel("/joint_states", "cdr", schema)
         for tick, row in enumerate(data):
             t_ns = EPOCH_NS + tick * STEP_NS
             message = encode(kind, joint_state(t_ns, list(NAMES), row[0].tolist()))
             writer.add_message(channel, t_ns, message, t_ns)
-        writer.finish()
     with Session.open(tmp_path / "f.mcap") as session:
         signals = session.joints("/joint_states")
         np.testing.assert_array_equal(np.array(signals.values).T, data[:, 0])
@@ -199,25 +181,14 @@ def test_undefined_padding_of_a_foreign_writer_does_no_harm(tmp_path: Path) -> N
     plain = encode(kind, joint_state(EPOCH_NS, ["ab"], [1.5]))
     padding_at = 4 + 8 + 4 + 1  # header, stamp, length of frame_id, its terminating zero
     assert plain[padding_at : padding_at + 3] == bytes(3)
-    with (tmp_path / "f.mcap").open("wb") as stream:
-        writer = McapWriter(stream)
-        writer.start(profile="ros2")
-        schema = writer.register_schema(JOINT_STATE, "ros2msg", schema_text(JOINT_STATE).encode())
+    with foreign_log(tmp_path / "f.mcap", JOINT_STATE) as (writer, schema):
         channel = writer.register_channel("/joint_states", "cdr", schema)
         for k in range(20):
             message = bytearray(plain)
             message[padding_at] = k
             writer.add_message(channel, EPOCH_NS + k, bytes(message), EPOCH_NS + k)
-        writer.finish()
-    decoded = DecoderFactory().decoder_for("cdr", _schema_record())
+    record = Schema(1, schema_text(JOINT_STATE).encode(), "ros2msg", JOINT_STATE)
+    decoded = DecoderFactory().decoder_for("cdr", record)
     assert list(decoded(bytes(message)).position) == [1.5]
     with Session.open(tmp_path / "f.mcap") as session:
         assert session.joints("/joint_states").values[0].tolist() == [1.5] * 20
-
-
-def _schema_record() -> object:
-    from mcap.records import Schema
-
-    return Schema(
-        id=1, name=JOINT_STATE, encoding="ros2msg", data=schema_text(JOINT_STATE).encode()
-    )

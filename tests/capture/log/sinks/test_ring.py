@@ -4,12 +4,9 @@ import functools
 import json
 import random
 import shutil
-import subprocess
-import sys
 import threading
 import tracemalloc
 from operator import itemgetter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +15,8 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from support.processes import wait_for
+from support.processes import python, wait_for
+from support.read_back import messages_of, metadata_of
 from undulog.capture import Session
 from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.log.sinks.mcap_sink import McapSink
@@ -40,13 +38,10 @@ def written(ring):
 
 def read(path):
     """All messages of a file by a foreign reader: channel by channel, as each was written."""
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        found = reader.iter_messages(log_time_order=False)
-        messages = [
-            (c.id, m.log_time, m.publish_time, m.sequence, bytes(m.data)) for _, c, m in found
-        ]
-    return by_channel(messages)
+    found = messages_of(path, log_time_order=False)
+    return by_channel(
+        [(c.id, m.log_time, m.publish_time, m.sequence, bytes(m.data)) for _, c, m in found]
+    )
 
 
 def by_channel(messages):
@@ -54,10 +49,22 @@ def by_channel(messages):
     return sorted(messages, key=itemgetter(0))
 
 
-def metadata(path):
-    with path.open("rb") as stream:
-        reader = make_reader(stream)
-        return {record.name: record.metadata for record in reader.iter_metadata()}
+def marked(ring, text=""):
+    """The last mark of a ring, which is closed."""
+    path = ring.mark(text)
+    ring.close(())
+    return path
+
+
+def put(ring, *messages):
+    """Write messages of channel 1: log time after the epoch [ns] and payload."""
+    for sequence, (t_ns, payload) in enumerate(messages):
+        ring.write(1, EPOCH_NS + t_ns, EPOCH_NS, sequence, payload)
+
+
+@pytest.fixture
+def ring(tmp_path):
+    return defined(RingSink(tmp_path / "run.mcap", SECOND))
 
 
 def defined(ring):
@@ -102,19 +109,20 @@ def test_a_mark_holds_the_messages_of_the_last_seconds_bit_for_bit(
     shutil.rmtree(folder)
 
 
-def test_what_was_in_force_before_the_window_is_carried_to_its_start(tmp_path):
-    ring = defined(RingSink(tmp_path / "run.mcap", SECOND))
-    ring.write(3, EPOCH_NS, EPOCH_NS + 1, 0, b"stand")
-    ring.write(4, EPOCH_NS + 2, EPOCH_NS + 2, 0, b"left")
-    ring.write(4, EPOCH_NS + 3, EPOCH_NS + 3, 1, b"right")
-    ring.write(4, EPOCH_NS + 4, EPOCH_NS + 4, 2, b"left")
-    ring.write(3, EPOCH_NS + 5, EPOCH_NS + 5, 1, b"walk")
-    ring.write(1, EPOCH_NS + 6, EPOCH_NS + 6, 0, b"old")
+def test_what_was_in_force_before_the_window_is_carried_to_its_start(ring):
     now_ns = EPOCH_NS + 5 * SECOND
-    ring.write(1, now_ns, now_ns, 1, b"new")
-    ring.write(3, now_ns + 9, now_ns + 9, 2, b"avoid")
-    path = ring.mark("slipped")
-    ring.close(())
+    for channel, t_ns, sequence, payload in [
+        (3, EPOCH_NS + 1, 0, b"stand"),
+        (4, EPOCH_NS + 2, 0, b"left"),
+        (4, EPOCH_NS + 3, 1, b"right"),
+        (4, EPOCH_NS + 4, 2, b"left"),
+        (3, EPOCH_NS + 5, 1, b"walk"),
+        (1, EPOCH_NS + 6, 0, b"old"),
+        (1, now_ns, 1, b"new"),
+        (3, now_ns + 9, 2, b"avoid"),
+    ]:
+        ring.write(channel, t_ns, t_ns, sequence, payload)
+    path = marked(ring, "slipped")
     assert read(path) == [
         (1, now_ns, now_ns, 1, b"new"),
         (3, now_ns, EPOCH_NS + 5, 1, b"walk"),
@@ -122,7 +130,7 @@ def test_what_was_in_force_before_the_window_is_carried_to_its_start(tmp_path):
         (4, now_ns, EPOCH_NS + 3, 1, b"right"),
         (4, now_ns, EPOCH_NS + 4, 2, b"left"),
     ]
-    facts = metadata(path)[MARK_RECORD]
+    facts = metadata_of(path)[MARK_RECORD]
     assert (facts["number"], facts["text"], facts["ring_s"]) == ("1", "slipped", "1.0")
     assert facts["stop_ns"] == str(now_ns + 9)
     carried = {"/gait/mode": EPOCH_NS + 5, "/tf_static": EPOCH_NS + 4}
@@ -157,19 +165,13 @@ def test_every_mark_explains_itself_and_opens_as_a_session(tmp_path):
             assert session.metadata["undulog"]["place"] == "x"
             assert session.attachments["scenario.toml"] == b"a = 1"
             assert session.warnings == []
-            positions = np.array([m.position for m in messages(path, "/joint_states")])
             wanted = np.arange(last - 200, last + 1.0)
-            np.testing.assert_array_equal(positions, np.column_stack([wanted, -wanted]))
-            assert [m.data for m in messages(path, "/gait/mode")] == ["walk"]
-    assert [m.msg for m in messages(path, "/rosout")] == ["late channel"]
-
-
-def messages(path, topic):
-    from mcap_ros2.decoder import DecoderFactory
-
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        return [decoded for *_, decoded in reader.iter_decoded_messages([topic])]
+            np.testing.assert_array_equal(
+                session.joints("/joint_states").values, np.stack([wanted, -wanted])
+            )
+            assert [m.data for _, m in session.messages("/gait/mode")] == ["walk"]
+    with Session(path) as session:
+        assert [m.msg for _, m in session.messages("/rosout")] == ["late channel"]
 
 
 def test_nothing_is_overwritten_and_numbers_go_on(tmp_path):
@@ -177,7 +179,7 @@ def test_nothing_is_overwritten_and_numbers_go_on(tmp_path):
     (tmp_path / "run_mark12.mcap").write_bytes(b"no mark of ours")
     (tmp_path / "other_mark0099.mcap").write_bytes(b"another's")
     ring = defined(RingSink(tmp_path / "run.mcap", SECOND))
-    ring.write(1, EPOCH_NS, EPOCH_NS, 0, b"x")
+    put(ring, (0, b"x"))
     (tmp_path / "run_mark0008.mcap").write_bytes(b"came later")
     assert ring.mark().name == "run_mark0009.mcap"
     assert ring.mark().name == "run_mark0010.mcap"
@@ -220,10 +222,9 @@ def test_a_failed_mark_is_told_once_and_the_ring_goes_on(tmp_path):
 
 def test_close_tells_of_a_failure_that_nobody_heard_of(tmp_path):
     ring = defined(RingSink(tmp_path / "none" / "run.mcap", SECOND))
-    ring.write(1, EPOCH_NS, EPOCH_NS, 0, b"x")
-    ring.mark()
+    put(ring, (0, b"x"))
     with pytest.raises(LogWriteError, match=r"run_mark0001\.mcap"):
-        ring.close(())
+        marked(ring)
     ring.close(())
 
 
@@ -238,7 +239,7 @@ def test_a_full_disk_is_told_and_what_fits_stays(disk_of):
     assert mark.path.stat().st_size > 0
     ring.close(())
     with pytest.raises(LogWriteError, match="closed"):
-        ring.write(1, EPOCH_NS, EPOCH_NS, 0, b"x")
+        put(ring, (0, b"x"))
 
 
 def test_marks_wait_their_turn_and_too_many_are_refused(tmp_path):
@@ -278,39 +279,29 @@ def test_memory_is_bounded_and_what_went_early_is_counted(tmp_path):
     assert ring.dropped == 60_000 - ring.messages
     assert ring.accepted == 60_000
     assert ring.span_ns == (ring.messages - 1) * MS
-    path = ring.mark()
-    ring.close(())
+    path = marked(ring)
     assert sorted(m[3] for m in read(path)) == list(range(ring.dropped, 60_000))
-    assert metadata(path)[MARK_RECORD]["dropped"] == str(ring.dropped)
+    assert metadata_of(path)[MARK_RECORD]["dropped"] == str(ring.dropped)
 
 
 def test_a_message_larger_than_the_bound_is_kept_alone(tmp_path):
     ring = defined(RingSink(tmp_path / "run.mcap", SECOND, max_bytes=1000))
-    ring.write(1, EPOCH_NS, EPOCH_NS, 0, b"x")
-    ring.write(1, EPOCH_NS, EPOCH_NS, 1, b"x" * 5000)
+    put(ring, (0, b"x"), (0, b"x" * 5000))
     assert (ring.messages, ring.dropped) == (1, 1)
     ring.close(())
 
 
-def test_an_empty_ring_makes_an_empty_session(tmp_path):
-    ring = defined(RingSink(tmp_path / "run.mcap", SECOND))
-    path = ring.mark()
-    ring.close(())
-    assert read(path) == []
+def test_an_empty_ring_makes_an_empty_session(ring):
+    assert read(marked(ring)) == []
     (mark,) = ring.marks
     assert (mark.messages, mark.start_ns, mark.stop_ns, mark.error) == (0, None, None, None)
     with pytest.raises(LogWriteError, match="closed"):
         ring.mark()
 
 
-def test_a_log_time_that_goes_back_empties_nothing(tmp_path):
-    ring = defined(RingSink(tmp_path / "run.mcap", SECOND))
-    ring.write(1, EPOCH_NS, EPOCH_NS, 0, b"a")
-    ring.write(1, EPOCH_NS - 10 * SECOND, EPOCH_NS, 1, b"b")
-    ring.write(1, EPOCH_NS + 1, EPOCH_NS, 2, b"c")
-    path = ring.mark()
-    ring.close(())
-    assert sorted(m[4] for m in read(path)) == [b"a", b"b", b"c"]
+def test_a_log_time_that_goes_back_empties_nothing(ring):
+    put(ring, (0, b"a"), (-10 * SECOND, b"b"), (1, b"c"))
+    assert sorted(m[4] for m in read(marked(ring))) == [b"a", b"b", b"c"]
 
 
 def test_a_process_that_ends_without_a_close_still_writes_its_mark(tmp_path):
@@ -326,32 +317,23 @@ def test_a_process_that_ends_without_a_close_still_writes_its_mark(tmp_path):
         "ring.mark()\n"
         "raise SystemExit('gone wrong')\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, timeout=PATIENCE_S, check=False
-    )
-    assert b"gone wrong" in done.stderr
-    assert len(read(Path(tmp_path) / "run_mark0001.mcap")) == 50_000
+    assert "gone wrong" in python(code, timeout=PATIENCE_S).stderr
+    assert len(read(tmp_path / "run_mark0001.mcap")) == 50_000
 
 
-def test_definitions_of_every_kind_come_back(tmp_path):
-    ring = defined(RingSink(tmp_path / "run.mcap", SECOND))
+def test_definitions_of_every_kind_come_back(ring):
     ring.define(Metadata("undulog", {"session_id": "s"}))
     ring.define(Attachment(1, 2, "robot.toml", "application/toml", b"data"))
-    path = ring.mark()
-    ring.close(())
+    path = marked(ring)
     with path.open("rb") as stream:
         reader = make_reader(stream)
-        summary = reader.get_summary()
-        assert [c.topic for c in summary.channels.values()] == [
-            "/a",
-            "/b",
-            "/gait/mode",
-            "/tf_static",
-        ]
-        assert summary.channels[1].metadata == {"unit": "rad"}
+        channels = reader.get_summary().channels
         (attachment,) = reader.iter_attachments()
-        assert (attachment.name, attachment.data) == ("robot.toml", b"data")
-    assert metadata(path)["undulog"] == {"session_id": "s"}
+    topics = ["/a", "/b", "/gait/mode", "/tf_static"]
+    assert [channel.topic for channel in channels.values()] == topics
+    assert channels[1].metadata == {"unit": "rad"}
+    assert (attachment.name, attachment.data) == ("robot.toml", b"data")
+    assert metadata_of(path)["undulog"] == {"session_id": "s"}
 
 
 def test_a_recording_kept_in_a_ring_tells_of_its_marks(tmp_path):

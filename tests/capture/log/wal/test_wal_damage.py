@@ -4,18 +4,17 @@ import itertools
 import os
 import random
 import re
-import select
 import shutil
 import struct
-import subprocess
 import sys
 import tempfile
-import time
 import tracemalloc
 from pathlib import Path
 
 import pytest
 
+from support.damage import damaged_bytes
+from support.kills import killed_after
 from support.wal_messages import CHANNEL, MESSAGE, check_messages, filled, message
 from undulog.capture.common.errors import LogError
 from undulog.capture.log.wal.format import SegmentHeader
@@ -43,55 +42,33 @@ while True:
 )
 
 
-def kill_at(folder, seconds, segment_size, release):
-    """Run the child, kill it that long after its first message; the last position accepted."""
-    command = [sys.executable, "-c", KILLED, str(folder), str(segment_size), release]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as child:
-        pipe = child.stdout.fileno()
-        told = os.read(pipe, 1 << 16)
-        deadline = time.monotonic() + seconds
-        while (left := deadline - time.monotonic()) > 0:
-            if select.select([pipe], [], [], left)[0]:
-                told += os.read(pipe, 1 << 16)
-        child.kill()
-        while rest := os.read(pipe, 1 << 16):
-            told += rest
-    assert child.returncode == -9
-    assert told, "the child did not start"
-    whole = len(told) // 8 * 8
-    return int.from_bytes(told[whole - 8 : whole], "little")
+def slow_kill(run):
+    rng = random.Random(run)
+    size, release = rng.choice([4096, 1 << 14, 1 << 20]), rng.choice(["keep", "release"])
+    return pytest.param(run, size, release, marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize(
     ("run", "segment_size", "release"),
-    [(0, 1 << 22, "keep"), (1, 1 << 14, "keep"), (2, 1 << 14, "release"), (3, 4096, "release")],
+    [
+        (0, 1 << 22, "keep"),
+        (1, 1 << 14, "keep"),
+        (2, 1 << 14, "release"),
+        (3, 4096, "release"),
+        *map(slow_kill, range(4, 34)),
+    ],
 )
 def test_a_kill_loses_no_accepted_message(tmp_path, run, segment_size, release):
-    seconds = random.Random(run).uniform(0.05, 0.4)
-    accepted = kill_at(tmp_path / "w", seconds, segment_size, release)
-    recovery = recover(tmp_path / "w")
+    folder = tmp_path / "w"
+    command = [sys.executable, "-c", KILLED, str(folder), str(segment_size), release]
+    accepted = killed_after(command, random.Random(run).uniform(0.0, 0.5))
+    recovery = recover(folder)
     positions = check_messages(list(recovery))
     assert recovery.missing == 0
-    # The child may have been killed between accepting and telling.
+    # The child may have been killed between accepting and reporting.
     assert positions[-1] in (accepted, accepted + 1)
-    assert recovery.before == 0 if release == "keep" else recovery.before <= accepted - 200
+    assert recovery.before == 0 if release == "keep" else recovery.before <= max(accepted - 200, 0)
     assert len(recovery.definitions) == 3
-
-
-@pytest.mark.slow
-def test_thirty_kills_lose_no_accepted_message(tmp_path):
-    rng = random.Random(11)
-    for run in range(30):
-        folder = tmp_path / str(run)
-        size = rng.choice([4096, 1 << 14, 1 << 20])
-        release = rng.choice(["keep", "release"])
-        accepted = kill_at(folder, rng.uniform(0.0, 0.5), size, release)
-        recovery = recover(folder)
-        positions = check_messages(list(recovery))
-        assert recovery.missing == 0
-        assert positions[-1] in (accepted, accepted + 1)
-        assert recovery.before == 0 if release == "keep" else recovery.before <= accepted - 200
-        shutil.rmtree(folder)
 
 
 # -- damage ----------------------------------------------------------------------------------------
@@ -202,33 +179,15 @@ def damage(rng, folder):
     files = sorted(folder.glob("*.seg"))
     last = max(folder.glob("0*.seg"))
     hit = set()
-    for _ in range(rng.randint(1, 3)):
-        path = rng.choice(files)
+    for path in [rng.choice(files) for _ in range(rng.randint(1, 3))]:
         if not path.exists():
             continue
         hit.add(path.name)
-        raw = bytearray(path.read_bytes())
-        at = rng.randrange(len(raw) + 1)
-        length = rng.choice([1, 2, 8, 64, 512])
-        kind = rng.randrange(6)
-        if kind == 0:  # bytes
-            for _ in range(rng.randint(1, 20)):
-                if raw:
-                    raw[rng.randrange(len(raw))] = rng.randrange(256)
-        elif kind == 1:  # a stretch of noise, zeros or ones
-            noise = rng.choice([rng.randbytes(length), bytes(length), b"\xff" * length])
-            raw[at : at + length] = noise[: len(raw) - at]
-        elif kind == 2:
-            del raw[at:]
-        elif kind == 3:  # bytes lost or doubled: all behind them moves
-            raw[at : at + length] = rng.choice([b"", 2 * raw[at : at + length]])
-        elif kind == 4:  # one block in the place of another
-            start = rng.randrange(len(raw) + 1)
-            raw[at : at + length] = raw[start : start + length]
-        elif path != last:  # that the last one is gone, nothing could tell
+        damaged = damaged_bytes(rng, path.read_bytes(), rng.choice([1, 2, 8, 64, 512]))
+        if damaged is not None:
+            path.write_bytes(damaged)
+        elif path != last:  # a missing last segment leaves no trace
             path.unlink()
-            continue
-        path.write_bytes(raw)
     return hit
 
 

@@ -3,12 +3,11 @@
 import os
 import re
 import resource
-import threading
 import time
 
 import pytest
 
-from support.processes import python, wait_for
+from support.processes import python
 from support.wal_messages import MESSAGE, check_messages, message
 from undulog.capture.common.errors import LogWriteError
 from undulog.capture.log.wal.reader import recover
@@ -16,25 +15,6 @@ from undulog.capture.log.wal.segment import free_bytes, require_space
 from undulog.capture.log.wal.writer import WriteAheadLog
 
 # -- the disk --------------------------------------------------------------------------------
-
-
-def test_syncing_is_done_off_the_appending_thread(tmp_path, monkeypatch):
-    threads = set()
-    for name in ("fsync", "fdatasync"):
-        real = getattr(os, name)
-
-        def noted(file, real=real):
-            threads.add(threading.get_ident())
-            return real(file)
-
-        monkeypatch.setattr(os, name, noted)
-    with WriteAheadLog(tmp_path / "w", sync_interval_s=0.01, segment_size=1 << 16) as wal:
-        for position in range(1, 1001):
-            wal.append(*message(position))
-        wait_for(lambda: wal.synced >= 1000, "nothing was synced")
-        assert threads
-        assert threading.get_ident() not in threads
-        wal.release(1000)
 
 
 def test_a_failing_disk_is_told_by_the_next_append_and_by_close(tmp_path, monkeypatch):

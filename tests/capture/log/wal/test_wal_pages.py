@@ -8,10 +8,10 @@ import time
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 from support.paths import ROOT
 from support.processes import wait_for
+from support.read_back import summary_of
 from support.wal_messages import message
 from undulog.capture import Session
 from undulog.capture.log.messages.frames import empty_frames
@@ -70,8 +70,7 @@ def test_a_recorder_whose_log_is_cut_short_ends_in_good_order(size, tmp_path):
     assert recorder.returncode == 1, said
     assert "000001.seg: was cut short by another program" in said
     assert "Traceback" not in said
-    with output.open("rb") as stream:
-        assert make_reader(stream).get_summary() is not None  # a whole file
+    assert summary_of(output) is not None  # a whole file
     with Session.open(output) as session:
         frames = session.frames("/can/bus")
         np.testing.assert_array_equal(frames["t_device_ns"], np.arange(len(frames)))

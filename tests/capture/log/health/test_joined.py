@@ -4,12 +4,13 @@ from itertools import product
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
-from undulog.capture.log.edit.edited_log import Fault, joined, listed
+from support.foreign_logs import foreign_log
+from support.written_sessions import joint_state
+from undulog.capture.log.health.rules import Fault, joined, listed
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.definitions import message_type, schema_text
+from undulog.capture.log.messages.definitions import message_type
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -21,10 +22,7 @@ TICKS = 400
 def lost(path, *, of_topic=None, whole=True, servos=False):
     """20 s at 20 Hz; in each topic a cycle is lost, or its numbers: 200, or ``of_topic``'s."""
     kind = message_type(JOINT_STATE)
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2", library="test")
-        schema = writer.register_schema(JOINT_STATE, "ros2msg", schema_text(JOINT_STATE).encode())
+    with foreign_log(path, JOINT_STATE) as (writer, schema):
         topics = (*TOPICS, "/joint_commands")
         channels = {topic: writer.register_channel(topic, "cdr", schema) for topic in topics}
         groups = [[name] for name in JOINTS] if servos else [list(JOINTS)]
@@ -34,11 +32,8 @@ def lost(path, *, of_topic=None, whole=True, servos=False):
                 continue
             t_ns = EPOCH_NS + tick * 50_000_000
             values = 0.4 * np.sin(0.1 * tick - np.arange(len(names)))
-            stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
-            position = np.full(len(names), np.nan) if gone else values
-            fields = {"header": {"stamp": stamp}, "name": names, "position": position}
+            fields = joint_state(t_ns, names, np.full(len(names), np.nan) if gone else values)
             writer.add_message(channels[topic], t_ns, encode(kind, fields), t_ns, 0)
-        writer.finish()
     return check_session(path)
 
 
