@@ -118,11 +118,11 @@ def _legend(colors: str, content: Content, *, has_cycles: bool) -> str:
     return " ".join(words)
 
 
-def log_facts(rec: rr.RecordingStream, text: str) -> None:
-    """Write the session's facts."""
+def log_facts(rec: rr.RecordingStream, text: str, entity: str = FACTS) -> None:
+    """Write the session's facts as Markdown."""
     import rerun as rr
 
-    rec.log(FACTS, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+    rec.log(entity, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
 
 
 def _robot(session: SessionView) -> str:

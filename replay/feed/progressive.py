@@ -281,7 +281,7 @@ def _send(task: Task, sink: _Sink, found: Survey, identity: str) -> tuple[str, .
     parts = stretches(session, found.wanted, found.context_ns)
     first = next(parts)
     rec = sink.open(identity)
-    send_properties(rec, session)
+    send_properties(rec, session.session_id, session.start_ns)
     drawing = Drawing(rec, clock, Sources.of(session, found), task.known.named, span=first.span)
     words_first = _words(session) <= _FEW_WORDS
     if words_first:

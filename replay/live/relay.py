@@ -23,7 +23,7 @@ from undulog.capture.common.files import part_file
 from undulog.capture.common.process import StopRequest, interruptible
 from undulog.capture.recorder.live_wire import Kind, LiveMessage, read_records
 
-from ..feed.recording import APPLICATION, recording_id, require_whole
+from ..feed.recording import APPLICATION, recording_id, require_whole, send_properties
 from ..viewer import viewer
 from ..viewer.viewer import Viewer
 from .decode import LiveLog
@@ -248,8 +248,7 @@ class Relay:
         rec.set_log_time_enabled(False)
         rec.set_log_tick_enabled(False)
         self._connect(rec)
-        rec.send_recording_name(f"{session_id} live")
-        rec.send_recording_start_time_nanos(epoch_ns)
+        send_properties(rec, f"{session_id} live", epoch_ns)
         self._rec = rec
         self._sessions.append(session_id)
         return LiveScene(rec, self._log, session_id, epoch_ns)

@@ -20,9 +20,8 @@ from ..draw.scene.body import COMMANDED, LABELS, MARKERS, MEASURED
 from ..draw.scene.stage import TRAIL
 from ..layout import bar_chart, blueprint, build_views, plot, tabs, trail_window
 from ..samples.content import Content, Series
-from .alignment import Align
-from .differences import BARS, DIFFERENCES, LINES, POWER, Quantity
-from .side import COMPARED, Side
+from .draw import BARS, DIFFERENCES, LINES, POWER, Quantity
+from .sessions import COMPARED, Align, Side
 
 FACTS = f"{COMPARED}/facts"
 
@@ -141,7 +140,6 @@ class Shown:
 
     Attributes:
         content: Its own recording's.
-        body: Whether its body is drawn.
         lines: Whether its head, middle or tail was measured.
         differences: Its angles minus the first session's; none of the first.
         apart: Whether the distance of its head from the first one's was written.
@@ -150,11 +148,15 @@ class Shown:
 
     side: Side
     content: Content
-    body: bool
     lines: bool
     differences: tuple[Series, ...] = ()
     apart: bool = False
     bars: tuple[Quantity, ...] = ()
+
+    @property
+    def body(self) -> bool:
+        """Whether its body is drawn."""
+        return self.content.start is not None
 
 
 def build_blueprint(

@@ -29,30 +29,32 @@ from undulog.analysis.compare.compare import Choices, compare_fitted
 from undulog.analysis.compare.side import ComparedSession
 from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import UndulogError
-from undulog.capture.common.files import check_stop, part_file
+from undulog.capture.common.files import check_stop
 from undulog.capture.common.process import StopRequest
 
-from ..draw.plots.joints import log_table, part_entities
+from ..draw.facts import log_facts
+from ..draw.plots.joints import log_table
 from ..draw.scene.body import body_title
-from ..feed.recording import Recording, open_recording, recording_id, require_whole, rerun_writes
-from ..samples.content import Color, Series
-from ..samples.sampling import decimate, interpolate
+from ..feed.recording import Recording, recording_file, recording_id
+from ..samples.content import Color
+from ..samples.sampling import decimate
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
-from ..samples.tracks import Table, Track, join_tracks, pairs
-from . import differences, style
+from ..samples.tracks import Table
+from . import draw
 from . import layout as words
-from .alignment import (
+from .layout import SEPARATE, Found, Shown, build_blueprint
+from .sessions import (
     Align,
-    Aligned,
     Placement,
+    Side,
     align,
-    counterparts,
+    convert,
     head_distance,
+    names_of,
     placement,
     placement_text,
+    read_side,
 )
-from .layout import SEPARATE, Found, Shown, build_blueprint
-from .side import Side, convert, names_of, read_side
 
 _ARROW: Any = pa  # comes without types
 _CHUNK: Any = Chunk
@@ -113,57 +115,10 @@ def _moved(chunk: Any, moves: dict[str, int]) -> Chunk:
     return moved
 
 
-def angle_differences(a: Aligned, b: Aligned, how: Align) -> tuple[Track, ...]:
-    """Measured angles of one session minus those of another.
-
-    Args:
-        a: The session that is subtracted, and whose times count.
-
-    Returns:
-        A track [rad] for each joint that both have; ``b`` is taken on the straight line between
-        its samples, NaN where it has none.
-    """
-    return tuple(
-        Track(one.name, one.t_ns, _taken(a, b, how, one, other) - one.values)
-        for one, other in pairs(a.side.measured, b.side.measured)
-    )
-
-
-def _taken(a: Aligned, b: Aligned, how: Align, track: Track, other: Track) -> np.ndarray:
-    at_ns, known = counterparts(a, b, how, track.t_ns)
-    values = np.full(track.t_ns.size, np.nan)
-    values[known] = interpolate(other.t_ns, other.values, at_ns[known])
-    return values
-
-
-def log_differences(
-    rec: rr.RecordingStream,
-    a: Aligned,
-    entity: str,
-    differences: Sequence[Track],
-    drawn: Sequence[Series],
-) -> tuple[Series, ...]:
-    """Write differences as the angles of the session that was subtracted are drawn.
-
-    Args:
-        a: The session that was subtracted.
-        differences: The differences [rad].
-        drawn: Its measured angles; joints of one series are drawn at common times.
-    """
-    known = {track.name: track for track in differences}
-    parts = [[known[name] for name in one.names if name in known] for one in drawn]
-    tables = [join_tracks(part) for part in parts if part]
-    paths = part_entities(entity, [table.names for table in tables])
-    return tuple(
-        log_table(rec, a.clock, path, table, a.side.palette, degrees=True)
-        for path, table in zip(paths, tables, strict=True)
-    )
-
-
 ANGLES = "/angles"
 """Differences of the measured angles, below a session's own path."""
 
-Layout = Callable[[Sequence[Shown], Sequence[differences.Quantity], Align, str], rrb.Blueprint]
+Layout = Callable[[Sequence[Shown], Sequence[draw.Quantity], Align, str], rrb.Blueprint]
 
 _APART_RATE_HZ = 25.0
 
@@ -183,18 +138,13 @@ class Converted:
     """A session with what was made of it.
 
     Attributes:
-        aligned: The session and its place on the timelines.
-        seen: What a comparison takes from it, or None where it can't be analysed.
+        side: The session and its place on the timelines.
+        seen: Its input of a comparison, or None where it can't be analysed.
     """
 
-    aligned: Aligned
+    side: Side
     recording: Recording
     seen: ComparedSession | None
-
-    @property
-    def side(self) -> Side:
-        """The session."""
-        return self.aligned.side
 
 
 @dataclass(frozen=True)
@@ -238,52 +188,40 @@ def write_overlay(
     Raises:
         LogWriteError: If the file can't be written, or an end was asked for.
     """
-    rr.set_strict_mode(True)
     sides = [one.side for one in sessions]
-    told = [f"{one.side.name}: {said}" for one in sessions for said in one.recording.warnings]
+    warnings = [f"{one.side.name}: {text}" for one in sessions for text in one.recording.warnings]
     found = {one.side.name: _compare(sessions[0], one) for one in sessions[1:]}
     for name, one in found.items():
-        told += [f"{name} (B): {said}" if len(found) > 1 else said for said in one.notes]
-    placements = _placements(sessions, how, place, told)
+        warnings += [f"{name} (B): {text}" if len(found) > 1 else text for text in one.notes]
+    placements = _placements(sessions, how, place, warnings)
     names = [side.name for side in sides]
     identity = recording_id("\n".join([*(side.session_id for side in sides), *names, how, place]))
-    with part_file(path) as draft, rerun_writes(path):
-        rec = open_recording(identity, in_file=True)
-        try:
-            rec.save(draft)
-            rec.send_recording_name(", ".join(names))
-            rec.send_recording_start_time_nanos(sides[0].start_ns)
-            check_stop(path, stop)
-            send(rec, [_chunks(one) for one in sessions])
-            check_stop(path, stop)
-            shown = _log(rec, sessions, found, placements, how)
-            seen = [(one.side, one.seen) for one in sessions if one.seen is not None]
-            quantities = differences.log_bars(rec, seen)
-            title = _title(shown)
-            text = words.markdown(
-                sides,
-                found,
-                how,
-                has_cycles=any(side.rhythm is not None for side in sides),
-                legend=_legend(shown, title),
-                notes=told,
-            )
-            document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
-            rec.log(words.FACTS, document, static=True)
-            rec.send_blueprint(layout(shown, quantities, how, title))
-        finally:
-            rec.disconnect()
-        require_whole(draft, path)
+    with recording_file(path, identity, ", ".join(names), sides[0].start_ns, stop) as rec:
         check_stop(path, stop)
-    return Overlay(path, identity, shown, found, placements, tuple(dict.fromkeys(told)))
+        send(rec, [_chunks(one) for one in sessions])
+        check_stop(path, stop)
+        shown = _log(rec, sessions, found, placements, how)
+        seen = [(one.side, one.seen) for one in sessions if one.seen is not None]
+        quantities = draw.log_bars(rec, seen)
+        title = _title(shown)
+        text = words.markdown(
+            sides,
+            found,
+            how,
+            has_cycles=any(side.rhythm is not None for side in sides),
+            legend=_legend(shown, title),
+            notes=warnings,
+        )
+        log_facts(rec, text, words.FACTS)
+        rec.send_blueprint(layout(shown, quantities, how, title))
+    return Overlay(path, identity, shown, found, placements, tuple(dict.fromkeys(warnings)))
 
 
 def _chunks(one: Converted) -> LazyChunkStream:
     """A session's own recording under its name and on the common timelines."""
-    aligned = one.aligned
-    later_ns = aligned.side.start_ns - aligned.zero_ns
-    entity = aligned.side.entity
-    return chunks_of(one.recording.path, entity, later_ns=later_ns, more_cycles=aligned.cycles)
+    side = one.side
+    later_ns = side.start_ns - side.zero_ns
+    return chunks_of(one.recording.path, side.entity, later_ns=later_ns, more_cycles=side.cycles)
 
 
 def _compare(first: Converted, other: Converted) -> Found:
@@ -299,23 +237,22 @@ def _compare(first: Converted, other: Converted) -> Found:
 
 
 def _placements(
-    sessions: Sequence[Converted], how: Align, place: Place, told: list[str]
+    sessions: Sequence[Converted], how: Align, place: Place, warnings: list[str]
 ) -> dict[str, Placement]:
     """How the other bodies are laid on the first one, with a sentence about each."""
-    bodies = [one.aligned for one in sessions if one.recording.content.start is not None]
+    bodies = [one.side for one in sessions if one.recording.content.start is not None]
     found: dict[str, Placement] = {}
     for one in bodies[1:] if place is Place.START else ():
-        placed = placement(bodies[0], one, how)
-        name, first = one.side.name, bodies[0].side.name
+        placed, first = placement(bodies[0], one, how), bodies[0].name
         if placed is None:
-            told.append(
-                f"{name} and {first} have no body at a shared moment: each in its own world"
+            warnings.append(
+                f"{one.name} and {first} have no body at a shared moment: each in its own world"
             )
         else:
-            found[name] = placed
-            told.append(placement_text(placed, name, first))
+            found[one.name] = placed
+            warnings.append(placement_text(placed, one.name, first))
     if len(bodies) > 1 and place is Place.WORLD:
-        told.append("every body is drawn at the pose of its own session")
+        warnings.append("every body is drawn at the pose of its own session")
     return found
 
 
@@ -328,63 +265,58 @@ def _log(
 ) -> tuple[Shown, ...]:
     """Write all that isn't in the sessions' own recordings."""
     rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    first = sessions[0]
-    content = first.recording.content
-    drawn = differences.log_lines(rec, first.aligned, 0, content.places)
-    shown = [Shown(first.side, content, content.start is not None, drawn)]
+    a, content = sessions[0].side, sessions[0].recording.content
+    shown = [Shown(a, content, draw.log_lines(rec, a, 0, content.places))]
     for rank, one in enumerate(sessions[1:], start=1):
-        a, b, own = first.aligned, one.aligned, one.recording.content
-        comparison = found[b.side.name].comparison
-        placed = placements.get(b.side.name, Placement())
-        places = differences.places_in(b.side, content.places, own.places)
-        drawn = differences.log_lines(rec, b, rank, places)
-        angles = angle_differences(a, b, how)
-        angles = log_differences(rec, a, f"{b.side.own}{ANGLES}", angles, content.measured)
-        apart = _log_apart(rec, (a, b), how, placed, style.tint(rank))
-        bars = differences.log_difference_bars(rec, a.side, b.side, comparison)
-        shown.append(Shown(b.side, own, own.start is not None, drawn, angles, apart, bars))
-    bodies = [k for k, one in enumerate(shown) if one.body]
-    for rank, k in enumerate(bodies):
-        _log_body(rec, sessions[k].aligned, rank, placements)
-    style.log_ends(rec, [sessions[k].aligned for k in bodies])
-    powers = {k: one.side for k, one in enumerate(shown) if one.content.has_power}
-    differences.log_power_names(rec, powers)
+        b, own = one.side, one.recording.content
+        placed = placements.get(b.name, Placement())
+        places = draw.places_in(b, content.places, own.places)
+        lines = draw.log_lines(rec, b, rank, places)
+        angles = draw.angle_differences(a, b, how)
+        angles = draw.log_differences(rec, a, f"{b.own}{ANGLES}", angles, content.measured)
+        apart = _log_apart(rec, (a, b), how, placed, draw.tint(rank))
+        bars = draw.log_difference_bars(rec, a, b, found[b.name].comparison)
+        shown.append(Shown(b, own, lines, angles, apart, bars))
+    bodies = [one.side for one in shown if one.body]
+    for rank, side in enumerate(bodies):
+        _log_body(rec, side, rank, placements)
+    draw.log_ends(rec, bodies)
+    draw.log_power_names(rec, {k: one.side for k, one in enumerate(shown) if one.content.has_power})
     return tuple(shown)
 
 
 def _log_apart(
     rec: rr.RecordingStream,
-    pair: tuple[Aligned, Aligned],
+    pair: tuple[Side, Side],
     how: Align,
     placed: Placement,
     color: Color,
 ) -> bool:
     """How far the heads are apart, where both were tracked."""
     a, b = pair
-    one, other = a.side.head, b.side.head
+    one, other = a.head, b.head
     if one is None or other is None or not (one.tracked and other.tracked):
         return False
     t_ns = one.t_ns[decimate(one.t_ns, _APART_RATE_HZ)]
     apart = head_distance(a, b, how, placed, t_ns)
     known = bool(np.isfinite(apart).any())
     if known:
-        name = f"{b.side.name}, {a.side.name}"
+        name = f"{b.name}, {a.name}"
         table = Table((name,), t_ns, apart[:, None])
-        log_table(rec, a.clock, f"{b.side.own}{SEPARATE}", table, {name: color}, degrees=False)
+        log_table(rec, a.clock, f"{b.own}{SEPARATE}", table, {name: color}, degrees=False)
     return known
 
 
 def _log_body(
-    rec: rr.RecordingStream, one: Aligned, rank: int, placements: Mapping[str, Placement]
+    rec: rr.RecordingStream, side: Side, rank: int, placements: Mapping[str, Placement]
 ) -> None:
-    side = one.side
     if side.head is None or side.robot is None:
         return
-    style.log_name(rec, one, rank, side.head, side.robot)
+    draw.log_name(rec, side, rank, side.head, side.robot)
     if rank:
-        style.log_look(rec, side.entity, rank, side.robot)
+        draw.log_wireframe(rec, side.entity, rank, side.robot)
     if side.name in placements:
-        style.log_placement(rec, side.entity, placements[side.name])
+        draw.log_placement(rec, side.entity, placements[side.name])
 
 
 def _title(shown: Sequence[Shown]) -> str:

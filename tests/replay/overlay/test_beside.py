@@ -20,9 +20,8 @@ from undulog.capture.common.errors import LogWriteError
 from undulog.capture.common.files import check_stop
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.common.process import StopRequest
-from undulog.replay.overlay.alignment import Align, align, times_of
 from undulog.replay.overlay.layout import build_blueprint
-from undulog.replay.overlay.side import convert, read_side
+from undulog.replay.overlay.sessions import Align, align, convert, read_side, times_of
 from undulog.replay.overlay.write import Converted, combine_sessions, write_overlay
 from undulog.replay.samples.timeline import SESSION_TIME, Rhythm
 
@@ -476,7 +475,7 @@ def converted(files, tmp_path_factory):
             read_side(one, name) for one, name in zip(sessions, ("robot", "twin"), strict=True)
         ]
         return [
-            Converted(one, *convert(session, folder / f"{one.side.name}.rrd"))
+            Converted(one, *convert(session, folder / f"{one.name}.rrd"))
             for one, session in zip(align(sides, Align.TIME), sessions, strict=True)
         ]
 
