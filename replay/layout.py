@@ -25,7 +25,7 @@ from .draw import facts
 from .draw.cycles import mean_cycle
 from .draw.cycles.heat_maps import VISIBLE
 from .draw.cycles.steps import SEGMENTS
-from .draw.plots import gait, joints
+from .draw.plots import lines
 from .draw.scene import body
 from .draw.scene import stage as trail
 from .draw.scene.body import body_title
@@ -80,8 +80,8 @@ def build_views(content: Content) -> Views:
     """The views of what a recording holds."""
     words: list[rrb.View] = [rrb.TextDocumentView(name="Session", contents=[facts.FACTS])]
     if content.has_events:
-        words.append(rrb.TextLogView(name="Events", contents=[f"{gait.EVENTS}/**"]))
-    mode = rrb.StateTimelineView(name="Gait mode", contents=[gait.MODE])
+        words.append(rrb.TextLogView(name="Events", contents=[f"{lines.EVENTS}/**"]))
+    mode = rrb.StateTimelineView(name="Gait mode", contents=[lines.MODE])
     about = rrb.TextDocumentView(name="About the mean cycle", contents=[mean_cycle.ABOUT])
     angles, effort = _angle_views(content), _effort_views(content)
     if content.live:  # nothing comes after the cursor
@@ -221,7 +221,7 @@ def _angle_views(content: Content) -> list[rrb.View]:
     if content.places is not None:
         three = len(content.places.names) == 3
         title = "Head, middle, tail [°]" if three else "Angle [°]"
-        views.append(plot(title, [f"{joints.PLACES}/**"]))
+        views.append(plot(title, [f"{lines.PLACES}/**"]))
     for plane in Plane:
         names = _names(content.robot, plane)
         if names & {name for series in content.measured for name in series.names}:

@@ -132,11 +132,9 @@ PLAY_RAD = 0.02
 PLAY_SPREAD_RAD = 0.05
 """Prior standard deviation of a play [rad]."""
 
-_ITERATIONS = 4
-"""Of a fit under another law; it starts from the fit under the twin's."""
+_ITERATIONS = 4  # of a fit under another law; it starts from the fit under the twin's
 
-_MOVES = 1e-3
-"""A joint that moves less shows no play [rad, RMS]."""
+_MOVES = 1e-3  # a joint that moves less shows no play [rad, RMS]
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,7 @@ from .identifiability import Alternative
 from .parameters import Measured
 from .solve import deviations, normal_of, score_covariance, slope_of
 
-_STILL = 1e-3
-"""A joint that moves less has no gain [rad, RMS]."""
+_STILL = 1e-3  # a joint that moves less has no gain [rad, RMS]
 
 
 @dataclass(frozen=True)

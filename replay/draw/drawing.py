@@ -27,7 +27,7 @@ from . import facts
 from .cycles.heat_maps import heat_maps, log_maps
 from .cycles.mean_cycle import Look, log_mean_cycle, read_averaged
 from .cycles.steps import charts, cycle_tables, log_charts, log_current, log_cycles
-from .plots import gait, joints
+from .plots import lines
 from .plots.write import Plots, log_others, log_words
 from .scene.body import body_title
 from .scene.motion import BODY_RATE_HZ, HeadPath, read_head
@@ -90,7 +90,7 @@ def clock_of(session: SessionView) -> Clock:
     phases: tuple[Track, ...] = ()
     if GAIT in session.channels:
         phases = read_columns(session, {GAIT: ["position"]}).get((GAIT, "position"), ())
-    return Clock(session.start_ns, gait.rhythm_of(phases))
+    return Clock(session.start_ns, lines.rhythm_of(phases))
 
 
 class Drawing:
@@ -117,7 +117,7 @@ class Drawing:
         robot = sources.session.robot
         moving = sources.measured or sources.commanded
         self._palette = palette_of(robot, [track.name for track in moving])
-        self._places = joints.head_middle_tail(robot, sources.commanded or sources.measured)
+        self._places = lines.head_middle_tail(robot, sources.commanded or sources.measured)
         self._plots = Plots(rec, clock, sources.found, self._places, self._palette)
         self._head, self._scene = self._open_scene(span)
         self.content = self._written()
@@ -147,8 +147,8 @@ class Drawing:
         """Write modes, events and remarks."""
         rec, clock, session = self._rec, self._clock, self._sources.session
         warnings = self._sources.warnings
-        modes = gait.log_mode(rec, clock, session, warnings)
-        events = gait.log_events(rec, clock, session, warnings)
+        modes = lines.log_mode(rec, clock, session, warnings)
+        events = lines.log_events(rec, clock, session, warnings)
         words = log_words(rec, clock, session)
         self.content = replace(self.content, modes=modes, has_events=events or words)
 
@@ -290,8 +290,8 @@ def palette_of(robot: Robot | None, names: Sequence[str]) -> dict[str, entities.
         Colour by joint name; joints that the robot doesn't have are grey.
     """
     if robot is None:
-        return joints.joint_palette(names)
-    return dict.fromkeys(names, entities.GREY) | joints.joint_palette(robot.joint_names)
+        return lines.joint_palette(names)
+    return dict.fromkeys(names, entities.GREY) | lines.joint_palette(robot.joint_names)
 
 
 def start_of(head: HeadPath) -> Start | None:

@@ -183,8 +183,8 @@ def _stream(
 SIDES = (160, 2160)
 """Shortest and longest side of a clip [pixels]."""
 
+# What this viewer draws around a single view [pixels]; measured again where it does not.
 _FRAME = (7, 71)
-"""What this viewer draws around a single view [pixels]; measured again where it does not."""
 _SAMPLES = 8
 
 

@@ -31,7 +31,7 @@ from ..draw.cycles import mean_cycle
 from ..draw.cycles.heat_maps import POWER
 from ..draw.cycles.steps import CYCLES
 from ..draw.drawing import Drawing, Sources, clock_of
-from ..draw.plots.gait import MODE
+from ..draw.plots.lines import MODE
 from ..draw.scene.motion import BODY_RATE_HZ
 from ..layout import build_blueprint, build_views
 from ..samples.content import (
@@ -126,10 +126,8 @@ def _mean_series(kind: str, names: tuple[str, ...]) -> tuple[Series, ...]:
     return (Series(f"{mean_cycle.ENSEMBLE}/{kind}", names),) if names else ()
 
 
-_TAKE_S = 0.1
-"""How long to wait for the viewer between two looks at whether it is still wanted [s]."""
-_FEW_WORDS = 5000
-"""Modes and events that are read before the first picture, at most."""
+_TAKE_S = 0.1  # how long to wait for the viewer between two looks at whether it is still wanted [s]
+_FEW_WORDS = 5000  # modes and events that are read before the first picture, at most
 
 
 class NoLongerWantedError(Exception):

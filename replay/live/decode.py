@@ -25,10 +25,12 @@ from undulog.capture.recorder.live_wire import LiveMessage
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Robot
 
-from ..draw.plots.gait import MODE
+from ..draw.plots.lines import MODE
 from ..draw.scene.motion import POSE, HeadPath, tracked_head
-from ..samples.sampling import ordered
-from ..samples.tracks import JOINT_STATE, OFFSETS, Columns, Track, without_filler
+from ..samples.tracks import JOINT_STATE, OFFSETS, Columns, Track, ordered, without_filler
+
+PATIENCE_NS = 250_000_000
+"""How long a quantity without new samples delays those computed from it [ns]."""
 
 _OFFSETS_KEPT = 64
 

@@ -19,11 +19,10 @@ from undulog.capture.common.arrays import FloatArray
 
 from ..draw.cycles.heat_maps import POWER
 from ..draw.cycles.steps import CYCLES, SEGMENTS
-from ..draw.plots.joints import DEGREES, log_look, log_rows, part_entities
+from ..draw.plots.lines import DEGREES, log_look, log_rows, part_entities
 from ..samples.content import GAIN, LAG, SCALARS, Chart, Color, Quantity, Series
-from ..samples.sampling import GAP_STEPS, mark_gaps, typical_step_ns
 from ..samples.timeline import SESSION_TIME, Clock
-from ..samples.tracks import Table, Track, tables
+from ..samples.tracks import GAP_STEPS, Table, Track, mark_gaps, tables, typical_step_ns
 from .cycles import Cycle
 
 
@@ -86,7 +85,7 @@ class LivePlot:
             entity: E.g. ``/joints/measured``.
             degrees: Whether the values are angles [rad], to be plotted in degrees.
             component: What is written; None for ``Angle:degrees`` or ``Scalars:scalars``.
-            look: As :func:`~.replay.draw.plots.joints.log_look` takes it.
+            look: As :func:`~.replay.draw.plots.lines.log_look` takes it.
         """
         self._entity, self._degrees = entity, degrees
         self._component = component or (DEGREES if degrees else SCALARS)

@@ -41,31 +41,24 @@ def open_window() -> Viewer:
     Raises:
         UndulogError: If it doesn't start.
     """
-    return _ready(viewer.open_window(_WINDOW))
+    window = viewer.open_window(_WINDOW)
+    window.wait_until_it_listens()
+    return window
 
 
 def open_server(notify: Callable[[str], None]) -> Viewer:
     """Serve the viewer to browsers on this machine.
 
     Args:
-        tell: Called with the address to open, once it is served.
+        notify: Called with the address to open, once it is served.
 
     Raises:
         UndulogError: If it doesn't start.
     """
     server, page = viewer.open_server(_SERVER)
-    _ready(server)
+    server.wait_until_it_listens()
     notify(page)
     return server
-
-
-def _ready(started: Viewer) -> Viewer:
-    try:
-        started.wait_until_it_listens()
-    except BaseException:
-        started.close()
-        raise
-    return started
 
 
 BATCH_S = 0.03
@@ -78,8 +71,8 @@ _FLUSH_S = 1.0
 _GRACE_S = 3.0
 _LOOK_S = 0.05
 
+# Streams whose viewer takes nothing: to let go of one would wait for it.
 _HELD: list[LiveStream] = []
-"""Streams whose viewer takes nothing: to let go of one would wait for it."""
 
 Connect = Callable[[rr.RecordingStream], None]
 """Gives a recording stream its sink."""

@@ -32,14 +32,21 @@ from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.robot.model import Robot
 
 from ..draw.cycles.steps import bar_of, log_bar
-from ..draw.plots.joints import log_look, log_rows, log_table, part_entities
+from ..draw.plots.lines import log_look, log_rows, log_table, part_entities
 from ..draw.scene.body import MEASURED, MESHES, meshed
 from ..draw.scene.motion import HeadPath
 from ..draw.scene.stage import TRAIL
 from ..samples.content import GREY, TOTAL, Bar, Color, Places, Series, line_title
-from ..samples.sampling import decimate, interpolate, mark_gaps, typical_step_ns
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
-from ..samples.tracks import Track, join_tracks, pairs
+from ..samples.tracks import (
+    Track,
+    decimate,
+    interpolate,
+    join_tracks,
+    mark_gaps,
+    pairs,
+    typical_step_ns,
+)
 from .sessions import COMPARED, Align, Placement, Side, counterparts
 
 _SNAKE = "/world/snake"
@@ -47,8 +54,8 @@ NAME = f"{_SNAKE}/name"
 
 _WHITE: Color = (236, 236, 240, 255)
 _TINTS: tuple[Color, ...] = (_WHITE, (240, 140, 200, 255), (176, 150, 250, 255))
+# Mesh and line radius [points] of the second body, the third, and so on in turn.
 _WIRES = ((FillMode.MajorWireframe, 1.0), (FillMode.DenseWireframe, 0.4))
-"""Mesh and line radius [points] of the second body, the third, and so on in turn."""
 _NAME_RATE_HZ = 25.0
 _LIFT_RADII, _LIFT, _TIER = 5.0, 0.05, 0.08
 _MESH_OPACITY = 90
@@ -151,40 +158,16 @@ _DASH_S, _SPACE_S = (0.1, 0.04, 0.2), 0.06
 _WIDTH = 2.0
 
 
-@dataclass(frozen=True)
-class Dashes:
-    """A dashed line's rhythm in samples."""
+def _dashed(values: FloatArray, t_ns: IntArray, rank: int) -> FloatArray:
+    """Replace the spaces of a dashed line by NaN; each session has dashes of its own length.
 
-    drawn: int
-    left_out: int
-
-
-def dashes_of(t_ns: IntArray, place: int) -> Dashes:
-    """How a line is dashed.
-
-    Args:
-        t_ns: Sampling times [ns].
-        place: Which session it is, 1 for the second: each has dashes of a length of its own.
-
-    Returns:
-        At least two samples a dash, which make a piece of line, and one a space.
+    A dash has at least two samples, which make a piece of line, and a space has one.
     """
     step_s = max(typical_step_ns(t_ns), 1) * 1e-9
-    long = _DASH_S[(place - 1) % len(_DASH_S)]
-    return Dashes(max(round(long / step_s), 2), max(round(_SPACE_S / step_s), 1))
-
-
-def dashed(values: FloatArray, dashes: Dashes) -> FloatArray:
-    """Leave spaces in a line.
-
-    Args:
-        values: Shape (n, k).
-
-    Returns:
-        Shape (n, k), NaN in the spaces.
-    """
-    place = np.arange(len(values)) % (dashes.drawn + dashes.left_out)
-    return np.where((place < dashes.drawn)[:, None], values, np.nan)
+    drawn = max(round(_DASH_S[(rank - 1) % len(_DASH_S)] / step_s), 2)
+    left_out = max(round(_SPACE_S / step_s), 1)
+    is_drawn = np.arange(len(values)) % (drawn + left_out) < drawn
+    return np.where(is_drawn[:, None], values, np.nan)
 
 
 def places_in(other: Side, first: Places | None, own: Places | None) -> Places | None:
@@ -219,7 +202,7 @@ def log_lines(rec: rr.RecordingStream, one: Side, rank: int, places: Places | No
         log_look(rec, entity, [name], one.palette, titles={name: title}, width=_WIDTH)
         t_ns, values = mark_gaps(track.t_ns, track.values[:, None])
         if rank:
-            values = dashed(values, dashes_of(track.t_ns, rank))
+            values = _dashed(values, track.t_ns, rank)
         log_rows(rec, one.clock, entity, t_ns, values, degrees=True)
     return bool(tracks)
 
@@ -243,8 +226,7 @@ DIFFERENCES = "/segments"
 _WIDE, _NARROW = 0.5, 0.26
 _ALL = _WIDE + _NARROW
 _WHISKER = 0.25  # of the bar's width
-_SEEN = 0.02
-"""A whisker is drawn if it ends further from its bar's end than this share of the bar."""
+_SEEN = 0.02  # a whisker is drawn if it ends further from its bar's end than this share of the bar
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from undulog.analysis.results.formats import short, utc
 
 from ..draw.facts import FACTS as SESSION
 from ..draw.facts import code, document, escaped, listed
-from ..draw.plots import gait
+from ..draw.plots import lines
 from ..draw.scene import stage as ranges
 from ..draw.scene.body import COMMANDED, LABELS, MARKERS, MEASURED
 from ..draw.scene.stage import TRAIL
@@ -130,8 +130,7 @@ def _changes(first: Side, other: Side, changed: Sequence[Change]) -> str:
 SEPARATE = "/head_distance"
 """Distance of the heads, below a session's own path."""
 
-_HIDDEN = (COMMANDED, MARKERS, LABELS, ranges.RANGES)
-"""What is drawn of the first body only."""
+_HIDDEN = (COMMANDED, MARKERS, LABELS, ranges.RANGES)  # what is drawn of the first body only
 
 
 @dataclass(frozen=True)
@@ -264,7 +263,7 @@ def _words(shown: Sequence[Shown]) -> list[rrb.View]:
         rrb.TextDocumentView(name=one.side.name, contents=[f"{one.side.entity}{SESSION}"])
         for one in shown
     ]
-    events = [f"{one.side.entity}{gait.EVENTS}" for one in shown if one.content.has_events]
+    events = [f"{one.side.entity}{lines.EVENTS}" for one in shown if one.content.has_events]
     if events:
         found.append(rrb.TextLogView(name="Events", contents=events))
     return found

@@ -33,13 +33,12 @@ from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternio
 from undulog.capture.robot.model import Robot
 
 from ..draw.drawing import palette_of
-from ..draw.plots.gait import rhythm_of
+from ..draw.plots.lines import rhythm_of
 from ..draw.scene.motion import HeadPath, read_head
 from ..feed.recording import Recording, write_recording
 from ..samples.content import Color
-from ..samples.sampling import gaps, interpolate
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME, Clock, Rhythm
-from ..samples.tracks import Track, read_columns, resampled, wanted_fields
+from ..samples.tracks import Track, gaps, interpolate, read_columns, resampled, wanted_fields
 
 COMPARED = "/compared"
 """Where everything goes that belongs to no single session."""
@@ -282,14 +281,11 @@ def _aligned(side: Side, how: Align) -> Side:
     return replace(side, zero_ns=zero_ns, cycles=-int(np.floor(rhythm.cycles[0])))
 
 
-_LOOK_AT = 1000
-"""Samples of the head among which a first moment is looked for."""
+_LOOK_AT = 1000  # samples of the head among which a first moment is looked for
 
-_ROTATION = 0.99
-"""A quaternion shorter than this is none."""
+_ROTATION = 0.99  # a quaternion shorter than this is none
 
-_INSTANTS = 48
-"""Of a cycle, at which a body's direction is taken."""
+_INSTANTS = 48  # of a cycle, at which a body's direction is taken
 
 _SAME_M, _SAME_RAD = 1e-3, math.radians(0.1)
 

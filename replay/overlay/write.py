@@ -33,13 +33,12 @@ from undulog.capture.common.files import check_stop
 from undulog.capture.common.process import StopRequest
 
 from ..draw.facts import log_facts
-from ..draw.plots.joints import log_table
+from ..draw.plots.lines import log_table
 from ..draw.scene.body import body_title
 from ..feed.recording import Recording, recording_file, recording_id
 from ..samples.content import Color
-from ..samples.sampling import decimate
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
-from ..samples.tracks import Table
+from ..samples.tracks import Table, decimate
 from . import draw
 from . import layout as words
 from .layout import SEPARATE, Found, Shown, build_blueprint
@@ -58,8 +57,7 @@ from .sessions import (
 
 _ARROW: Any = pa  # comes without types
 _CHUNK: Any = Chunk
-_AHEAD = 32
-"""Chunks that may wait to be written."""
+_AHEAD = 32  # chunks that may wait to be written
 
 _PROPERTIES = "/__properties/**"
 

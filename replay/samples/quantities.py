@@ -10,8 +10,7 @@ import rerun as rr
 from undulog.capture.common.arrays import FloatArray
 
 from .content import COMMANDED, ERROR, MEASURED, MECHANICAL, TOTAL
-from .sampling import hold, interpolate
-from .tracks import Columns, Track, pairs
+from .tracks import Columns, Track, hold, interpolate, pairs
 
 
 def tracking_errors(measured: Sequence[Track], commanded: Sequence[Track]) -> tuple[Track, ...]:

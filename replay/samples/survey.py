@@ -19,30 +19,30 @@ from undulog.capture.robot.model import Robot
 
 from .content import MEASURED, MECHANICAL
 from .quantities import power_limit, quantities, segment_power
-from .sampling import GAP_STEPS, decimate, interpolate, typical_step_ns
 from .timeline import STRETCH_NS, stretches
 from .tracks import (
+    GAP_STEPS,
     OFFSETS,
     Columns,
     Track,
+    decimate,
     in_turn,
+    interpolate,
     one_after_another,
     read_columns,
     resampled,
+    typical_step_ns,
     wanted_fields,
 )
 
 GAIT = "/gait"
 
-_KEPT = 4000
-"""Samples of each line that are kept, about."""
+_KEPT = 4000  # samples of each line that are kept, about
 _CONTEXT_NS = (500_000_000, 60_000_000_000)
 _REACH_STEPS = 1.2 * GAP_STEPS
 
-_LOOKS = 8
-"""How many stretches after the first one are looked into where not all is read, at most."""
-_LOOK_NS = 2_000_000_000
-"""How long is looked into each of them [ns]."""
+_LOOKS = 8  # how many stretches after the first one are looked into where not all is read, at most
+_LOOK_NS = 2_000_000_000  # how long is looked into each of them [ns]
 
 
 @dataclass(frozen=True)

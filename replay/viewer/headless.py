@@ -20,8 +20,8 @@ from .viewer import Viewer
 _START_S = 60.0
 _REST_S = 30.0
 _LOOK_AGAIN_S = 0.2
+# Equal pictures in a row of the empty window after which its greetings are over.
 _GREETINGS_GONE = 8
-"""Equal pictures in a row of the empty window after which its greetings are over."""
 
 
 class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):

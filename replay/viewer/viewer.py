@@ -27,8 +27,8 @@ WHOLE_IN_MEMORY = "--server-memory-limit=75%"
 """A server keeps the whole recording for browsers that come late, whatever memory that takes: by
 Rerun's own limit, 1 GiB, a session of some hours would lose its beginning."""
 
+# A window holds the recording itself: what its own server keeps beside that is there twice.
 _PASSING_ON = "--server-memory-limit=64MB"
-"""A window holds the recording itself: what its own server keeps beside that is there twice."""
 
 _START_S = 60.0
 _LOOK_S = 0.05
@@ -110,19 +110,22 @@ class Viewer(AbstractContextManager["Viewer"]):
         return self._process.poll() is not None
 
     def wait_until_it_listens(self) -> None:
-        """Wait until data can be sent to it.
+        """Wait until data can be sent to it; close it if that fails.
 
         Raises:
             UndulogError: If it ends before, or doesn't start.
         """
         deadline = time.monotonic() + _START_S
-        while not _listens(self._port):
-            if self.ended:
-                self.check()
-                raise UndulogError("the Rerun viewer ended before it showed anything")
-            if time.monotonic() > deadline:
-                raise UndulogError(f"the Rerun viewer did not start within {_START_S:g} s")
-            time.sleep(_LOOK_S)
+        with ExitStack() as on_failure:
+            on_failure.callback(self.close)
+            while not _listens(self._port):
+                if self.ended:
+                    self.check()
+                    raise UndulogError("the Rerun viewer ended before it showed anything")
+                if time.monotonic() > deadline:
+                    raise UndulogError(f"the Rerun viewer did not start within {_START_S:g} s")
+                time.sleep(_LOOK_S)
+            on_failure.pop_all()
 
     def wait(self, stop: StopRequest) -> None:
         """Wait until it has ended, or an end is asked for.

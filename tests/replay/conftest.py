@@ -2,7 +2,7 @@
 
 import io
 import math
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -206,21 +206,20 @@ class Recorded:
         """Paths of all entities."""
         return {chunk.entity_path for chunk in self._chunks}
 
+    def statics(self, entity, component):
+        """Values of a static component, a list each."""
+        own = (one for one in self._chunks if one.entity_path == entity and one.is_static)
+        batches = (chunk.to_record_batch() for chunk in own)
+        return [b.column(component).to_pylist()[0] for b in batches if component in b.schema.names]
+
     def static(self, entity, component):
-        """Value of a static component, a list."""
-        for chunk in self._chunks:
-            if chunk.entity_path == entity and chunk.is_static:
-                batch = chunk.to_record_batch()
-                if component in batch.schema.names:
-                    return batch.column(component).to_pylist()[0]
-        raise KeyError(f"{entity} has no static {component}")
+        """First value of a static component, a list."""
+        return next(iter(self.statics(entity, component)))
 
     def column(self, entity, component):
         """Rows of a component in file order: a list of lists."""
-        rows = []
-        for batch in self._temporal(entity):
-            rows += batch.column(component).to_pylist()
-        return rows
+        batches = self._temporal(entity)
+        return [row for batch in batches for row in batch.column(component).to_pylist()]
 
     def rows(self, entity, component):
         """Session time [ns] to values, in order; rows without any are left out."""
@@ -307,3 +306,17 @@ def rgb():
     from PIL import Image
 
     return lambda png: np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+
+
+@pytest.fixture(scope="session")
+def sizes(rgb):
+    """Height and width of each view that isn't behind a tab."""
+
+    def in_front(viewer):
+        found = []
+        for name in viewer.views:
+            with suppress(ConnectionError):  # behind a tab
+                found.append(rgb(viewer.picture(name)).shape[:2])
+        return found
+
+    return in_front

@@ -34,8 +34,8 @@ SIZE = (360.0, 300.0)
 VISIBLE = ((-50.0, SIZE[0] + 10.0), (-8.0, SIZE[1] + 84.0))
 """What a view of a map shows: its x and its y [scene units]."""
 
+# Smallest span of the colours: noise isn't magnified.
 _LEAST = {GAIN.key: 0.5, LAG.key: 0.5, POWER.key: 1.0}
-"""Smallest span of the colours: noise isn't magnified."""
 
 _NOTHING = (34, 34, 38)
 _STROKE = (110, 110, 116, 255)

@@ -46,7 +46,7 @@ from ...samples.content import (
 from ...samples.timeline import Clock
 from ...samples.tracks import Track
 from ...samples.tracks import tables as tables_of
-from ..plots.joints import log_look, log_rows, part_entities
+from ..plots.lines import log_look, log_rows, part_entities
 
 CYCLES = "/cycles"
 

@@ -32,17 +32,19 @@ from ...samples.content import (
     Signal,
 )
 from ...samples.quantities import SIGNALS, quantities, topic_entity
-from ...samples.sampling import mark_gaps, ordered, plot_step
 from ...samples.survey import Survey
 from ...samples.timeline import Clock, Span, Stretch, stretch_length_ns
-from ...samples.tracks import JOINT_STATE, Track, join_tracks
-from .gait import EVENTS, INFO, changes, log_texts
-from .joints import (
+from ...samples.tracks import JOINT_STATE, Track, join_tracks, mark_gaps, ordered, plot_step
+from .lines import (
     DEGREES,
+    EVENTS,
+    INFO,
     PLACES,
+    changes,
     joint_palette,
     log_look,
     log_rows,
+    log_texts,
     log_total_look,
     part_entities,
     places_look,
@@ -56,8 +58,7 @@ MOST_LINES = 12
 
 _WORDS = "std_msgs/msg/String"
 _SHOWN_ELSEWHERE = {"/gait/mode", "/rosout", "/robot_description"}
-_TAKE_TURNS = {"tf2_msgs/msg/TFMessage"}
-"""Types whose messages are each about something else."""
+_TAKE_TURNS = {"tf2_msgs/msg/TFMessage"}  # types whose messages are each about something else
 _NOT_PLOTTED = ("covariance", "stamp", "layout", "header")
 
 

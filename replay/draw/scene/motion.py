@@ -14,8 +14,16 @@ from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternio
 from undulog.capture.robot.model import Robot
 
 from ...samples.quantities import mechanical_power
-from ...samples.sampling import decimate, hold, interpolate, mark_gaps, ordered
-from ...samples.tracks import Columns, Track, resampled
+from ...samples.tracks import (
+    Columns,
+    Track,
+    decimate,
+    hold,
+    interpolate,
+    mark_gaps,
+    ordered,
+    resampled,
+)
 
 BODY_RATE_HZ = 50.0
 SPARSE_RATE_HZ = 25.0
@@ -107,35 +115,17 @@ class HeadPath:
         return HeadPath(self.t_ns[rows], self.position[rows], self.quaternion[rows], self.tracked)
 
 
-@dataclass(frozen=True)
-class Frames:
-    """When the body is drawn, and where its head was then.
-
-    Attributes:
-        head: The head's path at most 50 times a second, on its own sampling times; a row of NaN
-            in each gap.
-        sparse: Which of these rows, no more than 25 a second, are drawn of what moves beside the
-            body, shape (n,).
-    """
-
-    head: HeadPath
-    sparse: BoolArray
-
-    def between(self, rows: slice) -> Frames:
-        """Some of them.
-
-        Returns:
-            These only.
-        """
-        return Frames(self.head.at(rows), self.sparse[rows])
-
-
-def frames_of(head: HeadPath, end_ns: int) -> Frames:
+def frames_of(head: HeadPath, end_ns: int) -> tuple[HeadPath, BoolArray]:
     """Choose when the body is drawn.
 
     Args:
         head: The head's path.
         end_ns: The session's end [ns].
+
+    Returns:
+        The path at most 50 times a second, on its own sampling times, with a row of NaN in each
+        gap; and which of these rows, no more than 25 a second, are drawn of what moves beside the
+        body, shape (n,).
     """
     chosen = head.at(decimate(head.t_ns, BODY_RATE_HZ))
     t_ns, pose = mark_gaps(chosen.t_ns, chosen.pose, end_ns)
@@ -143,7 +133,7 @@ def frames_of(head: HeadPath, end_ns: int) -> Frames:
     sparse[decimate(t_ns, SPARSE_RATE_HZ)] = True
     # A gap ends whatever is drawn.
     sparse |= np.isnan(pose).any(axis=1)
-    return Frames(HeadPath.of(t_ns, pose, tracked=head.tracked), sparse)
+    return HeadPath.of(t_ns, pose, tracked=head.tracked), sparse
 
 
 def read_head(

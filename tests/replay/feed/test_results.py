@@ -186,7 +186,8 @@ def marked(session_file, analysis, comparison, tmp_path, read_back):
     return read_back(tmp_path / "a.rrd")
 
 
-def test_named_modules_are_marked_on_the_body(marked, snake25, truth):
+def test_named_modules_are_marked_on_the_body(marked, recording, snake25, truth):
+    assert not any("named" in path for path in recording[1].entities)  # without results
     assert marked.column("/world/snake/named", "Points3D:labels")[0] == ["joint05"]
     assert marked.static("/world/snake/named", "Points3D:colors") == [PINK]
     # Above the axis of joint 5, between links 5 and 6.
@@ -203,11 +204,6 @@ def test_named_modules_are_marked_at_their_bars_and_in_words(marked):
     words = marked.static("/session", "TextDocument:text")[0]
     assert "**Named, pink in the pictures:** joint05 (answers differently" in words
     assert "- gain, lag and energy are those of made.json" in words
-
-
-def test_without_results_nothing_is_marked(recording):
-    _, recorded = recording
-    assert not any("named" in path for path in recorded.entities)
 
 
 def test_results_and_tabs_are_of_one_session(session_file, tmp_path, view):
