@@ -77,10 +77,10 @@ HARMONICS = 5
 """Of the gait that are looked at."""
 
 BETWEEN = 3
-"""Frequencies to each side of a harmonic, one resolution 1/T apart, that tell the noise's level."""
+"""Frequencies to each side of a harmonic, one resolution 1/T apart, that give the noise level."""
 
 FEWEST_CYCLES = 3.0
-"""Cycles from which lines can be told from what is between them."""
+"""Least number of cycles that separates the lines from the noise between them."""
 
 LAGS = 20
 """Of the test of Ljung and Box."""

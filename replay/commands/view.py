@@ -222,7 +222,7 @@ def _report_live(report: RelayReport, save: Path | None, *, json: bool) -> None:
 
 
 def _view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
-    """Show a session until the viewer is closed or an end is asked for."""
+    """Show a session until the viewer is closed or a stop is requested."""
     if not web:
         viewer.require_display()
     with ExitStack() as stack:

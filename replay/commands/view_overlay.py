@@ -27,7 +27,7 @@ def view_overlay(
     web: bool,
     json: bool,
 ) -> None:
-    """See sessions side by side.
+    """Show or save sessions side by side.
 
     Args:
         files: Two or more sessions.

@@ -24,7 +24,7 @@ _MARKUP = re.compile(r"([\\`*_{}\[\]<>()#+!|~&$])")
 
 
 def escaped(text: str) -> str:
-    """Text with names from a log, as part of Markdown.
+    """Escape text with names from a log for Markdown.
 
     Returns:
         One line of Markdown that shows it and marks nothing up.
@@ -33,7 +33,7 @@ def escaped(text: str) -> str:
 
 
 def code(text: str) -> str:
-    """A name from a log as code in Markdown, in a table too.
+    """Return a name from a log as a code span of Markdown, valid in tables too.
 
     Returns:
         A code span of one line; the text itself where it has a backtick.
@@ -52,7 +52,7 @@ def markdown(
     has_cycles: bool,
     awaited: bool = False,
 ) -> str:
-    """What a reader needs beside the picture.
+    """Return the text that is shown beside the picture, as Markdown.
 
     Args:
         analysis: Its analysis, or None where there is none.

@@ -53,7 +53,7 @@ class Recording:
 
 
 def recording_id(session_id: str) -> str:
-    """The recording's id, the same for the same session on every machine.
+    """Return the recording's id, the same for the same session on every machine.
 
     Args:
         session_id: The session's id.
@@ -82,7 +82,7 @@ def write_recording(
             out.
         steady: The cycles of its steady gait, for a session whose phase was not logged.
         named: Modules that tests name, to be marked.
-        notes: What the caller has to say about the session, a sentence each.
+        notes: The caller's notes on the session, a sentence each.
         layout: Makes the blueprint from what the recording holds.
 
     Raises:
@@ -136,7 +136,7 @@ def recording_file(
 
 
 def open_recording(identity: str, *, in_file: bool = False) -> rr.RecordingStream:
-    """A recording stream for a session, without a sink.
+    """Return a recording stream for a session, without a sink.
 
     Args:
         identity: The recording's id.

@@ -50,7 +50,7 @@ class Cycle:
         start_ns: Its start [Unix ns].
         stop_ns: Its end [Unix ns].
         names: The joints, head to tail.
-        gain: Response over command, NaN where the cycle tells nothing, shape (m,).
+        gain: Response over command, NaN where it can't be computed, shape (m,).
         lag_rad: Positive where the response is late [rad], shape (m,).
         power_w: Mean mechanical power [W], NaN where it isn't known, shape (m,).
     """
@@ -109,7 +109,7 @@ class CycleMeter:
         """Take new samples.
 
         Args:
-            robot: The robot, which says what plane a joint is of; None where it isn't known.
+            robot: The robot, for the joints' planes; None where it isn't known.
 
         Returns:
             The cycles that have become known.

@@ -1,8 +1,8 @@
 """The relay's end of the live feed: a socket that is read at once, and a bounded queue.
 
-A thread reads the socket, so that a slow picture doesn't fill it; when the queue is full the oldest
-messages go. It looks a hundred times a second rather than waits: to wake a process that waits is
-what makes a send dear, and the recorder would pay for it.
+A thread reads the socket, so that slow drawing doesn't fill it; when the queue is full the oldest
+messages are dropped. It polls a hundred times a second instead of blocking: a send that wakes a
+blocked process costs the recorder time.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Inbox(AbstractContextManager["Inbox"]):
                 self.path.unlink()
 
     def take(self) -> list[Datagram]:
-        """What has come since the last time, in order."""
+        """Take the datagrams received since the last call, in order."""
         with self._lock:
             taken = list(self._queue)
             self._queue.clear()
@@ -119,12 +119,12 @@ class Inbox(AbstractContextManager["Inbox"]):
 
 
 def _said(datagram: Datagram) -> bytes:
-    """What tells definitions from their repetition: all but the counter in the head."""
+    """Return a definition's key, the same for its repetitions: all but the counter in the head."""
     return bytes([datagram.head.kind]) + datagram.data[HEAD_SIZE:]
 
 
 def _bind(path: Path) -> tuple[socket.socket, int]:
-    """A socket of that name which only its owner may write to, and its inode."""
+    """Bind a socket that only its owner may write to; return it and its inode."""
     if path.exists() and not path.is_socket():
         raise UsageError(f"{path} is there and is no socket; choose another name")
     if path.is_socket() and _answers(path):

@@ -27,7 +27,7 @@ from .cycles import Cycle
 
 
 class LiveStream(rr.RecordingStream):
-    """A recording stream that says a static thing once, and again only when it has changed."""
+    """A recording stream that logs static data only when they change."""
 
     def __init__(self, application_id: str, recording_id: str) -> None:
         """Make a stream that isn't connected yet."""
@@ -96,7 +96,7 @@ class LivePlot:
 
     @property
     def series(self) -> tuple[Series, ...]:
-        """What has been written."""
+        """The series that have been written."""
         paths = part_entities(self._entity, self._parts)
         pairs = zip(paths, self._parts, strict=True)
         return tuple(Series(path, part, self._component) for path, part in pairs)
@@ -135,7 +135,7 @@ class LivePlot:
                 log_rows(rec, clock, path, t_ns, values, degrees=self._degrees, component=component)
 
     def _with_gap(self, path: str, table: Table) -> Table:
-        """A row of NaN before the samples where there was a gap, which ends the line."""
+        """Insert a row of NaN before the samples after a gap, which ends the line."""
         last_ns, step_ns = self._last.get(path, (0, 0))
         first_ns = int(table.t_ns[0])
         self._last[path] = (int(table.t_ns[-1]), typical_step_ns(table.t_ns) or step_ns)
@@ -192,7 +192,7 @@ class CycleBars:
         *,
         everything: bool = False,
     ) -> None:
-        """Draw what waits, at the time at which its cycle started.
+        """Draw waiting cycles, at the times at which they started.
 
         Args:
             palette: Colour by joint name, head to tail.

@@ -1,9 +1,9 @@
 """The relay: reads a recorder's live feed and draws it in Rerun, in a process of its own.
 
-A viewer that is frozen makes Rerun wait for ever once some hundred megabytes lie before it. That
-happens here, in a thread that does nothing else, and never in the recorder: the inbox goes on
-reading and drops what is not drawn. Where the whole relay stands still the socket fills, and the
-recorder drops what it doesn't take.
+A frozen viewer makes Rerun block for ever once some hundred megabytes are queued. That happens
+here, in a thread of its own, and never in the recorder: the inbox continues to read and drops the
+messages that are not drawn. If the whole relay is stopped the socket fills, and the recorder drops
+the messages that the socket doesn't accept.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def open_server(notify: Callable[[str], None]) -> Viewer:
 BATCH_S = 0.03
 """How often what has come is drawn [s]."""
 SILENCE_S = 10.0
-"""A feed that says nothing for so long has ended; a living one repeats its definitions [s]."""
+"""A feed that is silent for so long has ended; a live one repeats its definitions [s]."""
 
 _LAGS_KEPT = 100_000
 _FLUSH_S = 1.0
@@ -80,7 +80,7 @@ Connect = Callable[[rr.RecordingStream], None]
 
 @dataclass
 class RelayReport:
-    """What became of a live feed.
+    """Counts and lag of a live feed.
 
     Attributes:
         sessions: Session ids, in the order they came.
@@ -100,7 +100,7 @@ class RelayReport:
 
 
 class Relay:
-    """Draws what lies in an inbox; one thread calls it."""
+    """Draws the messages of an inbox; one thread calls it."""
 
     def __init__(self, inbox: Inbox, connect: Connect, *, one_session: bool = False) -> None:
         """Draw nothing yet.
@@ -127,7 +127,7 @@ class Relay:
 
     @property
     def report(self) -> RelayReport:
-        """What became of the feed so far."""
+        """Counts and lag of the feed so far."""
         lag_s = None
         if lags := tuple(self._lags):
             p50, p99 = np.percentile(lags, [50.0, 99.0]).tolist()
@@ -146,7 +146,7 @@ class Relay:
         return self._dropped + self._inbox.dropped
 
     def step(self) -> None:
-        """Draw what has come since the last step; waits for Rerun, if Rerun waits.
+        """Draw the messages received since the last step; blocks while Rerun blocks.
 
         Raises:
             LogWriteError: If the sink can't be made.
@@ -167,7 +167,7 @@ class Relay:
             self._end()
 
     def close(self) -> None:
-        """Hand over what is left; waits for Rerun, but not for long."""
+        """Flush the remaining data; waits for Rerun at most a second."""
         self._end()
         if self._rec is None:
             return
@@ -184,7 +184,7 @@ class Relay:
         return time.monotonic() - self._heard_at
 
     def _begin(self, feed_id: int) -> bool:
-        """Turn to a new feed; False where the first was the last."""
+        """Switch to a new feed; return False if only the first is drawn."""
         if self._one_session and self._scene is not None:
             self._end()
             return False
@@ -218,7 +218,7 @@ class Relay:
         batch = self._log.decode(messages)
         if self._scene is None:
             self._scene = self._open(min(message.log_time_ns for message in messages))
-        if self._states:  # said before, and told again to whoever comes
+        if self._states:  # latched states, repeated for late relays
             self._scene.draw(self._log.decode(self._states), self._not_shown)
             self._states.clear()
         self._scene.draw(batch, self._not_shown)
@@ -228,7 +228,7 @@ class Relay:
         messages.clear()
 
     def _open(self, first_ns: int) -> LiveScene:
-        """A recording stream for the session."""
+        """Open a recording stream for the session."""
         rr.set_strict_mode(True)
         facts = self._log.facts
         session_id = facts.get("session_id") or f"feed-{self._feed_id or 0:016x}"
@@ -253,7 +253,7 @@ class Relay:
 
 
 def relay_to_viewer(path: Path, viewer: Viewer | None, address: str) -> RelayReport:
-    """Draw sessions in a viewer until it is closed or we are told to stop.
+    """Draw sessions in a viewer until it is closed or a stop is requested.
 
     Args:
         viewer: The viewer, if it is a process of ours.
@@ -272,7 +272,7 @@ def relay_to_viewer(path: Path, viewer: Viewer | None, address: str) -> RelayRep
 
 
 def relay_to_file(path: Path, output: Path) -> RelayReport:
-    """Draw one session to a file, which appears when the session ends or we are told to stop.
+    """Draw one session to a file, which appears when the session ends or a stop is requested.
 
     Args:
         output: The .rrd file; one of that name is replaced.
@@ -322,7 +322,7 @@ class _Painter(threading.Thread):
 def _run(
     relay: Relay, request: StopRequest, viewer: Viewer | None, *, until_end: bool = False
 ) -> RelayReport:
-    """Draw until told to stop, or until the viewer or (if so wanted) the session has ended."""
+    """Draw until a stop is requested, or the viewer or (``until_end``) the session has ended."""
     painter = _Painter(relay)
     painter.start()
     while painter.is_alive() and not request.requested:

@@ -1,8 +1,8 @@
 """Draws a recording while it is made, with the entities, colours and views of its replay.
 
-What a sample says by itself is drawn at once; what needs several samples (the body, power, the
-tracking error) is computed over the last seconds, with the replay's own functions, and drawn as far
-as all that it needs has come.
+Single samples are drawn at once; quantities of several samples (the body, power, the tracking
+error) are computed over the last seconds, with the replay's own functions, and drawn up to the time
+at which all of their inputs have been received.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class _Window:
         self._newest_ns = max([self._newest_ns, *map(int, ends)])
 
     def ready_ns(self, inputs: Iterable[Sequence[Track]], *others: IntArray) -> int:
-        """Until when something can be computed that needs all of its inputs.
+        """Return the time up to which a quantity can be computed from all of its inputs.
 
         Args:
             inputs: Tracks that it is computed from.
@@ -109,7 +109,7 @@ class _Fresh:
         self._until_ns: dict[str, int] = {}
 
     def rows(self, name: str, t_ns: IntArray, upto_ns: int | None = None) -> slice:
-        """Which samples are new; they count as drawn from now on.
+        """Return which samples are new, and mark them as drawn.
 
         Args:
             t_ns: Their times [ns], ascending, shape (n,).
@@ -126,7 +126,7 @@ class _Fresh:
     def tracks(
         self, name: str, tracks: Iterable[Track], upto_ns: int | None = None
     ) -> tuple[Track, ...]:
-        """The new samples of tracks.
+        """Return the new samples of tracks, and mark them as drawn.
 
         Args:
             upto_ns: The last time that can be drawn [ns]; None for all.
@@ -145,7 +145,7 @@ class _Fresh:
 def _grown(
     old: tuple[IntArray, FloatArray] | None, t_ns: IntArray, values: FloatArray
 ) -> tuple[IntArray, FloatArray]:
-    """New samples after those of the last seconds before them."""
+    """Append new samples to those of the last seconds before them."""
     if old is None:
         return t_ns, values
     if not t_ns.size:
@@ -155,7 +155,7 @@ def _grown(
 
 
 def _joined(old: HeadPath | None, new: HeadPath) -> HeadPath:
-    """A tracked head's path after that of the last seconds before it."""
+    """Append a tracked head's path to that of the last seconds before it."""
     kept = None if old is None else (old.t_ns, old.pose)
     return HeadPath.of(*_grown(kept, new.t_ns, new.pose), tracked=True)
 
@@ -198,7 +198,7 @@ class LiveScene:
 
     @property
     def content(self) -> Content:
-        """What has been drawn so far."""
+        """Content that has been drawn so far."""
         return Content(
             robot=self._log.robot,
             start=self._start,
@@ -241,7 +241,7 @@ class LiveScene:
         self._lay_out(dropped)
 
     def finish(self, dropped: int = 0) -> None:
-        """Say that the recording has ended.
+        """Draw the end of the recording.
 
         Args:
             dropped: Messages that could not be shown.
@@ -268,7 +268,7 @@ class LiveScene:
     def _draw_places(
         self, kind: str, tracks: tuple[Track, ...], palette: dict[str, entities.Color] | None
     ) -> None:
-        """Head, middle and tail once more, for a plot that can be read at a glance."""
+        """Add a plot of head, middle and tail alone, which can be read at a glance."""
         places = self._places
         if places is None:
             return
@@ -280,7 +280,7 @@ class LiveScene:
         plot.write(self._rec, self._clock, own, palette)
 
     def _choose_places(self, moving: tuple[Track, ...]) -> None:
-        """Head, middle and tail of the plane that moves, once it is clear which does."""
+        """Choose head, middle and tail of the plane that moves, once it is clear which does."""
         now = time.monotonic()
         if self._places is not None and now < self._places_at:
             return
@@ -325,7 +325,7 @@ class LiveScene:
     def _draw_words(self, batch: Batch) -> None:
         turns: list[tuple[int, str]] = []
         for t_ns, mode in batch.modes:
-            if t_ns > self._mode_ns:  # what holds is told again and again
+            if t_ns > self._mode_ns:  # the current mode is repeated
                 if mode != self._mode:
                     turns.append((t_ns, mode))
                 self._mode, self._mode_ns = mode, t_ns
@@ -376,7 +376,7 @@ class LiveScene:
         return np.flatnonzero(np.diff(slot, prepend=slot[:1] - 1)).astype(np.int64)
 
     def _scale(self, drive: tuple[Track, ...]) -> None:
-        """Let the colours' full power grow with what was seen, in steps of 1, 2, 5."""
+        """Increase the colours' full power with the measured power, in steps of 1, 2, 5."""
         if not drive:
             return
         seen = power_limit(np.concatenate([track.values for track in drive]))
@@ -394,7 +394,7 @@ class LiveScene:
             stage.log_rays(self._rec, self._clock, motion, chosen, sensors=sensors, reading=reading)
 
     def _draw_trail(self, head: HeadPath) -> None:
-        """The head's path from the last point that was drawn, ten points a second."""
+        """Draw the head's path from the last drawn point, ten points a second."""
         for row in range(head.t_ns.size):
             point = head.at(slice(row, row + 1))
             last = self._trail_end
@@ -420,7 +420,7 @@ class LiveScene:
         self._rec.send_blueprint(build_blueprint(content))
 
     def _facts(self, content: Content, dropped: int, *, ended: bool) -> str:
-        """The session in words, as in :mod:`.replay.draw.facts`."""
+        """Return the session's facts as text, as in :mod:`.replay.draw.facts`."""
         robot = content.robot
         start = datetime.fromtimestamp(self._clock.start_ns // 1_000_000_000, UTC)
         made = "no robot description"
@@ -440,6 +440,6 @@ class LiveScene:
 
 
 def _shape(content: Content) -> tuple[object, ...]:
-    """What the layout depends on: not which robot, and where, but whether there is one."""
+    """Return the content that determines the layout: whether there is a robot, not which."""
     bare = replace(content, robot=None, start=None, power_limit_w=None)
     return content.robot is None, content.start is None, content.power_limit_w is None, bare

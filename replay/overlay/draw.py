@@ -62,7 +62,7 @@ _MESH_OPACITY = 90
 
 
 def tint(place: int) -> Color:
-    """The colour of a session as a whole.
+    """Return the colour of a session as a whole.
 
     Args:
         place: 0 for the first session.
@@ -131,7 +131,7 @@ def log_name(rec: rr.RecordingStream, one: Side, place: int, head: HeadPath, rob
 
 
 def log_ends(rec: rr.RecordingStream, sessions: Sequence[Side]) -> None:
-    """Take each body away when its session is over and others go on."""
+    """Remove each body when its session ends before the others."""
     for timeline in (SESSION_TIME, GAIT_CYCLE):
         ends = {one.entity: _end(one, timeline) for one in sessions}
         known = {entity: end for entity, end in ends.items() if end is not None}
@@ -144,7 +144,7 @@ def log_ends(rec: rr.RecordingStream, sessions: Sequence[Side]) -> None:
 
 
 def _end(one: Side, timeline: str) -> int | None:
-    """A session's end on a timeline [ns], or None where it isn't on it."""
+    """Return a session's end on a timeline [ns], or None if it isn't on it."""
     if timeline == SESSION_TIME:
         return one.end_ns - one.zero_ns
     rhythm = one.clock.rhythm
@@ -171,7 +171,7 @@ def _dashed(values: FloatArray, t_ns: IntArray, rank: int) -> FloatArray:
 
 
 def places_in(other: Side, first: Places | None, own: Places | None) -> Places | None:
-    """The joints of another session that stand for its body.
+    """Return the joints of another session that stand for its body.
 
     Args:
         first: The first session's joints.
@@ -284,11 +284,11 @@ def log_bars(
 def log_difference_bars(
     rec: rr.RecordingStream, first: Side, other: Side, comparison: Comparison | None
 ) -> tuple[Quantity, ...]:
-    """Write how a session's joints answer otherwise than the first one's.
+    """Write how a session's joints respond differently from the first one's.
 
     Args:
         first: The first session.
-        comparison: What it says; None where there is none.
+        comparison: Their comparison, or None.
 
     Returns:
         Quantities of which there is a difference.
@@ -338,7 +338,7 @@ def _estimate(known: Known, *, log: bool) -> Estimate:
 
 
 def angle_differences(a: Side, b: Side, how: Align) -> tuple[Track, ...]:
-    """Measured angles of one session minus those of another.
+    """Return the measured angles of one session minus those of another.
 
     Args:
         a: The session that is subtracted, and whose times count.

@@ -48,7 +48,7 @@ _TOPICS = ("/joint_states", "/gait")
 
 @dataclass(frozen=True)
 class Side:
-    """What side by side needs of a session, beside its own recording.
+    """A session of an overlay, without its own recording.
 
     Attributes:
         name: What it is called, e.g. ``twin``.
@@ -113,16 +113,16 @@ class Side:
 
 
 def names_of(files: Sequence[Path], wanted: Sequence[str] | None) -> tuple[str, ...]:
-    """What the sessions are called.
+    """Return the sessions' names.
 
     Args:
-        wanted: Names that were asked for, or None for the files' own.
+        wanted: Requested names, or None for the files' own.
 
     Returns:
         A name a session, all different.
 
     Raises:
-        UsageError: If there are too few or too many, or they can't be told apart.
+        UsageError: If their number is wrong, or they aren't different.
     """
     if wanted is None:
         stems = [file.stem for file in files]
@@ -143,7 +143,7 @@ def names_of(files: Sequence[Path], wanted: Sequence[str] | None) -> tuple[str, 
 
 
 def read_side(session: SessionView, name: str) -> Side:
-    """Read what side by side needs of a session."""
+    """Read a session for an overlay."""
     wanted = {topic: ["position"] for topic in _TOPICS if topic in wanted_fields(session)}
     columns = read_columns(session, wanted)
     measured = columns.get(("/joint_states", "position"), ())
@@ -168,7 +168,7 @@ def read_side(session: SessionView, name: str) -> Side:
 
 
 def convert(session: SessionView, path: Path) -> tuple[Recording, ComparedSession | None]:
-    """Write the session's own recording, and take from it what a comparison needs.
+    """Write the session's own recording, and return it with the input of a comparison.
 
     Returns:
         The recording, and the analysis, or None where the session can't be analysed; why is
@@ -190,7 +190,7 @@ def convert(session: SessionView, path: Path) -> tuple[Recording, ComparedSessio
 
 
 class Align(StrEnum):
-    """What happens at once."""
+    """How sessions are aligned in time."""
 
     TIME = "time"
     """The same time since each session's first sample."""
@@ -208,7 +208,7 @@ class Align(StrEnum):
 
 
 def align(sides: Sequence[Side], how: Align) -> tuple[Side, ...]:
-    """Put sessions on common timelines.
+    """Align sessions on common timelines.
 
     Raises:
         UsageError: If a session has no gait to be aligned by.
@@ -229,7 +229,7 @@ def align(sides: Sequence[Side], how: Align) -> tuple[Side, ...]:
 
 
 def counterparts(a: Side, b: Side, how: Align, t_ns: IntArray) -> tuple[IntArray, BoolArray]:
-    """When in one session happens what happens in another one at given times.
+    """Return the times in one session that correspond to times in another.
 
     Args:
         a: The session that the times are of.
@@ -248,7 +248,7 @@ def counterparts(a: Side, b: Side, how: Align, t_ns: IntArray) -> tuple[IntArray
 
 
 def times_of(rhythm: Rhythm, cycles: FloatArray) -> tuple[IntArray, BoolArray]:
-    """When a gait first reached given phases.
+    """Return the times at which a gait first reached given phases.
 
     Args:
         rhythm: The gait's phase.
@@ -324,7 +324,7 @@ class Placement:
 
 
 def placement(a: Side, b: Side, how: Align) -> Placement | None:
-    """How one body is laid on another.
+    """Return the placement of one body onto another.
 
     Args:
         a: The session whose world stays.
@@ -353,7 +353,7 @@ def placement(a: Side, b: Side, how: Align) -> Placement | None:
 
 
 def placement_text(placed: Placement, name: str, first: str) -> str:
-    """A placement in words.
+    """Return the text of a placement.
 
     Args:
         name: The session that is moved.
@@ -372,7 +372,7 @@ def placement_text(placed: Placement, name: str, first: str) -> str:
 
 
 def head_distance(a: Side, b: Side, how: Align, placed: Placement, t_ns: IntArray) -> FloatArray:
-    """How far the heads are from each other as they are drawn.
+    """Return the distance of the heads as they are drawn.
 
     Args:
         a: One session, with a head.
@@ -394,7 +394,7 @@ def head_distance(a: Side, b: Side, how: Align, placed: Placement, t_ns: IntArra
 
 
 def _heading(one: Side, t_ns: int) -> float | None:
-    """Which way a body points in the cycle after a time [rad]; None where it isn't known."""
+    """Return a body's heading in the cycle after a time [rad]; None if it isn't known."""
     times, rhythm = np.array([t_ns], dtype=np.int64), one.clock.rhythm
     if rhythm is not None:
         cycle = interpolate(rhythm.t_ns, rhythm.cycles, times)
@@ -410,7 +410,7 @@ def _heading(one: Side, t_ns: int) -> float | None:
 
 
 def _directions(side: Side, t_ns: IntArray) -> FloatArray:
-    """Sum of the links' forward axes on the ground, shape (n, 2); NaN where a pose isn't known."""
+    """Return the sum of the links' forward axes, shape (n, 2); NaN where a pose isn't known."""
     robot, head = side.robot, side.head
     assert robot is not None  # noqa: S101 - the caller saw a head
     assert head is not None  # noqa: S101

@@ -65,7 +65,7 @@ _PROPERTIES = "/__properties/**"
 def chunks_of(
     recording: Path, entity: str, *, later_ns: int = 0, more_cycles: int = 0
 ) -> LazyChunkStream:
-    """A recording's chunks under a path of their own.
+    """Return a recording's chunks under a path of their own.
 
     Args:
         entity: Path to put in front of every entity's, e.g. ``/twin``.
@@ -101,7 +101,7 @@ def send(rec: rr.RecordingStream, streams: Sequence[LazyChunkStream]) -> None:
 
 
 def _moved(chunk: Any, moves: dict[str, int]) -> Chunk:
-    """A chunk further on along its timelines; rows that aren't on one stay off it."""
+    """Shift a chunk along its timelines; rows that aren't on one stay off it."""
     batch = chunk.to_record_batch()
     for timeline, by in moves.items():
         place = batch.schema.get_field_index(timeline)
@@ -128,12 +128,12 @@ class Place(StrEnum):
     """Where the first one starts."""
 
     WORLD = "world"
-    """Where their sessions say that they were."""
+    """At the poses of their own sessions."""
 
 
 @dataclass(frozen=True)
 class Converted:
-    """A session with what was made of it.
+    """A session, its recording and its input of a comparison.
 
     Attributes:
         side: The session and its place on the timelines.
@@ -152,7 +152,7 @@ class Overlay:
     Attributes:
         recording_id: Follows from the sessions' ids and names, and how they are aligned and placed.
         shown: What it holds of each session.
-        found: What the comparison with the first session says, by the others' names.
+        found: Result of the comparison with the first session, by the others' names.
         placements: How bodies are moved, by name; those that aren't are left out.
         warnings: What is missing or was assumed, a sentence each.
     """
@@ -174,17 +174,17 @@ def write_overlay(
     stop: StopRequest | None = None,
     layout: Layout = build_blueprint,
 ) -> Overlay:
-    """Bring converted sessions together.
+    """Combine converted sessions in one recording.
 
     Args:
         sessions: Two or more; differences are from the first.
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
         place: Where the bodies are drawn.
-        stop: Looked at now and then; once an end is asked for, nothing is written.
+        stop: Checked now and then; once a stop is requested, nothing is written.
         layout: Makes the blueprint from what was written.
 
     Raises:
-        LogWriteError: If the file can't be written, or an end was asked for.
+        LogWriteError: If the file can't be written, or a stop is requested.
     """
     sides = [one.side for one in sessions]
     warnings = [f"{one.side.name}: {text}" for one in sessions for text in one.recording.warnings]
@@ -216,7 +216,7 @@ def write_overlay(
 
 
 def _chunks(one: Converted) -> LazyChunkStream:
-    """A session's own recording under its name and on the common timelines."""
+    """Return a session's own recording under its name and on the common timelines."""
     side = one.side
     later_ns = side.start_ns - side.zero_ns
     return chunks_of(one.recording.path, side.entity, later_ns=later_ns, more_cycles=side.cycles)
@@ -237,7 +237,7 @@ def _compare(first: Converted, other: Converted) -> Found:
 def _placements(
     sessions: Sequence[Converted], how: Align, place: Place, warnings: list[str]
 ) -> dict[str, Placement]:
-    """How the other bodies are laid on the first one, with a sentence about each."""
+    """Return the placements of the other bodies onto the first one; append a warning for each."""
     bodies = [one.side for one in sessions if one.recording.content.start is not None]
     found: dict[str, Placement] = {}
     for one in bodies[1:] if place is Place.START else ():
@@ -261,7 +261,7 @@ def _log(
     placements: Mapping[str, Placement],
     how: Align,
 ) -> tuple[Shown, ...]:
-    """Write all that isn't in the sessions' own recordings."""
+    """Write the entities that aren't in the sessions' own recordings."""
     rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     a, content = sessions[0].side, sessions[0].recording.content
     shown = [Shown(a, content, draw.log_lines(rec, a, 0, content.places))]
@@ -290,7 +290,7 @@ def _log_apart(
     placed: Placement,
     color: Color,
 ) -> bool:
-    """How far the heads are apart, where both were tracked."""
+    """Write the distance of the heads, if both were tracked."""
     a, b = pair
     one, other = a.head, b.head
     if one is None or other is None or not (one.tracked and other.tracked):
@@ -318,7 +318,7 @@ def _log_body(
 
 
 def _title(shown: Sequence[Shown]) -> str:
-    """Name of the bodies' view: who is who."""
+    """Return the name of the bodies' view, which names the sessions."""
     first, *others = [one.side.name for one in shown if one.body] or [""]
     if not others:
         return f"{first}; the others have no body" if first else ""
@@ -346,7 +346,7 @@ def combine_sessions(
     on_step: Callable[[int, str], None] = lambda _done, _note: None,
     stop: StopRequest | None = None,
 ) -> Overlay:
-    """Convert sessions and bring them together.
+    """Convert sessions and combine them in one recording.
 
     Args:
         files: Two or more sessions; differences are from the first.
@@ -354,7 +354,7 @@ def combine_sessions(
         names: What they are called, or None for the files' names.
         place: Where the bodies are drawn.
         on_step: Told before each of :func:`steps` how many are done, and what comes.
-        stop: Looked at now and then; once an end is asked for, nothing is written.
+        stop: Checked now and then; once a stop is requested, nothing is written.
 
     Raises:
         UsageError: If the names don't fit, or a session has no gait to be aligned by.
@@ -386,5 +386,5 @@ def combine_sessions(
 
 
 def steps(count: int) -> int:
-    """How many steps it takes."""
+    """Return the number of steps."""
     return count + 2

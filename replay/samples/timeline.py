@@ -45,7 +45,7 @@ class Span:
     known_ns: int | None = None
 
     def rows(self, t_ns: IntArray) -> slice:
-        """Which rows lie in it.
+        """Return the rows within the span.
 
         Args:
             t_ns: Their times [ns], ascending, shape (n,).
@@ -178,7 +178,7 @@ class Clock:
         """Cut rows into chunks that share their timelines.
 
         Rows whose gait phase isn't known (before the gait starts, in a gap) have no place on
-        ``gait_cycle``, and Rerun wants the same timelines in all rows of a chunk.
+        ``gait_cycle``, and Rerun requires the same timelines in all rows of a chunk.
 
         Args:
             t_ns: Sampling times of the rows [ns], shape (n,).

@@ -26,7 +26,7 @@ from undulog.capture.log.read.signals import JointSignals
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
 OFFSETS = ("/joint_sample_offset", "/joint_command_offset")
-"""JointState topics that say when, not what."""
+"""JointState topics of sampling times instead of values."""
 
 Columns = dict[tuple[str, str], tuple["Track", ...]]
 """(topic, field of the JointState) to tracks."""
@@ -71,7 +71,7 @@ MOST_TOPICS = 100
 
 
 def drawn_topics(session: SessionView) -> tuple[list[str], int]:
-    """The JointState topics of a picture.
+    """Return the JointState topics that are drawn.
 
     Returns:
         At most :data:`MOST_TOPICS`, the contract's before others, in the session's order; and how
@@ -88,7 +88,7 @@ def drawn_topics(session: SessionView) -> tuple[list[str], int]:
 
 
 def wanted_fields(session: SessionView) -> dict[str, list[str]]:
-    """What a picture needs of a session's JointState topics.
+    """Return the fields of a session's JointState topics that are drawn.
 
     Returns:
         Topic to fields: the position of every topic, velocity and effort of ``/joint_states``.
@@ -106,7 +106,7 @@ def read_columns(
     start_ns: int | None = None,
     stop_ns: int | None = None,
 ) -> Columns:
-    """JointState topics of a session.
+    """Read JointState topics of a session.
 
     Args:
         wanted: Topic to fields; None for all of :func:`wanted_fields`.
@@ -149,7 +149,7 @@ def without_filler(track: Track) -> Track:
     """Leave out the NaN that only fill up messages about something else.
 
     A robot that reports one quantity, or one servo, a message fills the other places with NaN.
-    Where half of a joint's samples or more are NaN they say nothing; fewer are a gap.
+    If half of a joint's samples or more are NaN, these are fillers; fewer are a gap.
 
     Returns:
         The track without its NaN where they are half or more, else the track itself.
@@ -167,7 +167,7 @@ def pairs(first: Sequence[Track], second: Sequence[Track]) -> list[tuple[Track, 
 
 
 def one_after_another(pieces: Sequence[Track]) -> Track:
-    """Pieces of one track, at least one, as a whole."""
+    """Join successive pieces of one track, at least one."""
     t_ns = np.concatenate([piece.t_ns for piece in pieces])
     return Track(pieces[0].name, t_ns, np.concatenate([piece.values for piece in pieces]))
 
@@ -211,7 +211,7 @@ def in_turn(first: IntArray, other: IntArray) -> bool:
 
 
 def join_tracks(tracks: Sequence[Track]) -> Table:
-    """Joints at the times of the first of them.
+    """Return joints as one table at the times of the first of them.
 
     Args:
         tracks: Joints that were sampled together or in turn, at least one.
@@ -228,7 +228,7 @@ def join_tracks(tracks: Sequence[Track]) -> Table:
 def resampled(
     tracks: Sequence[Track], names: Sequence[str], at_ns: IntArray, method: Resampler
 ) -> FloatArray:
-    """All joints at common times.
+    """Return all joints at common times.
 
     Args:
         tracks: The tracks, in any order.
@@ -252,7 +252,7 @@ _TAIL = 0.01
 
 
 def plot_step(values: FloatArray) -> float:
-    """The step that a plotted line is rounded to.
+    """Return the step that a plotted line is rounded to.
 
     Args:
         values: Samples of the line, any unit, shape (n,); NaN where there is none.
@@ -292,7 +292,7 @@ GAP_STEPS = 5.0
 
 
 def typical_step_ns(t_ns: IntArray) -> int:
-    """Median distance of successive samples.
+    """Return the median distance of successive samples.
 
     Args:
         t_ns: Sampling times [ns], ascending, shape (n,).
@@ -306,7 +306,7 @@ def typical_step_ns(t_ns: IntArray) -> int:
 
 
 def gaps(t_ns: IntArray) -> BoolArray:
-    """Which samples are followed by a gap.
+    """Return which samples are followed by a gap.
 
     Args:
         t_ns: Sampling times [ns], ascending, shape (n,).
@@ -367,7 +367,7 @@ def decimate(t_ns: IntArray, rate_hz: float) -> IntArray:
 
 
 def interpolate(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArray:
-    """Straight line between the samples about each wanted time.
+    """Interpolate linearly between the samples about each time.
 
     Args:
         t_ns: Sampling times [ns], ascending, shape (n,).
@@ -398,7 +398,7 @@ def interpolate(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArr
 
 
 def hold(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArray:
-    """The last sample at or before each wanted time: a servo keeps its command till the next.
+    """Return the last sample at or before each time: a servo keeps its command until the next.
 
     Args:
         t_ns: Sampling times [ns], ascending, shape (n,).
@@ -407,7 +407,7 @@ def hold(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArray:
 
     Returns:
         Shape (m,) or (m, k); NaN before the first sample and later than a gap's length after
-        the last one, where a lost command cannot be told from a held one.
+        the last one, where a lost command can't be distinguished from a held one.
     """
     found = np.full((at_ns.size, *values.shape[1:]), np.nan)
     if not t_ns.size:
@@ -421,7 +421,7 @@ def hold(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArray:
 
 
 def ordered(t_ns: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Samples in the order of their times.
+    """Sort samples by time.
 
     Args:
         t_ns: Sampling times [ns], shape (n,).

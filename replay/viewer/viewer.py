@@ -36,7 +36,7 @@ _GRACE_S = 3.0
 
 
 def viewer_binary() -> Path:
-    """The viewer that came with the installed Rerun.
+    """Return the path of the viewer that came with the installed Rerun.
 
     Raises:
         MissingExtraError: If Rerun is not installed.
@@ -83,7 +83,7 @@ class Viewer(AbstractContextManager["Viewer"]):
         self._port = free_ports(1)[0] if port is None else port
         self.address = f"rerun+http://{LOOPBACK}:{self._port}/proxy"
         """Where a recording stream connects to."""
-        # The viewer leaves a folder behind when it is told to end; here it goes with ours.
+        # The viewer leaves a folder behind when it is terminated; it is removed with ours.
         self._scratch = tempfile.TemporaryDirectory(prefix="undulog-viewer-")
         self._said = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
         self._told_to_end = False
@@ -128,7 +128,7 @@ class Viewer(AbstractContextManager["Viewer"]):
             on_failure.pop_all()
 
     def wait(self, stop: StopRequest) -> None:
-        """Wait until it has ended, or an end is asked for.
+        """Wait until it has ended, or a stop is requested.
 
         Args:
             stop: The request to look at.
@@ -211,7 +211,7 @@ def serve(recording: Path, notify: Callable[[str], None]) -> None:
     """Serve a recording to browsers on this machine until interrupted.
 
     Args:
-        tell: Called with the address to open.
+        notify: Called with the address to open.
 
     Raises:
         UndulogError: If the server fails.
@@ -224,7 +224,7 @@ def serve(recording: Path, notify: Callable[[str], None]) -> None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of this machine that nobody listens on at the moment."""
+    """Return free ports of this machine."""
     with ExitStack() as stack:
         held = [stack.enter_context(socket.create_server((LOOPBACK, 0))) for _ in range(count)]
         return [int(one.getsockname()[1]) for one in held]

@@ -90,7 +90,7 @@ def log_mean_cycle(
     analysis: Analysis | None,
     warnings: list[str],
 ) -> MeanCycle | None:
-    """Average the cycles and write what comes out.
+    """Average the cycles and draw the mean.
 
     Args:
         columns: From :func:`read_averaged`.
@@ -272,7 +272,7 @@ def _log_joints(
     values: FloatArray,
     palette: Mapping[str, Color],
 ) -> tuple[Series, ...]:
-    """A line a joint; ``values`` of shape (p, k)."""
+    """Draw a line for each joint; ``values`` of shape (p, k)."""
     if not names:
         return ()
     log_look(rec, entity, names, palette)

@@ -37,7 +37,7 @@ _DESCRIPTORS = {
 
 
 def joint_palette(names: Sequence[str]) -> dict[str, Color]:
-    """The colour that each joint keeps everywhere.
+    """Return the colour of each joint, the same in all views.
 
     Args:
         names: All joints, head to tail.
@@ -54,7 +54,7 @@ def head_middle_tail(robot: Robot | None, moving: Sequence[Track]) -> Places | N
 
     Args:
         robot: The robot; without it all joints count as one plane.
-        moving: Angles by which the busiest plane is told: commands, or else measurements [rad].
+        moving: Angles that determine the busiest plane: commands, or else measurements [rad].
 
     Returns:
         First, middle and last joint of the plane that moves most, or None without joints.
@@ -75,7 +75,7 @@ def head_middle_tail(robot: Robot | None, moving: Sequence[Track]) -> Places | N
 
 
 def places_look(places: Places, kind: str) -> dict[str, Any]:
-    """Names and width of the lines of head, middle and tail, for :func:`log_look`.
+    """Return names and width of the lines of head, middle and tail, for :func:`log_look`.
 
     Args:
         kind: ``measured`` or ``commanded``.
@@ -88,7 +88,7 @@ def places_look(places: Places, kind: str) -> dict[str, Any]:
 
 
 def part_entities(entity: str, parts: Sequence[Sequence[str]]) -> list[str]:
-    """Where joints go that were sampled at times of their own.
+    """Return the entities of joints that were sampled at times of their own.
 
     Args:
         entity: E.g. ``/joints/measured``.
@@ -134,7 +134,7 @@ def log_look(
     width: float | None = None,
     steps: bool = False,
 ) -> None:
-    """Say how the lines of an entity are drawn.
+    """Write the style of an entity's lines.
 
     Args:
         names: Joints, a line each.
@@ -188,7 +188,7 @@ _COLORS = {"mechanical": (255, 84, 48, 255), "electrical": (150, 124, 230, 255)}
 
 
 def log_total_look(rec: rr.RecordingStream, kind: str) -> None:
-    """Say how the line of one kind of the body's power is drawn.
+    """Write the style of one kind of the body's power.
 
     Args:
         kind: ``mechanical`` or ``electrical``.
@@ -225,7 +225,7 @@ _LEVELS = {
 
 
 def rhythm_of(gait: Sequence[Track]) -> Rhythm | None:
-    """The phase of the plane that swings most.
+    """Return the phase of the plane that swings most.
 
     Args:
         gait: Tracks named ``<plane>.A``, ``<plane>.phase`` and so on.
@@ -246,7 +246,7 @@ def rhythm_of(gait: Sequence[Track]) -> Rhythm | None:
 
 
 def changes(states: Sequence[str]) -> list[int]:
-    """Indices at which the state differs from the one before.
+    """Return the indices at which the state differs from the one before.
 
     Returns:
         Indices, the first message's included.

@@ -63,7 +63,7 @@ _NOT_PLOTTED = ("covariance", "stamp", "layout", "header")
 
 
 def is_foreign(session: SessionView) -> bool:
-    """Whether undulog has neither recorded nor imported a session.
+    """Return whether a session was neither recorded nor imported by undulog.
 
     Returns:
         True where it doesn't carry undulog's metadata.
@@ -105,7 +105,7 @@ def log_others(
 
 
 def log_words(rec: rr.RecordingStream, clock: Clock, session: SessionView) -> bool:
-    """Write what String topics of a foreign bag say, each time that it changes, as events."""
+    """Write String topics of a foreign bag as events, each time that their value changes."""
     said: list[tuple[int, str]] = []
     for topic, channel in _others(session):
         if channel.type_name == _WORDS and channel.is_ros2:
@@ -254,7 +254,7 @@ class Plots:
         places: Places | None,
         palette: Mapping[str, Color],
     ) -> None:
-        """Say how the lines look.
+        """Write the style of the lines.
 
         Args:
             places: Joints that stand for the body, or None.
@@ -284,7 +284,7 @@ class Plots:
                 self._add_places(found, places, source, kind, palette)
 
     def series(self, entity: str) -> tuple[Series, ...]:
-        """What is written of a quantity.
+        """Return the series that are written of a quantity.
 
         Args:
             entity: E.g. ``/joints/measured``.
@@ -296,7 +296,7 @@ class Plots:
 
     @property
     def signals(self) -> dict[str, tuple[Series, ...]]:
-        """Entity of a topic to what is written of it, where it has no views of its own."""
+        """Series of the topics without views of their own, by entity."""
         return {
             entity: plot.series
             for entity, plot in self._plots.items()
@@ -321,7 +321,7 @@ class Plots:
         kind: str,
         palette: Mapping[str, Color],
     ) -> None:
-        """Head, middle and tail once more, for a plot that can be read at a glance."""
+        """Add a plot of head, middle and tail alone, which can be read at a glance."""
         samples = [one for one in found.samples.get(source, ()) if one.name in places.names]
         if not samples:
             return

@@ -62,7 +62,7 @@ class Motion:
     def links(
         self, rows: slice | IntArray, angles: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Where the links are.
+        """Return the poses of the links.
 
         Args:
             rows: Which drawing times, k of them.
@@ -102,7 +102,7 @@ class HeadPath:
 
     @classmethod
     def of(cls, t_ns: IntArray, pose: FloatArray, *, tracked: bool) -> HeadPath:
-        """Take a path apart, of columns as in :data:`POSE`, shape (n, 7)."""
+        """Build a path from columns as in :data:`POSE`, shape (n, 7)."""
         return cls(t_ns, pose[:, :3], pose[:, 3:], tracked)
 
     @property
@@ -139,7 +139,7 @@ def frames_of(head: HeadPath, end_ns: int) -> tuple[HeadPath, BoolArray]:
 def read_head(
     session: SessionView, robot: Robot, positions: Sequence[Track], warnings: list[str]
 ) -> HeadPath:
-    """The head's pose from ``/odom``, or held at the origin.
+    """Read the head's pose from ``/odom``; without odometry it is held at the origin.
 
     Args:
         positions: Measured joint angles, whose times serve where there is no odometry.
@@ -161,7 +161,7 @@ def read_head(
 
 
 def still_head(t_ns: IntArray) -> HeadPath:
-    """The head at the origin, where nobody tracked it.
+    """Return the path of an untracked head: the origin.
 
     Args:
         t_ns: Times [ns], shape (n,).
@@ -171,7 +171,7 @@ def still_head(t_ns: IntArray) -> HeadPath:
 
 
 def tracked_head(t_ns: IntArray, pose: FloatArray) -> HeadPath:
-    """The head's path from odometry.
+    """Return the head's path from odometry.
 
     Args:
         t_ns: Sampling times [ns], shape (n,).

@@ -38,7 +38,7 @@ def rays(
     rotation: FloatArray,
     reading: FloatArray | NDArray[np.float32],
 ) -> tuple[FloatArray, FloatArray]:
-    """From each range sensor to what it sees.
+    """Return the rays from each range sensor to the obstacle that it detects.
 
     Args:
         robot: The robot, m joints.
@@ -89,7 +89,7 @@ def read_ranges(
 
 
 def range_sensors(robot: Robot, topics: Collection[str]) -> tuple[Sensor, ...]:
-    """The robot's distance sensors of which something was logged.
+    """Return the robot's distance sensors that were logged.
 
     Args:
         topics: Topics that were.
@@ -110,7 +110,7 @@ def log_rays(
     sensors: tuple[Sensor, ...],
     reading: FloatArray | NDArray[np.float32],
 ) -> None:
-    """Draw what distance sensors see.
+    """Draw the rays of the distance sensors.
 
     Args:
         chosen: Which of its drawing times, shape (n,).
@@ -140,7 +140,7 @@ _WHOLE = Span()
 
 
 def trail_segments(t_ns: IntArray, position: FloatArray) -> tuple[IntArray, NDArray[np.float32]]:
-    """Straight pieces between successive head positions.
+    """Return line segments between successive head positions.
 
     Args:
         t_ns: Times [ns], ascending, shape (n,).
@@ -182,7 +182,7 @@ _RIM_SIDES = 64
 
 
 def world_of(session: SessionView, warnings: list[str]) -> World | None:
-    """The world that the session's scenario describes.
+    """Return the world of the session's scenario.
 
     Args:
         warnings: Extended by what can't be read.
@@ -208,7 +208,7 @@ def world_of(session: SessionView, warnings: list[str]) -> World | None:
 
 
 def log_surroundings(rec: rr.RecordingStream, world: World) -> None:
-    """Draw what does not move."""
+    """Draw obstacles and target."""
     cylinders = [one for one in world.obstacles if isinstance(one, Cylinder)]
     boxes = [_box(one) for one in world.obstacles if not isinstance(one, Cylinder)]
     if cylinders:
@@ -265,7 +265,7 @@ class Scene:
         warnings: list[str],
         span: Span,
     ) -> None:
-        """Write what doesn't move, and the head's trail.
+        """Draw the static surroundings and the head's trail.
 
         Args:
             head: Where its head was.
