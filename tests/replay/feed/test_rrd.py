@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from undulog.capture import Session, SessionWriter
+from support.written_topics import EPOCH_NS as START
+from support.written_topics import write_topics
+from undulog.capture import Session
 from undulog.capture.common.errors import DataError, LogWriteError
 from undulog.capture.common.palette import joint_colors
 from undulog.replay.draw.scene.body import ROUNDING
 from undulog.replay.feed.recording import recording_id, write_recording
-
-START = 1_735_689_600_000_000_000
 
 
 def converted(file, path, **options):
@@ -222,14 +222,11 @@ def test_servos_polled_in_turn_are_drawn_where_they_were_at_the_first_ones_times
     names = snake25.joint_names
     offset = 2.5e-4 * np.arange(25)
     t = START + np.arange(50, dtype=np.int64) * 10_000_000
-    with SessionWriter(
-        tmp_path / "a.mcap", session_id="polled", epoch_ns=START, robot=snake25
-    ) as w:
-        states = w.joint_state("/joint_states", names, unit="rad")
-        offsets = w.joint_state("/joint_sample_offset", names, unit="s")
-        for t_ns in t.tolist():
-            states.write(t_ns, np.full(25, (t_ns - START) * 1e-9) + offset)
-            offsets.write(t_ns, offset)
+    topics = {
+        "/joint_states": (names, "rad", (t - START)[:, None] * 1e-9 + offset),
+        "/joint_sample_offset": (names, "s", np.tile(offset, (50, 1))),
+    }
+    write_topics(tmp_path / "a.mcap", t, topics, robot=snake25)
     found = read_back(converted(tmp_path / "a.mcap", tmp_path / "a.rrd").path)
     np.testing.assert_array_equal(found.times("/joints/measured"), t - START)
     shown = np.radians(rows(found.column("/joints/measured", "Angle:degrees")))
@@ -240,14 +237,13 @@ def test_servos_polled_in_turn_are_drawn_where_they_were_at_the_first_ones_times
 
 def test_a_foreign_bag_with_a_message_a_servo_shows_every_servo(read_back, tmp_path):
     t = START + np.arange(60, dtype=np.int64) * 10_000_000
-    with SessionWriter(tmp_path / "a.mcap", session_id="", epoch_ns=START) as w:
-        both = w.joint_state("/joint_states", ["left", "right"], unit="rad")
-        other = w.joint_state("/gripper/state", ["finger"], unit="m")
-        for i, t_ns in enumerate(t.tolist()):
-            angles = np.full(2, np.nan)
-            angles[i % 2] = i
-            both.write(t_ns, angles)
-            other.write(t_ns, np.array([0.01]))
+    i = np.arange(60.0)
+    angles = np.stack([np.where(i % 2, np.nan, i), np.where(i % 2, i, np.nan)], axis=1)
+    topics = {
+        "/joint_states": (["left", "right"], "rad", angles),
+        "/gripper/state": (["finger"], "m", np.full((60, 1), 0.01)),
+    }
+    write_topics(tmp_path / "a.mcap", t, topics, session_id="")
     written = converted(tmp_path / "a.mcap", tmp_path / "a.rrd")
     found = read_back(written.path)
     right = rows(found.column("/joints/measured/right", "Angle:degrees"))
@@ -257,8 +253,7 @@ def test_a_foreign_bag_with_a_message_a_servo_shows_every_servo(read_back, tmp_p
 
 
 def test_a_session_without_messages_is_an_error(tmp_path):
-    with SessionWriter(tmp_path / "a.mcap", session_id="empty", epoch_ns=START) as w:
-        w.joint_state("/joint_states", ["a"], unit="rad")
+    write_topics(tmp_path / "a.mcap", [], {"/joint_states": (["a"], "rad", np.zeros((0, 1)))})
     with pytest.raises(DataError, match="no messages"):
         converted(tmp_path / "a.mcap", tmp_path / "a.rrd")
 

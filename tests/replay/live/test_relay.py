@@ -9,7 +9,7 @@ import pytest
 
 from support.live_stage import EPOCH_NS, WAIT_S, Recorder
 from support.processes import freeze, wait_for
-from undulog.capture import SessionWriter
+from support.written_topics import write_topics
 from undulog.capture.common.errors import UsageError
 from undulog.capture.recorder import live_feed
 from undulog.capture.recorder.live_feed import spawn_relay
@@ -91,14 +91,12 @@ def test_killed_relay_is_replaced(stage, read_back, monkeypatch):
 def test_joints_sampled_in_turn_are_drawn_at_their_own_times(
     stage, snake25, truth, tmp_path, read_back
 ):
-    path = tmp_path / "turns.mcap"
-    offset = np.linspace(0.0, 8e-3, 25)
-    with SessionWriter(path, session_id="turns", epoch_ns=EPOCH_NS, robot=snake25) as w:
-        offsets = w.joint_state("/joint_sample_offset", snake25.joint_names, unit="s")
-        states = w.joint_state("/joint_states", snake25.joint_names, unit="rad")
-        for i, t_ns in enumerate(truth.t_ns.tolist()):
-            offsets.write(t_ns, offset)
-            states.write(t_ns, truth.position[i])
+    names, offset = snake25.joint_names, np.linspace(0.0, 8e-3, 25)
+    topics = {
+        "/joint_sample_offset": (names, "s", np.tile(offset, (300, 1))),
+        "/joint_states": (names, "rad", truth.position),
+    }
+    path = write_topics(tmp_path / "turns.mcap", truth.t_ns, topics, robot=snake25)
     recorder, relay = stage.recorder(path), stage.relay()
     recorder.send_all()
     relay.finish()

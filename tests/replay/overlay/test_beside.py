@@ -14,8 +14,9 @@ import rerun.blueprint as rrb
 import undulog
 from support.golden_pictures import marked
 from support.twin_chains import chain as chain_text
+from support.written_topics import EPOCH_NS, GAIT, write_topics
 from undulog.analysis.compare.compare import Choices, compare_sessions
-from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import LogWriteError
 from undulog.capture.common.files import check_stop
 from undulog.capture.common.palette import joint_colors
@@ -25,7 +26,6 @@ from undulog.replay.overlay.sessions import Align, align, convert, read_side, ti
 from undulog.replay.overlay.write import Converted, combine_sessions, write_overlay
 from undulog.replay.samples.timeline import SESSION_TIME, Rhythm
 
-EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("joint01", "joint02", "joint03", "joint04", "joint05")
 LAG = 0.7
 
@@ -85,38 +85,31 @@ def make(chain):
     """Writes a session of a wave."""
 
     def write(path, wave, *, robot=True, gait=True, names=NAMES, noise=1e-4, polled_s=0.0):
-        described = chain(len(names), "chain") if robot else None
         rng = np.random.default_rng(sum(path.name.encode()))
-        with SessionWriter(
+        t, joints = wave.t, np.arange(len(names))
+        cycles = wave.cycles(t)[:, None]
+        polled = wave.cycles(t[:, None] + polled_s * joints)
+        angle = wave.angle(joints, polled)
+        speed = 2 * np.pi * wave.frequency_hz * wave.angle(joints, polled + 0.25)
+        noisy = angle + noise * rng.standard_normal(angle.shape)
+        wrapped = np.angle(np.exp(2j * np.pi * cycles))
+        topics = {
+            "/joint_commands": (names, "rad", 0.4 * np.sin(2 * np.pi * cycles - joints * LAG)),
+            "/joint_sample_offset": (names, "s", np.tile(polled_s * joints, (t.size, 1))),
+            "/joint_states": (names, "rad", noisy, speed, 0.1 * speed),
+            "/gait": (GAIT, "rad", np.hstack([np.full_like(wrapped, 0.4), wrapped])),
+        }
+        left_out = [*([] if polled_s else ["/joint_sample_offset"]), *([] if gait else ["/gait"])]
+        return write_topics(
             path,
-            session_id=path.stem,
+            wave.epoch_ns + np.round(t * 1e9).astype(np.int64),
+            {topic: one for topic, one in topics.items() if topic not in left_out},
+            head=wave.head(t),
+            turn=np.array([0.0, 0.0, math.sin(wave.turn / 2), math.cos(wave.turn / 2)]),
             epoch_ns=wave.epoch_ns,
-            robot=described,
+            robot=chain(len(names)) if robot else None,
             clock={"robot": "simulated"},
-        ) as w:
-            commands = w.joint_state("/joint_commands", names, unit="rad")
-            states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
-            odometry = w.odometry("/odom", frame="world", child="link01")
-            phase = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
-            offsets = w.joint_state("/joint_sample_offset", names, unit="s") if polled_s else None
-            joints, zero = np.arange(len(names)), np.zeros(3)
-            turned = np.array([0.0, 0.0, math.sin(wave.turn / 2), math.cos(wave.turn / 2)])
-            for t in wave.t.tolist():
-                t_ns, cycles = wave.epoch_ns + round(t * 1e9), wave.cycles(t)
-                commands.write(t_ns, 0.4 * np.sin(2 * np.pi * cycles - joints * LAG))
-                polled = wave.cycles(t + polled_s * joints)
-                angle = wave.angle(joints, polled)
-                speed = 2 * np.pi * wave.frequency_hz * wave.angle(joints, polled + 0.25)
-                if offsets is not None:
-                    offsets.write(t_ns, polled_s * joints)
-                states.write(
-                    t_ns, angle + noise * rng.standard_normal(angle.shape), speed, 0.1 * speed
-                )
-                odometry.write(t_ns, wave.head(t), turned, zero, zero)
-                if gait:
-                    wrapped = math.remainder(2 * np.pi * cycles, 2 * np.pi)
-                    phase.write(t_ns, np.array([0.4, wrapped]))
-        return path
+        )
 
     return write
 
@@ -340,10 +333,9 @@ def test_without_a_robot_the_other_body_stands_alone(files, make, read_back, tmp
 
 
 def test_sessions_without_measured_angles_are_seen_too(chain, files, tmp_path, overlaid):
-    with SessionWriter(tmp_path / "c.mcap", session_id="c", epoch_ns=EPOCH_NS, robot=chain(5)) as w:
-        commands = w.joint_state("/joint_commands", NAMES, unit="rad")
-        for i in range(100):
-            commands.write(EPOCH_NS + i * 10_000_000, np.zeros(5))
+    t_ns = EPOCH_NS + np.arange(100) * 10_000_000
+    topics = {"/joint_commands": (NAMES, "rad", np.zeros((100, 5)))}
+    write_topics(tmp_path / "c.mcap", t_ns, topics, robot=chain(5))
     out, found = overlaid(tmp_path / "c.mcap", files[0])
     assert "note: c: no measured joint angles on /joint_states" in out
     assert found.times("/c/joints/commanded").size == 100
@@ -376,15 +368,12 @@ def test_three_sessions_are_each_held_against_the_first(files, still, overlaid):
 def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
     files, chain, tmp_path, overlaid
 ):
-    late = tmp_path / "late.mcap"
-    with SessionWriter(late, session_id="late", epoch_ns=EPOCH_NS, robot=chain(5)) as w:
-        states = w.joint_state("/joint_states", NAMES, unit="rad")
-        phase = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
-        for i in range(300):
-            t_ns = EPOCH_NS + i * 10_000_000
-            states.write(t_ns, np.full(5, i * 1e-3))
-            if i >= 100:
-                phase.write(t_ns, np.array([0.4, 2 * np.pi * (i - 100) / 100]))
+    i = np.arange(300)
+    gait = np.stack([np.full(300, 0.4), 2 * np.pi * (i - 100) / 100], axis=1)
+    gait[:100] = np.nan
+    angles = np.tile(i[:, None] * 1e-3, 5)
+    topics = {"/joint_states": (NAMES, "rad", angles), "/gait": (GAIT, "rad", gait)}
+    late = write_topics(tmp_path / "late.mcap", EPOCH_NS + i * 10_000_000, topics, robot=chain(5))
     _, found = overlaid(files[0], late, "--align", "gait")
     times = found.times("/late/joints/measured")
     np.testing.assert_array_equal(times, (np.arange(300) - 100) * 10_000_000)
