@@ -95,9 +95,9 @@ def row_by_row(path: Path, seconds: float, recording: Path) -> tuple[float, floa
         robot = session.robot
         assert robot is not None
         measured = columns["/joint_states", "position"]
-        frames = frames_of(read_head(session, robot, measured, []), session.end_ns)
-        rows = slice(0, int(np.searchsorted(frames.head.t_ns, stop_ns)))
-        motion = assemble(robot, frames.between(rows).head, columns)
+        head, _ = frames_of(read_head(session, robot, measured, []), session.end_ns)
+        rows = slice(0, int(np.searchsorted(head.t_ns, stop_ns)))
+        motion = assemble(robot, head.at(rows), columns)
     lengths, radii = capsule_shape(robot)
     samples = [
         (int(t_ns), f"{entity}/{track.name}", value)

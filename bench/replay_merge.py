@@ -27,8 +27,7 @@ from hour_session import write_session
 from rerun.chunk import Chunk, LazyChunkStream
 
 from undulog.capture import Session
-from undulog.replay.overlay.alignment import Align, align
-from undulog.replay.overlay.side import convert, read_side
+from undulog.replay.overlay.sessions import Align, align, convert, read_side
 from undulog.replay.overlay.write import Converted, chunks_of, send, write_overlay
 from undulog.replay.viewer.viewer import viewer_binary
 

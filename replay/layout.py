@@ -25,7 +25,7 @@ from .draw import facts
 from .draw.cycles import mean_cycle
 from .draw.cycles.heat_maps import VISIBLE
 from .draw.cycles.steps import SEGMENTS
-from .draw.plots import gait, joints
+from .draw.plots import lines
 from .draw.scene import body
 from .draw.scene import stage as trail
 from .draw.scene.body import body_title
@@ -77,11 +77,11 @@ class Views:
 
 
 def build_views(content: Content) -> Views:
-    """The views of what a recording holds."""
+    """Return the views of a recording's content."""
     words: list[rrb.View] = [rrb.TextDocumentView(name="Session", contents=[facts.FACTS])]
     if content.has_events:
-        words.append(rrb.TextLogView(name="Events", contents=[f"{gait.EVENTS}/**"]))
-    mode = rrb.StateTimelineView(name="Gait mode", contents=[gait.MODE])
+        words.append(rrb.TextLogView(name="Events", contents=[f"{lines.EVENTS}/**"]))
+    mode = rrb.StateTimelineView(name="Gait mode", contents=[lines.MODE])
     about = rrb.TextDocumentView(name="About the mean cycle", contents=[mean_cycle.ABOUT])
     angles, effort = _angle_views(content), _effort_views(content)
     if content.live:  # nothing comes after the cursor
@@ -158,7 +158,7 @@ def _grid(span: float) -> rrb.LineGrid3D:
 
 
 def _beside(start: Start, offset: tuple[float, float, float]) -> tuple[float, float, float]:
-    """A point given forward, left and up of the head at the start [m]."""
+    """Return a point given forward, left and up of the head at the start [m]."""
     cos, sin = math.cos(start.heading), math.sin(start.heading)
     x, y, z = start.position
     forward, left, up = offset
@@ -166,7 +166,7 @@ def _beside(start: Start, offset: tuple[float, float, float]) -> tuple[float, fl
 
 
 def _grid_spacing(span: float) -> float:
-    """A length that can be read off: at most a fifth of the body [m]."""
+    """Return a round length of at most a fifth of the body [m]."""
     steps = (5.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
     return next((step for step in steps if step <= 0.2 * span), 0.01)
 
@@ -185,7 +185,7 @@ def _effort_views(content: Content) -> list[rrb.View]:
 
 
 def bar_chart(title: str, contents: str) -> rrb.BarChartView:
-    """A view of bars without a legend."""
+    """Return a view of bars without a legend."""
     legend = rrb.PlotLegend(visible=False)
     return rrb.BarChartView(name=title, contents=[contents], plot_legend=legend)
 
@@ -221,7 +221,7 @@ def _angle_views(content: Content) -> list[rrb.View]:
     if content.places is not None:
         three = len(content.places.names) == 3
         title = "Head, middle, tail [°]" if three else "Angle [°]"
-        views.append(plot(title, [f"{joints.PLACES}/**"]))
+        views.append(plot(title, [f"{lines.PLACES}/**"]))
     for plane in Plane:
         names = _names(content.robot, plane)
         if names & {name for series in content.measured for name in series.names}:
@@ -250,7 +250,7 @@ def _plane_of_places(content: Content) -> set[str] | None:
 def _joint_plot(
     title: str, series: Sequence[Series], names: set[str] | None, *, legend: bool = False
 ) -> rrb.TimeSeriesView:
-    """A line a joint; ``names`` chooses the lines that are visible at first."""
+    """Return a plot with a line for each joint; ``names`` are visible at first."""
     contents = [one.entity for one in series]
     return plot(title, contents, overrides=_lines(series, names), legend=legend)
 
@@ -276,7 +276,7 @@ def _whole_plot(
     overrides: Mapping[EntityPathLike, rrb.Visualizer] | None = None,
     legend: rrb.Corner2D | None = None,
 ) -> rrb.TimeSeriesView:
-    """All there is on its timeline, whatever the cursor does."""
+    """Return a plot of the whole timeline, independent of the cursor."""
     return rrb.TimeSeriesView(
         name=title,
         contents=contents,
@@ -293,7 +293,7 @@ def plot(
     overrides: Mapping[EntityPathLike, rrb.Visualizer] | None = None,
     legend: bool = True,
 ) -> rrb.TimeSeriesView:
-    """A plot about the time cursor."""
+    """Return a plot about the time cursor."""
     return rrb.TimeSeriesView(
         name=title,
         contents=contents,
@@ -304,12 +304,12 @@ def plot(
 
 
 def trail_window() -> rrb.VisibleTimeRanges:
-    """The part of the head's trail that is seen."""
+    """Return the visible part of the head's trail."""
     return _window(trail.TRAIL_SECONDS, 0.0, SESSION_TIME)
 
 
 def _window(before_s: float, after_s: float, *timelines: str) -> rrb.VisibleTimeRanges:
-    """A stretch about the cursor; on the session's timelines where none is given."""
+    """Return a window about the cursor, by default on the session's timelines."""
     start = rrb.TimeRangeBoundary.cursor_relative(seconds=-before_s)
     end = rrb.TimeRangeBoundary.cursor_relative(seconds=after_s)
     return rrb.VisibleTimeRanges(
@@ -321,7 +321,7 @@ def _window(before_s: float, after_s: float, *timelines: str) -> rrb.VisibleTime
 
 
 def build_blueprint(content: Content, front: Tab = "session") -> rrb.Blueprint:
-    """Lay out the views of what a recording holds.
+    """Lay out the views of a recording's content.
 
     Args:
         front: The tab in front; the session's where the recording has no such tab. In front, the

@@ -33,14 +33,14 @@ from undulog.sim.twin.recording import Recording
 from undulog.sim.twin.twin import Sample
 
 EVENTS = "/rosout"
-"""Events are said in words, which may name what was changed: they are not compared."""
+"""Events are text, which may name what was changed: they are not compared."""
 
 _ALWAYS = 1 << 64
 
 
 @dataclass(frozen=True)
 class LogDifference:
-    """What two sessions have alike.
+    """Differences of two sessions, message by message.
 
     Attributes:
         same: Topics whose messages are the same: times, numbers and bytes.
@@ -62,7 +62,7 @@ class LogDifference:
 
 
 def compare_logs(one: Path, other: Path) -> LogDifference:
-    """Hold two sessions against each other, topic by topic.
+    """Compare two sessions, topic by topic.
 
     Args:
         other: Another one, of the same time.
@@ -101,7 +101,7 @@ def _messages_of(log: RawLog, channel_id: int) -> Iterator[tuple[int, int, bytes
 
 @dataclass(frozen=True)
 class Repetition:
-    """What is to be run again, and where.
+    """A motion to be run again, and its scenario.
 
     Attributes:
         original: The session that commands are taken from.
@@ -173,7 +173,7 @@ def replay_in_twin(
     stop: StopRequest | None = None,
     on_sample: Callable[[Sample], None] | None = None,
 ) -> ReproducedRun:
-    """Give a session's commands to the twin again, record it, and compare.
+    """Run a session's commands in the twin, record the run and compare it.
 
     Args:
         repetition: What, and where.
@@ -197,10 +197,10 @@ def replay_in_twin(
 
 
 def compared(first: SessionView, second: SessionView) -> tuple[Comparison | None, str | None]:
-    """Hold a run against the one that its commands were taken from.
+    """Compare a run with the one that its commands were taken from.
 
     Returns:
-        What differs; or None, and why that can't be told, e.g. of a run shorter than two cycles.
+        The comparison; or None, and the reason, e.g. a run shorter than two cycles.
     """
     if RESPONSE_TOPIC not in first.channels:
         return None, f"{first.path.name} has commands and no response ({RESPONSE_TOPIC})"
@@ -211,7 +211,7 @@ def compared(first: SessionView, second: SessionView) -> tuple[Comparison | None
 
 
 def what_next(original: Path, again: Path, *, comparable: bool) -> list[str]:
-    """What to do with a session and its repetition.
+    """Return commands that show a session and its repetition.
 
     Args:
         comparable: Whether they can be compared.
@@ -238,14 +238,14 @@ def replay_on_bus(
     force: bool = False,
     as_json: bool = False,
 ) -> int:
-    """Give a session's commands again on a bus, and say how it went and what differs.
+    """Send a session's commands on a bus, and report the outcome and the differences.
 
     Args:
         arm: Whether commands are sent; a dry run in the twin if not.
         robot: The robot on the bus, a name or a file; the session's own if None.
         duration_s: How long [s]; as long as there are commands if None.
         output: The session to write; a dry run needs none.
-        recorder: Control socket of a recorder that is told the gait; the only one that runs if
+        recorder: Control socket of a recorder that receives the gait; the only one that runs if
             None.
         as_json: Report as one JSON object.
 

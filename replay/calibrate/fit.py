@@ -115,7 +115,7 @@ class Wanted:
         spread: Prior standard deviation of each ln theta.
         within: A parameter is determined if its 95 % interval is no wider than this to either side,
             as a share of it; of a dead time: of a control period.
-        settle_s: The first part to leave out [s]; what the session says if None.
+        settle_s: The first part to leave out [s]; the session's own if None.
     """
 
     only: tuple[str, ...] = ()
@@ -136,7 +136,7 @@ class Fitted:
         module: The joint whose own it is, or None.
         unit: SI.
         ci95: 95 % interval; None where the twin doesn't fit, since it would hold for noise alone.
-        determined: Whether the session tells it.
+        determined: Whether the session determines it.
     """
 
     name: str

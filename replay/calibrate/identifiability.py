@@ -1,4 +1,4 @@
-"""What a session tells, and what it doesn't.
+"""Which parameters a session determines, and which it doesn't.
 
 In units of the prior's deviations, x = P^1/2 z, the fit's covariance has eigenvalues between 0 (the
 session tells all about that direction) and 1 (nothing). A direction whose deviation is still more
@@ -64,7 +64,7 @@ _TELLS = {
 
 @dataclass(frozen=True)
 class CorrelatedParameters:
-    """A direction that a session doesn't tell.
+    """A direction in the parameters that a session doesn't determine.
 
     Attributes:
         left: Standard deviation along it, as a share of the prior's: 1 where nothing is told.
@@ -132,11 +132,9 @@ PLAY_RAD = 0.02
 PLAY_SPREAD_RAD = 0.05
 """Prior standard deviation of a play [rad]."""
 
-_ITERATIONS = 4
-"""Of a fit under another law; it starts from the fit under the twin's."""
+_ITERATIONS = 4  # of a fit under another law; it starts from the fit under the twin's
 
-_MOVES = 1e-3
-"""A joint that moves less shows no play [rad, RMS]."""
+_MOVES = 1e-3  # a joint that moves less shows no play [rad, RMS]
 
 
 @dataclass(frozen=True)

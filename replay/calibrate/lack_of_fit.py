@@ -40,8 +40,7 @@ from .identifiability import Alternative
 from .parameters import Measured
 from .solve import deviations, normal_of, score_covariance, slope_of
 
-_STILL = 1e-3
-"""A joint that moves less has no gain [rad, RMS]."""
+_STILL = 1e-3  # a joint that moves less has no gain [rad, RMS]
 
 
 @dataclass(frozen=True)
@@ -78,10 +77,10 @@ HARMONICS = 5
 """Of the gait that are looked at."""
 
 BETWEEN = 3
-"""Frequencies to each side of a harmonic, one resolution 1/T apart, that tell the noise's level."""
+"""Frequencies to each side of a harmonic, one resolution 1/T apart, that give the noise level."""
 
 FEWEST_CYCLES = 3.0
-"""Cycles from which lines can be told from what is between them."""
+"""Least number of cycles that separates the lines from the noise between them."""
 
 LAGS = 20
 """Of the test of Ljung and Box."""

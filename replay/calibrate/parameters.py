@@ -229,7 +229,7 @@ class Answers:
     Attributes:
         scenario: With theta_0.
         make_gait: Builds the gait of recorded commands.
-        measured: Which joints are asked for, and when.
+        measured: The joints and their sampling times.
         kernels: What computes the force laws.
         on_tick: Called at every tick; may raise to end the run.
         work_s: What they took [s].

@@ -34,7 +34,7 @@ def robot_text(calibration: Calibration) -> str:
     """The robot description with the fitted servo.
 
     Returns:
-        TOML: the former description, its comments kept, under a head that says what was fitted.
+        TOML: the former description, its comments kept, under a header with the fitted parameters.
 
     Raises:
         DataError: If the scenario's robot has no description.

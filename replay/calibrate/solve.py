@@ -53,8 +53,7 @@ FLOOR = 1e-7
 """No encoder is better than this [rad]; keeps the weights of a noiseless session finite."""
 
 _WINDOW = 5.0
-_MOST = 0.995
-"""Largest phi: a memory of 400 samples."""
+_MOST = 0.995  # largest phi: a memory of 400 samples
 
 
 def deviations(residuals: Sequence[FloatArray]) -> FloatArray:
@@ -189,8 +188,8 @@ STEP = 1e-3
 LONGEST = 0.7
 """No entry of x changes by more in one iteration."""
 
+# A step this small against the standard errors ends the fit: the next would be far smaller.
 _DONE = 0.1
-"""A step this small against the standard errors ends the fit: the next would be far smaller."""
 
 _TRIES = 6
 

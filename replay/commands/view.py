@@ -1,7 +1,8 @@
-"""Command ``view``."""
+"""Command ``view``: one session as a file or in a viewer, or while it is recorded."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -10,15 +11,22 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import echo, emit_json, progress
+from undulog.capture import Session
+from undulog.capture.common.console import complain, echo, emit_json, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output
+from undulog.capture.common.process import interruptible
 
+from ..samples.content import Layer
+from ..viewer import viewer
 from .view_film import view_clip
 from .view_options import ClipOptions, OverlayOptions, SingleOptions
 
 if TYPE_CHECKING:
     from ..feed.recording import Recording
+    from ..live.relay import RelayReport
+
+_NICENESS, _LIVE_NICENESS = 5, 10
 
 
 def view(
@@ -80,11 +88,11 @@ def view(
     if save is not None:
         check_output(save, [".rrd"], "a Rerun recording; end its name in .rrd", force=force)
     if live is not None:
-        from .view_viewer import view_live
-
-        view_live(live, save=save, web=web, connect=connect, json=json)
+        _view_live(live, save=save, web=web, connect=connect, json=json)
+    elif len(files) == 1 and save is not None:
+        _report(*_convert(files[0], save, single or SingleOptions()), json=json)
     elif len(files) == 1:
-        _view_file(files[0], single or SingleOptions(), save=save, web=web, json=json)
+        _view_session(files[0], single or SingleOptions(), web=web)
     else:
         from .view_overlay import view_overlay
 
@@ -117,20 +125,8 @@ def _check_usage(
         )
 
 
-def _view_file(
-    file: Path, single: SingleOptions, *, save: Path | None, web: bool, json: bool
-) -> None:
-    if save is not None:
-        _report(*_convert(file, save, single), json=json)
-    else:
-        from .view_viewer import view_session
-
-        view_session(file, single, web=web)
-
-
 def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording, float]:
     from undulog.analysis.signals.stretch import Options
-    from undulog.capture import Session
 
     from ..feed.numbers import saved
 
@@ -177,3 +173,91 @@ def _report(recording: Recording, duration_s: float, *, json: bool) -> None:
     path = recording.path
     echo(f"{path}: {duration_s:.1f} s, {size / 1e6:.1f} MB; open it with: rerun {path}")
     echo(*(f"note: {warning}" for warning in recording.warnings))
+
+
+def _view_live(
+    path: Path, *, save: Path | None, web: bool, connect: str | None, json: bool
+) -> None:
+    """Show what a recorder on this machine records, until it is closed or interrupted."""
+    from ..live.relay import open_server, open_window, relay_to_file, relay_to_viewer
+
+    if not (web or connect or save):
+        viewer.require_display()
+    _be_nice(_LIVE_NICENESS)  # it never competes with the recorder
+    if save is not None:
+        report = relay_to_file(path, save)
+    elif connect is not None:
+        report = relay_to_viewer(path, None, connect)
+    elif web:
+        with open_server(echo) as server:
+            report = relay_to_viewer(path, server, server.address)
+    else:
+        with open_window() as window:
+            report = relay_to_viewer(path, window, window.address)
+    _report_live(report, save, json=json)
+    if connect is not None and report.complaint:
+        complain(f"error: {report.complaint}")
+        os._exit(1)  # at once: Rerun would wait at its end for a viewer that takes nothing
+
+
+def _report_live(report: RelayReport, save: Path | None, *, json: bool) -> None:
+    lag = report.lag_s
+    if json:
+        names = ("p50", "p99", "max")
+        facts = {
+            "path": None if save is None else str(save),
+            "sessions": list(report.sessions),
+            "shown": report.shown,
+            "dropped": report.dropped,
+            "unread": report.unread,
+            "lag_s": None if lag is None else dict(zip(names, lag, strict=True)),
+        }
+        emit_json(facts)
+        return
+    where = f"{save}: " if save is not None else ""
+    late = "" if lag is None else f", {lag[0] * 1e3:.0f} ms late (median)"
+    echo(f"{where}{report.shown} messages shown, {report.dropped} dropped{late}")
+    if report.unread:
+        echo(f"note: {report.unread} messages could not be read")
+
+
+def _view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
+    """Show a session until the viewer is closed or a stop is requested."""
+    if not web:
+        viewer.require_display()
+    with ExitStack() as stack:
+        stop = stack.enter_context(interruptible())
+        session = single.view(stack.enter_context(Session.open(file)))
+        known = Layer(None)
+        if single.result:
+            from ..feed.numbers import read_results
+
+            known = read_results(session, single.result)
+        if web:
+            process, page = viewer.open_server(viewer.WHOLE_IN_MEMORY)
+            stack.enter_context(process).wait_until_it_listens()
+            echo(page)
+        else:
+            process = stack.enter_context(viewer.open_window())
+        # Rerun would report a closed window as errors of its own, in colours.
+        os.environ.setdefault("RUST_LOG", "off")
+        from ..feed.numbers import Analysing
+        from ..feed.progressive import NoLongerWantedError, Task, show_session, steps
+
+        analysing = stack.enter_context(Analysing(file, single.topics))
+        try:
+            with progress("view", total=steps(session)) as bar:
+                bar.update(0, note="the beginning")
+                # What is looked at goes before what is converted.
+                begun = partial(_be_nice, _NICENESS)
+                task = Task(session, known, analysing, single.tab or "session", bar, begun)
+                notes = show_session(task, process, stop)
+        except NoLongerWantedError:
+            return
+        echo(f"{file}: {session.duration_s:.1f} s, all of it in the viewer")
+        echo(*(f"note: {note}" for note in notes))
+        process.wait(stop)
+
+
+def _be_nice(niceness: int) -> None:
+    os.nice(max(niceness - os.nice(0), 0))

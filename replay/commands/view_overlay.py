@@ -15,7 +15,7 @@ from ..viewer import viewer
 from .view_options import OverlayOptions
 
 if TYPE_CHECKING:
-    from ..overlay.alignment import Align
+    from ..overlay.sessions import Align
     from ..overlay.write import Overlay, Place
 
 
@@ -27,7 +27,7 @@ def view_overlay(
     web: bool,
     json: bool,
 ) -> None:
-    """See sessions side by side.
+    """Show or save sessions side by side.
 
     Args:
         files: Two or more sessions.
@@ -39,8 +39,7 @@ def view_overlay(
     Raises:
         UsageError: If the names don't fit, or a session has no gait to be aligned by.
     """
-    from ..overlay.alignment import Align
-    from ..overlay.side import names_of
+    from ..overlay.sessions import Align, names_of
     from ..overlay.write import Place, combine_sessions, steps
 
     names = names_of(files, None if options.names is None else options.names.split(","))

@@ -1,7 +1,7 @@
 """What is drawn of a session, piece by piece: the same for a file and for a viewer that runs.
 
-Whoever draws decides the order: a file is written when everything is known, a viewer gets the
-beginning first. What is drawn by then says :attr:`Drawing.content`.
+The caller decides the order: a file is written when everything is known, a viewer gets the
+beginning first. :attr:`Drawing.content` is the content drawn so far.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from . import facts
 from .cycles.heat_maps import heat_maps, log_maps
 from .cycles.mean_cycle import Look, log_mean_cycle, read_averaged
 from .cycles.steps import charts, cycle_tables, log_charts, log_current, log_cycles
-from .plots import gait, joints
+from .plots import lines
 from .plots.write import Plots, log_others, log_words
 from .scene.body import body_title
 from .scene.motion import BODY_RATE_HZ, HeadPath, read_head
@@ -38,7 +38,7 @@ _WHOLE = Span()
 
 @dataclass
 class Sources:
-    """What is known of the session before anything is drawn.
+    """A session with its survey, as the input of a drawing.
 
     Attributes:
         warnings: What is missing or was assumed, a sentence each; grows while it is drawn.
@@ -50,7 +50,7 @@ class Sources:
 
     @classmethod
     def of(cls, session: SessionView, found: Survey | None = None) -> Sources:
-        """Look through a session.
+        """Survey a session.
 
         Args:
             found: What it holds, where that is known; None to go through it.
@@ -82,7 +82,7 @@ class Sources:
 
 
 def clock_of(session: SessionView) -> Clock:
-    """The session's timelines.
+    """Return the session's timelines.
 
     Returns:
         Its clock, with the phase of its gait where one was logged.
@@ -90,7 +90,7 @@ def clock_of(session: SessionView) -> Clock:
     phases: tuple[Track, ...] = ()
     if GAIT in session.channels:
         phases = read_columns(session, {GAIT: ["position"]}).get((GAIT, "position"), ())
-    return Clock(session.start_ns, gait.rhythm_of(phases))
+    return Clock(session.start_ns, lines.rhythm_of(phases))
 
 
 class Drawing:
@@ -105,7 +105,7 @@ class Drawing:
         *,
         span: Span = _WHOLE,
     ) -> None:
-        """Write how things look, and what doesn't move.
+        """Write styles and static entities.
 
         Args:
             named: Modules that tests name, to be marked.
@@ -117,7 +117,7 @@ class Drawing:
         robot = sources.session.robot
         moving = sources.measured or sources.commanded
         self._palette = palette_of(robot, [track.name for track in moving])
-        self._places = joints.head_middle_tail(robot, sources.commanded or sources.measured)
+        self._places = lines.head_middle_tail(robot, sources.commanded or sources.measured)
         self._plots = Plots(rec, clock, sources.found, self._places, self._palette)
         self._head, self._scene = self._open_scene(span)
         self.content = self._written()
@@ -135,7 +135,7 @@ class Drawing:
             self._scene.write(stretch)
 
     def widen(self, found: Survey, span: Span) -> None:
-        """Go on with a further part of a session of which the beginning is drawn.
+        """Continue with a further part of a session whose beginning is drawn.
 
         Args:
             span: The part of the head's trail that isn't drawn yet.
@@ -147,13 +147,13 @@ class Drawing:
         """Write modes, events and remarks."""
         rec, clock, session = self._rec, self._clock, self._sources.session
         warnings = self._sources.warnings
-        modes = gait.log_mode(rec, clock, session, warnings)
-        events = gait.log_events(rec, clock, session, warnings)
+        modes = lines.log_mode(rec, clock, session, warnings)
+        events = lines.log_events(rec, clock, session, warnings)
         words = log_words(rec, clock, session)
         self.content = replace(self.content, modes=modes, has_events=events or words)
 
     def write_others(self) -> None:
-        """Write what a bag of another make has beside joints."""
+        """Write the topics of a foreign bag that aren't joints."""
         others = log_others(self._rec, self._clock, self._sources.session, self._sources.warnings)
         self.content = replace(self.content, signals=(*self.content.signals, *others))
 
@@ -175,7 +175,7 @@ class Drawing:
         self.content = replace(self.content, charts=found, maps=maps)
 
     def write_cycles(self, layer: Layer) -> None:
-        """Write what is known cycle by cycle, and the mean of all cycles.
+        """Write values by cycle, and the mean of all cycles.
 
         Args:
             layer: What is known of the session.
@@ -222,7 +222,7 @@ class Drawing:
         return told
 
     def _written(self) -> Content:
-        """What is there as soon as a stretch is."""
+        """Return the content that every window of samples has."""
         plots = self._plots
         return Content(
             robot=self._sources.session.robot,
@@ -280,7 +280,7 @@ class Drawing:
 
 
 def palette_of(robot: Robot | None, names: Sequence[str]) -> dict[str, entities.Color]:
-    """Colours of the robot's joints, or of those in the log where there is no robot.
+    """Return colours of the robot's joints, or of those in the log if there is no robot.
 
     Args:
         robot: The robot, or None.
@@ -290,12 +290,12 @@ def palette_of(robot: Robot | None, names: Sequence[str]) -> dict[str, entities.
         Colour by joint name; joints that the robot doesn't have are grey.
     """
     if robot is None:
-        return joints.joint_palette(names)
-    return dict.fromkeys(names, entities.GREY) | joints.joint_palette(robot.joint_names)
+        return lines.joint_palette(names)
+    return dict.fromkeys(names, entities.GREY) | lines.joint_palette(robot.joint_names)
 
 
 def start_of(head: HeadPath) -> Start | None:
-    """Where the camera finds the robot.
+    """Return the initial pose of the robot, for the camera.
 
     Args:
         head: The head's path.

@@ -24,7 +24,7 @@ _MARKUP = re.compile(r"([\\`*_{}\[\]<>()#+!|~&$])")
 
 
 def escaped(text: str) -> str:
-    """Text with names from a log, as part of Markdown.
+    """Escape text with names from a log for Markdown.
 
     Returns:
         One line of Markdown that shows it and marks nothing up.
@@ -33,7 +33,7 @@ def escaped(text: str) -> str:
 
 
 def code(text: str) -> str:
-    """A name from a log as code in Markdown, in a table too.
+    """Return a name from a log as a code span of Markdown, valid in tables too.
 
     Returns:
         A code span of one line; the text itself where it has a backtick.
@@ -52,7 +52,7 @@ def markdown(
     has_cycles: bool,
     awaited: bool = False,
 ) -> str:
-    """What a reader needs beside the picture.
+    """Return the text that is shown beside the picture, as Markdown.
 
     Args:
         analysis: Its analysis, or None where there is none.
@@ -118,11 +118,11 @@ def _legend(colors: str, content: Content, *, has_cycles: bool) -> str:
     return " ".join(words)
 
 
-def log_facts(rec: rr.RecordingStream, text: str) -> None:
-    """Write the session's facts."""
+def log_facts(rec: rr.RecordingStream, text: str, entity: str = FACTS) -> None:
+    """Write the session's facts as Markdown."""
     import rerun as rr
 
-    rec.log(FACTS, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+    rec.log(entity, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
 
 
 def _robot(session: SessionView) -> str:

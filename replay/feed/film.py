@@ -183,14 +183,14 @@ def _stream(
 SIDES = (160, 2160)
 """Shortest and longest side of a clip [pixels]."""
 
+# What this viewer draws around a single view [pixels]; measured again where it does not.
 _FRAME = (7, 71)
-"""What this viewer draws around a single view [pixels]; measured again where it does not."""
 _SAMPLES = 8
 
 
 @dataclass(frozen=True)
 class Shot:
-    """What is filmed.
+    """Time window, frame rate and size of a clip.
 
     Attributes:
         start_s: Where it begins on ``session_time`` [s].
@@ -235,7 +235,7 @@ class Shot:
 
 
 def scene_only(content: Content) -> rrb.Blueprint:
-    """The layout of a clip: the body's view and nothing else.
+    """Return the layout of a clip: the body's view and nothing else.
 
     Raises:
         DataError: If there is no body to see.
@@ -270,12 +270,12 @@ def film(
 
     Args:
         output: The clip, ``.gif`` or ``.mp4``; an existing one is replaced when this one is whole.
-        legend: What the colours say, written into every frame above its time.
+        legend: Meaning of the colours, written into every frame above its time.
         on_frame: Called with the number of frames done.
         stop: Ends the work early; nothing is written then.
 
     Raises:
-        LogWriteError: If the clip can't be written, or an end was asked for.
+        LogWriteError: If the clip can't be written, or a stop is requested.
         UndulogError: If the viewer doesn't start or draw.
     """
     times_s = shot.times_s
@@ -298,7 +298,7 @@ def film(
 
 @contextmanager
 def _camera(recording: Path, shot: Shot) -> Generator[Callable[[float], Image.Image]]:
-    """What takes a picture of exactly the size wanted at any time."""
+    """Yield a function that takes a picture of exactly the clip's size at any time."""
     around = _FRAME
     for _ in range(2):
         window = (shot.size[0] + around[0], shot.size[1] + around[1])
@@ -326,7 +326,7 @@ def _caption(legend: str, seconds: float, speed: float) -> str:
 
 
 def _font(legend: str, size: tuple[int, int]) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Letters that are easy to read and let the legend fit."""
+    """Return a font that is easy to read and fits the legend."""
     wanted = max(11.0, size[1] / 32.0)
     wide = ImageFont.load_default(wanted).getlength(legend)
     return ImageFont.load_default(min(wanted, wanted * 0.95 * size[0] / max(wide, 1.0)))

@@ -72,7 +72,7 @@ class Analysing(AbstractContextManager["Analysing"]):
 
     @property
     def layer(self) -> Layer | None:
-        """What it found; None while it isn't done, and a note where it failed."""
+        """Its result; None while it isn't done, and a note if it failed."""
         if self._process is None or self._process.poll() is None:
             return None
         code = self._process.returncode
@@ -88,7 +88,7 @@ class Analysing(AbstractContextManager["Analysing"]):
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Analyse, and write what was found to standard output.
+    """Analyse a session and write the result to standard output.
 
     Args:
         arguments: The session's path, the topics of commands and responses.
@@ -103,7 +103,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def computed(session: SessionView, options: Options | None = None) -> Layer:
-    """Analyse a session now; one without a gait can be seen too.
+    """Analyse a session; one without a gait gets a note instead.
 
     Args:
         options: Where its joints are; None for the topics of the log contract.
@@ -124,7 +124,7 @@ def computed(session: SessionView, options: Options | None = None) -> Layer:
 
 
 def saved(session: SessionView, paths: Sequence[Path], options: Options | None = None) -> Layer:
-    """Read what was found of a session before.
+    """Read saved results of a session, and analyse it if they have no numbers.
 
     Args:
         paths: Results, JSON: of the session, of an experiment or a comparison that it is part of.
@@ -143,7 +143,7 @@ def saved(session: SessionView, paths: Sequence[Path], options: Options | None =
 
 
 def read_results(session: SessionView, paths: Sequence[Path]) -> Layer:
-    """Read what was found of a session before, and compute nothing.
+    """Read saved results of a session.
 
     Args:
         paths: As for :func:`saved`.

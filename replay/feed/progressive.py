@@ -31,7 +31,7 @@ from ..draw.cycles import mean_cycle
 from ..draw.cycles.heat_maps import POWER
 from ..draw.cycles.steps import CYCLES
 from ..draw.drawing import Drawing, Sources, clock_of
-from ..draw.plots.gait import MODE
+from ..draw.plots.lines import MODE
 from ..draw.scene.motion import BODY_RATE_HZ
 from ..layout import build_blueprint, build_views
 from ..samples.content import (
@@ -56,7 +56,7 @@ from .recording import open_recording, recording_id, send_properties
 
 
 def predict_layout(content: Content, rhythm: Rhythm | None) -> Content:
-    """Add what an analysis adds to a session like this.
+    """Add the views that an analysis of such a session adds.
 
     Args:
         content: What there is without it.
@@ -100,7 +100,7 @@ def predict_layout(content: Content, rhythm: Rhythm | None) -> Content:
 
 
 def same_arrangement(first: Content, other: Content) -> bool:
-    """Whether two contents have the same views, so that one's layout does for the other.
+    """Return whether two contents have the same views, so that they can share a layout.
 
     Returns:
         Whether their views differ in nothing but titles.
@@ -126,14 +126,12 @@ def _mean_series(kind: str, names: tuple[str, ...]) -> tuple[Series, ...]:
     return (Series(f"{mean_cycle.ENSEMBLE}/{kind}", names),) if names else ()
 
 
-_TAKE_S = 0.1
-"""How long to wait for the viewer between two looks at whether it is still wanted [s]."""
-_FEW_WORDS = 5000
-"""Modes and events that are read before the first picture, at most."""
+_TAKE_S = 0.1  # how long to wait for the viewer between two looks at whether it is still wanted [s]
+_FEW_WORDS = 5000  # modes and events that are read before the first picture, at most
 
 
 class NoLongerWantedError(Exception):
-    """The viewer was closed, or an end was asked for."""
+    """The viewer was closed, or a stop was requested."""
 
 
 class _UnforeseenError(Exception):
@@ -142,10 +140,10 @@ class _UnforeseenError(Exception):
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be shown.
+    """A session to be sent to a viewer.
 
     Attributes:
-        known: What results say of it; its numbers are computed where they don't.
+        known: Saved results; its numbers are computed if these have none.
         analysing: Its analysis, not started.
         front: The tab in front once its views are filled; until then it is the session's.
         bar: Told how far it is, of :func:`steps`.
@@ -169,7 +167,7 @@ class _Sink:
     streams: list[rr.RecordingStream] = field(default_factory=list[rr.RecordingStream])
 
     def open(self, identity: str) -> rr.RecordingStream:
-        """A recording stream, which keeps what is written until it is connected."""
+        """Open a recording stream, which buffers until it is connected."""
         rec = open_recording(identity)
         self.streams.append(rec)
         return rec
@@ -182,13 +180,13 @@ class _Sink:
         rec.send_blueprint(layout)
 
     def _attended(self, call: Callable[[], None]) -> None:
-        """Make a call of Rerun's that never returns where the viewer fails meanwhile."""
+        """Make a call of Rerun's that never returns if the viewer fails meanwhile."""
         failed: list[BaseException] = []
 
         def run() -> None:
             try:
                 call()
-            except BaseException as error:  # noqa: BLE001  it is raised again, by who waits
+            except BaseException as error:  # noqa: BLE001  raised again by the waiting thread
                 failed.append(error)
 
         thread = threading.Thread(target=run, daemon=True)
@@ -198,7 +196,7 @@ class _Sink:
             try:
                 self.look()
             except BaseException:
-                if thread.is_alive():  # so would be whoever waits for the streams' end
+                if thread.is_alive():  # closing the streams would block as well
                     self.streams.clear()
                     rr.unregister_shutdown()
                 raise
@@ -206,7 +204,7 @@ class _Sink:
             raise failed[0]
 
     def look(self) -> None:
-        """Whether it is still wanted."""
+        """Raise if the viewer has ended or an end is requested."""
         if self.stop.requested:
             raise NoLongerWantedError
         if self.viewer.ended:
@@ -214,7 +212,7 @@ class _Sink:
             raise NoLongerWantedError
 
     def hand_over(self, rec: rr.RecordingStream) -> None:
-        """Wait until the viewer has taken all of it, as long as it is wanted."""
+        """Wait until the viewer has received all data, unless an end is requested."""
         while True:
             self.look()
             begun = time.monotonic()
@@ -231,7 +229,7 @@ class _Sink:
 
 
 def steps(session: SessionView) -> int:
-    """How many steps it takes.
+    """Return the number of steps.
 
     Returns:
         The number: one a stretch, and one for the analysis.
@@ -251,7 +249,7 @@ def show_session(task: Task, viewer: Viewer, stop: StopRequest) -> tuple[str, ..
         What is missing or was assumed, a sentence each.
 
     Raises:
-        NoLongerWantedError: If the viewer was closed, or an end asked for, before all was sent.
+        NoLongerWantedError: If the viewer was closed, or a stop requested, before all was sent.
         DataError: If the session holds nothing that can be drawn.
         UndulogError: If the viewer fails.
     """
@@ -275,13 +273,13 @@ def show_session(task: Task, viewer: Viewer, stop: StopRequest) -> tuple[str, ..
 
 
 def _send(task: Task, sink: _Sink, found: Survey, identity: str) -> tuple[str, ...]:
-    """Draw all of it in one recording."""
+    """Draw a session in one recording."""
     session = task.session
     clock = clock_of(session)
     parts = stretches(session, found.wanted, found.context_ns)
     first = next(parts)
     rec = sink.open(identity)
-    send_properties(rec, session)
+    send_properties(rec, session.session_id, session.start_ns)
     drawing = Drawing(rec, clock, Sources.of(session, found), task.known.named, span=first.span)
     words_first = _words(session) <= _FEW_WORDS
     if words_first:
@@ -350,13 +348,13 @@ class _Numbers:
 
 
 def _whole(session: SessionView, found: Survey) -> Survey:
-    """What is found, made complete as far as the rest of the drawing needs it."""
+    """Complete a brief survey as far as the rest of the drawing needs it."""
     if found.is_whole:
         return found
     _require_nothing_else(session, found)
     if "/odom" in session.channels:
         return found
-    # The joints' times say when the body is drawn.
+    # The body is drawn at the joints' times.
     return replace(found, drawing_ns=survey(session, BODY_RATE_HZ).drawing_ns)
 
 
@@ -377,6 +375,6 @@ def _require_nothing_else(session: SessionView, found: Survey) -> None:
 
 
 def _words(session: SessionView) -> int:
-    """How many modes and events there are."""
+    """Return the number of modes and events."""
     channels = session.channels
     return sum(channels[topic].count for topic in (MODE, "/rosout") if topic in channels)

@@ -23,7 +23,8 @@ from undulog.analysis.results.analysis import Analysis
 from undulog.analysis.session.cycles import CycleMaps
 from undulog.capture import SessionView
 from undulog.capture.common.errors import LogWriteError
-from undulog.capture.common.files import part_file
+from undulog.capture.common.files import check_stop, part_file
+from undulog.capture.common.process import StopRequest
 
 from ..draw.drawing import Drawing, Sources, clock_of
 from ..layout import build_blueprint
@@ -52,7 +53,7 @@ class Recording:
 
 
 def recording_id(session_id: str) -> str:
-    """The recording's id, the same for the same session on every machine.
+    """Return the recording's id, the same for the same session on every machine.
 
     Args:
         session_id: The session's id.
@@ -81,7 +82,7 @@ def write_recording(
             out.
         steady: The cycles of its steady gait, for a session whose phase was not logged.
         named: Modules that tests name, to be marked.
-        notes: What the caller has to say about the session, a sentence each.
+        notes: The caller's notes on the session, a sentence each.
         layout: Makes the blueprint from what the recording holds.
 
     Raises:
@@ -91,30 +92,51 @@ def write_recording(
     layer = Layer(analysis, steady, tuple(named), tuple(notes))
     sources, clock = Sources.of(session), clock_of(session)
     identity = recording_id(session.session_id)
-    with part_file(path) as draft, rerun_writes(path):
+    with recording_file(path, identity, session.session_id, session.start_ns) as rec:
+        drawing = Drawing(rec, clock, sources, layer.named)
+        session.forget()
+        for stretch in stretches(session, sources.found.wanted, sources.found.context_ns):
+            drawing.write(stretch)
+            rec.flush()  # what is drawn is written before more is read
+        drawing.write_response(layer)
+        drawing.write_words()
+        drawing.write_others()
+        drawing.write_cycles(layer)
+        found = drawing.write_facts(session, layer, drawing.content)
+        rec.send_blueprint(layout(drawing.content))
+    return Recording(path, identity, drawing.content, tuple(found))
+
+
+@contextmanager
+def recording_file(
+    path: Path, identity: str, name: str, start_ns: int, stop: StopRequest | None = None
+) -> Generator[rr.RecordingStream]:
+    """Open a recording stream into a file, which is whole on leaving.
+
+    Args:
+        path: The .rrd file; an existing one is replaced when the new one is whole.
+        identity: The recording's id.
+        name: The recording's name.
+        start_ns: Time at 0 of ``session_time`` [Unix ns].
+        stop: Checked at the end; once it is requested, nothing is written.
+
+    Raises:
+        LogWriteError: If the file can't be written, or ``stop`` is requested.
+    """
+    with part_file(path) as draft, _rerun_errors(path):
         rec = open_recording(identity, in_file=True)
         try:
             rec.save(draft)
-            send_properties(rec, session)
-            drawing = Drawing(rec, clock, sources, layer.named)
-            session.forget()
-            for stretch in stretches(session, sources.found.wanted, sources.found.context_ns):
-                drawing.write(stretch)
-                rec.flush()  # what is drawn is written before more is read
-            drawing.write_response(layer)
-            drawing.write_words()
-            drawing.write_others()
-            drawing.write_cycles(layer)
-            told = drawing.write_facts(session, layer, drawing.content)
-            rec.send_blueprint(layout(drawing.content))
+            send_properties(rec, name, start_ns)
+            yield rec
         finally:
             rec.disconnect()
         require_whole(draft, path)
-    return Recording(path, identity, drawing.content, tuple(told))
+        check_stop(path, stop)
 
 
 def open_recording(identity: str, *, in_file: bool = False) -> rr.RecordingStream:
-    """A recording stream for a session, without a sink.
+    """Return a recording stream for a session, without a sink.
 
     Args:
         identity: The recording's id.
@@ -130,22 +152,15 @@ def open_recording(identity: str, *, in_file: bool = False) -> rr.RecordingStrea
     return rec
 
 
-def send_properties(rec: rr.RecordingStream, session: SessionView) -> None:
-    """Say whose recording it is."""
-    rec.send_recording_name(session.session_id)
-    rec.send_recording_start_time_nanos(session.start_ns)
+def send_properties(rec: rr.RecordingStream, name: str, start_ns: int) -> None:
+    """Send the recording's name and the time of its start [Unix ns]."""
+    rec.send_recording_name(name)
+    rec.send_recording_start_time_nanos(start_ns)
 
 
 @contextmanager
-def rerun_writes(path: Path) -> Generator[None]:
-    """Report what Rerun raises where it can't write, e.g. on a full disk, with the file's name.
-
-    Args:
-        path: What the file will be called.
-
-    Raises:
-        LogWriteError: For a ``RuntimeError`` of Rerun's.
-    """
+def _rerun_errors(path: Path) -> Generator[None]:
+    """Raise Rerun's ``RuntimeError``, e.g. on a full disk, as a LogWriteError with the path."""
     try:
         yield
     except RuntimeError as error:

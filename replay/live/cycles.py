@@ -24,8 +24,7 @@ from undulog.capture.robot.model import Robot
 from ..samples.quantities import products
 from ..samples.survey import GAIT
 from ..samples.tracks import Track, one_after_another
-from .decode import Batch
-from .inbox import PATIENCE_NS
+from .decode import PATIENCE_NS, Batch
 
 KEPT_S = 60.0
 """A cycle and its surroundings that last longer than this are not computed [s]."""
@@ -33,8 +32,7 @@ KEPT_S = 60.0
 _TURN = 2.0 * np.pi
 _ROUNDING_RAD = 1e-6
 _MARGIN_NS = 100_000_000
-_BEYOND = 2
-"""Samples of the phase beyond a cycle's surroundings that are waited for."""
+_BEYOND = 2  # samples of the phase beyond a cycle's surroundings that are waited for
 _KEYS = (
     ("/joint_commands", "position"),
     ("/joint_states", "position"),
@@ -52,7 +50,7 @@ class Cycle:
         start_ns: Its start [Unix ns].
         stop_ns: Its end [Unix ns].
         names: The joints, head to tail.
-        gain: Response over command, NaN where the cycle tells nothing, shape (m,).
+        gain: Response over command, NaN where it can't be computed, shape (m,).
         lag_rad: Positive where the response is late [rad], shape (m,).
         power_w: Mean mechanical power [W], NaN where it isn't known, shape (m,).
     """
@@ -111,7 +109,7 @@ class CycleMeter:
         """Take new samples.
 
         Args:
-            robot: The robot, which says what plane a joint is of; None where it isn't known.
+            robot: The robot, for the joints' planes; None where it isn't known.
 
         Returns:
             The cycles that have become known.

@@ -25,10 +25,12 @@ from undulog.capture.recorder.live_wire import LiveMessage
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Robot
 
-from ..draw.plots.gait import MODE
+from ..draw.plots.lines import MODE
 from ..draw.scene.motion import POSE, HeadPath, tracked_head
-from ..samples.sampling import ordered
-from ..samples.tracks import JOINT_STATE, OFFSETS, Columns, Track, without_filler
+from ..samples.tracks import JOINT_STATE, OFFSETS, Columns, Track, ordered, without_filler
+
+PATIENCE_NS = 250_000_000
+"""How long a quantity without new samples delays those computed from it [ns]."""
 
 _OFFSETS_KEPT = 64
 
@@ -49,7 +51,7 @@ class Batch:
     Attributes:
         head: Of the head's pose, or None.
         ranges: Topic to sampling times [ns], shape (n,), and distances [m], shape (n,).
-        modes: When a gait mode was said [ns], and which.
+        modes: Times of gait modes [ns], and their names.
         events: When something happened [ns], and its message.
         newest_ns: The newest log time [ns]; 0 where there is no message.
         messages: How many messages it was made of.
@@ -115,7 +117,7 @@ class LiveLog:
         return self._robot
 
     def unit(self, topic: str) -> str:
-        """Unit of a JointState topic; ``rad`` where its channel doesn't say."""
+        """Unit of a JointState topic; ``rad`` where its channel has none."""
         found = [one.channel for one in self._topics.values() if one.channel.topic == topic]
         return found[0].metadata.get("unit", "rad") if found else "rad"
 
@@ -162,7 +164,7 @@ class LiveLog:
                 self.unread += len(own)
             else:
                 found.append((topic, own))
-        found.sort(key=lambda pair: pair[0].channel.topic not in OFFSETS)  # these tell the times
+        found.sort(key=lambda pair: pair[0].channel.topic not in OFFSETS)  # these shift the times
         for topic, own in found:
             self._read(topic, own, batch)
         return batch
@@ -320,4 +322,4 @@ def _sorter(kind: MessageType) -> LayoutSorter:
 
 
 def _ignore(_sentence: str) -> None:
-    """What is odd in a log is told by the recorder and by ``log check``, not by the picture."""
+    """Ignore irregularities of a log: the recorder and ``log check`` report them."""

@@ -19,16 +19,15 @@ from undulog.capture.common.arrays import FloatArray
 
 from ..draw.cycles.heat_maps import POWER
 from ..draw.cycles.steps import CYCLES, SEGMENTS
-from ..draw.plots.joints import DEGREES, log_look, log_rows, part_entities
+from ..draw.plots.lines import DEGREES, log_look, log_rows, part_entities
 from ..samples.content import GAIN, LAG, SCALARS, Chart, Color, Quantity, Series
-from ..samples.sampling import GAP_STEPS, mark_gaps, typical_step_ns
 from ..samples.timeline import SESSION_TIME, Clock
-from ..samples.tracks import Table, Track, tables
+from ..samples.tracks import GAP_STEPS, Table, Track, mark_gaps, tables, typical_step_ns
 from .cycles import Cycle
 
 
 class LiveStream(rr.RecordingStream):
-    """A recording stream that says a static thing once, and again only when it has changed."""
+    """A recording stream that logs static data only when they change."""
 
     def __init__(self, application_id: str, recording_id: str) -> None:
         """Make a stream that isn't connected yet."""
@@ -86,7 +85,7 @@ class LivePlot:
             entity: E.g. ``/joints/measured``.
             degrees: Whether the values are angles [rad], to be plotted in degrees.
             component: What is written; None for ``Angle:degrees`` or ``Scalars:scalars``.
-            look: As :func:`~.replay.draw.plots.joints.log_look` takes it.
+            look: As :func:`~.replay.draw.plots.lines.log_look` takes it.
         """
         self._entity, self._degrees = entity, degrees
         self._component = component or (DEGREES if degrees else SCALARS)
@@ -97,7 +96,7 @@ class LivePlot:
 
     @property
     def series(self) -> tuple[Series, ...]:
-        """What has been written."""
+        """The series that have been written."""
         paths = part_entities(self._entity, self._parts)
         pairs = zip(paths, self._parts, strict=True)
         return tuple(Series(path, part, self._component) for path, part in pairs)
@@ -136,7 +135,7 @@ class LivePlot:
                 log_rows(rec, clock, path, t_ns, values, degrees=self._degrees, component=component)
 
     def _with_gap(self, path: str, table: Table) -> Table:
-        """A row of NaN before the samples where there was a gap, which ends the line."""
+        """Insert a row of NaN before the samples after a gap, which ends the line."""
         last_ns, step_ns = self._last.get(path, (0, 0))
         first_ns = int(table.t_ns[0])
         self._last[path] = (int(table.t_ns[-1]), typical_step_ns(table.t_ns) or step_ns)
@@ -193,7 +192,7 @@ class CycleBars:
         *,
         everything: bool = False,
     ) -> None:
-        """Draw what waits, at the time at which its cycle started.
+        """Draw waiting cycles, at the times at which they started.
 
         Args:
             palette: Colour by joint name, head to tail.

@@ -1,9 +1,9 @@
 """The relay: reads a recorder's live feed and draws it in Rerun, in a process of its own.
 
-A viewer that is frozen makes Rerun wait for ever once some hundred megabytes lie before it. That
-happens here, in a thread that does nothing else, and never in the recorder: the inbox goes on
-reading and drops what is not drawn. Where the whole relay stands still the socket fills, and the
-recorder drops what it doesn't take.
+A frozen viewer makes Rerun block for ever once some hundred megabytes are queued. That happens
+here, in a thread of its own, and never in the recorder: the inbox continues to read and drops the
+messages that are not drawn. If the whole relay is stopped the socket fills, and the recorder drops
+the messages that the socket doesn't accept.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from undulog.capture.common.files import part_file
 from undulog.capture.common.process import StopRequest, interruptible
 from undulog.capture.recorder.live_wire import Kind, LiveMessage, read_records
 
-from ..feed.recording import APPLICATION, recording_id, require_whole
+from ..feed.recording import APPLICATION, recording_id, require_whole, send_properties
 from ..viewer import viewer
 from ..viewer.viewer import Viewer
 from .decode import LiveLog
@@ -41,45 +41,38 @@ def open_window() -> Viewer:
     Raises:
         UndulogError: If it doesn't start.
     """
-    return _ready(viewer.open_window(_WINDOW))
+    window = viewer.open_window(_WINDOW)
+    window.wait_until_it_listens()
+    return window
 
 
 def open_server(notify: Callable[[str], None]) -> Viewer:
     """Serve the viewer to browsers on this machine.
 
     Args:
-        tell: Called with the address to open, once it is served.
+        notify: Called with the address to open, once it is served.
 
     Raises:
         UndulogError: If it doesn't start.
     """
     server, page = viewer.open_server(_SERVER)
-    _ready(server)
+    server.wait_until_it_listens()
     notify(page)
     return server
-
-
-def _ready(started: Viewer) -> Viewer:
-    try:
-        started.wait_until_it_listens()
-    except BaseException:
-        started.close()
-        raise
-    return started
 
 
 BATCH_S = 0.03
 """How often what has come is drawn [s]."""
 SILENCE_S = 10.0
-"""A feed that says nothing for so long has ended; a living one repeats its definitions [s]."""
+"""A feed that is silent for so long has ended; a live one repeats its definitions [s]."""
 
 _LAGS_KEPT = 100_000
 _FLUSH_S = 1.0
 _GRACE_S = 3.0
 _LOOK_S = 0.05
 
+# Streams whose viewer takes nothing: to let go of one would wait for it.
 _HELD: list[LiveStream] = []
-"""Streams whose viewer takes nothing: to let go of one would wait for it."""
 
 Connect = Callable[[rr.RecordingStream], None]
 """Gives a recording stream its sink."""
@@ -87,7 +80,7 @@ Connect = Callable[[rr.RecordingStream], None]
 
 @dataclass
 class RelayReport:
-    """What became of a live feed.
+    """Counts and lag of a live feed.
 
     Attributes:
         sessions: Session ids, in the order they came.
@@ -107,7 +100,7 @@ class RelayReport:
 
 
 class Relay:
-    """Draws what lies in an inbox; one thread calls it."""
+    """Draws the messages of an inbox; one thread calls it."""
 
     def __init__(self, inbox: Inbox, connect: Connect, *, one_session: bool = False) -> None:
         """Draw nothing yet.
@@ -134,7 +127,7 @@ class Relay:
 
     @property
     def report(self) -> RelayReport:
-        """What became of the feed so far."""
+        """Counts and lag of the feed so far."""
         lag_s = None
         if lags := tuple(self._lags):
             p50, p99 = np.percentile(lags, [50.0, 99.0]).tolist()
@@ -153,7 +146,7 @@ class Relay:
         return self._dropped + self._inbox.dropped
 
     def step(self) -> None:
-        """Draw what has come since the last step; waits for Rerun, if Rerun waits.
+        """Draw the messages received since the last step; blocks while Rerun blocks.
 
         Raises:
             LogWriteError: If the sink can't be made.
@@ -174,7 +167,7 @@ class Relay:
             self._end()
 
     def close(self) -> None:
-        """Hand over what is left; waits for Rerun, but not for long."""
+        """Flush the remaining data; waits for Rerun at most a second."""
         self._end()
         if self._rec is None:
             return
@@ -191,7 +184,7 @@ class Relay:
         return time.monotonic() - self._heard_at
 
     def _begin(self, feed_id: int) -> bool:
-        """Turn to a new feed; False where the first was the last."""
+        """Switch to a new feed; return False if only the first is drawn."""
         if self._one_session and self._scene is not None:
             self._end()
             return False
@@ -225,7 +218,7 @@ class Relay:
         batch = self._log.decode(messages)
         if self._scene is None:
             self._scene = self._open(min(message.log_time_ns for message in messages))
-        if self._states:  # said before, and told again to whoever comes
+        if self._states:  # latched states, repeated for late relays
             self._scene.draw(self._log.decode(self._states), self._not_shown)
             self._states.clear()
         self._scene.draw(batch, self._not_shown)
@@ -235,7 +228,7 @@ class Relay:
         messages.clear()
 
     def _open(self, first_ns: int) -> LiveScene:
-        """A recording stream for the session."""
+        """Open a recording stream for the session."""
         rr.set_strict_mode(True)
         facts = self._log.facts
         session_id = facts.get("session_id") or f"feed-{self._feed_id or 0:016x}"
@@ -248,8 +241,7 @@ class Relay:
         rec.set_log_time_enabled(False)
         rec.set_log_tick_enabled(False)
         self._connect(rec)
-        rec.send_recording_name(f"{session_id} live")
-        rec.send_recording_start_time_nanos(epoch_ns)
+        send_properties(rec, f"{session_id} live", epoch_ns)
         self._rec = rec
         self._sessions.append(session_id)
         return LiveScene(rec, self._log, session_id, epoch_ns)
@@ -261,7 +253,7 @@ class Relay:
 
 
 def relay_to_viewer(path: Path, viewer: Viewer | None, address: str) -> RelayReport:
-    """Draw sessions in a viewer until it is closed or we are told to stop.
+    """Draw sessions in a viewer until it is closed or a stop is requested.
 
     Args:
         viewer: The viewer, if it is a process of ours.
@@ -280,7 +272,7 @@ def relay_to_viewer(path: Path, viewer: Viewer | None, address: str) -> RelayRep
 
 
 def relay_to_file(path: Path, output: Path) -> RelayReport:
-    """Draw one session to a file, which appears when the session ends or we are told to stop.
+    """Draw one session to a file, which appears when the session ends or a stop is requested.
 
     Args:
         output: The .rrd file; one of that name is replaced.
@@ -330,7 +322,7 @@ class _Painter(threading.Thread):
 def _run(
     relay: Relay, request: StopRequest, viewer: Viewer | None, *, until_end: bool = False
 ) -> RelayReport:
-    """Draw until told to stop, or until the viewer or (if so wanted) the session has ended."""
+    """Draw until a stop is requested, or the viewer or (``until_end``) the session has ended."""
     painter = _Painter(relay)
     painter.start()
     while painter.is_alive() and not request.requested:

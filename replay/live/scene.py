@@ -1,24 +1,25 @@
 """Draws a recording while it is made, with the entities, colours and views of its replay.
 
-What a sample says by itself is drawn at once; what needs several samples (the body, power, the
-tracking error) is computed over the last seconds, with the replay's own functions, and drawn as far
-as all that it needs has come.
+Single samples are drawn at once; quantities of several samples (the body, power, the tracking
+error) are computed over the last seconds, with the replay's own functions, and drawn up to the time
+at which all of their inputs have been received.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
 import rerun as rr
 
-from undulog.capture.common.arrays import IntArray
+from undulog.capture.common.arrays import FloatArray, IntArray
 
 from ..draw.drawing import palette_of, start_of
 from ..draw.facts import code, document, listed, log_facts
-from ..draw.plots import gait, joints
+from ..draw.plots import lines
 from ..draw.scene import body, stage
 from ..draw.scene.motion import BODY_RATE_HZ, SPARSE_RATE_HZ, HeadPath, Motion, assemble, still_head
 from ..layout import build_blueprint
@@ -26,20 +27,137 @@ from ..samples import content as entities
 from ..samples import quantities
 from ..samples.content import Content, Signal, Start, signal_title
 from ..samples.quantities import DRAWN, SIGNALS, power_limit, topic_entity
-from ..samples.sampling import hold
 from ..samples.timeline import Clock
-from ..samples.tracks import Track
+from ..samples.tracks import Columns, Track, hold, ordered
 from .cycles import CycleMeter
-from .decode import Batch, LiveLog
-from .inbox import Fresh, Window, joined
+from .decode import PATIENCE_NS, Batch, LiveLog
 from .plot import CycleBars, LivePlot
 
 _LAYOUT_EVERY_S = 1.0
 _FACTS_EVERY_S = 2.0
 _PLACES_EVERY_S = 0.2
 _TAIL_NS = round(1e9 / stage.TRAIL_RATE_HZ)
-_CLEARER = 2.0
-"""Another plane's joints are plotted once they swing so many times as far."""
+_CLEARER = 2.0  # another plane's joints are plotted once they swing so many times as far
+
+
+_KEPT_NS = 2_000_000_000  # length of a window
+
+
+class _Window:
+    """Samples of the last seconds."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self.head: HeadPath | None = None
+        self.ranges: dict[str, tuple[IntArray, FloatArray]] = {}
+        self._tracks: dict[tuple[str, str], dict[str, Track]] = {}
+        self._newest_ns = 0
+
+    @property
+    def columns(self) -> Columns:
+        """All JointState columns."""
+        return {key: tuple(tracks.values()) for key, tracks in self._tracks.items()}
+
+    def tracks(self, topic: str, field: str = "position") -> tuple[Track, ...]:
+        """One column.
+
+        Args:
+            topic: E.g. ``/joint_states``.
+            field: ``position``, ``velocity`` or ``effort``.
+
+        Returns:
+            A track a joint; none where nothing has come.
+        """
+        return tuple(self._tracks.get((topic, field), {}).values())
+
+    def add(self, batch: Batch) -> None:
+        """Take new samples, and forget the oldest."""
+        for key, tracks in batch.columns.items():
+            own = self._tracks.setdefault(key, {})
+            for track in tracks:
+                old = own.get(track.name)
+                kept = None if old is None else (old.t_ns, old.values)
+                own[track.name] = Track(track.name, *_grown(kept, track.t_ns, track.values))
+        for topic, (t_ns, values) in batch.ranges.items():
+            self.ranges[topic] = _grown(self.ranges.get(topic), t_ns, values)
+        if batch.head is not None:
+            self.head = _joined(self.head, batch.head)
+        ends = [one.t_ns[-1] for tracks in batch.columns.values() for one in tracks]
+        self._newest_ns = max([self._newest_ns, *map(int, ends)])
+
+    def ready_ns(self, inputs: Iterable[Sequence[Track]], *others: IntArray) -> int:
+        """Return the time up to which a quantity can be computed from all of its inputs.
+
+        Args:
+            inputs: Tracks that it is computed from.
+            others: Times of further inputs [ns].
+
+        Returns:
+            The earliest of the inputs' last times, but no more than the patience before the newest
+            sample of all [ns].
+        """
+        ends = [int(track.t_ns[-1]) for tracks in inputs for track in tracks if track.t_ns.size]
+        ends += [int(t_ns[-1]) for t_ns in others if t_ns.size]
+        return max(min(ends, default=0), self._newest_ns - PATIENCE_NS)
+
+
+class _Fresh:
+    """Remembers up to where something has been drawn."""
+
+    def __init__(self) -> None:
+        """Nothing has been drawn."""
+        self._until_ns: dict[str, int] = {}
+
+    def rows(self, name: str, t_ns: IntArray, upto_ns: int | None = None) -> slice:
+        """Return which samples are new, and mark them as drawn.
+
+        Args:
+            t_ns: Their times [ns], ascending, shape (n,).
+            upto_ns: The last time that can be drawn [ns]; None for all.
+        """
+        start = int(np.searchsorted(t_ns, self._until_ns.get(name, -1), side="right"))
+        stop = t_ns.size
+        if upto_ns is not None:
+            stop = int(np.searchsorted(t_ns, upto_ns, side="right"))
+        if stop > start:
+            self._until_ns[name] = int(t_ns[stop - 1])
+        return slice(start, max(start, stop))
+
+    def tracks(
+        self, name: str, tracks: Iterable[Track], upto_ns: int | None = None
+    ) -> tuple[Track, ...]:
+        """Return the new samples of tracks, and mark them as drawn.
+
+        Args:
+            upto_ns: The last time that can be drawn [ns]; None for all.
+
+        Returns:
+            Those that have new samples, with these only.
+        """
+        found: list[Track] = []
+        for track in tracks:
+            rows = self.rows(f"{name}/{track.name}", track.t_ns, upto_ns)
+            if rows.stop > rows.start:
+                found.append(Track(track.name, track.t_ns[rows], track.values[rows]))
+        return tuple(found)
+
+
+def _grown(
+    old: tuple[IntArray, FloatArray] | None, t_ns: IntArray, values: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Append new samples to those of the last seconds before them."""
+    if old is None:
+        return t_ns, values
+    if not t_ns.size:
+        return old
+    first = int(np.searchsorted(old[0], int(t_ns[0]) - _KEPT_NS))
+    return ordered(np.concatenate([old[0][first:], t_ns]), np.concatenate([old[1][first:], values]))
+
+
+def _joined(old: HeadPath | None, new: HeadPath) -> HeadPath:
+    """Append a tracked head's path to that of the last seconds before it."""
+    kept = None if old is None else (old.t_ns, old.pose)
+    return HeadPath.of(*_grown(kept, new.t_ns, new.pose), tracked=True)
 
 
 class LiveScene:
@@ -57,7 +175,7 @@ class LiveScene:
         """
         self._rec, self._log, self._session_id = rec, log, session_id
         self._clock = Clock(epoch_ns)
-        self._window, self._fresh = Window(), Fresh()
+        self._window, self._fresh = _Window(), _Fresh()
         self._measured = LivePlot(entities.MEASURED, degrees=True)
         self._commanded = LivePlot(entities.COMMANDED, degrees=True)
         self._errors = LivePlot(entities.ERROR, degrees=True)
@@ -80,7 +198,7 @@ class LiveScene:
 
     @property
     def content(self) -> Content:
-        """What has been drawn so far."""
+        """Content that has been drawn so far."""
         return Content(
             robot=self._log.robot,
             start=self._start,
@@ -123,7 +241,7 @@ class LiveScene:
         self._lay_out(dropped)
 
     def finish(self, dropped: int = 0) -> None:
-        """Say that the recording has ended.
+        """Draw the end of the recording.
 
         Args:
             dropped: Messages that could not be shown.
@@ -150,24 +268,24 @@ class LiveScene:
     def _draw_places(
         self, kind: str, tracks: tuple[Track, ...], palette: dict[str, entities.Color] | None
     ) -> None:
-        """Head, middle and tail once more, for a plot that can be read at a glance."""
+        """Add a plot of head, middle and tail alone, which can be read at a glance."""
         places = self._places
         if places is None:
             return
-        look = joints.places_look(places, kind)
-        entity = f"{joints.PLACES}/{kind}"
+        look = lines.places_look(places, kind)
+        entity = f"{lines.PLACES}/{kind}"
         new = LivePlot(entity, degrees=True, component=entities.SCALARS, **look)
         plot = self._place_plots.setdefault((kind, places.names), new)
         own = [track for track in tracks if track.name in places.names]
         plot.write(self._rec, self._clock, own, palette)
 
     def _choose_places(self, moving: tuple[Track, ...]) -> None:
-        """Head, middle and tail of the plane that moves, once it is clear which does."""
+        """Choose head, middle and tail of the plane that moves, once it is clear which does."""
         now = time.monotonic()
         if self._places is not None and now < self._places_at:
             return
         self._places_at = now + _PLACES_EVERY_S
-        found = joints.head_middle_tail(self._log.robot, moving)
+        found = lines.head_middle_tail(self._log.robot, moving)
         if found is None or found == self._places:
             return
         if self._places is not None and self._places.plane is not found.plane:
@@ -187,7 +305,7 @@ class LiveScene:
             whole = quantities.total(tracks)
             upto_ns = self._window.ready_ns([tracks])
             for part in self._fresh.tracks(kind, [whole] if whole else [], upto_ns):
-                joints.log_sum(self._rec, self._clock, kind, part)
+                lines.log_sum(self._rec, self._clock, kind, part)
                 self._has_power = True
         fresh = self._fresh.tracks("power", mechanical, self._window.ready_ns([mechanical]))
         self._joint_power.write(self._rec, self._clock, fresh, palette)
@@ -198,7 +316,7 @@ class LiveScene:
                 continue
             names = [track.name for track in self._window.tracks(topic)]
             of_joints = bool(set(names) & set(palette))
-            colors = palette if of_joints else joints.joint_palette(names)
+            colors = palette if of_joints else lines.joint_palette(names)
             known = self._signals.get(topic)
             plot = known[0] if known else LivePlot(topic_entity(SIGNALS, topic))
             self._signals[topic] = plot, of_joints
@@ -207,13 +325,13 @@ class LiveScene:
     def _draw_words(self, batch: Batch) -> None:
         turns: list[tuple[int, str]] = []
         for t_ns, mode in batch.modes:
-            if t_ns > self._mode_ns:  # what holds is told again and again
+            if t_ns > self._mode_ns:  # the current mode is repeated
                 if mode != self._mode:
                     turns.append((t_ns, mode))
                 self._mode, self._mode_ns = mode, t_ns
         self._modes += len(turns)
-        gait.log_states(self._rec, self._clock, turns)
-        gait.log_lines(self._rec, self._clock, batch.events)
+        lines.log_states(self._rec, self._clock, turns)
+        lines.log_lines(self._rec, self._clock, batch.events)
         self._has_events |= bool(batch.events)
 
     # -- the body --------------------------------------------------------------------------
@@ -247,7 +365,7 @@ class LiveScene:
             self._draw_trail(motion.head)
 
     def _slots(self, t_ns: IntArray, rate_hz: float) -> IntArray:
-        """At most so many of the rows a second; :func:`~.replay.samples.sampling.decimate` chooses.
+        """At most so many of the rows a second; :func:`~.replay.samples.tracks.decimate` chooses.
 
         The slots start with the first row of all, so that it doesn't matter where a batch ends.
         """
@@ -258,7 +376,7 @@ class LiveScene:
         return np.flatnonzero(np.diff(slot, prepend=slot[:1] - 1)).astype(np.int64)
 
     def _scale(self, drive: tuple[Track, ...]) -> None:
-        """Let the colours' full power grow with what was seen, in steps of 1, 2, 5."""
+        """Increase the colours' full power with the measured power, in steps of 1, 2, 5."""
         if not drive:
             return
         seen = power_limit(np.concatenate([track.values for track in drive]))
@@ -276,14 +394,14 @@ class LiveScene:
             stage.log_rays(self._rec, self._clock, motion, chosen, sensors=sensors, reading=reading)
 
     def _draw_trail(self, head: HeadPath) -> None:
-        """The head's path from the last point that was drawn, ten points a second."""
+        """Draw the head's path from the last drawn point, ten points a second."""
         for row in range(head.t_ns.size):
             point = head.at(slice(row, row + 1))
             last = self._trail_end
             if last is not None:
                 if point.t_ns[0] - last.t_ns[0] < _TAIL_NS:
                     continue
-                stage.log_trail(self._rec, self._clock, joined(last, point))
+                stage.log_trail(self._rec, self._clock, _joined(last, point))
             self._trail_end = point
 
     # -- layout ----------------------------------------------------------------------------
@@ -302,7 +420,7 @@ class LiveScene:
         self._rec.send_blueprint(build_blueprint(content))
 
     def _facts(self, content: Content, dropped: int, *, ended: bool) -> str:
-        """The session in words, as in :mod:`.replay.draw.facts`."""
+        """Return the session's facts as text, as in :mod:`.replay.draw.facts`."""
         robot = content.robot
         start = datetime.fromtimestamp(self._clock.start_ns // 1_000_000_000, UTC)
         made = "no robot description"
@@ -322,6 +440,6 @@ class LiveScene:
 
 
 def _shape(content: Content) -> tuple[object, ...]:
-    """What the layout depends on: not which robot, and where, but whether there is one."""
+    """Return the content that determines the layout: whether there is a robot, not which."""
     bare = replace(content, robot=None, start=None, power_limit_w=None)
     return content.robot is None, content.start is None, content.power_limit_w is None, bare

@@ -14,15 +14,14 @@ from undulog.analysis.results.formats import short, utc
 
 from ..draw.facts import FACTS as SESSION
 from ..draw.facts import code, document, escaped, listed
-from ..draw.plots import gait
+from ..draw.plots import lines
 from ..draw.scene import stage as ranges
 from ..draw.scene.body import COMMANDED, LABELS, MARKERS, MEASURED
 from ..draw.scene.stage import TRAIL
 from ..layout import bar_chart, blueprint, build_views, plot, tabs, trail_window
 from ..samples.content import Content, Series
-from .alignment import Align
-from .differences import BARS, DIFFERENCES, LINES, POWER, Quantity
-from .side import COMPARED, Side
+from .draw import BARS, DIFFERENCES, LINES, POWER, Quantity
+from .sessions import COMPARED, Align, Side
 
 FACTS = f"{COMPARED}/facts"
 
@@ -37,11 +36,11 @@ _ALIGNED = {
 
 @dataclass(frozen=True)
 class Found:
-    """What a session's comparison with the first one says.
+    """Result of a session's comparison with the first one.
 
     Attributes:
         comparison: Numbers, or None where there are none.
-        changed: What the two sessions say of themselves, and say otherwise.
+        changed: Metadata in which the two sessions differ.
     """
 
     comparison: Comparison | None
@@ -50,7 +49,7 @@ class Found:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the comparison leaves out and what its intervals don't know."""
+        """Omissions and limits of the comparison."""
         if self.comparison is None:
             return ()
         partial = self.comparison.partial
@@ -59,7 +58,7 @@ class Found:
 
 
 def answer(first: Side, other: Side, found: Found) -> str:
-    """A comparison's answer with the sessions' names.
+    """Return a comparison's answer with the sessions' names.
 
     Args:
         first: The first session, A.
@@ -80,12 +79,12 @@ def markdown(
     legend: str,
     notes: Sequence[str],
 ) -> str:
-    """What a reader needs beside the picture.
+    """Return the text that is shown beside the picture, as Markdown.
 
     Args:
-        found: What the comparison with the first says, by the others' names.
+        found: Result of the comparison with the first session, by the others' names.
         has_cycles: Whether there is a timeline of gait cycles.
-        legend: How the bodies are told apart.
+        legend: How the bodies differ in style.
         notes: How the bodies were placed, what is missing, what was assumed, a sentence each.
     """
     first, *others = sides
@@ -131,17 +130,15 @@ def _changes(first: Side, other: Side, changed: Sequence[Change]) -> str:
 SEPARATE = "/head_distance"
 """Distance of the heads, below a session's own path."""
 
-_HIDDEN = (COMMANDED, MARKERS, LABELS, ranges.RANGES)
-"""What is drawn of the first body only."""
+_HIDDEN = (COMMANDED, MARKERS, LABELS, ranges.RANGES)  # what is drawn of the first body only
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What was written of a session.
+    """Content of a session in the recording.
 
     Attributes:
         content: Its own recording's.
-        body: Whether its body is drawn.
         lines: Whether its head, middle or tail was measured.
         differences: Its angles minus the first session's; none of the first.
         apart: Whether the distance of its head from the first one's was written.
@@ -150,17 +147,21 @@ class Shown:
 
     side: Side
     content: Content
-    body: bool
     lines: bool
     differences: tuple[Series, ...] = ()
     apart: bool = False
     bars: tuple[Quantity, ...] = ()
 
+    @property
+    def body(self) -> bool:
+        """Whether its body is drawn."""
+        return self.content.start is not None
+
 
 def build_blueprint(
     shown: Sequence[Shown], bars: Sequence[Quantity], how: Align, title: str
 ) -> rrb.Blueprint:
-    """Lay out what a side by side recording holds.
+    """Lay out the content of a side by side recording.
 
     Args:
         shown: What was written of each session, the first one first.
@@ -198,7 +199,7 @@ def build_blueprint(
 
 
 def _scene(bodies: Sequence[Shown], title: str) -> rrb.Spatial3DView:
-    """The first body's own view of the world, with all bodies in it."""
+    """Return the first body's own view of the world, with all bodies in it."""
     first = bodies[0]
     scene = build_views(first.content).scene
     assert scene is not None  # noqa: S101 - its body is drawn
@@ -231,7 +232,7 @@ def _both(shown: Sequence[Shown]) -> list[rrb.View]:
 
 
 def _differences(shown: Sequence[Shown]) -> list[rrb.View]:
-    """A view a plane and session, and how far the heads are apart."""
+    """Return a view for each plane and session, and one of the distance of the heads."""
     first, *others = shown
     found: list[rrb.View] = []
     for one in others:
@@ -262,7 +263,7 @@ def _words(shown: Sequence[Shown]) -> list[rrb.View]:
         rrb.TextDocumentView(name=one.side.name, contents=[f"{one.side.entity}{SESSION}"])
         for one in shown
     ]
-    events = [f"{one.side.entity}{gait.EVENTS}" for one in shown if one.content.has_events]
+    events = [f"{one.side.entity}{lines.EVENTS}" for one in shown if one.content.has_events]
     if events:
         found.append(rrb.TextLogView(name="Events", contents=events))
     return found

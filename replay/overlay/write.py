@@ -29,35 +29,35 @@ from undulog.analysis.compare.compare import Choices, compare_fitted
 from undulog.analysis.compare.side import ComparedSession
 from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import UndulogError
-from undulog.capture.common.files import check_stop, part_file
+from undulog.capture.common.files import check_stop
 from undulog.capture.common.process import StopRequest
 
-from ..draw.plots.joints import log_table, part_entities
+from ..draw.facts import log_facts
+from ..draw.plots.lines import log_table
 from ..draw.scene.body import body_title
-from ..feed.recording import Recording, open_recording, recording_id, require_whole, rerun_writes
-from ..samples.content import Color, Series
-from ..samples.sampling import decimate, interpolate
+from ..feed.recording import Recording, recording_file, recording_id
+from ..samples.content import Color
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
-from ..samples.tracks import Table, Track, join_tracks, pairs
-from . import differences, style
+from ..samples.tracks import Table, decimate
+from . import draw
 from . import layout as words
-from .alignment import (
+from .layout import SEPARATE, Found, Shown, build_blueprint
+from .sessions import (
     Align,
-    Aligned,
     Placement,
+    Side,
     align,
-    counterparts,
+    convert,
     head_distance,
+    names_of,
     placement,
     placement_text,
+    read_side,
 )
-from .layout import SEPARATE, Found, Shown, build_blueprint
-from .side import Side, convert, names_of, read_side
 
 _ARROW: Any = pa  # comes without types
 _CHUNK: Any = Chunk
-_AHEAD = 32
-"""Chunks that may wait to be written."""
+_AHEAD = 32  # chunks that may wait to be written
 
 _PROPERTIES = "/__properties/**"
 
@@ -65,7 +65,7 @@ _PROPERTIES = "/__properties/**"
 def chunks_of(
     recording: Path, entity: str, *, later_ns: int = 0, more_cycles: int = 0
 ) -> LazyChunkStream:
-    """A recording's chunks under a path of their own.
+    """Return a recording's chunks under a path of their own.
 
     Args:
         entity: Path to put in front of every entity's, e.g. ``/twin``.
@@ -101,7 +101,7 @@ def send(rec: rr.RecordingStream, streams: Sequence[LazyChunkStream]) -> None:
 
 
 def _moved(chunk: Any, moves: dict[str, int]) -> Chunk:
-    """A chunk further on along its timelines; rows that aren't on one stay off it."""
+    """Shift a chunk along its timelines; rows that aren't on one stay off it."""
     batch = chunk.to_record_batch()
     for timeline, by in moves.items():
         place = batch.schema.get_field_index(timeline)
@@ -113,57 +113,10 @@ def _moved(chunk: Any, moves: dict[str, int]) -> Chunk:
     return moved
 
 
-def angle_differences(a: Aligned, b: Aligned, how: Align) -> tuple[Track, ...]:
-    """Measured angles of one session minus those of another.
-
-    Args:
-        a: The session that is subtracted, and whose times count.
-
-    Returns:
-        A track [rad] for each joint that both have; ``b`` is taken on the straight line between
-        its samples, NaN where it has none.
-    """
-    return tuple(
-        Track(one.name, one.t_ns, _taken(a, b, how, one, other) - one.values)
-        for one, other in pairs(a.side.measured, b.side.measured)
-    )
-
-
-def _taken(a: Aligned, b: Aligned, how: Align, track: Track, other: Track) -> np.ndarray:
-    at_ns, known = counterparts(a, b, how, track.t_ns)
-    values = np.full(track.t_ns.size, np.nan)
-    values[known] = interpolate(other.t_ns, other.values, at_ns[known])
-    return values
-
-
-def log_differences(
-    rec: rr.RecordingStream,
-    a: Aligned,
-    entity: str,
-    differences: Sequence[Track],
-    drawn: Sequence[Series],
-) -> tuple[Series, ...]:
-    """Write differences as the angles of the session that was subtracted are drawn.
-
-    Args:
-        a: The session that was subtracted.
-        differences: The differences [rad].
-        drawn: Its measured angles; joints of one series are drawn at common times.
-    """
-    known = {track.name: track for track in differences}
-    parts = [[known[name] for name in one.names if name in known] for one in drawn]
-    tables = [join_tracks(part) for part in parts if part]
-    paths = part_entities(entity, [table.names for table in tables])
-    return tuple(
-        log_table(rec, a.clock, path, table, a.side.palette, degrees=True)
-        for path, table in zip(paths, tables, strict=True)
-    )
-
-
 ANGLES = "/angles"
 """Differences of the measured angles, below a session's own path."""
 
-Layout = Callable[[Sequence[Shown], Sequence[differences.Quantity], Align, str], rrb.Blueprint]
+Layout = Callable[[Sequence[Shown], Sequence[draw.Quantity], Align, str], rrb.Blueprint]
 
 _APART_RATE_HZ = 25.0
 
@@ -175,26 +128,21 @@ class Place(StrEnum):
     """Where the first one starts."""
 
     WORLD = "world"
-    """Where their sessions say that they were."""
+    """At the poses of their own sessions."""
 
 
 @dataclass(frozen=True)
 class Converted:
-    """A session with what was made of it.
+    """A session, its recording and its input of a comparison.
 
     Attributes:
-        aligned: The session and its place on the timelines.
-        seen: What a comparison takes from it, or None where it can't be analysed.
+        side: The session and its place on the timelines.
+        seen: Its input of a comparison, or None where it can't be analysed.
     """
 
-    aligned: Aligned
+    side: Side
     recording: Recording
     seen: ComparedSession | None
-
-    @property
-    def side(self) -> Side:
-        """The session."""
-        return self.aligned.side
 
 
 @dataclass(frozen=True)
@@ -204,7 +152,7 @@ class Overlay:
     Attributes:
         recording_id: Follows from the sessions' ids and names, and how they are aligned and placed.
         shown: What it holds of each session.
-        found: What the comparison with the first session says, by the others' names.
+        found: Result of the comparison with the first session, by the others' names.
         placements: How bodies are moved, by name; those that aren't are left out.
         warnings: What is missing or was assumed, a sentence each.
     """
@@ -226,64 +174,52 @@ def write_overlay(
     stop: StopRequest | None = None,
     layout: Layout = build_blueprint,
 ) -> Overlay:
-    """Bring converted sessions together.
+    """Combine converted sessions in one recording.
 
     Args:
         sessions: Two or more; differences are from the first.
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
         place: Where the bodies are drawn.
-        stop: Looked at now and then; once an end is asked for, nothing is written.
+        stop: Checked now and then; once a stop is requested, nothing is written.
         layout: Makes the blueprint from what was written.
 
     Raises:
-        LogWriteError: If the file can't be written, or an end was asked for.
+        LogWriteError: If the file can't be written, or a stop is requested.
     """
-    rr.set_strict_mode(True)
     sides = [one.side for one in sessions]
-    told = [f"{one.side.name}: {said}" for one in sessions for said in one.recording.warnings]
+    warnings = [f"{one.side.name}: {text}" for one in sessions for text in one.recording.warnings]
     found = {one.side.name: _compare(sessions[0], one) for one in sessions[1:]}
     for name, one in found.items():
-        told += [f"{name} (B): {said}" if len(found) > 1 else said for said in one.notes]
-    placements = _placements(sessions, how, place, told)
+        warnings += [f"{name} (B): {text}" if len(found) > 1 else text for text in one.notes]
+    placements = _placements(sessions, how, place, warnings)
     names = [side.name for side in sides]
     identity = recording_id("\n".join([*(side.session_id for side in sides), *names, how, place]))
-    with part_file(path) as draft, rerun_writes(path):
-        rec = open_recording(identity, in_file=True)
-        try:
-            rec.save(draft)
-            rec.send_recording_name(", ".join(names))
-            rec.send_recording_start_time_nanos(sides[0].start_ns)
-            check_stop(path, stop)
-            send(rec, [_chunks(one) for one in sessions])
-            check_stop(path, stop)
-            shown = _log(rec, sessions, found, placements, how)
-            seen = [(one.side, one.seen) for one in sessions if one.seen is not None]
-            quantities = differences.log_bars(rec, seen)
-            title = _title(shown)
-            text = words.markdown(
-                sides,
-                found,
-                how,
-                has_cycles=any(side.rhythm is not None for side in sides),
-                legend=_legend(shown, title),
-                notes=told,
-            )
-            document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
-            rec.log(words.FACTS, document, static=True)
-            rec.send_blueprint(layout(shown, quantities, how, title))
-        finally:
-            rec.disconnect()
-        require_whole(draft, path)
+    with recording_file(path, identity, ", ".join(names), sides[0].start_ns, stop) as rec:
         check_stop(path, stop)
-    return Overlay(path, identity, shown, found, placements, tuple(dict.fromkeys(told)))
+        send(rec, [_chunks(one) for one in sessions])
+        check_stop(path, stop)
+        shown = _log(rec, sessions, found, placements, how)
+        seen = [(one.side, one.seen) for one in sessions if one.seen is not None]
+        quantities = draw.log_bars(rec, seen)
+        title = _title(shown)
+        text = words.markdown(
+            sides,
+            found,
+            how,
+            has_cycles=any(side.rhythm is not None for side in sides),
+            legend=_legend(shown, title),
+            notes=warnings,
+        )
+        log_facts(rec, text, words.FACTS)
+        rec.send_blueprint(layout(shown, quantities, how, title))
+    return Overlay(path, identity, shown, found, placements, tuple(dict.fromkeys(warnings)))
 
 
 def _chunks(one: Converted) -> LazyChunkStream:
-    """A session's own recording under its name and on the common timelines."""
-    aligned = one.aligned
-    later_ns = aligned.side.start_ns - aligned.zero_ns
-    entity = aligned.side.entity
-    return chunks_of(one.recording.path, entity, later_ns=later_ns, more_cycles=aligned.cycles)
+    """Return a session's own recording under its name and on the common timelines."""
+    side = one.side
+    later_ns = side.start_ns - side.zero_ns
+    return chunks_of(one.recording.path, side.entity, later_ns=later_ns, more_cycles=side.cycles)
 
 
 def _compare(first: Converted, other: Converted) -> Found:
@@ -299,23 +235,22 @@ def _compare(first: Converted, other: Converted) -> Found:
 
 
 def _placements(
-    sessions: Sequence[Converted], how: Align, place: Place, told: list[str]
+    sessions: Sequence[Converted], how: Align, place: Place, warnings: list[str]
 ) -> dict[str, Placement]:
-    """How the other bodies are laid on the first one, with a sentence about each."""
-    bodies = [one.aligned for one in sessions if one.recording.content.start is not None]
+    """Return the placements of the other bodies onto the first one; append a warning for each."""
+    bodies = [one.side for one in sessions if one.recording.content.start is not None]
     found: dict[str, Placement] = {}
     for one in bodies[1:] if place is Place.START else ():
-        placed = placement(bodies[0], one, how)
-        name, first = one.side.name, bodies[0].side.name
+        placed, first = placement(bodies[0], one, how), bodies[0].name
         if placed is None:
-            told.append(
-                f"{name} and {first} have no body at a shared moment: each in its own world"
+            warnings.append(
+                f"{one.name} and {first} have no body at a shared moment: each in its own world"
             )
         else:
-            found[name] = placed
-            told.append(placement_text(placed, name, first))
+            found[one.name] = placed
+            warnings.append(placement_text(placed, one.name, first))
     if len(bodies) > 1 and place is Place.WORLD:
-        told.append("every body is drawn at the pose of its own session")
+        warnings.append("every body is drawn at the pose of its own session")
     return found
 
 
@@ -326,69 +261,64 @@ def _log(
     placements: Mapping[str, Placement],
     how: Align,
 ) -> tuple[Shown, ...]:
-    """Write all that isn't in the sessions' own recordings."""
+    """Write the entities that aren't in the sessions' own recordings."""
     rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    first = sessions[0]
-    content = first.recording.content
-    drawn = differences.log_lines(rec, first.aligned, 0, content.places)
-    shown = [Shown(first.side, content, content.start is not None, drawn)]
+    a, content = sessions[0].side, sessions[0].recording.content
+    shown = [Shown(a, content, draw.log_lines(rec, a, 0, content.places))]
     for rank, one in enumerate(sessions[1:], start=1):
-        a, b, own = first.aligned, one.aligned, one.recording.content
-        comparison = found[b.side.name].comparison
-        placed = placements.get(b.side.name, Placement())
-        places = differences.places_in(b.side, content.places, own.places)
-        drawn = differences.log_lines(rec, b, rank, places)
-        angles = angle_differences(a, b, how)
-        angles = log_differences(rec, a, f"{b.side.own}{ANGLES}", angles, content.measured)
-        apart = _log_apart(rec, (a, b), how, placed, style.tint(rank))
-        bars = differences.log_difference_bars(rec, a.side, b.side, comparison)
-        shown.append(Shown(b.side, own, own.start is not None, drawn, angles, apart, bars))
-    bodies = [k for k, one in enumerate(shown) if one.body]
-    for rank, k in enumerate(bodies):
-        _log_body(rec, sessions[k].aligned, rank, placements)
-    style.log_ends(rec, [sessions[k].aligned for k in bodies])
-    powers = {k: one.side for k, one in enumerate(shown) if one.content.has_power}
-    differences.log_power_names(rec, powers)
+        b, own = one.side, one.recording.content
+        placed = placements.get(b.name, Placement())
+        places = draw.places_in(b, content.places, own.places)
+        lines = draw.log_lines(rec, b, rank, places)
+        angles = draw.angle_differences(a, b, how)
+        angles = draw.log_differences(rec, a, f"{b.own}{ANGLES}", angles, content.measured)
+        apart = _log_apart(rec, (a, b), how, placed, draw.tint(rank))
+        bars = draw.log_difference_bars(rec, a, b, found[b.name].comparison)
+        shown.append(Shown(b, own, lines, angles, apart, bars))
+    bodies = [one.side for one in shown if one.body]
+    for rank, side in enumerate(bodies):
+        _log_body(rec, side, rank, placements)
+    draw.log_ends(rec, bodies)
+    draw.log_power_names(rec, {k: one.side for k, one in enumerate(shown) if one.content.has_power})
     return tuple(shown)
 
 
 def _log_apart(
     rec: rr.RecordingStream,
-    pair: tuple[Aligned, Aligned],
+    pair: tuple[Side, Side],
     how: Align,
     placed: Placement,
     color: Color,
 ) -> bool:
-    """How far the heads are apart, where both were tracked."""
+    """Write the distance of the heads, if both were tracked."""
     a, b = pair
-    one, other = a.side.head, b.side.head
+    one, other = a.head, b.head
     if one is None or other is None or not (one.tracked and other.tracked):
         return False
     t_ns = one.t_ns[decimate(one.t_ns, _APART_RATE_HZ)]
     apart = head_distance(a, b, how, placed, t_ns)
     known = bool(np.isfinite(apart).any())
     if known:
-        name = f"{b.side.name}, {a.side.name}"
+        name = f"{b.name}, {a.name}"
         table = Table((name,), t_ns, apart[:, None])
-        log_table(rec, a.clock, f"{b.side.own}{SEPARATE}", table, {name: color}, degrees=False)
+        log_table(rec, a.clock, f"{b.own}{SEPARATE}", table, {name: color}, degrees=False)
     return known
 
 
 def _log_body(
-    rec: rr.RecordingStream, one: Aligned, rank: int, placements: Mapping[str, Placement]
+    rec: rr.RecordingStream, side: Side, rank: int, placements: Mapping[str, Placement]
 ) -> None:
-    side = one.side
     if side.head is None or side.robot is None:
         return
-    style.log_name(rec, one, rank, side.head, side.robot)
+    draw.log_name(rec, side, rank, side.head, side.robot)
     if rank:
-        style.log_look(rec, side.entity, rank, side.robot)
+        draw.log_wireframe(rec, side.entity, rank, side.robot)
     if side.name in placements:
-        style.log_placement(rec, side.entity, placements[side.name])
+        draw.log_placement(rec, side.entity, placements[side.name])
 
 
 def _title(shown: Sequence[Shown]) -> str:
-    """Name of the bodies' view: who is who."""
+    """Return the name of the bodies' view, which names the sessions."""
     first, *others = [one.side.name for one in shown if one.body] or [""]
     if not others:
         return f"{first}; the others have no body" if first else ""
@@ -416,7 +346,7 @@ def combine_sessions(
     on_step: Callable[[int, str], None] = lambda _done, _note: None,
     stop: StopRequest | None = None,
 ) -> Overlay:
-    """Convert sessions and bring them together.
+    """Convert sessions and combine them in one recording.
 
     Args:
         files: Two or more sessions; differences are from the first.
@@ -424,7 +354,7 @@ def combine_sessions(
         names: What they are called, or None for the files' names.
         place: Where the bodies are drawn.
         on_step: Told before each of :func:`steps` how many are done, and what comes.
-        stop: Looked at now and then; once an end is asked for, nothing is written.
+        stop: Checked now and then; once a stop is requested, nothing is written.
 
     Raises:
         UsageError: If the names don't fit, or a session has no gait to be aligned by.
@@ -456,5 +386,5 @@ def combine_sessions(
 
 
 def steps(count: int) -> int:
-    """How many steps it takes."""
+    """Return the number of steps."""
     return count + 2

@@ -42,7 +42,7 @@ class Places:
 
     Attributes:
         names: One to three joint names, head to tail.
-        plane: The plane they bend, or None where no robot says.
+        plane: The plane they bend, or None without a robot.
     """
 
     names: tuple[str, ...]
@@ -66,7 +66,7 @@ def line_title(name: str, label: str) -> str:
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a table of cycles holds.
+    """Quantity of a table of cycles.
 
     Attributes:
         key: Last part of its entity's path, with the unit.
@@ -91,7 +91,7 @@ class CycleTable:
         names: The joints, head to tail.
         start_s: Start of each cycle, from the session's start [s], shape (c,).
         stop_s: Its end [s], shape (c,).
-        value: In the quantity's unit, NaN where the cycle tells nothing, shape (m, c).
+        value: In the quantity's unit, NaN where it isn't known, shape (m, c).
     """
 
     quantity: Quantity
@@ -207,7 +207,7 @@ class Named:
     """A module that a test names.
 
     Attributes:
-        why: What is said of it, without a stop.
+        why: The finding, without a full stop.
     """
 
     joint: str
@@ -216,7 +216,7 @@ class Named:
 
 @dataclass(frozen=True)
 class Layer:
-    """What is known of a session beside its samples.
+    """Results of a session: its analysis, and modules that tests name.
 
     Attributes:
         analysis: Its numbers, or None.
@@ -231,7 +231,7 @@ class Layer:
     notes: tuple[str, ...] = ()
 
     def with_numbers(self, computed: Layer) -> Layer:
-        """Put numbers to what results say without them.
+        """Add an analysis to results without one.
 
         Args:
             computed: The session's analysis, or a note why there is none.
@@ -259,7 +259,7 @@ _UNITS = {"degC": "°C"}
 
 
 def signal_title(topic: str, unit: str) -> str:
-    """A title short enough for a tab.
+    """Return a title short enough for a tab.
 
     Returns:
         For example ``Current [A]``; another make's topics keep their names.
@@ -284,7 +284,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Start:
-    """Where the camera finds the robot.
+    """Return the initial pose of the robot, for the camera.
 
     Attributes:
         position: The head's first known position [m].
@@ -309,7 +309,7 @@ class AwaitedMap:
 
 @dataclass(frozen=True)
 class Content:
-    """What a recording holds.
+    """Content of a recording.
 
     Attributes:
         robot: The robot, or None.

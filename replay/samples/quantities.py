@@ -10,12 +10,11 @@ import rerun as rr
 from undulog.capture.common.arrays import FloatArray
 
 from .content import COMMANDED, ERROR, MEASURED, MECHANICAL, TOTAL
-from .sampling import hold, interpolate
-from .tracks import Columns, Track, pairs
+from .tracks import Columns, Track, hold, interpolate, pairs
 
 
 def tracking_errors(measured: Sequence[Track], commanded: Sequence[Track]) -> tuple[Track, ...]:
-    """Measured minus commanded angle, at the measurement's times.
+    """Return measured minus commanded angles, at the measurement's times.
 
     Args:
         measured: Measured angles [rad].
@@ -31,7 +30,7 @@ def tracking_errors(measured: Sequence[Track], commanded: Sequence[Track]) -> tu
 
 
 def mechanical_power(columns: Columns) -> tuple[Track, ...]:
-    """Power at the joints, tau q', at the sampling times of the efforts.
+    """Return the power at the joints, tau q', at the sampling times of the efforts.
 
     Args:
         columns: The session's columns.
@@ -45,7 +44,7 @@ def mechanical_power(columns: Columns) -> tuple[Track, ...]:
 
 
 def electrical_power(columns: Columns) -> tuple[Track, ...]:
-    """Power of the motors, u i, at the sampling times of the currents.
+    """Return the power of the motors, u i, at the sampling times of the currents.
 
     Args:
         columns: The session's columns.
@@ -60,7 +59,7 @@ def electrical_power(columns: Columns) -> tuple[Track, ...]:
 
 
 def products(first: Sequence[Track], second: Sequence[Track]) -> tuple[Track, ...]:
-    """Product of two quantities of each joint.
+    """Return the product of two quantities of each joint.
 
     Returns:
         A track for each joint that has both; NaN where either is missing.
@@ -72,7 +71,7 @@ def products(first: Sequence[Track], second: Sequence[Track]) -> tuple[Track, ..
 
 
 def total(tracks: Sequence[Track]) -> Track | None:
-    """Sum over the joints, at the first joint's sampling times.
+    """Return the sum over the joints, at the first joint's sampling times.
 
     Args:
         tracks: The joints' power [W].
@@ -88,7 +87,7 @@ def total(tracks: Sequence[Track]) -> Track | None:
 
 
 def power_limit(power_w: FloatArray) -> float:
-    """The power at which the colour is full: the 99th percentile of its magnitude.
+    """Return the power at which the colour is full: the 99th percentile of its magnitude.
 
     Args:
         power_w: Mechanical power [W], any shape; NaN where it isn't known.
@@ -128,7 +127,7 @@ SIGNALS = "/signals"
 
 
 def topic_entity(root: str, topic: str) -> str:
-    """Where a topic goes.
+    """Return the entity of a topic.
 
     Args:
         root: E.g. ``/signals``.
@@ -142,7 +141,7 @@ def topic_entity(root: str, topic: str) -> str:
 
 
 def quantities(columns: Columns) -> dict[str, tuple[Track, ...]]:
-    """The plotted quantities.
+    """Return the plotted quantities.
 
     Args:
         columns: JointState columns, of the whole session or of a stretch of it.

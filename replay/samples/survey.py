@@ -1,4 +1,4 @@
-"""What only a whole session can tell: which lines there are, how far they swing, when they meet.
+"""Survey of a whole session: its lines, their ranges, and which are sampled together.
 
 It goes through the session once, stretch by stretch, before anything is drawn, and keeps a few
 thousand samples of each line. Where the picture can't wait for the whole, the first stretch and a
@@ -19,35 +19,35 @@ from undulog.capture.robot.model import Robot
 
 from .content import MEASURED, MECHANICAL
 from .quantities import power_limit, quantities, segment_power
-from .sampling import GAP_STEPS, decimate, interpolate, typical_step_ns
 from .timeline import STRETCH_NS, stretches
 from .tracks import (
+    GAP_STEPS,
     OFFSETS,
     Columns,
     Track,
+    decimate,
     in_turn,
+    interpolate,
     one_after_another,
     read_columns,
     resampled,
+    typical_step_ns,
     wanted_fields,
 )
 
 GAIT = "/gait"
 
-_KEPT = 4000
-"""Samples of each line that are kept, about."""
+_KEPT = 4000  # samples of each line that are kept, about
 _CONTEXT_NS = (500_000_000, 60_000_000_000)
 _REACH_STEPS = 1.2 * GAP_STEPS
 
-_LOOKS = 8
-"""How many stretches after the first one are looked into where not all is read, at most."""
-_LOOK_NS = 2_000_000_000
-"""How long is looked into each of them [ns]."""
+_LOOKS = 8  # how many stretches after the first one are looked into where not all is read, at most
+_LOOK_NS = 2_000_000_000  # how long is looked into each of them [ns]
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What a session holds.
+    """Content of a session.
 
     Attributes:
         wanted: JointState topic to the fields that come.
@@ -71,7 +71,7 @@ class Survey:
 
 
 def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Survey:
-    """Go through a session.
+    """Survey a session.
 
     Args:
         rate_hz: How many drawing times a second are kept, at most.
@@ -157,7 +157,7 @@ def _columns(
 def _carried(session: SessionView) -> dict[str, list[str]]:
     """The fields that come, but for the gait's, which is read as a whole.
 
-    The first stretch tells; what is not in it is looked for in the whole session, once.
+    They are searched in the first second, and if one is missing in the whole session, once.
     """
     wanted = {topic: one for topic, one in wanted_fields(session).items() if topic != GAIT}
     stop_ns = session.start_ns + 1_000_000_000
@@ -202,7 +202,7 @@ def _parts(tracks: Sequence[Track], *, turns: bool) -> list[tuple[str, ...]]:
 def _refined(
     before: Sequence[tuple[str, ...]], now: Sequence[tuple[str, ...]]
 ) -> list[tuple[str, ...]]:
-    """Parts that are together in both; who is in one of them only follows that one."""
+    """Return parts that are together in both; a line in one of them only follows that one."""
     label = {name: i for i, part in enumerate(now) for name in part}
     found: list[tuple[str, ...]] = []
     for part in before:

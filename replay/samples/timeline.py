@@ -18,18 +18,14 @@ import rerun as rr
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
-from .sampling import interpolate
-from .tracks import Columns, read_columns
+from .tracks import Columns, interpolate, read_columns
 
 STRETCH_NS = 40_000_000_000
 """About how long a stretch is [ns]: at 100 Hz its rows are one chunk of the recording."""
 
-_LEAST_STRETCHES = 200
-"""A session may always have so many stretches: more than two hours have."""
-_LEAST_MESSAGES = 100
-"""Mean messages in a stretch, at least, where there are more."""
-_READ_AGAIN = 8
-"""How many stretches a chunk may be read for, in the mean, where there are more."""
+_LEAST_STRETCHES = 200  # a session may always have so many stretches: more than two hours have
+_LEAST_MESSAGES = 100  # mean messages in a stretch, at least, where there are more
+_READ_AGAIN = 8  # how many stretches a chunk may be read for, in the mean, where there are more
 
 _FIRST_NS, _LAST_NS = -(1 << 62), 1 << 62
 
@@ -49,7 +45,7 @@ class Span:
     known_ns: int | None = None
 
     def rows(self, t_ns: IntArray) -> slice:
-        """Which rows lie in it.
+        """Return the rows within the span.
 
         Args:
             t_ns: Their times [ns], ascending, shape (n,).
@@ -182,7 +178,7 @@ class Clock:
         """Cut rows into chunks that share their timelines.
 
         Rows whose gait phase isn't known (before the gait starts, in a gap) have no place on
-        ``gait_cycle``, and Rerun wants the same timelines in all rows of a chunk.
+        ``gait_cycle``, and Rerun requires the same timelines in all rows of a chunk.
 
         Args:
             t_ns: Sampling times of the rows [ns], shape (n,).

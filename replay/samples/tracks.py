@@ -1,4 +1,13 @@
-"""Joint samples as they are drawn: each joint's own times, joints sampled together in one table."""
+"""Joint samples as they are drawn: each joint's own times, and samples on other samples' times.
+
+Each servo has its own sampling times; a picture of the whole body needs all of them at one
+instant. Between two samples the straight line is drawn, across a gap nothing: there the result is
+NaN, and so is everything computed from it.
+
+Values are rounded finer than can be seen and coarse enough to be packed: Rerun packs its files with
+LZ4, which finds what repeats, and noise below what a screen shows never does. Values rounded to a
+power of two take half the space of those that were logged.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +19,14 @@ import numpy as np
 
 from undulog.capture import SessionView
 from undulog.capture.bus.decoded_topics import JOINT_TOPIC
-from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.log.read.signals import JointSignals
-
-from .sampling import interpolate, ordered
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
 OFFSETS = ("/joint_sample_offset", "/joint_command_offset")
-"""JointState topics that say when, not what."""
+"""JointState topics of sampling times instead of values."""
 
 Columns = dict[tuple[str, str], tuple["Track", ...]]
 """(topic, field of the JointState) to tracks."""
@@ -64,7 +71,7 @@ MOST_TOPICS = 100
 
 
 def drawn_topics(session: SessionView) -> tuple[list[str], int]:
-    """The JointState topics of a picture.
+    """Return the JointState topics that are drawn.
 
     Returns:
         At most :data:`MOST_TOPICS`, the contract's before others, in the session's order; and how
@@ -81,7 +88,7 @@ def drawn_topics(session: SessionView) -> tuple[list[str], int]:
 
 
 def wanted_fields(session: SessionView) -> dict[str, list[str]]:
-    """What a picture needs of a session's JointState topics.
+    """Return the fields of a session's JointState topics that are drawn.
 
     Returns:
         Topic to fields: the position of every topic, velocity and effort of ``/joint_states``.
@@ -99,7 +106,7 @@ def read_columns(
     start_ns: int | None = None,
     stop_ns: int | None = None,
 ) -> Columns:
-    """JointState topics of a session.
+    """Read JointState topics of a session.
 
     Args:
         wanted: Topic to fields; None for all of :func:`wanted_fields`.
@@ -142,7 +149,7 @@ def without_filler(track: Track) -> Track:
     """Leave out the NaN that only fill up messages about something else.
 
     A robot that reports one quantity, or one servo, a message fills the other places with NaN.
-    Where half of a joint's samples or more are NaN they say nothing; fewer are a gap.
+    If half of a joint's samples or more are NaN, these are fillers; fewer are a gap.
 
     Returns:
         The track without its NaN where they are half or more, else the track itself.
@@ -160,7 +167,7 @@ def pairs(first: Sequence[Track], second: Sequence[Track]) -> list[tuple[Track, 
 
 
 def one_after_another(pieces: Sequence[Track]) -> Track:
-    """Pieces of one track, at least one, as a whole."""
+    """Join successive pieces of one track, at least one."""
     t_ns = np.concatenate([piece.t_ns for piece in pieces])
     return Track(pieces[0].name, t_ns, np.concatenate([piece.values for piece in pieces]))
 
@@ -204,7 +211,7 @@ def in_turn(first: IntArray, other: IntArray) -> bool:
 
 
 def join_tracks(tracks: Sequence[Track]) -> Table:
-    """Joints at the times of the first of them.
+    """Return joints as one table at the times of the first of them.
 
     Args:
         tracks: Joints that were sampled together or in turn, at least one.
@@ -221,7 +228,7 @@ def join_tracks(tracks: Sequence[Track]) -> Table:
 def resampled(
     tracks: Sequence[Track], names: Sequence[str], at_ns: IntArray, method: Resampler
 ) -> FloatArray:
-    """All joints at common times.
+    """Return all joints at common times.
 
     Args:
         tracks: The tracks, in any order.
@@ -237,3 +244,193 @@ def resampled(
     for table in tables([track for track in tracks if track.name in column]):
         found[:, [column[name] for name in table.names]] = method(table.t_ns, table.values, at_ns)
     return found
+
+
+LEVELS = 500
+"""Steps that the range of a plotted line is cut into, at least."""
+_TAIL = 0.01
+
+
+def plot_step(values: FloatArray) -> float:
+    """Return the step that a plotted line is rounded to.
+
+    Args:
+        values: Samples of the line, any unit, shape (n,); NaN where there is none.
+
+    Returns:
+        A power of two, at most 1/500 of the range that holds all but the lowest and highest
+        hundredth of the samples, so that rounding moves none by more than a thousandth of that
+        range; 0, for none, where the line is flat.
+    """
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return 0.0
+    low, high = np.quantile(known, [_TAIL, 1.0 - _TAIL])
+    span = float(high - low) or float(known.max() - known.min())
+    return float(2.0 ** np.floor(np.log2(span / LEVELS))) if span > 0.0 else 0.0
+
+
+def rounded(values: FloatArray, steps: Sequence[float] | FloatArray) -> FloatArray:
+    """Round to multiples of a step.
+
+    Args:
+        values: Shape (n, k).
+        steps: One a column, shape (k,); 0 leaves a column as it is.
+
+    Returns:
+        Shape (n, k); at most half a step from the values.
+    """
+    step = np.asarray(steps, dtype=np.float64)
+    if not step.any():
+        return values
+    safe = np.where(step > 0.0, step, 1.0)
+    return np.where(step > 0.0, np.round(values / safe) * safe, values)
+
+
+GAP_STEPS = 5.0
+"""Two samples further apart than this many typical steps have a gap between them."""
+
+
+def typical_step_ns(t_ns: IntArray) -> int:
+    """Return the median distance of successive samples.
+
+    Args:
+        t_ns: Sampling times [ns], ascending, shape (n,).
+
+    Returns:
+        The step [ns]; 0 where there are fewer than two distinct times.
+    """
+    steps = np.diff(t_ns)
+    steps = steps[steps > 0]
+    return int(np.median(steps)) if steps.size else 0
+
+
+def gaps(t_ns: IntArray) -> BoolArray:
+    """Return which samples are followed by a gap.
+
+    Args:
+        t_ns: Sampling times [ns], ascending, shape (n,).
+
+    Returns:
+        Shape (n - 1,), or (0,) for fewer than two samples.
+    """
+    return np.asarray(np.diff(t_ns) > GAP_STEPS * typical_step_ns(t_ns), dtype=np.bool_)
+
+
+def mark_gaps(
+    t_ns: IntArray, values: FloatArray, end_ns: int | None = None
+) -> tuple[IntArray, FloatArray]:
+    """Put one row of NaN into every gap, a step after its last sample.
+
+    A plot joins neighbouring rows by a line and a body keeps its last pose until the next one;
+    the row of NaN ends both where the data end.
+
+    Args:
+        t_ns: Sampling times [ns], ascending, shape (n,).
+        values: Shape (n, k).
+        end_ns: Where the session ends [ns]; a silence before it counts as a gap.
+
+    Returns:
+        Times and values with the rows put in; the arguments themselves where there is no gap.
+    """
+    step = typical_step_ns(t_ns)
+    before = np.flatnonzero(gaps(t_ns))
+    if end_ns is not None and t_ns.size and end_ns - t_ns[-1] > GAP_STEPS * step:
+        before = np.append(before, t_ns.size - 1)
+    if not before.size:
+        return t_ns, values
+    return (
+        np.insert(t_ns, before + 1, t_ns[before] + step),
+        np.insert(values, before + 1, np.nan, axis=0),
+    )
+
+
+def decimate(t_ns: IntArray, rate_hz: float) -> IntArray:
+    """Choose samples so that no more than ``rate_hz`` a second remain.
+
+    Every slot of 1 / ``rate_hz`` that holds samples keeps its first one; slots are centred on
+    multiples of that period after the first sample, so that jitter about a multiple is harmless.
+
+    Args:
+        t_ns: Sampling times [ns], ascending, shape (n,).
+        rate_hz: At most this many samples a second.
+
+    Returns:
+        Indices into ``t_ns``, ascending.
+    """
+    if not t_ns.size:
+        return np.zeros(0, dtype=np.int64)
+    period = round(1e9 / rate_hz)
+    slot = (t_ns - t_ns[0] + period // 4) // period
+    first = np.flatnonzero(np.diff(slot, prepend=slot[0] - 1))
+    return first.astype(np.int64)
+
+
+def interpolate(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArray:
+    """Interpolate linearly between the samples about each time.
+
+    Args:
+        t_ns: Sampling times [ns], ascending, shape (n,).
+        values: Shape (n,) or (n, k).
+        at_ns: Wanted times [ns], shape (m,).
+
+    Returns:
+        Shape (m,) or (m, k). A wanted time that is a sampling time gets that sample. NaN before
+        the first sample, after the last, across a gap and beside a NaN sample.
+    """
+    if np.array_equal(t_ns, at_ns):
+        return values
+    found = np.full((at_ns.size, *values.shape[1:]), np.nan)
+    if not t_ns.size:
+        return found
+    left = np.searchsorted(t_ns, at_ns, side="right") - 1
+    inside = left >= 0
+    exact = inside & (t_ns[np.maximum(left, 0)] == at_ns)
+    found[exact] = values[left[exact]]
+    if t_ns.size > 1:
+        joined = np.append(~gaps(t_ns), False)
+        between = inside & ~exact & joined[np.maximum(left, 0)]
+        i = left[between]
+        share = (at_ns[between] - t_ns[i]) / (t_ns[i + 1] - t_ns[i])
+        share = share.reshape(-1, *[1] * (values.ndim - 1))
+        found[between] = (1.0 - share) * values[i] + share * values[i + 1]
+    return found
+
+
+def hold(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArray:
+    """Return the last sample at or before each time: a servo keeps its command until the next.
+
+    Args:
+        t_ns: Sampling times [ns], ascending, shape (n,).
+        values: Shape (n,) or (n, k).
+        at_ns: Wanted times [ns], shape (m,).
+
+    Returns:
+        Shape (m,) or (m, k); NaN before the first sample and later than a gap's length after
+        the last one, where a lost command can't be distinguished from a held one.
+    """
+    found = np.full((at_ns.size, *values.shape[1:]), np.nan)
+    if not t_ns.size:
+        return found
+    left = np.searchsorted(t_ns, at_ns, side="right") - 1
+    age = at_ns - t_ns[np.maximum(left, 0)]
+    limit = GAP_STEPS * typical_step_ns(t_ns) if t_ns.size > 1 else 0.0
+    known = (left >= 0) & (age <= limit)
+    found[known] = values[left[known]]
+    return found
+
+
+def ordered(t_ns: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Sort samples by time.
+
+    Args:
+        t_ns: Sampling times [ns], shape (n,).
+        values: Shape (n,) or (n, k).
+
+    Returns:
+        Both sorted by time, equal times in their given order; unchanged where sorted already.
+    """
+    if np.all(t_ns[1:] >= t_ns[:-1]):
+        return t_ns, values
+    order = np.argsort(t_ns, kind="stable")
+    return t_ns[order], values[order]

@@ -20,8 +20,8 @@ from .viewer import Viewer
 _START_S = 60.0
 _REST_S = 30.0
 _LOOK_AGAIN_S = 0.2
+# Equal pictures in a row of the empty window after which its greetings are over.
 _GREETINGS_GONE = 8
-"""Equal pictures in a row of the empty window after which its greetings are over."""
 
 
 class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
@@ -95,7 +95,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         return {view.name: view for view in self._client.get_state().views}
 
     def complaints(self) -> list[str]:
-        """What the views say they could not draw."""
+        """Return the errors that the views report."""
         self.picture()
         return [
             f"{view.name}: {report.summary}"
@@ -104,7 +104,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         ]
 
     def picture(self, view: str | None = None) -> bytes:
-        """A picture, once two shots in a row agree.
+        """Return a picture, once two shots in a row agree.
 
         Args:
             view: Name of a view in front, or None for the whole window.
@@ -116,7 +116,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         return self.picture_of(None if view is None else self.views[view].view_id)
 
     def picture_of(self, view_id: str | None) -> bytes:
-        """A picture by a view's id, for many in a row.
+        """Return a picture by a view's id, for many in a row.
 
         Args:
             view_id: As :attr:`views` has it, or None for the whole window.
@@ -149,7 +149,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
 def client_of(
     address: str, ended: Callable[[], bool] = lambda: False, *, look_s: float = _LOOK_AGAIN_S
 ) -> ViewerClient:
-    """Wait until a viewer answers.
+    """Return a client of a viewer, once it answers.
 
     Args:
         ended: Whether it has ended, so that waiting is in vain.

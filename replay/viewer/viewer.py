@@ -27,8 +27,8 @@ WHOLE_IN_MEMORY = "--server-memory-limit=75%"
 """A server keeps the whole recording for browsers that come late, whatever memory that takes: by
 Rerun's own limit, 1 GiB, a session of some hours would lose its beginning."""
 
+# A window holds the recording itself: what its own server keeps beside that is there twice.
 _PASSING_ON = "--server-memory-limit=64MB"
-"""A window holds the recording itself: what its own server keeps beside that is there twice."""
 
 _START_S = 60.0
 _LOOK_S = 0.05
@@ -36,7 +36,7 @@ _GRACE_S = 3.0
 
 
 def viewer_binary() -> Path:
-    """The viewer that came with the installed Rerun.
+    """Return the path of the viewer that came with the installed Rerun.
 
     Raises:
         MissingExtraError: If Rerun is not installed.
@@ -83,7 +83,7 @@ class Viewer(AbstractContextManager["Viewer"]):
         self._port = free_ports(1)[0] if port is None else port
         self.address = f"rerun+http://{LOOPBACK}:{self._port}/proxy"
         """Where a recording stream connects to."""
-        # The viewer leaves a folder behind when it is told to end; here it goes with ours.
+        # The viewer leaves a folder behind when it is terminated; it is removed with ours.
         self._scratch = tempfile.TemporaryDirectory(prefix="undulog-viewer-")
         self._said = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
         self._told_to_end = False
@@ -110,22 +110,25 @@ class Viewer(AbstractContextManager["Viewer"]):
         return self._process.poll() is not None
 
     def wait_until_it_listens(self) -> None:
-        """Wait until data can be sent to it.
+        """Wait until data can be sent to it; close it if that fails.
 
         Raises:
             UndulogError: If it ends before, or doesn't start.
         """
         deadline = time.monotonic() + _START_S
-        while not _listens(self._port):
-            if self.ended:
-                self.check()
-                raise UndulogError("the Rerun viewer ended before it showed anything")
-            if time.monotonic() > deadline:
-                raise UndulogError(f"the Rerun viewer did not start within {_START_S:g} s")
-            time.sleep(_LOOK_S)
+        with ExitStack() as on_failure:
+            on_failure.callback(self.close)
+            while not _listens(self._port):
+                if self.ended:
+                    self.check()
+                    raise UndulogError("the Rerun viewer ended before it showed anything")
+                if time.monotonic() > deadline:
+                    raise UndulogError(f"the Rerun viewer did not start within {_START_S:g} s")
+                time.sleep(_LOOK_S)
+            on_failure.pop_all()
 
     def wait(self, stop: StopRequest) -> None:
-        """Wait until it has ended, or an end is asked for.
+        """Wait until it has ended, or a stop is requested.
 
         Args:
             stop: The request to look at.
@@ -208,7 +211,7 @@ def serve(recording: Path, notify: Callable[[str], None]) -> None:
     """Serve a recording to browsers on this machine until interrupted.
 
     Args:
-        tell: Called with the address to open.
+        notify: Called with the address to open.
 
     Raises:
         UndulogError: If the server fails.
@@ -221,7 +224,7 @@ def serve(recording: Path, notify: Callable[[str], None]) -> None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of this machine that nobody listens on at the moment."""
+    """Return free ports of this machine."""
     with ExitStack() as stack:
         held = [stack.enter_context(socket.create_server((LOOPBACK, 0))) for _ in range(count)]
         return [int(one.getsockname()[1]) for one in held]

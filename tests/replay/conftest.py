@@ -2,7 +2,7 @@
 
 import io
 import math
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,13 +11,12 @@ import pytest
 import undulog
 from support import processes
 from support.built_results import around, passive_joint
+from support.written_topics import EPOCH_NS, GAIT, write_topics
 from undulog.analysis.results.analysis import Analysis, GaitFacts, SessionFacts, Window
 from undulog.analysis.results.coupling import Coupling
 from undulog.analysis.results.estimate import Estimate, Provenance
-from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture import Session, load_robot
 from undulog.capture.robot.model import Plane
-
-EPOCH_NS = 1_735_689_600_000_000_000
 
 
 @pytest.fixture(scope="session")
@@ -77,40 +76,39 @@ def write(snake25, truth):
         keep=None,
         session_id="made-for-tests",
     ):
-        position = truth.position if position is None else position
-        keep = np.ones(len(truth.t), dtype=bool) if keep is None else keep
-        names, level = snake25.joint_names, np.array([0.0, 0.0, 0.0, 1.0])
-        known = {"robot": snake25 if robot else None, "clock": {"robot": "simulated"}}
-        with SessionWriter(path, session_id=session_id, epoch_ns=EPOCH_NS, **known) as w:
-            commands = w.joint_state("/joint_commands", names, unit="rad")
-            states = w.joint_state(
-                "/joint_states", names, unit="rad", velocity=effort, effort=effort
-            )
-            current = w.joint_state("/joint_current", names, unit="A")
-            voltage = w.joint_state("/joint_voltage", names, unit="V")
-            if odometry:
-                odom = w.odometry("/odom", frame="world", child="link01")
+        kept = slice(None) if keep is None else keep
+        names, drive = snake25.joint_names, [truth.velocity[kept], truth.effort[kept]]
+        angles = (truth.position if position is None else position)[kept]
+        amplitude = np.full(len(truth.t), 0.4)
+        topics = {
+            "/joint_commands": (names, "rad", truth.command[kept]),
+            "/joint_states": (names, "rad", angles, *(drive if effort else [])),
+            "/joint_current": (names, "A", truth.effort[kept]),
+            "/joint_voltage": (names, "V", np.full_like(angles, 6.0)),
+            "/gait": (GAIT, "rad", np.stack([amplitude, truth.phase], axis=1)[kept]),
+        }
+        if not gait:
+            del topics["/gait"]
+
+        def begin(writer):
+            writer.set_verdict("good")
             if gait:
-                facts = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
-                mode = w.string("/gait/mode")
-                log = w.log("/rosout")
+                mode, log = writer.string("/gait/mode"), writer.log("/rosout")
                 mode.write(EPOCH_NS, "walk")
                 log.write(EPOCH_NS + 5, "info", "drive", "start")
                 mode.write(EPOCH_NS + 1_000_000_000, "avoid")
                 log.write(EPOCH_NS + 1_000_000_000, "error", "drive", "wall ahead")
-            for i in np.flatnonzero(keep):
-                t_ns = int(truth.t_ns[i])
-                commands.write(t_ns, truth.command[i])
-                drive = [truth.velocity[i], truth.effort[i]] if effort else []
-                states.write(t_ns, position[i], *drive)
-                current.write(t_ns, truth.effort[i])
-                voltage.write(t_ns, np.full(25, 6.0))
-                if odometry:
-                    odom.write(t_ns, truth.head[i], level, np.zeros(3), np.zeros(3))
-                if gait:
-                    facts.write(t_ns, np.array([0.4, truth.phase[i]]))
-            w.set_verdict("good")
-        return path
+
+        return write_topics(
+            path,
+            truth.t_ns[kept],
+            topics,
+            head=truth.head[kept] if odometry else None,
+            begin=begin,
+            session_id=session_id,
+            robot=snake25 if robot else None,
+            clock={"robot": "simulated"},
+        )
 
     return write_session
 
@@ -131,30 +129,20 @@ def write_long(snake25):
         phase = 2 * np.pi * 0.25 * t
         wave = phase[:, None] - np.arange(25) * np.pi / 6
         swing = np.where(np.arange(25) % 2, 0.3, 0.4)  # one plane moves more
-        with SessionWriter(path, session_id="long", epoch_ns=EPOCH_NS, robot=snake25) as w:
-            commands = w.joint_state("/joint_commands", names, unit="rad")
-            states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
-            heat = w.joint_state("/joint_temperature", names, unit="degC")
-            gait = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
-            if odometry:
-                odom = w.odometry("/odom", frame="world", child="link01")
-            level = np.array([0.0, 0.0, 0.0, 1.0])
-            for i, second in enumerate(t):
-                t_ns = EPOCH_NS + round(second * 1e9)
-                commands.write(t_ns, swing * np.sin(wave[i]))
-                speed = 0.9 * swing * 0.5 * np.pi * np.cos(wave[i] - 0.1)
-                states.write(
-                    t_ns, 0.9 * swing * np.sin(wave[i] - 0.1), speed, 0.1 * np.cos(wave[i])
-                )
-                gait.write(t_ns, np.array([0.4, phase[i]]))
-                if odometry:
-                    head = np.array([0.1 * second, 0.0, 0.0])
-                    odom.write(t_ns, head, level, np.zeros(3), np.zeros(3))
-                if second >= heat_from_s:
-                    degrees = np.full(25, 30.0) + 0.01 * second
-                    degrees[24] = degrees[24] if second >= last_from_s else np.nan
-                    heat.write(t_ns, degrees)
-        return path
+        heat = np.tile(30.0 + 0.01 * t[:, None], 25)
+        heat[t < last_from_s, 24] = np.nan
+        heat[t < heat_from_s] = np.nan
+        measured = 0.9 * swing * np.sin(wave - 0.1)
+        speed = 0.9 * swing * 0.5 * np.pi * np.cos(wave - 0.1)
+        topics = {
+            "/joint_commands": (names, "rad", swing * np.sin(wave)),
+            "/joint_states": (names, "rad", measured, speed, 0.1 * np.cos(wave)),
+            "/joint_temperature": (names, "degC", heat),
+            "/gait": (GAIT, "rad", np.stack([np.full(t.size, 0.4), phase], axis=1)),
+        }
+        head = np.outer(t, [0.1, 0.0, 0.0]) if odometry else None
+        times_ns = EPOCH_NS + np.round(t * 1e9).astype(np.int64)
+        return write_topics(path, times_ns, topics, head=head, session_id="long", robot=snake25)
 
     return write_session
 
@@ -206,21 +194,20 @@ class Recorded:
         """Paths of all entities."""
         return {chunk.entity_path for chunk in self._chunks}
 
+    def statics(self, entity, component):
+        """Values of a static component, a list each."""
+        own = (one for one in self._chunks if one.entity_path == entity and one.is_static)
+        batches = (chunk.to_record_batch() for chunk in own)
+        return [b.column(component).to_pylist()[0] for b in batches if component in b.schema.names]
+
     def static(self, entity, component):
-        """Value of a static component, a list."""
-        for chunk in self._chunks:
-            if chunk.entity_path == entity and chunk.is_static:
-                batch = chunk.to_record_batch()
-                if component in batch.schema.names:
-                    return batch.column(component).to_pylist()[0]
-        raise KeyError(f"{entity} has no static {component}")
+        """First value of a static component, a list."""
+        return next(iter(self.statics(entity, component)))
 
     def column(self, entity, component):
         """Rows of a component in file order: a list of lists."""
-        rows = []
-        for batch in self._temporal(entity):
-            rows += batch.column(component).to_pylist()
-        return rows
+        batches = self._temporal(entity)
+        return [row for batch in batches for row in batch.column(component).to_pylist()]
 
     def rows(self, entity, component):
         """Session time [ns] to values, in order; rows without any are left out."""
@@ -307,3 +294,17 @@ def rgb():
     from PIL import Image
 
     return lambda png: np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+
+
+@pytest.fixture(scope="session")
+def sizes(rgb):
+    """Height and width of each view that isn't behind a tab."""
+
+    def in_front(viewer):
+        found = []
+        for name in viewer.views:
+            with suppress(ConnectionError):  # behind a tab
+                found.append(rgb(viewer.picture(name)).shape[:2])
+        return found
+
+    return in_front

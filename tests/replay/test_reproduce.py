@@ -32,7 +32,12 @@ def again(room, output, *words, source="run.mcap", code=0):
 
 
 def test_in_its_own_world_a_run_is_the_same_to_the_last_bit(room, tmp_path, capsys):
-    path = again(room, tmp_path / "a.mcap")
+    path = tmp_path / "a.mcap"
+    path.write_text("mine")
+    again(room, path, code=2)
+    assert "--force" in capsys.readouterr().err
+    assert path.read_text() == "mine"
+    again(room, path, "--force")
     told = capsys.readouterr().out.splitlines()
     assert told[0].startswith(f"{path}: run.mcap again on the twin of chain5 in wave, 5 s")
     assert told[1].startswith("The same to the last bit: all ")
@@ -162,10 +167,3 @@ def test_a_wrong_change_names_the_key(room, tmp_path, capsys, change, told):
 def test_wrong_usage_says_what_would_be_right(room, capsys, words, told):
     assert front.run(["replay", str(room / "run.mcap"), *words.split()]) == 2
     assert told in capsys.readouterr().err
-
-
-def test_nothing_is_overwritten(room, tmp_path, capsys):
-    (tmp_path / "a.mcap").write_text("mine")
-    again(room, tmp_path / "a.mcap", code=2)
-    assert "--force" in capsys.readouterr().err
-    assert (tmp_path / "a.mcap").read_text() == "mine"

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+from scipy.signal import lfilter
 
 import undulog as front
 from support import twin_chains
@@ -56,3 +57,9 @@ def rewritten(source, target, change):
                 t_ns, rows = change(t_ns, rows)
             for one, row in zip(t_ns.tolist(), rows, strict=True):
                 channel.write(one, row)
+
+
+def colored(random, rho, *shape):
+    """AR(1) noise of variance one, shape (..., n)."""
+    white = random.standard_normal((*shape[:-1], shape[-1] + 500))
+    return np.sqrt(1 - rho**2) * lfilter([1.0], [1.0, -rho], white)[..., 500:]

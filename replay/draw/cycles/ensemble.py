@@ -24,9 +24,8 @@ from undulog.capture.robot.kinematics import link_poses
 from undulog.capture.robot.model import Robot
 
 from ...samples.content import Places
-from ...samples.sampling import interpolate
 from ...samples.timeline import Rhythm
-from ...samples.tracks import Track
+from ...samples.tracks import Track, interpolate
 
 DEGREES = np.rint(np.degrees(np.append(phases_rad(), 2 * np.pi))).astype(np.int64)
 """Phases of a mean cycle, the end again like the beginning [degrees], shape (p,)."""
@@ -36,7 +35,7 @@ _NS = 1e9
 
 @dataclass(frozen=True)
 class Pace:
-    """The gait's phase over the stretch whose cycles are averaged.
+    """The gait's phase over the time window whose cycles are averaged.
 
     Attributes:
         t_ns: Times [ns], ascending, at most one sample beyond the stretch, shape (n,).
@@ -62,7 +61,7 @@ class Pace:
         return (self.stop_s - self.start_s) / turns
 
     def shortened(self, stop_s: float, start_ns: int) -> Pace:
-        """The same over less of the session.
+        """Return the pace up to an earlier end.
 
         Args:
             stop_s: Where it ends at the latest [s].
@@ -114,7 +113,7 @@ class MeanCycles:
         return self.value[k], self.half[k]
 
     def ordered(self, names: Sequence[str]) -> FloatArray:
-        """Values as columns in another order.
+        """Return values as columns in another order.
 
         Returns:
             Shape (p, number of names); NaN columns where there is no such channel.
@@ -134,7 +133,7 @@ def pace_of(
     places: Places | None,
     start_ns: int,
 ) -> Pace | None:
-    """Which stretch is averaged, and its phase.
+    """Return the time window that is averaged, and its phase.
 
     Args:
         rhythm: The logged phase, or None.
@@ -170,7 +169,7 @@ def pace_of(
 
 
 def falsified(analysis: Analysis | None, start_s: float, stop_s: float) -> tuple[str, ...]:
-    """Joints whose measured angles are not what the joint did.
+    """Return the joints whose measured angles are falsified by an artefact.
 
     Args:
         analysis: The session's analysis, or None.
@@ -188,7 +187,7 @@ def falsified(analysis: Analysis | None, start_s: float, stop_s: float) -> tuple
 
 
 def mean_cycles(tracks: Sequence[Track], pace: Pace) -> MeanCycles | None:
-    """The mean cycle of some channels.
+    """Return the mean cycles of channels.
 
     Args:
         tracks: The channels, each on its own times.
@@ -209,7 +208,7 @@ def mean_cycles(tracks: Sequence[Track], pace: Pace) -> MeanCycles | None:
 
 
 def body_frame(robot: Robot, angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The links in a frame that goes along with the body.
+    """Return the links in a frame that moves with the body.
 
     Its origin is the mean of the links' centres, its axes are their mean orientation (the rotation
     nearest to the mean of theirs), so that shapes lie over each other however the robot travels.
@@ -238,7 +237,7 @@ def body_frame(robot: Robot, angles: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def _at(t_s: FloatArray, phase: FloatArray, at_s: float) -> float:
-    """The phase at a time that may lie a sample's interval beyond the samples."""
+    """Return the phase at a time up to one sampling interval outside the samples."""
     k = int(np.clip(np.searchsorted(t_s, at_s), 1, t_s.size - 1))
     rate = (phase[k] - phase[k - 1]) / (t_s[k] - t_s[k - 1])
     return float(phase[k] + rate * (at_s - t_s[k]))
@@ -251,7 +250,7 @@ def _fitted(
     places: Places,
     start_ns: int,
 ) -> Pace | None:
-    """The phase of a rhythm that was found: 0 at the crest of the first joint's command."""
+    """Return the phase of a fitted rhythm: 0 at the crest of the first joint's command."""
     track = next((one for one in commanded if one.name == places.names[0]), None)
     if track is None:
         return None
@@ -269,7 +268,7 @@ def _fitted(
 
 
 def _cut(track: Track, pace: Pace) -> FloatArray:
-    """A channel's whole cycles, shape (c, ``PHASES``)."""
+    """Return a channel's whole cycles, shape (c, ``PHASES``)."""
     phase = interpolate(pace.t_ns, pace.phase_rad, track.t_ns)
     known: BoolArray = np.isfinite(phase) & np.isfinite(track.values)
     phase, values = phase[known], track.values[known]

@@ -34,8 +34,8 @@ SIZE = (360.0, 300.0)
 VISIBLE = ((-50.0, SIZE[0] + 10.0), (-8.0, SIZE[1] + 84.0))
 """What a view of a map shows: its x and its y [scene units]."""
 
+# Smallest span of the colours: noise isn't magnified.
 _LEAST = {GAIN.key: 0.5, LAG.key: 0.5, POWER.key: 1.0}
-"""Smallest span of the colours: noise isn't magnified."""
 
 _NOTHING = (34, 34, 38)
 _STROKE = (110, 110, 116, 255)
@@ -52,7 +52,7 @@ _BAR_TOP = SIZE[1] + 58.0
 def heat_maps(
     analysis: Analysis, tables: Sequence[CycleTable], names: Sequence[str]
 ) -> tuple[HeatMap, ...]:
-    """The maps of what is known of each cycle.
+    """Return the maps of gain, lag and power by joint and cycle.
 
     Args:
         analysis: The session's analysis, for its windows.
@@ -78,7 +78,7 @@ def heat_maps(
 
 
 def cell_colors(shown: HeatMap) -> NDArray[np.uint8]:
-    """The colours of a map's cells.
+    """Return the colours of a map's cells.
 
     Args:
         shown: The map, m joints and c cycles.
@@ -176,7 +176,7 @@ def _log_axes(rec: rr.RecordingStream, shown: HeatMap, named: Collection[str]) -
 
 
 def _log_bar(rec: rr.RecordingStream, shown: HeatMap) -> None:
-    """The colours with the values at their ends."""
+    """Draw the colour bar with the values at its ends."""
     low, high = shown.low, shown.high
     ramp = np.linspace(low, high, 128)
     whole = CycleTable(
@@ -207,7 +207,7 @@ def _log_text(
 
 
 def _log_cell_texts(rec: rr.RecordingStream, shown: HeatMap) -> None:
-    """What a cell holds, in words, under the mouse: a dot of the cell's own colour."""
+    """Write the text of each cell, shown under the mouse: a dot of the cell's own colour."""
     count, width, height = _cells(shown)
     m = len(shown.places)
     at = np.stack(np.meshgrid(np.arange(m), np.arange(count)), axis=-1).reshape(-1, 2)
@@ -231,7 +231,7 @@ def _cell_texts(shown: HeatMap) -> Iterator[str]:
 
 
 def _log_frame(rec: rr.RecordingStream, clock: Clock, shown: HeatMap) -> None:
-    """A frame about the cycle at the cursor, gone where there is none."""
+    """Draw a frame about the cycle at the cursor; none where there is no cycle."""
     count, _, height = _cells(shown)
     t_ns, ends = cycle_edges_ns(shown.table, clock.start_ns)
     drawn = np.insert(np.ones(count, dtype=np.int64), ends + 1, 0)

@@ -25,7 +25,7 @@ from ...samples.content import GREY, Color, MeanCycle, Places, Series, line_titl
 from ...samples.quantities import mechanical_power, segment_power
 from ...samples.timeline import ENSEMBLE_CYCLE, Clock
 from ...samples.tracks import Columns, read_columns
-from ..plots.joints import log_look
+from ..plots.lines import log_look
 from ..scene.body import capsule_columns, capsule_poses, power_colors
 from .ensemble import DEGREES, MeanCycles, Pace, body_frame, falsified, mean_cycles, pace_of
 
@@ -40,8 +40,7 @@ MOST_S = 600.0
 _TOPICS = ("/joint_states", "/joint_commands")
 
 _WHITE = (255, 255, 255, 255)
-_FAINT = 110
-"""Opacity of the lines at the ends of an interval."""
+_FAINT = 110  # opacity of the lines at the ends of an interval
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ def log_mean_cycle(
     analysis: Analysis | None,
     warnings: list[str],
 ) -> MeanCycle | None:
-    """Average the cycles and write what comes out.
+    """Average the cycles and draw the mean.
 
     Args:
         columns: From :func:`read_averaged`.
@@ -273,7 +272,7 @@ def _log_joints(
     values: FloatArray,
     palette: Mapping[str, Color],
 ) -> tuple[Series, ...]:
-    """A line a joint; ``values`` of shape (p, k)."""
+    """Draw a line for each joint; ``values`` of shape (p, k)."""
     if not names:
         return ()
     log_look(rec, entity, names, palette)

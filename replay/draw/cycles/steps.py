@@ -46,13 +46,13 @@ from ...samples.content import (
 from ...samples.timeline import Clock
 from ...samples.tracks import Track
 from ...samples.tracks import tables as tables_of
-from ..plots.joints import log_look, log_rows, part_entities
+from ..plots.lines import log_look, log_rows, part_entities
 
 CYCLES = "/cycles"
 
 
 def cycle_tables(analysis: Analysis, steady: CycleMaps | None = None) -> tuple[CycleTable, ...]:
-    """What an analysis says of each cycle.
+    """Return an analysis's values by joint and cycle.
 
     Args:
         analysis: The session's analysis.
@@ -75,7 +75,7 @@ def cycle_tables(analysis: Analysis, steady: CycleMaps | None = None) -> tuple[C
 
 
 def together(tables: Sequence[CycleTable]) -> CycleTable:
-    """Tables of one quantity as one, on the cycles of the one with most of them.
+    """Combine tables of one quantity on the cycles of the one with most of them.
 
     Args:
         tables: At least one, of one quantity.
@@ -131,7 +131,7 @@ def log_cycles(
 
 
 def cycle_times_ns(table: CycleTable, start_ns: int) -> tuple[IntArray, IntArray]:
-    """When the cycles start and end.
+    """Return the times at which the cycles start and end.
 
     Args:
         start_ns: Unix time of the session's start [ns].
@@ -148,7 +148,7 @@ def cycle_times_ns(table: CycleTable, start_ns: int) -> tuple[IntArray, IntArray
 
 
 def cycle_edges_ns(table: CycleTable, start_ns: int) -> tuple[IntArray, IntArray]:
-    """When a cycle starts, or ends without another that follows.
+    """Return the times at which a cycle starts, or ends without a following one.
 
     Args:
         start_ns: Unix time of the session's start [ns].
@@ -230,7 +230,7 @@ _MARK_LEFT, _MARK_WIDTH = -0.56, 0.12
 
 
 def charts(analysis: Analysis) -> tuple[Chart, ...]:
-    """What an analysis says about each joint, in the units that are shown.
+    """Return an analysis's values by joint, in the units that are shown.
 
     Args:
         analysis: The session's analysis.
@@ -376,7 +376,7 @@ def _bars(
 def bar_of(
     joint: str, place: int, estimate: Estimate, scale: float, baseline: float = 0.0
 ) -> Bar | None:
-    """A joint's bar.
+    """Return a joint's bar.
 
     Args:
         place: Its number along the body, the head's joint is 1.

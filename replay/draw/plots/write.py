@@ -32,17 +32,19 @@ from ...samples.content import (
     Signal,
 )
 from ...samples.quantities import SIGNALS, quantities, topic_entity
-from ...samples.sampling import mark_gaps, ordered, plot_step
 from ...samples.survey import Survey
 from ...samples.timeline import Clock, Span, Stretch, stretch_length_ns
-from ...samples.tracks import JOINT_STATE, Track, join_tracks
-from .gait import EVENTS, INFO, changes, log_texts
-from .joints import (
+from ...samples.tracks import JOINT_STATE, Track, join_tracks, mark_gaps, ordered, plot_step
+from .lines import (
     DEGREES,
+    EVENTS,
+    INFO,
     PLACES,
+    changes,
     joint_palette,
     log_look,
     log_rows,
+    log_texts,
     log_total_look,
     part_entities,
     places_look,
@@ -56,13 +58,12 @@ MOST_LINES = 12
 
 _WORDS = "std_msgs/msg/String"
 _SHOWN_ELSEWHERE = {"/gait/mode", "/rosout", "/robot_description"}
-_TAKE_TURNS = {"tf2_msgs/msg/TFMessage"}
-"""Types whose messages are each about something else."""
+_TAKE_TURNS = {"tf2_msgs/msg/TFMessage"}  # types whose messages are each about something else
 _NOT_PLOTTED = ("covariance", "stamp", "layout", "header")
 
 
 def is_foreign(session: SessionView) -> bool:
-    """Whether undulog has neither recorded nor imported a session.
+    """Return whether a session was neither recorded nor imported by undulog.
 
     Returns:
         True where it doesn't carry undulog's metadata.
@@ -104,7 +105,7 @@ def log_others(
 
 
 def log_words(rec: rr.RecordingStream, clock: Clock, session: SessionView) -> bool:
-    """Write what String topics of a foreign bag say, each time that it changes, as events."""
+    """Write String topics of a foreign bag as events, each time that their value changes."""
     said: list[tuple[int, str]] = []
     for topic, channel in _others(session):
         if channel.type_name == _WORDS and channel.is_ros2:
@@ -253,7 +254,7 @@ class Plots:
         places: Places | None,
         palette: Mapping[str, Color],
     ) -> None:
-        """Say how the lines look.
+        """Write the style of the lines.
 
         Args:
             places: Joints that stand for the body, or None.
@@ -283,7 +284,7 @@ class Plots:
                 self._add_places(found, places, source, kind, palette)
 
     def series(self, entity: str) -> tuple[Series, ...]:
-        """What is written of a quantity.
+        """Return the series that are written of a quantity.
 
         Args:
             entity: E.g. ``/joints/measured``.
@@ -295,7 +296,7 @@ class Plots:
 
     @property
     def signals(self) -> dict[str, tuple[Series, ...]]:
-        """Entity of a topic to what is written of it, where it has no views of its own."""
+        """Series of the topics without views of their own, by entity."""
         return {
             entity: plot.series
             for entity, plot in self._plots.items()
@@ -320,7 +321,7 @@ class Plots:
         kind: str,
         palette: Mapping[str, Color],
     ) -> None:
-        """Head, middle and tail once more, for a plot that can be read at a glance."""
+        """Add a plot of head, middle and tail alone, which can be read at a glance."""
         samples = [one for one in found.samples.get(source, ()) if one.name in places.names]
         if not samples:
             return

@@ -37,7 +37,7 @@ _NOWHERE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def meshed(robot: Robot) -> NDArray[np.bool_]:
-    """Which links are drawn as their meshes.
+    """Return which links are drawn as meshes.
 
     Returns:
         Whether a link's mesh is at hand, shape (number of links,).
@@ -98,7 +98,7 @@ _UNKNOWN = np.array([70, 70, 74, 255], dtype=np.uint8)
 
 
 def power_colors(power_w: FloatArray, limit_w: float) -> NDArray[np.uint8]:
-    """Colours of power, symmetric about zero.
+    """Return colours of power, symmetric about zero.
 
     Args:
         power_w: Mechanical power [W], any shape; NaN where it isn't known.
@@ -128,7 +128,7 @@ SHADES = 32
 
 
 def capsule_shape(robot: Robot) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Cylinder lengths and radii that draw the links.
+    """Return lengths and radii of the cylinders that draw the links.
 
     A cylinder is one radius shorter than its link, so that neighbouring balls overlap without
     lying in each other and the segments stay countable.
@@ -144,7 +144,7 @@ def capsule_shape(robot: Robot) -> tuple[NDArray[np.float32], NDArray[np.float32
 def capsule_poses(
     robot: Robot, centre: FloatArray, rotation: FloatArray
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where the links' capsules start and how they are turned.
+    """Return the poses of the links' capsules.
 
     Args:
         robot: The robot, m joints.
@@ -181,7 +181,7 @@ def capsule_columns(
     colors: NDArray[np.uint8],
     drawn: NDArray[np.bool_] | bool = True,
 ) -> rr.ComponentColumnList:
-    """Rows of capsules, without those whose pose isn't known.
+    """Return rows of capsules, without those whose pose isn't known.
 
     Args:
         robot: The robot, m joints.
@@ -267,7 +267,7 @@ def rounded_to(values: FloatArray, step: float) -> NDArray[np.float32]:
 
 
 def body_title(content: Content) -> str:
-    """Name of the body's view, which is also the legend of its colours."""
+    """Return the name of the body's view, which is also the legend of its colours."""
     if content.power_limit_w is None:
         return "Body, blue head to amber tail"
     if content.live:  # the scale may still grow
@@ -287,7 +287,7 @@ _LABEL_COLOR = (255, 255, 255, 255)
 def above_joints(
     robot: Robot, names: tuple[str, ...], centre: FloatArray, rotation: FloatArray
 ) -> FloatArray:
-    """Points just above the named joints.
+    """Return points just above the named joints.
 
     Args:
         robot: The robot, m joints.

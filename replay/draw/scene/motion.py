@@ -14,8 +14,16 @@ from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternio
 from undulog.capture.robot.model import Robot
 
 from ...samples.quantities import mechanical_power
-from ...samples.sampling import decimate, hold, interpolate, mark_gaps, ordered
-from ...samples.tracks import Columns, Track, resampled
+from ...samples.tracks import (
+    Columns,
+    Track,
+    decimate,
+    hold,
+    interpolate,
+    mark_gaps,
+    ordered,
+    resampled,
+)
 
 BODY_RATE_HZ = 50.0
 SPARSE_RATE_HZ = 25.0
@@ -54,7 +62,7 @@ class Motion:
     def links(
         self, rows: slice | IntArray, angles: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Where the links are.
+        """Return the poses of the links.
 
         Args:
             rows: Which drawing times, k of them.
@@ -94,7 +102,7 @@ class HeadPath:
 
     @classmethod
     def of(cls, t_ns: IntArray, pose: FloatArray, *, tracked: bool) -> HeadPath:
-        """Take a path apart, of columns as in :data:`POSE`, shape (n, 7)."""
+        """Build a path from columns as in :data:`POSE`, shape (n, 7)."""
         return cls(t_ns, pose[:, :3], pose[:, 3:], tracked)
 
     @property
@@ -107,35 +115,17 @@ class HeadPath:
         return HeadPath(self.t_ns[rows], self.position[rows], self.quaternion[rows], self.tracked)
 
 
-@dataclass(frozen=True)
-class Frames:
-    """When the body is drawn, and where its head was then.
-
-    Attributes:
-        head: The head's path at most 50 times a second, on its own sampling times; a row of NaN
-            in each gap.
-        sparse: Which of these rows, no more than 25 a second, are drawn of what moves beside the
-            body, shape (n,).
-    """
-
-    head: HeadPath
-    sparse: BoolArray
-
-    def between(self, rows: slice) -> Frames:
-        """Some of them.
-
-        Returns:
-            These only.
-        """
-        return Frames(self.head.at(rows), self.sparse[rows])
-
-
-def frames_of(head: HeadPath, end_ns: int) -> Frames:
+def frames_of(head: HeadPath, end_ns: int) -> tuple[HeadPath, BoolArray]:
     """Choose when the body is drawn.
 
     Args:
         head: The head's path.
         end_ns: The session's end [ns].
+
+    Returns:
+        The path at most 50 times a second, on its own sampling times, with a row of NaN in each
+        gap; and which of these rows, no more than 25 a second, are drawn of what moves beside the
+        body, shape (n,).
     """
     chosen = head.at(decimate(head.t_ns, BODY_RATE_HZ))
     t_ns, pose = mark_gaps(chosen.t_ns, chosen.pose, end_ns)
@@ -143,13 +133,13 @@ def frames_of(head: HeadPath, end_ns: int) -> Frames:
     sparse[decimate(t_ns, SPARSE_RATE_HZ)] = True
     # A gap ends whatever is drawn.
     sparse |= np.isnan(pose).any(axis=1)
-    return Frames(HeadPath.of(t_ns, pose, tracked=head.tracked), sparse)
+    return HeadPath.of(t_ns, pose, tracked=head.tracked), sparse
 
 
 def read_head(
     session: SessionView, robot: Robot, positions: Sequence[Track], warnings: list[str]
 ) -> HeadPath:
-    """The head's pose from ``/odom``, or held at the origin.
+    """Read the head's pose from ``/odom``; without odometry it is held at the origin.
 
     Args:
         positions: Measured joint angles, whose times serve where there is no odometry.
@@ -171,7 +161,7 @@ def read_head(
 
 
 def still_head(t_ns: IntArray) -> HeadPath:
-    """The head at the origin, where nobody tracked it.
+    """Return the path of an untracked head: the origin.
 
     Args:
         t_ns: Times [ns], shape (n,).
@@ -181,7 +171,7 @@ def still_head(t_ns: IntArray) -> HeadPath:
 
 
 def tracked_head(t_ns: IntArray, pose: FloatArray) -> HeadPath:
-    """The head's path from odometry.
+    """Return the head's path from odometry.
 
     Args:
         t_ns: Sampling times [ns], shape (n,).

@@ -19,16 +19,15 @@ from undulog.sim.scenario.obstacles import Box, Cylinder, Obstacle, Target, Wall
 from undulog.sim.scenario.world import World, read_world
 
 from ...samples.content import Color, Places
-from ...samples.sampling import decimate, gaps, hold, ordered
 from ...samples.timeline import Clock, Span, Stretch
+from ...samples.tracks import decimate, gaps, hold, ordered
 from . import body
 from .body import ROUNDING, rounded_to
 from .motion import HeadPath, Motion, assemble, frames_of
 
 RANGES = "/world/snake/ranges"
 
-_AT_ONCE = 4
-"""Sensors that are read in one pass over the file: an hour of each takes memory."""
+_AT_ONCE = 4  # sensors that are read in one pass over the file: an hour of each takes memory
 _RANGE_COLOR = (232, 214, 130, 255)
 
 
@@ -39,7 +38,7 @@ def rays(
     rotation: FloatArray,
     reading: FloatArray | NDArray[np.float32],
 ) -> tuple[FloatArray, FloatArray]:
-    """From each range sensor to what it sees.
+    """Return the rays from each range sensor to the obstacle that it detects.
 
     Args:
         robot: The robot, m joints.
@@ -90,7 +89,7 @@ def read_ranges(
 
 
 def range_sensors(robot: Robot, topics: Collection[str]) -> tuple[Sensor, ...]:
-    """The robot's distance sensors of which something was logged.
+    """Return the robot's distance sensors that were logged.
 
     Args:
         topics: Topics that were.
@@ -111,7 +110,7 @@ def log_rays(
     sensors: tuple[Sensor, ...],
     reading: FloatArray | NDArray[np.float32],
 ) -> None:
-    """Draw what distance sensors see.
+    """Draw the rays of the distance sensors.
 
     Args:
         chosen: Which of its drawing times, shape (n,).
@@ -141,7 +140,7 @@ _WHOLE = Span()
 
 
 def trail_segments(t_ns: IntArray, position: FloatArray) -> tuple[IntArray, NDArray[np.float32]]:
-    """Straight pieces between successive head positions.
+    """Return line segments between successive head positions.
 
     Args:
         t_ns: Times [ns], ascending, shape (n,).
@@ -183,7 +182,7 @@ _RIM_SIDES = 64
 
 
 def world_of(session: SessionView, warnings: list[str]) -> World | None:
-    """The world that the session's scenario describes.
+    """Return the world of the session's scenario.
 
     Args:
         warnings: Extended by what can't be read.
@@ -209,7 +208,7 @@ def world_of(session: SessionView, warnings: list[str]) -> World | None:
 
 
 def log_surroundings(rec: rr.RecordingStream, world: World) -> None:
-    """Draw what does not move."""
+    """Draw obstacles and target."""
     cylinders = [one for one in world.obstacles if isinstance(one, Cylinder)]
     boxes = [_box(one) for one in world.obstacles if not isinstance(one, Cylinder)]
     if cylinders:
@@ -266,7 +265,7 @@ class Scene:
         warnings: list[str],
         span: Span,
     ) -> None:
-        """Write what doesn't move, and the head's trail.
+        """Draw the static surroundings and the head's trail.
 
         Args:
             head: Where its head was.
@@ -280,10 +279,10 @@ class Scene:
         self._places, self._palette, self._limit_w = places, palette, limit_w
         self.named: list[str] = []
         """Joints of modules that a test names, which carry a mark."""
-        self._frames = frames_of(head, session.end_ns)
-        self._sparse = np.flatnonzero(self._frames.sparse)
+        self._head, sparse = frames_of(head, session.end_ns)
+        self._sparse = np.flatnonzero(sparse)
         self._sensors = range_sensors(robot, session.channels)
-        at_ns = self._frames.head.t_ns[self._sparse]
+        at_ns = self._head.t_ns[self._sparse]
         self._distance = read_ranges(session, self._sensors, at_ns)
         rec.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         world = world_of(session, warnings)
@@ -294,13 +293,12 @@ class Scene:
 
     def write(self, stretch: Stretch) -> None:
         """Draw a stretch."""
-        rows = stretch.span.rows(self._frames.head.t_ns)
+        rows = stretch.span.rows(self._head.t_ns)
         if rows.stop <= rows.start:
             return
-        frames = self._frames.between(rows)
-        motion = assemble(self._robot, frames.head, stretch.columns)
-        sparse = np.flatnonzero(frames.sparse)
+        motion = assemble(self._robot, self._head.at(rows), stretch.columns)
         own = slice(*np.searchsorted(self._sparse, [rows.start, rows.stop]).tolist())
+        sparse = self._sparse[own] - rows.start
         rec, clock = self._rec, self._clock
         body.log_body(rec, clock, motion, limit_w=self._limit_w)
         body.log_ghost(rec, clock, motion, sparse)

@@ -7,11 +7,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 import undulog as front
 from support.paths import TRACE
-from support.twin_fits import fitted, rewritten, room_for
+from support.twin_fits import colored, fitted, rewritten, room_for
 from undulog.capture import load_robot
 from undulog.capture.common.process import StopRequest
 from undulog.replay.calibrate.identifiability import ridges
@@ -95,27 +94,19 @@ def test_a_dead_time_is_told_and_not_written(small, tmp_path, capsys):
         ("-o a.toml --on can:x", "expected twin or twin:SCENARIO"),
         ("-o a.toml --spread 3", "--spread 3"),
         ("-o a.toml --within 0", "--within 0"),
+        ("-o a.toml --settle 60", "is --settle too long?"),
+        ("-o a.mine.toml", "--force"),
     ],
 )
 def test_wrong_usage_says_what_would_be_right(small, tmp_path, capsys, words, told):
+    mine = tmp_path / "a.mine.toml"
+    mine.write_text("mine")
     words = words.replace("a.", f"{tmp_path}/a.").split()
-    assert front.run(["sim", "fit", str(small / "run.mcap"), *words]) == 2
+    code = 1 if "--settle" in words else 2
+    assert front.run(["sim", "fit", str(small / "run.mcap"), *words]) == code
     assert told in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_nothing_is_overwritten(small, tmp_path, capsys):
-    (tmp_path / "a.toml").write_text("mine")
-    words = ["sim", "fit", str(small / "run.mcap"), "-o", str(tmp_path / "a.toml")]
-    assert front.run(words) == 2
-    assert "--force" in capsys.readouterr().err
-    assert (tmp_path / "a.toml").read_text() == "mine"
-
-
-def test_a_session_without_settled_samples_is_refused(small, tmp_path, capsys):
-    words = ["-o", str(tmp_path / "a.toml"), "--settle", "60"]
-    assert front.run(["sim", "fit", str(small / "run.mcap"), *words]) == 1
-    assert "is --settle too long?" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [mine]
+    assert mine.read_text() == "mine"
 
 
 def test_an_interrupted_fit_leaves_nothing(small, tmp_path, capsys, monkeypatch):
@@ -240,17 +231,11 @@ def test_the_memory_of_noise_is_that_of_its_closed_form():
     assert memory(list(noise)) == pytest.approx((1 + rho) / (1 - rho), rel=0.1)
 
 
-def colored(random, rho, shape):
-    """AR(1) noise of variance one, shape (..., n)."""
-    white = random.standard_normal((*shape[:-1], shape[-1] + 500))
-    return math.sqrt(1 - rho**2) * lfilter([1.0], [1.0, -rho], white)[..., 500:]
-
-
 @pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
 def test_scores_of_coloured_noise_vary_as_its_spectrum_says(rho):
     """J = cos(w t): the sum of n samples varies by n/2 times the spectrum at w."""
     n, w = 40000, 2 * np.pi * 0.01
-    noise = colored(np.random.default_rng(4), rho, (n,))
+    noise = colored(np.random.default_rng(4), rho, n)
     column = np.cos(w * np.arange(n))[:, None]
     got = score_covariance([column], [noise], np.ones(1), np.ones(1))
     spectrum = (1 - rho**2) / abs(1 - rho * np.exp(-1j * w)) ** 2
@@ -270,7 +255,7 @@ def test_intervals_of_a_linear_model_cover(n, rho):
         columns = list(np.moveaxis(0.02 * base @ mixed, 1, 0))
         columns = [column - column.mean(axis=0) for column in columns]
         truth = 0.5 * random.standard_normal(count)
-        noise = 0.005 * colored(random, rho, (3, n))
+        noise = 0.005 * colored(random, rho, 3, n)
         measured = [c @ truth + e - e.mean() for c, e in zip(columns, noise, strict=True)]
         solution = solve_linear(columns, measured, prior)
         half = 1.96 * np.sqrt(np.diag(solution[1]))

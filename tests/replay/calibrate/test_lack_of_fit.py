@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 import undulog as front
 from support import twin_fits
+from support.twin_fits import colored
 from undulog.replay.calibrate.identifiability import play_direction
 from undulog.replay.calibrate.lack_of_fit import (
     JointFit,
@@ -29,16 +29,11 @@ T = np.arange(650) * 0.01
 """Six and a half cycles of 1 Hz at 100 Hz."""
 
 
-def colored(random, rho, count=T.size):
-    white = random.standard_normal(count + 500)
-    return math.sqrt(1 - rho**2) * lfilter([1.0], [1.0, -rho], white)[500:]
-
-
 def of_kind(random, kind):
     """Noise of deviation 1: white, with a memory, or an encoder's on a drifting joint."""
     if kind == "mixed":
-        return 0.6 * colored(random, 0.95) + 0.8 * random.standard_normal(T.size)
-    return colored(random, kind)
+        return 0.6 * colored(random, 0.95, T.size) + 0.8 * random.standard_normal(T.size)
+    return colored(random, kind, T.size)
 
 
 @pytest.mark.parametrize("kind", [0.0, 0.9, 0.99, "mixed"])
@@ -55,7 +50,7 @@ def test_it_finds_what_comes_back_every_cycle():
     random = np.random.default_rng(2)
     for rho, loud in ((0.0, 1.0), (0.6, 2.5)):
         law = loud * 0.7 * SIGMA * np.sin(3 * OMEGA * T + 1.0)
-        found = [periodic(T, SIGMA * colored(random, rho) + law, OMEGA) for _ in range(60)]
+        found = [periodic(T, SIGMA * colored(random, rho, T.size) + law, OMEGA) for _ in range(60)]
         assert np.mean([one.p < 0.01 for one in found]) > 0.9
         size = np.median([one.periodic_rad for one in found])
         assert size == pytest.approx(loud * 0.7 * SIGMA / math.sqrt(2), rel=0.25)
@@ -81,9 +76,9 @@ def test_rounding_that_comes_back_every_cycle_is_no_misfit():
 
 def test_without_a_gait_the_memory_is_tested():
     random = np.random.default_rng(4)
-    p = np.array([ljung_box(colored(random, 0.8)) for _ in range(300)])
+    p = np.array([ljung_box(colored(random, 0.8, T.size)) for _ in range(300)])
     assert np.mean(p < 0.05) <= 0.05 + 3 * 0.0126
-    bent = [ljung_box(colored(random, 0.0) + 0.7 * np.sin(OMEGA * T)) for _ in range(50)]
+    bent = [ljung_box(colored(random, 0.0, T.size) + 0.7 * np.sin(OMEGA * T)) for _ in range(50)]
     assert np.mean(np.array(bent) < 0.01) > 0.9
 
 
@@ -98,7 +93,9 @@ def linear(random, rho, *, apart=0.0, runs=60):
         columns = [c - c.mean(axis=0) for c in columns]
         truth, change = 0.5 * random.standard_normal(4), np.array([apart, 0.0, 0.0, 0.0])
         way = np.sign(T - T.mean())[:, None]
-        angles = [c @ truth + (way * c) @ change + SIGMA * colored(random, rho) for c in columns]
+        angles = [
+            c @ truth + (way * c) @ change + SIGMA * colored(random, rho, T.size) for c in columns
+        ]
         angles = [a - a.mean() for a in angles]
         precision = np.full(4, 4.0)
         normal = np.diag(precision) + sum(c.T @ c for c in columns) / SIGMA**2

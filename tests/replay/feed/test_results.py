@@ -155,22 +155,14 @@ def test_with_a_comparison_alone_the_session_is_analysed(session, comparison, tm
     assert [one.joint for one in layer.named] == ["joint05"]
 
 
-def test_results_of_another_session_are_refused(session, analysis, tmp_path):
+def test_results_that_do_not_fit_the_session_are_refused(session, analysis, experiment, tmp_path):
     other = dataclasses.replace(analysis.session, id="another")
     path = dataclasses.replace(analysis, session=other).save(tmp_path / "other.json")
     with pytest.raises(DataError, match=r"other\.json: a result of session another; the session"):
         saved(session, [path])
-
-
-def test_two_results_with_numbers_of_the_session_are_refused(
-    session, analysis, experiment, tmp_path
-):
     paths = [analysis.save(tmp_path / "a.json"), experiment.save(tmp_path / "b.json")]
     with pytest.raises(DataError, match=r"b\.json: the second result with numbers"):
         saved(session, paths)
-
-
-def test_a_result_that_names_no_session_is_refused(session, tmp_path):
     path = NO_COUPLING.save(tmp_path / "coupling.json")
     with pytest.raises(DataError, match=r"a Coupling names no session"):
         saved(session, [path])
@@ -186,7 +178,8 @@ def marked(session_file, analysis, comparison, tmp_path, read_back):
     return read_back(tmp_path / "a.rrd")
 
 
-def test_named_modules_are_marked_on_the_body(marked, snake25, truth):
+def test_named_modules_are_marked_on_the_body(marked, recording, snake25, truth):
+    assert not any("named" in path for path in recording[1].entities)  # without results
     assert marked.column("/world/snake/named", "Points3D:labels")[0] == ["joint05"]
     assert marked.static("/world/snake/named", "Points3D:colors") == [PINK]
     # Above the axis of joint 5, between links 5 and 6.
@@ -205,21 +198,13 @@ def test_named_modules_are_marked_at_their_bars_and_in_words(marked):
     assert "- gain, lag and energy are those of made.json" in words
 
 
-def test_without_results_nothing_is_marked(recording):
-    _, recorded = recording
-    assert not any("named" in path for path in recorded.entities)
-
-
 def test_results_and_tabs_are_of_one_session(session_file, tmp_path, view):
-    for words in (["--result", tmp_path / "a.json"], ["--tab", "cycles"]):
+    missing, output = tmp_path / "nowhere.json", tmp_path / "a.rrd"
+    for words in (["--result", missing], ["--tab", "cycles"]):
         code, _, err = view(session_file, session_file, *words)
         assert code == 2
         assert f"{words[0]}: needs one session" in err
-
-
-def test_a_result_that_is_not_there_fails(session_file, tmp_path, view):
-    missing = tmp_path / "nowhere.json"
-    code, _, err = view(session_file, "--result", missing, "--save", tmp_path / "a.rrd")
+    code, _, err = view(session_file, "--result", missing, "--save", output)
     assert code == 1
     assert "nowhere.json" in err
-    assert not (tmp_path / "a.rrd").exists()
+    assert not output.exists()

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from undulog.capture import Session, SessionWriter
+from support.written_topics import EPOCH_NS as START
+from support.written_topics import write_topics
+from undulog.capture import Session
 from undulog.capture.common.errors import DataError, LogWriteError
 from undulog.capture.common.palette import joint_colors
 from undulog.replay.draw.scene.body import ROUNDING
 from undulog.replay.feed.recording import recording_id, write_recording
-
-START = 1_735_689_600_000_000_000
 
 
 def converted(file, path, **options):
@@ -43,64 +43,41 @@ def assert_drawn(shown, truth):
     assert (apart <= 1e-3 * room + 1e-7 * np.nanmax(np.abs(truth))).all()
 
 
-def test_the_file_passes_reruns_own_verification(recording, rerun_command):
-    rerun_command("rrd", "verify", recording[0].path)
-
-
 def test_all_entities_are_there_by_name(recording):
-    assert recording[1].entities >= {
-        "/world/snake/measured",
-        "/world/snake/commanded",
-        "/world/snake/places",
-        "/world/trail",
-        "/joints/commanded",
-        "/joints/measured",
-        "/joints/error",
-        "/joints/places/measured",
-        "/joints/places/commanded",
-        "/power/mechanical",
-        "/power/total/mechanical",
-        "/power/total/electrical",
-        "/signals/joint_current",
-        "/segments/lag_degrees/estimate/joint01",
-        "/gait/mode",
-        "/events",
-        "/session",
+    below = {
+        "/world": ("snake/measured", "snake/commanded", "snake/places", "trail"),
+        "/joints": ("measured", "commanded", "error", "places/measured", "places/commanded"),
+        "/power": ("mechanical", "total/mechanical", "total/electrical"),
+        "": ("signals/joint_current", "segments/lag_degrees/estimate/joint01"),
     }
+    entities = {f"{root}/{name}" for root, names in below.items() for name in names}
+    assert recording[1].entities >= entities | {"/gait/mode", "/events", "/session"}
 
 
-def test_angles_are_shown_in_degrees(recording, truth):
+def test_what_is_drawn_follows_from_the_columns(recording, truth):
     _, found = recording
-    for entity, angles in (("measured", truth.position), ("commanded", truth.command)):
-        shown = rows(found.column(f"/joints/{entity}", "Angle:degrees"))
-        assert_drawn(shown, np.degrees(angles))
-        np.testing.assert_array_equal(found.times(f"/joints/{entity}"), truth.t_ns - START)
-
-
-def test_other_topics_are_shown_in_their_unit(recording, truth):
-    shown = rows(recording[1].column("/signals/joint_current", "Scalars:scalars"))
-    assert_drawn(shown, truth.effort)
-
-
-def test_head_middle_and_tail_have_a_plot_of_their_own(recording, truth):
-    _, found = recording
-    shown = rows(found.column("/joints/places/measured", "Scalars:scalars"))
-    assert_drawn(shown, np.degrees(truth.position[:, [0, 12, 24]]))
+    power = truth.effort * truth.velocity
+    total = power.sum(axis=1, keepdims=True)
+    electrical = 6.0 * truth.effort.sum(axis=1, keepdims=True)
+    for entity, values in {
+        "/joints/measured": np.degrees(truth.position),
+        "/joints/commanded": np.degrees(truth.command),
+        "/joints/error": np.degrees(truth.position - truth.command),
+        "/joints/places/measured": np.degrees(truth.position[:, [0, 12, 24]]),
+        "/power/mechanical": power,
+        "/power/total/mechanical": total,
+        "/power/total/electrical": electrical,
+        "/signals/joint_current": truth.effort,  # in its own unit
+    }.items():
+        is_angle = entity.startswith("/joints") and "places" not in entity
+        component = "Angle:degrees" if is_angle else "Scalars:scalars"
+        assert_drawn(rows(found.column(entity, component)), values)
+        np.testing.assert_array_equal(found.times(entity), truth.t_ns - START)
     names = ["joint01 head", "joint13 middle", "joint25 tail"]
     assert found.static("/joints/places/measured", "SeriesLines:names") == names
     assert found.static("/joints/places/measured", "SeriesLines:widths") == [2.0, 2.0, 2.0]
-
-
-def test_error_and_power_follow_from_the_columns(recording, truth):
-    _, found = recording
-    error = rows(found.column("/joints/error", "Angle:degrees"))
-    assert_drawn(error, np.degrees(truth.position - truth.command))
-    power = truth.effort * truth.velocity
-    assert_drawn(rows(found.column("/power/mechanical", "Scalars:scalars")), power)
-    total = rows(found.column("/power/total/mechanical", "Scalars:scalars"))
-    assert_drawn(total, power.sum(axis=1, keepdims=True))
-    electrical = rows(found.column("/power/total/electrical", "Scalars:scalars"))
-    assert_drawn(electrical, 6.0 * truth.effort.sum(axis=1, keepdims=True))
+    cycles = found.times("/joints/measured", "gait_cycle") / 1e9
+    np.testing.assert_allclose(cycles, truth.phase / (2 * np.pi), atol=1e-9)
 
 
 def test_joints_are_named_and_keep_their_colours(recording, snake25):
@@ -120,11 +97,6 @@ def test_the_body_is_drawn_at_50_hz_where_the_head_was(recording, truth, snake25
     # The head looks along x, so its capsule starts half its length behind its centre.
     expected = truth.head[::2] - [length / 2, 0.0, 0.0]
     np.testing.assert_allclose(origin[:, 0], expected, atol=ROUNDING / 2 + 1e-9)
-
-
-def test_the_gait_gives_a_second_timeline(recording, truth):
-    cycles = recording[1].times("/joints/measured", "gait_cycle") / 1e9
-    np.testing.assert_allclose(cycles, truth.phase / (2 * np.pi), atol=1e-9)
 
 
 def test_mode_and_events_are_as_logged(recording):
@@ -150,6 +122,7 @@ def test_the_same_session_gives_the_same_recording(
     assert again.recording_id == recording[0].recording_id == recording_id("made-for-tests")
     assert recording[1].stores == [("undulog", again.recording_id)]
     rerun_command("rrd", "compare", recording[0].path, again.path)
+    rerun_command("rrd", "verify", again.path)
 
 
 def test_a_recording_is_replaced_by_a_whole_one_only(session_file, tmp_path):
@@ -225,12 +198,14 @@ def test_without_odometry_the_head_stays_at_the_origin(made):
     assert "/world/trail" not in found.entities
 
 
-def test_without_a_robot_there_are_plots_but_no_body(made, truth):
-    written, found = made(robot=False)
+def test_without_a_robot_and_a_gait_there_are_plots_on_one_timeline(made, truth):
+    written, found = made(robot=False, gait=False)
     assert any("no robot description" in warning for warning in written.warnings)
     assert not [entity for entity in found.entities if entity.startswith("/world")]
     shown = rows(found.column("/joints/measured", "Angle:degrees"))
     assert_drawn(shown, np.degrees(truth.position))
+    assert found.times("/joints/measured", "gait_cycle").size == 0
+    assert "/events" not in found.entities
 
 
 def test_without_torques_the_body_wears_the_colours_of_its_joints(made):
@@ -241,26 +216,17 @@ def test_without_torques_the_body_wears_the_colours_of_its_joints(made):
     assert "/power/mechanical" not in found.entities
 
 
-def test_without_a_gait_there_is_one_timeline(made):
-    _, found = made(gait=False)
-    assert found.times("/joints/measured", "gait_cycle").size == 0
-    assert "/events" not in found.entities
-
-
 def test_servos_polled_in_turn_are_drawn_where_they_were_at_the_first_ones_times(
     snake25, read_back, tmp_path
 ):
     names = snake25.joint_names
     offset = 2.5e-4 * np.arange(25)
     t = START + np.arange(50, dtype=np.int64) * 10_000_000
-    with SessionWriter(
-        tmp_path / "a.mcap", session_id="polled", epoch_ns=START, robot=snake25
-    ) as w:
-        states = w.joint_state("/joint_states", names, unit="rad")
-        offsets = w.joint_state("/joint_sample_offset", names, unit="s")
-        for t_ns in t.tolist():
-            states.write(t_ns, np.full(25, (t_ns - START) * 1e-9) + offset)
-            offsets.write(t_ns, offset)
+    topics = {
+        "/joint_states": (names, "rad", (t - START)[:, None] * 1e-9 + offset),
+        "/joint_sample_offset": (names, "s", np.tile(offset, (50, 1))),
+    }
+    write_topics(tmp_path / "a.mcap", t, topics, robot=snake25)
     found = read_back(converted(tmp_path / "a.mcap", tmp_path / "a.rrd").path)
     np.testing.assert_array_equal(found.times("/joints/measured"), t - START)
     shown = np.radians(rows(found.column("/joints/measured", "Angle:degrees")))
@@ -271,14 +237,13 @@ def test_servos_polled_in_turn_are_drawn_where_they_were_at_the_first_ones_times
 
 def test_a_foreign_bag_with_a_message_a_servo_shows_every_servo(read_back, tmp_path):
     t = START + np.arange(60, dtype=np.int64) * 10_000_000
-    with SessionWriter(tmp_path / "a.mcap", session_id="", epoch_ns=START) as w:
-        both = w.joint_state("/joint_states", ["left", "right"], unit="rad")
-        other = w.joint_state("/gripper/state", ["finger"], unit="m")
-        for i, t_ns in enumerate(t.tolist()):
-            angles = np.full(2, np.nan)
-            angles[i % 2] = i
-            both.write(t_ns, angles)
-            other.write(t_ns, np.array([0.01]))
+    i = np.arange(60.0)
+    angles = np.stack([np.where(i % 2, np.nan, i), np.where(i % 2, i, np.nan)], axis=1)
+    topics = {
+        "/joint_states": (["left", "right"], "rad", angles),
+        "/gripper/state": (["finger"], "m", np.full((60, 1), 0.01)),
+    }
+    write_topics(tmp_path / "a.mcap", t, topics, session_id="")
     written = converted(tmp_path / "a.mcap", tmp_path / "a.rrd")
     found = read_back(written.path)
     right = rows(found.column("/joints/measured/right", "Angle:degrees"))
@@ -288,8 +253,7 @@ def test_a_foreign_bag_with_a_message_a_servo_shows_every_servo(read_back, tmp_p
 
 
 def test_a_session_without_messages_is_an_error(tmp_path):
-    with SessionWriter(tmp_path / "a.mcap", session_id="empty", epoch_ns=START) as w:
-        w.joint_state("/joint_states", ["a"], unit="rad")
+    write_topics(tmp_path / "a.mcap", [], {"/joint_states": (["a"], "rad", np.zeros((0, 1)))})
     with pytest.raises(DataError, match="no messages"):
         converted(tmp_path / "a.mcap", tmp_path / "a.rrd")
 

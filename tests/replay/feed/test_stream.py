@@ -4,7 +4,6 @@ import signal
 import time
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,25 +33,15 @@ pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 
 
 class Told:
-    """Hears how far it is."""
+    """Hears how far it is; asks for an end as soon as the first picture is out, if wanted."""
 
-    def __init__(self):
-        self.heard = []
+    def __init__(self, stop=None):
+        self.heard, self.stop = [], stop
 
     def update(self, done, note=""):
         self.heard.append((done, note))
-
-
-class Stopping(Told):
-    """Asks for an end as soon as the first picture is out."""
-
-    def __init__(self, stop):
-        super().__init__()
-        self.stop = stop
-
-    def update(self, done, note=""):
-        super().update(done, note)
-        self.stop.signal = signal.SIGINT
+        if self.stop is not None:
+            self.stop.signal = signal.SIGINT
 
 
 @contextmanager
@@ -202,7 +191,7 @@ def test_the_layout_foreseen_is_that_of_the_analysed_session(tmp_path):
 
 def test_an_end_that_is_asked_for_comes_soon_and_ends_the_viewer(long_file, tmp_path):
     stop = StopRequest()
-    bar = Stopping(stop)
+    bar = Told(stop)
     with streaming(long_file, tmp_path / "a.rrd") as (viewer, task_of):
         with pytest.raises(NoLongerWantedError):
             show_session(task_of(bar), viewer, stop)
@@ -219,32 +208,6 @@ def test_a_viewer_that_dies_is_told(long_file, tmp_path):
 
         with pytest.raises(UndulogError, match="viewer was ended by signal 9"):
             show_session(task_of(Killing()), viewer, StopRequest())
-
-
-@pytest.mark.slow
-def test_a_frozen_viewer_holds_up_the_reading_and_can_be_ended(long_file, tmp_path):
-    stop = StopRequest()
-    with streaming(long_file, tmp_path / "a.rrd") as (viewer, task_of):
-
-        class Freezing(Told):
-            def update(self, done, note=""):
-                super().update(done, note)
-                viewer._process.send_signal(signal.SIGSTOP)
-
-        class Impatient(StopRequest):
-            @property
-            def requested(self):
-                return time.monotonic() > end
-
-        bar, stop = Freezing(), Impatient()
-        end = time.monotonic() + 8.0
-        with pytest.raises(NoLongerWantedError):
-            show_session(task_of(bar), viewer, stop)
-        assert time.monotonic() < end + 30.0
-        # What the sockets hold may be sent; the session is longer than that only for the hour.
-        assert bar.heard
-        assert viewer.ended
-    assert not Path(f"/proc/{viewer._process.pid}").exists()
 
 
 def test_an_analysis_that_dies_is_a_note(tmp_path):

@@ -9,8 +9,9 @@ import pytest
 from mcap.reader import make_reader
 
 from support.live_stage import EPOCH_NS, WAIT_S, Relay, seen_live
+from support.written_topics import write_topics
 from undulog.analysis.session.analyse import analyse_session
-from undulog.capture import Session, SessionWriter
+from undulog.capture import Session
 from undulog.capture.recorder.live_wire import LiveMessage
 from undulog.capture.robot.model import Plane
 from undulog.replay.live.cycles import CycleMeter
@@ -30,32 +31,28 @@ def walk(snake25, tmp_path_factory):
     """
     path = tmp_path_factory.mktemp("walk") / "walk.mcap"
     yaw = snake25.joint_indices(Plane.HORIZONTAL)
-    k = np.arange(len(yaw))
-    lag = 0.1 + 0.02 * k
-    offset = np.linspace(0.0, 6e-3, 25)
-    rng = np.random.default_rng(5)
-    parts = ["horizontal.A", "horizontal.omega", "horizontal.lag", "horizontal.phase"]
+    k, t = np.arange(len(yaw)), np.arange(900)[:, None] / 100.0
+    offset = np.tile(np.linspace(0.0, 6e-3, 25), (900, 1))
     omega = 2 * np.pi * FREQUENCY_HZ
-    with SessionWriter(path, session_id="walk", epoch_ns=EPOCH_NS, robot=snake25) as w:
-        names = snake25.joint_names
-        offsets = w.joint_state("/joint_sample_offset", names, unit="s")
-        commands = w.joint_state("/joint_commands", names, unit="rad")
-        states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
-        gait = w.joint_state("/gait", parts, unit="rad, omega in rad/s")
-        for i in range(900):
-            t, t_ns = i / 100.0, EPOCH_NS + i * 10_000_000
-            size = 0.4 if t < 4.0 else 0.2
-            own = omega * (t + offset[yaw]) - k * np.pi / 6
-            command, position, velocity, effort = np.zeros((4, 25))
-            command[yaw] = size * np.sin(omega * t - k * np.pi / 6)
-            position[yaw] = GAIN * size * np.sin(own - lag) + rng.normal(0, 1e-4, len(yaw))
-            velocity[yaw] = SPEED * np.cos(own)
-            effort[yaw] = TORQUE * np.cos(own)
-            offsets.write(t_ns, offset)
-            commands.write(t_ns, command)
-            states.write(t_ns, position, velocity, effort)
-            phase = np.angle(np.exp(1j * omega * t))  # within a turn, as some controllers log it
-            gait.write(t_ns, np.array([size, omega, np.pi / 6, phase]))
+    size = np.where(t < 4.0, 0.4, 0.2)
+    own = omega * (t + offset[:, yaw]) - k * np.pi / 6
+    noise = np.random.default_rng(5).normal(0, 1e-4, own.shape)
+    command, position, velocity, effort = np.zeros((4, 900, 25))
+    command[:, yaw] = size * np.sin(omega * t - k * np.pi / 6)
+    position[:, yaw] = GAIN * size * np.sin(own - 0.1 - 0.02 * k) + noise
+    velocity[:, yaw] = SPEED * np.cos(own)
+    effort[:, yaw] = TORQUE * np.cos(own)
+    phase = np.angle(np.exp(1j * omega * t))  # within a turn, as some controllers log it
+    gait = np.hstack([size, np.full_like(t, omega), np.full_like(t, np.pi / 6), phase])
+    parts = ["horizontal.A", "horizontal.omega", "horizontal.lag", "horizontal.phase"]
+    names = snake25.joint_names
+    topics = {
+        "/joint_sample_offset": (names, "s", offset),
+        "/joint_commands": (names, "rad", command),
+        "/joint_states": (names, "rad", position, velocity, effort),
+        "/gait": (parts, "rad, omega in rad/s", gait),
+    }
+    write_topics(path, EPOCH_NS + np.arange(900) * 10_000_000, topics, robot=snake25)
     return path
 
 

@@ -33,27 +33,23 @@ def test_every_message_is_shown(live, session_file):
     assert report["lag_s"]["p50"] > 0
 
 
-def test_angles_are_those_that_were_measured(live, truth):
+def test_angles_and_power_are_those_that_were_measured(live, truth):
     _, drawn = live
-    t_ns = truth.t_ns - EPOCH_NS
-    for entity, values in (
-        ("/joints/measured", truth.position),
-        ("/joints/commanded", truth.command),
-        ("/joints/error", truth.position - truth.command),
+    for entity, component, values, atol in (
+        ("/joints/measured", "Angle:degrees", np.degrees(truth.position), 2e-6),
+        ("/joints/commanded", "Angle:degrees", np.degrees(truth.command), 2e-6),
+        ("/joints/error", "Angle:degrees", np.degrees(truth.position - truth.command), 2e-6),
+        ("/power/mechanical", "Scalars:scalars", truth.effort * truth.velocity, 1e-8),
+        (
+            "/power/total/electrical",
+            "Scalars:scalars",
+            6.0 * truth.effort.sum(axis=1)[:, None],
+            1e-6,
+        ),
     ):
-        found = drawn.rows(entity, "Angle:degrees")
-        assert list(found) == t_ns.tolist()
-        np.testing.assert_allclose(list(found.values()), np.degrees(values), atol=2e-6)
-
-
-def test_power_is_torque_times_velocity(live, truth):
-    _, drawn = live
-    found = drawn.rows("/power/mechanical", "Scalars:scalars")
-    assert list(found) == (truth.t_ns - EPOCH_NS).tolist()
-    np.testing.assert_allclose(list(found.values()), truth.effort * truth.velocity, atol=1e-8)
-    total = drawn.rows("/power/total/electrical", "Scalars:scalars")
-    shown = np.ravel(list(total.values()))
-    np.testing.assert_allclose(shown, 6.0 * truth.effort.sum(axis=1), atol=1e-6)
+        found = drawn.rows(entity, component)
+        assert list(found) == (truth.t_ns - EPOCH_NS).tolist()
+        np.testing.assert_allclose(list(found.values()), values, atol=atol)
 
 
 @pytest.mark.parametrize(
@@ -87,23 +83,11 @@ def test_live_and_replay_draw_the_same(live, replay, entity, component):
             assert np.allclose(one, other, atol=atol, equal_nan=True)
 
 
-def test_names_and_colours_are_the_replays(live, replay):
+def test_entities_names_and_colours_are_the_replays_and_said_once(live, replay):
     _, drawn = live
+    assert {entity for entity in drawn.entities if not entity.startswith("/__")} <= replay.entities
     for entity in ("/joints/measured", "/joints/commanded", "/power/total/mechanical"):
         for component in ("SeriesLines:names", "SeriesLines:colors"):
             assert drawn.static(entity, component) == replay.static(entity, component)
-
-
-def test_whatever_is_drawn_is_in_the_replay_too(live, replay):
-    _, drawn = live
-    assert {entity for entity in drawn.entities if not entity.startswith("/__")} <= replay.entities
-
-
-def test_static_things_are_said_once(live):
-    _, drawn = live
-    chunks = [
-        chunk
-        for chunk in drawn._chunks
-        if chunk.entity_path == "/joints/measured" and chunk.is_static
-    ]
-    assert len(chunks) == 1
+    static = [one for one in drawn._chunks if one.entity_path == "/joints/measured"]
+    assert sum(one.is_static for one in static) == 1

@@ -14,19 +14,18 @@ import rerun.blueprint as rrb
 import undulog
 from support.golden_pictures import marked
 from support.twin_chains import chain as chain_text
+from support.written_topics import EPOCH_NS, GAIT, write_topics
 from undulog.analysis.compare.compare import Choices, compare_sessions
-from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import LogWriteError
 from undulog.capture.common.files import check_stop
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.common.process import StopRequest
-from undulog.replay.overlay.alignment import Align, align, times_of
 from undulog.replay.overlay.layout import build_blueprint
-from undulog.replay.overlay.side import convert, read_side
+from undulog.replay.overlay.sessions import Align, align, convert, read_side, times_of
 from undulog.replay.overlay.write import Converted, combine_sessions, write_overlay
 from undulog.replay.samples.timeline import SESSION_TIME, Rhythm
 
-EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("joint01", "joint02", "joint03", "joint04", "joint05")
 LAG = 0.7
 
@@ -86,38 +85,31 @@ def make(chain):
     """Writes a session of a wave."""
 
     def write(path, wave, *, robot=True, gait=True, names=NAMES, noise=1e-4, polled_s=0.0):
-        described = chain(len(names), "chain") if robot else None
         rng = np.random.default_rng(sum(path.name.encode()))
-        with SessionWriter(
+        t, joints = wave.t, np.arange(len(names))
+        cycles = wave.cycles(t)[:, None]
+        polled = wave.cycles(t[:, None] + polled_s * joints)
+        angle = wave.angle(joints, polled)
+        speed = 2 * np.pi * wave.frequency_hz * wave.angle(joints, polled + 0.25)
+        noisy = angle + noise * rng.standard_normal(angle.shape)
+        wrapped = np.angle(np.exp(2j * np.pi * cycles))
+        topics = {
+            "/joint_commands": (names, "rad", 0.4 * np.sin(2 * np.pi * cycles - joints * LAG)),
+            "/joint_sample_offset": (names, "s", np.tile(polled_s * joints, (t.size, 1))),
+            "/joint_states": (names, "rad", noisy, speed, 0.1 * speed),
+            "/gait": (GAIT, "rad", np.hstack([np.full_like(wrapped, 0.4), wrapped])),
+        }
+        left_out = [*([] if polled_s else ["/joint_sample_offset"]), *([] if gait else ["/gait"])]
+        return write_topics(
             path,
-            session_id=path.stem,
+            wave.epoch_ns + np.round(t * 1e9).astype(np.int64),
+            {topic: one for topic, one in topics.items() if topic not in left_out},
+            head=wave.head(t),
+            turn=np.array([0.0, 0.0, math.sin(wave.turn / 2), math.cos(wave.turn / 2)]),
             epoch_ns=wave.epoch_ns,
-            robot=described,
+            robot=chain(len(names)) if robot else None,
             clock={"robot": "simulated"},
-        ) as w:
-            commands = w.joint_state("/joint_commands", names, unit="rad")
-            states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
-            odometry = w.odometry("/odom", frame="world", child="link01")
-            phase = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
-            offsets = w.joint_state("/joint_sample_offset", names, unit="s") if polled_s else None
-            joints, zero = np.arange(len(names)), np.zeros(3)
-            turned = np.array([0.0, 0.0, math.sin(wave.turn / 2), math.cos(wave.turn / 2)])
-            for t in wave.t.tolist():
-                t_ns, cycles = wave.epoch_ns + round(t * 1e9), wave.cycles(t)
-                commands.write(t_ns, 0.4 * np.sin(2 * np.pi * cycles - joints * LAG))
-                polled = wave.cycles(t + polled_s * joints)
-                angle = wave.angle(joints, polled)
-                speed = 2 * np.pi * wave.frequency_hz * wave.angle(joints, polled + 0.25)
-                if offsets is not None:
-                    offsets.write(t_ns, polled_s * joints)
-                states.write(
-                    t_ns, angle + noise * rng.standard_normal(angle.shape), speed, 0.1 * speed
-                )
-                odometry.write(t_ns, wave.head(t), turned, zero, zero)
-                if gait:
-                    wrapped = math.remainder(2 * np.pi * cycles, 2 * np.pi)
-                    phase.write(t_ns, np.array([0.4, wrapped]))
-        return path
+        )
 
     return write
 
@@ -205,34 +197,22 @@ def chord(wave, step_s):
     return np.rad2deg(fastest * step_s**2 / 8) + 2e-5  # and 32 bits
 
 
-def test_differences_by_time_are_those_of_the_waves(beside):
-    found = beside["time"]
-    entity = "/compared/twin/angles"
-    shared = ROBOT.t <= TWIN.t[-1]
+@pytest.mark.parametrize("how", ["time", "phase"])
+def test_differences_are_those_of_the_waves(beside, how):
+    found, entity, joints = beside[how], "/compared/twin/angles", np.arange(len(NAMES))
     np.testing.assert_array_equal(found.times(entity), np.round(ROBOT.t * 1e9))
-    joints = np.arange(len(NAMES))
-    truth = np.rad2deg(
-        TWIN.angle(joints, TWIN.cycles(ROBOT.t)[:, None])
-        - ROBOT.angle(joints, ROBOT.cycles(ROBOT.t)[:, None])
-    )
-    rows = degrees(found, entity)
-    assert shared.all()
-    assert np.abs(rows - truth).max() < chord(TWIN, 1 / TWIN.rate_hz)
-    assert found.static(entity, "SeriesLines:names") == list(NAMES)
-
-
-def test_differences_by_phase_are_those_of_the_waves_at_equal_phase(beside):
-    found = beside["phase"]
-    entity = "/compared/twin/angles"
     at = found.times(entity, "gait_cycle") * 1e-9
     np.testing.assert_allclose(at, ROBOT.cycles(ROBOT.t), atol=2e-9)
-    joints = np.arange(len(NAMES))
-    truth = np.rad2deg(TWIN.angle(joints, at[:, None]) - ROBOT.angle(joints, at[:, None]))
+    own = TWIN.cycles(ROBOT.t) if how == "time" else at
+    truth = np.rad2deg(TWIN.angle(joints, own[:, None]) - ROBOT.angle(joints, at[:, None]))
+    common = np.full(at.size, True)
+    if how == "phase":
+        common = (at >= 0.3) & (at <= TWIN.cycles(TWIN.t[-1]) - 5.0)
+        assert 0.7 * at.size < np.count_nonzero(common)
     rows = degrees(found, entity)
-    common = (at >= 0.3) & (at <= TWIN.cycles(TWIN.t[-1]) - 5.0)
-    assert 0.7 * at.size < np.count_nonzero(common)
     assert np.isnan(rows[~common]).all()
     assert np.abs(rows[common] - truth[common]).max() < chord(TWIN, 1 / TWIN.rate_hz)
+    assert found.static(entity, "SeriesLines:names") == list(NAMES)
 
 
 def test_the_twin_is_laid_on_the_robot_where_both_begin(beside):
@@ -264,32 +244,22 @@ def test_in_the_sessions_own_worlds_nothing_is_moved(files, read_back, tmp_path,
     told = json.loads(view(capsys, *files, "--place", "world", "--save", path, "--json"))
     assert told["sessions"][1]["placed"] is None
     assert "every body is drawn at the pose of its own session" in told["warnings"]
-    with pytest.raises(KeyError):
-        read_back(path).static("/b/world", "Transform3D:translation")
+    assert read_back(path).statics("/b/world", "Transform3D:translation") == []
 
 
-def test_the_second_body_is_a_wireframe_with_its_name_at_the_head(beside):
+def test_bodies_have_their_look_and_name_and_leave_when_their_session_ends(beside):
     found = beside["time"]
     solid, wires = 3, 1
-    assert found.static("/robot/world/snake/measured", "Capsules3D:fill_mode") == [solid]
-    assert wires in [
-        batch.column("Capsules3D:fill_mode").to_pylist()[0][0]
-        for chunk in found._chunks
-        if chunk.entity_path == "/twin/world/snake/measured" and chunk.is_static
-        for batch in [chunk.to_record_batch()]
-        if "Capsules3D:fill_mode" in batch.schema.names
-    ]
+    for name, mode in (("robot", solid), ("twin", wires)):
+        modes = found.statics(f"/{name}/world/snake/measured", "Capsules3D:fill_mode")
+        assert [mode] in modes
     for name in ("robot", "twin"):
         labels = found.column(f"/{name}/world/snake/name", "Points3D:labels")
         assert {label for row in labels for label in row} == {name}
-
-
-def test_a_body_leaves_when_its_session_ends_before_the_others(beside):
     cleared = "/robot/world/snake"
-    end = round(ROBOT.t[-1] * 1e9)
-    assert beside["time"].times(cleared).tolist() == [end + 1]
-    assert beside["time"].times("/twin/world/snake").size == 0
-    assert beside["time"].times(cleared, "gait_cycle").tolist() == [end + 1]  # at 1 Hz
+    for timeline in ("session_time", "gait_cycle"):  # at 1 Hz
+        assert found.times(cleared, timeline).tolist() == [round(ROBOT.t[-1] * 1e9) + 1]
+    assert found.times("/twin/world/snake").size == 0
 
 
 def test_bars_and_their_differences_are_those_of_compare(make, tmp_path, overlaid):
@@ -325,18 +295,18 @@ def still(make, tmp_path_factory):
     return make(tmp_path_factory.mktemp("still") / "still.mcap", Wave(seconds=2.0), gait=False)
 
 
-def test_without_a_gait_phases_are_refused_and_times_are_not(files, still, tmp_path, capsys):
-    for how in ("phase", "gait"):
-        said = view(capsys, files[0], still, "--align", how, "--save", tmp_path / "x.rrd", code=2)
-        assert "no phase of a gait was logged (/gait) in still; align by --align time" in said
+def test_without_a_gait_phases_are_refused_and_times_are_not(files, still, make, tmp_path, capsys):
+    back = make(tmp_path / "back.mcap", Wave(frequency_hz=-1.0, seconds=2.0))
+    none = "no phase of a gait was logged (/gait) in still; align by --align time"
+    for how, other, why in (
+        ("phase", still, none),
+        ("gait", still, none),
+        ("phase", back, "runs backwards in back"),
+    ):
+        save = ("--save", tmp_path / "x.rrd")
+        assert why in view(capsys, files[0], other, "--align", how, *save, code=2)
     assert not (tmp_path / "x.rrd").exists()
     view(capsys, files[0], still, "--save", tmp_path / "x.rrd")
-
-
-def test_a_gait_that_runs_backwards_has_no_cycles_to_count(files, make, tmp_path, capsys):
-    back = make(tmp_path / "back.mcap", Wave(frequency_hz=-1.0, seconds=2.0))
-    words = ["--align", "phase", "--save", tmp_path / "x.rrd"]
-    assert "runs backwards in back" in view(capsys, files[0], back, *words, code=2)
 
 
 def test_a_phase_is_found_where_it_was_first_reached():
@@ -363,10 +333,9 @@ def test_without_a_robot_the_other_body_stands_alone(files, make, read_back, tmp
 
 
 def test_sessions_without_measured_angles_are_seen_too(chain, files, tmp_path, overlaid):
-    with SessionWriter(tmp_path / "c.mcap", session_id="c", epoch_ns=EPOCH_NS, robot=chain(5)) as w:
-        commands = w.joint_state("/joint_commands", NAMES, unit="rad")
-        for i in range(100):
-            commands.write(EPOCH_NS + i * 10_000_000, np.zeros(5))
+    t_ns = EPOCH_NS + np.arange(100) * 10_000_000
+    topics = {"/joint_commands": (NAMES, "rad", np.zeros((100, 5)))}
+    write_topics(tmp_path / "c.mcap", t_ns, topics, robot=chain(5))
     out, found = overlaid(tmp_path / "c.mcap", files[0])
     assert "note: c: no measured joint angles on /joint_states" in out
     assert found.times("/c/joints/commanded").size == 100
@@ -376,20 +345,15 @@ def test_sessions_without_measured_angles_are_seen_too(chain, files, tmp_path, o
     assert "/compared/a/angles" not in found.entities
 
 
-def test_of_different_robots_the_joints_in_common_are_compared(make, tmp_path, overlaid):
+def test_joints_in_common_are_compared_and_without_one_nothing_is(make, tmp_path, overlaid):
     long = make(tmp_path / "long.mcap", ROBOT)
     short = make(tmp_path / "short.mcap", ROBOT, names=NAMES[:3])
-    _, found = overlaid(long, short)
+    other = make(tmp_path / "other.mcap", ROBOT, robot=False, names=("left", "right"))
+    out, found = overlaid(long, short, other)
     assert found.static("/compared/short/angles", "SeriesLines:names") == list(NAMES[:3])
     facts = found.static("/compared/facts", "TextDocument:text")[0]
     assert "robot: chain5 → chain3" in facts
-
-
-def test_without_a_joint_in_common_there_is_no_difference(make, tmp_path, overlaid):
-    one = make(tmp_path / "one.mcap", ROBOT, robot=False)
-    other = make(tmp_path / "other.mcap", ROBOT, robot=False, names=("left", "right"))
-    out, found = overlaid(one, other)
-    assert out.startswith("other (B) against one (A): not compared: no joint")
+    assert "\nother (B) against long (A): not compared: no joint" in out
     assert "/compared/other/angles" not in found.entities
 
 
@@ -404,15 +368,12 @@ def test_three_sessions_are_each_held_against_the_first(files, still, overlaid):
 def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
     files, chain, tmp_path, overlaid
 ):
-    late = tmp_path / "late.mcap"
-    with SessionWriter(late, session_id="late", epoch_ns=EPOCH_NS, robot=chain(5)) as w:
-        states = w.joint_state("/joint_states", NAMES, unit="rad")
-        phase = w.joint_state("/gait", ["horizontal.A", "horizontal.phase"], unit="rad")
-        for i in range(300):
-            t_ns = EPOCH_NS + i * 10_000_000
-            states.write(t_ns, np.full(5, i * 1e-3))
-            if i >= 100:
-                phase.write(t_ns, np.array([0.4, 2 * np.pi * (i - 100) / 100]))
+    i = np.arange(300)
+    gait = np.stack([np.full(300, 0.4), 2 * np.pi * (i - 100) / 100], axis=1)
+    gait[:100] = np.nan
+    angles = np.tile(i[:, None] * 1e-3, 5)
+    topics = {"/joint_states": (NAMES, "rad", angles), "/gait": (GAIT, "rad", gait)}
+    late = write_topics(tmp_path / "late.mcap", EPOCH_NS + i * 10_000_000, topics, robot=chain(5))
     _, found = overlaid(files[0], late, "--align", "gait")
     times = found.times("/late/joints/measured")
     np.testing.assert_array_equal(times, (np.arange(300) - 100) * 10_000_000)
@@ -449,11 +410,8 @@ def test_servos_polled_in_turn_differ_at_times_of_the_first(make, tmp_path, over
         (["--json"], "--save"),
     ],
 )
-def test_wrong_usage_is_explained(files, capsys, words, complaint):
+def test_wrong_usage_is_explained(files, tmp_path, capsys, words, complaint):
     assert complaint in view(capsys, *files, *words, code=2)
-
-
-def test_one_session_has_nothing_to_be_aligned_with(files, tmp_path, capsys):
     said = view(capsys, files[0], "--align", "phase", "--save", tmp_path / "x.rrd", code=2)
     assert "--align: needs two sessions or more" in said
 
@@ -476,7 +434,7 @@ def converted(files, tmp_path_factory):
             read_side(one, name) for one, name in zip(sessions, ("robot", "twin"), strict=True)
         ]
         return [
-            Converted(one, *convert(session, folder / f"{one.side.name}.rrd"))
+            Converted(one, *convert(session, folder / f"{one.name}.rrd"))
             for one, session in zip(align(sides, Align.TIME), sessions, strict=True)
         ]
 

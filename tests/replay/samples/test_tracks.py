@@ -1,14 +1,26 @@
-"""Joints sampled together share a table; everything else keeps its own times."""
+"""Joint samples: tables of common times, resampling against closed forms, and rounding."""
 
 import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from undulog.replay.samples.sampling import hold, interpolate
 from undulog.replay.samples.tracks import (
+    LEVELS,
     Track,
+    decimate,
+    gaps,
+    hold,
     in_turn,
+    interpolate,
     join_tracks,
+    mark_gaps,
+    ordered,
+    plot_step,
     resampled,
+    rounded,
     tables,
+    typical_step_ns,
     without_filler,
 )
 
@@ -68,3 +80,130 @@ def test_joints_in_turn_are_brought_to_the_first_ones_times():
     np.testing.assert_array_equal(table.t_ns, T)
     np.testing.assert_allclose(table.values[:-1, 1], 0.1 * T[:-1], atol=1e-12)
     assert np.isnan(table.values[-1, 1])  # nothing comes after it
+
+
+MS = 1_000_000
+
+
+def ticks(*milliseconds):
+    return np.array(milliseconds, dtype=np.int64) * MS
+
+
+def test_a_rate_keeps_at_most_that_many_samples_a_second():
+    t = np.arange(1000, dtype=np.int64) * 10 * MS
+    np.testing.assert_array_equal(decimate(t, 50.0), np.arange(0, 1000, 2))
+    jittered = t + np.random.default_rng(1).integers(-2 * MS, 2 * MS, 1000)
+    assert np.array_equal(decimate(jittered, 50.0) % 2, np.zeros(500))
+    assert len(decimate(10 * t[:20], 50.0)) == 20
+    assert decimate(ticks(), 50.0).size == 0
+
+
+@given(
+    st.lists(st.integers(1, 40), min_size=2, max_size=30),
+    st.floats(-5, 5),
+    st.floats(-5, 5),
+    st.lists(st.integers(0, 1200), min_size=1, max_size=20),
+)
+def test_a_straight_line_is_interpolated_exactly_or_not_at_all(steps, slope, offset, wanted):
+    t = np.cumsum(np.array(steps, dtype=np.int64)) * MS
+    at = np.array(wanted, dtype=np.int64) * MS
+    found = interpolate(t, slope * t / MS + offset, at)
+    known = np.isfinite(found)
+    np.testing.assert_allclose(found[known], (slope * at / MS + offset)[known], atol=1e-9)
+    assert not known[(at < t[0]) | (at > t[-1])].any()
+    assert known[np.isin(at, t)].all()
+
+
+def test_nothing_is_drawn_across_a_gap():
+    t = ticks(0, 10, 20, 30, 200, 210)
+    assert gaps(t).tolist() == [False, False, False, True, False]
+    found = interpolate(t, np.arange(6.0), ticks(25, 30, 35, 100, 200, 205))
+    np.testing.assert_array_equal(found, [2.5, 3.0, np.nan, np.nan, 4.0, 4.5])
+
+
+@pytest.mark.parametrize(
+    ("t", "values", "at", "expected"),
+    [
+        (
+            (0, 10, 20, 30),
+            [0.0, np.nan, 2.0, 3.0],
+            (0, 5, 10, 15, 20, 25),
+            [0, *[np.nan] * 3, 2, 2.5],
+        ),
+        ((0, 10), [[0.0, 10.0], [1.0, 20.0]], (5,), [[0.5, 15.0]]),
+    ],
+)
+def test_a_missing_sample_spoils_its_neighbourhood_only(t, values, at, expected):
+    found = interpolate(ticks(*t), np.array(values), ticks(*at))
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_a_command_is_held_until_the_next():
+    t = ticks(0, 10, 20)
+    found = hold(t, np.array([1.0, 2.0, 3.0]), ticks(-1, 0, 9, 10, 19, 69, 71))
+    np.testing.assert_array_equal(found, [np.nan, 1.0, 1.0, 2.0, 2.0, 3.0, np.nan])
+
+
+def test_without_samples_nothing_is_known():
+    assert np.isnan(interpolate(ticks(), np.zeros(0), ticks(1))).all()
+    assert np.isnan(hold(ticks(), np.zeros(0), ticks(1))).all()
+    assert typical_step_ns(ticks(5)) == 0
+
+
+def test_a_gap_gets_one_row_of_nan_a_step_after_its_last_sample():
+    t, values = mark_gaps(ticks(0, 10, 20, 100, 110), np.arange(5.0)[:, None])
+    np.testing.assert_array_equal(t, ticks(0, 10, 20, 30, 100, 110))
+    np.testing.assert_array_equal(values[:, 0], [0, 1, 2, np.nan, 3, 4])
+
+
+def test_silence_before_the_end_is_a_gap():
+    t, values = ticks(0, 10, 20), np.zeros((3, 2))
+    found = mark_gaps(t, values, end_ns=100 * MS)
+    np.testing.assert_array_equal(found[0], ticks(0, 10, 20, 30))
+    assert np.isnan(found[1][-1]).all()
+    whole = mark_gaps(t, values, end_ns=40 * MS)
+    assert whole[0] is t
+    assert whole[1] is values
+
+
+def test_samples_out_of_order_are_sorted():
+    t, values = ordered(ticks(10, 0, 20), np.array([1.0, 0.0, 2.0]))
+    np.testing.assert_array_equal(t, ticks(0, 10, 20))
+    np.testing.assert_array_equal(values, [0.0, 1.0, 2.0])
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_too_few_samples_have_no_gaps(count):
+    t = ticks(*range(count))
+    assert gaps(t).size == 0
+    assert mark_gaps(t, np.zeros((count, 1)))[0].size == count
+
+
+@pytest.mark.parametrize("size", [1e-6, 0.3, 45.0, 1e5])
+def test_a_step_is_a_power_of_two_below_a_five_hundredth_of_the_range(size):
+    values = size * np.sin(np.linspace(0.0, 20.0, 5000))
+    step = plot_step(values)
+    assert np.log2(step) == np.round(np.log2(step))
+    room = np.ptp(np.quantile(values, [0.01, 0.99]))
+    assert room / LEVELS / 2 < step <= room / LEVELS
+    apart = np.abs(rounded(values[:, None], [step])[:, 0] - values)
+    assert apart.max() <= room / 1000
+
+
+def test_a_step_follows_the_range_of_nearly_all_samples():
+    values = np.sin(np.linspace(0.0, 20.0, 5000))
+    spiky = values.copy()
+    spiky[::500] = 1e6
+    assert plot_step(spiky) == plot_step(values)
+    still = np.zeros(5000)
+    still[100:110] = 1.0
+    assert plot_step(still) == 2.0**-9  # of its whole range
+
+
+def test_a_flat_line_and_no_line_are_left_alone():
+    assert (
+        plot_step(np.full(10, 3.3)) == plot_step(np.zeros(0)) == plot_step(np.full(3, np.nan)) == 0
+    )
+    values = np.array([[0.1, 0.1], [np.nan, 0.3]])
+    np.testing.assert_array_equal(rounded(values, [0.0, 0.0]), values)
+    np.testing.assert_array_equal(rounded(values, [0.25, 0.0]), [[0.0, 0.1], [np.nan, 0.3]])

@@ -89,39 +89,42 @@ def test_a_phase_that_runs_backwards_is_turned_round():
     np.testing.assert_allclose(found.of("a")[0], np.sin(PHASE), atol=1e-6)
 
 
-def test_the_analysed_window_is_averaged_where_there_is_a_gait(analysis):
+@pytest.fixture
+def steady(analysis):
+    """An analysis of a gait at 0.5 Hz, up to 10 s."""
+
+    def make(start_s):
+        window = dataclasses.replace(analysis.gait.windows[0], start_s=start_s, stop_s=10.0)
+        gait = dataclasses.replace(analysis.gait, windows=(window,))
+        return dataclasses.replace(analysis, gait=gait)
+
+    return make
+
+
+def test_the_analysed_window_is_averaged_where_there_is_a_gait(steady):
     t = np.arange(1001) / 100
-    window = dataclasses.replace(analysis.gait.windows[0], start_s=4.0, stop_s=10.0)
-    gait = dataclasses.replace(analysis.gait, windows=(window,))
-    steady = dataclasses.replace(analysis, gait=gait)
     rhythm = Rhythm.from_phase(ns(t), 2 * np.pi * 0.5 * t)
     swing = np.where(t < 4.0, 9.0, 1.0) * np.sin(2 * np.pi * 0.5 * t)  # a start, then the gait
-    found = mean_cycles([Track("a", ns(t), swing)], pace(rhythm, steady))
+    found = mean_cycles([Track("a", ns(t), swing)], pace(rhythm, steady(4.0)))
     assert found.cycles.tolist() == [3]
     np.testing.assert_allclose(found.of("a")[0], np.sin(PHASE), atol=1e-6)
 
 
-def test_without_a_logged_phase_it_is_zero_at_the_commands_crest(analysis):
+def test_without_a_logged_phase_it_is_zero_at_the_commands_crest(steady):
     t = np.arange(1001) / 100
-    window = dataclasses.replace(analysis.gait.windows[0], start_s=0.0, stop_s=10.0)
-    gait = dataclasses.replace(analysis.gait, windows=(window,))
-    steady = dataclasses.replace(analysis, gait=gait)  # at 0.5 Hz
     wave = 2 * np.pi * 0.5 * t - 1.1
     command = Track("a", ns(t), 0.4 * np.cos(wave))
-    own = pace(None, steady, commanded=[command], places=Places(("a",), None))
+    own = pace(None, steady(0.0), commanded=[command], places=Places(("a",), None))
     found = mean_cycles([command, Track("b", ns(t), 0.3 * np.cos(wave - 0.2))], own)
     np.testing.assert_allclose(found.of("a")[0], 0.4 * np.cos(PHASE), atol=1e-6)
     np.testing.assert_allclose(found.of("b")[0], 0.3 * np.cos(PHASE - 0.2), atol=1e-6)
     assert not own.logged
 
 
-def test_without_phase_or_gait_there_is_none():
-    assert pace(None) is None
-
-
-def test_less_than_a_cycle_is_none():
+def test_without_a_whole_cycle_there_is_none():
     t = np.arange(150) / 100
     assert pace(Rhythm.from_phase(ns(t), 2 * np.pi * 0.5 * t)) is None
+    assert pace(None) is None
 
 
 def test_the_frame_goes_along_with_the_body(snake25):

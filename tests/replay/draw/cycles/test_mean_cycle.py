@@ -39,34 +39,22 @@ def rows(recorded, entity):
     return np.array(recorded.column(entity, "Scalars:scalars"), dtype=float)
 
 
-def test_it_runs_from_0_to_360_degrees_and_closes(recording):
-    _, recorded = recording
-    times = recorded.times("/ensemble/measured", ENSEMBLE_CYCLE)
-    np.testing.assert_array_equal(times, np.arange(0, 361, 5))
-    angles = rows(recorded, "/ensemble/measured")
-    np.testing.assert_array_equal(angles[0], angles[-1])
-
-
-def test_angles_and_errors_are_the_closed_form(recording):
+def test_angles_errors_and_power_are_the_closed_form(recording):
     said, recorded = recording
     assert said.content.mean.period_s == pytest.approx(2.0)
-    phase = np.radians(np.arange(0, 361, 5))[:, None]
-    k = np.arange(13)
+    degrees = np.arange(0, 361, 5)
+    times = recorded.times("/ensemble/measured", ENSEMBLE_CYCLE)
+    np.testing.assert_array_equal(times, degrees)
+    phase, k = np.radians(degrees)[:, None], np.arange(13)
     late = phase - k * np.pi / 3 - np.radians(7 + 0.5 * k)
     (series,) = said.content.mean.measured
-    angles = rows(recorded, "/ensemble/measured")
     assert len(series.names) == 25
+    angles = rows(recorded, "/ensemble/measured")
+    np.testing.assert_array_equal(angles[0], angles[-1])
     np.testing.assert_allclose(angles[:, ::2], np.degrees(0.38 * np.sin(late)), atol=1e-3)
     np.testing.assert_allclose(angles[:, 1::2], 0.0, atol=1e-9)
     error = np.degrees(0.38 * np.sin(late) - 0.4 * np.sin(phase - k * np.pi / 3))
     np.testing.assert_allclose(rows(recorded, "/ensemble/error")[:, ::2], error, atol=1e-3)
-
-
-def test_power_is_averaged_as_power_is(recording):
-    _, recorded = recording
-    phase = np.radians(np.arange(0, 361, 5))[:, None]
-    k = np.arange(13)
-    late = phase - k * np.pi / 3 - np.radians(7 + 0.5 * k)
     power = 0.1 * np.cos(late + 1.2) * 0.38 * np.pi * np.cos(late)
     np.testing.assert_allclose(rows(recorded, "/ensemble/power")[:, ::2], power, atol=1e-5)
 
@@ -84,10 +72,7 @@ def test_the_body_moves_about_its_own_middle(recording):
     np.testing.assert_allclose(middle.mean(axis=1), 0.0, atol=1e-3)
     assert (middle[:, 0, 0] > 0.3).all()  # the head is in front
     assert np.ptp(middle[:, 0, 1]) > 0.03  # and swings
-
-
-def test_nothing_of_it_is_on_the_sessions_timelines_but_a_shape_that_stands(recording):
-    _, recorded = recording
+    # On the session's timelines there is a shape that stands, and nothing else.
     assert recorded.times("/ensemble/measured", "session_time").size == 0
     assert recorded.times("/ensemble/body/on_session_time/measured", "session_time").size == 1
 

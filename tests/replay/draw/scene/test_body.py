@@ -1,4 +1,4 @@
-"""Capsules against SciPy's rotations and hand-made postures."""
+"""Capsules against SciPy's rotations and hand-made postures; colours of power."""
 
 import numpy as np
 import pytest
@@ -12,9 +12,10 @@ from undulog.replay.draw.scene.body import (
     capsule_columns,
     capsule_poses,
     capsule_shape,
+    power_colors,
 )
 from undulog.replay.draw.scene.motion import HeadPath, assemble, frames_of
-from undulog.replay.samples.quantities import segment_power
+from undulog.replay.samples.quantities import power_limit, segment_power
 from undulog.replay.samples.tracks import Track
 
 
@@ -99,12 +100,33 @@ def test_the_body_is_drawn_on_the_heads_own_times(snake25):
     head = HeadPath(t_ns, np.zeros((100, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (100, 1)), tracked=True)
     slow = t_ns[::4] + 1_000_000
     positions = tuple(Track(n, slow, 1e-9 * slow) for n in snake25.joint_names)
-    frames = frames_of(head, int(t_ns[-1]))
-    motion = assemble(snake25, frames.head, {("/joint_states", "position"): tuple(positions)})
+    path, sparse = frames_of(head, int(t_ns[-1]))
+    motion = assemble(snake25, path, {("/joint_states", "position"): tuple(positions)})
     np.testing.assert_array_equal(motion.t_ns, t_ns[::2])
     inside = (motion.t_ns >= slow[0]) & (motion.t_ns <= slow[-1])
     np.testing.assert_allclose(motion.angles[inside, 7], 1e-9 * motion.t_ns[inside])
     assert np.isnan(motion.angles[~inside]).all()
     assert motion.commands is None
     assert motion.power_w is None
-    np.testing.assert_array_equal(motion.t_ns[frames.sparse], t_ns[::4])
+    np.testing.assert_array_equal(motion.t_ns[sparse], t_ns[::4])
+
+
+def test_sign_and_size_of_power_can_be_read_from_the_colour():
+    power = np.array([-2.0, 0.0, 2.0, 5.0, np.nan])
+    driven, idle, drives, beyond, unknown = power_colors(power, 2.0)
+    assert driven[2] > driven[0]  # cyan
+    assert drives[0] > drives[2]  # vermilion
+    assert np.ptp(idle[:3].astype(int)) < 12  # grey
+    np.testing.assert_array_equal(beyond, drives)
+    assert unknown.tolist() != idle.tolist()
+    half = power_colors(np.array([1.0]), 2.0)[0].astype(int)
+    np.testing.assert_allclose(half, (idle.astype(int) + drives) / 2, atol=1)
+
+
+def test_the_limit_is_a_percentile_with_two_digits():
+    power = np.linspace(-0.1234, 0.1234, 10001)
+    assert power_limit(power) == 0.13
+    assert power_limit(1000 * power) == 130.0
+    assert power_limit(np.append(power, [np.nan, 1e6])) == 0.13
+    assert power_limit(np.zeros(4)) == 1.0
+    assert power_limit(np.full(4, np.nan)) == 1.0

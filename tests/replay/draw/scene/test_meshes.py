@@ -7,10 +7,10 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from undulog.capture import Session, SessionWriter, load_robot
+from support.written_topics import EPOCH_NS, write_topics
+from undulog.capture import Session, load_robot
 from undulog.capture.robot.kinematics import link_poses
 
-EPOCH_NS = 1_735_689_600_000_000_000
 SHAPES = "/world/snake/meshes"
 
 
@@ -56,12 +56,9 @@ def file(robot, angles, tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("meshes")
     path = folder / "boxes.mcap"
-    with SessionWriter(path, session_id="boxes", epoch_ns=EPOCH_NS, robot=robot) as writer:
-        states = writer.joint_state(
-            "/joint_states", robot.joint_names, unit="rad", velocity=True, effort=True
-        )
-        for i, row in enumerate(angles):
-            states.write(EPOCH_NS + i * 10_000_000, row, np.ones(25), np.linspace(-1, 1, 25))
+    drive = np.ones((10, 25)), np.tile(np.linspace(-1, 1, 25), (10, 1))
+    topics = {"/joint_states": (robot.joint_names, "rad", angles, *drive)}
+    write_topics(path, EPOCH_NS + np.arange(10) * 10_000_000, topics, robot=robot)
     with Session.open(path) as session:
         return write_recording(session, folder / "boxes.rrd").path
 

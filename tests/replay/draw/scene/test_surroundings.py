@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from undulog.capture import Session, SessionWriter
+from support.written_topics import EPOCH_NS, write_topics
+from undulog.capture import Session
 from undulog.replay.feed.recording import write_recording
 from undulog.sim import load_scenario
 from undulog.sim.scenario.obstacles import Cylinder, Wall
-
-EPOCH_NS = 1_735_689_600_000_000_000
 
 
 @pytest.fixture(scope="module")
@@ -22,12 +21,13 @@ def recorded(snake25, tmp_path):
     """A function that records a straight robot with a scenario attached, and converts it."""
 
     def convert(scenario):
-        path = tmp_path / "run.mcap"
-        with SessionWriter(path, session_id="x", epoch_ns=EPOCH_NS, robot=snake25) as writer:
-            writer.attach("scenario.toml", "application/toml", scenario)
-            states = writer.joint_state("/joint_states", snake25.joint_names, unit="rad")
-            for i in range(4):
-                states.write(EPOCH_NS + i * 10_000_000, np.zeros(25))
+        path = write_topics(
+            tmp_path / "run.mcap",
+            EPOCH_NS + np.arange(4) * 10_000_000,
+            {"/joint_states": (snake25.joint_names, "rad", np.zeros((4, 25)))},
+            begin=lambda writer: writer.attach("scenario.toml", "application/toml", scenario),
+            robot=snake25,
+        )
         with Session.open(path) as session:
             return write_recording(session, tmp_path / "run.rrd")
 

@@ -1,10 +1,11 @@
-"""Which joints stand for the body, and errors against closed forms."""
+"""Which joints stand for the body, errors against closed forms, and the gait's rhythm and modes."""
 
 import numpy as np
 
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Plane
-from undulog.replay.draw.plots.joints import head_middle_tail, joint_palette
+from undulog.replay.draw.plots.lines import changes, head_middle_tail, joint_palette, rhythm_of
+from undulog.replay.draw.scene.stage import trail_segments
 from undulog.replay.samples.quantities import (
     electrical_power,
     mechanical_power,
@@ -35,11 +36,8 @@ def test_without_a_robot_all_joints_are_one_plane():
     found = head_middle_tail(None, [Track(name, T, np.zeros(200)) for name in "abcde"])
     assert (found.names, found.plane) == (("a", "c", "e"), None)
     assert head_middle_tail(None, []) is None
-
-
-def test_one_joint_stands_for_itself():
-    found = head_middle_tail(None, [Track("servo", T, np.zeros(200))])
-    assert found.names == found.labels == ("servo",)
+    single = head_middle_tail(None, [Track("servo", T, np.zeros(200))])
+    assert single.names == single.labels == ("servo",)
 
 
 def test_the_error_is_measured_minus_the_command_in_force():
@@ -87,3 +85,39 @@ def test_the_whole_bodys_power_needs_every_joint():
     assert np.flatnonzero(np.isnan(whole.values)).tolist() == [7]
     assert np.nanmax(whole.values) == np.nanmin(whole.values) == 2.0
     assert total([]) is None
+
+
+LONG = np.arange(500, dtype=np.int64) * 10_000_000
+
+
+def gait(**planes):
+    tracks = []
+    for plane, (amplitude, frequency) in planes.items():
+        tracks.append(Track(f"{plane}.A", LONG, np.full(500, amplitude)))
+        tracks.append(Track(f"{plane}.phase", LONG, 2e-9 * np.pi * frequency * LONG))
+    return tracks
+
+
+def test_the_plane_that_swings_most_sets_the_rhythm():
+    rhythm = rhythm_of(gait(horizontal=(0.1, 0.5), vertical=(0.4, 2.0)))
+    np.testing.assert_allclose(rhythm.cycles, 2e-9 * LONG, atol=1e-9)
+
+
+def test_a_phase_that_stands_still_is_no_rhythm():
+    assert rhythm_of(gait(horizontal=(0.4, 0.0))) is None
+    assert rhythm_of(gait(horizontal=(0.4, 0.1))) is None  # half a cycle
+    assert rhythm_of([]) is None
+
+
+def test_a_mode_begins_where_it_differs_from_the_one_before():
+    assert changes(["walk", "walk", "avoid", "avoid", "walk"]) == [0, 2, 4]
+    assert changes([]) == []
+
+
+def test_the_trail_joins_successive_positions_but_not_across_a_gap():
+    t = np.array([0, 100, 200, 300, 2000, 2100], dtype=np.int64)
+    position = np.arange(18.0).reshape(6, 3)
+    position[1] = np.nan
+    ends, pieces = trail_segments(t, position)
+    np.testing.assert_array_equal(ends, [300, 2100])
+    np.testing.assert_array_equal(pieces, [position[2:4], position[4:6]])

@@ -1,15 +1,13 @@
-"""Where each session lies on the timelines that all of them share.
+"""The sessions of an overlay: what is read of each, and how they are aligned and placed.
 
 ``session_time`` counts from each session's own zero: its first sample, or the start of its gait.
 ``gait_cycle`` is moved by whole cycles only, so that equal places are equal phases; every session
 is in its first cycle between 0 and 1 there. The other way round, a sample of one session finds its
 counterpart in another one at the same time, or at the same phase.
 
-Bodies of several sessions in one world.
-
 Where a robot's world has its origin is the choice of whoever tracked it, so by default the other
-bodies are laid on the first one: turned about the vertical and moved on the ground, so that at the
-first moment that both sessions share the heads are at one point and the bodies point one way. A
+bodies are moved onto the first one: turned about the vertical and moved on the ground, so that at
+the first moment that both sessions share the heads are at one point and the bodies point one way. A
 body's direction is the mean of its links' over one cycle of its gait, in which what swings to the
 left swings to the right too; without a gait it is that of the moment.
 """
@@ -17,24 +15,182 @@ left swings to the right too; without a gait it is that of the moment.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from pathlib import Path
 
 import numpy as np
+import rerun as rr
 
+from undulog.analysis.compare.alignment import facts_of
+from undulog.analysis.compare.side import ComparedSession, see
+from undulog.analysis.signals.stretch import Options
+from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
-from undulog.capture.common.errors import UsageError
+from undulog.capture.common.errors import UndulogError, UsageError
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture.robot.model import Robot
 
-from ..samples.sampling import gaps, interpolate
+from ..draw.drawing import palette_of
+from ..draw.plots.lines import rhythm_of
+from ..draw.scene.motion import HeadPath, read_head
+from ..feed.recording import Recording, write_recording
+from ..samples.content import Color
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME, Clock, Rhythm
-from ..samples.tracks import resampled
-from .side import Side
+from ..samples.tracks import Track, gaps, interpolate, read_columns, resampled, wanted_fields
+
+COMPARED = "/compared"
+"""Where everything goes that belongs to no single session."""
+
+_TOPICS = ("/joint_states", "/gait")
+
+
+@dataclass(frozen=True)
+class Side:
+    """A session of an overlay, without its own recording.
+
+    Attributes:
+        name: What it is called, e.g. ``twin``.
+        path: The session's file.
+        start_ns: Time of its first sample [Unix ns].
+        end_ns: Time of its last one [Unix ns].
+        verdict: Health of the recording, or None where nobody judged it.
+        robot: Its robot, or None.
+        measured: Measured joint angles [rad].
+        head: The head's path, or None where no body can be drawn.
+        rhythm: The gait's phase, or None where none was logged.
+        palette: Colour by joint name.
+        facts: How it was made, by name.
+        zero_ns: Its time at 0 of ``session_time`` [Unix ns].
+        cycles: Whole cycles that are added to its gait's phase.
+    """
+
+    name: str
+    path: Path
+    session_id: str
+    start_ns: int
+    end_ns: int
+    verdict: str | None
+    robot: Robot | None
+    measured: tuple[Track, ...]
+    head: HeadPath | None
+    rhythm: Rhythm | None
+    palette: Mapping[str, Color]
+    facts: Mapping[str, str]
+    zero_ns: int
+    cycles: int = 0
+
+    @property
+    def clock(self) -> Clock:
+        """Timelines that place the session's samples on the common ones."""
+        rhythm = self.rhythm
+        if rhythm is not None:
+            rhythm = Rhythm(rhythm.t_ns, rhythm.cycles + self.cycles)
+        return Clock(self.zero_ns, rhythm)
+
+    @property
+    def entity(self) -> str:
+        """Path under which all of its entities are."""
+        return f"/{rr.escape_entity_path_part(self.name)}"
+
+    @property
+    def own(self) -> str:
+        """Path under which its comparison with the first session is."""
+        return f"{COMPARED}/{rr.escape_entity_path_part(self.name)}"
+
+    @property
+    def runs_back(self) -> bool:
+        """Whether the gait's phase falls."""
+        return self.rhythm is not None and bool(self.rhythm.cycles[-1] < self.rhythm.cycles[0])
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joint names, head to tail."""
+        if self.robot is not None:
+            return self.robot.joint_names
+        return tuple(track.name for track in self.measured)
+
+
+def names_of(files: Sequence[Path], wanted: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the sessions' names.
+
+    Args:
+        wanted: Requested names, or None for the files' own.
+
+    Returns:
+        A name a session, all different.
+
+    Raises:
+        UsageError: If their number is wrong, or they aren't different.
+    """
+    if wanted is None:
+        stems = [file.stem for file in files]
+        if len(set(stems)) == len(stems) and COMPARED.strip("/") not in stems:
+            return tuple(stems)
+        return tuple(f"{stem} {i + 1}" for i, stem in enumerate(stems))
+    names = [name.strip() for name in wanted]
+    if len(names) != len(files):
+        raise UsageError(
+            f"--names gives {len(names)} names for {len(files)} sessions; give one each, with "
+            "commas between them, e.g. --names robot,twin"
+        )
+    if not all(names) or len(set(names)) < len(names):
+        raise UsageError(f"--names {','.join(names)}: every session needs a name of its own")
+    if COMPARED.strip("/") in names:
+        raise UsageError(f"--names: {COMPARED.strip('/')!r} is where the differences go")
+    return tuple(names)
+
+
+def read_side(session: SessionView, name: str) -> Side:
+    """Read a session for an overlay."""
+    wanted = {topic: ["position"] for topic in _TOPICS if topic in wanted_fields(session)}
+    columns = read_columns(session, wanted)
+    measured = columns.get(("/joint_states", "position"), ())
+    head = None
+    if session.robot is not None and measured:
+        head = read_head(session, session.robot, measured, [])  # its recording says what is missing
+    return Side(
+        name=name,
+        path=session.path,
+        session_id=session.session_id,
+        start_ns=session.start_ns,
+        zero_ns=session.start_ns,
+        end_ns=session.end_ns,
+        verdict=session.verdict,
+        robot=session.robot,
+        measured=measured,
+        head=head,
+        rhythm=rhythm_of(columns.get(("/gait", "position"), ())),
+        palette=palette_of(session.robot, [track.name for track in measured]),
+        facts=facts_of(session),
+    )
+
+
+def convert(session: SessionView, path: Path) -> tuple[Recording, ComparedSession | None]:
+    """Write the session's own recording, and return it with the input of a comparison.
+
+    Returns:
+        The recording, and the analysis, or None where the session can't be analysed; why is
+        among the recording's warnings.
+
+    Raises:
+        DataError: If the session holds nothing that can be drawn.
+        LogWriteError: If the file can't be written.
+    """
+    notes: list[str] = []
+    seen: ComparedSession | None = None
+    try:
+        seen = see(session, Options(), notes.append)
+    except UndulogError as error:  # a session without a gait can be seen too
+        notes.append(f"not analysed: {error}")
+    session.forget()
+    analysis = None if seen is None else seen.analysis
+    return write_recording(session, path, analysis=analysis, notes=notes), seen
 
 
 class Align(StrEnum):
-    """What happens at once."""
+    """How sessions are aligned in time."""
 
     TIME = "time"
     """The same time since each session's first sample."""
@@ -51,30 +207,8 @@ class Align(StrEnum):
         return GAIT_CYCLE if self is Align.PHASE else SESSION_TIME
 
 
-@dataclass(frozen=True)
-class Aligned:
-    """A session with its place on the common timelines.
-
-    Attributes:
-        zero_ns: Its time at 0 of ``session_time`` [Unix ns].
-        cycles: Whole cycles that are added to its gait's phase.
-    """
-
-    side: Side
-    zero_ns: int
-    cycles: int
-
-    @property
-    def clock(self) -> Clock:
-        """Turns the session's sampling times into places on the common timelines."""
-        rhythm = self.side.rhythm
-        if rhythm is not None:
-            rhythm = Rhythm(rhythm.t_ns, rhythm.cycles + self.cycles)
-        return Clock(self.zero_ns, rhythm)
-
-
-def align(sides: Sequence[Side], how: Align) -> tuple[Aligned, ...]:
-    """Put sessions on common timelines.
+def align(sides: Sequence[Side], how: Align) -> tuple[Side, ...]:
+    """Align sessions on common timelines.
 
     Raises:
         UsageError: If a session has no gait to be aligned by.
@@ -94,8 +228,8 @@ def align(sides: Sequence[Side], how: Align) -> tuple[Aligned, ...]:
     return tuple(_aligned(side, how) for side in sides)
 
 
-def counterparts(a: Aligned, b: Aligned, how: Align, t_ns: IntArray) -> tuple[IntArray, BoolArray]:
-    """When in one session happens what happens in another one at given times.
+def counterparts(a: Side, b: Side, how: Align, t_ns: IntArray) -> tuple[IntArray, BoolArray]:
+    """Return the times in one session that correspond to times in another.
 
     Args:
         a: The session that the times are of.
@@ -114,7 +248,7 @@ def counterparts(a: Aligned, b: Aligned, how: Align, t_ns: IntArray) -> tuple[In
 
 
 def times_of(rhythm: Rhythm, cycles: FloatArray) -> tuple[IntArray, BoolArray]:
-    """When a gait first reached given phases.
+    """Return the times at which a gait first reached given phases.
 
     Args:
         rhythm: The gait's phase.
@@ -139,22 +273,19 @@ def times_of(rhythm: Rhythm, cycles: FloatArray) -> tuple[IntArray, BoolArray]:
     return np.where(known, t_ns[left] + step, 0), known
 
 
-def _aligned(side: Side, how: Align) -> Aligned:
+def _aligned(side: Side, how: Align) -> Side:
     rhythm = side.rhythm
     if rhythm is None:
-        return Aligned(side, side.start_ns, 0)
+        return side
     zero_ns = int(rhythm.t_ns[0]) if how is Align.GAIT else side.start_ns
-    return Aligned(side, zero_ns, -int(np.floor(rhythm.cycles[0])))
+    return replace(side, zero_ns=zero_ns, cycles=-int(np.floor(rhythm.cycles[0])))
 
 
-_LOOK_AT = 1000
-"""Samples of the head among which a first moment is looked for."""
+_LOOK_AT = 1000  # samples of the head among which a first moment is looked for
 
-_ROTATION = 0.99
-"""A quaternion shorter than this is none."""
+_ROTATION = 0.99  # a quaternion shorter than this is none
 
-_INSTANTS = 48
-"""Of a cycle, at which a body's direction is taken."""
+_INSTANTS = 48  # of a cycle, at which a body's direction is taken
 
 _SAME_M, _SAME_RAD = 1e-3, math.radians(0.1)
 
@@ -192,8 +323,8 @@ class Placement:
         return (0.0, 0.0, math.sin(self.turn / 2), math.cos(self.turn / 2))
 
 
-def placement(a: Aligned, b: Aligned, how: Align) -> Placement | None:
-    """How one body is laid on another.
+def placement(a: Side, b: Side, how: Align) -> Placement | None:
+    """Return the placement of one body onto another.
 
     Args:
         a: The session whose world stays.
@@ -202,7 +333,7 @@ def placement(a: Aligned, b: Aligned, how: Align) -> Placement | None:
     Returns:
         The placement, or None where either has no body at any shared moment.
     """
-    one, other = a.side.head, b.side.head
+    one, other = a.head, b.head
     if one is None or other is None:
         return None
     at_ns, known = counterparts(a, b, how, one.t_ns)
@@ -222,7 +353,7 @@ def placement(a: Aligned, b: Aligned, how: Align) -> Placement | None:
 
 
 def placement_text(placed: Placement, name: str, first: str) -> str:
-    """A placement in words.
+    """Return the text of a placement.
 
     Args:
         name: The session that is moved.
@@ -240,10 +371,8 @@ def placement_text(placed: Placement, name: str, first: str) -> str:
     )
 
 
-def head_distance(
-    a: Aligned, b: Aligned, how: Align, placed: Placement, t_ns: IntArray
-) -> FloatArray:
-    """How far the heads are from each other as they are drawn.
+def head_distance(a: Side, b: Side, how: Align, placed: Placement, t_ns: IntArray) -> FloatArray:
+    """Return the distance of the heads as they are drawn.
 
     Args:
         a: One session, with a head.
@@ -254,7 +383,7 @@ def head_distance(
     Returns:
         Distance on the ground [m], shape (n,); NaN where either isn't known.
     """
-    one, other = a.side.head, b.side.head
+    one, other = a.head, b.head
     assert one is not None  # noqa: S101 - the caller drew both
     assert other is not None  # noqa: S101
     at_ns, known = counterparts(a, b, how, t_ns)
@@ -264,15 +393,15 @@ def head_distance(
     return np.asarray(np.hypot(apart[:, 0], apart[:, 1]), dtype=np.float64)
 
 
-def _heading(one: Aligned, t_ns: int) -> float | None:
-    """Which way a body points in the cycle after a time [rad]; None where it isn't known."""
+def _heading(one: Side, t_ns: int) -> float | None:
+    """Return a body's heading in the cycle after a time [rad]; None if it isn't known."""
     times, rhythm = np.array([t_ns], dtype=np.int64), one.clock.rhythm
     if rhythm is not None:
         cycle = interpolate(rhythm.t_ns, rhythm.cycles, times)
         ends, known = times_of(rhythm, cycle + 1.0)
         if known[0]:
             times = t_ns + np.arange(_INSTANTS) * (int(ends[0]) - t_ns) // _INSTANTS
-    forward = _directions(one.side, times)
+    forward = _directions(one, times)
     forward = forward[np.isfinite(forward).all(axis=1)]
     if not forward.size:
         return None
@@ -281,7 +410,7 @@ def _heading(one: Aligned, t_ns: int) -> float | None:
 
 
 def _directions(side: Side, t_ns: IntArray) -> FloatArray:
-    """Sum of the links' forward axes on the ground, shape (n, 2); NaN where a pose isn't known."""
+    """Return the sum of the links' forward axes, shape (n, 2); NaN where a pose isn't known."""
     robot, head = side.robot, side.head
     assert robot is not None  # noqa: S101 - the caller saw a head
     assert head is not None  # noqa: S101

@@ -1,6 +1,7 @@
-"""What is written of each cycle, against the analysis it shows and against closed forms."""
+"""Steps, maps and bars against the analysis they show and against closed forms."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -87,15 +88,11 @@ def test_the_numbers_are_the_analysiss(by_cycle):
     np.testing.assert_allclose(gain.value[:, 0], 100 * (0.9 + 0.002 * np.arange(13) - 1))
     assert np.isnan(gain.value[:, 1]).all()
     np.testing.assert_allclose(lag.value[:, 0], np.degrees(0.1 + 0.01 * np.arange(13)))
-    assert energy.value[3, 0] == pytest.approx(-0.02)
-    assert np.isnan(energy.value[4, 1])  # half of its samples are missing
-
-
-def test_a_lag_does_not_jump_by_a_turn(by_cycle):
-    lag = cycle_tables(by_cycle)[1]
     # -pi + 0.1 after 0.13 is pi + 0.1 if the mean direction lies on that side.
     assert abs(lag.value[3, 2] - lag.value[3, 0]) < 180 + 1e-9
     assert np.degrees(np.pi + 0.1) % 360 == pytest.approx(lag.value[3, 2] % 360)
+    assert energy.value[3, 0] == pytest.approx(-0.02)
+    assert np.isnan(energy.value[4, 1])  # half of its samples are missing
 
 
 def test_a_step_spans_its_cycle_and_ends_with_it(by_cycle, written):
@@ -163,7 +160,7 @@ def test_a_map_runs_head_to_tail_and_its_colours_end_at_the_window(by_cycle, sna
     )
 
 
-def test_the_frame_is_about_the_cycle_at_the_cursor(by_cycle, written):
+def test_frame_and_white_bars_are_of_the_cycle_at_the_cursor(by_cycle, written):
     _, recorded = written(by_cycle)
     entity = "/maps/lag_degrees/now"
     np.testing.assert_allclose(recorded.times(entity) / 1e9, [0, 1, 2, 3])
@@ -171,10 +168,6 @@ def test_the_frame_is_about_the_cycle_at_the_cursor(by_cycle, written):
     assert [len(row) for row in centers] == [1, 1, 1, 0]
     # The map is 300 units high, its rows are the three cycles.
     np.testing.assert_allclose([row[0][1] for row in centers[:3]], [50, 150, 250])
-
-
-def test_the_white_bars_are_the_cycle_at_the_cursor(by_cycle, written):
-    _, recorded = written(by_cycle)
     entity = "/segments/gain_minus_one_percent/current"
     bars = [row[0] for row in recorded.column(entity, "BarChart:values")]
     heights = [np.array(bar["buffer"], dtype=float) for bar in bars]
@@ -196,3 +189,25 @@ def test_without_cycles_there_are_no_views_of_them(analysis, written):
     assert said.content.cycles == ()
     assert said.content.maps == ()
     assert not any(path.startswith(("/cycles", "/maps")) for path in recorded.entities)
+
+
+def test_bars_show_gain_lag_and_energy_of_the_joints_that_have_them(analysis):
+    gain, lag, energy = charts(analysis)
+    assert [bar.place for bar in gain.bars] == list(range(1, 26, 2))
+    assert [bar.joint for bar in lag.bars] == [f"joint{i:02d}" for i in range(1, 26, 2)]
+    assert gain.bars[1].value == pytest.approx(100 * (0.95 + 0.008 - 1))
+    assert gain.bars[0].value == pytest.approx(-5.0)
+    assert gain.bars[0].far == pytest.approx(-6.0)  # the end beyond it, seen from the baseline
+    assert lag.bars[1].value == pytest.approx(7.6)
+    assert lag.bars[1].far == pytest.approx(7.6 + math.degrees(0.02))
+    assert len(energy.bars) == 25
+    assert energy.bars[3].value == pytest.approx(0.01)
+    assert energy.bars[3].far is None
+
+
+def test_what_no_joint_has_gets_no_chart(analysis):
+    bare = [
+        dataclasses.replace(joint, gain=Estimate(), lag_rad=Estimate()) for joint in analysis.joints
+    ]
+    (energy,) = charts(dataclasses.replace(analysis, joints=tuple(bare)))
+    assert energy.title == "Net energy [J]"
