@@ -19,7 +19,7 @@ import os
 import sqlite3
 import struct
 import zlib
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from itertools import chain
 from pathlib import Path
@@ -50,12 +50,12 @@ from ..log.messages.frames import (
 from .candump import read_candump
 from .frame_log import (
     EARLIEST_NS,
-    FRAMES_PER_BLOCK,
     LATEST_NS,
     RELATIVE_EPOCH_NS,
-    BlockBuilder,
     FrameLog,
+    FrameRow,
     LogBlock,
+    blocks_of,
 )
 from .mf4 import open_mf4
 
@@ -202,7 +202,7 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
 
 
 def _datable(log: FrameLog) -> FrameLog:
-    """The log without the frames whose time no stamp can hold, which are counted."""
+    """Leave out, and count, the frames whose time no stamp can hold."""
     log.blocks = _before_the_latest(log.blocks, log.problems)
     return log
 
@@ -210,9 +210,8 @@ def _datable(log: FrameLog) -> FrameLog:
 def _before_the_latest(blocks: Iterator[LogBlock], problems: list[str]) -> Iterator[LogBlock]:
     late = 0
     for block in blocks:
-        keep = block.times_ns() < LATEST_NS
-        late += len(block) - int(keep.sum())
-        kept = block if keep.all() else block.where(keep)
+        kept = block[block.times_ns() < LATEST_NS]
+        late += len(block) - len(kept)
         if len(kept):
             yield kept
     if late:
@@ -274,9 +273,8 @@ def _python_can_log(
         problems=problems,
     )
     epoch_ns = RELATIVE_EPOCH_NS if relative else 0
-    log.blocks = _blocks(
-        path, chain([first], messages), log, epoch_ns, lambda: _read_part(reader), odd
-    )
+    rows = _rows(path, chain([first], messages), log, epoch_ns, odd)
+    log.blocks = blocks_of(rows, lambda: _read_part(reader))
     claimed = getattr(reader, "file_size", 0)  # of a BLF file, by its header
     if suffix == ".blf" and claimed > path.stat().st_size:
         log.problems.append(
@@ -317,23 +315,14 @@ def _read_part(reader: MessageReader) -> float:
         return 0.0
 
 
-def _blocks(  # noqa: PLR0917
-    path: Path,
-    messages: Iterator[Message],
-    log: FrameLog,
-    epoch_ns: int,
-    done: Callable[[], float],
-    odd: _Odd,
-) -> Iterator[LogBlock]:
-    rows = BlockBuilder()
+def _rows(
+    path: Path, messages: Iterator[Message], log: FrameLog, epoch_ns: int, odd: _Odd
+) -> Iterator[FrameRow]:
     unmarked = 0
     with _noted("can", log.problems):
         for message in messages:
             unmarked += not message.is_fd and len(message.data) > 8
-            _append(rows, message, log, epoch_ns, path)
-            if len(rows) == FRAMES_PER_BLOCK:
-                yield rows.block(done())
-                rows = BlockBuilder()
+            yield _row(path, message, log, epoch_ns)
     if odd.count:
         log.problems.append(
             f"{odd.count} records are no CAN frames (a time, an identifier, a length or data that "
@@ -344,8 +333,6 @@ def _blocks(  # noqa: PLR0917
             f"{unmarked} frames of more than 8 bytes are CAN FD frames; the log does not mark "
             "them, and shorter ones count as classic"
         )
-    if len(rows):
-        yield rows.block(1.0)
 
 
 class _Odd:
@@ -371,35 +358,32 @@ class _Odd:
         return sound
 
 
-def _append(rows: BlockBuilder, message: Message, log: FrameLog, epoch_ns: int, path: Path) -> None:
+def _row(path: Path, message: Message, log: FrameLog, epoch_ns: int) -> FrameRow:
     t_ns = epoch_ns + round(message.timestamp * 1e6) * 1000
     if t_ns < 0:
         raise ImportFormatError(path, f"has a frame at {message.timestamp} s, before 1970")
-    flags = (
-        (ERROR_FLAG if message.is_error_frame else 0)
-        | (REMOTE_FLAG if message.is_remote_frame else 0)
-        | (EXTENDED_FLAG if message.is_extended_id and not message.is_error_frame else 0)
-    )
     channel = message.channel
-    bus = f"can{channel}" if isinstance(channel, int) else str(channel or "can0")
-    if bus not in log.buses:
-        log.buses.append(bus)
-    # An error frame tells what happened on the bus, and is of neither kind.
+    # An error frame reports an event on the bus and is neither classic nor CAN FD.
     is_fd = (message.is_fd or len(message.data) > 8) and not message.is_error_frame
     data = bytes(message.data[: 64 if is_fd else 8])
-    if is_fd:
-        flags &= ~REMOTE_FLAG  # none in CAN FD: python-can takes empty frames for such
-    rows.append(
+    flags = (
+        (ERROR_FLAG if message.is_error_frame else 0)
+        # None in CAN FD: python-can takes empty frames for such.
+        | (REMOTE_FLAG if message.is_remote_frame and not is_fd else 0)
+        | (EXTENDED_FLAG if message.is_extended_id and not message.is_error_frame else 0)
+    )
+    fd_flags = (FD_BRS if message.bitrate_switch else 0) | (
+        FD_ESI if message.error_state_indicator else 0
+    )
+    return FrameRow(
         t_ns=t_ns,
         id_flags=message.arbitration_id | flags,
         length=len(data) if is_fd else message.dlc,
         way=DIR_RX if message.is_rx else DIR_TX,
-        bus=log.buses.index(bus),
+        bus=log.bus_index(f"can{channel}" if isinstance(channel, int) else str(channel or "can0")),
+        is_fd=is_fd,
+        fd_flags=fd_flags if is_fd else 0,
         data=data,
-        fd_flags=(FD_BRS if message.bitrate_switch else 0)
-        | (FD_ESI if message.error_state_indicator else 0)
-        if is_fd
-        else None,
     )
 
 

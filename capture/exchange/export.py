@@ -97,14 +97,9 @@ def export_log(
             chosen.open(part, facts) as write,
         ):
             for block in frame_blocks(session, facts.buses, fd=chosen.holds_fd):
-                kept = replace(
-                    block,
-                    frames=chosen.kept(block.frames),
-                    fd_frames=chosen.kept(block.fd_frames) if chosen.holds_fd else block.fd_frames,
-                )
-                tally.add(block.frames, kept.frames)
-                tally.add(block.fd_frames, kept.fd_frames)
-                write(kept)
+                kept = chosen.kept(block)
+                tally.add(block, kept)
+                write(replace(block, frames=kept))
                 bar.update(block.done)
                 check_stop(output, stop)
         counts, warnings = dict(facts.counts), [*session.warnings, *chosen.notes(facts)]

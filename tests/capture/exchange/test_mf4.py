@@ -17,7 +17,7 @@ from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.can_logs import open_frame_log
-from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
+from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS, joined
 from undulog.capture.log.messages.frames import (
     DIR_RX,
     DIR_TX,
@@ -40,7 +40,7 @@ def read(path: Path):
     """Everything in a file: frames, name of each one's bus, the log."""
     with open_frame_log(path) as log:
         blocks = list(log.blocks)
-        frames = np.concatenate([block.frames for block in blocks])
+        frames = joined(blocks).classic()
         buses = [log.buses[i] for block in blocks for i in block.bus]
     assert blocks[-1].done == pytest.approx(1.0)
     return frames, buses, log
