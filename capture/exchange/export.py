@@ -17,10 +17,10 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
@@ -37,18 +37,19 @@ from ..log.read.signals import JointSignals
 from .frame_blocks import LossTally, chosen_buses, frame_blocks, frame_facts
 from .frame_formats import FRAME_FORMATS
 
+_Format = TypeVar("_Format")
+
 
 @dataclass
 class ExportReport:
-    """What an export of frames did.
+    """Result of an export of frames.
 
     Attributes:
+        title: Name of the format.
         buses: Bus to number of frames written.
-        warnings: What the format doesn't hold, or the session doesn't give, one sentence each.
+        warnings: Facts that the format doesn't hold or the session lacks, one sentence each.
     """
 
-    source: Path
-    output: Path
     title: str
     buses: dict[str, int]
     warnings: list[str] = field(default_factory=list[str])
@@ -82,12 +83,7 @@ def export_log(
         LogWriteError: If the output can't be written or the export was stopped; nothing is left
             behind then.
     """
-    chosen = FRAME_FORMATS.get(output.suffix.lower())
-    if chosen is None:
-        valid = ", ".join(FRAME_FORMATS)
-        raise UsageError(f"{output}: no format has the suffix {output.suffix!r}; valid: {valid}")
-    refuse_same(source, output)
-    refuse_existing(output, force=force)
+    chosen = _chosen(FRAME_FORMATS, "format", source, output, force=force)
     tally = LossTally()
     with Session.open(source) as session:
         facts = frame_facts(session, chosen_buses(session, bus))
@@ -108,21 +104,21 @@ def export_log(
         elif left_out := sum(facts.fd_counts.values()):
             warnings.append(f"{left_out} CAN FD frames left out: the format has 8 bytes a frame")
         warnings += tally.sentences()
-    return ExportReport(source, output, chosen.title, counts, warnings)
+    return ExportReport(chosen.title, counts, warnings)
 
 
-def refuse_same(source: Path, output: Path) -> None:
-    """Check that an export doesn't replace its own session.
-
-    Raises:
-        UsageError: If they are one file.
-    """
+def _chosen(
+    formats: Mapping[str, _Format], what: str, source: Path, output: Path, *, force: bool
+) -> _Format:
+    """Return the format by the suffix of the output, which must not be the session itself."""
+    if output.suffix.lower() not in formats:
+        valid = ", ".join(formats)
+        raise UsageError(f"{output}: no {what} has the suffix {output.suffix!r}; valid: {valid}")
     if output.exists() and source.exists() and output.samefile(source):
         raise UsageError(f"{output} is the session itself; choose another name")
+    refuse_existing(output, force=force)
+    return formats[output.suffix.lower()]
 
-
-DEFAULT_TOPICS = tuple(JOINT_TOPIC.values())
-"""The topics written unless others are named, those of them that the session has."""
 
 _MOST_TOPICS = 500
 _ROWS_PER_BLOCK = 100_000
@@ -132,15 +128,13 @@ _FORMULA = tuple("=+-@\t\r\n'＝＋－＠")
 
 @dataclass
 class ColumnReport:
-    """What an export of columns did.
+    """Result of an export of columns.
 
     Attributes:
         rows: Topic to number of rows.
-        warnings: What is missing or doubtful, one sentence each.
+        warnings: Missing or doubtful facts, one sentence each.
     """
 
-    source: Path
-    output: Path
     columns: list[str]
     rows: dict[str, int] = field(default_factory=dict[str, int])
     warnings: list[str] = field(default_factory=list[str])
@@ -166,13 +160,6 @@ class RowBlock:
 WriteRows = Callable[[RowBlock], None]
 
 
-TableFormat = Callable[[Path, Sequence[str]], AbstractContextManager[WriteRows]]
-"""Creates a table with columns of those names; a ``with`` block around what writes rows.
-
-It raises OSError if the table can't be written, MissingExtraError if a package for it is missing.
-"""
-
-
 def export_columns(
     source: Path,
     output: Path,
@@ -187,7 +174,7 @@ def export_columns(
 
     Args:
         output: The table to write; its suffix is one of :data:`TABLE_FORMATS`.
-        topics: JointState topics; if none, those of :data:`DEFAULT_TOPICS` that are there.
+        topics: JointState topics; if none, commands and all quantities that the joints measure.
         stop: Ends the export, with nothing left behind.
 
     Raises:
@@ -200,12 +187,7 @@ def export_columns(
         LogWriteError: If the output can't be written or the export was stopped; nothing is left
             behind then.
     """
-    open_table = TABLE_FORMATS.get(output.suffix.lower())
-    if open_table is None:
-        valid = ", ".join(TABLE_FORMATS)
-        raise UsageError(f"{output}: no table has the suffix {output.suffix!r}; valid: {valid}")
-    refuse_same(source, output)
-    refuse_existing(output, force=force)
+    open_table = _chosen(TABLE_FORMATS, "table", source, output, force=force)
     with Session.open(source) as session:
         chosen = _topics(session, topics)
         if len(chosen) > _MOST_TOPICS:
@@ -215,7 +197,7 @@ def export_columns(
             )
         wanted = {topic: _columns(session, topic) for topic in chosen}
         columns = [name for found in wanted.values() for name in found.values()]
-        report = ColumnReport(source, output, ["t_ns", "topic", "joint", *columns])
+        report = ColumnReport(["t_ns", "topic", "joint", *columns])
         with (
             part_file(output) as part,
             progress(f"export {output.name}", len(wanted)) as bar,
@@ -291,8 +273,8 @@ def _open_parquet(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
         yield write
 
 
-TABLE_FORMATS: dict[str, TableFormat] = {".csv": _open_csv, ".parquet": _open_parquet}
-"""Suffix to what creates a table."""
+TABLE_FORMATS = {".csv": _open_csv, ".parquet": _open_parquet}
+"""Suffix to the function that creates a table with columns of some names."""
 
 
 def _writer(stream: TextIO, texts: Sequence[str]) -> Any:
@@ -320,7 +302,7 @@ def _topics(session: Session, wanted: Sequence[str]) -> list[str]:
     joint = [t for t, channel in session.channels.items() if channel.type_name == JOINT_STATE]
     if not joint:
         raise MissingChannelError(session.path, "joint topics", sorted(session.channels))
-    return [topic for topic in DEFAULT_TOPICS if topic in joint] or sorted(joint)
+    return [topic for topic in JOINT_TOPIC.values() if topic in joint] or sorted(joint)
 
 
 def _columns(session: Session, topic: str) -> dict[str, str]:
