@@ -143,7 +143,7 @@ def export_log(
 def _column_map(
     log: Path, robot: Robot, columns: Path | None, options: tuple[str, ...]
 ) -> ColumnMap | None:
-    """The column map of a CSV log; None for a log of CAN frames."""
+    """Return the column map of a CSV log; None for a log of CAN frames."""
     from ..exchange.csv_import import column_map_from_options, is_frame_csv, read_column_map
 
     if not is_file(log):

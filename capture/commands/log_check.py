@@ -41,10 +41,7 @@ def log_check(file: Path, /, *, json: bool = False) -> int:
 
 
 def as_json(health: SessionHealth) -> dict[str, Any]:
-    """A session's health as plain JSON values.
-
-    Args:
-        health: What was measured.
+    """Return a session's health as plain JSON values.
 
     Returns:
         ``verdict``, ``reasons``, ``notes``, ``stored``, ``session``, ``file``, ``channels``,

@@ -20,9 +20,6 @@ _MESSAGES_PER_LOOK = 1000
 def describe(session: Session) -> dict[str, Any]:
     """Return the contents of a session as plain JSON values.
 
-    Args:
-        session: An open session.
-
     Returns:
         ``session``, ``topics`` (in order of name), ``metadata``, ``attachments``, ``warnings``. A
         topic's ``read`` states whether its messages can be read: those of other encodings are only

@@ -28,9 +28,6 @@ and paragraph ends. All characters that XML forbids are among them."""
 def plain(text: str) -> str:
     r"""Escape the control characters of a text.
 
-    Args:
-        text: Any text, e.g. with names from a log.
-
     Returns:
         One line: control and format characters, line breaks and lone surrogates as escapes, e.g.
         ``\x1b``, ``\n``, ``\u202e``; the rest unchanged.
@@ -107,11 +104,7 @@ def progress(description: str, total: float) -> Generator[Progress]:
 
 
 def emit_json(value: Any) -> None:
-    """Print one JSON value on stdout.
-
-    Args:
-        value: Plain JSON values; NaN is refused, since it is not JSON.
-    """
+    """Print one JSON value on stdout; NaN is an error."""
     sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
@@ -219,16 +212,12 @@ def table(
 
 
 def fit(text: str, width: int) -> str:
-    """Text of exactly this many characters."""
+    """Cut or pad a text to a width."""
     return cut(text, width).ljust(width)
 
 
 def cut(text: str, width: int) -> str:
-    """Text with control characters escaped, no longer than there is room.
-
-    Args:
-        text: Any text; a device may have put anything into it.
-    """
+    """Escape control characters and cut a text to a width."""
     clean = Text(_printable(text))
     clean.truncate(max(width, 1), overflow="ellipsis")
     return clean.plain

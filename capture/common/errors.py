@@ -102,7 +102,7 @@ class Fault:
     valid: str
 
     def __str__(self) -> str:
-        """One line: key, what was found, what is valid."""
+        """Return key, found value and valid values in one line."""
         return f"{self.key}: found {self.found}; valid: {self.valid}"
 
 
@@ -195,7 +195,7 @@ class MissingChannelError(LogError, KeyError):
         LogError.__init__(self, path, f"has no {wanted}; it has {listed}")
 
     def __str__(self) -> str:
-        """The message itself (``KeyError`` would quote it)."""
+        """Return the message without the quotes of ``KeyError``."""
         return str(self.args[0])
 
 

@@ -109,17 +109,17 @@ class Bound:
 
 
 def above(limit: float) -> Bound:
-    """The number must be greater than the limit."""
+    """Require a number greater than the limit."""
     return Bound(">", limit)
 
 
 def at_least(limit: float) -> Bound:
-    """The number must not be less than the limit."""
+    """Require a number of at least the limit."""
     return Bound(">=", limit)
 
 
 def at_most(limit: float) -> Bound:
-    """The number must not be greater than the limit."""
+    """Require a number of at most the limit."""
     return Bound("<=", limit)
 
 
@@ -135,15 +135,11 @@ class Faults:
         self._faults: dict[Fault, None] = {}
 
     def add(self, key: str, found: str, valid: str) -> None:
-        """Note a fault.
-
-        Args:
-            key: Where it is, e.g. ``joints[3].plane``.
-        """
+        """Note a fault."""
         self._faults[Fault(key, found, valid)] = None
 
     def all(self) -> tuple[Fault, ...]:
-        """All faults, in the order found."""
+        """Return all faults, in the order found."""
         return tuple(self._faults)
 
 
@@ -174,20 +170,20 @@ class Table:
         self._asked: dict[str, None] = {}
 
     def __contains__(self, key: str) -> bool:
-        """Whether the table itself has the key."""
+        """Return whether the table itself has the key."""
         self._asked[key] = None
         return key in self.values
 
     def over(self, defaults: Table) -> Table:
-        """The same table, nothing read yet, with defaults behind it."""
+        """Return the same table, nothing read yet, with defaults behind it."""
         return Table(self.values, self._where, self.faults, defaults)
 
     def replaced(self, values: Mapping[str, Any]) -> Table:
-        """A table of other values in the same place."""
+        """Return a table of other values in the same place."""
         return Table(values, self._where, self.faults)
 
     def key(self, key: str) -> str:
-        """The full key, e.g. ``joints[3].plane``."""
+        """Return the full key, e.g. ``joints[3].plane``."""
         return f"{self._where}.{key}" if self._where else key
 
     def fault(self, key: str, valid: str, found: str | None = None) -> None:
@@ -245,7 +241,7 @@ class Table:
     def choice(
         self, key: str, kinds: Iterable[_Choice], default: _Choice | None = None
     ) -> _Choice | None:
-        """One of a few words; None after a fault. Without a default it is required."""
+        """Read one of a few words; None after a fault. Without a default it is required."""
         value = self.look(key)[1]
         if value is None and default is not None:
             return default
@@ -256,7 +252,7 @@ class Table:
         return words[value]
 
     def number(self, key: str, *bounds: Bound, default: float | None = None) -> float:
-        """A finite number within the bounds; NaN after a fault. Without a default it is required.
+        """Read a finite number within the bounds; NaN after a fault. Required without a default.
 
         A default need not be within the bounds.
         """
@@ -297,7 +293,7 @@ class Table:
         *bounds: Bound,
         default: tuple[float, ...] | None = None,
     ) -> tuple[float, ...]:
-        """An array of finite numbers, each within the bounds; NaN after a fault.
+        """Read an array of finite numbers, each within the bounds; NaN after a fault.
 
         Without a default it is required.
         """
@@ -314,7 +310,7 @@ class Table:
         return (math.nan,) * count
 
     def words(self, key: str, *, valid: Iterable[str] | None = None) -> tuple[str, ...]:
-        """An array of different strings; empty when absent, without the bad ones after a fault.
+        """Read an array of different strings; empty when absent, without the invalid ones.
 
         Args:
             valid: The words to choose from; any string when None.
@@ -340,7 +336,7 @@ class Table:
         return tuple(good)
 
     def table(self, key: str, defaults: Table | None = None) -> Table:
-        """A sub-table, with its defaults; an empty one when absent or after a fault."""
+        """Read a sub-table, with its defaults; an empty one when absent or after a fault."""
         self._asked[key] = None
         value = self.values.get(key, {})
         if not isinstance(value, dict):
@@ -349,7 +345,7 @@ class Table:
         return Table(cast("dict[str, Any]", value), self.key(key), self.faults, defaults)
 
     def tables(self, key: str) -> list[Table]:
-        """An array of tables; empty when absent, without the bad ones after a fault."""
+        """Read an array of tables; empty when absent, without the invalid ones."""
         self._asked[key] = None
         value = self.values.get(key, [])
         if not isinstance(value, list):
@@ -382,7 +378,7 @@ def _limits(bounds: Iterable[Bound], numbers: Iterable[float]) -> list[str]:
 
 
 def finite_number(value: object) -> float | None:
-    """A finite number from TOML or JSON, else None; booleans are not numbers."""
+    """Return a finite number from TOML or JSON, else None; booleans are not numbers."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:

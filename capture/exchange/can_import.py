@@ -162,7 +162,7 @@ class _Import:
         report.end_ns = max(report.end_ns, int(t_ns.max()))
 
     def _raw_messages(self, topic: str, frames: FrameArray) -> Iterator[Message]:
-        """Batches of raw frames; their log times increase, so that their order is kept."""
+        """Yield batches of raw frames; their log times increase, so that their order is kept."""
         if not len(frames):
             return
         if topic not in self._channels:
@@ -182,7 +182,7 @@ def _writing(channel: FrameChannel, frames: FrameArray) -> Callable[[int], None]
 
 
 def _targets(samples: Iterable[DecodedSignals]) -> set[str]:
-    """The joints and sensors that have samples."""
+    """Return the joints and sensors that have samples."""
     found: set[str] = set()
     for decoded in samples:
         members: list[int] = np.unique(decoded.member).tolist()

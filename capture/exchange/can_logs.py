@@ -170,9 +170,6 @@ _READ_ERRORS = (
 def open_frame_log(path: Path) -> Generator[FrameLog]:
     """Open a log of CAN frames by its suffix.
 
-    Args:
-        path: The file, with one of :data:`SUFFIXES`.
-
     Raises:
         ImportFormatError: If there is no such file, its format isn't known or isn't what its
             suffix says, or it holds no frames; also while its blocks are taken.
@@ -219,11 +216,7 @@ def _before_the_latest(blocks: Iterator[LogBlock], problems: list[str]) -> Itera
 
 
 def log_suffix(path: Path) -> str:
-    """The suffix that tells the format, in lower case: that before ``.gz``, if compressed.
-
-    Returns:
-        E.g. ``.asc``.
-    """
+    """Return the suffix of the format in lower case, that before ``.gz``, e.g. ``.asc``."""
     suffixes = [suffix.lower() for suffix in path.suffixes]
     return next((suffix for suffix in reversed(suffixes) if suffix != ".gz"), "")
 
@@ -284,7 +277,7 @@ def _python_can_log(
 
 
 def _lines(path: Path, stream: TextIO) -> Iterator[str]:
-    """The lines of a text, its errors with the file."""
+    """Yield the lines of a text; errors name the file."""
     try:
         yield from stream
     except (OSError, EOFError) as error:  # a damaged .gz, above all
@@ -292,7 +285,7 @@ def _lines(path: Path, stream: TextIO) -> Iterator[str]:
 
 
 def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:
-    """The reader's messages, its errors with the file and the place."""
+    """Yield the reader's messages; errors name the file and the position."""
     count = 0
     try:
         for message in reader:
@@ -304,7 +297,7 @@ def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:
 
 
 def _read_part(reader: MessageReader) -> float:
-    """How much of its file a reader has taken, 0 to 1; 0 where it can't be told."""
+    """Return the share of its file that a reader has read, 0 to 1; 0 if it is unknown."""
     stream = getattr(reader, "file", None)
     raw = getattr(stream, "buffer", stream)  # of a text stream, which itself can't tell
     if not isinstance(raw, io.BufferedIOBase):
@@ -342,7 +335,7 @@ class _Odd:
         self.count = 0
 
     def is_frame(self, message: Message) -> bool:
-        """Whether a record can be a frame; counts those that can't."""
+        """Return whether a record can be a frame; count those that can't."""
         record: Any = message  # a database and a damaged file have any type and value
         time, identifier, code = record.timestamp, record.arbitration_id, record.dlc
         sound = (
@@ -388,7 +381,7 @@ def _row(path: Path, message: Message, log: FrameLog, epoch_ns: int) -> FrameRow
 
 
 def _with_length_code(message: Message) -> Message:
-    """A frame of ASC, whose reader takes a length code for CAN FD's: 9 comes as 12 bytes."""
+    """Correct the length code of an ASC frame, which the reader decodes as CAN FD's: 9 as 12."""
     from can.util import len2dlc
 
     if not message.is_fd and not message.is_remote_frame:

@@ -113,15 +113,12 @@ def _row(match: re.Match[str], log: FrameLog) -> FrameRow:
 def candump_lines(
     block: LogBlock, buses: Sequence[str], *, directions: bool, nanoseconds: bool
 ) -> Iterator[str]:
-    """Format frames as candump does.
+    """Format frames as candump does, one line a frame with its line end.
 
     Args:
         buses: Names of the buses, by the block's indices.
         directions: Whether to write ``R`` and ``T``.
         nanoseconds: Whether times have nine decimals; candump writes six.
-
-    Yields:
-        One line a frame, with its line end.
     """
     digits, unit = (9, 1) if nanoseconds else (6, 1000)
     frames, data = block.frames, block.frames["data"].tobytes()

@@ -95,7 +95,7 @@ class ColumnMap:
     delimiter: str = ","
 
     def toml(self) -> str:
-        """The map as a TOML file, for the session's attachments."""
+        """Return the map as a TOML file, for the session's attachments."""
         lines = [f"delimiter = {json.dumps(self.delimiter)}", "", "[time]"]
         lines += [f"column = {json.dumps(self.time_column)}", f'unit = "{self.time_unit}"']
         for column in self.columns:
@@ -109,9 +109,6 @@ class ColumnMap:
 
 def read_column_map(path: Path, robot: Robot) -> ColumnMap:
     """Read a map from its TOML file.
-
-    Args:
-        robot: The robot whose joints it names.
 
     Raises:
         InputFileError: If the file isn't there or can't be read.
@@ -225,11 +222,7 @@ _BESIDE_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
 
 
 def is_frame_csv(path: Path) -> bool:
-    """Whether a CSV file holds CAN frames, as python-can writes them.
-
-    Returns:
-        False for any other table; also for a file that can't be read.
-    """
+    """Return whether a file is a CSV of CAN frames by python-can; False if it is unreadable."""
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as stream:
             return stream.readline().startswith(CSV_HEADER)
@@ -353,7 +346,7 @@ class _Topic:
 
 
 def _topics_of(present: set[Quantity]) -> Iterator[tuple[Quantity, ...]]:
-    """The quantities of each topic; a row's velocity and effort belong to its position."""
+    """Yield the quantities of each topic; a row's velocity and effort belong to its position."""
     beside = [q for q in _BESIDE_POSITION if q in present and Quantity.POSITION in present]
     for quantity in JOINT_TOPIC:
         if quantity is Quantity.POSITION and quantity in present:
@@ -421,7 +414,7 @@ def _cell_namer(source: Path, row: int) -> Callable[[str, str], ImportFormatErro
 def _time_ns(
     cell: str, unit_ns: int, where: Callable[[str, str], ImportFormatError], name: str
 ) -> int:
-    """A time in ns, without going through a double, which can't hold Unix times to the ns."""
+    """Parse a time [ns] in decimal: a double can't hold Unix times to the ns."""
     try:
         t_ns = Decimal(cell.strip()) * unit_ns
         if abs(t_ns) < LATEST_NS:
@@ -444,7 +437,7 @@ def _number(cell: str, where: Callable[[str, str], ImportFormatError], name: str
 
 
 def _converted(column: Column, values: FloatArray) -> FloatArray:
-    """Cells in the session's unit: unwrapped, scaled and offset, converted."""
+    """Convert cells to the session's unit: unwrapped, scaled and offset."""
     plain = values.copy()
     if column.wrap:
         known = ~np.isnan(plain)

@@ -219,7 +219,7 @@ def export_columns(
 
 @contextmanager
 def _open_csv(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
-    """CSV in UTF-8; floats with as many digits as bring them back exactly, NaN as an empty cell."""
+    """Write CSV in UTF-8; floats with all digits that are needed, NaN as an empty cell."""
     with path.open("w", encoding="utf-8", newline="") as stream:
         head = ["t_ns", "topic", "joint", *map(_as_text, columns)]
         _writer(stream, head).writerow(head)
@@ -278,14 +278,14 @@ TABLE_FORMATS = {".csv": _open_csv, ".parquet": _open_parquet}
 
 
 def _writer(stream: TextIO, texts: Sequence[str]) -> Any:
-    """A writer of rows with those texts; a carriage return ends a row where it isn't quoted."""
+    """Return a writer of rows with some texts, quoted if one has a carriage return."""
     odd = any("\r" in text for text in texts)  # the module doesn't quote for it
     quoting = csv.QUOTE_NONNUMERIC if odd else csv.QUOTE_MINIMAL
     return csv.writer(stream, lineterminator="\n", quoting=quoting)
 
 
 def _as_text(name: str) -> str:
-    """A name that no spreadsheet takes for a formula."""
+    """Escape a name that a spreadsheet takes for a formula."""
     return f"'{name}" if name.startswith(_FORMULA) else name
 
 
@@ -306,7 +306,7 @@ def _topics(session: Session, wanted: Sequence[str]) -> list[str]:
 
 
 def _columns(session: Session, topic: str) -> dict[str, str]:
-    """The fields that a topic carries, with the names of their columns."""
+    """Return the fields that a topic carries, with the names of their columns."""
     found: dict[str, str] = {}
     for name in UNITS:
         try:
@@ -326,7 +326,7 @@ def _columns(session: Session, topic: str) -> dict[str, str]:
 def _blocks(
     session: Session, topic: str, columns: Mapping[str, str]
 ) -> Iterator[tuple[RowBlock, float]]:
-    """A topic's rows, sorted by time, with how much of them is done, 0 to 1."""
+    """Yield a topic's rows, sorted by time, and the share that is done, 0 to 1."""
     read = session.joint_columns({topic: list(columns)})
     sets = _aligned([read[topic, name] for name in columns])
     for number, signals in enumerate(sets):
@@ -335,7 +335,7 @@ def _blocks(
 
 
 def _aligned(signals: Sequence[JointSignals]) -> list[list[JointSignals]]:
-    """Sets of signals that have the same joints and times, so that they share rows.
+    """Group signals that have the same joints and times, so that they share rows.
 
     That is one set, but for foreign logs that leave a field empty in some messages.
     """
@@ -355,7 +355,7 @@ def _aligned(signals: Sequence[JointSignals]) -> list[list[JointSignals]]:
 def _sorted_blocks(
     signals: Sequence[JointSignals], columns: Sequence[str]
 ) -> Iterator[tuple[RowBlock, float]]:
-    """Rows of signals that share joints and times."""
+    """Yield the rows of signals that share joints and times."""
     first = signals[0]
     if not first.names:
         return

@@ -129,10 +129,7 @@ class FrameFacts:
 
 
 def chosen_buses(session: SessionView, bus: str | None) -> list[str]:
-    """The buses to export.
-
-    Args:
-        bus: The one wanted; all if None.
+    """Return the buses to export: one, or all if ``bus`` is None.
 
     Raises:
         MissingChannelError: If the session has no raw frames, or no such bus.
@@ -210,7 +207,7 @@ def frame_facts(session: SessionView, buses: Sequence[str]) -> FrameFacts:
 
 
 def _edges(session: SessionView, topics: Sequence[str]) -> list[int | None]:
-    """Borders of the windows of log times; open at both ends."""
+    """Return borders of the windows of log times; open at both ends."""
     messages = sum(session.channels[topic].count for topic in topics)
     count = max(1, -(-messages // _MESSAGES_PER_BLOCK))
     span = session.end_ns - session.start_ns

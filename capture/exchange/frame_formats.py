@@ -122,7 +122,7 @@ class _Template:
         self._leaves = layout_of(kind, example).leaves
 
     def messages(self, frames: FrameArray) -> list[bytes]:
-        """One message a frame."""
+        """Return one message a frame."""
         matrix = np.tile(self._example, (len(frames), 1))
         id_flags, t_ns = frames["id_flags"], frames["t_host_ns"]
         columns = {
@@ -154,7 +154,7 @@ def _interleaved(templates: list[_Template], block: LogBlock) -> list[bytes]:
 
 
 def _namespace(bus: str) -> str:
-    """A name of ROS 2 for a bus: letters, digits and underscores, no digit first."""
+    """Return a name of ROS 2 for a bus: letters, digits and underscores, no digit first."""
     name = re.sub(r"[^A-Za-z0-9_]", "_", bus)
     return f"/can_{name}" if name[:1].isdigit() or not name else f"/{name}"
 
@@ -325,7 +325,7 @@ FRAME_FORMATS: dict[str, FrameFormat] = {
 
 
 def channel_numbers(buses: Sequence[str]) -> list[int]:
-    """Numbers for buses in formats that have no names, counted from 0 as python-can does.
+    """Return numbers for buses in formats that have no names, counted from 0 as python-can does.
 
     Returns:
         N for a bus ``canN``, so that an import names it the same; the lowest free number for any

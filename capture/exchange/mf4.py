@@ -189,7 +189,7 @@ def _log(path: Path, mdf: Any) -> FrameLog:
 
 
 def _groups(mdf: Any) -> tuple[list[_Group], list[str]]:
-    """The groups of CAN frames, and what is left out."""
+    """Return the groups of CAN frames, and sentences on records that are left out."""
     groups: list[_Group] = []
     left_out: dict[str, int] = {}
     for index, group in enumerate(mdf.groups):
@@ -214,7 +214,7 @@ def _groups(mdf: Any) -> tuple[list[_Group], list[str]]:
 
 
 def _start(header: Any) -> tuple[int, str]:
-    """The start of the measurement [Unix ns], and what its clock is.
+    """Return the start of the measurement [Unix ns], and its clock.
 
     It is taken to 1 us: asammdf computes it in floating point, to 0.1 us.
     """
@@ -235,7 +235,7 @@ class _Reader:
         self._start_ns = start_ns
 
     def pieces(self, group: _Group) -> Iterator[_Piece]:
-        """The frames of a group, in the order they were logged."""
+        """Yield the frames of a group, in the order they were logged."""
         latest = np.iinfo(np.int64).min
         for first in range(0, group.count, FRAMES_PER_BLOCK):
             count = min(FRAMES_PER_BLOCK, group.count - first)
@@ -298,7 +298,7 @@ class _Reader:
 def _fd_facts(
     kind: str, size: IntArray, numbers: Callable[[str], IntArray | None]
 ) -> tuple[BoolArray, NDArray[np.uint8]]:
-    """Which are CAN FD frames, and their flags; an error frame is of neither kind."""
+    """Return which frames are CAN FD frames, and their flags; an error frame is neither kind."""
     is_fd, flags = size > 8, np.zeros(len(size), dtype=np.uint8)
     if (longer := numbers("EDL")) is not None:
         is_fd |= longer != 0
@@ -310,7 +310,7 @@ def _fd_facts(
 
 
 def _ways(column: NDArray[Any] | None, count: int) -> NDArray[np.uint8]:
-    """Directions: the file has them as numbers, or as texts Rx and Tx."""
+    """Convert directions, numbers or the texts Rx and Tx."""
     if column is None:
         return np.full(count, DIR_RX, dtype=np.uint8)
     texts = column.dtype.kind in "SU"

@@ -27,20 +27,13 @@ from .motion import (
     within,
 )
 
+# Effort, as a share of a neighbour's, below which a motor does not drive its joint: friction.
 POWERLESS = 0.2
-"""Effort, as a share of a neighbour's, below which a motor does not drive its joint: friction."""
-
+# Control error, in those of the neighbours, from which a motor with power would push.
 PUSHING_ERROR_RATIO = 2.5
-"""Control error, in those of the neighbours, from which a motor with power would push."""
-
-ENDS = 2
-"""Joints at either end of a free chain, which little load may keep from any effort."""
-
-SAME = 0.35
-"""Change of an effort, as a share of the usual one, up to which it is the usual one."""
-
-PUSHING = 1.3
-"""Share of the usual effort above which a motor pushes against something."""
+ENDS = 2  # joints at either end of a free chain, which little load may keep from any effort
+SAME = 0.35  # change of an effort, as a share of the usual one, up to which it is the usual one
+PUSHING = 1.3  # share of the usual effort above which a motor pushes against something
 
 
 @dataclass(frozen=True)
@@ -65,13 +58,10 @@ class UsualEffort:
 
 
 def usual_effort(judged: Sequence[Judged]) -> UsualEffort:
-    """Effort of each joint that follows.
+    """Return effort of each joint that follows.
 
     Args:
         judged: The joints; those without a usual response are left out.
-
-    Returns:
-        The efforts; none where none was recorded.
     """
     size: list[float] = []
     ratio: list[complex] = []
@@ -123,11 +113,7 @@ def effort_there(
 
 
 def powerless(judged: Sequence[Judged], k: int) -> list[Symptom]:
-    """Find whether neighbours swing a joint: far from its command, without effort against it.
-
-    Args:
-        judged: All driven joints, in chain order.
-    """
+    """Find whether neighbours swing a joint: far from its command, without effort against it."""
     each, near = judged[k], neighbours(judged, k)
     r = each.response
     if each.motion.effort is None or min(k, len(judged) - 1 - k) < ENDS:

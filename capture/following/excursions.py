@@ -19,68 +19,33 @@ from .motion import (
     runs_of,
 )
 
-FAR = 6.0
-"""Robust standard deviations of the residual that make an excursion."""
-
-FAR_SHARE = 0.2
-"""An excursion is also farther than this share of the usual amplitude."""
-
-FEW = 4
-"""Samples that an excursion has at least."""
-
-SHORT = 0.04
-"""Share of a cycle that an excursion lasts at least."""
-
-JOIN = 0.3
-"""Excursions closer than this share of a cycle are one: a residual passes through zero."""
-
-HELD_WINDOWS = 2
-"""Windows in turn in which a joint that is held stands still."""
-
+FAR = 6.0  # robust standard deviations of the residual that make an excursion
+FAR_SHARE = 0.2  # an excursion is also farther than this share of the usual amplitude
+FEW = 4  # samples that an excursion has at least
+SHORT = 0.04  # share of a cycle that an excursion lasts at least
+JOIN = 0.3  # excursions closer than this share of a cycle are one: a residual passes through zero
+HELD_WINDOWS = 2  # windows in turn in which a joint that is held stands still
+# Cycles in which a joint may stand at the beginning of a record: it is being started.
 STARTING = 2.0
-"""Cycles in which a joint may stand at the beginning of a record: it is being started."""
-
-LOADED_WINDOWS = 2 * BLOCKS + 1
-"""The same where its neighbours are held back, too."""
-
-HELD = 0.25
-"""A joint that moves less than this share of what it should stands still."""
-
+LOADED_WINDOWS = 2 * BLOCKS + 1  # the same where its neighbours are held back, too
+HELD = 0.25  # a joint that moves less than this share of what it should stands still
 NOISY = 0.6
 """Von Neumann ratio above which a residual is noise, not motion: 1 for white noise
 (von Neumann, Ann. Math. Stat. 12, 1941; halved, so that it is 1 minus the autocorrelation)."""
 
+# A residual whose standard deviation is below this share of its mean is a shifted zero.
 STEPPED = 0.35
-"""A residual whose standard deviation is below this share of its mean is a shifted zero."""
-
-SETTLING = 1.5
-"""Cycles from the start in which a departure is a transient."""
-
-MIN_DEPARTURES = 3
-"""Short departures that make a fault."""
-
-GROWN = 0.8
-"""Share of the command's later size below which it still grows."""
-
-AT_TIMES = 0.03
-"""Share of the record that they last together: less is what collisions do."""
-
-DRIFT_SHARE = 0.15
-"""Drift of the offset, as a share of the amplitude, that is no fault."""
-
+SETTLING = 1.5  # cycles from the start in which a departure is a transient
+MIN_DEPARTURES = 3  # short departures that make a fault
+GROWN = 0.8  # share of the command's later size below which it still grows
+AT_TIMES = 0.03  # share of the record that they last together: less is what collisions do
+DRIFT_SHARE = 0.15  # drift of the offset, as a share of the amplitude, that is no fault
 DRIFT_RAD = float(np.radians(1.0))
 DRIFT_EXPLAINED = 0.6
-FEWEST = 12
-"""Windows that a drift needs."""
-
-AS_USUAL = 0.97
-"""Share of the usual explained share above which a window follows as usual."""
-
-MANY = 4 * BLOCKS
-"""Windows of a departure that is a state of its own, with a beginning and an end."""
-
-TRANSITION = 0.3
-"""Share of its windows in which it begins or ends."""
+FEWEST = 12  # windows that a drift needs
+AS_USUAL = 0.97  # share of the usual explained share above which a window follows as usual
+MANY = 4 * BLOCKS  # windows of a departure that is a state of its own, with a beginning and an end
+TRANSITION = 0.3  # share of its windows in which it begins or ends
 
 
 @dataclass(frozen=True)
@@ -195,9 +160,6 @@ def departures(
         response: The joint's windowed response.
         alone: Of each, whether no other joint departs at the same time.
         loaded: Whether its neighbours are held back by a load: then it may be, for a while.
-
-    Returns:
-        One symptom a kind of departure.
     """
     begin, end = found.record_s
     settled = begin + SETTLING * response.period_s

@@ -41,52 +41,29 @@ from .motion import (
     windowed_response,
 )
 
+# Share of a joint's samples that may be missing beyond what the joints have in common.
 LOST_SHARE = 0.01
-"""Share of a joint's samples that may be missing beyond what the joints have in common."""
-
+# Share of the fast samples that may repeat the one before, beyond what all joints do.
 STALE_SHARE = 0.15
-"""Share of the fast samples that may repeat the one before, beyond what all joints do."""
-
-WRAP = 5.0
-"""A step so many times as large as the command's largest is no motion."""
-
-SAME_TURN = 0.1
-"""Steps of one counter differ by less than this, relative."""
-
+WRAP = 5.0  # a step so many times as large as the command's largest is no motion
+SAME_TURN = 0.1  # steps of one counter differ by less than this, relative
+# Turns of counters: of a shaft, of half and double shafts, of a servo's range, in raw units.
 TURNS = (2 * np.pi, 4 * np.pi, np.pi, 300 * np.pi / 180, 360.0, 4096.0, 65536.0)
-"""Turns of counters: of a shaft, of half and double shafts, of a servo's range, in raw units."""
-
 MOSTLY = 0.8
 
-SILENT = 0.02
-"""A gap longer than this share of the record is a silence."""
-
+SILENT = 0.02  # a gap longer than this share of the record is a silence
+# Chance of so many repeats by which a joint of many sessions is taken to repeat old values.
 RARE = 1e-6
-"""Chance of so many repeats by which a joint of many sessions is taken to repeat old values."""
-
+# More repeats in turn than this are a joint that stands or a sensor that froze, not old values.
 LONGEST = 8
-"""More repeats in turn than this are a joint that stands or a sensor that froze, not old values."""
-
-GAP = 1.8
-"""An interval of so many median ones lacks a sample."""
-
-FAST = 0.5
-"""Fast samples: the joint moves more than this share of its usual fast step."""
-
-AROUND = 4
-"""Samples on either side over which its motion is taken."""
-
-SPIKE = 8.0
-"""Robust standard deviations of the noise about the running median that make a spike."""
-
+GAP = 1.8  # an interval of so many median ones lacks a sample
+FAST = 0.5  # fast samples: the joint moves more than this share of its usual fast step
+AROUND = 4  # samples on either side over which its motion is taken
+SPIKE = 8.0  # robust standard deviations of the noise about the running median that make a spike
+# A spike is also larger than so many of the command's largest steps: the median may be late.
 SPIKE_STEPS = 3.0
-"""A spike is also larger than so many of the command's largest steps: the median may be late."""
-
-SPIKE_SHARE = 0.1
-"""A spike is also larger than this share of the command's range."""
-
-SPIKES = 0.003
-"""Share of the samples that may be spikes beyond what the joints have in common."""
+SPIKE_SHARE = 0.1  # a spike is also larger than this share of the command's range
+SPIKES = 0.003  # share of the samples that may be spikes beyond what the joints have in common
 
 
 def _record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
@@ -175,7 +152,7 @@ def _spikes(each: JointMotion) -> float:
 
 
 def _silences(each: JointMotion, missing: float) -> tuple[Span, ...]:
-    """The gaps, where a few long ones hold most of what is missing; else none."""
+    """Return the gaps if a few long ones hold most missing samples; else none."""
     t_s = each.position.t_s
     step = np.diff(t_s)
     length = float(t_s[-1] - t_s[0])
@@ -186,7 +163,7 @@ def _silences(each: JointMotion, missing: float) -> tuple[Span, ...]:
 
 
 def _repeats(each: JointMotion) -> tuple[int, int]:
-    """How many samples during fast motion repeat the one before, and of how many."""
+    """Count the samples during fast motion that repeat the one before, and all of them."""
     values = each.position.values
     step = np.abs(np.diff(values))
     moved = step[step > 0]
@@ -206,11 +183,8 @@ def _repeats(each: JointMotion) -> tuple[int, int]:
     return int(np.count_nonzero(fast & repeated)), int(np.count_nonzero(fast))
 
 
-OFF = 0.3
-"""Relative deviation of H from the common response that makes a joint a candidate."""
-
-NEAR = 0.2
-"""Relative deviation below which the other joint's command explains it."""
+OFF = 0.3  # relative deviation of H from the common response that makes a joint a candidate
+NEAR = 0.2  # relative deviation below which the other joint's command explains it
 
 
 def _swapped_pairs(judged: Sequence[Judged], common: complex) -> dict[str, str]:
@@ -231,7 +205,7 @@ def _swapped_pairs(judged: Sequence[Judged], common: complex) -> dict[str, str]:
 
 
 def _explains(commanded: Judged, measured: Judged, common: complex) -> bool:
-    """Whether one joint's command gives the other's position by the common response."""
+    """Return whether one joint's command gives the other's position by the common response."""
     r = windowed_response(
         commanded.motion.command, measured.motion.position, commanded.response.period_s
     )
@@ -241,27 +215,17 @@ def _explains(commanded: Judged, measured: Judged, common: complex) -> bool:
     return abs(ratio / common - 1) < NEAR and float(np.median(r.explained[r.valid])) > 0.8
 
 
-DRIVEN_SHARE = 0.01
-"""A joint whose command moves less than this share of the largest is held still."""
-
+DRIVEN_SHARE = 0.01  # a joint whose command moves less than this share of the largest is held still
+# A command that moves less than this is held still, whatever the others do [rad].
 MIN_COMMAND_RAD = 1e-3
-"""A command that moves less than this is held still, whatever the others do [rad]."""
-
-SHORTEST_S = 2.0
-"""A shorter record is not judged [s]."""
-
+SHORTEST_S = 2.0  # a shorter record is not judged [s]
+# Explained share of its neighbours beside which a joint that follows nothing stands out.
 ORDERLY = 0.8
-"""Explained share of its neighbours beside which a joint that follows nothing stands out."""
-
-RARELY = 0.1
-"""A joint that follows in less than this share of its windows does not follow."""
+RARELY = 0.1  # a joint that follows in less than this share of its windows does not follow
 
 
 def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
     """Find the joints that do not follow their command.
-
-    Args:
-        motions: The joints with commands and positions, in chain order.
 
     Returns:
         At most one fault a joint, in chain order. Joints whose command does not move are not
@@ -344,7 +308,7 @@ def _from_windows(each: Judged, coherence: float) -> list[Symptom]:
 
 
 def _unit_factor(each: Judged, gain: float) -> str | None:
-    """The factor between degrees and radians that a gain shows, in words."""
+    """Return the factor between degrees and radians that a gain shows, in words."""
     follows, valid = np.count_nonzero(each.follows), np.count_nonzero(each.response.valid)
     if follows < MIN_SHARE * valid or gain <= 0:
         return None
@@ -374,7 +338,7 @@ def _from_residuals(
 
 
 def _shared(span: Span, spans: Sequence[Sequence[Span]], own: int) -> bool:
-    """Whether another joint departs at the same time: then something happened to the body."""
+    """Return whether another joint departs at the same time, as after a contact of the body."""
     return any(
         start < span[1] and stop > span[0]
         for k, other in enumerate(spans)

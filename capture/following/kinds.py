@@ -19,29 +19,14 @@ from .motion import JointMotion, Samples, median_of, record_span, robust_deviati
 if TYPE_CHECKING:
     from .motion import Judged
 
-MOVING = 0.5
-"""Correlation of a velocity or second sensor with the command that shows motion."""
-
-AT_REST = 0.3
-"""Share of its usual motion below which a velocity or second sensor shows rest."""
-
-NO_EFFORT = 0.15
-"""Share of the usual effort below which a motor does not push."""
-
-CONSTANT = 0.1
-"""Standard deviation over mean below which an effort is constant."""
-
-OF_SENSOR = 0.5
-"""Share of a shift that a second sensor lacks, above which it is the first sensor's."""
-
-MOSTLY = 0.5
-"""Share of exact repeats above which a sensor may be frozen."""
-
-MIN_RETURNS = 3
-"""Times that a joint stands at one place, which is no chance."""
-
-LIMIT_SHARE = 0.02
-"""Nearer to a limit than this share of the range is at it."""
+MOVING = 0.5  # correlation of a velocity or second sensor with the command that shows motion
+AT_REST = 0.3  # share of its usual motion below which a velocity or second sensor shows rest
+NO_EFFORT = 0.15  # share of the usual effort below which a motor does not push
+CONSTANT = 0.1  # standard deviation over mean below which an effort is constant
+OF_SENSOR = 0.5  # share of a shift that a second sensor lacks, above which it is the first sensor's
+MOSTLY = 0.5  # share of exact repeats above which a sensor may be frozen
+MIN_RETURNS = 3  # times that a joint stands at one place, which is no chance
+LIMIT_SHARE = 0.02  # nearer to a limit than this share of the range is at it
 
 _KINDS: dict[str, tuple[str, ...]] = {
     "still": ("dead", "jammed", "stalled", "frozen_sensor"),
@@ -124,7 +109,7 @@ def fault_of(
 
 
 def _again(main: Symptom, length: float, end: float, cycle_s: float) -> bool:
-    """Whether a joint follows again, for a cycle or more, after it stood still."""
+    """Return whether a joint follows again, for a cycle or more, after it stood still."""
     spans = sorted(main.spans_s)
     if any(after[0] - before[1] > cycle_s for before, after in pairwise(spans)):
         return True
@@ -137,7 +122,7 @@ def _standing(
     main: Symptom,
     usual: UsualEffort,
 ) -> tuple[list[str], str]:
-    """Kinds of a joint that stands still, by what else was recorded."""
+    """Return kinds of a joint that stands still, by what else was recorded."""
     spans = main.spans_s or (record_span(motion),)
     second = _shows_motion(motion, motion.reference, spans, judged, speed=False)
     if second:
@@ -155,7 +140,7 @@ def _standing(
 def _by_effort(
     motion: JointMotion, judged: Judged, main: Symptom, usual: UsualEffort
 ) -> tuple[list[str], str]:
-    """Kinds of a joint that stands still, by its noise and its effort."""
+    """Return kinds of a joint that stands still, by its noise and its effort."""
     kinds = list(_KINDS[main.name])
     spans = main.spans_s or (record_span(motion),)
     repeats = _repeats(motion, spans)
@@ -189,14 +174,14 @@ def _by_effort(
 
 
 def _repeats(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
-    """Whether most positions are, to the bit, the one before."""
+    """Return whether most positions are, to the bit, the one before."""
     inside = motion.position.values[within(motion.position.t_s, spans)]
     repeated = int(np.count_nonzero(np.diff(inside) == 0))
     return inside.size < 2 or repeated > MOSTLY * (inside.size - 1)
 
 
 def _opposite(motion: JointMotion) -> tuple[list[str], str]:
-    """Kinds of a joint that moves the opposite way."""
+    """Return kinds of a joint that moves the opposite way."""
     if motion.reference is not None and motion.reference.values.size > 8:
         along = _correlation(motion.reference.at(motion.position.t_s), motion.position.values)
         if along < -MOVING:
@@ -211,7 +196,7 @@ def _opposite(motion: JointMotion) -> tuple[list[str], str]:
 
 
 def _shifted(motion: JointMotion, main: Symptom, kinds: list[str]) -> tuple[list[str], str]:
-    """Kinds of a zero that moved: by a second sensor, or by the velocity at a step."""
+    """Return kinds of a zero that moved: by a second sensor, or by the velocity at a step."""
     sensor = {"stepped": "slipped_sensor", "drifting": "drifting_sensor"}[main.name]
     if motion.reference is None or motion.reference.values.size <= 8:
         return kinds, ""
@@ -226,13 +211,13 @@ def _shifted(motion: JointMotion, main: Symptom, kinds: list[str]) -> tuple[list
 
 
 def _trend(values: FloatArray, t_s: FloatArray, _: BoolArray) -> float:
-    """Change over the record, by the regression line."""
+    """Return change over the record, by the regression line."""
     centred = t_s - t_s.mean()
     return float(centred @ values / (centred @ centred)) * float(np.ptp(t_s))
 
 
 def _step(values: FloatArray, _: FloatArray, inside: BoolArray) -> float:
-    """Mean inside a span less the mean outside it."""
+    """Return mean inside a span less the mean outside it."""
     if not inside.any() or inside.all():
         return 0.0
     return float(values[inside].mean() - values[~inside].mean())
@@ -271,7 +256,7 @@ def _shows_motion(
 
 
 def _at_limit(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
-    """Whether the joint stands at a limit of its description."""
+    """Return whether the joint stands at a limit of its description."""
     if motion.limits is None:
         return False
     level = median_of(motion.position.values[within(motion.position.t_s, spans)])
@@ -281,7 +266,7 @@ def _at_limit(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
 
 
 def _at_one_end(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
-    """Whether the joint stands again and again at the same end of its motion."""
+    """Return whether the joint stands again and again at the same end of its motion."""
     if len(spans) < MIN_RETURNS:
         return False
     values = motion.position.values

@@ -15,17 +15,10 @@ from .fault import Span
 BLOCKS = 4
 """Blocks a cycle: windows of one cycle start at every quarter of it."""
 
-FEW_SAMPLES = 8
-"""A window with fewer samples is not judged."""
-
-FULL_SHARE = 0.6
-"""A window with less than this share of its usual samples is not judged."""
-
-QUIET = 0.25
-"""A window whose command moves less than this share of its usual range is not judged."""
-
-RIDGE = 1e-6
-"""Relative ridge on the normal equations: a ramp and its delayed copy are collinear."""
+FEW_SAMPLES = 8  # a window with fewer samples is not judged
+FULL_SHARE = 0.6  # a window with less than this share of its usual samples is not judged
+QUIET = 0.25  # a window whose command moves less than this share of its usual range is not judged
+RIDGE = 1e-6  # relative ridge on the normal equations: a ramp and its delayed copy are collinear
 
 
 @dataclass(frozen=True)
@@ -41,7 +34,7 @@ class Samples:
     values: FloatArray
 
     def at(self, t_s: FloatArray) -> FloatArray:
-        """Values at other times, interpolated linearly; the ends are held."""
+        """Return values at other times, interpolated linearly; the ends are held."""
         if t_s is self.t_s:
             return self.values
         return np.interp(t_s, self.t_s, self.values).astype(np.float64, copy=False)
@@ -91,7 +84,7 @@ class JointMotion:
 
 
 def cycle_s(command: Samples) -> float:
-    """Median length of the command's cycles.
+    """Return median length of the command's cycles.
 
     Returns:
         Time from one upward crossing of its middle to the next, with hysteresis [s]; a tenth of
@@ -219,7 +212,7 @@ def _solved(
 def predicted(
     motion: JointMotion, period_s: float, ratio: complex, offset: float, t_s: FloatArray
 ) -> FloatArray:
-    """The position that a response would give.
+    """Return the position that a response would give.
 
     Args:
         period_s: Cycle of its command T [s].
@@ -253,31 +246,19 @@ def record_span(motion: JointMotion) -> Span:
 COHERENT = 0.5
 """Explained share above which a window follows its command, with whatever gain and lag."""
 
-NO_RESPONSE = 0.2
-"""Gain, as a share of the common one, below which a window shows no response."""
-
-STILL = 0.3
-"""Motion, as a share of the usual one, below which a joint stands still."""
-
+NO_RESPONSE = 0.2  # gain, as a share of the common one, below which a window shows no response
+STILL = 0.3  # motion, as a share of the usual one, below which a joint stands still
+# Phase against the common response beyond which a joint moves the opposite way.
 OPPOSITE_RAD = np.radians(150.0)
-"""Phase against the common response beyond which a joint moves the opposite way."""
-
 DEGREE = float(np.degrees(1.0))
 
+# Factor within which a gain of 180/pi is a matter of units: a weak servo's gain is in it.
 UNIT_SLACK = 1.6
-"""Factor within which a gain of 180/pi is a matter of units: a weak servo's gain is in it."""
-
-NEIGHBOURS = 4
-"""Joints that one joint is compared with: the nearest ones."""
-
-MIN_WINDOWS = 5
-"""Windows (two whole cycles) that a joint's own usual response needs."""
-
-LOADED = 0.7
-"""Gain below which a joint's neighbours are held back by a load: then it may be, too."""
-
+NEIGHBOURS = 4  # joints that one joint is compared with: the nearest ones
+MIN_WINDOWS = 5  # windows (two whole cycles) that a joint's own usual response needs
+LOADED = 0.7  # gain below which a joint's neighbours are held back by a load: then it may be, too
+# A joint whose windows follow less than this share of the time has no usual response.
 MIN_SHARE = 0.5
-"""A joint whose windows follow less than this share of the time has no usual response."""
 
 _Value = TypeVar("_Value")
 
@@ -318,7 +299,7 @@ class Judged:
 
 
 def own_response(response: Response) -> complex | None:
-    """The usual response of one joint.
+    """Return the usual response of one joint.
 
     Returns:
         Median of H over the windows that it explains; None where it explains too few, which is
@@ -334,16 +315,13 @@ def neighbours(values: Sequence[_Value], k: int) -> list[_Value]:
     """Return the values of the ``NEIGHBOURS`` joints nearest to a joint, without its own.
 
     The gain of a loaded chain changes along the body.
-
-    Args:
-        values: One of each driven joint, e.g. its response, in chain order.
     """
     others = sorted((j for j in range(len(values)) if j != k), key=lambda j: (abs(j - k), j))
     return [values[j] for j in others[:NEIGHBOURS]]
 
 
 def common_response(own: Sequence[complex | None]) -> complex:
-    """The response that some joints have in common.
+    """Return the response that some joints have in common.
 
     Args:
         own: Response of each; None for none.

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import can
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -88,17 +87,6 @@ def test_frames_of_every_kind(tmp_path: Path):
     assert frames["dir"].tolist() == [DIR_TX, DIR_RX, DIR_RX, DIR_RX, DIR_RX]
     assert frames["data"][0].tolist() == [0x9B, 1, 0, 0, 0, 0, 0, 0]
     assert log.problems == ["1 frames without a direction, unlike the first one"]
-
-
-def test_python_can_reads_what_is_written(tmp_path: Path):
-    text = "".join(
-        f"(1717639553.{i:06d}) can0 {i % 0x800:03X}#{i:016X} {'RT'[i % 2]}\n" for i in range(500)
-    )
-    (tmp_path / "y.log").write_text(written(text, tmp_path / "x.log"))
-    messages = list(can.CanutilsLogReader(tmp_path / "y.log"))
-    assert [round(m.timestamp * 1e6) - 1717639553_000000 for m in messages] == list(range(500))
-    assert [bytes(m.data) for m in messages] == [i.to_bytes(8, "big") for i in range(500)]
-    assert [m.is_rx for m in messages] == [i % 2 == 0 for i in range(500)]
 
 
 def test_can_fd_frames(tmp_path: Path):
