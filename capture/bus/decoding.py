@@ -64,11 +64,11 @@ class FrameTally:
     Attributes:
         decoded: Frames with at least one sample.
         remote: Remote frames; they carry no data.
-        unknown: Identifier to number of data frames that no database knows.
+        unknown: Identifier to number of data frames that are in no database.
         silent: Identifier to number of data frames that the databases know and whose contents the
             map doesn't name, e.g. requests.
         short: Signal, as ``message.signal``, to number of frames too short to hold it.
-        undirected: Identifier to number of frames that only their direction could tell apart, in a
+        undirected: Identifier to number of frames that differ only in their direction, in a
             log without directions.
     """
 

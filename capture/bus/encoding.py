@@ -39,7 +39,7 @@ def poll_frames(robot: Robot) -> FrameArray:
 
     Returns:
         Records of :data:`.FRAME_DTYPE`, without times, in the order of the map;
-        none where nothing has to be asked.
+        none where no request is needed.
 
     Raises:
         DataError: If the robot has no bus, or a request that is no classic CAN frame.

@@ -106,8 +106,8 @@ def _print_stored(health: SessionHealth) -> None:
     elif health.stored == health.verdict:
         echo(f"stored verdict: {health.stored}, the same")
     else:
-        said = f" ({'; '.join(health.stored_reasons)})" if health.stored_reasons else ""
-        echo(f"stored verdict: {health.stored}{said}; from the data: {health.verdict}")
+        reasons = f" ({'; '.join(health.stored_reasons)})" if health.stored_reasons else ""
+        echo(f"stored verdict: {health.stored}{reasons}; from the data: {health.verdict}")
 
 
 def _print_series(health: SessionHealth) -> None:

@@ -1,6 +1,6 @@
 """Parameters that are declared once: frozen dataclasses read from strict tables, and written.
 
-A field's annotation says what its key may hold, its default what an absent key stands for::
+The annotation of a field declares the values of its key, its default the value without a key::
 
     @dataclass(frozen=True)
     class Turns:

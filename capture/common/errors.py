@@ -14,7 +14,7 @@
     |- PlanError (ValueError)               a drive plan with faults, all listed
     |- NullModelError (ValueError)          a null model with faults, all listed
     |- SimulationError (ArithmeticError)    the twin blew up: time, link and likely cause
-    |- DataError (ValueError)               samples unfit for what was asked
+    |- DataError (ValueError)               samples unfit for a computation
     |- SourceError                          a source that can't be opened or used
     |- ControlError                         a running recorder that can't be reached, or refuses
     |  `- SocketInUseError                  another recorder listens at a control socket
@@ -155,7 +155,7 @@ class SettingsError(UsageError):
         """Build the message.
 
         Args:
-            faults: All faults, at least one; their keys say where: ``--ring``,
+            faults: All faults, at least one; their keys are the places: ``--ring``,
                 ``UNDULOG_RECORD_RING`` or ``snake.toml: record.ring``.
         """
         self.faults: tuple[Fault, ...] = tuple(faults)
@@ -163,11 +163,11 @@ class SettingsError(UsageError):
 
 
 class SimulationError(UndulogError, ArithmeticError):
-    """The twin's state became impossible: says when, which link, and the likely cause."""
+    """An impossible state of the twin; names time, link and likely cause."""
 
 
 class DataError(UndulogError, ValueError):
-    """Samples that are unfit for what was asked of them."""
+    """Samples that are unfit for a computation."""
 
 
 class JointSetError(UsageError, DataError):
@@ -209,7 +209,7 @@ class SourceError(UndulogError):
 
 
 class ControlError(UndulogError):
-    """A running recorder can't be reached, or refuses what it was asked."""
+    """A running recorder can't be reached, or refuses a request."""
 
 
 class SocketInUseError(ControlError):

@@ -99,7 +99,7 @@ def check_output(output: Path, endings: Iterable[str], why: str, *, force: bool)
 
     Args:
         endings: Any of which its name must have.
-        why: What to say if it has none of them.
+        why: Message if it has none of them.
         force: Whether an existing file may be replaced.
 
     Raises:
@@ -150,10 +150,10 @@ def write_text(output: Path, text: str) -> None:
 
 
 def check_stop(output: Path, stop: StopRequest | None) -> None:
-    """End the writing of a part file if an end was asked for.
+    """End the writing of a part file if a stop was requested.
 
     Raises:
-        LogWriteError: If an end was asked for.
+        LogWriteError: If a stop was requested.
     """
     if stop is not None and stop.requested:
         raise LogWriteError(output, "stopped on request, nothing is written")

@@ -100,11 +100,11 @@ def threads_or_default(threads: int | None) -> int:
     """Return the number of threads to use.
 
     Args:
-        threads: As many as was asked for; None for one a core that this process may use, at most
+        threads: Number; None for one a core that this process may use, at most
             four.
 
     Raises:
-        UsageError: If less than one was asked for.
+        UsageError: If it is less than one.
     """
     if threads is None:
         usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
@@ -163,17 +163,17 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequest:
-    """Whether, and by which signal, an end was asked for."""
+    """Whether a stop was requested, and by which signal."""
 
     def __init__(self) -> None:
         """Start without a request."""
         self.signal: signal.Signals | None = None
         self.again = False
-        """Whether it was asked for a second time."""
+        """Whether a stop was requested a second time."""
 
     @property
     def requested(self) -> bool:
-        """Whether an end was asked for."""
+        """Whether a stop was requested."""
         return self.signal is not None
 
 
@@ -186,7 +186,7 @@ def interruptible(*, twice: bool = False) -> Generator[StopRequest]:
 
     Args:
         twice: Take a second SIGINT or SIGTERM as a request, too; only the third acts as it would
-            have. A terminal that goes says so by more than one SIGHUP: these only count once.
+            have. A terminal that closes sends more than one SIGHUP: these only count once.
 
     Yields:
         The request; look at ``requested`` between two samples.

@@ -361,7 +361,7 @@ class Table:
         return good
 
     def close(self) -> None:
-        """Note every key of this table that nobody asked for."""
+        """Note every key of this table that was not read."""
         for key in self.values:
             if key not in self._asked:
                 self.faults.add(self.key(key), "an unknown key", listed(self._asked, key))

@@ -25,7 +25,7 @@ from .frame_log import FrameLog, LogBlock
 from .import_output import ImportReport, imported_session
 
 DIRECTIONS_KEY = "import.directions"
-"""Metadata key: ``recorded``, or ``none`` for a log that doesn't tell sent from received."""
+"""Metadata key: ``recorded``, or ``none`` for a log without directions."""
 
 _BATCH_NS = 50_000_000  # one message of raw frames spans at most this
 
@@ -61,7 +61,7 @@ def import_can(
         blocks = iter(log.blocks)
         first = next(blocks, None)
         if first is None:
-            raise ImportFormatError(source, "holds no CAN frames")
+            raise ImportFormatError(source, "; ".join(["holds no CAN frames", *log.problems[:1]]))
         chosen = bus or log.buses[int(first.bus[0])]
         facts = {
             "import.format": log_suffix(source).removeprefix("."),

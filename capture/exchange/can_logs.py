@@ -21,7 +21,6 @@ import struct
 import zlib
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TextIO, cast
 
@@ -48,15 +47,7 @@ from ..log.messages.frames import (
     REMOTE_FLAG,
 )
 from .candump import read_candump
-from .frame_log import (
-    EARLIEST_NS,
-    LATEST_NS,
-    RELATIVE_EPOCH_NS,
-    FrameLog,
-    FrameRow,
-    LogBlock,
-    blocks_of,
-)
+from .frame_log import LATEST_NS, FrameLog, FrameRow, LogBlock, blocks_of
 from .mf4 import open_mf4
 
 if TYPE_CHECKING:
@@ -143,7 +134,7 @@ SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db", ".mf4")
 CSV_HEADER = "timestamp,arbitration_id,"
 """How a CSV file begins that python-can wrote; any other needs a column map."""
 
-_MOST_TEXTS = 20  # different warnings of a library that are told
+_MOST_TEXTS = 20  # different warnings of a library that are reported
 _LINES_LEFT_OUT = ("Unsupported type", "Dropping bus info line")
 _WITHOUT_DIRECTIONS = (".csv", ".db")
 _LATEST_S = 8e9  # the year 2223; a time from the log's start fits behind its epoch, too
@@ -171,8 +162,8 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
     """Open a log of CAN frames by its suffix.
 
     Raises:
-        ImportFormatError: If there is no such file, its format isn't known or isn't what its
-            suffix says, or it holds no frames; also while its blocks are taken.
+        ImportFormatError: If there is no such file, or its format isn't known or isn't that of
+            its suffix; also while its blocks are taken.
         MissingExtraError: If the format is MF4 and its extra is not installed.
     """
     if not is_file(path):
@@ -246,28 +237,17 @@ def _check_database(path: Path) -> None:
 def _python_can_log(
     path: Path, reader: MessageReader, suffix: str, problems: list[str]
 ) -> FrameLog:
-    messages = _messages(path, reader)
-    if suffix == ".asc":
-        messages = map(_with_length_code, messages)
-    odd = _Odd()
-    messages = filter(odd.is_frame, messages)
-    with _noted("can", problems):
-        first = next(messages, None)
-    if first is None:
-        raise ImportFormatError(path, "; ".join(["holds no CAN frames", *problems[:1]]))
-    relative = first.timestamp * 1e9 < EARLIEST_NS
     log = FrameLog(
         blocks=iter(()),
         buses=[],
         directions=suffix not in _WITHOUT_DIRECTIONS,
-        time="counted from the log's start, put at 2000-01-01T00:00:00Z; rounded to 1 us"
-        if relative
-        else "as recorded, rounded to 1 us",
+        time="as recorded, rounded to 1 us",
         problems=problems,
     )
-    epoch_ns = RELATIVE_EPOCH_NS if relative else 0
-    rows = _rows(path, chain([first], messages), log, epoch_ns, odd)
-    log.blocks = blocks_of(rows, lambda: _read_part(reader))
+    messages = _messages(path, reader)
+    if suffix == ".asc":
+        messages = map(_with_length_code, messages)
+    log.blocks = blocks_of(_rows(path, messages, log), lambda: _read_part(reader))
     claimed = getattr(reader, "file_size", 0)  # of a BLF file, by its header
     if suffix == ".blf" and claimed > path.stat().st_size:
         log.problems.append(
@@ -299,7 +279,9 @@ def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:
 def _read_part(reader: MessageReader) -> float:
     """Return the share of its file that a reader has read, 0 to 1; 0 if it is unknown."""
     stream = getattr(reader, "file", None)
-    raw = getattr(stream, "buffer", stream)  # of a text stream, which itself can't tell
+    raw = getattr(
+        stream, "buffer", stream
+    )  # of a text stream, whose tell() fails while it is iterated
     if not isinstance(raw, io.BufferedIOBase):
         return 0.0
     try:
@@ -308,17 +290,20 @@ def _read_part(reader: MessageReader) -> float:
         return 0.0
 
 
-def _rows(
-    path: Path, messages: Iterator[Message], log: FrameLog, epoch_ns: int, odd: _Odd
-) -> Iterator[FrameRow]:
-    unmarked = 0
+def _rows(path: Path, messages: Iterator[Message], log: FrameLog) -> Iterator[FrameRow]:
+    epoch_ns, invalid, unmarked = None, 0, 0
     with _noted("can", log.problems):
         for message in messages:
+            if not _is_frame(message):
+                invalid += 1
+                continue
+            if epoch_ns is None:
+                epoch_ns = log.epoch_ns(message.timestamp * 1e9, "rounded to 1 us")
             unmarked += not message.is_fd and len(message.data) > 8
             yield _row(path, message, log, epoch_ns)
-    if odd.count:
+    if invalid:
         log.problems.append(
-            f"{odd.count} records are no CAN frames (a time, an identifier, a length or data that "
+            f"{invalid} records are no CAN frames (a time, an identifier, a length or data that "
             "can't be) and are left out"
         )
     if unmarked:
@@ -328,27 +313,19 @@ def _rows(
         )
 
 
-class _Odd:
-    """Records that a damaged file has as frames, and that can be none."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def is_frame(self, message: Message) -> bool:
-        """Return whether a record can be a frame; count those that can't."""
-        record: Any = message  # a database and a damaged file have any type and value
-        time, identifier, code = record.timestamp, record.arbitration_id, record.dlc
-        sound = (
-            isinstance(time, int | float)
-            and -_LATEST_S < time < _LATEST_S
-            and isinstance(identifier, int)
-            and 0 <= identifier <= ID_MASK
-            and isinstance(code, int)
-            and 0 <= code <= _MOST_BYTES
-            and isinstance(record.data, bytes | bytearray | memoryview)
-        )
-        self.count += not sound
-        return sound
+def _is_frame(message: Message) -> bool:
+    """Return whether a record of a damaged file can be a frame."""
+    record: Any = message  # a database and a damaged file have any type and value
+    time, identifier, code = record.timestamp, record.arbitration_id, record.dlc
+    return (
+        isinstance(time, int | float)
+        and -_LATEST_S < time < _LATEST_S
+        and isinstance(identifier, int)
+        and 0 <= identifier <= ID_MASK
+        and isinstance(code, int)
+        and 0 <= code <= _MOST_BYTES
+        and isinstance(record.data, bytes | bytearray | memoryview)
+    )
 
 
 def _row(path: Path, message: Message, log: FrameLog, epoch_ns: int) -> FrameRow:

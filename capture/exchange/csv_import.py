@@ -30,6 +30,7 @@ from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
@@ -378,7 +379,7 @@ def _read_stream(source: Path, stream: TextIO, column_map: ColumnMap) -> _TimedC
             raise ImportFormatError(
                 source, f"row {reader.line_num} has {len(row)} cells, the header {len(header)}"
             )
-        where = _cell_namer(source, reader.line_num)
+        where = partial(_fault, source, reader.line_num)
         t_ns = _time_ns(row[places[0]], unit_ns, where, wanted[0])
         if times and t_ns < times[-1]:
             raise where(wanted[0], f"time goes back, from {times[-1] / unit_ns:g}")
@@ -388,16 +389,17 @@ def _read_stream(source: Path, stream: TextIO, column_map: ColumnMap) -> _TimedC
     if not times:
         raise ImportFormatError(source, "has no rows below its header")
     series = [np.frombuffer(numbers, dtype=np.float64) for numbers in cells]
-    notes = [
-        f"column {column.column!r}: {count} cells without a value"
-        for column, values in zip(column_map.columns, series, strict=True)
-        if (count := int(np.isnan(values).sum()))
-    ]
-    values = [
-        _converted(column, values)
-        for column, values in zip(column_map.columns, series, strict=True)
-    ]
+    notes: list[str] = []
+    values: list[FloatArray] = []
+    for column, cells_of in zip(column_map.columns, series, strict=True):
+        if count := int(np.isnan(cells_of).sum()):
+            notes.append(f"column {column.column!r}: {count} cells without a value")
+        values.append(_converted(column, cells_of))
     return _TimedColumns(np.array(times, dtype=np.int64), values, notes)
+
+
+def _fault(source: Path, row: int, column: str, what: str) -> ImportFormatError:
+    return ImportFormatError(source, f"row {row}, column {column!r}: {what}")
 
 
 def _place(source: Path, header: list[str], name: str) -> int:
@@ -405,10 +407,6 @@ def _place(source: Path, header: list[str], name: str) -> int:
         found = f"{header.count(name)} columns" if name in header else "no column"
         raise ImportFormatError(source, f"has {found} {name!r}; it has {listed(header, name)}")
     return header.index(name)
-
-
-def _cell_namer(source: Path, row: int) -> Callable[[str, str], ImportFormatError]:
-    return lambda column, what: ImportFormatError(source, f"row {row}, column {column!r}: {what}")
 
 
 def _time_ns(

@@ -4,7 +4,7 @@ Columns: ``t_ns`` (the sample's own time, Unix ns), ``topic``, ``joint``, and on
 named ``TOPIC.FIELD [UNIT]`` without the topic's leading slash, or ``TOPIC [UNIT]`` where the topic
 is the quantity: ``joint_states.velocity [rad/s]``, ``joint_current [A]``. A row has the quantities
 of its topic, and nothing in the columns of other topics. Nothing is resampled or filled in: joints
-that were asked one after the other have rows at different times. Rows are sorted by time within a
+that were sampled one after the other have rows at different times. Rows are sorted by time within a
 topic.
 
 A spreadsheet takes text in a CSV that begins with ``=``, ``+``, ``-`` or ``@`` for a formula. So

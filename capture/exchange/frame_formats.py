@@ -1,6 +1,6 @@
 """Formats of CAN traces that can be written, by suffix.
 
-A format says what it keeps of frames (:meth:`FrameFormat.kept`) and writes just that, so that what
+A format declares what it keeps of frames (:meth:`FrameFormat.kept`) and writes that, so that what
 is lost can be counted before it is lost. Formats: candump (:mod:`.capture.exchange.candump`),
 Vector's ASC and BLF by python-can, and messages of ROS 2 (:mod:`.capture.exchange.frame_formats`).
 

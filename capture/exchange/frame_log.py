@@ -151,6 +151,13 @@ class FrameLog:
     problems: list[str] = field(default_factory=list[str])
     read: int = 0
 
+    def epoch_ns(self, first_ns: float, precision: str) -> int:
+        """Return the offset to Unix times [ns]; describe the times of a log without a date."""
+        if first_ns >= EARLIEST_NS:
+            return 0
+        self.time = f"counted from the log's start, put at 2000-01-01T00:00:00Z; {precision}"
+        return RELATIVE_EPOCH_NS
+
     def bus_index(self, name: str) -> int:
         """Return the index of a bus, which is added if it is new."""
         if name not in self.buses:

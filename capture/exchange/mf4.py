@@ -41,7 +41,7 @@ from ..log.messages.frames import (
     REMOTE_FLAG,
     empty_fd_frames,
 )
-from .frame_log import EARLIEST_NS, FRAMES_PER_BLOCK, RELATIVE_EPOCH_NS, FrameLog, LogBlock, joined
+from .frame_log import FRAMES_PER_BLOCK, FrameLog, LogBlock, joined
 
 
 @contextmanager
@@ -57,7 +57,7 @@ def _readable(path: Path, what: str) -> Generator[None]:
 
 
 def _let_go(error: Exception) -> None:
-    """Free what asammdf half opened: it fails once more when it goes, and would say so."""
+    """Free what asammdf half opened: it fails again when it is deleted, with a message."""
     before = sys.unraisablehook
 
     def quiet(fault: sys.UnraisableHookArgs) -> None:
@@ -144,7 +144,7 @@ def open_mf4(path: Path) -> Generator[FrameLog]:
         from asammdf import MDF
     except ImportError as error:
         raise MissingExtraError(f"importing {path.name}", "mf4", "asammdf") from error
-    # What it says here is about decoding by databases inside the file, which is not asked for.
+    # Its messages here are about decoding by databases inside the file, which is not needed.
     with _noted([]), _readable(path, "can't be read"):
         _check_head(path)
         mdf = MDF(BytesIO(gzip.decompress(path.read_bytes())) if path.suffix == ".gz" else path)
@@ -206,11 +206,11 @@ def _groups(mdf: Any) -> tuple[list[_Group], list[str]]:
         elif count:
             what = names[1] if len(names) > 1 else names[0] if names else f"group {index}"
             left_out[what] = left_out.get(what, 0) + count
-    told = [
+    sentences = [
         f"{count} records of {what} left out: only CAN data, remote and error frames are kept"
         for what, count in left_out.items()
     ]
-    return groups, told
+    return groups, sentences
 
 
 def _start(header: Any) -> tuple[int, str]:
@@ -329,9 +329,7 @@ def _blocks(path: Path, reader: _Reader, groups: list[_Group], total: int) -> It
                 break
             t_ns = piece.times_ns()
             if epoch_ns is None:
-                epoch_ns = RELATIVE_EPOCH_NS if t_ns[0] < EARLIEST_NS else 0
-                if epoch_ns:
-                    log.time = "counted from the log's start, put at 2000-01-01T00:00:00Z; to 1 ns"
+                epoch_ns = log.epoch_ns(int(t_ns[0]), "to 1 ns")
             if (earliest := int(t_ns.min()) + epoch_ns) < 0:
                 raise ImportFormatError(path, f"has a frame at {earliest / _NS} s, before 1970")
             piece.frames["t_host_ns"] = (t_ns + epoch_ns).astype(np.uint64)

@@ -1,6 +1,6 @@
 """From symptoms to the kinds of fault that fit: what effort, velocity and a second sensor decide.
 
-A position alone can't tell a jammed joint from a frozen sensor. A kind is ruled out only by
+A position alone can't separate a jammed joint from a frozen sensor. A kind is ruled out only by
 another quantity that was recorded; otherwise all kinds that fit are named.
 """
 

@@ -328,7 +328,7 @@ def common_response(own: Sequence[complex | None]) -> complex:
 
     Returns:
         Median gain at the circular median lag of the joints that respond, with one vote for an
-        ideal response, so that two joints of opposite sign are told apart.
+        ideal response, so that two joints of opposite sign are separated.
     """
     values = np.asarray([1.0 + 0.0j, *(each for each in own if each is not None)])
     unit = values / np.abs(values)

@@ -16,8 +16,8 @@ A description has the head first::
 
 A ``[chain]`` with ``joints = 100`` and ``planes = ["horizontal", "vertical"]`` (taken in turn from
 the head) stands for ``joints`` of a long chain. ``links`` may be left out: then there is one more
-than joints, ``link01`` the head, all as the defaults say. ``[defaults.joint]``,
-``[defaults.servo]`` and ``[defaults.<sensor kind>]`` work the same way. ``[safety]`` says how far
+than joints, ``link01`` the head, all with default values. ``[defaults.joint]``,
+``[defaults.servo]`` and ``[defaults.<sensor kind>]`` work the same way. ``[safety]`` limits how far
 the robot may be driven, ``[safety_of.joint07]`` what is otherwise for one joint. In an entry of
 ``bus.signals`` whose target is ``{joint}``, the entry stands for one a joint, and ``{joint}`` in
 its message and signal for that joint's name. The keys are the fields of the classes of

@@ -55,7 +55,7 @@ class Safety:
         max_current: Greatest current of a servo [A].
         max_temperature: Greatest temperature of a servo [degC].
         min_voltage: Least supply voltage of a servo [V].
-        reply_timeout_s: A joint that says nothing for so long is lost [s].
+        reply_timeout_s: Time without a reply after which a joint is lost [s].
         max_late_s: So late a control tick may be [s].
         fault_after_s: Tracking error and current are a fault when they last so long [s].
         on_fault: How a drive ends that has to end early.
@@ -105,7 +105,7 @@ class ClockDomain(StrEnum):
 
 
 class SensorKind(StrEnum):
-    """The kinds of sensor a robot description knows."""
+    """Kind of sensor."""
 
     IR = "ir"
     SONAR = "sonar"
@@ -213,8 +213,8 @@ class Sensor:
         link: Name of the link that carries it.
         position: Mount point in the link's frame [m].
         rpy: Roll, pitch, yaw of the sensor's frame in the link's frame [rad]; rays leave along x.
-        range_min: Shortest distance it can tell [m]; None where it has no range.
-        range_max: Longest distance it can tell [m]; None where it has no range.
+        range_min: Shortest distance it can measure [m]; None where it has no range.
+        range_max: Longest distance it can measure [m]; None where it has no range.
         field_of_view: Full cone angle [rad]; None where it has none.
         axes: Measured axes of the sensor's frame, e.g. ``("x", "y", "z")``.
         assumed: Names of the fields that were assumed rather than known.
@@ -305,7 +305,7 @@ class BusSignal:
 
 @dataclass(frozen=True)
 class BusPoll:
-    """A request that makes a servo or a sensor tell its state, and moves nothing.
+    """A request for the state of a servo or a sensor, which moves nothing.
 
     Attributes:
         signals: Signal names with their raw numbers, before the DBC's scale; others are 0.
@@ -322,7 +322,7 @@ class Bus:
     Attributes:
         databases: DBC file names, relative to the robot TOML.
         bitrate: [bit/s].
-        polls: What has to be asked in each control tick; empty where the robot tells unasked.
+        polls: Requests of each control tick; empty where the robot sends unrequested.
     """
 
     databases: tuple[str, ...]

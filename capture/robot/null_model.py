@@ -1,6 +1,6 @@
 """Null model files: how identical modules would answer one gait, as a function of few parameters.
 
-Whoever has a model of the robot (the twin, or anything else) writes one; who analyses needs no
+A program with a model of the robot (the twin, or any other) writes it; the analysis needs no
 model then. With x = ln(theta / theta_0) of the parameters that all modules share, and y the vector
 of ln(response / command), log gain minus j lag, of the m driven joints::
 

@@ -140,8 +140,8 @@ def test_what_is_out_of_range_or_unknown_has_numbers_of_its_own():
     robot = load_robot("snake25")
     (frame,) = BusEncoder(robot, Direction.RX).encode({("ir01", Quantity.RANGE, ""): math.inf})
     database = cantools.database.load_string(dict(robot.databases)["snake25.dbc"], "dbc")
-    told = database.decode_message("ranges_1", frame["data"].tobytes())
-    assert told == {
+    codes = database.decode_message("ranges_1", frame["data"].tobytes())
+    assert codes == {
         "ir01": "nothing in range",
         **dict.fromkeys(("ir02", "ir03", "ir04"), "unknown"),
     }

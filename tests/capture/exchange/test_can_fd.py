@@ -366,7 +366,7 @@ def test_import_decodes_both_kinds(tmp_path: Path):
     assert (state.t_ns - command.t_ns).tolist() == [500_000] * 200
 
 
-def test_a_frame_too_short_for_its_signal_is_told(tmp_path: Path):
+def test_a_frame_too_short_for_its_signal_is_reported(tmp_path: Path):
     (tmp_path / "x.log").write_text(
         "(1.000000) can0 100##1" + "00" * 48 + " R\n(1.000100) can0 100#" + "00" * 8 + " R\n"
     )
@@ -429,7 +429,7 @@ def test_a_recording_keeps_and_decodes_both_kinds(tmp_path: Path):
             ],
         )
         sender = threading.Thread(target=send)
-        recorder.on_event(lambda *said: "connected" in said[3] and sender.start())
+        recorder.on_event(lambda *event: "connected" in event[3] and sender.start())
         recorder.run(StopRequest(), 60.0)
         sender.join()
     bus.shutdown()

@@ -128,7 +128,7 @@ def test_error_and_fd_frames_of_a_blf(tmp_path: Path):
         assert session.verdict == "degraded"
 
 
-def test_a_cut_blf_is_told(tmp_path: Path):
+def test_a_cut_blf_is_reported(tmp_path: Path):
     whole, cut = tmp_path / "whole.blf", tmp_path / "cut.blf"
     with can.BLFWriter(whole, max_container_size=1000) as writer:
         for i in range(300):
@@ -172,7 +172,7 @@ ROUNDS = 40
 
 @pytest.fixture(scope="module")
 def polled(tmp_path_factory):
-    """25 servos told and asked in turn every 10 ms, by foreign encoder and writer (ASC)."""
+    """25 servos commanded and polled in turn every 10 ms, by foreign encoder and writer (ASC)."""
     folder = tmp_path_factory.mktemp("polled")
     robot = load_robot("snake25")
     database = cantools.database.load_string(robot.databases[0][1], "dbc")

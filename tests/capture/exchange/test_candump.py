@@ -49,7 +49,7 @@ TIME = st.builds("{}.{:06d}".format, st.integers(0, 4_102_444_800), st.integers(
 LOG = st.lists(st.tuples(TIME, st.sampled_from(["can0", "vcan1"]), CONTENT), min_size=1)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(lines=LOG, ways=st.none() | st.lists(st.sampled_from("RT"), min_size=1))
 def test_what_is_read_is_written_the_same(lines, ways, tmp_path):
     text = "".join(

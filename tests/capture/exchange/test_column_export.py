@@ -189,8 +189,8 @@ def test_the_verb(polled, tmp_path: Path, capsys):
     assert undulog.run(arguments) == 2
     assert "x.csv exists already" in capsys.readouterr().err
     assert undulog.run([*arguments, "--force", "--json", "--topics", "/gait"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (said["rows"], said["topics"], said["warnings"]) == (200, {"/gait": 200}, [])
+    report = json.loads(capsys.readouterr().out)
+    assert (report["rows"], report["topics"], report["warnings"]) == (200, {"/gait": 200}, [])
     assert undulog.run([*arguments, "--force", "--bus", "can0"]) == 2
     assert "--bus is for CAN frames; a .csv file has joint columns" in capsys.readouterr().err
 

@@ -200,7 +200,7 @@ FIELDS = {
 
 
 def losses(frames, held, *, sub_us):
-    """The sentences that must be said, from the truth alone."""
+    """The sentences that must be reported, from the truth alone."""
     counts = {}
     for each in frames:
         kept = held(each)

@@ -192,7 +192,7 @@ def test_rosbags_reads_them(session_of_every_kind, tmp_path: Path):
     assert [bytes(m.data) for _, m in messages] == [bytes(row) for row in frames["data"]]
 
 
-def test_names_that_a_format_has_not_are_told(tmp_path: Path):
+def test_names_that_a_format_has_not_are_reported(tmp_path: Path):
     frames = every_kind()[:20]
     buses = {"can3": frames, "left-arm": frames, "0": frames}
     source = write_session(tmp_path / "run.mcap", buses)
@@ -209,7 +209,7 @@ def test_names_that_a_format_has_not_are_told(tmp_path: Path):
 @pytest.mark.parametrize(
     ("suffix", "words"), [(".blf", "written as received"), (".mcap", "on from_can_bus")]
 )
-def test_directions_that_are_none_are_told(suffix, words, tmp_path: Path):
+def test_directions_that_are_none_are_reported(suffix, words, tmp_path: Path):
     facts = {"import.directions": "none"}
     source = write_session(tmp_path / "run.mcap", {"can0": every_kind()[:20]}, **facts)
     report = export_log(source, tmp_path / f"x{suffix}")
@@ -307,9 +307,9 @@ def test_the_verb_says_what_is_lost(session_of_every_kind, tmp_path: Path, capsy
     ]
     arguments = ["log", "export", str(source), "-o", str(output), "--force", "--json"]
     assert undulog.run(arguments) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["warnings"] == ["18 error frames lose their direction"]
-    assert said["buses"] == {"can0": len(frames)}
+    report = json.loads(capsys.readouterr().out)
+    assert report["warnings"] == ["18 error frames lose their direction"]
+    assert report["buses"] == {"can0": len(frames)}
     arguments = ["log", "export", str(source), "-o", str(output), "--force", "--topics", "/x"]
     assert undulog.run(arguments) == 2
     assert "--topics is for tables; a .blf file has CAN frames" in capsys.readouterr().err

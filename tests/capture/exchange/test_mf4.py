@@ -144,7 +144,7 @@ def test_fields_that_a_group_may_lack(tmp_path: Path):
     assert log.directions is False
 
 
-def test_what_is_left_out_is_told(tmp_path: Path):
+def test_what_is_left_out_is_reported(tmp_path: Path):
     long_columns = {
         "ID": (("<u4",), 2),
         "DLC": (("u1",), 15),
@@ -214,8 +214,8 @@ def test_files_that_hold_no_frames(tmp_path: Path):
 
 def test_a_damaged_file_is_one_error_and_nothing_else(tmp_path: Path, capfd, monkeypatch):
     """Read or refused, whatever is damaged; neither asammdf nor the interpreter says a word."""
-    said = []
-    monkeypatch.setattr(sys, "unraisablehook", said.append)
+    messages = []
+    monkeypatch.setattr(sys, "unraisablehook", messages.append)
     path = tmp_path / "log.mf4"
     with can.MF4Writer(path) as writer:
         for i in range(300):
@@ -232,7 +232,7 @@ def test_a_damaged_file_is_one_error_and_nothing_else(tmp_path: Path, capfd, mon
             assert str(path) in str(error)  # noqa: PT017
             refused += 1
     assert refused > 20
-    assert said == []
+    assert messages == []
     assert capfd.readouterr() == ("", "")
 
 

@@ -449,7 +449,7 @@ def test_what_arming_lacks_is_named_with_an_example():
     assert "max_rate" in missing_limits(parse_robot(single, "worm.toml", {}))
 
 
-def test_faults_of_safety_are_told_together():
+def test_faults_of_safety_are_reported_together():
     text = (
         MINIMAL
         + """
@@ -462,11 +462,11 @@ on_fault = "jump"
 max_rate = 1.0
 """
     )
-    told = "\n".join(faults_of(text))
-    assert "safety.max_rate: found 0.0; valid: a finite number > 0" in told
-    assert "safety.max_curent: found an unknown key" in told
-    assert 'safety.on_fault: found "jump"; valid: hold, ramp-down' in told
-    assert "safety_of.joint03: found an unknown key" in told
+    text = "\n".join(faults_of(text))
+    assert "safety.max_rate: found 0.0; valid: a finite number > 0" in text
+    assert "safety.max_curent: found an unknown key" in text
+    assert 'safety.on_fault: found "jump"; valid: hold, ramp-down' in text
+    assert "safety_of.joint03: found an unknown key" in text
     alone = MINIMAL + "[safety_of.joint01]\nmax_rate = 1.0\n"
     assert "safety_of: found a table; valid: leave it out" in "\n".join(faults_of(alone))
 
