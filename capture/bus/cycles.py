@@ -65,19 +65,16 @@ class RoundGatherer:
         Returns:
             The rounds that are complete now; the last one may still grow and is kept back.
         """
-        self._append(t_ns, joint, values)
+        self._t_ns = np.concatenate([self._t_ns, t_ns])
+        self._joint = np.concatenate([self._joint, joint])
+        self._values = np.concatenate([self._values, values])
         starts = _round_starts(self._t_ns, self._joint, self._joints)
         return self._take(starts[:-1], starts[-1] if starts else 0)
 
     def finish(self) -> Rounds:
-        """The last round, complete or not."""
+        """Return the last round, complete or not."""
         starts = _round_starts(self._t_ns, self._joint, self._joints)
         return self._take(starts, len(self._t_ns))
-
-    def _append(self, t_ns: IntArray, joint: IntArray, values: FloatArray) -> None:
-        self._t_ns = np.concatenate([self._t_ns, t_ns])
-        self._joint = np.concatenate([self._joint, joint])
-        self._values = np.concatenate([self._values, values])
 
     def _take(self, starts: list[int], stop: int) -> Rounds:
         """Turn the samples before ``stop`` into rounds and keep the rest."""
@@ -97,7 +94,7 @@ class RoundGatherer:
 
 
 def _round_starts(t_ns: IntArray, joint: IntArray, joints: int) -> list[int]:
-    """Index of the first sample of each round.
+    """Return index of the first sample of each round.
 
     A round that starts at s ends at the first sample i whose joint was last seen at s or later, or
     that is too far from s in time. Of more samples than there are joints one must be such a one,

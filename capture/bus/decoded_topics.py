@@ -27,11 +27,8 @@ from ..robot.model import BusSignal, Quantity, Robot, Sensor, SensorKind
 from .cycles import RoundGatherer, Rounds
 from .decoding import BusDecoder, DecodedSignals
 
-SAMPLE_OFFSET_TOPIC = "/joint_sample_offset"
-"""Sample time minus stamp of what the joints measure [s]."""
-
-COMMAND_OFFSET_TOPIC = "/joint_command_offset"
-"""Send time minus stamp of what the joints were told [s]."""
+_SAMPLE_OFFSET_TOPIC = "/joint_sample_offset"  # sample time minus stamp of measurements [s]
+_COMMAND_OFFSET_TOPIC = "/joint_command_offset"  # send time minus stamp of commands [s]
 
 JOINT_TOPIC: dict[Quantity, str] = {
     Quantity.COMMAND: "/joint_commands",
@@ -47,7 +44,6 @@ JOINT_TOPIC: dict[Quantity, str] = {
 _BESIDE_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
 _SCALAR = (SensorKind.IR, SensorKind.SONAR)
 _STAMPS_KEPT = 10_000
-_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -70,31 +66,17 @@ class DecodedTopics:
     def __init__(self, writer: SessionWriter, robot: Robot, decoder: BusDecoder) -> None:
         """Plan the topics; each is opened when its first sample comes."""
         joints = robot.joint_names
-        offsets = {
-            topic: _OffsetTopic(writer, topic, joints)
-            for topic in (SAMPLE_OFFSET_TOPIC, COMMAND_OFFSET_TOPIC)
-        }
-        self._groups = [
-            _JointGroup(
-                writer,
-                joints,
-                topics,
-                offsets[
-                    COMMAND_OFFSET_TOPIC
-                    if topics[0][0] is Quantity.COMMAND
-                    else SAMPLE_OFFSET_TOPIC
-                ],
-            )
-            for topics in _groups_of(decoder, joints)
-        ]
+        sampled = _OffsetTopic(writer, _SAMPLE_OFFSET_TOPIC, joints)
+        commanded = _OffsetTopic(writer, _COMMAND_OFFSET_TOPIC, joints)
+        self._groups: list[_JointGroup] = []
+        for topics in _groups_of(decoder, joints):
+            offsets = commanded if topics[0][0] is Quantity.COMMAND else sampled
+            self._groups.append(_JointGroup(writer, joints, topics, offsets))
         self._sensors = [_SensorTopic(writer, sensor) for sensor in robot.sensors]
         self._sensor_targets = _Targets([sensor.name for sensor in robot.sensors])
 
     def add(self, samples: Sequence[DecodedSignals]) -> list[Message]:
         """Take the samples of one block of frames.
-
-        Args:
-            samples: As :meth:`.capture.bus.decoding.BusDecoder.decode` gives them.
 
         Returns:
             The messages that are complete now, in no order.
@@ -104,17 +86,18 @@ class DecodedTopics:
             messages += group.add(samples)
         pieces: dict[int, list[_Piece]] = {}
         for decoded in samples:
-            for member, sensor in self._sensor_targets.members(decoded.signals):
+            index = self._sensor_targets.index(decoded.signals)
+            for member in self._sensor_targets.members(decoded.signals):
                 own = decoded.member == member
                 column = "xyz".index(decoded.signals[0].axis or "x")
                 piece = (column, decoded.rows[own], decoded.t_ns[own], decoded.values[own])
-                pieces.setdefault(sensor, []).append(piece)
+                pieces.setdefault(int(index[member]), []).append(piece)
         for sensor, own_pieces in pieces.items():
             messages += self._sensors[sensor].messages(own_pieces)
         return messages
 
     def finish(self) -> list[Message]:
-        """The messages that waited for more samples."""
+        """Return the messages that waited for more samples."""
         return [message for group in self._groups for message in group.finish()]
 
     def forget(self) -> None:
@@ -123,38 +106,36 @@ class DecodedTopics:
             group.forget()
 
 
+_Block: TypeAlias = tuple[IntArray, IntArray, IntArray, FloatArray]
+"""Samples of joints: rows, times [Unix ns], joints, values."""
+
 _Piece: TypeAlias = tuple[int, IntArray, IntArray, FloatArray]
 """Samples of one axis of a sensor: column, rows, times [Unix ns], values."""
 
 
 class _Targets:
-    """Which of our targets the members of decoded signals are."""
+    """Index of some targets, joints or sensors, by the members of decoded signals."""
 
     def __init__(self, targets: Sequence[str]) -> None:
         self._index = {target: k for k, target in enumerate(targets)}
-        self._known: dict[int, tuple[tuple[BusSignal, ...], IntArray]] = {}
-        self._members: dict[int, list[tuple[int, int]]] = {}
+        self._known: dict[int, tuple[tuple[BusSignal, ...], IntArray, list[int]]] = {}
 
-    def members(self, signals: tuple[BusSignal, ...]) -> list[tuple[int, int]]:
-        """Member and target of each entry whose target is ours."""
-        found = self._members.get(id(signals))
-        if found is None:
-            index: list[int] = self.index(signals).tolist()
-            found = [(member, target) for member, target in enumerate(index) if target >= 0]
-            self._members[id(signals)] = found
-        return found
-
-    def of(self, decoded: DecodedSignals) -> IntArray:
-        """Index of each sample's target, -1 for others, shape (n,)."""
-        return self.index(decoded.signals)[decoded.member]
+    def members(self, signals: tuple[BusSignal, ...]) -> list[int]:
+        """Return the members whose target is one of these."""
+        return self._of(signals)[2]
 
     def index(self, signals: tuple[BusSignal, ...]) -> IntArray:
-        """Index of each entry's target, -1 for others."""
+        """Return the index of each member's target, -1 for others."""
+        return self._of(signals)[1]
+
+    def _of(
+        self, signals: tuple[BusSignal, ...]
+    ) -> tuple[tuple[BusSignal, ...], IntArray, list[int]]:
         known = self._known.get(id(signals))  # kept with its key, so that the id stays its own
         if known is None:
-            index = [self._index.get(signal.target, -1) for signal in signals]
-            known = self._known[id(signals)] = (signals, np.array(index, dtype=np.int64))
-        return known[1]
+            index = np.array([self._index.get(s.target, -1) for s in signals], dtype=np.int64)
+            known = self._known[id(signals)] = (signals, index, np.flatnonzero(index >= 0).tolist())
+        return known
 
 
 class _OffsetTopic:
@@ -168,7 +149,7 @@ class _OffsetTopic:
     def place(
         self, stamp_ns: int, sampled_ns: int, offset_s: FloatArray
     ) -> tuple[int, list[Message]]:
-        """Find a stamp for a round; returns it with the offset message, unless written already.
+        """Return a stamp for a round, and the offset message unless it was written before.
 
         Rounds of several topics that come in the same frames share a stamp and its offsets. A
         stamp that stands for other offsets is left to them: this round gets one that is earlier
@@ -194,7 +175,7 @@ class _OffsetTopic:
         return stamp_ns, [Message(self._topic, sampled_ns, write)]
 
     def forget(self) -> None:
-        """Write offsets again: the messages of the last call may be lost."""
+        """Write all further offsets: the messages of the last call may be lost."""
         self._written.clear()
 
 
@@ -233,17 +214,15 @@ class _JointGroup:
         self._gatherer.forget()
         self._offsets.forget()
 
-    def _blocks(
-        self, samples: Sequence[DecodedSignals]
-    ) -> list[tuple[IntArray, IntArray, IntArray, FloatArray]]:
-        """Rows, times, joints, values; signals that come in the same frames side by side."""
-        blocks: dict[int, tuple[IntArray, IntArray, IntArray, FloatArray]] = {}
+    def _blocks(self, samples: Sequence[DecodedSignals]) -> list[_Block]:
+        """Return rows, times, joints, values; signals of the same frames side by side."""
+        blocks: dict[int, _Block] = {}
         for decoded in samples:
             quantity = decoded.signals[0].quantity
-            if quantity not in self._columns or (self._targets.index(decoded.signals) < 0).all():
+            if quantity not in self._columns or not self._targets.members(decoded.signals):
                 continue
             block = blocks.get(id(decoded.rows))
-            joint = self._targets.of(decoded)
+            joint = self._targets.index(decoded.signals)[decoded.member]
             if block is None or (block[2] != joint).any():
                 values = np.full((len(joint), len(self._columns)), np.nan)
                 block = (decoded.rows, decoded.t_ns, joint, values)
@@ -257,10 +236,8 @@ class _JointGroup:
             kept.append((rows[own], t_ns[own], joint[own], values[own]))
         return kept
 
-    def _together(
-        self, blocks: Sequence[tuple[IntArray, IntArray, IntArray, FloatArray]]
-    ) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-        """One block; samples of one joint in one frame share a row."""
+    def _together(self, blocks: Sequence[_Block]) -> _Block:
+        """Join blocks; samples of one joint in one frame share a row."""
         rows = np.concatenate([block[0] for block in blocks])
         t_ns = np.concatenate([block[1] for block in blocks])
         joint = np.concatenate([block[2] for block in blocks])
@@ -327,7 +304,7 @@ class _JointTopic:
 
 
 def _groups_of(decoder: BusDecoder, joints: tuple[str, ...]) -> list[list[tuple[Quantity, ...]]]:
-    """The JointState topics, as their quantities, grouped by the frames that bring them.
+    """Return the JointState topics, as their quantities, grouped by the frames that bring them.
 
     Position comes first where velocity or effort come with it.
     """
@@ -344,7 +321,7 @@ def _groups_of(decoder: BusDecoder, joints: tuple[str, ...]) -> list[list[tuple[
 
 
 def _topics_of(decoder: BusDecoder, joints: tuple[str, ...]) -> list[tuple[Quantity, ...]]:
-    """The quantities of each JointState topic; position first where others come with it."""
+    """Return the quantities of each JointState topic; position first where others come with it."""
     with_position = [
         quantity
         for quantity in _BESIDE_POSITION
@@ -360,7 +337,7 @@ def _topics_of(decoder: BusDecoder, joints: tuple[str, ...]) -> list[tuple[Quant
 def _comes_with(
     decoder: BusDecoder, joints: tuple[str, ...], quantity: Quantity, other: Quantity
 ) -> bool:
-    """Whether every joint that has the quantity has it in the frames of the other one."""
+    """Return whether every joint that has the quantity has it in the frames of the other one."""
     own = [(joint, decoder.carriers(joint, quantity)) for joint in joints]
     return any(carriers for _, carriers in own) and all(
         not carriers or carriers == decoder.carriers(joint, other) for joint, carriers in own
@@ -375,7 +352,7 @@ class _SensorTopic:
         self._write: Callable[[FloatArray, int, int], None] | None = None
 
     def messages(self, pieces: Sequence[_Piece]) -> list[Message]:
-        """Values of one frame side by side, one message a frame."""
+        """Join the values of each frame into one message."""
         if not any(len(rows) for _, rows, _, _ in pieces):
             return []
         if self._write is None:

@@ -8,7 +8,7 @@ names is counted, by reason, in a :class:`FrameTally`.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TypeAlias
 
 import numpy as np
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from ..common.arrays import BoolArray, FloatArray, IntArray
 from ..log.health.bus_tally import counts_text
 from ..log.messages.frames import (
-    DIR_RX,
     DIR_TX,
     ERROR_FLAG,
     EXTENDED_FLAG,
@@ -30,7 +29,6 @@ from ..robot.bus_map import SESSION_UNIT
 from ..robot.model import BusSignal, Direction, Quantity, Robot
 from .map_entry import MapEntry, bus_messages, compile_entry, frame_id
 
-_WAY = {Direction.RX: DIR_RX, Direction.TX: DIR_TX}
 _TX_BIT = 1 << 32  # above the 32 bits of id_flags
 Carrier: TypeAlias = tuple[int, tuple[tuple[int, ...], ...]]
 """One kind of frame: identifier and direction, and the multiplexer values that select a signal."""
@@ -61,16 +59,16 @@ class DecodedSignals:
 
 @dataclass
 class FrameTally:
-    """What became of the frames.
+    """Count of frames by result.
 
     Attributes:
         decoded: Frames with at least one sample.
         remote: Remote frames; they carry no data.
-        unknown: Identifier to number of data frames that no database knows.
+        unknown: Identifier to number of data frames that are in no database.
         silent: Identifier to number of data frames that the databases know and whose contents the
             map doesn't name, e.g. requests.
         short: Signal, as ``message.signal``, to number of frames too short to hold it.
-        undirected: Identifier to number of frames that only their direction could tell apart, in a
+        undirected: Identifier to number of frames that differ only in their direction, in a
             log without directions.
     """
 
@@ -85,17 +83,11 @@ class FrameTally:
 
     def add(self, other: FrameTally) -> None:
         """Count further frames."""
-        self.frames += other.frames
-        self.decoded += other.decoded
-        self.errors += other.errors
-        self.remote += other.remote
-        self.unknown += other.unknown
-        self.silent += other.silent
-        self.short += other.short
-        self.undirected += other.undirected
+        for item in fields(self):
+            setattr(self, item.name, getattr(self, item.name) + getattr(other, item.name))
 
     def problems(self) -> list[str]:
-        """One sentence for each kind of frame that should not be there or lost its samples."""
+        """Return a sentence for each kind of frame that is an error or lost its samples."""
         lines: list[str] = []
         if self.errors:
             lines.append(f"{self.errors} error frames")
@@ -112,7 +104,7 @@ class FrameTally:
         return lines
 
     def notes(self) -> list[str]:
-        """One sentence for each kind of frame that is in order and brings no sample."""
+        """Return a sentence for each kind of frame that is valid and has no sample."""
         lines: list[str] = []
         if self.remote:
             lines.append(f"{self.remote} remote frames, which carry no data")
@@ -182,15 +174,14 @@ class BusDecoder:
         self._families, places = _families(self._carried)
         keys = sorted(known | {identifier | _TX_BIT for identifier in known})
         self._keys = np.array(keys, dtype=np.int64)
-        found = [places.get(key, (_SILENT, 0)) for key in keys]
         found = [
-            (_UNDIRECTED, 0) if key & ~_TX_BIT in undirected else place
-            for key, place in zip(keys, found, strict=True)
+            (_UNDIRECTED, 0) if key & ~_TX_BIT in undirected else places.get(key, (_SILENT, 0))
+            for key in keys
         ]
         self._family, self._member = np.array(found, dtype=np.int64).reshape(-1, 2).T
 
     def carriers(self, target: str, quantity: Quantity) -> frozenset[Carrier]:
-        """What kinds of frame bring a quantity; equal sets mean the same frames.
+        """Return the kinds of frame that carry a quantity; equal sets mean the same frames.
 
         Args:
             target: Name of a joint or sensor.
@@ -212,9 +203,6 @@ class BusDecoder:
         Args:
             frames: Records of :data:`.capture.log.messages.frames.FRAME_DTYPE`, or of
                 :data:`.capture.log.messages.frames.FD_FRAME_DTYPE`, shape (n,).
-
-        Returns:
-            The samples of the map entries that occur, and what became of the frames.
         """
         id_flags = frames["id_flags"]
         is_error = (id_flags & np.uint32(ERROR_FLAG)) != 0
@@ -247,7 +235,7 @@ class BusDecoder:
 def _families(
     carried: dict[int, list[tuple[BusSignal, MapEntry]]],
 ) -> tuple[list[_Family], dict[int, tuple[int, int]]]:
-    """Frames with equal entries together; and the family and member number of each key."""
+    """Group frames with equal entries; return also the family and member number of each key."""
     members: dict[tuple[MapEntry, ...], list[int]] = {}
     for key, pairs in carried.items():
         members.setdefault(tuple(entry for _, entry in pairs), []).append(key)
@@ -302,7 +290,7 @@ def _numbers(member: IntArray) -> list[int]:
 
 
 def _selected(data: NDArray[np.uint8], size: NDArray[np.uint8], entry: MapEntry) -> BoolArray:
-    """Frames that are meant to carry the entry: every multiplexer above it selects it.
+    """Return which frames carry the entry by the multiplexers above it.
 
     A frame too short for a multiplexer counts as selected, hence as too short.
     """

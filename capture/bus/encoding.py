@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -31,15 +31,15 @@ if TYPE_CHECKING:
     from cantools.database.can.signal import Signal
 
 
-_MOST_POLL_BYTES = 8
+_MOST_BYTES = 8
 
 
 def poll_frames(robot: Robot) -> FrameArray:
-    """The frames that ask for the robot's state.
+    """Return the frames that request the robot's state.
 
     Returns:
         Records of :data:`.FRAME_DTYPE`, without times, in the order of the map;
-        none where nothing has to be asked.
+        none where no request is needed.
 
     Raises:
         DataError: If the robot has no bus, or a request that is no classic CAN frame.
@@ -48,25 +48,19 @@ def poll_frames(robot: Robot) -> FrameArray:
     frames = empty_frames(len(bus.polls))
     frames["dir"] = DIR_TX
     for frame, poll in zip(frames, bus.polls, strict=True):
-        message = messages[poll.message]
-        if message.length > _MOST_POLL_BYTES:
-            raise DataError(
-                f"{poll.message} of {robot.name} is a CAN FD frame; only classic are sent"
-            )
+        message = _classic(messages, poll.message, robot)
         fields = {each.name: BitField.of(each) for each in message.signals}
         word = 0
         for name, number in poll.signals:
             word |= fields[name].placed(number, message.length)
         frame["id_flags"], frame["dlc"] = frame_id(message), message.length
-        data = word.to_bytes(message.length, "little").ljust(_MOST_POLL_BYTES, b"\0")
+        data = word.to_bytes(message.length, "little").ljust(_MOST_BYTES, b"\0")
         frame["data"] = np.frombuffer(data, np.uint8)
     return frames
 
 
 BusValue: TypeAlias = tuple[str, Quantity, str]
 """What a value is: name of a joint or sensor, quantity, and axis of a vector quantity, else ""."""
-
-_MOST_BYTES = 8
 
 
 @dataclass(frozen=True)
@@ -78,16 +72,13 @@ class _Slot:
 
     def placed(self, value: float, size: int) -> int:
         if value == math.inf and self.entry.out_of_range is not None:
-            return self._code(self.entry.out_of_range, size)
+            return self.code(self.entry.out_of_range, size)
         physical = self.entry.physical(value)
         bits = self.entry.bits.raw_bits(physical, self.within)
         return self.entry.bits.placed(bits, size)
 
-    def unknown(self, size: int) -> int | None:
-        """What stands for no value, at its place; None where nothing does."""
-        return None if self.entry.unknown is None else self._code(self.entry.unknown, size)
-
-    def _code(self, raw: int, size: int) -> int:
+    def code(self, raw: int, size: int) -> int:
+        """Return a raw number at its place."""
         bits = self.entry.bits
         return bits.placed(raw & ((1 << bits.length) - 1), size)
 
@@ -99,29 +90,30 @@ class _Frame:
     Attributes:
         fixed: Multiplexers and initial values of what the map doesn't name, at their places.
         slots: The values that it carries.
-        last: The last of each, at its place.
-        unknown: What stands for no value of those that have it, at its place.
+        default: Bits of each if it is not given, at its place: those for an unknown value, else
+            those sent last.
     """
 
     id_flags: int
     size: int
     fixed: int
     slots: dict[BusValue, _Slot]
-    last: dict[BusValue, int] = field(default_factory=dict[BusValue, int])
-    unknown: dict[BusValue, int] = field(default_factory=dict[BusValue, int])
+    default: dict[BusValue, int]
 
     def data(self, values: Mapping[BusValue, float]) -> bytes | None:
-        """Its bytes, None if no value is of this frame."""
+        """Return its bytes, None if no value is of this frame."""
         given = False
         word = self.fixed
         for key, slot in self.slots.items():
             value = values.get(key, math.nan)
-            if not math.isnan(value):
-                self.last[key] = slot.placed(value, self.size)
-                given = True
-                word |= self.last[key]
-            else:
-                word |= self.unknown.get(key, self.last[key])
+            if math.isnan(value):
+                word |= self.default[key]
+                continue
+            given = True
+            bits = slot.placed(value, self.size)
+            word |= bits
+            if slot.entry.unknown is None:
+                self.default[key] = bits
         return word.to_bytes(self.size, "little") if given else None
 
 
@@ -146,9 +138,7 @@ class BusEncoder:
                 carried.setdefault(signal.message, []).append(signal)
         self._frames: list[_Frame] = []
         for name, signals in carried.items():
-            if messages[name].length > _MOST_BYTES:
-                raise DataError(f"{name} of {robot.name} is a CAN FD frame; only classic are sent")
-            self._frames += _frames_of(messages[name], signals)
+            self._frames += _frames_of(_classic(messages, name, robot), signals)
         self._carrying: dict[BusValue, list[int]] = {}
         for number, frame in enumerate(self._frames):
             for key in frame.slots:
@@ -189,13 +179,17 @@ class BusEncoder:
         return frames
 
 
+def _classic(messages: Mapping[str, Message], name: str, robot: Robot) -> Message:
+    if messages[name].length > _MOST_BYTES:
+        raise DataError(f"{name} of {robot.name} is a CAN FD frame; only classic are sent")
+    return messages[name]
+
+
 def _frames_of(message: Message, signals: list[BusSignal]) -> list[_Frame]:
-    """One frame for each combination of multiplexer values that the entries need."""
+    """Return one frame for each combination of multiplexer values that the entries need."""
     dbc = {each.name: each for each in message.signals}
     entries = {signal: compile_entry(message, signal) for signal in signals}
-    selections: dict[tuple[tuple[BitField, int], ...], None] = {}
-    for entry in entries.values():
-        selections[_selection(entry)] = None
+    selections = dict.fromkeys(_selection(entry) for entry in entries.values())
     if len(selections) > 1:
         selections.pop((), None)  # what is in every frame needs none of its own
     frames: list[_Frame] = []
@@ -213,26 +207,24 @@ def _frames_of(message: Message, signals: list[BusSignal]) -> list[_Frame]:
             (signal.target, signal.quantity, signal.axis): _slot(entry, dbc[signal.signal])
             for signal, entry in own.items()
         }
-        last = {
+        default = {
             key: _initial(dbc[signal.signal], message.length)
             for key, signal in zip(slots, own, strict=True)
         }
-        unknown = {
-            key: code
-            for key, slot in slots.items()
-            if (code := slot.unknown(message.length)) is not None
-        }
-        frames.append(_Frame(frame_id(message), message.length, fixed, slots, last, unknown))
+        for key, slot in slots.items():
+            if slot.entry.unknown is not None:
+                default[key] = slot.code(slot.entry.unknown, message.length)
+        frames.append(_Frame(frame_id(message), message.length, fixed, slots, default))
     return frames
 
 
 def _selection(entry: MapEntry) -> tuple[tuple[BitField, int], ...]:
-    """The multiplexers above an entry, each with the least value that selects it."""
+    """Return the multiplexers above an entry, each with the least value that selects it."""
     return tuple((bits, min(identifiers)) for bits, identifiers in entry.conditions)
 
 
 def _selected(conditions: Conditions, chosen: Mapping[BitField, int]) -> bool:
-    """Whether the multiplexers' values select a signal."""
+    """Return whether the multiplexers' values select a signal."""
     return all(chosen.get(bits) in valid for bits, valid in conditions)
 
 
@@ -243,7 +235,7 @@ def _slot(entry: MapEntry, signal: Signal) -> _Slot:
 
 
 def _initial(signal: Signal, size: int) -> int:
-    """A signal's initial value at its place; zero where the DBC gives none."""
+    """Return a signal's initial value at its place; zero where the DBC gives none."""
     bits = BitField.of(signal)
     if signal.initial is None or not isinstance(signal.initial, int | float):
         return 0

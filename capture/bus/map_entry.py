@@ -54,7 +54,7 @@ class BitField:
 
     @classmethod
     def of(cls, signal: Signal) -> BitField:
-        """The field of a DBC signal."""
+        """Return the field of a DBC signal."""
         return cls(
             start=signal.start,
             length=signal.length,
@@ -77,7 +77,7 @@ class BitField:
         return 8 * (self.start // 8) + 7 - self.start % 8
 
     def raw(self, data: NDArray[np.uint8]) -> NDArray[Any]:
-        """The bits as numbers, not yet scaled.
+        """Return the bits as numbers, not yet scaled.
 
         Args:
             data: Data bytes, shape (n, k) with k of 8 or more, C-contiguous; ``size`` is at most k.
@@ -103,7 +103,7 @@ class BitField:
         return top >> np.uint64(unused)
 
     def _at_top(self, data: NDArray[np.uint8], unused: int) -> NDArray[np.uint64]:
-        """The field at the top of words, out of more than 8 bytes.
+        """Return the field at the top of words, out of more than 8 bytes.
 
         A word is taken where the field begins; one that doesn't begin with a byte may reach into a
         ninth.
@@ -126,7 +126,7 @@ class BitField:
         return words << np.uint64(unused)
 
     def values(self, data: NDArray[np.uint8]) -> FloatArray:
-        """The physical values.
+        """Return the physical values.
 
         Args:
             data: Data bytes, shape (n, k) with k of 8 or more, C-contiguous; ``size`` is at most k.
@@ -138,10 +138,7 @@ class BitField:
             return self.raw(data).astype(np.float64) * self.scale + self.offset
 
     def raw_range(self, lower: float = -math.inf, upper: float = math.inf) -> tuple[float, float]:
-        """The least and the greatest raw number of a range of physical values.
-
-        Args:
-            lower: Least physical value that is allowed.
+        """Return the least and the greatest raw number of a range of physical values.
 
         Returns:
             Whole numbers that the field can hold; of a floating field any numbers.
@@ -156,7 +153,7 @@ class BitField:
         return max(least, first), min(greatest, last)
 
     def raw_bits(self, value: float, within: tuple[float, float] | None = None) -> int:
-        """The bits of a physical value, the inverse of :meth:`values`.
+        """Return the bits of a physical value, the inverse of :meth:`values`.
 
         Args:
             value: Not NaN; what the field can't hold becomes the nearest that it can.
@@ -175,10 +172,7 @@ class BitField:
         return int(number.view(_UNSIGNED[self.length]))
 
     def placed(self, bits: int, size: int) -> int:
-        """Bits at their place in a frame's data.
-
-        Args:
-            bits: Of this field, ``length`` of them.
+        """Return bits at their place in a frame's data.
 
         Returns:
             The data as one little-endian number, zero elsewhere: those of several fields are
@@ -227,7 +221,7 @@ class MapEntry:
         return tuple(identifiers for _, identifiers in self.conditions)
 
     def values(self, data: NDArray[np.uint8]) -> FloatArray:
-        """Values in the session's unit.
+        """Return values in the session's unit.
 
         Args:
             data: Data bytes, shape (n, k) with k of 8 or more, C-contiguous.
@@ -243,25 +237,12 @@ class MapEntry:
         return values
 
     def physical(self, value: float) -> float:
-        """The DBC's physical value of a value: the inverse of what :meth:`values` does with it.
-
-        Args:
-            value: In the session's unit.
-
-        Returns:
-            The value that the DBC's own scale and offset apply to.
-        """
+        """Return the DBC's physical value of a value: the inverse of :meth:`values`."""
         return ((value - self.unit.offset) / self.unit.factor - self.offset) / self.scale
 
 
 def bus_messages(robot: Robot) -> tuple[Bus, Mapping[str, Message]]:
-    """A robot's bus map and the messages of its databases.
-
-    Args:
-        robot: The robot; its databases have been checked when it was read.
-
-    Returns:
-        The map, and message name to message.
+    """Return a robot's bus map, and the messages of its databases by name.
 
     Raises:
         DataError: If the robot has no bus, or not the databases that its map needs.
@@ -278,19 +259,12 @@ def bus_messages(robot: Robot) -> tuple[Bus, Mapping[str, Message]]:
 
 
 def frame_id(message: Message) -> int:
-    """A message's identifier with the flags of :mod:`.capture.log.messages.frames`."""
+    """Return a message's identifier with the flags of :mod:`.capture.log.messages.frames`."""
     return message.frame_id | (EXTENDED_FLAG if message.is_extended_frame else 0)
 
 
 def conditions_of(signal: Signal, by_name: Mapping[str, Signal]) -> Conditions:
-    """What selects a signal.
-
-    Args:
-        by_name: All signals of its message.
-
-    Returns:
-        The multiplexers above it, the nearest first.
-    """
+    """Return the multiplexers that select a signal of a message, the nearest first."""
     conditions: list[tuple[BitField, tuple[int, ...]]] = []
     while signal.multiplexer_signal is not None:
         identifiers = tuple(signal.multiplexer_ids or ())
@@ -300,11 +274,7 @@ def conditions_of(signal: Signal, by_name: Mapping[str, Signal]) -> Conditions:
 
 
 def compile_entry(message: Message, signal: BusSignal) -> MapEntry:
-    """Compile one entry.
-
-    Args:
-        message: The message that carries it.
-    """
+    """Compile one entry."""
     by_name = {each.name: each for each in message.signals}
     wanted = by_name[signal.signal]
     bits = BitField.of(wanted)

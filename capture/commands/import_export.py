@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from ..common.console import echo, emit_json
 from ..common.errors import ImportFormatError, UsageError
-from ..common.files import is_file
+from ..common.files import check_output, is_file
 
 if TYPE_CHECKING:
     from ..exchange.csv_import import ColumnMap
@@ -51,14 +51,13 @@ def import_log(
         force: Replace an existing output.
         json: Report as one JSON object.
     """
-    from ..common.console import refuse_existing
     from ..common.process import interruptible
     from ..exchange.can_import import import_can
     from ..exchange.csv_import import import_csv
     from ..robot.description import load_robot
 
-    _require_mcap(output)
-    refuse_existing(output, force=force)
+    why = f"a session is an .mcap file, not {output.suffix or 'nameless'}"
+    check_output(output, (".mcap",), why, force=force)
     described = load_robot(robot)
     column_map = _column_map(log, described, columns, map_)
     if column_map is not None and bus is not None:
@@ -138,16 +137,14 @@ def export_log(
         facts = {"source": str(session), "output": str(output), **counts, "warnings": warnings}
         emit_json(facts)
         return
-    echo(f"{output}: {what}")
-    for warning in warnings:
-        echo(f"  warning: {warning}")
+    echo(f"{output}: {what}", *(f"  warning: {warning}" for warning in warnings))
 
 
 def _column_map(
     log: Path, robot: Robot, columns: Path | None, options: tuple[str, ...]
 ) -> ColumnMap | None:
-    """The column map of a CSV log; None for a log of CAN frames."""
-    from ..exchange.csv_import import is_frame_csv
+    """Return the column map of a CSV log; None for a log of CAN frames."""
+    from ..exchange.csv_import import column_map_from_options, is_frame_csv, read_column_map
 
     if not is_file(log):
         raise ImportFormatError(log, "no such file")
@@ -155,19 +152,12 @@ def _column_map(
         if columns is not None or options:
             raise UsageError(f"{log} holds CAN frames; --columns and --map are for other CSV logs")
         return None
-    from ..exchange.csv_import import column_map_from_options, read_column_map
-
     if (columns is None) == (not options):
         given = "not both" if options else "to describe its columns"
         raise UsageError(f"{log} needs --columns MAP.toml or --map options, {given}")
     if columns is not None:
         return read_column_map(columns, robot)
     return column_map_from_options(options, robot)
-
-
-def _require_mcap(output: Path) -> None:
-    if output.suffix.lower() != ".mcap":
-        raise UsageError(f"{output}: a session is an .mcap file, not {output.suffix or 'nameless'}")
 
 
 def _print_import(report: ImportReport) -> None:
@@ -181,7 +171,5 @@ def _print_import(report: ImportReport) -> None:
     width = max(map(len, report.samples), default=0)
     for topic, count in sorted(report.samples.items()):
         echo(f"  {topic:<{width}}  {count} messages")
-    for problem in report.problems:
-        echo(f"  problem: {problem}")
-    for note in report.notes:
-        echo(f"  note: {note}")
+    echo(*(f"  problem: {problem}" for problem in report.problems))
+    echo(*(f"  note: {note}" for note in report.notes))

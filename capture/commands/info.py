@@ -21,14 +21,7 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
 
 
 def package_version(name: str) -> str | None:
-    """Version of an installed package.
-
-    Args:
-        name: Its name in the package index.
-
-    Returns:
-        The version, or None where it is not installed.
-    """
+    """Return the version of a package, None if it is not installed."""
     try:
         return version(name)
     except PackageNotFoundError:
@@ -36,11 +29,7 @@ def package_version(name: str) -> str | None:
 
 
 def base_versions() -> dict[str, str]:
-    """Python and the packages that every result depends on, for provenance.
-
-    Returns:
-        Name to version.
-    """
+    """Return the versions of Python and the packages that every result depends on."""
     found = {name: package_version(name) for name in _BASE}
     return {"python": platform.python_version()} | {k: v for k, v in found.items() if v}
 

@@ -41,19 +41,16 @@ def log_check(file: Path, /, *, json: bool = False) -> int:
 
 
 def as_json(health: SessionHealth) -> dict[str, Any]:
-    """A session's health as plain JSON values.
-
-    Args:
-        health: What was measured.
+    """Return a session's health as plain JSON values.
 
     Returns:
         ``verdict``, ``reasons``, ``notes``, ``stored``, ``session``, ``file``, ``channels``,
         ``series``, ``joints``, ``buses``, ``sources``; what can't be computed is null.
     """
-    series: list[dict[str, Any]] = []
-    for each in health.series:
-        timing = asdict(each.timing) | {"rate_hz": each.timing.rate_hz}
-        series.append(asdict(each) | {"timing": timing})
+    series = [
+        asdict(each) | {"timing": asdict(each.timing) | {"rate_hz": each.timing.rate_hz}}
+        for each in health.series
+    ]
     return {
         "verdict": health.verdict,
         "reasons": list(health.reasons),
@@ -84,16 +81,12 @@ def _print(health: SessionHealth) -> None:
     count = len(health.reasons)
     why = f", for {count} reason{'s' if count != 1 else ''}" if count else ""
     echo(f"{health.verdict}: {health.session_id}, {robot}{health.duration_s:.2f} s{why}")
-    for sentence in health.reasons:
-        echo(f"  {sentence}")
-    for sentence in health.notes:
-        echo(f"  note: {sentence}")
+    echo(*(f"  {sentence}" for sentence in health.reasons))
+    echo(*(f"  note: {sentence}" for sentence in health.notes))
     _print_stored(health)
     _print_series(health)
-    for bus in health.buses:
-        echo("", _bus_line(bus))
-    for source in health.sources:
-        echo("", _source_line(source))
+    for line in (*map(_bus_line, health.buses), *map(_source_line, health.sources)):
+        echo("", line)
     _print_sequences(health)
     file = health.file
     echo(
@@ -113,8 +106,8 @@ def _print_stored(health: SessionHealth) -> None:
     elif health.stored == health.verdict:
         echo(f"stored verdict: {health.stored}, the same")
     else:
-        said = f" ({'; '.join(health.stored_reasons)})" if health.stored_reasons else ""
-        echo(f"stored verdict: {health.stored}{said}; from the data: {health.verdict}")
+        reasons = f" ({'; '.join(health.stored_reasons)})" if health.stored_reasons else ""
+        echo(f"stored verdict: {health.stored}{reasons}; from the data: {health.verdict}")
 
 
 def _print_series(health: SessionHealth) -> None:
@@ -124,8 +117,7 @@ def _print_series(health: SessionHealth) -> None:
         f"{'series':<{width}}  {'samples':>8}  {'rate/Hz':>8}  {'gaps':>5}  {'missing':>7}  "
         f"{'longest/s':>9}  {'jitter':>6}  {'p99':>5}  {'twice':>5}  {'back':>4}  {'NaN':>6}",
     )
-    for each in health.series:
-        echo(_series_line(each, width))
+    echo(*(_series_line(each, width) for each in health.series))
 
 
 def _series_line(each: SeriesHealth, width: int) -> str:

@@ -46,8 +46,8 @@ def log_recover(
         report = recover_log(file, output or recovered_path(file), force=force, stop=request)
     if json:
         emit_json(report.as_json())
-        return
-    _print_recovered(report)
+    else:
+        _print_recovered(report)
 
 
 def _print_recovered(report: RecoverReport) -> None:
@@ -56,12 +56,16 @@ def _print_recovered(report: RecoverReport) -> None:
     lost = missing.get(report.missing, f"{report.missing} are missing")
     echo(
         f"{report.output}: {messages} messages over {report.duration_s:.2f} s, "
-        f"{report.from_wal} of them from the write-ahead log; {lost}"
+        f"{report.from_wal} of them from the write-ahead log; {lost}",
+        *_remarks(report),
     )
-    for warning in report.warnings:
-        echo(f"warning: {warning}")
-    for note in report.notes:
-        echo(f"note: {note}")
+
+
+def _remarks(report: EditReport | RecoverReport) -> list[str]:
+    return [
+        *(f"warning: {warning}" for warning in report.warnings),
+        *(f"note: {note}" for note in report.notes),
+    ]
 
 
 def log_cut(
@@ -158,12 +162,8 @@ def _print_report(report: EditReport, *, as_json: bool) -> None:
     origin = ", ".join(dict.fromkeys(source["session_id"] for source in report.sources))
     echo(
         f"{report.output}: {report.duration_s:.2f} s of {origin}, {messages} messages, "
-        f"{report.output.stat().st_size / 1e6:.1f} MB"
+        f"{report.output.stat().st_size / 1e6:.1f} MB",
+        *_remarks(report),
     )
-    for warning in report.warnings:
-        echo(f"warning: {warning}")
-    for note in report.notes:
-        echo(f"note: {note}")
     width = max(map(len, report.messages), default=0)
-    for topic, count in report.messages.items():
-        echo(f"  {topic:<{width}}  {count} messages")
+    echo(*(f"  {topic:<{width}}  {count} messages" for topic, count in report.messages.items()))

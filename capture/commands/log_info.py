@@ -18,10 +18,7 @@ _MESSAGES_PER_LOOK = 1000
 
 
 def describe(session: Session) -> dict[str, Any]:
-    """What a session holds, as plain JSON values.
-
-    Args:
-        session: An open session.
+    """Return the contents of a session as plain JSON values.
 
     Returns:
         ``session``, ``topics`` (in order of name), ``metadata``, ``attachments``, ``warnings``. A
@@ -68,7 +65,7 @@ def describe(session: Session) -> dict[str, Any]:
 
 
 def _fd_frames(session: Session, channel: Channel) -> int | None:
-    """Number of CAN FD frames of a topic, never all in memory; None for any other topic."""
+    """Count the CAN FD frames of a topic, a window at a time; None for any other topic."""
     if not channel.topic.startswith(FD_TOPIC_PREFIX) or not channel.is_ros2:
         return None
     windows = max(1, channel.count // _MESSAGES_PER_LOOK)
@@ -96,8 +93,8 @@ def log_info(file: Path, /, *, json: bool = False) -> None:
         facts = describe(session)
     if json:
         emit_json(facts)
-        return
-    _print_facts(facts)
+    else:
+        _print_facts(facts)
 
 
 def _print_facts(facts: dict[str, Any]) -> None:
@@ -111,9 +108,8 @@ def _print_facts(facts: dict[str, Any]) -> None:
         else "no messages"
     )
     echo(f"{session['id']}: {robot}, {held}, {_size(session['size_bytes'])}{parts}")
-    for warning in facts["warnings"]:
-        echo(f"warning: {warning}")
-    foreign = Counter(topic["encoding"] or "no encoding" for topic in _foreign(facts))
+    echo(*(f"warning: {warning}" for warning in facts["warnings"]))
+    foreign = Counter(t["encoding"] or "no encoding" for t in facts["topics"] if not t["read"])
     if foreign:
         order = sorted(foreign.items(), key=lambda item: (-item[1], item[0]))
         listed = ", ".join(f"{encoding} {count}" for encoding, count in order)
@@ -137,17 +133,12 @@ def _print_facts(facts: dict[str, Any]) -> None:
     echo(f"verdict: {session['verdict'] or 'none stored'}; written by {writer}")
 
 
-def _foreign(facts: dict[str, Any]) -> list[dict[str, Any]]:
-    """The topics whose messages aren't ROS 2's."""
-    return [topic for topic in facts["topics"] if not topic["read"]]
-
-
 def _type(topic: dict[str, Any]) -> str:
-    """A topic's type, with the encodings where they aren't those of ROS 2."""
+    """Return a topic's type, with the encodings where they aren't those of ROS 2."""
     if topic["read"]:
         return topic["type"]
-    said = [topic["encoding"] or "no encoding", topic["schema"] or "no schema"]
-    return f"{topic['type']} ({', '.join(said)})".lstrip()
+    encodings = f"{topic['encoding'] or 'no encoding'}, {topic['schema'] or 'no schema'}"
+    return f"{topic['type']} ({encodings})".lstrip()
 
 
 def _size(size_bytes: int) -> str:

@@ -124,26 +124,24 @@ def _run(settings: RecordSettings, stop: StopRequest) -> RecordReport:
 
 
 def _live_view(socket: Path, relay: ExitStack) -> Callable[[], str]:
-    """Start the live view; return a function that gives, once, why it ended by itself."""
+    """Start the live view; return a function that returns, once, why it ended by itself."""
     from ..recorder.live_feed import spawn_relay
 
-    complaints: list[str] = []
     try:
         process = spawn_relay(socket)
     except UndulogError as error:  # the recording goes on without
-        complaints.append(str(error))
-        return lambda: complaints.pop() if complaints else ""
+        complaints = iter([str(error)])
+        return lambda: next(complaints, "")
     relay.callback(process.close, leave_window=True)
-    told = False
+    ended = False
 
     def look() -> str:
-        nonlocal told
-        code = None if told else process.poll()
-        if code is None:
+        nonlocal ended
+        code = None if ended else process.poll()
+        ended = ended or code is not None
+        if not code:
             return ""
-        told = True
-        why = process.complaint().removeprefix("error: ") or f"has ended, exit code {code}"
-        return why if code else ""
+        return process.complaint().removeprefix("error: ") or f"has ended, exit code {code}"
 
     return look
 
@@ -157,9 +155,8 @@ def _print_report(report: RecordReport) -> None:
     )
     echo(f"  ended: {report.ending.reason}")
     for name, counts in report.sources.items():
-        parts = [f"{counts['frames']} frames"]
         dropped = counts["dropped"]
-        parts.append("losses unknown" if dropped is None else f"{dropped} lost before us")
-        echo(f"  {name}: {', '.join([*parts, *counted_faults(counts)])}")
-    for reason in report.reasons:
-        echo(f"  reason: {reason}")
+        lost = "losses unknown" if dropped is None else f"{dropped} lost before us"
+        facts = [f"{counts['frames']} frames", lost, *counted_faults(counts)]
+        echo(f"  {name}: {', '.join(facts)}")
+    echo(*(f"  reason: {reason}" for reason in report.reasons))

@@ -6,7 +6,7 @@ They reach running recorders through their control sockets.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,7 +24,7 @@ _FAULTS = ("malformed", "error_frames", "reconnects")
 
 
 def counted_faults(source: Mapping[str, Any]) -> list[str]:
-    """What a source counts and should not have to, where it does: ``3 error frames``."""
+    """Return the counts of faults of a source that are not zero: ``3 error frames``."""
     return [f"{source[key]} {key.replace('_', ' ')}" for key in _FAULTS if source.get(key)]
 
 
@@ -119,9 +119,7 @@ def stop(*, wait: bool = False, socket: Path | None = None, json: bool = False) 
         _print_reply("stopping", reply, as_json=json)
     else:
         files = ", ".join(str(file) for file in reply.get("files", []))
-        echo(f"{files or 'nothing written'}: {_facts(reply)}")
-        for reason in reply.get("reasons", []):
-            echo(f"  reason: {reason}")
+        echo(f"{files or 'nothing written'}: {_facts(reply)}", *_reasons(reply))
     return int(bool(reply.get("failed", False)))
 
 
@@ -153,7 +151,7 @@ def _running() -> list[Path]:
 
 
 def _recorder(socket: Path | None, *, for_ever: bool = False) -> ControlClient:
-    """The recorder that is meant: the one of that socket, or the only one that runs."""
+    """Connect to the recorder of a socket, or to the only one that runs."""
     from ..recorder.control_client import PATIENCE_S, ControlClient
 
     if socket is None:
@@ -166,18 +164,21 @@ def _recorder(socket: Path | None, *, for_ever: bool = False) -> ControlClient:
 
 
 def _summary(recording: Mapping[str, Any]) -> list[str]:
-    """A recording's status: the answer first."""
-    lines = [
-        f"{recording.get('output')}: {recording.get('state', 'recording')}, {_facts(recording)}"
+    """Return the status of a recording, the most important line first."""
+    return [
+        f"{recording.get('output')}: {recording.get('state', 'recording')}, {_facts(recording)}",
+        *_reasons(recording),
+        *(f"  {_source(source)}" for source in recording.get("sources", [])),
+        f"  socket: {recording['socket']}",
     ]
-    lines += [f"  reason: {reason}" for reason in recording.get("reasons", [])]
-    lines += [f"  {_source(source)}" for source in recording.get("sources", [])]
-    lines.append(f"  socket: {recording['socket']}")
-    return lines
+
+
+def _reasons(reply: Mapping[str, Any]) -> list[str]:
+    return [f"  reason: {reason}" for reason in reply.get("reasons", [])]
 
 
 def _source(source: Mapping[str, Any]) -> str:
-    """A source's state in one line."""
+    """Return the state of a source in one line."""
     ended = "has ended" if source.get("finished") else "not connected"
     parts = ["connected" if source.get("connected") and not source.get("finished") else ended]
     if (frames := source.get("frames")) is not None:
@@ -191,24 +192,18 @@ def _source(source: Mapping[str, Any]) -> str:
 
 
 def _facts(reply: Mapping[str, Any]) -> str:
-    """Duration, messages, size and verdict, as far as they are known."""
+    """Return duration, messages, size and verdict, as far as they are known."""
     from ..common.amounts import format_size
 
-    parts: list[str] = []
-    seconds = reply.get("elapsed_s", reply.get("duration_s"))
-    if seconds is not None:
-        parts.append(f"{seconds:.1f} s")
-    if (messages := reply.get("messages")) is not None:
-        parts.append(f"{messages} messages")
-    if (size := reply.get("bytes", reply.get("size_bytes"))) is not None:
-        parts.append(format_size(size))
-    if (free := reply.get("free")) is not None:
-        parts.append(f"{format_size(free)} free")
-    if (verdict := reply.get("verdict")) is not None:
-        parts.append(f"verdict {verdict}")
-    if (ended := reply.get("ended")) is not None:
-        parts.append(f"ended: {ended}")
-    return ", ".join(parts)
+    facts: tuple[tuple[Any, Callable[[Any], str]], ...] = (
+        (reply.get("elapsed_s", reply.get("duration_s")), "{:.1f} s".format),
+        (reply.get("messages"), "{} messages".format),
+        (reply.get("bytes", reply.get("size_bytes")), format_size),
+        (reply.get("free"), lambda size: f"{format_size(size)} free"),
+        (reply.get("verdict"), "verdict {}".format),
+        (reply.get("ended"), "ended: {}".format),
+    )
+    return ", ".join(text(value) for value, text in facts if value is not None)
 
 
 def _ask(request: Mapping[str, Any], done: str, socket: Path | None, *, as_json: bool) -> None:

@@ -1,8 +1,8 @@
-"""Sizes and durations as people write them: ``500MB``, ``1GiB``, ``10min``, ``1h30min``.
+"""Sizes and durations as text: ``500MB``, ``1GiB``, ``10min``, ``1h30min``.
 
-A number needs its unit, except that a bare one is bytes or seconds. Units are spelt as their
-standards have them (``kB`` is 1000 bytes, ``KiB`` 1024), case included: ``mb`` might be anything.
-Arithmetic is exact: what is no whole number of bytes or nanoseconds is refused, not rounded.
+A number without a unit is in bytes or seconds. Units are spelt as in their standards (``kB`` is
+1000 bytes, ``KiB`` 1024) and case matters. Arithmetic is exact: an amount that is not a whole
+number of bytes or nanoseconds is an error, not rounded.
 """
 
 from __future__ import annotations
@@ -46,100 +46,71 @@ _LONGEST_TEXT = 64
 
 
 def parse_size(value: object) -> int:
-    """A size as whole bytes.
+    """Return a size as whole bytes.
 
     Args:
         value: ``500MB``, ``1.5 GiB``, or a bare whole number of bytes, as text or number.
 
-    Returns:
-        The size [B], at least 0.
-
     Raises:
-        DataError: If it is no size; says what would be.
+        DataError: If it is no size; the message describes a valid one.
     """
-    number, unit = _split(value, "a size such as 500MB or 1GiB")
-    factor = _factor(unit or "B", SIZE_UNITS, "size")
-    return _whole(number * factor, "bytes")
+    wanted = "a size such as 500MB or 1GiB"
+    found = _AMOUNT.fullmatch(_text(value, wanted))
+    if found is None:
+        raise DataError(wanted)
+    return _whole(Fraction(found[1]) * _factor(found[2] or "B", SIZE_UNITS, "size"), "bytes")
 
 
 def parse_duration_ns(value: object) -> int:
-    """A duration as whole nanoseconds.
+    """Return a duration as whole nanoseconds.
 
     Args:
         value: ``30s``, ``10min``, ``1h30min`` (long units first), or a bare number of seconds, as
             text or number.
 
-    Returns:
-        The duration [ns], at least 0.
-
     Raises:
-        DataError: If it is no duration; says what would be.
+        DataError: If it is no duration; the message describes a valid one.
     """
     wanted = "a duration such as 30s, 10min or 1h30min"
-    text = value.strip() if isinstance(value, str) else value
-    parts = _AMOUNT.findall(text) if isinstance(text, str) and len(text) <= _LONGEST_TEXT else []
-    if len(parts) < 2 or not isinstance(text, str):
-        number, unit = _split(text, wanted)
-        return _whole(number * _factor(unit or "s", DURATION_UNITS, "time"), "nanoseconds")
-    if "".join(number + unit for number, unit in parts) != text.replace(" ", ""):
+    text = _text(value, wanted)
+    parts = _AMOUNT.findall(text)
+    if not parts or "".join(number + unit for number, unit in parts) != text.replace(" ", ""):
         raise DataError(wanted)
+    if len(parts) == 1:
+        if _AMOUNT.fullmatch(text) is None:  # more than one space
+            raise DataError(wanted)
+        parts = [(parts[0][0], parts[0][1] or "s")]
     factors = [_factor(unit, DURATION_UNITS, "time") for _, unit in parts]
     if any(later >= earlier for earlier, later in pairwise(factors)):
         raise DataError(f"{wanted}: each unit once, the longest first")
-    total = Fraction(0)
-    for (number, _), factor in zip(parts, factors, strict=True):
-        total += Fraction(number) * factor
+    amounts = zip(parts, factors, strict=True)
+    total = sum((Fraction(number) * factor for (number, _), factor in amounts), Fraction(0))
     return _whole(total, "nanoseconds")
 
 
 def parse_duration_s(value: object) -> float:
-    """A duration in seconds.
-
-    Args:
-        value: As :func:`parse_duration_ns` takes it.
-
-    Returns:
-        The duration [s], at least 0.
-
-    Raises:
-        DataError: If it is no duration; says what would be.
-    """
+    """Return a duration in seconds, as :func:`parse_duration_ns`."""
     return parse_duration_ns(value) / 1e9
 
 
 def format_size(size: int) -> str:
-    """A size as people read it.
-
-    Args:
-        size: [B].
-
-    Returns:
-        E.g. ``12.3 MB``; decimal units.
-    """
+    """Format a size [B] in decimal units, e.g. ``12.3 MB``."""
     for unit in ("TB", "GB", "MB", "kB"):
         if size >= 0.9995 * SIZE_UNITS[unit]:  # 999.6 kB would show as 1e+03 kB
             return f"{size / SIZE_UNITS[unit]:.3g} {unit}"
     return f"{size} B"
 
 
-def _split(value: object, wanted: str) -> tuple[Fraction, str]:
-    """A number and its unit; the unit is empty where there is none."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        text = repr(value) if isinstance(value, float) else _digits(value, wanted)
-    elif isinstance(value, str):
-        text = value.strip()
-    else:
+def _text(value: object, wanted: str) -> str:
+    """Return an amount as a text of limited length."""
+    if isinstance(value, int) and not 0 <= value <= LARGEST:  # slow to convert if huge
         raise DataError(wanted)
-    found = _AMOUNT.fullmatch(text) if len(text) <= _LONGEST_TEXT else None
-    if found is None:
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise DataError(wanted)
-    return Fraction(found[1]), found[2]
-
-
-def _digits(value: int, wanted: str) -> str:
-    if not 0 <= value <= LARGEST:  # also spares the slow conversion of huge numbers
+    text = value.strip() if isinstance(value, str) else repr(value)
+    if len(text) > _LONGEST_TEXT:
         raise DataError(wanted)
-    return str(value)
+    return text
 
 
 def _factor(unit: str, units: Mapping[str, int], what: str) -> int:

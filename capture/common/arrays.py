@@ -16,10 +16,6 @@ _Array = TypeVar("_Array", bound=NDArray[Any])
 
 
 def frozen(array: _Array) -> _Array:
-    """Mark an array read-only and return it.
-
-    Args:
-        array: Any array, any shape; changed in place (its write flag only).
-    """
+    """Mark an array read-only, in place, and return it."""
     array.setflags(write=False)
     return array

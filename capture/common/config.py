@@ -1,6 +1,6 @@
 """Parameters that are declared once: frozen dataclasses read from strict tables, and written.
 
-A field's annotation says what its key may hold, its default what an absent key stands for::
+The annotation of a field declares the values of its key, its default the value without a key::
 
     @dataclass(frozen=True)
     class Turns:
@@ -74,7 +74,7 @@ class Declared(NamedTuple):
 
 @functools.cache
 def declared(cls: type[Any]) -> dict[str, Declared]:
-    """What a dataclass declares of its fields, by name."""
+    """Return the declarations of a dataclass's fields, by name."""
     hints = get_type_hints(cls, include_extras=True)
     return {item.name: _declared(item, hints[item.name]) for item in dataclasses.fields(cls)}
 
@@ -149,9 +149,6 @@ def read_field(table: Table, cls: type[Any], name: str, default: Any = None) -> 
     Args:
         table: The table; faults are noted in its list.
         default: In place of the one that the class declares.
-
-    Returns:
-        The value; of use only if no fault was noted.
     """
     one = declared(cls)[name]
     return _value(table, one, one.default if default is None else default)

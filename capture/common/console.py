@@ -1,7 +1,7 @@
-"""What every command prints in the same way: lines, errors, progress and JSON.
+"""Output of all commands: lines, errors, progress and JSON.
 
-All text for a terminal passes :func:`plain`: names in a log are untrusted, and a terminal obeys the
-control characters in them.
+All text for a terminal passes :func:`plain`: names in a log are untrusted and may contain control
+characters.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from rich.cells import cell_len
 from rich.text import Text
@@ -26,10 +26,7 @@ and paragraph ends. All characters that XML forbids are among them."""
 
 
 def plain(text: str) -> str:
-    r"""Return text that a terminal shows and doesn't obey.
-
-    Args:
-        text: Any text, e.g. with names from a log.
+    r"""Escape the control characters of a text.
 
     Returns:
         One line: control and format characters, line breaks and lone surrogates as escapes, e.g.
@@ -67,36 +64,23 @@ def complain(message: str) -> None:
     sys.stderr.flush()
 
 
-class Progress(Protocol):
-    """What a long work reports to."""
+class Progress:
+    """Receiver of the progress of a long task; this one shows nothing."""
 
     def update(self, done: float, note: str = "") -> None:
-        """Say how far the work is.
+        """Show the progress.
 
         Args:
             done: In the units of the total.
             note: A few words, e.g. the real-time factor.
         """
-        ...
-
-
-class _Silent:
-    def update(self, done: float, note: str = "") -> None:
-        """Say nothing."""
 
 
 @contextmanager
 def progress(description: str, total: float) -> Generator[Progress]:
-    """A progress bar on stderr, or silence where stderr is not a terminal.
-
-    Args:
-        total: What ``done`` will reach.
-
-    Yields:
-        The object to report to.
-    """
+    """Show a progress bar on stderr if it is a terminal; ``total`` is the last ``done``."""
     if not sys.stderr.isatty():
-        yield _Silent()
+        yield Progress()
         return
     from rich.console import Console
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -112,7 +96,7 @@ def progress(description: str, total: float) -> Generator[Progress]:
     with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
         task = bars.add_task(plain(description), total=total, note="")
 
-        class _Bar:
+        class _Bar(Progress):
             def update(self, done: float, note: str = "") -> None:
                 bars.update(task, completed=done, note=plain(note))
 
@@ -120,11 +104,7 @@ def progress(description: str, total: float) -> Generator[Progress]:
 
 
 def emit_json(value: Any) -> None:
-    """Print one JSON value on stdout.
-
-    Args:
-        value: Plain JSON values; NaN is refused, since it is not JSON.
-    """
+    """Print one JSON value on stdout; NaN is an error."""
     sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
@@ -232,16 +212,12 @@ def table(
 
 
 def fit(text: str, width: int) -> str:
-    """Text of exactly this many characters."""
+    """Cut or pad a text to a width."""
     return cut(text, width).ljust(width)
 
 
 def cut(text: str, width: int) -> str:
-    """Text with control characters escaped, no longer than there is room.
-
-    Args:
-        text: Any text; a device may have put anything into it.
-    """
+    """Escape control characters and cut a text to a width."""
     clean = Text(_printable(text))
     clean.truncate(max(width, 1), overflow="ellipsis")
     return clean.plain

@@ -14,7 +14,7 @@
     |- PlanError (ValueError)               a drive plan with faults, all listed
     |- NullModelError (ValueError)          a null model with faults, all listed
     |- SimulationError (ArithmeticError)    the twin blew up: time, link and likely cause
-    |- DataError (ValueError)               samples unfit for what was asked
+    |- DataError (ValueError)               samples unfit for a computation
     |- SourceError                          a source that can't be opened or used
     |- ControlError                         a running recorder that can't be reached, or refuses
     |  `- SocketInUseError                  another recorder listens at a control socket
@@ -24,8 +24,8 @@
        |- ImportFormatError (ValueError)    a foreign log that cannot be imported
        `- LogWriteError (OSError)           disk full, closed file
 
-Every error says what was found, where, and what to do. ``exit_code`` is what the command
-line returns: 1 the work failed, 2 wrong usage.
+The message of an error has what was found, where, and what to do. ``exit_code`` is that of the
+command line: 1 the work failed, 2 wrong usage.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ class MissingExtraError(UsageError, ImportError):
         """Build the message.
 
         Args:
-            verb: What was asked for, e.g. ``sim run``.
-            extra: The extra that brings it, e.g. ``sim``.
-            missing: The module that could not be imported.
+            verb: The command, e.g. ``sim run``.
+            extra: The extra that installs the package, e.g. ``sim``.
+            missing: The package that could not be imported.
         """
         self.extra = extra
         super().__init__(
@@ -71,26 +71,22 @@ class OutputExistsError(UsageError, FileExistsError):
     """The output is there already and ``--force`` was not given."""
 
     def __init__(self, path: Path | str) -> None:
-        """Build the message.
-
-        Args:
-            path: The file that would have been overwritten.
-        """
+        """Build the message from the file that would have been overwritten."""
         self.path = Path(path)
         super().__init__(f"{path} exists already; choose another name or give --force")
 
 
-class InputFileError(UndulogError, OSError):
-    """A description, a model, a result: it isn't there, or it can't be read."""
+class _PathError(UndulogError):
+    """An error of one file."""
 
     def __init__(self, path: Path | str, message: str) -> None:
-        """Build the message.
-
-        Args:
-            message: What is wrong with it.
-        """
+        """Build the message from the path and a description of the fault and its cure."""
         self.path = Path(path)
         super().__init__(f"{path}: {message}")
+
+
+class InputFileError(_PathError, OSError):
+    """A description, a model or a result that is missing or can't be read."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +102,7 @@ class Fault:
     valid: str
 
     def __str__(self) -> str:
-        """One line: key, what was found, what is valid."""
+        """Return key, found value and valid values in one line."""
         return f"{self.key}: found {self.found}; valid: {self.valid}"
 
 
@@ -122,11 +118,7 @@ class FaultyFileError(UndulogError, ValueError):
     kind = "file"
 
     def __init__(self, path: Path | str, faults: Iterable[Fault]) -> None:
-        """Build the message.
-
-        Args:
-            faults: All its faults, at least one.
-        """
+        """Build the message from all faults, at least one."""
         self.path = Path(path)
         self.faults: tuple[Fault, ...] = tuple(faults)
         super().__init__(f"{path}: {_listing(self.faults, f'this {self.kind}')}")
@@ -163,7 +155,7 @@ class SettingsError(UsageError):
         """Build the message.
 
         Args:
-            faults: All faults, at least one; their keys say where: ``--ring``,
+            faults: All faults, at least one; their keys are the places: ``--ring``,
                 ``UNDULOG_RECORD_RING`` or ``snake.toml: record.ring``.
         """
         self.faults: tuple[Fault, ...] = tuple(faults)
@@ -171,28 +163,19 @@ class SettingsError(UsageError):
 
 
 class SimulationError(UndulogError, ArithmeticError):
-    """The twin's state became impossible: says when, which link, and the likely cause."""
+    """An impossible state of the twin; names time, link and likely cause."""
 
 
 class DataError(UndulogError, ValueError):
-    """Samples that are unfit for what was asked of them."""
+    """Samples that are unfit for a computation."""
 
 
 class JointSetError(UsageError, DataError):
     """Commands of another joint set than that of the robot that is to take them."""
 
 
-class LogError(UndulogError):
+class LogError(_PathError):
     """A log that cannot be read or written."""
-
-    def __init__(self, path: Path | str, message: str) -> None:
-        """Build the message.
-
-        Args:
-            message: What is wrong and what to do.
-        """
-        self.path = Path(path)
-        super().__init__(f"{path}: {message}")
 
 
 class NotALogError(LogError):
@@ -212,7 +195,7 @@ class MissingChannelError(LogError, KeyError):
         LogError.__init__(self, path, f"has no {wanted}; it has {listed}")
 
     def __str__(self) -> str:
-        """The message itself (``KeyError`` would quote it)."""
+        """Return the message without the quotes of ``KeyError``."""
         return str(self.args[0])
 
 
@@ -220,18 +203,13 @@ class SourceError(UndulogError):
     """A source of a recording that can't be opened or used."""
 
     def __init__(self, source: str, message: str) -> None:
-        """Build the message.
-
-        Args:
-            source: The source as the command line names it.
-            message: What is wrong and what to do.
-        """
+        """Build the message from the source as on the command line, and the fault."""
         self.source = source
         super().__init__(f"{source}: {message}")
 
 
 class ControlError(UndulogError):
-    """A running recorder can't be reached, or refuses what it was asked."""
+    """A running recorder can't be reached, or refuses a request."""
 
 
 class SocketInUseError(ControlError):

@@ -16,11 +16,7 @@ from .strict_table import listed
 
 
 def is_file(path: Path) -> bool:
-    """Whether a name, which a file may have given, is that of a file.
-
-    Returns:
-        False also for a name that no file system takes.
-    """
+    """Return whether a path is that of a file, also if the file system rejects its name."""
     try:
         return path.is_file()
     except OSError:  # too long
@@ -67,15 +63,12 @@ class Shelf:
     error: type[FaultyFileError]
 
     def names(self) -> tuple[str, ...]:
-        """Names of the shipped ones, sorted."""
+        """Return names of the shipped ones, sorted."""
         entries = (Path(entry.name) for entry in self._place().iterdir())
         return tuple(sorted(entry.stem for entry in entries if entry.suffix == ".toml"))
 
     def read(self, name_or_path: str | Path) -> Description:
         """Read a shipped description by name, or a file by path.
-
-        Args:
-            name_or_path: One of :meth:`names`, or the path of a TOML file.
 
         Raises:
             UsageError: If there is none of that name.
@@ -106,7 +99,7 @@ def check_output(output: Path, endings: Iterable[str], why: str, *, force: bool)
 
     Args:
         endings: Any of which its name must have.
-        why: What to say if it has none of them.
+        why: Message if it has none of them.
         force: Whether an existing file may be replaced.
 
     Raises:
@@ -157,13 +150,10 @@ def write_text(output: Path, text: str) -> None:
 
 
 def check_stop(output: Path, stop: StopRequest | None) -> None:
-    """End the writing of a part file if an end was asked for.
-
-    Args:
-        stop: The request to look at.
+    """End the writing of a part file if a stop was requested.
 
     Raises:
-        LogWriteError: If an end was asked for.
+        LogWriteError: If a stop was requested.
     """
     if stop is not None and stop.requested:
         raise LogWriteError(output, "stopped on request, nothing is written")

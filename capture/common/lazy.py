@@ -20,7 +20,7 @@ _hidden: set[str] = set()
 
 
 def defer() -> None:
-    """Have the packages look as if they were not installed, unless they are imported already."""
+    """Hide the packages from imports, unless they are imported already."""
     for name in DEFERRED:
         if name not in sys.modules:
             _hidden.add(name)
@@ -28,11 +28,7 @@ def defer() -> None:
 
 
 def undefer(name: str) -> None:
-    """Make a package importable again, for whoever needs it.
-
-    Args:
-        name: One of :data:`DEFERRED`.
-    """
+    """Make a package of :data:`DEFERRED` importable again."""
     if name in _hidden:
         _hidden.discard(name)
         del sys.modules[name]

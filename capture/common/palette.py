@@ -37,7 +37,7 @@ _CONE_TO_RGB = np.array(
 
 
 def joint_colors(count: int) -> NDArray[np.uint8]:
-    """Colours of the joints (or links) of a chain, head to tail.
+    """Return colours of the joints (or links) of a chain, head to tail.
 
     Args:
         count: Number of joints, at least 1.
@@ -52,30 +52,21 @@ def joint_colors(count: int) -> NDArray[np.uint8]:
 
 
 def joint_hex(count: int) -> tuple[str, ...]:
-    """The same colours as ``#rrggbb``.
-
-    Args:
-        count: Number of joints, at least 1.
-
-    Returns:
-        One string a joint, head to tail.
-    """
+    """Return the same colours as ``#rrggbb``, one a joint."""
     return tuple("#" + bytes(color[:3]).hex() for color in joint_colors(count))
 
 
 def _oklab(place: FloatArray) -> FloatArray:
-    """Points of the curve at equal steps of arc length; ``place`` in [0, 1], shape (n,)."""
+    """Return points of the curve at equal steps of arc length; ``place`` in [0, 1], shape (n,)."""
     t = np.linspace(0.0, 1.0, 513)[:, None]
     curve = (1 - t) ** 2 * _CURVE[0] + 2 * t * (1 - t) * _CURVE[1] + t**2 * _CURVE[2]
     step = np.linalg.norm(np.diff(curve, axis=0), axis=1)
     arc = np.concatenate([[0.0], np.cumsum(step)]) / step.sum()
-    lab = np.empty((place.size, 3), dtype=np.float64)
-    for channel in range(3):
-        lab[:, channel] = np.interp(place, arc, curve[:, channel])
-    return lab
+    channels: list[FloatArray] = [np.interp(place, arc, curve[:, k]) for k in range(3)]
+    return np.stack(channels, axis=1)
 
 
 def _srgb(lab: FloatArray) -> FloatArray:
-    """OKLab to gamma-encoded sRGB in [0, 1] (IEC 61966-2-1), shape (n, 3)."""
+    """Convert OKLab to gamma-encoded sRGB in [0, 1] (IEC 61966-2-1), shape (n, 3)."""
     linear = np.clip((lab @ _LAB_TO_CONE.T) ** 3 @ _CONE_TO_RGB.T, 0.0, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)

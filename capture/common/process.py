@@ -1,16 +1,15 @@
-"""Ending on request: a signal becomes a flag, so that a loop ends between two samples.
+"""Stop requests by signals, priority of threads, and work in threads.
 
-A recorder or a simulation that is told to stop must leave a whole file. Inside
-:func:`interruptible` the first SIGINT, SIGTERM or SIGHUP sets ``requested``; a second one of the
-same kind acts as it would have without us, for a loop that doesn't look. A loop that has to end in
+A recorder or a simulation that is stopped must leave a whole file. Inside :func:`interruptible` the
+first SIGINT, SIGTERM or SIGHUP sets ``requested``, so that a loop ends between two samples; another
+one of the same kind has its usual effect, for a loop that doesn't check. A loop that has to end in
 an orderly way even then takes two: the second one sets ``again``.
 
-Priority of the threads that empty the kernel's buffers: these hold milliseconds of a busy bus.
-
-Real-time priority is asked for first, and of that the lowest (SCHED_RR 1): where a system groups
-processes by session or service, nice values count only within a group. A recorder takes some tenth
-of a core; the kernel leaves others at least 5 % of each. Who started it with a positive nice value
-or a policy of its own is left in peace.
+Threads that empty the kernel's buffers, which hold milliseconds of a busy bus, get a raised
+priority. The lowest real-time priority (SCHED_RR 1) is requested first: where a system groups
+processes by session or service, nice values count only within a group. A recorder takes about a
+tenth of a core; the kernel leaves other processes at least 5 % of each. A process that was started
+with a positive nice value or another policy keeps it.
 """
 
 from __future__ import annotations
@@ -27,16 +26,14 @@ from typing import TypeVar
 
 from .errors import UsageError
 
-NICE = -10
-"""Asked for where real-time priority is refused."""
-
+_NICE = -10  # requested where real-time priority is refused
 _REAL_TIME = os.sched_param(1)
 _RESET = os.SCHED_RESET_ON_FORK  # for what the recorder starts: a viewer, a shell
 
 
 @dataclass(frozen=True)
 class Priority:
-    """What became of the request.
+    """Result of a request for priority.
 
     Attributes:
         text: The priority, e.g. ``SCHED_RR 1``, or that it was refused.
@@ -53,17 +50,18 @@ def raised_priority() -> Generator[Priority]:
     if policy != os.SCHED_OTHER or nice > 0:
         yield Priority(f"as it was started: {_named(policy, nice)}")
         return
+    raised = min(nice, _NICE)
+    priority = Priority(f"refused: {_named(policy, nice)}", refused=True)
+    for wanted, value, name in (
+        (os.SCHED_RR, nice, "SCHED_RR 1"),
+        (os.SCHED_OTHER, raised, f"nice {raised}"),
+    ):
+        with suppress(PermissionError):
+            _set_all(wanted, value)
+            priority = Priority(name)
+            break
     try:
-        _set_all(os.SCHED_RR, nice)
-        got = Priority("SCHED_RR 1")
-    except PermissionError:
-        try:
-            _set_all(os.SCHED_OTHER, min(nice, NICE))
-            got = Priority(f"nice {min(nice, NICE)}")
-        except PermissionError:
-            got = Priority(f"refused: {_named(policy, nice)}", refused=True)
-    try:
-        yield got
+        yield priority
     finally:
         _set_all(os.SCHED_OTHER, nice)
 
@@ -99,17 +97,14 @@ _MOST_BY_DEFAULT = 4
 
 
 def threads_or_default(threads: int | None) -> int:
-    """How many threads to use.
+    """Return the number of threads to use.
 
     Args:
-        threads: As many as was asked for; None for one a core that this process may use, at most
+        threads: Number; None for one a core that this process may use, at most
             four.
 
-    Returns:
-        At least 1.
-
     Raises:
-        UsageError: If less than one was asked for.
+        UsageError: If it is less than one.
     """
     if threads is None:
         usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
@@ -168,17 +163,17 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequest:
-    """Whether, and by which signal, an end was asked for."""
+    """Whether a stop was requested, and by which signal."""
 
     def __init__(self) -> None:
         """Start without a request."""
         self.signal: signal.Signals | None = None
         self.again = False
-        """Whether it was asked for a second time."""
+        """Whether a stop was requested a second time."""
 
     @property
     def requested(self) -> bool:
-        """Whether an end was asked for."""
+        """Whether a stop was requested."""
         return self.signal is not None
 
 
@@ -191,7 +186,7 @@ def interruptible(*, twice: bool = False) -> Generator[StopRequest]:
 
     Args:
         twice: Take a second SIGINT or SIGTERM as a request, too; only the third acts as it would
-            have. A terminal that goes says so by more than one SIGHUP: these only count once.
+            have. A terminal that closes sends more than one SIGHUP: these only count once.
 
     Yields:
         The request; look at ``requested`` between two samples.

@@ -1,9 +1,9 @@
-"""Strict reading of TOML tables: every fault noted, none raised until all are known.
+"""Strict reading of TOML tables: all faults are collected before an error is raised.
 
-A :class:`Table` hands out the values of one TOML table. A value that is missing, of the wrong type
-or out of range is noted in a :class:`Faults` and replaced by a harmless stand-in (NaN for numbers,
-so that comparisons with it are false and one fault does not beget another); the caller raises once
-at the end. Keys that nobody asked for are faults too: a mistyped key never passes for a default.
+A :class:`Table` returns the values of one TOML table. A value that is missing, of the wrong type
+or out of range is added to a :class:`Faults` and replaced by a harmless substitute (NaN for
+numbers: comparisons with it are false, so that one fault does not cause another); the caller raises
+once at the end. Keys that were not read are faults too: a mistyped key never passes for a default.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import math
 import operator
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, TypeVar, cast
@@ -21,27 +21,25 @@ from typing import Any, TypeVar, cast
 from .errors import Fault
 
 _Choice = TypeVar("_Choice", bound=StrEnum)
+_Value = TypeVar("_Value")
 
 NAME_PATTERN = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 """What a name of a robot, link, joint or sensor looks like: it becomes part of topics and files."""
 
 
 _DEEPEST = 64
-"""Tables and arrays in each other; deeper ones would end what walks them by a full stack."""
+"""Tables and arrays in each other; recursion over deeper ones would overflow the stack."""
 _INTEGERS = range(-(2**63), 2**63)
-_LARGEST = 1e15
 _SMALLEST = 1e-30
-"""No quantity in SI units is beyond; powers and quotients of those within don't overflow."""
+"""With the largest, 1e15: powers and quotients of quantities in SI units don't overflow."""
 
 
 def read_toml(text: str) -> dict[str, Any]:
     """Read a TOML text of any origin.
 
-    Returns:
-        Its tables: at most 64 of them, or arrays, in each other, and integers of 64 bits.
-
     Raises:
-        ValueError: If it is no such TOML; says what is wrong.
+        ValueError: If it is not TOML, has an integer of more than 64 bits, or nests tables and
+            arrays more than 64 deep.
     """
     try:
         values = tomllib.loads(text)
@@ -64,7 +62,7 @@ def read_toml(text: str) -> dict[str, Any]:
 
 
 def shown(value: object) -> str:
-    """A TOML value as a fault message shows it: strings quoted, tables by kind, arrays cut."""
+    """Format a TOML value for a fault message: strings quoted, tables by kind, arrays cut."""
     if isinstance(value, Mapping):
         return "a table"
     if isinstance(value, bool):
@@ -76,53 +74,57 @@ def shown(value: object) -> str:
 
 
 def listed(words: Iterable[str], found: object = None) -> str:
-    """The valid words, ``a, b, c``; where ``found`` is nearly one, ``(did you mean b?)`` after."""
+    """List the valid words, ``a, b, c``, and ``(did you mean b?)`` if ``found`` is close to one."""
     valid = list(words)
     near = difflib.get_close_matches(found, valid, n=1) if isinstance(found, str) else []
     hint = f" (did you mean {near[0]}?)" if near else ""
     return (", ".join(valid) or "none") + hint
 
 
-_COMPARISONS = {
+_COMPARISONS: dict[str, Callable[[float, float], bool]] = {
     ">": operator.gt,
     ">=": operator.ge,
     "<=": operator.le,
     "other than": operator.ne,
+    "0 or of a size from 1e-30 to": lambda number, limit: (
+        number == 0 or _SMALLEST <= abs(number) <= limit
+    ),
 }
 
 
 @dataclass(frozen=True)
 class Bound:
-    """One bound of a number, in words as a fault shows it: ``>= 0``."""
+    """One bound of a number, in the words of a fault: ``>= 0``."""
 
     comparison: str
     limit: float
 
     def holds(self, number: float) -> bool:
-        """Whether a number is within the bound."""
+        """Return whether a number is within the bound."""
         return _COMPARISONS[self.comparison](number, self.limit)
 
     def __str__(self) -> str:
-        """The bound in words."""
+        """Return the bound in words."""
         return f"{self.comparison} {self.limit:g}"
 
 
 def above(limit: float) -> Bound:
-    """The number must be greater than the limit."""
+    """Require a number greater than the limit."""
     return Bound(">", limit)
 
 
 def at_least(limit: float) -> Bound:
-    """The number must not be less than the limit."""
+    """Require a number of at least the limit."""
     return Bound(">=", limit)
 
 
 def at_most(limit: float) -> Bound:
-    """The number must not be greater than the limit."""
+    """Require a number of at most the limit."""
     return Bound("<=", limit)
 
 
 NONZERO = Bound("other than", 0.0)
+_USUAL = Bound("0 or of a size from 1e-30 to", 1e15)
 
 
 class Faults:
@@ -133,15 +135,11 @@ class Faults:
         self._faults: dict[Fault, None] = {}
 
     def add(self, key: str, found: str, valid: str) -> None:
-        """Note a fault.
-
-        Args:
-            key: Where it is, e.g. ``joints[3].plane``.
-        """
+        """Note a fault."""
         self._faults[Fault(key, found, valid)] = None
 
     def all(self) -> tuple[Fault, ...]:
-        """All faults, in the order found."""
+        """Return all faults, in the order found."""
         return tuple(self._faults)
 
 
@@ -172,20 +170,20 @@ class Table:
         self._asked: dict[str, None] = {}
 
     def __contains__(self, key: str) -> bool:
-        """Whether the table itself has the key."""
+        """Return whether the table itself has the key."""
         self._asked[key] = None
         return key in self.values
 
     def over(self, defaults: Table) -> Table:
-        """The same table, nothing read yet, with defaults behind it."""
+        """Return the same table, nothing read yet, with defaults behind it."""
         return Table(self.values, self._where, self.faults, defaults)
 
     def replaced(self, values: Mapping[str, Any]) -> Table:
-        """A table of other values in the same place."""
+        """Return a table of other values in the same place."""
         return Table(values, self._where, self.faults)
 
     def key(self, key: str) -> str:
-        """The full key, e.g. ``joints[3].plane``."""
+        """Return the full key, e.g. ``joints[3].plane``."""
         return f"{self._where}.{key}" if self._where else key
 
     def fault(self, key: str, valid: str, found: str | None = None) -> None:
@@ -211,30 +209,39 @@ class Table:
                 return where, value
         return self.key(key), self.values.get(key)
 
-    def text(self, key: str, default: str | None = None) -> str:
-        """A string; ``""`` after a fault. Without a default it is required."""
+    def _value(
+        self,
+        key: str,
+        default: _Value | None,
+        convert: Callable[[object], _Value | None],
+        valid: str,
+        substitute: _Value,
+    ) -> _Value:
+        """Return a converted value, the default when absent, the substitute after a fault."""
         value = self.look(key)[1]
         if value is None and default is not None:
             return default
-        if not isinstance(value, str):
-            self.fault(key, "a string")
-            return ""
-        return value
+        found = convert(value)
+        if found is None:
+            self.fault(key, valid)
+            return substitute
+        return found
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """Return a string; ``""`` after a fault. Without a default it is required."""
+        return self._value(
+            key, default, lambda value: value if isinstance(value, str) else None, "a string", ""
+        )
 
     def name(self, key: str, default: str | None = None) -> str:
-        """A name that can be part of a topic; ``""`` after a fault."""
-        value = self.look(key)[1]
-        if value is None and default is not None:
-            return default
-        if not isinstance(value, str) or not NAME_PATTERN.fullmatch(value):
-            self.fault(key, "a name of letters, digits, _ and -, beginning with a letter")
-            return ""
-        return value
+        """Return a name that can be part of a topic; ``""`` after a fault."""
+        valid = "a name of letters, digits, _ and -, beginning with a letter"
+        return self._value(key, default, _name, valid, "")
 
     def choice(
         self, key: str, kinds: Iterable[_Choice], default: _Choice | None = None
     ) -> _Choice | None:
-        """One of a few words; None after a fault. Without a default it is required."""
+        """Read one of a few words; None after a fault. Without a default it is required."""
         value = self.look(key)[1]
         if value is None and default is not None:
             return default
@@ -245,7 +252,7 @@ class Table:
         return words[value]
 
     def number(self, key: str, *bounds: Bound, default: float | None = None) -> float:
-        """A finite number within the bounds; NaN after a fault. Without a default it is required.
+        """Read a finite number within the bounds; NaN after a fault. Required without a default.
 
         A default need not be within the bounds.
         """
@@ -253,30 +260,31 @@ class Table:
         if value is None and default is not None:
             return default
         number = finite_number(value)
-        usual = number is None or _is_usual(number)
-        if number is not None and usual and all(bound.holds(number) for bound in bounds):
+        if number is not None and all(bound.holds(number) for bound in (*bounds, _USUAL)):
             return number
-        words = [str(bound) for bound in bounds] + ([] if usual else [_USUAL])
+        words = _limits(bounds, [] if number is None else [number])
         self.fault(key, f"a finite number {' and '.join(words)}".strip())
         return math.nan
 
     def integer(self, key: str, least: int, default: int | None = None) -> int:
-        """A whole number from ``least`` on, which stands in after a fault."""
-        value = self.look(key)[1]
-        if value is None and default is not None:
-            return default
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            self.fault(key, f"a whole number >= {least}")
-            return least
-        return value
+        """Return a whole number from ``least`` on; ``least`` after a fault."""
+
+        def convert(value: object) -> int | None:
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                return None
+            return value
+
+        return self._value(key, default, convert, f"a whole number >= {least}", least)
 
     def flag(self, key: str, *, default: bool) -> bool:
-        """True or false; the default when absent or after a fault."""
-        value = self.look(key)[1]
-        if value is None or isinstance(value, bool):
-            return default if value is None else value
-        self.fault(key, "true or false")
-        return default
+        """Return true or false; the default when absent or after a fault."""
+        return self._value(
+            key,
+            default,
+            lambda value: value if isinstance(value, bool) else None,
+            "true or false",
+            default,
+        )
 
     def numbers(
         self,
@@ -285,7 +293,7 @@ class Table:
         *bounds: Bound,
         default: tuple[float, ...] | None = None,
     ) -> tuple[float, ...]:
-        """An array of finite numbers, each within the bounds; NaN after a fault.
+        """Read an array of finite numbers, each within the bounds; NaN after a fault.
 
         Without a default it is required.
         """
@@ -294,17 +302,15 @@ class Table:
             return default
         entries = cast("list[object]", value) if isinstance(value, list) else []
         numbers = [n for n in map(finite_number, entries) if n is not None]
-        usual = all(_is_usual(number) for number in numbers)
-        bad = any(not bound.holds(number) for bound in bounds for number in numbers)
-        if len(entries) != count or len(numbers) != count or bad or not usual:
-            words = [str(bound) for bound in bounds] + ([] if usual else [_USUAL])
-            each = "".join(f", each {word}" for word in words)
-            self.fault(key, f"an array of {count} finite numbers{each}")
-            return (math.nan,) * count
-        return tuple(numbers)
+        good = all(bound.holds(number) for bound in (*bounds, _USUAL) for number in numbers)
+        if good and len(entries) == len(numbers) == count:
+            return tuple(numbers)
+        each = "".join(f", each {word}" for word in _limits(bounds, numbers))
+        self.fault(key, f"an array of {count} finite numbers{each}")
+        return (math.nan,) * count
 
     def words(self, key: str, *, valid: Iterable[str] | None = None) -> tuple[str, ...]:
-        """An array of different strings; empty when absent, without the bad ones after a fault.
+        """Read an array of different strings; empty when absent, without the invalid ones.
 
         Args:
             valid: The words to choose from; any string when None.
@@ -330,7 +336,7 @@ class Table:
         return tuple(good)
 
     def table(self, key: str, defaults: Table | None = None) -> Table:
-        """A sub-table, with its defaults; an empty one when absent or after a fault."""
+        """Read a sub-table, with its defaults; an empty one when absent or after a fault."""
         self._asked[key] = None
         value = self.values.get(key, {})
         if not isinstance(value, dict):
@@ -339,7 +345,7 @@ class Table:
         return Table(cast("dict[str, Any]", value), self.key(key), self.faults, defaults)
 
     def tables(self, key: str) -> list[Table]:
-        """An array of tables; empty when absent, without the bad ones after a fault."""
+        """Read an array of tables; empty when absent, without the invalid ones."""
         self._asked[key] = None
         value = self.values.get(key, [])
         if not isinstance(value, list):
@@ -355,21 +361,24 @@ class Table:
         return good
 
     def close(self) -> None:
-        """Note every key of this table that nobody asked for."""
+        """Note every key of this table that was not read."""
         for key in self.values:
             if key not in self._asked:
                 self.faults.add(self.key(key), "an unknown key", listed(self._asked, key))
 
 
-_USUAL = f"0 or of a size from {_SMALLEST:g} to {_LARGEST:g}"
+def _name(value: object) -> str | None:
+    return value if isinstance(value, str) and NAME_PATTERN.fullmatch(value) else None
 
 
-def _is_usual(number: float) -> bool:
-    return number == 0 or _SMALLEST <= abs(number) <= _LARGEST
+def _limits(bounds: Iterable[Bound], numbers: Iterable[float]) -> list[str]:
+    """Return the bounds in words; that of the size only where a number violates it."""
+    usual = all(map(_USUAL.holds, numbers))
+    return [str(bound) for bound in bounds] + ([] if usual else [str(_USUAL)])
 
 
 def finite_number(value: object) -> float | None:
-    """A finite number from TOML or JSON, else None; booleans are not numbers."""
+    """Return a finite number from TOML or JSON, else None; booleans are not numbers."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:

@@ -12,7 +12,7 @@ def listen_at(listener: socket.socket, path: Path, backlog: int) -> None:
     """Give a socket its name and listen; only its owner may connect.
 
     Between ``bind`` and ``listen`` a connection is refused, so the socket is bound under another
-    name, and gets this one when it listens: whoever sees the file can connect.
+    name, and gets this one when it listens: a client that sees the file can connect.
 
     Args:
         listener: A stream or seqpacket socket, not bound.

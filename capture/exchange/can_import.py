@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -24,7 +25,7 @@ from .frame_log import FrameLog, LogBlock
 from .import_output import ImportReport, imported_session
 
 DIRECTIONS_KEY = "import.directions"
-"""Metadata key: ``recorded``, or ``none`` for a log that doesn't tell sent from received."""
+"""Metadata key: ``recorded``, or ``none`` for a log without directions."""
 
 _BATCH_NS = 50_000_000  # one message of raw frames spans at most this
 
@@ -60,8 +61,8 @@ def import_can(
         blocks = iter(log.blocks)
         first = next(blocks, None)
         if first is None:
-            raise ImportFormatError(source, "holds no CAN frames")
-        chosen = bus or log.buses[first.first_bus()]
+            raise ImportFormatError(source, "; ".join(["holds no CAN frames", *log.problems[:1]]))
+        chosen = bus or log.buses[int(first.bus[0])]
         facts = {
             "import.format": log_suffix(source).removeprefix("."),
             "import.time": log.time,
@@ -99,7 +100,7 @@ class _Import:
         self._topics = DecodedTopics(writer, robot, self._decoder) if self._decoder else None
         self._channels: dict[str, FrameChannel] = {}
         self._tally = FrameTally()
-        self._other_buses: dict[str, int] = {}
+        self._other_buses: Counter[str] = Counter()
         self._latest_ns: dict[str, int] = {}
         self._backward = 0
         self._unseen = set(robot.joint_names)
@@ -107,17 +108,15 @@ class _Import:
     def add(self, block: LogBlock) -> None:
         messages: list[Message] = []
         for index, name in enumerate(self._log.buses):
-            frames = block.of_bus(index)
-            if not len(frames):
+            own = block[block.bus == index]
+            if not len(own):
                 continue
-            classic = block.frames[block.bus == index]
-            fd_frames = block.fd_frames[block.fd_bus == index]
-            messages += self._raw_messages(FRAME_TOPIC_PREFIX + name, classic)
-            messages += self._raw_messages(FD_TOPIC_PREFIX + name, fd_frames)
+            messages += self._raw_messages(FRAME_TOPIC_PREFIX + name, own.classic())
+            messages += self._raw_messages(FD_TOPIC_PREFIX + name, own.frames[own.is_fd])
             if name != self._chosen:
-                self._other_buses[name] = self._other_buses.get(name, 0) + len(frames)
+                self._other_buses[name] += len(own)
             elif self._decoder is not None and self._topics is not None:
-                samples, tally = self._decoder.decode(frames)
+                samples, tally = self._decoder.decode(own.to_decode())
                 self._tally.add(tally)
                 self._unseen -= _targets(samples) if self._unseen else set()
                 messages += self._topics.add(samples)
@@ -163,7 +162,7 @@ class _Import:
         report.end_ns = max(report.end_ns, int(t_ns.max()))
 
     def _raw_messages(self, topic: str, frames: FrameArray) -> Iterator[Message]:
-        """Batches of raw frames; their log times increase, so that their order is kept."""
+        """Yield batches of raw frames; their log times increase, so that their order is kept."""
         if not len(frames):
             return
         if topic not in self._channels:
@@ -183,7 +182,7 @@ def _writing(channel: FrameChannel, frames: FrameArray) -> Callable[[int], None]
 
 
 def _targets(samples: Iterable[DecodedSignals]) -> set[str]:
-    """The joints and sensors that have samples."""
+    """Return the joints and sensors that have samples."""
     found: set[str] = set()
     for decoded in samples:
         members: list[int] = np.unique(decoded.member).tolist()

@@ -19,9 +19,8 @@ import os
 import sqlite3
 import struct
 import zlib
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TextIO, cast
 
@@ -48,15 +47,7 @@ from ..log.messages.frames import (
     REMOTE_FLAG,
 )
 from .candump import read_candump
-from .frame_log import (
-    EARLIEST_NS,
-    FRAMES_PER_BLOCK,
-    LATEST_NS,
-    RELATIVE_EPOCH_NS,
-    BlockBuilder,
-    FrameLog,
-    LogBlock,
-)
+from .frame_log import LATEST_NS, FrameLog, FrameRow, LogBlock, blocks_of
 from .mf4 import open_mf4
 
 if TYPE_CHECKING:
@@ -143,7 +134,7 @@ SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db", ".mf4")
 CSV_HEADER = "timestamp,arbitration_id,"
 """How a CSV file begins that python-can wrote; any other needs a column map."""
 
-_MOST_TEXTS = 20  # different warnings of a library that are told
+_MOST_TEXTS = 20  # different warnings of a library that are reported
 _LINES_LEFT_OUT = ("Unsupported type", "Dropping bus info line")
 _WITHOUT_DIRECTIONS = (".csv", ".db")
 _LATEST_S = 8e9  # the year 2223; a time from the log's start fits behind its epoch, too
@@ -170,12 +161,9 @@ _READ_ERRORS = (
 def open_frame_log(path: Path) -> Generator[FrameLog]:
     """Open a log of CAN frames by its suffix.
 
-    Args:
-        path: The file, with one of :data:`SUFFIXES`.
-
     Raises:
-        ImportFormatError: If there is no such file, its format isn't known or isn't what its
-            suffix says, or it holds no frames; also while its blocks are taken.
+        ImportFormatError: If there is no such file, or its format isn't known or isn't that of
+            its suffix; also while its blocks are taken.
         MissingExtraError: If the format is MF4 and its extra is not installed.
     """
     if not is_file(path):
@@ -202,7 +190,7 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
 
 
 def _datable(log: FrameLog) -> FrameLog:
-    """The log without the frames whose time no stamp can hold, which are counted."""
+    """Leave out, and count, the frames whose time no stamp can hold."""
     log.blocks = _before_the_latest(log.blocks, log.problems)
     return log
 
@@ -210,9 +198,8 @@ def _datable(log: FrameLog) -> FrameLog:
 def _before_the_latest(blocks: Iterator[LogBlock], problems: list[str]) -> Iterator[LogBlock]:
     late = 0
     for block in blocks:
-        keep = block.times_ns() < LATEST_NS
-        late += len(block) - int(keep.sum())
-        kept = block if keep.all() else block.where(keep)
+        kept = block[block.times_ns() < LATEST_NS]
+        late += len(block) - len(kept)
         if len(kept):
             yield kept
     if late:
@@ -220,11 +207,7 @@ def _before_the_latest(blocks: Iterator[LogBlock], problems: list[str]) -> Itera
 
 
 def log_suffix(path: Path) -> str:
-    """The suffix that tells the format, in lower case: that before ``.gz``, if compressed.
-
-    Returns:
-        E.g. ``.asc``.
-    """
+    """Return the suffix of the format in lower case, that before ``.gz``, e.g. ``.asc``."""
     suffixes = [suffix.lower() for suffix in path.suffixes]
     return next((suffix for suffix in reversed(suffixes) if suffix != ".gz"), "")
 
@@ -254,29 +237,17 @@ def _check_database(path: Path) -> None:
 def _python_can_log(
     path: Path, reader: MessageReader, suffix: str, problems: list[str]
 ) -> FrameLog:
-    messages = _messages(path, reader)
-    if suffix == ".asc":
-        messages = map(_with_length_code, messages)
-    odd = _Odd()
-    messages = filter(odd.is_frame, messages)
-    with _noted("can", problems):
-        first = next(messages, None)
-    if first is None:
-        raise ImportFormatError(path, "; ".join(["holds no CAN frames", *problems[:1]]))
-    relative = first.timestamp * 1e9 < EARLIEST_NS
     log = FrameLog(
         blocks=iter(()),
         buses=[],
         directions=suffix not in _WITHOUT_DIRECTIONS,
-        time="counted from the log's start, put at 2000-01-01T00:00:00Z; rounded to 1 us"
-        if relative
-        else "as recorded, rounded to 1 us",
+        time="as recorded, rounded to 1 us",
         problems=problems,
     )
-    epoch_ns = RELATIVE_EPOCH_NS if relative else 0
-    log.blocks = _blocks(
-        path, chain([first], messages), log, epoch_ns, lambda: _read_part(reader), odd
-    )
+    messages = _messages(path, reader)
+    if suffix == ".asc":
+        messages = map(_with_length_code, messages)
+    log.blocks = blocks_of(_rows(path, messages, log), lambda: _read_part(reader))
     claimed = getattr(reader, "file_size", 0)  # of a BLF file, by its header
     if suffix == ".blf" and claimed > path.stat().st_size:
         log.problems.append(
@@ -286,7 +257,7 @@ def _python_can_log(
 
 
 def _lines(path: Path, stream: TextIO) -> Iterator[str]:
-    """The lines of a text, its errors with the file."""
+    """Yield the lines of a text; errors name the file."""
     try:
         yield from stream
     except (OSError, EOFError) as error:  # a damaged .gz, above all
@@ -294,7 +265,7 @@ def _lines(path: Path, stream: TextIO) -> Iterator[str]:
 
 
 def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:
-    """The reader's messages, its errors with the file and the place."""
+    """Yield the reader's messages; errors name the file and the position."""
     count = 0
     try:
         for message in reader:
@@ -306,9 +277,11 @@ def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:
 
 
 def _read_part(reader: MessageReader) -> float:
-    """How much of its file a reader has taken, 0 to 1; 0 where it can't be told."""
+    """Return the share of its file that a reader has read, 0 to 1; 0 if it is unknown."""
     stream = getattr(reader, "file", None)
-    raw = getattr(stream, "buffer", stream)  # of a text stream, which itself can't tell
+    raw = getattr(
+        stream, "buffer", stream
+    )  # of a text stream, whose tell() fails while it is iterated
     if not isinstance(raw, io.BufferedIOBase):
         return 0.0
     try:
@@ -317,26 +290,20 @@ def _read_part(reader: MessageReader) -> float:
         return 0.0
 
 
-def _blocks(  # noqa: PLR0917
-    path: Path,
-    messages: Iterator[Message],
-    log: FrameLog,
-    epoch_ns: int,
-    done: Callable[[], float],
-    odd: _Odd,
-) -> Iterator[LogBlock]:
-    rows = BlockBuilder()
-    unmarked = 0
+def _rows(path: Path, messages: Iterator[Message], log: FrameLog) -> Iterator[FrameRow]:
+    epoch_ns, invalid, unmarked = None, 0, 0
     with _noted("can", log.problems):
         for message in messages:
+            if not _is_frame(message):
+                invalid += 1
+                continue
+            if epoch_ns is None:
+                epoch_ns = log.epoch_ns(message.timestamp * 1e9, "rounded to 1 us")
             unmarked += not message.is_fd and len(message.data) > 8
-            _append(rows, message, log, epoch_ns, path)
-            if len(rows) == FRAMES_PER_BLOCK:
-                yield rows.block(done())
-                rows = BlockBuilder()
-    if odd.count:
+            yield _row(path, message, log, epoch_ns)
+    if invalid:
         log.problems.append(
-            f"{odd.count} records are no CAN frames (a time, an identifier, a length or data that "
+            f"{invalid} records are no CAN frames (a time, an identifier, a length or data that "
             "can't be) and are left out"
         )
     if unmarked:
@@ -344,67 +311,54 @@ def _blocks(  # noqa: PLR0917
             f"{unmarked} frames of more than 8 bytes are CAN FD frames; the log does not mark "
             "them, and shorter ones count as classic"
         )
-    if len(rows):
-        yield rows.block(1.0)
 
 
-class _Odd:
-    """Records that a damaged file has as frames, and that can be none."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def is_frame(self, message: Message) -> bool:
-        """Whether a record can be a frame; counts those that can't."""
-        record: Any = message  # a database and a damaged file have any type and value
-        time, identifier, code = record.timestamp, record.arbitration_id, record.dlc
-        sound = (
-            isinstance(time, int | float)
-            and -_LATEST_S < time < _LATEST_S
-            and isinstance(identifier, int)
-            and 0 <= identifier <= ID_MASK
-            and isinstance(code, int)
-            and 0 <= code <= _MOST_BYTES
-            and isinstance(record.data, bytes | bytearray | memoryview)
-        )
-        self.count += not sound
-        return sound
+def _is_frame(message: Message) -> bool:
+    """Return whether a record of a damaged file can be a frame."""
+    record: Any = message  # a database and a damaged file have any type and value
+    time, identifier, code = record.timestamp, record.arbitration_id, record.dlc
+    return (
+        isinstance(time, int | float)
+        and -_LATEST_S < time < _LATEST_S
+        and isinstance(identifier, int)
+        and 0 <= identifier <= ID_MASK
+        and isinstance(code, int)
+        and 0 <= code <= _MOST_BYTES
+        and isinstance(record.data, bytes | bytearray | memoryview)
+    )
 
 
-def _append(rows: BlockBuilder, message: Message, log: FrameLog, epoch_ns: int, path: Path) -> None:
+def _row(path: Path, message: Message, log: FrameLog, epoch_ns: int) -> FrameRow:
     t_ns = epoch_ns + round(message.timestamp * 1e6) * 1000
     if t_ns < 0:
         raise ImportFormatError(path, f"has a frame at {message.timestamp} s, before 1970")
-    flags = (
-        (ERROR_FLAG if message.is_error_frame else 0)
-        | (REMOTE_FLAG if message.is_remote_frame else 0)
-        | (EXTENDED_FLAG if message.is_extended_id and not message.is_error_frame else 0)
-    )
     channel = message.channel
-    bus = f"can{channel}" if isinstance(channel, int) else str(channel or "can0")
-    if bus not in log.buses:
-        log.buses.append(bus)
-    # An error frame tells what happened on the bus, and is of neither kind.
+    # An error frame reports an event on the bus and is neither classic nor CAN FD.
     is_fd = (message.is_fd or len(message.data) > 8) and not message.is_error_frame
     data = bytes(message.data[: 64 if is_fd else 8])
-    if is_fd:
-        flags &= ~REMOTE_FLAG  # none in CAN FD: python-can takes empty frames for such
-    rows.append(
+    flags = (
+        (ERROR_FLAG if message.is_error_frame else 0)
+        # None in CAN FD: python-can takes empty frames for such.
+        | (REMOTE_FLAG if message.is_remote_frame and not is_fd else 0)
+        | (EXTENDED_FLAG if message.is_extended_id and not message.is_error_frame else 0)
+    )
+    fd_flags = (FD_BRS if message.bitrate_switch else 0) | (
+        FD_ESI if message.error_state_indicator else 0
+    )
+    return FrameRow(
         t_ns=t_ns,
         id_flags=message.arbitration_id | flags,
         length=len(data) if is_fd else message.dlc,
         way=DIR_RX if message.is_rx else DIR_TX,
-        bus=log.buses.index(bus),
+        bus=log.bus_index(f"can{channel}" if isinstance(channel, int) else str(channel or "can0")),
+        is_fd=is_fd,
+        fd_flags=fd_flags if is_fd else 0,
         data=data,
-        fd_flags=(FD_BRS if message.bitrate_switch else 0)
-        | (FD_ESI if message.error_state_indicator else 0)
-        if is_fd
-        else None,
     )
 
 
 def _with_length_code(message: Message) -> Message:
-    """A frame of ASC, whose reader takes a length code for CAN FD's: 9 comes as 12 bytes."""
+    """Correct the length code of an ASC frame, which the reader decodes as CAN FD's: 9 as 12."""
     from can.util import len2dlc
 
     if not message.is_fd and not message.is_remote_frame:

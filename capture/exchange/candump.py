@@ -16,14 +16,10 @@ Times are kept as integers, so what is read here and written again is the same t
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ..common.arrays import IntArray
 from ..common.errors import ImportFormatError
 from ..log.mcap.chunk import LAST_NS
 from ..log.messages.frames import (
@@ -33,10 +29,9 @@ from ..log.messages.frames import (
     EXTENDED_FLAG,
     ID_MASK,
     REMOTE_FLAG,
-    FrameArray,
-    holds_fd,
+    identifier_text,
 )
-from .frame_log import FRAMES_PER_BLOCK, BlockBuilder, FrameLog, LogBlock
+from .frame_log import FrameLog, FrameRow, LogBlock, blocks_of
 
 _LINE = re.compile(
     r"\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#"
@@ -57,23 +52,22 @@ def read_candump(path: Path, lines: Iterator[str]) -> FrameLog:
         The log; faults in its lines are raised while its blocks are taken.
 
     Raises:
-        ImportFormatError: If a line is not what candump writes, or there is none.
+        ImportFormatError: If a line is not in the format of candump, or there is no line.
     """
     head = next(lines, "")
     match = _LINE.fullmatch(head)
     if match is None:
         raise ImportFormatError(path, f"is not a candump log; its first line is {_quoted(head)}")
     log = FrameLog(iter(()), [], match[10] is not None, "as recorded, exact")
-    log.blocks = _blocks(path, chain([head], lines), log)
+    size = max(path.stat().st_size, 1)
+    log.blocks = blocks_of(_rows(path, chain([head], lines), log), lambda: log.read / size)
     return log
 
 
-def _blocks(path: Path, lines: Iterator[str], log: FrameLog) -> Iterator[LogBlock]:
-    rows = BlockBuilder()
-    other_way = done = 0
-    size = max(path.stat().st_size, 1)
+def _rows(path: Path, lines: Iterator[str], log: FrameLog) -> Iterator[FrameRow]:
+    other_way = 0
     for number, line in enumerate(lines, start=1):
-        done += len(line)
+        log.read += len(line)
         match = _LINE.fullmatch(line)
         if match is None:
             if not line.strip():
@@ -83,18 +77,13 @@ def _blocks(path: Path, lines: Iterator[str], log: FrameLog) -> Iterator[LogBloc
                 break
             raise ImportFormatError(path, f"line {number} is no candump line: {_quoted(line)}")
         other_way += (match[10] is not None) != log.directions
-        _append(rows, match, log.buses)
-        if len(rows) == FRAMES_PER_BLOCK:
-            yield rows.block(done / size)
-            rows = BlockBuilder()
+        yield _row(match, log)
     if other_way:
         having = "without" if log.directions else "with"
         log.problems.append(f"{other_way} frames {having} a direction, unlike the first one")
-    if len(rows):
-        yield rows.block(1.0)
 
 
-def _append(rows: BlockBuilder, match: re.Match[str], buses: list[str]) -> None:
+def _row(match: re.Match[str], log: FrameLog) -> FrameRow:
     seconds, fraction, bus, digits, data, raw_dlc, remote_dlc, fd_flags, fd_data, way = (
         match.groups()
     )
@@ -103,79 +92,60 @@ def _append(rows: BlockBuilder, match: re.Match[str], buses: list[str]) -> None:
     if len(digits) == 8:
         # candump prints the error flag within the digits, and nothing else above 29 bits.
         flags = ERROR_FLAG if identifier & ERROR_FLAG else EXTENDED_FLAG
-    if bus not in buses:
-        buses.append(bus)
-    # No block holds a later time; nor does a stamp, so such frames are left out anyway.
-    t_ns = min(int(seconds) * _NS + int(fraction.ljust(9, "0")), LAST_NS)
-    if fd_flags is not None:
-        content = bytes.fromhex(fd_data)
-        length = len(content)
-    elif remote_dlc is not None:
-        content, length = b"", int(remote_dlc or 0)
+    content = bytes.fromhex(data or fd_data or "")
+    length = int(raw_dlc, 16) if raw_dlc else len(content)
+    if remote_dlc is not None:
+        length = int(remote_dlc or 0)
         flags |= REMOTE_FLAG
-    else:
-        content = bytes.fromhex(data)
-        length = int(raw_dlc, 16) if raw_dlc else len(content)
-    rows.append(
-        t_ns=t_ns,
-        id_flags=(identifier & ID_MASK) | flags,
-        length=length,
-        way=DIR_TX if way in {"T", "t"} else DIR_RX,
-        bus=buses.index(bus),
-        data=content,
-        fd_flags=None if fd_flags is None else int(fd_flags, 16),
+    return FrameRow(
+        # No block holds a later time; nor does a stamp, so such frames are left out anyway.
+        min(int(seconds) * _NS + int(fraction.ljust(9, "0")), LAST_NS),
+        (identifier & ID_MASK) | flags,
+        length,
+        DIR_TX if way in {"T", "t"} else DIR_RX,
+        log.bus_index(bus),
+        fd_flags is not None,
+        int(fd_flags, 16) if fd_flags else 0,
+        content,
     )
 
 
 def candump_lines(
-    frames: FrameArray,
-    buses: list[str],
-    bus: IntArray,
-    *,
-    directions: bool,
-    nanoseconds: bool,
+    block: LogBlock, buses: Sequence[str], *, directions: bool, nanoseconds: bool
 ) -> Iterator[str]:
-    """Frames as candump writes them.
+    """Format frames as candump does, one line a frame with its line end.
 
     Args:
-        frames: The frames, classic or CAN FD, in the order wanted, shape (n,).
-        bus: Index into ``buses`` for each frame, shape (n,).
+        buses: Names of the buses, by the block's indices.
         directions: Whether to write ``R`` and ``T``.
-        nanoseconds: Whether times have nine decimals rather than six, as candump has them.
-
-    Yields:
-        One line a frame, with its line end.
+        nanoseconds: Whether times have nine decimals; candump writes six.
     """
-    t_ns: NDArray[np.uint64] = frames["t_host_ns"]
     digits, unit = (9, 1) if nanoseconds else (6, 1000)
-    fd = holds_fd(frames)
+    frames, data = block.frames, block.frames["data"].tobytes()
     columns = (
-        t_ns.tolist(),
-        frames["id_flags"].tolist(),
-        frames["len" if fd else "dlc"].tolist(),
-        frames["dir"].tolist(),
-        bus.tolist(),
-        (frames["fd_flags"] & 0xF).tolist() if fd else [0] * len(frames),
+        *(frames[name].tolist() for name in ("t_host_ns", "id_flags", "len", "dir", "fd_flags")),
+        block.bus.tolist(),
+        block.is_fd.tolist(),
     )
-    data, room = frames["data"].tobytes(), 64 if fd else 8
-    for i, (t, id_flags, dlc, way, which, fd_flags) in enumerate(zip(*columns, strict=True)):
-        seconds, rest = divmod(t, _NS)
-        payload = data[room * i : room * i + min(dlc, room)].hex().upper()
-        if fd:
-            payload = f"#{fd_flags:X}{payload}"
+    rows = enumerate(zip(*columns, strict=True))
+    for i, (t_ns, id_flags, length, way, fd_flags, bus, is_fd) in rows:
+        seconds, rest = divmod(t_ns, _NS)
+        payload = data[64 * i : 64 * i + min(length, 64 if is_fd else 8)].hex().upper()
+        if is_fd:
+            payload = f"#{fd_flags & 0xF:X}{payload}"
         elif id_flags & REMOTE_FLAG:
-            payload = f"R{dlc or ''}"
-        elif dlc > 8:
-            payload += f"_{dlc:X}"
+            payload = f"R{length or ''}"
+        elif length > 8:
+            payload += f"_{length:X}"
         tail = (" T" if way == DIR_TX else " R") if directions else ""
         time = f"({seconds}.{rest // unit:0{digits}d})"
-        yield f"{time} {buses[which]} {_identifier(id_flags)}#{payload}{tail}\n"
+        yield f"{time} {buses[bus]} {_identifier(id_flags)}#{payload}{tail}\n"
 
 
 def _identifier(id_flags: int) -> str:
     if id_flags & ERROR_FLAG:
         return f"{id_flags & (ID_MASK | ERROR_FLAG):08X}"
-    return f"{id_flags & ID_MASK:0{8 if id_flags & EXTENDED_FLAG else 3}X}"
+    return identifier_text(id_flags)
 
 
 def _quoted(line: str) -> str:

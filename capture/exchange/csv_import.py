@@ -30,6 +30,7 @@ from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
@@ -95,7 +96,7 @@ class ColumnMap:
     delimiter: str = ","
 
     def toml(self) -> str:
-        """The map as a TOML file, for the session's attachments."""
+        """Return the map as a TOML file, for the session's attachments."""
         lines = [f"delimiter = {json.dumps(self.delimiter)}", "", "[time]"]
         lines += [f"column = {json.dumps(self.time_column)}", f'unit = "{self.time_unit}"']
         for column in self.columns:
@@ -109,9 +110,6 @@ class ColumnMap:
 
 def read_column_map(path: Path, robot: Robot) -> ColumnMap:
     """Read a map from its TOML file.
-
-    Args:
-        robot: The robot whose joints it names.
 
     Raises:
         InputFileError: If the file isn't there or can't be read.
@@ -225,11 +223,7 @@ _BESIDE_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
 
 
 def is_frame_csv(path: Path) -> bool:
-    """Whether a CSV file holds CAN frames, as python-can writes them.
-
-    Returns:
-        False for any other table; also for a file that can't be read.
-    """
+    """Return whether a file is a CSV of CAN frames by python-can; False if it is unreadable."""
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as stream:
             return stream.readline().startswith(CSV_HEADER)
@@ -353,7 +347,7 @@ class _Topic:
 
 
 def _topics_of(present: set[Quantity]) -> Iterator[tuple[Quantity, ...]]:
-    """The quantities of each topic; a row's velocity and effort belong to its position."""
+    """Yield the quantities of each topic; a row's velocity and effort belong to its position."""
     beside = [q for q in _BESIDE_POSITION if q in present and Quantity.POSITION in present]
     for quantity in JOINT_TOPIC:
         if quantity is Quantity.POSITION and quantity in present:
@@ -385,7 +379,7 @@ def _read_stream(source: Path, stream: TextIO, column_map: ColumnMap) -> _TimedC
             raise ImportFormatError(
                 source, f"row {reader.line_num} has {len(row)} cells, the header {len(header)}"
             )
-        where = _cell_namer(source, reader.line_num)
+        where = partial(_fault, source, reader.line_num)
         t_ns = _time_ns(row[places[0]], unit_ns, where, wanted[0])
         if times and t_ns < times[-1]:
             raise where(wanted[0], f"time goes back, from {times[-1] / unit_ns:g}")
@@ -395,16 +389,17 @@ def _read_stream(source: Path, stream: TextIO, column_map: ColumnMap) -> _TimedC
     if not times:
         raise ImportFormatError(source, "has no rows below its header")
     series = [np.frombuffer(numbers, dtype=np.float64) for numbers in cells]
-    notes = [
-        f"column {column.column!r}: {count} cells without a value"
-        for column, values in zip(column_map.columns, series, strict=True)
-        if (count := int(np.isnan(values).sum()))
-    ]
-    values = [
-        _converted(column, values)
-        for column, values in zip(column_map.columns, series, strict=True)
-    ]
+    notes: list[str] = []
+    values: list[FloatArray] = []
+    for column, cells_of in zip(column_map.columns, series, strict=True):
+        if count := int(np.isnan(cells_of).sum()):
+            notes.append(f"column {column.column!r}: {count} cells without a value")
+        values.append(_converted(column, cells_of))
     return _TimedColumns(np.array(times, dtype=np.int64), values, notes)
+
+
+def _fault(source: Path, row: int, column: str, what: str) -> ImportFormatError:
+    return ImportFormatError(source, f"row {row}, column {column!r}: {what}")
 
 
 def _place(source: Path, header: list[str], name: str) -> int:
@@ -414,14 +409,10 @@ def _place(source: Path, header: list[str], name: str) -> int:
     return header.index(name)
 
 
-def _cell_namer(source: Path, row: int) -> Callable[[str, str], ImportFormatError]:
-    return lambda column, what: ImportFormatError(source, f"row {row}, column {column!r}: {what}")
-
-
 def _time_ns(
     cell: str, unit_ns: int, where: Callable[[str, str], ImportFormatError], name: str
 ) -> int:
-    """A time in ns, without going through a double, which can't hold Unix times to the ns."""
+    """Parse a time [ns] in decimal: a double can't hold Unix times to the ns."""
     try:
         t_ns = Decimal(cell.strip()) * unit_ns
         if abs(t_ns) < LATEST_NS:
@@ -444,7 +435,7 @@ def _number(cell: str, where: Callable[[str, str], ImportFormatError], name: str
 
 
 def _converted(column: Column, values: FloatArray) -> FloatArray:
-    """Cells in the session's unit: unwrapped, scaled and offset, converted."""
+    """Convert cells to the session's unit: unwrapped, scaled and offset."""
     plain = values.copy()
     if column.wrap:
         known = ~np.isnan(plain)

@@ -4,7 +4,7 @@ Columns: ``t_ns`` (the sample's own time, Unix ns), ``topic``, ``joint``, and on
 named ``TOPIC.FIELD [UNIT]`` without the topic's leading slash, or ``TOPIC [UNIT]`` where the topic
 is the quantity: ``joint_states.velocity [rad/s]``, ``joint_current [A]``. A row has the quantities
 of its topic, and nothing in the columns of other topics. Nothing is resampled or filled in: joints
-that were asked one after the other have rows at different times. Rows are sorted by time within a
+that were sampled one after the other have rows at different times. Rows are sorted by time within a
 topic.
 
 A spreadsheet takes text in a CSV that begins with ``=``, ``+``, ``-`` or ``@`` for a formula. So
@@ -17,10 +17,10 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
@@ -37,18 +37,19 @@ from ..log.read.signals import JointSignals
 from .frame_blocks import LossTally, chosen_buses, frame_blocks, frame_facts
 from .frame_formats import FRAME_FORMATS
 
+_Format = TypeVar("_Format")
+
 
 @dataclass
 class ExportReport:
-    """What an export of frames did.
+    """Result of an export of frames.
 
     Attributes:
+        title: Name of the format.
         buses: Bus to number of frames written.
-        warnings: What the format doesn't hold, or the session doesn't give, one sentence each.
+        warnings: Facts that the format doesn't hold or the session lacks, one sentence each.
     """
 
-    source: Path
-    output: Path
     title: str
     buses: dict[str, int]
     warnings: list[str] = field(default_factory=list[str])
@@ -82,12 +83,7 @@ def export_log(
         LogWriteError: If the output can't be written or the export was stopped; nothing is left
             behind then.
     """
-    chosen = FRAME_FORMATS.get(output.suffix.lower())
-    if chosen is None:
-        valid = ", ".join(FRAME_FORMATS)
-        raise UsageError(f"{output}: no format has the suffix {output.suffix!r}; valid: {valid}")
-    refuse_same(source, output)
-    refuse_existing(output, force=force)
+    chosen = _chosen(FRAME_FORMATS, "format", source, output, force=force)
     tally = LossTally()
     with Session.open(source) as session:
         facts = frame_facts(session, chosen_buses(session, bus))
@@ -97,14 +93,9 @@ def export_log(
             chosen.open(part, facts) as write,
         ):
             for block in frame_blocks(session, facts.buses, fd=chosen.holds_fd):
-                kept = replace(
-                    block,
-                    frames=chosen.kept(block.frames),
-                    fd_frames=chosen.kept(block.fd_frames) if chosen.holds_fd else block.fd_frames,
-                )
-                tally.add(block.frames, kept.frames)
-                tally.add(block.fd_frames, kept.fd_frames)
-                write(kept)
+                kept = chosen.kept(block)
+                tally.add(block, kept)
+                write(replace(block, frames=kept))
                 bar.update(block.done)
                 check_stop(output, stop)
         counts, warnings = dict(facts.counts), [*session.warnings, *chosen.notes(facts)]
@@ -113,21 +104,21 @@ def export_log(
         elif left_out := sum(facts.fd_counts.values()):
             warnings.append(f"{left_out} CAN FD frames left out: the format has 8 bytes a frame")
         warnings += tally.sentences()
-    return ExportReport(source, output, chosen.title, counts, warnings)
+    return ExportReport(chosen.title, counts, warnings)
 
 
-def refuse_same(source: Path, output: Path) -> None:
-    """Check that an export doesn't replace its own session.
-
-    Raises:
-        UsageError: If they are one file.
-    """
+def _chosen(
+    formats: Mapping[str, _Format], what: str, source: Path, output: Path, *, force: bool
+) -> _Format:
+    """Return the format by the suffix of the output, which must not be the session itself."""
+    if output.suffix.lower() not in formats:
+        valid = ", ".join(formats)
+        raise UsageError(f"{output}: no {what} has the suffix {output.suffix!r}; valid: {valid}")
     if output.exists() and source.exists() and output.samefile(source):
         raise UsageError(f"{output} is the session itself; choose another name")
+    refuse_existing(output, force=force)
+    return formats[output.suffix.lower()]
 
-
-DEFAULT_TOPICS = tuple(JOINT_TOPIC.values())
-"""The topics written unless others are named, those of them that the session has."""
 
 _MOST_TOPICS = 500
 _ROWS_PER_BLOCK = 100_000
@@ -137,15 +128,13 @@ _FORMULA = tuple("=+-@\t\r\n'＝＋－＠")
 
 @dataclass
 class ColumnReport:
-    """What an export of columns did.
+    """Result of an export of columns.
 
     Attributes:
         rows: Topic to number of rows.
-        warnings: What is missing or doubtful, one sentence each.
+        warnings: Missing or doubtful facts, one sentence each.
     """
 
-    source: Path
-    output: Path
     columns: list[str]
     rows: dict[str, int] = field(default_factory=dict[str, int])
     warnings: list[str] = field(default_factory=list[str])
@@ -171,13 +160,6 @@ class RowBlock:
 WriteRows = Callable[[RowBlock], None]
 
 
-TableFormat = Callable[[Path, Sequence[str]], AbstractContextManager[WriteRows]]
-"""Creates a table with columns of those names; a ``with`` block around what writes rows.
-
-It raises OSError if the table can't be written, MissingExtraError if a package for it is missing.
-"""
-
-
 def export_columns(
     source: Path,
     output: Path,
@@ -192,7 +174,7 @@ def export_columns(
 
     Args:
         output: The table to write; its suffix is one of :data:`TABLE_FORMATS`.
-        topics: JointState topics; if none, those of :data:`DEFAULT_TOPICS` that are there.
+        topics: JointState topics; if none, commands and all quantities that the joints measure.
         stop: Ends the export, with nothing left behind.
 
     Raises:
@@ -205,12 +187,7 @@ def export_columns(
         LogWriteError: If the output can't be written or the export was stopped; nothing is left
             behind then.
     """
-    open_table = TABLE_FORMATS.get(output.suffix.lower())
-    if open_table is None:
-        valid = ", ".join(TABLE_FORMATS)
-        raise UsageError(f"{output}: no table has the suffix {output.suffix!r}; valid: {valid}")
-    refuse_same(source, output)
-    refuse_existing(output, force=force)
+    open_table = _chosen(TABLE_FORMATS, "table", source, output, force=force)
     with Session.open(source) as session:
         chosen = _topics(session, topics)
         if len(chosen) > _MOST_TOPICS:
@@ -220,7 +197,7 @@ def export_columns(
             )
         wanted = {topic: _columns(session, topic) for topic in chosen}
         columns = [name for found in wanted.values() for name in found.values()]
-        report = ColumnReport(source, output, ["t_ns", "topic", "joint", *columns])
+        report = ColumnReport(["t_ns", "topic", "joint", *columns])
         with (
             part_file(output) as part,
             progress(f"export {output.name}", len(wanted)) as bar,
@@ -242,7 +219,7 @@ def export_columns(
 
 @contextmanager
 def _open_csv(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
-    """CSV in UTF-8; floats with as many digits as bring them back exactly, NaN as an empty cell."""
+    """Write CSV in UTF-8; floats with all digits that are needed, NaN as an empty cell."""
     with path.open("w", encoding="utf-8", newline="") as stream:
         head = ["t_ns", "topic", "joint", *map(_as_text, columns)]
         _writer(stream, head).writerow(head)
@@ -296,19 +273,19 @@ def _open_parquet(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
         yield write
 
 
-TABLE_FORMATS: dict[str, TableFormat] = {".csv": _open_csv, ".parquet": _open_parquet}
-"""Suffix to what creates a table."""
+TABLE_FORMATS = {".csv": _open_csv, ".parquet": _open_parquet}
+"""Suffix to the function that creates a table with columns of some names."""
 
 
 def _writer(stream: TextIO, texts: Sequence[str]) -> Any:
-    """A writer of rows with those texts; a carriage return ends a row where it isn't quoted."""
+    """Return a writer of rows with some texts, quoted if one has a carriage return."""
     odd = any("\r" in text for text in texts)  # the module doesn't quote for it
     quoting = csv.QUOTE_NONNUMERIC if odd else csv.QUOTE_MINIMAL
     return csv.writer(stream, lineterminator="\n", quoting=quoting)
 
 
 def _as_text(name: str) -> str:
-    """A name that no spreadsheet takes for a formula."""
+    """Escape a name that a spreadsheet takes for a formula."""
     return f"'{name}" if name.startswith(_FORMULA) else name
 
 
@@ -325,11 +302,11 @@ def _topics(session: Session, wanted: Sequence[str]) -> list[str]:
     joint = [t for t, channel in session.channels.items() if channel.type_name == JOINT_STATE]
     if not joint:
         raise MissingChannelError(session.path, "joint topics", sorted(session.channels))
-    return [topic for topic in DEFAULT_TOPICS if topic in joint] or sorted(joint)
+    return [topic for topic in JOINT_TOPIC.values() if topic in joint] or sorted(joint)
 
 
 def _columns(session: Session, topic: str) -> dict[str, str]:
-    """The fields that a topic carries, with the names of their columns."""
+    """Return the fields that a topic carries, with the names of their columns."""
     found: dict[str, str] = {}
     for name in UNITS:
         try:
@@ -349,7 +326,7 @@ def _columns(session: Session, topic: str) -> dict[str, str]:
 def _blocks(
     session: Session, topic: str, columns: Mapping[str, str]
 ) -> Iterator[tuple[RowBlock, float]]:
-    """A topic's rows, sorted by time, with how much of them is done, 0 to 1."""
+    """Yield a topic's rows, sorted by time, and the share that is done, 0 to 1."""
     read = session.joint_columns({topic: list(columns)})
     sets = _aligned([read[topic, name] for name in columns])
     for number, signals in enumerate(sets):
@@ -358,7 +335,7 @@ def _blocks(
 
 
 def _aligned(signals: Sequence[JointSignals]) -> list[list[JointSignals]]:
-    """Sets of signals that have the same joints and times, so that they share rows.
+    """Group signals that have the same joints and times, so that they share rows.
 
     That is one set, but for foreign logs that leave a field empty in some messages.
     """
@@ -378,7 +355,7 @@ def _aligned(signals: Sequence[JointSignals]) -> list[list[JointSignals]]:
 def _sorted_blocks(
     signals: Sequence[JointSignals], columns: Sequence[str]
 ) -> Iterator[tuple[RowBlock, float]]:
-    """Rows of signals that share joints and times."""
+    """Yield the rows of signals that share joints and times."""
     first = signals[0]
     if not first.names:
         return

@@ -1,6 +1,6 @@
 """Formats of CAN traces that can be written, by suffix.
 
-A format says what it keeps of frames (:meth:`FrameFormat.kept`) and writes just that, so that what
+A format declares what it keeps of frames (:meth:`FrameFormat.kept`) and writes that, so that what
 is lost can be counted before it is lost. Formats: candump (:mod:`.capture.exchange.candump`),
 Vector's ASC and BLF by python-can, and messages of ROS 2 (:mod:`.capture.exchange.frame_formats`).
 
@@ -15,17 +15,18 @@ trace, so that frames of one time keep their order.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import datetime
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from mcap.writer import Writer
 
-from ..common.arrays import IntArray
+from ..common.arrays import BoolArray
 from ..log.messages.cdr import encode, layout_of
 from ..log.messages.definitions import parse_message_type, schema_text
 from ..log.messages.frames import (
@@ -38,31 +39,23 @@ from ..log.messages.frames import (
     ID_MASK,
     REMOTE_FLAG,
     FrameArray,
-    holds_fd,
 )
 from .candump import candump_lines
-from .frame_blocks import FrameFacts, is_error, is_remote, without_content
+from .frame_blocks import FrameFacts, is_error, is_remote
 from .frame_log import LogBlock
 
 if TYPE_CHECKING:
     from can.io.generic import MessageWriter
 
 
-TYPE_NAME = "can_msgs/msg/Frame"
-"""The messages' type."""
-
-SCHEMA = (
+_TYPE_NAME = "can_msgs/msg/Frame"
+_SCHEMA = (
     "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\n"
     "uint8 dlc\nuint8[8] data\n"
     + "=" * 80
     + "\nMSG: std_msgs/Header\n"
     + schema_text("std_msgs/msg/Header")
 )
-"""Its definition, dependencies appended."""
-
-TOPIC = {DIR_RX: "from_can_bus", DIR_TX: "to_can_bus"}
-"""Direction to the last part of the topic."""
-
 _NS = 1_000_000_000
 _STAMP_END_NS = 2**31 * _NS
 
@@ -70,15 +63,15 @@ _STAMP_END_NS = 2**31 * _NS
 class RosFrames:
     """An MCAP file of ``can_msgs/msg/Frame``."""
 
-    title = f"{TYPE_NAME}, one message a frame"
+    title = f"{_TYPE_NAME}, one message a frame"
     holds_fd = False
 
-    def kept(self, frames: FrameArray) -> FrameArray:
-        """Everything."""
-        return frames.copy()
+    def kept(self, block: LogBlock) -> FrameArray:
+        """Keep everything."""
+        return block.frames
 
     def notes(self, facts: FrameFacts) -> list[str]:
-        """Bus names that a topic can't have, and directions that are none."""
+        """Report changed bus names, missing directions and times after 2038."""
         notes = [
             f"topics can't be named after bus {name}: its are in {_namespace(name)}"
             for name in facts.buses
@@ -97,24 +90,23 @@ class RosFrames:
             writer = Writer(stream)
             writer.start(profile="ros2", library=f"undulog/{version('undulog')}")
             writer.add_metadata("undulog.export", {"session_id": facts.session_id})
-            schema = writer.register_schema(TYPE_NAME, "ros2msg", SCHEMA.encode())
+            schema = writer.register_schema(_TYPE_NAME, "ros2msg", _SCHEMA.encode())
             templates = [_Template(name) for name in facts.buses]
-            channels: dict[tuple[int, int], int] = {}
-            place = 0
+            channels: dict[tuple[int, bool], int] = {}
+            sequence = count()
 
             def write(block: LogBlock) -> None:
-                nonlocal place
-                frames, bus = block.frames, block.bus
-                messages = _interleaved(templates, frames, bus)
-                which: list[int] = bus.tolist()
-                way: list[int] = np.where(frames["dir"] == DIR_TX, DIR_TX, DIR_RX).tolist()
-                t_ns: list[int] = frames["t_host_ns"].tolist()
-                for key, t, data in zip(zip(which, way, strict=True), t_ns, messages, strict=True):
-                    if key not in channels:
-                        topic = f"{_namespace(facts.buses[key[0]])}/{TOPIC[key[1]]}"
-                        channels[key] = writer.register_channel(topic, "cdr", schema)
-                    writer.add_message(channels[key], t, data, t, place)
-                    place = (place + 1) & 0xFFFF_FFFF
+                messages = _interleaved(templates, block)
+                is_sent = (block.frames["dir"] == DIR_TX).tolist()
+                t_ns: list[int] = block.frames["t_host_ns"].tolist()
+                buses: list[int] = block.bus.tolist()
+                for bus, sent, t, data in zip(buses, is_sent, t_ns, messages, strict=True):
+                    if (bus, sent) not in channels:
+                        way = "to_can_bus" if sent else "from_can_bus"
+                        topic = f"{_namespace(facts.buses[bus])}/{way}"
+                        channels[bus, sent] = writer.register_channel(topic, "cdr", schema)
+                    number = next(sequence) & 0xFFFF_FFFF
+                    writer.add_message(channels[bus, sent], t, data, t, number)
 
             yield write
             writer.finish()
@@ -124,13 +116,13 @@ class _Template:
     """Messages of one bus: all have one length, and their numbers at the same places."""
 
     def __init__(self, bus: str) -> None:
-        kind = parse_message_type(TYPE_NAME, SCHEMA)
+        kind = parse_message_type(_TYPE_NAME, _SCHEMA)
         example = encode(kind, {"header": {"frame_id": bus}})
         self._example = np.frombuffer(example, dtype=np.uint8)
         self._leaves = layout_of(kind, example).leaves
 
     def messages(self, frames: FrameArray) -> list[bytes]:
-        """One message a frame."""
+        """Return one message a frame."""
         matrix = np.tile(self._example, (len(frames), 1))
         id_flags, t_ns = frames["id_flags"], frames["t_host_ns"]
         columns = {
@@ -140,8 +132,8 @@ class _Template:
             "is_rtr": (id_flags & REMOTE_FLAG) != 0,
             "is_extended": (id_flags & EXTENDED_FLAG) != 0,
             "is_error": (id_flags & ERROR_FLAG) != 0,
-            "dlc": frames["dlc"],
-            "data": frames["data"],
+            "dlc": frames["len"],
+            "data": frames["data"][:, :8],
         }
         for path, values in columns.items():
             leaf = self._leaves[path]
@@ -151,24 +143,24 @@ class _Template:
         return [row.tobytes() for row in matrix]
 
 
-def _interleaved(templates: list[_Template], frames: FrameArray, bus: IntArray) -> list[bytes]:
-    """The messages of frames of several buses, in their order."""
-    messages: list[bytes] = [b""] * len(frames)
-    for which, template in enumerate(templates):
-        rows = np.flatnonzero(bus == which)
-        for row, message in zip(rows.tolist(), template.messages(frames[rows]), strict=True):
+def _interleaved(templates: list[_Template], block: LogBlock) -> list[bytes]:
+    """Return the messages of the frames, in their order."""
+    messages: list[bytes] = [b""] * len(block)
+    for bus, template in enumerate(templates):
+        rows = np.flatnonzero(block.bus == bus)
+        for row, message in zip(rows.tolist(), template.messages(block.frames[rows]), strict=True):
             messages[row] = message
     return messages
 
 
 def _namespace(bus: str) -> str:
-    """A name of ROS 2 for a bus: letters, digits and underscores, no digit first."""
+    """Return a name of ROS 2 for a bus: letters, digits and underscores, no digit first."""
     name = re.sub(r"[^A-Za-z0-9_]", "_", bus)
     return f"/can_{name}" if name[:1].isdigit() or not name else f"/{name}"
 
 
 WriteFrames = Callable[[LogBlock], None]
-"""Writes a stretch of frames; of CAN FD frames only where the format holds them."""
+"""Writes a part of a log; CAN FD frames only where the format holds them."""
 
 
 _BLF_EPOCH_NS = 631_152_000 * _NS  # 1990: python-can takes less for no date
@@ -176,43 +168,48 @@ _NUMBERED = re.compile(r"can(0|[1-9]\d{0,3})")
 
 
 class FrameFormat(Protocol):
-    """One format of CAN traces."""
+    """One format of CAN traces.
+
+    Attributes:
+        title: Its name, as in ``in the format of ...``.
+        holds_fd: Whether it has CAN FD frames.
+    """
 
     title: str
-    """Its name, as in ``in the format of ...``."""
-
     holds_fd: bool
-    """Whether it has CAN FD frames."""
 
-    def kept(self, frames: FrameArray) -> FrameArray:
-        """What the format keeps of frames.
-
-        Args:
-            frames: Records, classic or, where the format holds them, CAN FD, shape (n,).
-
-        Returns:
-            What a reader of the format gets, shape (n,); the device times are not looked at.
-        """
+    def kept(self, block: LogBlock) -> FrameArray:
+        """Return the frames as a reader of the format gets them, except for device times."""
         ...
 
     def notes(self, facts: FrameFacts) -> list[str]:
-        """What the format can't say about the trace as a whole.
-
-        Returns:
-            One sentence each.
-        """
+        """Return what the format can't hold of the trace as a whole, one sentence each."""
         ...
 
     def open(self, path: Path, facts: FrameFacts) -> AbstractContextManager[WriteFrames]:
         """Create a file.
 
         Returns:
-            A ``with`` block around what writes frames, which must have been through :meth:`kept`.
+            Context of a function that writes frames, which must have been through :meth:`kept`.
 
         Raises:
             OSError: If it can't be written.
         """
         ...
+
+
+def _possible(block: LogBlock) -> FrameArray:
+    """Copy frames, remote ones without data, CAN FD ones with 64 bytes and never remote."""
+    frames, is_fd = block.frames.copy(), block.is_fd
+    frames["id_flags"][is_fd] &= ~np.uint32(REMOTE_FLAG)
+    frames["len"][is_fd] = np.minimum(frames["len"][is_fd], 64)
+    frames["data"][is_remote(frames)] = 0
+    return frames
+
+
+def _shorten(frames: FrameArray, which: BoolArray) -> None:
+    """Limit the length code of some frames to 8, in place."""
+    frames["len"][which] = np.minimum(frames["len"][which], 8)
 
 
 class Candump:
@@ -221,40 +218,23 @@ class Candump:
     title = "candump -L"
     holds_fd = True
 
-    def kept(self, frames: FrameArray) -> FrameArray:
-        """Everything but data of remote frames and further flags of error frames."""
-        kept = frames.copy()
-        error, remote = is_error(frames), is_remote(frames)
-        kept["id_flags"][error] &= ID_MASK | ERROR_FLAG
-        if holds_fd(frames):
-            return _without_remote(kept)
-        kept["data"][remote] = 0
-        kept["dlc"][remote] = np.minimum(frames["dlc"][remote], 8)
-        return kept
+    def kept(self, block: LogBlock) -> FrameArray:
+        """Keep everything but data of remote frames and further flags of error frames."""
+        frames = _possible(block)
+        frames["id_flags"][is_error(frames)] &= ID_MASK | ERROR_FLAG
+        _shorten(frames, is_remote(frames))
+        return frames
 
     def notes(self, facts: FrameFacts) -> list[str]:  # noqa: ARG002
-        """Nothing."""
+        """Report nothing."""
         return []
 
     @contextmanager
     def open(self, path: Path, facts: FrameFacts) -> Generator[WriteFrames]:
         """Create a file."""
+        options = {"directions": facts.directions, "nanoseconds": facts.nanoseconds}
         with path.open("w", encoding="utf-8", newline="\n") as stream:
-
-            def lines(frames: FrameArray, bus: IntArray) -> Iterator[str]:
-                return candump_lines(
-                    frames,
-                    facts.buses,
-                    bus,
-                    directions=facts.directions,
-                    nanoseconds=facts.nanoseconds,
-                )
-
-            def write(block: LogBlock) -> None:
-                classic, fd = lines(block.frames, block.bus), lines(block.fd_frames, block.fd_bus)
-                stream.writelines(block.interleaved(classic, fd))
-
-            yield write
+            yield lambda block: stream.writelines(candump_lines(block, facts.buses, **options))
 
 
 class Blf:
@@ -263,20 +243,17 @@ class Blf:
     title = "Vector BLF"
     holds_fd = True
 
-    def kept(self, frames: FrameArray) -> FrameArray:
-        """Everything but data of remote frames, and directions and flags of error frames."""
-        kept = frames.copy()
+    def kept(self, block: LogBlock) -> FrameArray:
+        """Keep everything but data of remote frames, and directions and flags of error frames."""
+        frames = _possible(block)
         error = is_error(frames)
-        kept["id_flags"][error] &= ID_MASK | ERROR_FLAG
-        if holds_fd(frames):
-            return _without_remote(kept)
-        kept["dlc"][error] = np.minimum(frames["dlc"][error], 8)
-        kept["dir"][error] = DIR_RX
-        kept["data"][is_remote(frames)] = 0
-        return kept
+        frames["id_flags"][error] &= ID_MASK | ERROR_FLAG
+        _shorten(frames, error & ~block.is_fd)
+        frames["dir"][error & ~block.is_fd] = DIR_RX
+        return frames
 
     def notes(self, facts: FrameFacts) -> list[str]:
-        """Bus names, directions that are none, and dates before 1990."""
+        """Report changed bus names, missing directions, and dates before 1990."""
         notes = _notes_on_buses(facts)
         if facts.start_ns < _BLF_EPOCH_NS:
             notes.append("its dates begin in 1990: the times are those since 1970, without a date")
@@ -304,21 +281,20 @@ class Asc:
     title = "Vector ASC"
     holds_fd = True
 
-    def kept(self, frames: FrameArray) -> FrameArray:
-        """Data and remote frames at whole microseconds; of error frames only the time."""
-        kept = frames.copy()
-        kept["t_host_ns"] = (frames["t_host_ns"] + 500) // 1000 * 1000
-        if holds_fd(frames):
-            return _without_remote(kept)
-        remote = is_remote(frames)
-        without_content(kept, is_error(frames))
+    def kept(self, block: LogBlock) -> FrameArray:
+        """Keep data and remote frames at whole microseconds; of error frames only the time."""
+        frames = _possible(block)
+        frames["t_host_ns"] = (frames["t_host_ns"] + 500) // 1000 * 1000
+        empty = is_error(frames) & ~block.is_fd
+        frames["id_flags"][empty] = ERROR_FLAG
+        for name in ("len", "data", "dir"):
+            frames[name][empty] = 0
         # Readers take a length code above 8 for that of a CAN FD frame.
-        kept["dlc"] = np.minimum(kept["dlc"], 8)
-        kept["data"][remote] = 0
-        return kept
+        _shorten(frames, ~block.is_fd)
+        return frames
 
     def notes(self, facts: FrameFacts) -> list[str]:
-        """Bus names, and directions that are none."""
+        """Report changed bus names and missing directions."""
         return _notes_on_buses(facts)
 
     @contextmanager
@@ -349,7 +325,7 @@ FRAME_FORMATS: dict[str, FrameFormat] = {
 
 
 def channel_numbers(buses: Sequence[str]) -> list[int]:
-    """Numbers for buses in formats that have no names, counted from 0 as python-can does.
+    """Return numbers for buses in formats that have no names, counted from 0 as python-can does.
 
     Returns:
         N for a bus ``canN``, so that an import names it the same; the lowest free number for any
@@ -359,13 +335,6 @@ def channel_numbers(buses: Sequence[str]) -> list[int]:
     taken = {int(match[1]) for match in matches if match}
     free = (number for number in range(len(buses) + len(taken)) if number not in taken)
     return [int(match[1]) if match else next(free) for match in matches]
-
-
-def _without_remote(fd_frames: FrameArray) -> FrameArray:
-    """CAN FD frames as they can be: none of them is a remote frame, none has over 64 bytes."""
-    fd_frames["id_flags"] &= ~np.uint32(REMOTE_FLAG)
-    fd_frames["len"] = np.minimum(fd_frames["len"], 64)
-    return fd_frames
 
 
 def _notes_on_buses(facts: FrameFacts) -> list[str]:
@@ -381,43 +350,35 @@ def _notes_on_buses(facts: FrameFacts) -> list[str]:
 
 
 def _writing(writer: MessageWriter, facts: FrameFacts, start_s: int) -> WriteFrames:
-    """What hands frames to a writer of python-can, timed from ``start_s`` [Unix s]."""
+    """Return what hands frames to a writer of python-can, timed from ``start_s`` [Unix s]."""
     from can import Message
 
-    channels = channel_numbers(facts.buses)
+    channels = np.array(channel_numbers(facts.buses))
 
-    def messages(frames: FrameArray, bus: IntArray) -> Iterator[Message]:
-        fd = holds_fd(frames)
-        room = 64 if fd else 8
-        columns: tuple[list[int], ...] = (
-            (frames["t_host_ns"].astype(np.int64) - start_s * _NS).tolist(),
-            frames["id_flags"].tolist(),
-            frames["len" if fd else "dlc"].tolist(),
-            frames["dir"].tolist(),
-            frames["fd_flags"].tolist() if fd else [0] * len(frames),
+    def write(block: LogBlock) -> None:
+        frames, data = block.frames, block.frames["data"].tobytes()
+        columns = (
+            (block.times_ns() - start_s * _NS).tolist(),
+            *(frames[name].tolist() for name in ("id_flags", "len", "dir", "fd_flags")),
+            channels[block.bus].tolist(),
+            block.is_fd.tolist(),
         )
-        numbers: list[int] = np.array(channels)[bus].tolist()
-        data = frames["data"].tobytes()
-        rows = zip(*columns, numbers, strict=True)
-        for i, (t_ns, id_flags, length, way, fd_flags, number) in enumerate(rows):
-            yield Message(
+        rows = enumerate(zip(*columns, strict=True))
+        for i, (t_ns, id_flags, length, way, fd_flags, channel, is_fd) in rows:
+            message = Message(
                 timestamp=(t_ns + 0.5) / _NS,  # python-can cuts to whole ns
                 arbitration_id=id_flags & ID_MASK,
                 is_extended_id=bool(id_flags & EXTENDED_FLAG),
                 is_remote_frame=bool(id_flags & REMOTE_FLAG),
                 is_error_frame=bool(id_flags & ERROR_FLAG),
-                channel=number,
+                channel=channel,
                 dlc=length,
-                data=data[room * i : room * i + min(length, room)],
+                data=data[64 * i : 64 * i + min(length, 64 if is_fd else 8)],
                 is_rx=way != DIR_TX,
-                is_fd=fd,
+                is_fd=is_fd,
                 bitrate_switch=bool(fd_flags & FD_BRS),
                 error_state_indicator=bool(fd_flags & FD_ESI),
             )
-
-    def write(block: LogBlock) -> None:
-        classic = messages(block.frames, block.bus)
-        for message in block.interleaved(classic, messages(block.fd_frames, block.fd_bus)):
             writer(message)
 
     return write

@@ -53,7 +53,7 @@ class ImportReport:
         return "good" if self.complete and not self.problems else "degraded"
 
     def as_json(self) -> dict[str, Any]:
-        """The report as plain JSON values."""
+        """Return the report as plain JSON values."""
         return {
             "source": str(self.source),
             "output": str(self.output),
@@ -69,11 +69,7 @@ class ImportReport:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal.
-
-    Returns:
-        64 digits.
-    """
+    """Return the SHA-256 of a file's bytes, in hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 

@@ -18,7 +18,7 @@ import sys
 import traceback
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
@@ -39,26 +39,14 @@ from ..log.messages.frames import (
     FD_ESI,
     ID_MASK,
     REMOTE_FLAG,
-    FrameArray,
     empty_fd_frames,
-    empty_frames,
 )
-from .frame_log import EARLIEST_NS, FRAMES_PER_BLOCK, RELATIVE_EPOCH_NS, FrameLog, LogBlock
+from .frame_log import FRAMES_PER_BLOCK, FrameLog, LogBlock, joined
 
 
 @contextmanager
-def readable(path: Path, what: str) -> Generator[None]:
-    """Turn whatever asammdf raises for a damaged file into our error with the file.
-
-    Args:
-        what: How the error begins, e.g. ``can't be read``.
-
-    Yields:
-        Nothing: a ``with`` block around calls of asammdf.
-
-    Raises:
-        ImportFormatError: If any of them fails.
-    """
+def _readable(path: Path, what: str) -> Generator[None]:
+    """Turn any error of asammdf into an ImportFormatError that begins with ``what``."""
     try:
         yield
     except ImportFormatError:
@@ -69,7 +57,7 @@ def readable(path: Path, what: str) -> Generator[None]:
 
 
 def _let_go(error: Exception) -> None:
-    """Free what asammdf half opened: it fails once more when it goes, and would say so."""
+    """Free what asammdf half opened: it fails again when it is deleted, with a message."""
     before = sys.unraisablehook
 
     def quiet(fault: sys.UnraisableHookArgs) -> None:
@@ -100,15 +88,8 @@ class _Saying(logging.Filter):
 
 
 @contextmanager
-def said(problems: list[str]) -> Generator[None]:
-    """Note what asammdf logs; it prints to the terminal of its own accord.
-
-    Args:
-        problems: Gets a sentence for each.
-
-    Yields:
-        Nothing: a ``with`` block around calls of asammdf.
-    """
+def _noted(problems: list[str]) -> Generator[None]:
+    """Add what asammdf logs to the problems, a sentence each, instead of printing it."""
     logger, saying = logging.getLogger("asammdf"), _Saying(problems)
     logger.addFilter(saying)
     try:
@@ -136,20 +117,10 @@ class _Group:
 
 @dataclass(frozen=True)
 class _Piece:
-    """Frames of one group; ``order`` never falls, not even where their times do.
-
-    Those of both kinds stand in records of CAN FD frames; ``len`` of a classic one is its length
-    code.
-    """
+    """Frames of one group; ``order`` never decreases, not even where their times do."""
 
     order: IntArray
-    bus: IntArray  # number of the bus, as the file has it
-    frames: FrameArray
-    is_fd: BoolArray
-
-    def __getitem__(self, rows: slice | IntArray) -> _Piece:
-        """Some of its frames."""
-        return _Piece(self.order[rows], self.bus[rows], self.frames[rows], self.is_fd[rows])
+    block: LogBlock  # its buses are numbers, as in the file
 
 
 @contextmanager
@@ -173,12 +144,12 @@ def open_mf4(path: Path) -> Generator[FrameLog]:
         from asammdf import MDF
     except ImportError as error:
         raise MissingExtraError(f"importing {path.name}", "mf4", "asammdf") from error
-    # What it says here is about decoding by databases inside the file, which is not asked for.
-    with said([]), readable(path, "can't be read"):
+    # Its messages here are about decoding by databases inside the file, which is not needed.
+    with _noted([]), _readable(path, "can't be read"):
         _check_head(path)
         mdf = MDF(BytesIO(gzip.decompress(path.read_bytes())) if path.suffix == ".gz" else path)
     try:
-        with readable(path, "can't be read"):
+        with _readable(path, "can't be read"):
             log = _log(path, mdf)
         yield log
     finally:
@@ -218,7 +189,7 @@ def _log(path: Path, mdf: Any) -> FrameLog:
 
 
 def _groups(mdf: Any) -> tuple[list[_Group], list[str]]:
-    """The groups of CAN frames, and what is left out."""
+    """Return the groups of CAN frames, and sentences on records that are left out."""
     groups: list[_Group] = []
     left_out: dict[str, int] = {}
     for index, group in enumerate(mdf.groups):
@@ -235,15 +206,15 @@ def _groups(mdf: Any) -> tuple[list[_Group], list[str]]:
         elif count:
             what = names[1] if len(names) > 1 else names[0] if names else f"group {index}"
             left_out[what] = left_out.get(what, 0) + count
-    told = [
+    sentences = [
         f"{count} records of {what} left out: only CAN data, remote and error frames are kept"
         for what, count in left_out.items()
     ]
-    return groups, told
+    return groups, sentences
 
 
 def _start(header: Any) -> tuple[int, str]:
-    """The start of the measurement [Unix ns], and what its clock is.
+    """Return the start of the measurement [Unix ns], and its clock.
 
     It is taken to 1 us: asammdf computes it in floating point, to 0.1 us.
     """
@@ -264,21 +235,19 @@ class _Reader:
         self._start_ns = start_ns
 
     def pieces(self, group: _Group) -> Iterator[_Piece]:
-        """The frames of a group, in the order they were logged."""
+        """Yield the frames of a group, in the order they were logged."""
         latest = np.iinfo(np.int64).min
         for first in range(0, group.count, FRAMES_PER_BLOCK):
             count = min(FRAMES_PER_BLOCK, group.count - first)
             times = self._mdf.get_master(group.index, record_offset=first, record_count=count)
             t_ns = self._start_ns + np.rint(np.asarray(times) * 1e9).astype(np.int64)
-            frames, bus, is_fd = self._frames(group, first, count)
-            frames["t_host_ns"] = t_ns.astype(np.uint64)
+            block = self._frames(group, first, count)
+            block.frames["t_host_ns"] = t_ns.astype(np.uint64)
             order = np.maximum(np.maximum.accumulate(t_ns), latest)
             latest = int(order[-1])
-            yield _Piece(order, bus, frames, is_fd)
+            yield _Piece(order, block)
 
-    def _frames(
-        self, group: _Group, first: int, count: int
-    ) -> tuple[FrameArray, IntArray, BoolArray]:
+    def _frames(self, group: _Group, first: int, count: int) -> LogBlock:
         def column(name: str, *, converted: bool = False) -> NDArray[Any] | None:
             if name not in group.channels:
                 return None
@@ -323,13 +292,13 @@ class _Reader:
             frames["data"][:, : cells.shape[1]] = cells
         frames["dir"] = _ways(column("Dir", converted=True), count)
         bus = none if (found := numbers("BusChannel")) is None else found
-        return frames, bus, is_fd
+        return LogBlock(frames, bus, is_fd)
 
 
 def _fd_facts(
     kind: str, size: IntArray, numbers: Callable[[str], IntArray | None]
 ) -> tuple[BoolArray, NDArray[np.uint8]]:
-    """Which are CAN FD frames, and their flags; an error frame is of neither kind."""
+    """Return which frames are CAN FD frames, and their flags; an error frame is neither kind."""
     is_fd, flags = size > 8, np.zeros(len(size), dtype=np.uint8)
     if (longer := numbers("EDL")) is not None:
         is_fd |= longer != 0
@@ -341,7 +310,7 @@ def _fd_facts(
 
 
 def _ways(column: NDArray[Any] | None, count: int) -> NDArray[np.uint8]:
-    """Directions: the file has them as numbers, or as texts Rx and Tx."""
+    """Convert directions, numbers or the texts Rx and Tx."""
     if column is None:
         return np.full(count, DIR_RX, dtype=np.uint8)
     texts = column.dtype.kind in "SU"
@@ -351,63 +320,44 @@ def _ways(column: NDArray[Any] | None, count: int) -> NDArray[np.uint8]:
 
 def _blocks(path: Path, reader: _Reader, groups: list[_Group], total: int) -> Iterator[LogBlock]:
     log, taken, epoch_ns = reader.log, 0, None
-    with said(log.problems):
+    with _noted(log.problems):
         merged = _merged([reader.pieces(group) for group in groups])
         while True:
-            with readable(path, f"can't be read after {taken} frames"):
+            with _readable(path, f"can't be read after {taken} frames"):
                 piece = next(merged, None)
             if piece is None:
                 break
-            frames = piece.frames
-            t_ns = frames["t_host_ns"].astype(np.int64)
+            t_ns = piece.times_ns()
             if epoch_ns is None:
-                epoch_ns = RELATIVE_EPOCH_NS if t_ns[0] < EARLIEST_NS else 0
-                if epoch_ns:
-                    log.time = "counted from the log's start, put at 2000-01-01T00:00:00Z; to 1 ns"
+                epoch_ns = log.epoch_ns(int(t_ns[0]), "to 1 ns")
             if (earliest := int(t_ns.min()) + epoch_ns) < 0:
                 raise ImportFormatError(path, f"has a frame at {earliest / _NS} s, before 1970")
-            frames["t_host_ns"] = (t_ns + epoch_ns).astype(np.uint64)
-            taken += len(frames)
-            yield _block(piece, _indices(piece.bus, log.buses), taken / total)
+            piece.frames["t_host_ns"] = (t_ns + epoch_ns).astype(np.uint64)
+            taken += len(piece)
+            yield replace(piece, bus=_indices(piece.bus, log), done=taken / total)
 
 
-def _block(piece: _Piece, bus: IntArray, done: float) -> LogBlock:
-    """The two kinds apart."""
-    is_fd = piece.is_fd
-    wide = piece.frames[~is_fd]
-    frames = empty_frames(len(wide))
-    for name in ("t_host_ns", "id_flags", "dir"):
-        frames[name] = wide[name]
-    frames["dlc"], frames["data"] = wide["len"], wide["data"][:, :8]
-    if not is_fd.any():
-        return LogBlock(frames, bus, done)
-    return LogBlock(frames, bus[~is_fd], done, piece.frames[is_fd], bus[is_fd], is_fd)
-
-
-def _indices(numbers: IntArray, buses: list[str]) -> IntArray:
-    """Indices of buses by their numbers; a bus that is new is added, in order of appearance."""
+def _indices(numbers: IntArray, log: FrameLog) -> IntArray:
+    """Return indices of buses by their numbers; a new bus is added, in order of appearance."""
     found, first, which = np.unique(numbers, return_index=True, return_inverse=True)
-    for place in np.argsort(first):
-        name = f"can{found[place]}"
-        if name not in buses:
-            buses.append(name)
-    return np.array([buses.index(f"can{number}") for number in found], dtype=np.int64)[which]
+    indices = np.empty(len(found), dtype=np.int64)
+    for k in np.argsort(first):
+        indices[k] = log.bus_index(f"can{found[k]}")
+    return indices[which]
 
 
-def _merged(streams: list[Iterator[_Piece]]) -> Iterator[_Piece]:
-    """Pieces of several groups as one stream; only one piece of each is held."""
+def _merged(streams: list[Iterator[_Piece]]) -> Iterator[LogBlock]:
+    """Merge the groups by time; only one piece of each is in memory."""
     heads = [next(stream, None) for stream in streams]
     while live := [(i, head) for i, head in enumerate(heads) if head is not None]:
         # What comes later in any group is not before the end of the piece that ends first.
         until = min(int(head.order[-1]) for _, head in live)
-        parts: list[_Piece] = []
+        orders: list[IntArray] = []
+        parts: list[LogBlock] = []
         for i, head in live:
             cut = int(np.searchsorted(head.order, until, side="right"))
-            parts.append(head[:cut])
-            rest = head[cut:]
+            orders.append(head.order[:cut])
+            parts.append(head.block[:cut])
+            rest = _Piece(head.order[cut:], head.block[cut:])
             heads[i] = rest if len(rest.order) else next(streams[i], None)
-        order = np.concatenate([part.order for part in parts])
-        bus = np.concatenate([part.bus for part in parts])
-        frames = np.concatenate([part.frames for part in parts])
-        is_fd = np.concatenate([part.is_fd for part in parts])
-        yield _Piece(order, bus, frames, is_fd)[np.argsort(order, kind="stable")]
+        yield joined(parts)[np.argsort(np.concatenate(orders), kind="stable")]

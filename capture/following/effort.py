@@ -1,4 +1,4 @@
-"""What a joint's effort says: whether its motor pushes, and as usual."""
+"""Comparison of a joint's effort with the usual one: whether its motor pushes."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from .motion import (
     Response,
     complex_median,
     marked_spans,
+    median_of,
     neighbours,
     record_span,
     whole_or,
@@ -26,20 +27,13 @@ from .motion import (
     within,
 )
 
+# Effort, as a share of a neighbour's, below which a motor does not drive its joint: friction.
 POWERLESS = 0.2
-"""Effort, as a share of a neighbour's, below which a motor does not drive its joint: friction."""
-
+# Control error, in those of the neighbours, from which a motor with power would push.
 PUSHING_ERROR_RATIO = 2.5
-"""Control error, in those of the neighbours, from which a motor with power would push."""
-
-ENDS = 2
-"""Joints at either end of a free chain, which little load may keep from any effort."""
-
-SAME = 0.35
-"""Change of an effort, as a share of the usual one, up to which it is the usual one."""
-
-PUSHING = 1.3
-"""Share of the usual effort above which a motor pushes against something."""
+ENDS = 2  # joints at either end of a free chain, which little load may keep from any effort
+SAME = 0.35  # change of an effort, as a share of the usual one, up to which it is the usual one
+PUSHING = 1.3  # share of the usual effort above which a motor pushes against something
 
 
 @dataclass(frozen=True)
@@ -60,17 +54,14 @@ class UsualEffort:
             outside = motion.effort.values[~within(motion.effort.t_s, main.spans_s)]
             if outside.size >= FEW_SAMPLES:
                 return float(np.median(np.abs(outside)))
-        return float(np.median(self.size)) if self.size.size else 0.0
+        return median_of(self.size, 0.0)
 
 
 def usual_effort(judged: Sequence[Judged]) -> UsualEffort:
-    """Effort of each joint that follows.
+    """Return effort of each joint that follows.
 
     Args:
         judged: The joints; those without a usual response are left out.
-
-    Returns:
-        The efforts; none where none was recorded.
     """
     size: list[float] = []
     ratio: list[complex] = []
@@ -88,17 +79,13 @@ def usual_effort(judged: Sequence[Judged]) -> UsualEffort:
 def effort_there(
     motion: JointMotion, judged: Judged, main: Symptom, usual: UsualEffort
 ) -> tuple[float, float] | None:
-    """Size of the effort where a joint stands, and its change, both in the usual one.
+    """Return size and change of the effort while a joint stands, relative to the usual effort.
 
     The effort's response to the command in windows of one cycle: a joint that is blocked pushes
     in step with its command, one that moves in step with its own lag behind it.
 
-    Args:
-        main: What it shows, and when.
-        usual: Effort of the joints that follow.
-
     Returns:
-        Both; None where nothing is known to compare with.
+        Both; None without an effort to compare with.
     """
     if motion.effort is None:
         return None
@@ -126,19 +113,13 @@ def effort_there(
 
 
 def powerless(judged: Sequence[Judged], k: int) -> list[Symptom]:
-    """A joint that its neighbours swing: far from its command, and no effort against it.
-
-    Args:
-        judged: All joints that are driven, in chain order.
-
-    Returns:
-        The symptom, if the joint shows it.
-    """
+    """Find whether neighbours swing a joint: far from its command, without effort against it."""
     each, near = judged[k], neighbours(judged, k)
     r = each.response
     if each.motion.effort is None or min(k, len(judged) - 1 - k) < ENDS:
         return []
-    usual = _known_median([_usual(one, _control_error(one.response)) for one in near])
+    errors = np.array([_usual(one, _control_error(one.response)) for one in near])
+    usual = median_of(errors[np.isfinite(errors)])
     far = _control_error(r) > np.fmax(PUSHING_ERROR_RATIO * usual, r.asked / 2)
     off = r.valid & ~each.still & far
     if not off.any():
@@ -155,12 +136,6 @@ def powerless(judged: Sequence[Judged], k: int) -> list[Symptom]:
     return [Symptom("powerless", whole_or(marked_spans(r, light), r), text)]
 
 
-def _known_median(values: Sequence[float]) -> float:
-    """Median of those that are known; NaN without any."""
-    known = [value for value in values if np.isfinite(value)]
-    return float(np.median(known)) if known else float("nan")
-
-
 def _control_error(response: Response) -> FloatArray:
     """Standard deviation of the position less the command in each window [rad], shape (w,)."""
     covariance = response.ratio.real * response.asked**2
@@ -173,7 +148,7 @@ def _effort_spread(each: Judged) -> FloatArray:
     if effort is None:
         return np.full(r.start_s.size, np.nan)
     i, j = (np.searchsorted(effort.t_s, edges) for edges in (r.start_s, r.stop_s))
-    level = effort.values - (float(np.median(effort.values)) if effort.values.size else 0.0)
+    level = effort.values - median_of(effort.values, 0.0)
     first, second = (np.concatenate(([0.0], np.cumsum(level**power))) for power in (1, 2))
     count = np.where(j > i, j - i, np.nan)
     mean, square = (first[j] - first[i]) / count, (second[j] - second[i]) / count
@@ -181,6 +156,5 @@ def _effort_spread(each: Judged) -> FloatArray:
 
 
 def _usual(each: Judged, values: FloatArray) -> float:
-    """Median over the windows that are judged; NaN without any."""
-    known = values[each.response.valid & np.isfinite(values)]
-    return float(np.median(known)) if known.size else float("nan")
+    """Return the median over the judged windows; NaN without any."""
+    return median_of(values[each.response.valid & np.isfinite(values)])

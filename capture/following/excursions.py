@@ -9,72 +9,43 @@ import numpy as np
 
 from ..common.arrays import BoolArray, FloatArray
 from .fault import Span, Symptom
-from .motion import BLOCKS, JointMotion, Response, predicted
+from .motion import (
+    BLOCKS,
+    JointMotion,
+    Response,
+    median_of,
+    predicted,
+    robust_deviation,
+    runs_of,
+)
 
-FAR = 6.0
-"""Robust standard deviations of the residual that make an excursion."""
-
-FAR_SHARE = 0.2
-"""An excursion is also farther than this share of the usual amplitude."""
-
-FEW = 4
-"""Samples that an excursion has at least."""
-
-SHORT = 0.04
-"""Share of a cycle that an excursion lasts at least."""
-
-JOIN = 0.3
-"""Excursions closer than this share of a cycle are one: a residual passes through zero."""
-
-HELD_WINDOWS = 2
-"""Windows in turn in which a joint that is held stands still."""
-
+FAR = 6.0  # robust standard deviations of the residual that make an excursion
+FAR_SHARE = 0.2  # an excursion is also farther than this share of the usual amplitude
+FEW = 4  # samples that an excursion has at least
+SHORT = 0.04  # share of a cycle that an excursion lasts at least
+JOIN = 0.3  # excursions closer than this share of a cycle are one: a residual passes through zero
+HELD_WINDOWS = 2  # windows in turn in which a joint that is held stands still
+# Cycles in which a joint may stand at the beginning of a record: it is being started.
 STARTING = 2.0
-"""Cycles in which a joint may stand at the beginning of a record: it is being started."""
-
-LOADED_WINDOWS = 2 * BLOCKS + 1
-"""The same where its neighbours are held back, too."""
-
-HELD = 0.25
-"""A joint that moves less than this share of what it should stands still."""
-
+LOADED_WINDOWS = 2 * BLOCKS + 1  # the same where its neighbours are held back, too
+HELD = 0.25  # a joint that moves less than this share of what it should stands still
 NOISY = 0.6
 """Von Neumann ratio above which a residual is noise, not motion: 1 for white noise
 (von Neumann, Ann. Math. Stat. 12, 1941; halved, so that it is 1 minus the autocorrelation)."""
 
+# A residual whose standard deviation is below this share of its mean is a shifted zero.
 STEPPED = 0.35
-"""A residual whose standard deviation is below this share of its mean is a shifted zero."""
-
-SETTLING = 1.5
-"""Cycles from the start in which a departure is a transient."""
-
-MIN_DEPARTURES = 3
-"""Short departures that make a fault."""
-
-GROWN = 0.8
-"""Share of the command's later size below which it still grows."""
-
-AT_TIMES = 0.03
-"""Share of the record that they last together: less is what collisions do."""
-
-DRIFT_SHARE = 0.15
-"""Drift of the offset, as a share of the amplitude, that is no fault."""
-
+SETTLING = 1.5  # cycles from the start in which a departure is a transient
+MIN_DEPARTURES = 3  # short departures that make a fault
+GROWN = 0.8  # share of the command's later size below which it still grows
+AT_TIMES = 0.03  # share of the record that they last together: less is what collisions do
+DRIFT_SHARE = 0.15  # drift of the offset, as a share of the amplitude, that is no fault
 DRIFT_RAD = float(np.radians(1.0))
 DRIFT_EXPLAINED = 0.6
-FEWEST = 12
-"""Windows that a drift needs."""
-
-AS_USUAL = 0.97
-"""Share of the usual explained share above which a window follows as usual."""
-
-MANY = 4 * BLOCKS
-"""Windows of a departure that is a state of its own, with a beginning and an end."""
-
-TRANSITION = 0.3
-"""Share of its windows in which it begins or ends."""
-
-TURN = 2 * np.pi
+FEWEST = 12  # windows that a drift needs
+AS_USUAL = 0.97  # share of the usual explained share above which a window follows as usual
+MANY = 4 * BLOCKS  # windows of a departure that is a state of its own, with a beginning and an end
+TRANSITION = 0.3  # share of its windows in which it begins or ends
 
 
 @dataclass(frozen=True)
@@ -82,7 +53,7 @@ class Excursions:
     """Departures of one joint from its usual response.
 
     Attributes:
-        t_s: Sampling times [s], shape (n,); empty without departures, as the next two.
+        t_s: Sampling times [s], shape (n,).
         residual: Position less what the usual response gives [rad], shape (n,).
         expected: What the usual response gives [rad], shape (n,).
         amplitude: Usual amplitude of the response [rad].
@@ -99,7 +70,7 @@ class Excursions:
 
 def find_holds(
     motion: JointMotion, response: Response, still: BoolArray, *, loaded: bool
-) -> Symptom | None:
+) -> list[Symptom]:
     """Find the times at which a joint stands still for a cycle or more.
 
     Args:
@@ -108,13 +79,12 @@ def find_holds(
 
     Returns:
         The symptom with its spans, from the first to the last sample at the level of each hold;
-        None if it never stands still in two windows in turn.
+        none if it never stands still in two windows in turn.
     """
     position = motion.position
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
     spans: list[Span] = []
     levels: list[float] = []
-    for first, stop in edges.reshape(-1, 2).tolist():
+    for first, stop in runs_of(still):
         if stop - first < (LOADED_WINDOWS if loaded else HELD_WINDOWS):
             continue
         i, j = np.searchsorted(
@@ -125,20 +95,21 @@ def find_holds(
         core = position.values[i + quarter : j - quarter]
         level = float(np.median(core))
         moved = response.asked[first:stop].max() * 2**0.5
-        slack = max(4 * 1.4826 * float(np.median(np.abs(core - level))), 0.1 * float(moved))
+        slack = max(4 * robust_deviation(core, level), 0.1 * float(moved))
         away = np.abs(position.values - level) > slack
         before, after = np.flatnonzero(away[: i + quarter]), np.flatnonzero(away[j - quarter :])
         start = int(before[-1]) + 1 if before.size else 0
         end = j - quarter + int(after[0]) - 1 if after.size else position.t_s.size - 1
-        begun = float(position.t_s[start]) - float(position.t_s[0]) < response.period_s / 4
-        if begun and position.t_s[end] - position.t_s[0] < STARTING * response.period_s:
+        since, until, origin = position.t_s[[start, end, 0]].tolist()
+        begun = since - origin < response.period_s / 4
+        if begun and until - origin < STARTING * response.period_s:
             continue
-        spans.append((float(position.t_s[start]), float(position.t_s[end])))
+        spans.append((since, until))
         levels.append(level)
     if not spans:
-        return None
+        return []
     text = f"position constant at {np.degrees(levels[0]):.1f} degrees"
-    return Symptom("held", tuple(dict.fromkeys(spans)), text)
+    return [Symptom("held", tuple(dict.fromkeys(spans)), text)]
 
 
 def find_excursions(
@@ -162,14 +133,12 @@ def find_excursions(
     t_s, values = motion.position.t_s[i:j], motion.position.values[i:j]
     expected = predicted(motion, period_s, ratio, offset, t_s)
     residual = values - expected
-    none = np.zeros(0)
     record = (float(t_s[0]), float(t_s[-1])) if t_s.size else (0.0, 0.0)
     if t_s.size < 2 * FEW:
-        return Excursions(none, none, none, 0.0, (), record)
+        return Excursions(t_s, residual, expected, 0.0, (), record)
     centre = float(np.median(residual))
-    scale = 1.4826 * float(np.median(np.abs(residual - centre)))
     amplitude = abs(ratio) * float(np.median(response.asked[follows])) * 2**0.5
-    threshold = max(FAR * scale, FAR_SHARE * amplitude)
+    threshold = max(FAR * robust_deviation(residual, centre), FAR_SHARE * amplitude)
     far = np.abs(residual - centre) > threshold
     spans = _joined(t_s, far, JOIN * period_s)
     step = motion.position.period_s
@@ -179,8 +148,6 @@ def find_excursions(
         if b - a + step >= max(SHORT * period_s, (FEW - 1) * step)
         and np.count_nonzero(far[slice(*np.searchsorted(t_s, (a, b + step / 2)))]) >= FEW
     )
-    if not long:
-        return Excursions(none, none, none, amplitude, (), record)
     return Excursions(t_s, residual - centre, expected + centre, amplitude, long, record)
 
 
@@ -193,9 +160,6 @@ def departures(
         response: The joint's windowed response.
         alone: Of each, whether no other joint departs at the same time.
         loaded: Whether its neighbours are held back by a load: then it may be, for a while.
-
-    Returns:
-        One symptom a kind of departure.
     """
     begin, end = found.record_s
     settled = begin + SETTLING * response.period_s
@@ -203,35 +167,34 @@ def departures(
     texts: dict[str, str] = {}
     for span, own in zip(found.spans_s, alone, strict=True):
         kind, text = _described(found, span, end, response.period_s)
-        if kind in ("astray", "opposite") and not own:
-            continue  # something that happened to the body
-        if kind in ("astray", "opposite", "held") and span[1] < settled:
-            continue  # the start of the motion
-        if kind in ("astray", "noisy") and _coherent(response, span):
-            continue  # it follows there, with another gain or lag
-        if kind == "held" and loaded:
+        start, stop = span
+        excused = (
+            # something that happened to the body
+            (kind in ("astray", "opposite") and not own)
+            # the start of the motion
+            or (kind in ("astray", "opposite", "held") and stop < settled)
+            # it follows there, with another gain or lag
+            or (kind in ("astray", "noisy") and _coherent(response, span))
+            or (kind == "held" and loaded)
+            # the last part of a cycle: too little to know a zero by
+            or (kind == "stepped" and stop - start < response.period_s / 2)
+            or (kind == "stepped" and _grows(response, start))
+        )
+        if excused:
             continue
-        if kind == "stepped" and span[1] - span[0] < response.period_s / 2:
-            continue  # the last part of a cycle: too little to know a zero by
-        if kind == "stepped" and _grows(response, span[0]):
-            continue
-        if kind == "stepped" and span[0] < settled < span[1]:
+        if kind == "stepped" and start < settled < stop:
             # The usual zero is that of the longer part: the step is where this part ends.
-            by_kind.setdefault(kind, []).append((span[1], end))
-            text = text.replace("off by", "was off by")
-        else:
-            by_kind.setdefault(kind, []).append(span)
+            start, stop, text = stop, end, text.replace("off by", "was off by")
+        by_kind.setdefault(kind, []).append((start, stop))
         texts.setdefault(kind, text)
     if "astray" in by_kind and not _lasting(by_kind["astray"], response.period_s, end - begin):
         del by_kind["astray"]
     symptoms = [Symptom(kind, tuple(own), texts[kind]) for kind, own in by_kind.items()]
-    if not found.spans_s and (drift := _drift(response, found)):
-        symptoms.append(drift)
-    return symptoms
+    return symptoms if found.spans_s else symptoms + _drift(response, found)
 
 
 def _coherent(response: Response, span: Span) -> bool:
-    """Whether the windows around a departure follow the command as closely as usual."""
+    """Return whether the windows around a departure follow the command as closely as usual."""
     near = (response.start_s < span[1]) & (response.stop_s > span[0]) & response.valid
     if not near.any():
         return False
@@ -242,23 +205,21 @@ def _coherent(response: Response, span: Span) -> bool:
 
 
 def _grows(response: Response, at_s: float) -> bool:
-    """Whether the command is larger after a time than before: so may be what limits the joint."""
+    """Return whether the command is larger after a time than before, as may be a limit's load."""
     before = response.asked[response.stop_s <= at_s + response.period_s / 2]
     after = response.asked[response.start_s >= at_s]
-    if not before.size or not after.size:
-        return False
-    return float(np.median(before)) < GROWN * float(np.median(after))
+    return median_of(before) < GROWN * median_of(after)  # false where there is none
 
 
 def _lasting(spans: Sequence[Span], period_s: float, length_s: float) -> bool:
-    """Whether departures come again and again, or one of them lasts a cycle."""
+    """Return whether departures repeat, or one of them lasts a cycle."""
     together = sum(stop - start for start, stop in spans)
     again = len(spans) >= MIN_DEPARTURES and together > AT_TIMES * length_s
     return again or any(stop - start > period_s for start, stop in spans)
 
 
 def _described(found: Excursions, span: Span, end: float, period_s: float) -> tuple[str, str]:
-    """Kind of symptom of one departure, and its size in words."""
+    """Return the kind of symptom of one departure, and its size in words."""
     i, j = np.searchsorted(found.t_s, span, side="left")
     j = min(j + 1, found.t_s.size)
     residual, expected = found.residual[i:j], found.expected[i:j]
@@ -271,27 +232,26 @@ def _described(found: Excursions, span: Span, end: float, period_s: float) -> tu
     mean, spread = float(np.mean(residual)), variance**0.5
     long = span[1] - span[0] > period_s or end - span[1] < period_s / 4
     if long and spread < STEPPED * abs(mean):
-        turns = mean / TURN
+        turns = mean / (2 * np.pi)
         if abs(turns) > 0.5 and abs(turns - round(turns)) < 0.05:
             return "wrapped", f"off by {round(turns)} turns"
         return "stepped", f"off by {np.degrees(mean):+.1f} degrees"
     if rough > NOISY and residual.size >= 2 * FEW and spread > abs(mean):
-        return "noisy", f"residual of {np.degrees(variance**0.5):.2g} degrees"
+        return "noisy", f"residual of {np.degrees(spread):.2g} degrees"
     if swing > 0.5 * found.amplitude and moved < HELD * swing:
         level = float(np.median(position))
         return "held", f"position constant at {np.degrees(level):.1f} degrees"
-    if float(residual @ expected) < 0 and moved > 0.5 * swing:
-        along = np.corrcoef(position, expected)[0, 1] if position.size > 2 else 0.0
-        if along < -0.7:
-            return "opposite", "moves against its command"
+    against = float(residual @ expected) < 0 and moved > 0.5 * swing and position.size > 2
+    if against and np.corrcoef(position, expected)[0, 1] < -0.7:
+        return "opposite", "moves against its command"
     return "astray", f"off by up to {np.degrees(np.abs(residual).max()):.1f} degrees"
 
 
-def _drift(response: Response, found: Excursions) -> Symptom | None:
-    """A zero that moves over the record: by a step, or steadily."""
+def _drift(response: Response, found: Excursions) -> list[Symptom]:
+    """Find a zero that moves over the record: by a step, or steadily."""
     valid = response.valid & (response.explained > 0.5)
     if np.count_nonzero(valid) < FEWEST:
-        return None
+        return []
     t_s, offset = (response.start_s + response.stop_s)[valid] / 2, response.offset[valid]
     spread = offset - offset.mean()
     power = float(spread @ spread)
@@ -307,23 +267,20 @@ def _drift(response: Response, found: Excursions) -> Symptom | None:
     inside = min(split + 1, offset.size - split - 1) >= BLOCKS
     if inside and by_step[split] > max(by_ramp, DRIFT_EXPLAINED * power):
         size = float(after[split] - before[split])
-        if abs(size) < least:
-            return None
         # The windows around a step hold parts of both: it lies in their middle.
         at = float((t_s[split] + t_s[split + 1]) / 2)
-        if _grows(response, at):
-            return None
-        return Symptom(
-            "stepped", ((at, found.record_s[1]),), f"off by {np.degrees(size):+.1f} degrees"
-        )
+        if abs(size) < least or _grows(response, at):
+            return []
+        text = f"off by {np.degrees(size):+.1f} degrees"
+        return [Symptom("stepped", ((at, found.record_s[1]),), text)]
     total = slope * float(np.ptp(t_s))
     if abs(total) < least or by_ramp < DRIFT_EXPLAINED * power:
-        return None
-    return Symptom("drifting", (), f"offset drifts by {np.degrees(total):+.1f} degrees")
+        return []
+    return [Symptom("drifting", (), f"offset drifts by {np.degrees(total):+.1f} degrees")]
 
 
 def _joined(t_s: FloatArray, marked: BoolArray, gap_s: float) -> tuple[Span, ...]:
-    """Marked samples as time spans; those closer than a gap are one."""
+    """Return marked samples as time spans; those closer than a gap are one."""
     at = np.flatnonzero(marked)
     if not at.size:
         return ()

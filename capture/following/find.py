@@ -9,6 +9,7 @@ one of them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -27,71 +28,46 @@ from .motion import (
     UNIT_SLACK,
     JointMotion,
     Judged,
-    Response,
-    Samples,
     common_response,
+    complex_median,
     judge,
     marked_spans,
+    median_of,
     neighbours,
     own_response,
+    robust_deviation,
+    runs_of,
     whole_or,
     windowed_response,
 )
 
+# Share of a joint's samples that may be missing beyond what the joints have in common.
 LOST_SHARE = 0.01
-"""Share of a joint's samples that may be missing beyond what the joints have in common."""
-
+# Share of the fast samples that may repeat the one before, beyond what all joints do.
 STALE_SHARE = 0.15
-"""Share of the fast samples that may repeat the one before, beyond what all joints do."""
-
-WRAP = 5.0
-"""A step so many times as large as the command's largest is no motion."""
-
-SAME_TURN = 0.1
-"""Steps of one counter differ by less than this, relative."""
-
+WRAP = 5.0  # a step so many times as large as the command's largest is no motion
+SAME_TURN = 0.1  # steps of one counter differ by less than this, relative
+# Turns of counters: of a shaft, of half and double shafts, of a servo's range, in raw units.
 TURNS = (2 * np.pi, 4 * np.pi, np.pi, 300 * np.pi / 180, 360.0, 4096.0, 65536.0)
-"""Turns of counters: of a shaft, of half and double shafts, of a servo's range, in raw units."""
-
 MOSTLY = 0.8
 
-SILENT = 0.02
-"""A gap longer than this share of the record is a silence."""
-
+SILENT = 0.02  # a gap longer than this share of the record is a silence
+# Chance of so many repeats by which a joint of many sessions is taken to repeat old values.
 RARE = 1e-6
-"""Chance of so many repeats by which a joint of many sessions is taken to repeat old values."""
-
+# More repeats in turn than this are a joint that stands or a sensor that froze, not old values.
 LONGEST = 8
-"""More repeats in turn than this are a joint that stands or a sensor that froze, not old values."""
-
-GAP = 1.8
-"""An interval of so many median ones lacks a sample."""
-
-FAST = 0.5
-"""Fast samples: the joint moves more than this share of its usual fast step."""
-
-AROUND = 4
-"""Samples on either side over which its motion is taken."""
-
-SPIKE = 8.0
-"""Robust standard deviations of the noise about the running median that make a spike."""
-
+GAP = 1.8  # an interval of so many median ones lacks a sample
+FAST = 0.5  # fast samples: the joint moves more than this share of its usual fast step
+AROUND = 4  # samples on either side over which its motion is taken
+SPIKE = 8.0  # robust standard deviations of the noise about the running median that make a spike
+# A spike is also larger than so many of the command's largest steps: the median may be late.
 SPIKE_STEPS = 3.0
-"""A spike is also larger than so many of the command's largest steps: the median may be late."""
-
-SPIKE_SHARE = 0.1
-"""A spike is also larger than this share of the command's range."""
-
-SPIKES = 0.003
-"""Share of the samples that may be spikes beyond what the joints have in common."""
+SPIKE_SHARE = 0.1  # a spike is also larger than this share of the command's range
+SPIKES = 0.003  # share of the samples that may be spikes beyond what the joints have in common
 
 
-def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
-    """Find joints whose positions are missing or repeated more than the others'.
-
-    Returns:
-        Joint name to symptoms; only joints that have some.
-    """
+def _record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
+    """Find joints whose positions are missing or repeated more than the others'."""
     sampled = [each for each in motions if each.position.t_s.size > 2]
     result: dict[str, list[Symptom]] = {}
     largest = max((each.command.range for each in sampled), default=0.0)
@@ -124,31 +100,28 @@ def record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
     return result
 
 
-def wraps(each: JointMotion) -> Symptom | None:
+def _wraps(each: JointMotion) -> list[Symptom]:
     """Find the steps of a counter that wraps around.
 
-    Returns:
-        The symptom, if steps of one size, both up and down or again and again, are larger than
-        the command ever moves between two samples and larger than half of its range.
+    They have one size, are both up and down or again and again, and are larger than the command
+    ever moves between two samples and than half of its range.
     """
     samples = each.position
     if samples.t_s.size < 16:
-        return None
+        return []
     step = np.diff(samples.values)
     large = np.abs(step) > max(WRAP * each.largest_step, 0.5 * each.command.range)
     sizes = np.abs(step[large])
     if not 2 <= sizes.size <= 0.2 * step.size:
-        return None
+        return []
     turn = float(np.median(sizes))
     near = np.abs(sizes / turn - 1) < SAME_TURN
     known = min(abs(turn / size - 1) for size in TURNS) < SAME_TURN
-    if np.mean(near) < MOSTLY or not known:
-        return None
     # A counter that wraps comes back: up and down steps cancel but for one.
     balance = abs(float(np.sum(np.sign(step[large]))))
-    if balance > max(1.0, 0.2 * sizes.size):
-        return None
-    return Symptom("wrapped", (), f"{sizes.size} steps of {np.degrees(turn):.0f} degrees")
+    if np.mean(near) < MOSTLY or not known or balance > max(1.0, 0.2 * sizes.size):
+        return []
+    return [Symptom("wrapped", (), f"{sizes.size} steps of {np.degrees(turn):.0f} degrees")]
 
 
 def _lost(each: JointMotion) -> float:
@@ -159,9 +132,9 @@ def _lost(each: JointMotion) -> float:
     gaps = step[step > GAP * usual]
     absent = float(np.sum(np.round(gaps / usual) - 1)) if gaps.size else 0.0
     # A record of one message per servo may end early: what lacks at the ends counts, too.
-    edges = max(0.0, samples.t_s[0] - each.command.t_s[0]) if each.command.t_s.size else 0.0
-    edges += max(0.0, each.command.t_s[-1] - samples.t_s[-1]) if each.command.t_s.size else 0.0
-    absent += max(0.0, edges / usual - 2.0)
+    if (commanded := each.command.t_s).size:
+        edges = max(0.0, samples.t_s[0] - commanded[0]) + max(0.0, commanded[-1] - samples.t_s[-1])
+        absent += max(0.0, edges / usual - 2.0)
     return absent / (samples.t_s.size + absent)
 
 
@@ -171,7 +144,7 @@ def _spikes(each: JointMotion) -> float:
     if values.size < 4 * AROUND:
         return 0.0
     away = np.abs(values - median_filter(values, size=5, mode="nearest"))
-    noise = 1.4826 * float(np.median(np.abs(np.diff(values, 2)))) / 6**0.5
+    noise = robust_deviation(np.diff(values, 2), 0.0) / 6**0.5
     far = away > max(
         SPIKE * noise, SPIKE_STEPS * each.largest_step, SPIKE_SHARE * each.command.range
     )
@@ -179,7 +152,7 @@ def _spikes(each: JointMotion) -> float:
 
 
 def _silences(each: JointMotion, missing: float) -> tuple[Span, ...]:
-    """The gaps, where a few long ones hold most of what is missing; else none."""
+    """Return the gaps if a few long ones hold most missing samples; else none."""
     t_s = each.position.t_s
     step = np.diff(t_s)
     length = float(t_s[-1] - t_s[0])
@@ -190,9 +163,8 @@ def _silences(each: JointMotion, missing: float) -> tuple[Span, ...]:
 
 
 def _repeats(each: JointMotion) -> tuple[int, int]:
-    """How many samples during fast motion repeat the one before, and of how many."""
-    samples: Samples = each.position
-    values = samples.values
+    """Count the samples during fast motion that repeat the one before, and all of them."""
+    values = each.position.values
     step = np.abs(np.diff(values))
     moved = step[step > 0]
     if moved.size < 10 or values.size < 4 * AROUND:
@@ -205,74 +177,55 @@ def _repeats(each: JointMotion) -> tuple[int, int]:
         return 0, 0
     repeated = step == 0
     # A joint that stands repeats, too, and for longer.
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], repeated, [False])).astype(np.int8)))
-    for first, stop in edges.reshape(-1, 2).tolist():
+    for first, stop in runs_of(repeated):
         if stop - first > LONGEST:
             repeated[first:stop] = False
     return int(np.count_nonzero(fast & repeated)), int(np.count_nonzero(fast))
 
 
-OFF = 0.3
-"""Relative deviation of H from the common response that makes a joint a candidate."""
-
-NEAR = 0.2
-"""Relative deviation below which the other joint's command explains it."""
+OFF = 0.3  # relative deviation of H from the common response that makes a joint a candidate
+NEAR = 0.2  # relative deviation below which the other joint's command explains it
 
 
-def swapped_pairs(judged: Sequence[Judged], common: complex) -> dict[str, str]:
-    """Find pairs of joints that answer each other's command.
-
-    Returns:
-        Joint name to its partner's, both ways.
-    """
+def _swapped_pairs(judged: Sequence[Judged], common: complex) -> dict[str, str]:
+    """Find pairs of joints that carry out each other's command, by name, both ways."""
     candidates = [
         each
         for each in judged
         if (each.follows.any() or each.opposite.any()) and abs(each.ratio / common - 1) > OFF
     ]
     partner: dict[str, str] = {}
-    for k, first in enumerate(candidates):
-        for second in candidates[k + 1 :]:
-            if first.motion.name in partner or second.motion.name in partner:
-                continue
-            if _explains(second, first, common) and _explains(first, second, common):
-                partner[first.motion.name] = second.motion.name
-                partner[second.motion.name] = first.motion.name
+    for first, second in combinations(candidates, 2):
+        names = first.motion.name, second.motion.name
+        if partner.keys() & names:
+            continue
+        if _explains(second, first, common) and _explains(first, second, common):
+            partner |= {names[0]: names[1], names[1]: names[0]}
     return partner
 
 
 def _explains(commanded: Judged, measured: Judged, common: complex) -> bool:
-    """Whether one joint's command gives the other's position by the common response."""
+    """Return whether one joint's command gives the other's position by the common response."""
     r = windowed_response(
         commanded.motion.command, measured.motion.position, commanded.response.period_s
     )
     if not r.valid.any():
         return False
-    ratio = complex(np.median(r.ratio[r.valid].real), np.median(r.ratio[r.valid].imag))
+    ratio = complex_median(r.ratio[r.valid])
     return abs(ratio / common - 1) < NEAR and float(np.median(r.explained[r.valid])) > 0.8
 
 
-DRIVEN_SHARE = 0.01
-"""A joint whose command moves less than this share of the largest is held still."""
-
+DRIVEN_SHARE = 0.01  # a joint whose command moves less than this share of the largest is held still
+# A command that moves less than this is held still, whatever the others do [rad].
 MIN_COMMAND_RAD = 1e-3
-"""A command that moves less than this is held still, whatever the others do [rad]."""
-
-SHORTEST_S = 2.0
-"""A shorter record is not judged [s]."""
-
+SHORTEST_S = 2.0  # a shorter record is not judged [s]
+# Explained share of its neighbours beside which a joint that follows nothing stands out.
 ORDERLY = 0.8
-"""Explained share of its neighbours beside which a joint that follows nothing stands out."""
-
-RARELY = 0.1
-"""A joint that follows in less than this share of its windows does not follow."""
+RARELY = 0.1  # a joint that follows in less than this share of its windows does not follow
 
 
 def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
     """Find the joints that do not follow their command.
-
-    Args:
-        motions: The joints with commands and positions, in chain order.
 
     Returns:
         At most one fault a joint, in chain order. Joints whose command does not move are not
@@ -294,28 +247,27 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
         for k, (each, r) in enumerate(zip(driven, responses, strict=True))
     ]
     symptoms: dict[str, list[Symptom]] = {each.name: [] for each in motions}
-    for each, wrapped in zip(driven, in_threads(wraps, driven, samples), strict=True):
-        symptoms[each.name] += [] if wrapped is None else [wrapped]
-    explained = [_explained(each) for each in responses]
+    for each, wrapped in zip(driven, in_threads(_wraps, driven, samples), strict=True):
+        symptoms[each.name] += wrapped
+    explained = [median_of(each.explained[each.valid]) for each in responses]
     for k, each in enumerate(judged):
         found = symptoms[each.motion.name]
         if not found:
             found += powerless(judged, k)
-        near = [share for share in neighbours(explained, k) if share is not None]
         if not found:
-            found += _from_windows(each, float(np.median(near)) if near else 1.0)
+            near = np.array(neighbours(explained, k))
+            found += _from_windows(each, median_of(near[~np.isnan(near)], 1.0))
         if not found:
-            held = find_holds(each.motion, each.response, each.still, loaded=each.loaded)
-            found += [] if held is None else [held]
-    for name, partner in swapped_pairs(judged, common).items():
+            found += find_holds(each.motion, each.response, each.still, loaded=each.loaded)
+    for name, partner in _swapped_pairs(judged, common).items():
         symptoms[name] = [Symptom("swapped", (), f"carries out the command of {partner}")]
     for name, departed in _from_residuals(judged, symptoms).items():
         symptoms[name] += departed
-    for name, lacking in record_faults(motions).items():
+    for name, lacking in _record_faults(motions).items():
         known = {each.name for each in symptoms[name]}
         if not known & {"still", "held", "wrapped"}:
             symptoms[name] += [each for each in lacking if each.name not in known]
-    by_name: Mapping[str, Judged] = {each.motion.name: each for each in judged}
+    by_name = {each.motion.name: each for each in judged}
     stands = any(each.name in ("still", "held") for own in symptoms.values() for each in own)
     usual = usual_effort(judged if stands else ())
     return tuple(
@@ -326,7 +278,7 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
 
 
 def _lasts(motion: JointMotion) -> bool:
-    """Whether command and position overlap for long enough to judge the one by the other."""
+    """Return whether command and position overlap for long enough to be compared."""
     command, position = motion.command.t_s, motion.position.t_s
     if min(command.size, position.size) < FEW_SAMPLES:
         return False
@@ -334,36 +286,31 @@ def _lasts(motion: JointMotion) -> bool:
 
 
 def _from_windows(each: Judged, coherence: float) -> list[Symptom]:
-    """What the windows of one joint show as a whole, beside its neighbours' coherence."""
+    """Find the symptom of all windows of a joint, given its neighbours' coherence."""
     r = each.response
     valid = int(np.count_nonzero(r.valid))
-    if not valid:
-        return []
-    follows = np.count_nonzero(each.follows) / valid
+    follows = np.count_nonzero(each.follows) / max(valid, 1)
     gain = abs(each.ratio) / abs(each.common)
-    found: Symptom | None = None
-    orderly = coherence > ORDERLY and not each.loaded
     if (unit := _unit_factor(each, gain)) is not None:
         # A joint that hardly moves may as well stand still, but for what its neighbours do to it.
         name = "scaled" if gain > 1 else "slight"
-        found = Symptom(name, (), f"moves {unit} times as far as the other joints")
-    elif np.count_nonzero(each.opposite) > 0.5 * valid:
+        return [Symptom(name, (), f"moves {unit} times as far as the other joints")]
+    if np.count_nonzero(each.opposite) > 0.5 * valid:
         spans = whole_or(marked_spans(r, each.opposite), r)
-        found = Symptom("opposite", spans, f"gain {-abs(each.ratio):.2f}")
-    elif follows >= MIN_SHARE and each.has_usual:
-        found = None  # its departures are found sample by sample
-    elif np.count_nonzero(each.still) > 0.5 * valid and follows < RARELY:
-        found = Symptom("still", (), "")
-    elif follows < RARELY and not each.opposite.any() and orderly:
-        found = Symptom("incoherent", (), "moves, but not with its command")
-    return [] if found is None else [found]
+        return [Symptom("opposite", spans, f"gain {-abs(each.ratio):.2f}")]
+    if not valid or follows >= RARELY:
+        return []  # its departures are found sample by sample
+    if np.count_nonzero(each.still) > 0.5 * valid:
+        return [Symptom("still", (), "")]
+    if not each.opposite.any() and coherence > ORDERLY and not each.loaded:
+        return [Symptom("incoherent", (), "moves, but not with its command")]
+    return []
 
 
 def _unit_factor(each: Judged, gain: float) -> str | None:
-    """The factor between degrees and radians that a gain shows, in words."""
-    if np.count_nonzero(each.follows) < MIN_SHARE * np.count_nonzero(each.response.valid):
-        return None
-    if gain <= 0:
+    """Return the factor between degrees and radians that a gain shows, in words."""
+    follows, valid = np.count_nonzero(each.follows), np.count_nonzero(each.response.valid)
+    if follows < MIN_SHARE * valid or gain <= 0:
         return None
     for factor, text in ((DEGREE, "180/pi"), (1 / DEGREE, "pi/180")):
         if abs(np.log(gain / factor)) < np.log(UNIT_SLACK):
@@ -371,17 +318,10 @@ def _unit_factor(each: Judged, gain: float) -> str | None:
     return None
 
 
-def _explained(response: Response) -> float | None:
-    """Median explained share of a joint's windows; None where none is judged."""
-    if not response.valid.any():
-        return None
-    return float(np.median(response.explained[response.valid]))
-
-
 def _from_residuals(
     judged: Sequence[Judged], symptoms: Mapping[str, Sequence[Symptom]]
 ) -> dict[str, list[Symptom]]:
-    """Times at which a joint leaves its own usual response, and no other joint does."""
+    """Find the times at which a joint leaves its usual response, and no other joint does."""
     kept = [each for each in judged if each.has_usual and not symptoms[each.motion.name]]
     samples = sum(each.motion.position.t_s.size for each in kept)
 
@@ -398,7 +338,7 @@ def _from_residuals(
 
 
 def _shared(span: Span, spans: Sequence[Sequence[Span]], own: int) -> bool:
-    """Whether another joint departs at the same time: then something happened to the body."""
+    """Return whether another joint departs at the same time, as after a contact of the body."""
     return any(
         start < span[1] and stop > span[0]
         for k, other in enumerate(spans)

@@ -1,6 +1,6 @@
 """From symptoms to the kinds of fault that fit: what effort, velocity and a second sensor decide.
 
-A position alone can't tell a jammed joint from a frozen sensor. A kind is ruled out only by
+A position alone can't separate a jammed joint from a frozen sensor. A kind is ruled out only by
 another quantity that was recorded; otherwise all kinds that fit are named.
 """
 
@@ -14,34 +14,19 @@ import numpy as np
 from ..common.arrays import BoolArray, FloatArray
 from .effort import PUSHING, SAME, UsualEffort, effort_there
 from .fault import Fault, Span, Symptom
-from .motion import JointMotion, Samples, record_span, within
+from .motion import JointMotion, Samples, median_of, record_span, robust_deviation, within
 
 if TYPE_CHECKING:
     from .motion import Judged
 
-MOVING = 0.5
-"""Correlation of a velocity or second sensor with the command that shows motion."""
-
-AT_REST = 0.3
-"""Share of its usual motion below which a velocity or second sensor shows rest."""
-
-NO_EFFORT = 0.15
-"""Share of the usual effort below which a motor does not push."""
-
-CONSTANT = 0.1
-"""Standard deviation over mean below which an effort is constant."""
-
-OF_SENSOR = 0.5
-"""Share of a shift that a second sensor lacks, above which it is the first sensor's."""
-
-MOSTLY = 0.5
-"""Share of exact repeats above which a sensor may be frozen."""
-
-MIN_RETURNS = 3
-"""Times that a joint stands at one place, which is no chance."""
-
-LIMIT_SHARE = 0.02
-"""Nearer to a limit than this share of the range is at it."""
+MOVING = 0.5  # correlation of a velocity or second sensor with the command that shows motion
+AT_REST = 0.3  # share of its usual motion below which a velocity or second sensor shows rest
+NO_EFFORT = 0.15  # share of the usual effort below which a motor does not push
+CONSTANT = 0.1  # standard deviation over mean below which an effort is constant
+OF_SENSOR = 0.5  # share of a shift that a second sensor lacks, above which it is the first sensor's
+MOSTLY = 0.5  # share of exact repeats above which a sensor may be frozen
+MIN_RETURNS = 3  # times that a joint stands at one place, which is no chance
+LIMIT_SHARE = 0.02  # nearer to a limit than this share of the range is at it
 
 _KINDS: dict[str, tuple[str, ...]] = {
     "still": ("dead", "jammed", "stalled", "frozen_sensor"),
@@ -61,8 +46,6 @@ _KINDS: dict[str, tuple[str, ...]] = {
     "stale": ("stale_sensor", "lost_samples"),
 }
 """Symptom to the kinds that fit where nothing else was recorded, the likeliest first."""
-
-_SENSOR = ("frozen_sensor", "stale_sensor")
 
 _PHRASES = {
     "still": "does not move with its command",
@@ -105,8 +88,7 @@ def fault_of(
     if main.name in ("still", "held") and judged is not None:
         kinds, decided = _standing(motion, judged, main, usual)
         if main.name == "held" and _again(main, end - begin, end, judged.response.period_s):
-            mechanical = [kind for kind in kinds if kind not in _SENSOR]
-            first = ["intermittent"] if mechanical else []
+            first = ["intermittent"] if set(kinds) - {"frozen_sensor", "stale_sensor"} else []
             late = ["stale_sensor"] if "frozen_sensor" in kinds else []
             kinds = [*first, *kinds, *late]
     elif main.name == "opposite":
@@ -120,20 +102,18 @@ def fault_of(
     until = None if whole or not spans or end - spans[-1][1] < cycle / 2 else spans[-1][1]
     length = sum(b - a for a, b in spans)
     share = 1.0 if whole or end <= begin else min(1.0, length / (end - begin))
-    phrase = _PHRASES[main.name]
-    parts = [phrase, main.text, *(each.text or _PHRASES[each.name] for each in symptoms[1:])]
-    evidence = ", ".join(part for part in dict.fromkeys(parts) if part)
-    if decided:
-        evidence += f"; {decided}"
+    others = (each.text or _PHRASES[each.name] for each in symptoms[1:])
+    parts = dict.fromkeys([_PHRASES[main.name], main.text, *others])
+    evidence = ", ".join(filter(None, parts)) + (f"; {decided}" if decided else "")
     return Fault(motion.name, tuple(kinds), spans, since, until, share, evidence)
 
 
 def _again(main: Symptom, length: float, end: float, cycle_s: float) -> bool:
-    """Whether a joint follows again, for a cycle or more, after it stood still."""
+    """Return whether a joint follows again, for a cycle or more, after it stood still."""
     spans = sorted(main.spans_s)
-    between = [after[0] - before[1] for before, after in pairwise(spans)]
-    last = spans[-1][1] if spans else end
-    return any(gap > cycle_s for gap in between) or end - last > 0.1 * length
+    if any(after[0] - before[1] > cycle_s for before, after in pairwise(spans)):
+        return True
+    return bool(spans) and end - spans[-1][1] > 0.1 * length
 
 
 def _standing(
@@ -142,44 +122,40 @@ def _standing(
     main: Symptom,
     usual: UsualEffort,
 ) -> tuple[list[str], str]:
-    """Kinds of a joint that stands still, by what else was recorded."""
+    """Return kinds of a joint that stands still, by what else was recorded."""
     spans = main.spans_s or (record_span(motion),)
-    for samples, name in ((motion.reference, "second sensor"), (motion.velocity, "velocity")):
-        if samples is None:
-            continue
-        speed = name == "velocity"
-        shown = _shows_motion(motion, samples, spans, judged, speed=speed)
-        if shown is True:
-            return ["frozen_sensor"], f"the {name} shows that it moves"
-        if shown is False and not speed:  # a velocity may be the position's own derivative
-            kinds, why = _by_effort(motion, judged, main, usual)
-            kept = [kind for kind in kinds if kind != "frozen_sensor"]
-            return kept, f"the second sensor stands still, too{'; ' + why if why else ''}"
-    return _by_effort(motion, judged, main, usual)
+    second = _shows_motion(motion, motion.reference, spans, judged, speed=False)
+    if second:
+        return ["frozen_sensor"], "the second sensor shows that it moves"
+    if second is None and _shows_motion(motion, motion.velocity, spans, judged, speed=True):
+        return ["frozen_sensor"], "the velocity shows that it moves"
+    # A velocity at rest decides nothing: it may be the position's own derivative.
+    kinds, why = _by_effort(motion, judged, main, usual)
+    if second is None:
+        return kinds, why
+    kept = [kind for kind in kinds if kind != "frozen_sensor"]
+    return kept, f"the second sensor stands still, too{'; ' + why if why else ''}"
 
 
 def _by_effort(
     motion: JointMotion, judged: Judged, main: Symptom, usual: UsualEffort
 ) -> tuple[list[str], str]:
-    """Kinds of a joint that stands still, by its noise and its effort."""
+    """Return kinds of a joint that stands still, by its noise and its effort."""
     kinds = list(_KINDS[main.name])
     spans = main.spans_s or (record_span(motion),)
     repeats = _repeats(motion, spans)
     if not repeats:  # new noise in each sample: the sensor measures
         kinds.remove("frozen_sensor")
     limit = ["at_limit"] if _at_limit(motion, spans) or _at_one_end(motion, main.spans_s) else []
-    if motion.effort is None:
+    known = effort_there(motion, judged, main, usual)
+    if motion.effort is None or known is None:
         return [*limit, *kinds], ""
     here = motion.effort.values[within(motion.effort.t_s, spans)]
-    known = effort_there(motion, judged, main, usual)
-    if known is None:
-        return [*limit, *kinds], ""
     size, change = known
     level = float(np.median(here))  # robust: a span may begin a moment early
-    spread = 1.4826 * float(np.median(np.abs(here - level)))
     held = repeats and np.count_nonzero(np.diff(here) == 0) > MOSTLY * here.size
     pushes = abs(level) > 0.5 * usual.size_of(motion, main)
-    constant = pushes and spread < CONSTANT * abs(level)
+    constant = pushes and robust_deviation(here, level) < CONSTANT * abs(level)
     unusual, works = change > SAME, size > 0.5
     rules = (
         (held, [*kinds, "stale_sensor"], "its effort is constant to the bit, too"),
@@ -198,14 +174,14 @@ def _by_effort(
 
 
 def _repeats(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
-    """Whether most positions are, to the bit, the one before."""
+    """Return whether most positions are, to the bit, the one before."""
     inside = motion.position.values[within(motion.position.t_s, spans)]
     repeated = int(np.count_nonzero(np.diff(inside) == 0))
     return inside.size < 2 or repeated > MOSTLY * (inside.size - 1)
 
 
 def _opposite(motion: JointMotion) -> tuple[list[str], str]:
-    """Kinds of a joint that moves the opposite way."""
+    """Return kinds of a joint that moves the opposite way."""
     if motion.reference is not None and motion.reference.values.size > 8:
         along = _correlation(motion.reference.at(motion.position.t_s), motion.position.values)
         if along < -MOVING:
@@ -220,28 +196,28 @@ def _opposite(motion: JointMotion) -> tuple[list[str], str]:
 
 
 def _shifted(motion: JointMotion, main: Symptom, kinds: list[str]) -> tuple[list[str], str]:
-    """Kinds of a zero that moved: by a second sensor, or by the velocity at a step."""
+    """Return kinds of a zero that moved: by a second sensor, or by the velocity at a step."""
     sensor = {"stepped": "slipped_sensor", "drifting": "drifting_sensor"}[main.name]
-    if motion.reference is not None and motion.reference.values.size > 8:
-        t_s = motion.position.t_s
-        gap = motion.position.values - motion.reference.at(t_s)
-        whole = motion.position.values - motion.command.at(t_s)
-        inside = within(t_s, main.spans_s or (record_span(motion),))
-        shift = _trend if main.name == "drifting" else _step
-        if abs(shift(gap, t_s, inside)) > OF_SENSOR * abs(shift(whole, t_s, inside)):
-            return [sensor], "the second sensor does not show it"
-        return ["slipped"], "the second sensor shows it, too"
-    return kinds, ""
+    if motion.reference is None or motion.reference.values.size <= 8:
+        return kinds, ""
+    t_s = motion.position.t_s
+    gap = motion.position.values - motion.reference.at(t_s)
+    whole = motion.position.values - motion.command.at(t_s)
+    inside = within(t_s, main.spans_s or (record_span(motion),))
+    shift = _trend if main.name == "drifting" else _step
+    if abs(shift(gap, t_s, inside)) > OF_SENSOR * abs(shift(whole, t_s, inside)):
+        return [sensor], "the second sensor does not show it"
+    return ["slipped"], "the second sensor shows it, too"
 
 
 def _trend(values: FloatArray, t_s: FloatArray, _: BoolArray) -> float:
-    """Change over the record, by the regression line."""
+    """Return change over the record, by the regression line."""
     centred = t_s - t_s.mean()
     return float(centred @ values / (centred @ centred)) * float(np.ptp(t_s))
 
 
 def _step(values: FloatArray, _: FloatArray, inside: BoolArray) -> float:
-    """Mean inside a span less the mean outside it."""
+    """Return mean inside a span less the mean outside it."""
     if not inside.any() or inside.all():
         return 0.0
     return float(values[inside].mean() - values[~inside].mean())
@@ -249,13 +225,15 @@ def _step(values: FloatArray, _: FloatArray, inside: BoolArray) -> float:
 
 def _shows_motion(
     motion: JointMotion,
-    samples: Samples,
+    samples: Samples | None,
     spans: tuple[Span, ...],
     judged: Judged,
     *,
     speed: bool,
 ) -> bool | None:
-    """Whether another quantity shows motion (True) or rest (False); None where it is unclear."""
+    """Return whether another quantity shows motion (True) or rest (False); None if unclear."""
+    if samples is None:
+        return None
     inside = within(samples.t_s, spans)
     t_s, values = samples.t_s[inside], samples.values[inside]
     if t_s.size < 8:
@@ -278,20 +256,17 @@ def _shows_motion(
 
 
 def _at_limit(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
-    """Whether the joint stands at a limit of its description."""
+    """Return whether the joint stands at a limit of its description."""
     if motion.limits is None:
         return False
-    inside = within(motion.position.t_s, spans)
-    if not inside.any():
-        return False
-    level = float(np.median(motion.position.values[inside]))
+    level = median_of(motion.position.values[within(motion.position.t_s, spans)])
     lower, upper = motion.limits
     slack = LIMIT_SHARE * (upper - lower)
     return level <= lower + slack or level >= upper - slack
 
 
 def _at_one_end(motion: JointMotion, spans: tuple[Span, ...]) -> bool:
-    """Whether the joint stands again and again at the same end of its motion."""
+    """Return whether the joint stands again and again at the same end of its motion."""
     if len(spans) < MIN_RETURNS:
         return False
     values = motion.position.values

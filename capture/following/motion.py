@@ -15,17 +15,10 @@ from .fault import Span
 BLOCKS = 4
 """Blocks a cycle: windows of one cycle start at every quarter of it."""
 
-FEW_SAMPLES = 8
-"""A window with fewer samples is not judged."""
-
-FULL_SHARE = 0.6
-"""A window with less than this share of its usual samples is not judged."""
-
-QUIET = 0.25
-"""A window whose command moves less than this share of its usual range is not judged."""
-
-RIDGE = 1e-6
-"""Relative ridge on the normal equations: a ramp and its delayed copy are collinear."""
+FEW_SAMPLES = 8  # a window with fewer samples is not judged
+FULL_SHARE = 0.6  # a window with less than this share of its usual samples is not judged
+QUIET = 0.25  # a window whose command moves less than this share of its usual range is not judged
+RIDGE = 1e-6  # relative ridge on the normal equations: a ramp and its delayed copy are collinear
 
 
 @dataclass(frozen=True)
@@ -41,7 +34,7 @@ class Samples:
     values: FloatArray
 
     def at(self, t_s: FloatArray) -> FloatArray:
-        """Values at other times, interpolated linearly; the ends are held."""
+        """Return values at other times, interpolated linearly; the ends are held."""
         if t_s is self.t_s:
             return self.values
         return np.interp(t_s, self.t_s, self.values).astype(np.float64, copy=False)
@@ -54,7 +47,7 @@ class Samples:
     @cached_property
     def period_s(self) -> float:
         """Median sampling interval [s]."""
-        return float(np.median(np.diff(self.t_s))) if self.t_s.size > 1 else float("nan")
+        return median_of(np.diff(self.t_s))
 
 
 @dataclass(frozen=True)
@@ -91,7 +84,7 @@ class JointMotion:
 
 
 def cycle_s(command: Samples) -> float:
-    """Median length of the command's cycles.
+    """Return median length of the command's cycles.
 
     Returns:
         Time from one upward crossing of its middle to the next, with hysteresis [s]; a tenth of
@@ -158,8 +151,7 @@ def windowed_response(command: Samples, position: Samples, period_s: float) -> R
     i, j = np.searchsorted(position.t_s, (start, start + count * block))
     t_s, p = position.t_s[i:j], position.values[i:j]
     c, d = command.at(t_s), command.at(t_s - period_s / BLOCKS)
-    middle = float(np.median(p)) if p.size else 0.0
-    level = float(np.median(c)) if c.size else 0.0
+    middle, level = median_of(p, 0.0), median_of(c, 0.0)
     rows = np.stack([np.ones_like(c), c - level, d - level, p - middle])
     # Sums over each block, then over the blocks of each window.
     edges: FloatArray = start + block * np.arange(count + 1, dtype=np.float64)
@@ -182,7 +174,7 @@ def _solved(
     centred = moments[:, 1:, 1:] - count[:, None, None] * mean[:, :, None] * mean[:, None, :]
     asked = np.sqrt(np.maximum(centred[:, 0, 0] / count, 0.0))
     spread = np.sqrt(np.maximum(centred[:, 2, 2] / count, 0.0))
-    usual = float(np.median(moments[:, 0, 0])) if len(moments) else 0.0
+    usual = median_of(moments[:, 0, 0], 0.0)
     valid = (moments[:, 0, 0] >= FEW_SAMPLES) & (moments[:, 0, 0] >= FULL_SHARE * usual)
     lively = np.percentile(asked[valid], 75) if valid.any() else 0.0
     valid &= (asked >= QUIET * lively) & (asked > 0)
@@ -220,7 +212,7 @@ def _solved(
 def predicted(
     motion: JointMotion, period_s: float, ratio: complex, offset: float, t_s: FloatArray
 ) -> FloatArray:
-    """The position that a response would give.
+    """Return the position that a response would give.
 
     Args:
         period_s: Cycle of its command T [s].
@@ -237,15 +229,7 @@ def predicted(
 
 
 def within(t_s: FloatArray, spans: tuple[Span, ...]) -> BoolArray:
-    """Find the times that lie in any of some spans.
-
-    Args:
-        t_s: Times, increasing [s], shape (n,).
-        spans: The spans, each with the first sample after it.
-
-    Returns:
-        Marks, shape (n,).
-    """
+    """Mark the times, increasing, that lie in any span, and the first one after each span."""
     marked = np.zeros(t_s.size, dtype=np.bool_)
     for start, stop in spans:
         i, j = np.searchsorted(t_s, (start, stop))
@@ -254,11 +238,7 @@ def within(t_s: FloatArray, spans: tuple[Span, ...]) -> BoolArray:
 
 
 def record_span(motion: JointMotion) -> Span:
-    """The span of a joint's record.
-
-    Returns:
-        First and last time of its positions, or else of its commands [s].
-    """
+    """Return the first and last time of a joint's positions, or else of its commands [s]."""
     t_s = motion.position.t_s if motion.position.t_s.size else motion.command.t_s
     return (float(t_s[0]), float(t_s[-1])) if t_s.size else (0.0, 0.0)
 
@@ -266,31 +246,19 @@ def record_span(motion: JointMotion) -> Span:
 COHERENT = 0.5
 """Explained share above which a window follows its command, with whatever gain and lag."""
 
-NO_RESPONSE = 0.2
-"""Gain, as a share of the common one, below which a window shows no response."""
-
-STILL = 0.3
-"""Motion, as a share of the usual one, below which a joint stands still."""
-
+NO_RESPONSE = 0.2  # gain, as a share of the common one, below which a window shows no response
+STILL = 0.3  # motion, as a share of the usual one, below which a joint stands still
+# Phase against the common response beyond which a joint moves the opposite way.
 OPPOSITE_RAD = np.radians(150.0)
-"""Phase against the common response beyond which a joint moves the opposite way."""
-
 DEGREE = float(np.degrees(1.0))
 
+# Factor within which a gain of 180/pi is a matter of units: a weak servo's gain is in it.
 UNIT_SLACK = 1.6
-"""Factor within which a gain of 180/pi is a matter of units: a weak servo's gain is in it."""
-
-NEIGHBOURS = 4
-"""Joints that one joint is compared with: the nearest ones."""
-
-MIN_WINDOWS = 5
-"""Windows (two whole cycles) that a joint's own usual response needs."""
-
-LOADED = 0.7
-"""Gain below which a joint's neighbours are held back by a load: then it may be, too."""
-
+NEIGHBOURS = 4  # joints that one joint is compared with: the nearest ones
+MIN_WINDOWS = 5  # windows (two whole cycles) that a joint's own usual response needs
+LOADED = 0.7  # gain below which a joint's neighbours are held back by a load: then it may be, too
+# A joint whose windows follow less than this share of the time has no usual response.
 MIN_SHARE = 0.5
-"""A joint whose windows follow less than this share of the time has no usual response."""
 
 _Value = TypeVar("_Value")
 
@@ -331,7 +299,7 @@ class Judged:
 
 
 def own_response(response: Response) -> complex | None:
-    """The usual response of one joint.
+    """Return the usual response of one joint.
 
     Returns:
         Median of H over the windows that it explains; None where it explains too few, which is
@@ -344,33 +312,29 @@ def own_response(response: Response) -> complex | None:
 
 
 def neighbours(values: Sequence[_Value], k: int) -> list[_Value]:
-    """The values of the joints nearest to one joint in the chain, without its own.
+    """Return the values of the ``NEIGHBOURS`` joints nearest to a joint, without its own.
 
-    Args:
-        values: One of each driven joint, e.g. its response, in chain order.
-
-    Returns:
-        Up to ``NEIGHBOURS`` values: the gain of a loaded chain changes along the body.
+    The gain of a loaded chain changes along the body.
     """
     others = sorted((j for j in range(len(values)) if j != k), key=lambda j: (abs(j - k), j))
     return [values[j] for j in others[:NEIGHBOURS]]
 
 
 def common_response(own: Sequence[complex | None]) -> complex:
-    """The response that some joints have in common.
+    """Return the response that some joints have in common.
 
     Args:
         own: Response of each; None for none.
 
     Returns:
         Median gain at the circular median lag of the joints that respond, with one vote for an
-        ideal response, so that two joints of opposite sign are told apart.
+        ideal response, so that two joints of opposite sign are separated.
     """
     values = np.asarray([1.0 + 0.0j, *(each for each in own if each is not None)])
     unit = values / np.abs(values)
     # The circular median: the phase of the joint that is nearest to all others.
     distance = np.abs(np.angle(unit[:, None] * unit.conj()[None, :])).sum(axis=1)
-    gain = float(np.median(np.abs(values[1:]))) if values.size > 1 else 1.0
+    gain = median_of(np.abs(values[1:]), 1.0)
     return complex(gain * unit[int(np.argmin(distance))])
 
 
@@ -394,19 +358,12 @@ def judge(motion: JointMotion, response: Response, common: complex) -> Judged:
     chosen = follows if follows.any() else opposite
     ratio = complex_median(response.ratio[chosen]) if chosen.any() else common
     use = chosen if chosen.any() else response.valid
-    offset = float(np.median(response.offset[use])) if use.any() else 0.0
+    offset = median_of(response.offset[use], 0.0)
     return Judged(motion, response, follows, still, opposite, ratio, offset, common)
 
 
 def marked_spans(response: Response, marked: BoolArray) -> tuple[Span, ...]:
-    """Marked windows as time spans, neighbours joined.
-
-    Args:
-        marked: Which of them, shape (w,).
-
-    Returns:
-        Start and end of each run [s].
-    """
+    """Return marked windows as time spans [s], overlapping ones joined."""
     spans: list[Span] = []
     for start, stop in zip(response.start_s[marked], response.stop_s[marked], strict=True):
         if spans and start <= spans[-1][1]:
@@ -417,14 +374,7 @@ def marked_spans(response: Response, marked: BoolArray) -> tuple[Span, ...]:
 
 
 def whole_or(spans: tuple[Span, ...], response: Response) -> tuple[Span, ...]:
-    """Nothing where the spans cover (nearly) the whole record, i.e. a permanent fault.
-
-    Args:
-        response: The windows of its joint.
-
-    Returns:
-        The spans, or none.
-    """
+    """Return the spans, or none if one covers nearly all windows, i.e. a permanent fault."""
     if len(spans) == 1 and response.start_s.size:
         cycle = response.period_s
         begin, end = response.start_s[0], response.stop_s[-1]
@@ -434,9 +384,21 @@ def whole_or(spans: tuple[Span, ...], response: Response) -> tuple[Span, ...]:
 
 
 def complex_median(values: ComplexArray) -> complex:
-    """Median of the real and of the imaginary parts.
-
-    Args:
-        values: One or more, shape (n,).
-    """
+    """Return the median of the real and of the imaginary parts, of at least one value."""
     return complex(np.median(values.real), np.median(values.imag))
+
+
+def median_of(values: FloatArray, default: float = float("nan")) -> float:
+    """Return the median, or the default without values."""
+    return float(np.median(values)) if values.size else default
+
+
+def robust_deviation(values: FloatArray, centre: float) -> float:
+    """Return the standard deviation of normal values by their median distance from the centre."""
+    return 1.4826 * float(np.median(np.abs(values - centre)))
+
+
+def runs_of(marked: BoolArray) -> list[list[int]]:
+    """Return the first index and the one after the last of each run of marks."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], marked, [False])).astype(np.int8)))
+    return edges.reshape(-1, 2).tolist()

@@ -8,7 +8,7 @@ A session holds SI, except temperatures, which stay in degrees Celsius.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from ..common.arrays import FloatArray
 from ..common.config import read_field
 from ..common.errors import UsageError
-from ..common.strict_table import Faults, Table, listed
+from ..common.strict_table import Faults, Table, finite_number, listed
 from .model import Bus, BusPoll, BusSignal, Direction, Joint, Quantity, Sensor, SensorKind
 
 if TYPE_CHECKING:
@@ -39,14 +39,7 @@ class Unit:
     offset: float = 0.0
 
     def convert(self, values: FloatArray) -> FloatArray:
-        """Values in the session's unit.
-
-        Args:
-            values: In this unit, any shape.
-
-        Returns:
-            ``factor * values + offset``, same shape.
-        """
+        """Return values in the session's unit, ``factor * values + offset``."""
         return values * self.factor + self.offset
 
 
@@ -106,21 +99,13 @@ SESSION_UNIT: dict[Quantity, str] = {
 
 
 def valid_units(quantity: Quantity) -> tuple[str, ...]:
-    """Names of the units that fit a quantity.
-
-    Returns:
-        The names, the session's own unit first.
-    """
+    """Return the names of the units that fit a quantity, that of sessions first."""
     dimension = SESSION_UNIT[quantity]
     return tuple(name for name, unit in UNITS.items() if unit.dimension == dimension)
 
 
 def unit_for(name: str, quantity: Quantity) -> Unit:
-    """The unit of that name, if it fits the quantity.
-
-    Args:
-        name: Unit name, e.g. ``deg``.
-        quantity: What is measured in it.
+    """Return the unit of a name, e.g. ``deg``, if it fits the quantity.
 
     Raises:
         UsageError: If there is no such unit or it measures something else; lists the valid ones.
@@ -143,7 +128,7 @@ JOINT_QUANTITIES = tuple(q for q in Quantity if q not in _OF_SENSOR.values())
 
 
 def database_messages(databases: Mapping[str, str], faults: Faults) -> dict[str, Message] | None:
-    """The messages of some DBC databases by name.
+    """Read DBC databases.
 
     Args:
         databases: DBC file name to text.
@@ -157,36 +142,24 @@ def database_messages(databases: Mapping[str, str], faults: Faults) -> dict[str,
     messages: dict[str, Message] = {}
     readable = True
     for name, text in databases.items():
+        where = f"bus.databases: {name}"
         try:
             found = _messages(text)
         except UnsupportedDatabaseFormatError as error:
-            faults.add(f"bus.databases: {name}", str(error.e_dbc), "a DBC without overlaps")
+            faults.add(where, str(error.e_dbc), "a DBC without overlaps")
             readable = False
             continue
         for message in found:
             for signal in message.signals:
-                if not (_is_finite(signal.scale) and _is_finite(signal.offset)):
-                    faults.add(
-                        f"bus.databases: {name}",
-                        f"{message.name}.{signal.name} is scaled by a number that is not finite",
-                        "a factor and an offset that a double can hold",
-                    )
+                if None in map(finite_number, (signal.scale, signal.offset)):
+                    why = f"{message.name}.{signal.name} is scaled by a number that is not finite"
+                    faults.add(where, why, "a factor and an offset that a double can hold")
                     readable = False
             if message.name in messages:
-                faults.add(
-                    f"bus.databases: {name}",
-                    f"a second message {message.name}",
-                    "message names that are unique in all databases together",
-                )
+                valid = "message names that are unique in all databases together"
+                faults.add(where, f"a second message {message.name}", valid)
             messages[message.name] = message
     return messages if readable else None
-
-
-def _is_finite(number: float) -> bool:
-    try:
-        return math.isfinite(number)
-    except OverflowError:  # an integer of hundreds of digits
-        return False
 
 
 @lru_cache(maxsize=16)  # every session of a robot carries the same databases
@@ -204,16 +177,13 @@ def read_bus(
     sensors: tuple[Sensor, ...],
     read_database: Callable[[str], str | None],
 ) -> tuple[Bus, tuple[tuple[str, str], ...]]:
-    """Read the bus of a robot.
+    """Read the bus of a robot; return it with the file name and text of each database.
 
     Args:
         table: The ``bus`` table; faults are noted in its list.
         joints: The robot's joints.
         sensors: The robot's sensors.
         read_database: Text of a DBC file by name, None where there is none.
-
-    Returns:
-        The bus, and DBC file name with text for each database.
     """
     databases: dict[str, str] = {}
     names = table.words("databases")
@@ -232,18 +202,16 @@ def read_bus(
     if len(databases) != len(names):
         messages = None  # what a missing database holds is not a fault of the map
     signals: dict[BusSignal, None] = {}
-    for each in table.tables("signals"):
-        for entry in _expanded(each, joints):
-            signal = _signal(entry, messages, joints, sensors)
-            entry.close()
-            if signal in signals:
-                entry.fault("signal", "one entry a signal, target and quantity", "a repeated entry")
-            signals[signal] = None
+    for entry in _expanded(table.tables("signals"), joints):
+        signal = _signal(entry, messages, joints, sensors)
+        entry.close()
+        if signal in signals:
+            entry.fault("signal", "one entry a signal, target and quantity", "a repeated entry")
+        signals[signal] = None
     polls: dict[BusPoll, None] = {}
-    for each in table.tables("polls"):
-        for entry in _expanded(each, joints):
-            polls[_poll(entry, messages, joints)] = None
-            entry.close()
+    for entry in _expanded(table.tables("polls"), joints):
+        polls[_poll(entry, messages, joints)] = None
+        entry.close()
     table.close()
     bus = Bus(tuple(databases), bitrate, tuple(signals), tuple(polls))
     return bus, tuple(databases.items())
@@ -252,38 +220,49 @@ def read_bus(
 def _poll(
     entry: Table, messages: Mapping[str, Message] | None, joints: tuple[Joint, ...]
 ) -> BusPoll:
-    """A request; its target, if it has one, only says which joint it is for."""
+    """Read a request; its target, if any, only names the joint that it is for."""
     names = [joint.name for joint in joints]
     if "target" in entry and (target := entry.text("target")) not in names:
         entry.fault("target", listed([*names, _PLACEHOLDER], target))
-    message = entry.text("message")
-    if messages is not None and message and message not in messages:
-        entry.fault("message", listed(messages, message))
+    message, signals = _message(entry, messages)
     table = entry.table("signals")
-    if messages is None or message not in messages:
+    if signals is None:
         return BusPoll(message, ())
-    known = {each.name: each for each in messages[message].signals}
-    numbers = [(name, table.integer(name, 0)) for name in known if name in table]
+    numbers = [(name, table.integer(name, 0)) for name in signals if name in table]
     for name, number in numbers:
-        if number >> known[name].length:
-            table.fault(name, f"a raw number of {known[name].length} bits")
+        if number >> signals[name].length:
+            table.fault(name, f"a raw number of {signals[name].length} bits")
     table.close()
     return BusPoll(message, tuple(numbers))
 
 
-def _expanded(entry: Table, joints: tuple[Joint, ...]) -> list[Table]:
-    """The entry itself, or one entry a joint where its target is the placeholder."""
-    if entry.values.get("target") != _PLACEHOLDER:
-        return [entry]
-    return [
-        entry.replaced(
-            {
-                key: value.replace(_PLACEHOLDER, joint.name) if isinstance(value, str) else value
-                for key, value in entry.values.items()
-            }
-        )
-        for joint in joints
-    ]
+def _message(
+    entry: Table, messages: Mapping[str, Message] | None
+) -> tuple[str, dict[str, Signal] | None]:
+    """Read the name of a message; return it with its signals, None where it is unknown."""
+    name = entry.text("message")
+    if messages is None or name not in messages:
+        if messages is not None and name:
+            entry.fault("message", listed(messages, name))
+        return name, None
+    return name, {signal.name: signal for signal in messages[name].signals}
+
+
+def _expanded(entries: Iterable[Table], joints: tuple[Joint, ...]) -> Iterator[Table]:
+    """Yield each entry, or one entry a joint where its target is the placeholder."""
+    for entry in entries:
+        if entry.values.get("target") != _PLACEHOLDER:
+            yield entry
+            continue
+        for joint in joints:
+            yield entry.replaced(
+                {
+                    key: value.replace(_PLACEHOLDER, joint.name)
+                    if isinstance(value, str)
+                    else value
+                    for key, value in entry.values.items()
+                }
+            )
 
 
 def _signal(
@@ -292,17 +271,11 @@ def _signal(
     joints: tuple[Joint, ...],
     sensors: tuple[Sensor, ...],
 ) -> BusSignal:
-    message, signal = entry.text("message"), entry.text("signal")
-    dbc: Signal | None = None
-    if messages is None:
-        pass
-    elif message and message not in messages:
-        entry.fault("message", listed(messages, message))
-    elif message and signal:
-        known = {each.name: each for each in messages[message].signals}
-        dbc = known.get(signal)
-        if dbc is None:
-            entry.fault("signal", f"a signal of {message}: {listed(known, signal)}")
+    message, known = _message(entry, messages)
+    signal = entry.text("signal")
+    dbc = (known or {}).get(signal)
+    if known is not None and signal and dbc is None:
+        entry.fault("signal", f"a signal of {message}: {listed(known, signal)}")
     direction = entry.choice("direction", Direction) or Direction.RX
     target, quantity = entry.text("target"), entry.choice("quantity", Quantity)
     unit = entry.text("unit")
@@ -337,23 +310,25 @@ def _signal(
 
 
 def _code(entry: Table, key: str, dbc: Signal | None) -> int | None:
-    """A raw number with a meaning of its own; None where there is none."""
+    """Read a raw number with a special meaning; None where there is none."""
     if key not in entry:
         return None
-    least = -(1 << (dbc.length - 1)) if dbc is not None and dbc.is_signed else 0
-    greatest = least + (1 << dbc.length) - 1 if dbc is not None else None
-    number = entry.integer(key, least if dbc is not None else -(1 << 63))
-    if dbc is not None and dbc.is_float:
+    if dbc is None:
+        return entry.integer(key, -(1 << 63))
+    least = -(1 << (dbc.length - 1)) if dbc.is_signed else 0
+    greatest = least + (1 << dbc.length) - 1
+    number = entry.integer(key, least)
+    if dbc.is_float:
         entry.fault(key, "leave it out: a float has numbers for that, NaN and inf")
-    elif greatest is not None and number > greatest:
-        entry.fault(key, f"a raw number of {dbc.length if dbc else 0} bits, {least} to {greatest}")
+    elif number > greatest:
+        entry.fault(key, f"a raw number of {dbc.length} bits, {least} to {greatest}")
     return number
 
 
 def _quantities(
     target: str, joints: tuple[Joint, ...], sensors: tuple[Sensor, ...]
 ) -> tuple[Quantity, ...]:
-    """What can be known of a target; nothing where there is no such target."""
+    """Return the quantities of a target, none if there is no such target."""
     if any(joint.name == target for joint in joints):
         return JOINT_QUANTITIES
     return tuple(_OF_SENSOR[sensor.kind] for sensor in sensors if sensor.name == target)

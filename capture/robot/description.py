@@ -16,8 +16,8 @@ A description has the head first::
 
 A ``[chain]`` with ``joints = 100`` and ``planes = ["horizontal", "vertical"]`` (taken in turn from
 the head) stands for ``joints`` of a long chain. ``links`` may be left out: then there is one more
-than joints, ``link01`` the head, all as the defaults say. ``[defaults.joint]``,
-``[defaults.servo]`` and ``[defaults.<sensor kind>]`` work the same way. ``[safety]`` says how far
+than joints, ``link01`` the head, all with default values. ``[defaults.joint]``,
+``[defaults.servo]`` and ``[defaults.<sensor kind>]`` work the same way. ``[safety]`` limits how far
 the robot may be driven, ``[safety_of.joint07]`` what is otherwise for one joint. In an entry of
 ``bus.signals`` whose target is ``{joint}``, the entry stands for one a joint, and ``{joint}`` in
 its message and signal for that joint's name. The keys are the fields of the classes of
@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from ..common.errors import Fault, RobotFileError
 from ..common.files import Shelf
 from ..common.strict_table import Faults, Table, listed, read_toml
 from .bus_map import read_bus
-from .kinematics import MESH_TYPES, is_mesh, read_meshes
+from .kinematics import MESH_TYPES, mesh_type, read_meshes
 from .model import (
     JOINT_LIMITS,
     ClockDomain,
@@ -51,81 +52,57 @@ from .model import (
 )
 
 
-def note_repeated(faults: Faults, what: str, names: Sequence[str]) -> None:
-    """Note names that occur more than once; empty ones are faults already.
-
-    Args:
-        what: What has these names, e.g. ``links``.
-    """
+def _note_repeated(faults: Faults, what: str, names: Sequence[str]) -> None:
+    """Note names that occur more than once; empty ones are faults already."""
     for name in sorted({name for name in names if name and names.count(name) > 1}):
         faults.add(what, f"{names.count(name)} times {name}", "every name once")
 
 
-LONGEST_CHAIN = 1000
-"""Joints of a chain that is described by its length: far beyond any robot, short of a slip."""
+_LONGEST_CHAIN = 1000  # joints of a chain given by its length; more are a typing error
 
 
-def read_joints(top: Table, defaults: Table) -> tuple[Joint, ...]:
-    """Read ``joints``, or a ``chain`` of like ones, with ``defaults`` of joint and servo.
-
-    Args:
-        defaults: Its ``defaults``.
-
-    Returns:
-        The joints, the one next to the head first.
-    """
+def _read_joints(top: Table, defaults: Table) -> tuple[Joint, ...]:
+    """Read ``joints``, or a ``chain`` of equal ones, head to tail."""
     common, servo = defaults.table("joint"), defaults.table("servo")
     tables = _chain(top) if "chain" in top else top.tables("joints")
     if not tables:
         top.fault("joints", "an array of at least one table, the joint next to the head first")
-    joints = tuple(_joint(table.over(common), servo) for table in tables)
+
+    def joint(table: Table) -> Joint:
+        return read(table, Joint, servo=lambda: read(table.table("servo", servo), Servo))
+
+    joints = tuple(joint(table.over(common)) for table in tables)
     if tables:
         common.close()
         servo.close()
     return joints
 
 
-def _joint(table: Table, servo: Table) -> Joint:
-    return read(table, Joint, servo=lambda: read(table.table("servo", servo), Servo))
-
-
 def _chain(top: Table) -> list[Table]:
-    """Tables for ``joints`` of a chain that is described by its length."""
+    """Return tables for ``joints`` of a chain that is given by its length."""
     if "joints" in top:
         top.fault("joints", "leave it out: the chain has them")
     table = top.table("chain")
     count = table.integer("joints", 1)
-    if count > LONGEST_CHAIN:
-        table.fault("joints", f"at most {LONGEST_CHAIN}")
+    if count > _LONGEST_CHAIN:
+        table.fault("joints", f"at most {_LONGEST_CHAIN}")
         count = 1
     planes = table.words("planes", valid=Plane) or tuple(Plane)
     table.close()
-    names = numbered("joint", count)
     return [
-        table.replaced({"name": name, "plane": planes[i % len(planes)]})
-        for i, name in enumerate(names)
+        table.replaced({"name": name, "plane": plane})
+        for name, plane in zip(numbered("joint", count), cycle(planes))
     ]
 
 
 def numbered(word: str, count: int) -> list[str]:
-    """Names of like parts that sort as they stand in the chain.
-
-    Returns:
-        ``joint01``, ``joint02``, ...; three digits for more than 99.
-    """
+    """Return names whose order is that of the chain: ``joint01``, ..., or ``joint001``, ..."""
     width = max(2, len(str(count)))
     return [f"{word}{i:0{width}d}" for i in range(1, count + 1)]
 
 
-def read_links(top: Table, defaults: Table, joint_count: int) -> tuple[Link, ...]:
-    """Read ``links``, or make one more than joints as ``defaults`` say.
-
-    Args:
-        defaults: Its ``defaults``.
-
-    Returns:
-        The links, the head first.
-    """
+def _read_links(top: Table, defaults: Table, joint_count: int) -> tuple[Link, ...]:
+    """Read ``links``, by default one more than joints with default values, head to tail."""
     common = defaults.table("link")
     tables = top.tables("links")
     if "links" not in top:
@@ -135,13 +112,13 @@ def read_links(top: Table, defaults: Table, joint_count: int) -> tuple[Link, ...
     links = tuple(_link(table.over(common)) for table in tables)
     if tables:
         common.close()
-    note_repeated(top.faults, "links", [link.name for link in links])
+    _note_repeated(top.faults, "links", [link.name for link in links])
     return links
 
 
 def _link(table: Table) -> Link:
     link = read_fields(table, Link)
-    if link.mesh and not is_mesh(link.mesh):
+    if link.mesh and mesh_type(link.mesh) is None:
         table.fault("mesh", f"a file {listed(MESH_TYPES)}, or leave it out")
     # Each principal moment of a rigid body is at most the sum of the other two.
     if 2 * max(link.inertia) > sum(link.inertia) * (1 + 1e-12):
@@ -150,12 +127,8 @@ def _link(table: Table) -> Link:
     return link
 
 
-def read_safety(top: Table, joints: tuple[Joint, ...]) -> Safety | None:
-    """Read ``safety``, and what single joints have otherwise.
-
-    Returns:
-        The limits that are given; None without the table.
-    """
+def _read_safety(top: Table, joints: tuple[Joint, ...]) -> Safety | None:
+    """Read ``safety``, and ``safety_of`` with the limits of single joints."""
     if "safety" not in top:
         if "safety_of" in top:
             top.fault("safety_of", "leave it out: there is no safety for it to differ from")
@@ -166,23 +139,19 @@ def read_safety(top: Table, joints: tuple[Joint, ...]) -> Safety | None:
     of: list[tuple[str, str, float]] = []
     for joint in joints:
         own = singles.table(joint.name)
-        given = [(joint.name, limit, read_field(own, Safety, limit)) for limit in JOINT_LIMITS]
-        of += [one for one in given if one[2] is not None]
+        given = ((limit, read_field(own, Safety, limit)) for limit in JOINT_LIMITS)
+        of += [(joint.name, limit, value) for limit, value in given if value is not None]
         own.close()
     singles.close()
     return replace(safety, of=tuple(of))
 
 
 _RANGED = (SensorKind.IR, SensorKind.SONAR)
+_RANGE_FIELDS = ("range_min", "range_max", "field_of_view")
 
 
-def read_sensors(top: Table, defaults: Table, links: tuple[Link, ...]) -> tuple[Sensor, ...]:
-    """Read ``sensors``, with ``defaults`` of each kind.
-
-    Args:
-        defaults: Its ``defaults``.
-        links: The links that may carry them.
-    """
+def _read_sensors(top: Table, defaults: Table, links: tuple[Link, ...]) -> tuple[Sensor, ...]:
+    """Read ``sensors``, with ``defaults`` of each kind."""
     common = {kind: defaults.table(kind) for kind in SensorKind}
     used: set[SensorKind] = set()
     sensors: list[Sensor] = []
@@ -197,13 +166,12 @@ def read_sensors(top: Table, defaults: Table, links: tuple[Link, ...]) -> tuple[
             table.close()
         elif kind in defaults:
             defaults.fault(kind, f"leave it out: no sensor is of kind {kind}")
-    topics = [sensor.topic for sensor in sensors]
-    note_repeated(top.faults, "topics of the sensors", topics)
+    _note_repeated(top.faults, "topics of the sensors", [sensor.topic for sensor in sensors])
     return tuple(sensors)
 
 
 def _sensor(table: Table, kind: SensorKind, link_names: list[str]) -> Sensor:
-    ranges = ("range_min", "range_max", "field_of_view") if kind in _RANGED else ()
+    ranges = _RANGE_FIELDS if kind in _RANGED else ()
     fields = ("link", "position", "rpy", *(ranges or ("axes",)))
 
     def link() -> str:
@@ -212,8 +180,8 @@ def _sensor(table: Table, kind: SensorKind, link_names: list[str]) -> Sensor:
             table.fault("link", listed(link_names, name))
         return name
 
-    def given(name: str) -> Any:
-        return read_required(table, Sensor, name) if name in ranges else None
+    def given(name: str) -> Callable[[], Any]:
+        return lambda: read_required(table, Sensor, name) if name in ranges else None
 
     def axes() -> tuple[str, ...]:
         found = table.words("axes", valid=("x", "y", "z")) if not ranges else ()
@@ -221,16 +189,8 @@ def _sensor(table: Table, kind: SensorKind, link_names: list[str]) -> Sensor:
             table.fault("axes", 'an array of the measured axes, e.g. ["x", "y"]')
         return found
 
-    sensor = read_fields(
-        table,
-        Sensor,
-        link=link,
-        range_min=lambda: given("range_min"),
-        range_max=lambda: given("range_max"),
-        field_of_view=lambda: given("field_of_view"),
-        axes=axes,
-        assumed=tuple,
-    )
+    own = {name: given(name) for name in _RANGE_FIELDS}
+    sensor = read_fields(table, Sensor, link=link, axes=axes, assumed=tuple, **own)
     sensor = replace(sensor, assumed=table.words("assumed", valid=fields))
     table.close()
     return sensor
@@ -241,7 +201,7 @@ _PARTS = ("links", "joints", "servo", "sensors", "bus")
 
 
 def robot_names() -> tuple[str, ...]:
-    """Names of the shipped robots, sorted."""
+    """Return names of the shipped robots, sorted."""
     return _SHELF.names()
 
 
@@ -281,10 +241,7 @@ def parse_robot(text: str, source: str | Path, databases: Mapping[str, str]) -> 
 
 
 def robot_in_session(attachments: Mapping[str, bytes], source: str | Path) -> Robot | None:
-    """The robot that a session carries.
-
-    Args:
-        attachments: The session's attached files, by name.
+    """Read the robot description of a session.
 
     Returns:
         The robot with its databases and those of its meshes that are there; None if no
@@ -312,7 +269,7 @@ def robot_in_session(attachments: Mapping[str, bytes], source: str | Path) -> Ro
 
 
 def _bytes(path: Any) -> bytes | None:  # a Path, or a Traversable inside the package
-    """Content of a file; None when it cannot be read."""
+    """Return the content of a file; None if it cannot be read."""
     try:
         return path.read_bytes()
     except OSError:
@@ -320,7 +277,7 @@ def _bytes(path: Any) -> bytes | None:  # a Path, or a Traversable inside the pa
 
 
 def _decoded(path: Any) -> str | None:
-    """Text of a DBC file; None when it cannot be read."""
+    """Return the text of a DBC file; None if it cannot be read."""
     data = _bytes(path)
     if data is None:
         return None
@@ -346,14 +303,14 @@ def _parse(
     name, description = top.name("name"), top.text("description", "")
     clock = top.choice("clock", ClockDomain) or ClockDomain.HOST
     assumed = top.words("assumed", valid=_PARTS)
-    joints = read_joints(top, defaults)
-    links = read_links(top, defaults, len(joints))
-    sensors = read_sensors(top, defaults, links)
-    note_repeated(faults, "joints and sensors", [part.name for part in (*joints, *sensors)])
+    joints = _read_joints(top, defaults)
+    links = _read_links(top, defaults, len(joints))
+    sensors = _read_sensors(top, defaults, links)
+    _note_repeated(faults, "joints and sensors", [part.name for part in (*joints, *sensors)])
     bus, databases = None, ()
     if "bus" in top:
         bus, databases = read_bus(top.table("bus"), joints, sensors, read_database)
-    safety = read_safety(top, joints)
+    safety = _read_safety(top, joints)
     meshes = () if read_mesh is None else read_meshes(links, faults, read_mesh)
     defaults.close()
     top.close()

@@ -23,35 +23,19 @@ MESH_TYPES = {
 """Suffix of a mesh file to its media type (IANA)."""
 
 
-def is_mesh(name: str) -> bool:
-    """Whether a file is a mesh, by its name.
-
-    Returns:
-        Whether its suffix is one of :data:`MESH_TYPES`.
-    """
-    return mesh_type(name) is not None
-
-
 def mesh_type(name: str) -> str | None:
-    """Media type of a mesh file.
-
-    Returns:
-        The type, None for a file of another kind.
-    """
+    """Return the media type of a mesh file by its name, None for a file of another kind."""
     return MESH_TYPES.get(PurePosixPath(name).suffix.lower())
 
 
 def read_meshes(
     links: Sequence[Link], faults: Faults, read: Callable[[str], bytes | None]
 ) -> tuple[tuple[str, bytes], ...]:
-    """Read the mesh files that the links name, each once.
+    """Read the mesh files of the links, each once; return their names and bytes.
 
     Args:
         faults: Where files that can't be read are noted.
         read: Bytes of a file of that name, None where it can't be read.
-
-    Returns:
-        File name and bytes of each.
     """
     meshes: dict[str, bytes] = {}
     for link in links:
@@ -66,7 +50,7 @@ def read_meshes(
 
 
 def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
-    """Rotation matrices of unit quaternions.
+    """Return the rotation matrices of unit quaternions.
 
     Args:
         quaternion: x, y, z, w, shape (..., 4).
@@ -84,7 +68,7 @@ def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
 
 
 def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
-    """Unit quaternions of rotation matrices, w >= 0.
+    """Return the unit quaternions of rotation matrices, w >= 0.
 
     Shepperd's method (J. Guidance and Control 1, 1978): the largest of the four components is
     computed first, so that no division is by a small number.
@@ -103,12 +87,9 @@ def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
     outer[..., 1, 1] = 1 - xx + yy - zz
     outer[..., 2, 2] = 1 - xx - yy + zz
     outer[..., 3, 3] = 1 + xx + yy + zz
-    outer[..., 0, 1] = outer[..., 1, 0] = r[..., 0, 1] + r[..., 1, 0]
-    outer[..., 0, 2] = outer[..., 2, 0] = r[..., 0, 2] + r[..., 2, 0]
-    outer[..., 1, 2] = outer[..., 2, 1] = r[..., 1, 2] + r[..., 2, 1]
-    outer[..., 0, 3] = outer[..., 3, 0] = r[..., 2, 1] - r[..., 1, 2]
-    outer[..., 1, 3] = outer[..., 3, 1] = r[..., 0, 2] - r[..., 2, 0]
-    outer[..., 2, 3] = outer[..., 3, 2] = r[..., 1, 0] - r[..., 0, 1]
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        outer[..., i, j] = outer[..., j, i] = r[..., i, j] + r[..., j, i]
+        outer[..., k, 3] = outer[..., 3, k] = r[..., j, i] - r[..., i, j]
     largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
     column = np.take_along_axis(outer, largest[..., None, None], axis=-1)[..., 0]
     unit = column / np.linalg.norm(column, axis=-1, keepdims=True)
@@ -116,16 +97,8 @@ def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
     return sign * unit
 
 
-def joint_rotations(robot: Robot, angles: FloatArray) -> FloatArray:
-    """Rotation of each rear link in its front link's frame.
-
-    Args:
-        robot: The robot, m joints.
-        angles: Joint angles [rad], shape (..., m).
-
-    Returns:
-        Shape (..., m, 3, 3).
-    """
+def _joint_rotations(robot: Robot, angles: FloatArray) -> FloatArray:
+    """Return the rotation of each rear link in its front link's frame, (..., m, 3, 3)."""
     yaw = np.array([joint.plane is Plane.HORIZONTAL for joint in robot.joints])
     c, s = np.cos(angles), np.sin(angles)
     rotation = np.zeros((*angles.shape, 3, 3), dtype=np.float64)
@@ -142,7 +115,7 @@ def joint_rotations(robot: Robot, angles: FloatArray) -> FloatArray:
 def link_poses(
     robot: Robot, head_position: FloatArray, head_rotation: FloatArray, angles: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Centres and orientations of all links in the world.
+    """Return centres and orientations of all links in the world.
 
     Args:
         robot: The robot, m joints.
@@ -159,7 +132,7 @@ def link_poses(
     m = len(robot.joints)
     if angles.shape[-1:] != (m,):
         raise DataError(f"angles has shape {angles.shape}; the robot {robot.name} has {m} joints")
-    turn = joint_rotations(robot, angles)
+    turn = _joint_rotations(robot, angles)
     position = np.empty((*angles.shape[:-1], m + 1, 3), dtype=np.float64)
     rotation = np.empty((*angles.shape[:-1], m + 1, 3, 3), dtype=np.float64)
     position[..., 0, :] = head_position

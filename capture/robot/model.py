@@ -55,7 +55,7 @@ class Safety:
         max_current: Greatest current of a servo [A].
         max_temperature: Greatest temperature of a servo [degC].
         min_voltage: Least supply voltage of a servo [V].
-        reply_timeout_s: A joint that says nothing for so long is lost [s].
+        reply_timeout_s: Time without a reply after which a joint is lost [s].
         max_late_s: So late a control tick may be [s].
         fault_after_s: Tracking error and current are a fault when they last so long [s].
         on_fault: How a drive ends that has to end early.
@@ -75,7 +75,7 @@ class Safety:
     of: tuple[tuple[str, str, float], ...] = ()
 
     def values(self, limit: str, joint_names: tuple[str, ...]) -> FloatArray:
-        """One limit of each joint.
+        """Return one limit of each joint.
 
         Args:
             limit: One of :data:`JOINT_LIMITS`.
@@ -105,7 +105,7 @@ class ClockDomain(StrEnum):
 
 
 class SensorKind(StrEnum):
-    """The kinds of sensor a robot description knows."""
+    """Kind of sensor."""
 
     IR = "ir"
     SONAR = "sonar"
@@ -147,7 +147,7 @@ class Servo:
     stribeck_speed: Positive = 0.05
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """A rotor at rest withstands no less than a moving one."""
+        """Check that a rotor at rest withstands no less than a moving one."""
         if 0 < self.static_friction < self.coulomb_friction:
             yield "static_friction", f"0, or at least coulomb_friction = {self.coulomb_friction:g}"
 
@@ -155,13 +155,6 @@ class Servo:
     def resistance_ohm(self) -> float:
         """Winding resistance R = Kt V / stall torque [ohm]."""
         return self.torque_constant * self.supply_v / self.stall_torque
-
-
-MAY_BE_ZERO = (
-    *("viscous_friction", "coulomb_friction", "static_friction"),
-    *("gear_damping", "backlash"),
-)
-"""Parameters of a servo that may be zero; all others are positive."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +176,7 @@ class Joint:
     servo: Servo = field(default_factory=Servo)
 
     def contradictions(self) -> Iterator[tuple[str, str, str]]:
-        """The upper limit is above the lower one."""
+        """Check that the upper limit is above the lower one."""
         if self.lower >= self.upper:
             yield "upper", f"more than lower = {self.lower:g}", f"{self.upper:g}"
 
@@ -220,8 +213,8 @@ class Sensor:
         link: Name of the link that carries it.
         position: Mount point in the link's frame [m].
         rpy: Roll, pitch, yaw of the sensor's frame in the link's frame [rad]; rays leave along x.
-        range_min: Shortest distance it can tell [m]; None where it has no range.
-        range_max: Longest distance it can tell [m]; None where it has no range.
+        range_min: Shortest distance it can measure [m]; None where it has no range.
+        range_max: Longest distance it can measure [m]; None where it has no range.
         field_of_view: Full cone angle [rad]; None where it has none.
         axes: Measured axes of the sensor's frame, e.g. ``("x", "y", "z")``.
         assumed: Names of the fields that were assumed rather than known.
@@ -239,7 +232,7 @@ class Sensor:
     assumed: tuple[str, ...] = ()
 
     def contradictions(self) -> Iterator[tuple[str, str, str]]:
-        """A range has an extent."""
+        """Check that a range has an extent."""
         least, most = self.range_min, self.range_max
         if least is not None and most is not None and least >= most:
             yield "range_max", f"more than range_min = {least:g}", f"{most:g}"
@@ -312,7 +305,7 @@ class BusSignal:
 
 @dataclass(frozen=True)
 class BusPoll:
-    """A request that makes a servo or a sensor tell its state, and moves nothing.
+    """A request for the state of a servo or a sensor, which moves nothing.
 
     Attributes:
         signals: Signal names with their raw numbers, before the DBC's scale; others are 0.
@@ -329,7 +322,7 @@ class Bus:
     Attributes:
         databases: DBC file names, relative to the robot TOML.
         bitrate: [bit/s].
-        polls: What has to be asked in each control tick; empty where the robot tells unasked.
+        polls: Requests of each control tick; empty where the robot sends unrequested.
     """
 
     databases: tuple[str, ...]
@@ -380,7 +373,7 @@ class Robot:
         return math.fsum(link.mass for link in self.links)
 
     def joint_indices(self, plane: Plane) -> IntArray:
-        """Indices of the joints of one plane, head to tail.
+        """Return indices of the joints of one plane, head to tail.
 
         Returns:
             Indices into ``joints``, shape (number of joints in that plane,).
@@ -389,7 +382,7 @@ class Robot:
         return frozen(np.array(chosen, dtype=np.int64))
 
     def limits(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper joint limits [rad], each of shape (m,)."""
+        """Return lower and upper joint limits [rad], each of shape (m,)."""
         lower = np.array([joint.lower for joint in self.joints], dtype=np.float64)
         upper = np.array([joint.upper for joint in self.joints], dtype=np.float64)
         return frozen(lower), frozen(upper)

@@ -1,6 +1,6 @@
 """Null model files: how identical modules would answer one gait, as a function of few parameters.
 
-Whoever has a model of the robot (the twin, or anything else) writes one; who analyses needs no
+A program with a model of the robot (the twin, or any other) writes it; the analysis needs no
 model then. With x = ln(theta / theta_0) of the parameters that all modules share, and y the vector
 of ln(response / command), log gain minus j lag, of the m driven joints::
 
@@ -84,7 +84,7 @@ class NullModel:
         return np.array([one.reach for one in self.parameters])
 
     def error_at(self, x: FloatArray) -> float:
-        """How far off the model is, in proportion to how far it is from where it was made.
+        """Return the error of the model, in proportion to the distance from its reference.
 
         What it leaves out is of third order only where the robot is smooth; friction is not.
 
@@ -97,7 +97,7 @@ class NullModel:
         return self.error * min(float(np.max(np.abs(x) / self.reach, initial=0.0)), 1.0)
 
     def at(self, x: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """The response of identical modules.
+        """Return the response of identical modules.
 
         Args:
             x: ln(theta / theta_0), shape (K,).
@@ -111,9 +111,6 @@ class NullModel:
 
 def write_null_model(path: Path, model: NullModel) -> None:
     """Write a null model.
-
-    Args:
-        path: The file, replaced if it is there.
 
     Raises:
         LogWriteError: If it can't be written.
@@ -151,8 +148,7 @@ def read_null_model(path: Path) -> NullModel:
     except (ValueError, RecursionError) as error:
         raise NullModelError(path, [Fault("syntax", str(error), "JSON in UTF-8")]) from error
     if not isinstance(values, dict) or cast("dict[str, Any]", values).get("format") != FORMAT:
-        found = "no such format"
-        raise NullModelError(path, [Fault("format", found, f'"{FORMAT}"')])
+        raise NullModelError(path, [Fault("format", "no such format", f'"{FORMAT}"')])
     faults = Faults()
     top = Table(cast("dict[str, Any]", values), "", faults)
     top.text("format")
@@ -220,7 +216,7 @@ def _pair(y: ComplexArray) -> dict[str, Any]:
 
 
 def _array(table: Table, key: str, shape: tuple[int, ...]) -> FloatArray:
-    """Nested arrays of finite numbers; NaN after a fault."""
+    """Read nested arrays of finite numbers; NaN after a fault."""
     value = table.look(key)[1]
     flat: list[float] = []
     if not _fits(value, shape, flat):
@@ -231,7 +227,7 @@ def _array(table: Table, key: str, shape: tuple[int, ...]) -> FloatArray:
 
 
 def _fits(value: object, shape: tuple[int, ...], flat: list[float]) -> bool:
-    """Whether a value is nested arrays of this shape; its numbers are appended."""
+    """Return whether a value is nested arrays of a shape; append its numbers."""
     if not shape:
         good = isinstance(value, int | float) and not isinstance(value, bool)
         flat.append(float(cast("float", value)) if good else math.nan)

@@ -13,8 +13,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
-from ..common.strict_table import read_toml
-from .model import MAY_BE_ZERO
+from ..common.config import declared
+from ..common.strict_table import above, read_toml
+from .model import Servo
 
 RUN_RECORD = "undulog.run"
 
@@ -63,7 +64,8 @@ class Run:
         """Check the numbers: readers divide by them."""
         servos = [item for servo in self.servo_of.values() for item in servo.items()]
         for name, value in [("physics_rate_hz", self.physics_rate_hz), *servos]:
-            if not (0 < value < math.inf or (value == 0 and name in MAY_BE_ZERO)):
+            bounds = (above(0.0),) if name == "physics_rate_hz" else declared(Servo)[name].bounds
+            if not (value < math.inf and all(bound.holds(value) for bound in bounds)):
                 raise ValueError(f"{name} is {value}")
 
     def record(self) -> dict[str, str]:
@@ -111,11 +113,7 @@ def run_from_record(facts: Mapping[str, str]) -> Run:
 
 
 def run_from_scenario(text: bytes, joint_names: Iterable[str]) -> Run | None:
-    """Read the attached scenario of a session without the record.
-
-    Returns:
-        The facts; None if they can't be read.
-    """
+    """Read the attached scenario of a session without the record; None if it is unreadable."""
     try:
         scenario = read_toml(text.decode())
         world, each = _table(scenario, "world"), _table(scenario, "servo_of")

@@ -11,6 +11,7 @@ from cantools.database.errors import DecodeError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from support.bus_robots import bus_robot
 from undulog.capture import load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.bus.map_entry import BitField
@@ -24,7 +25,6 @@ from undulog.capture.log.messages.frames import (
     empty_frames,
 )
 from undulog.capture.robot.bus_map import UNITS
-from undulog.capture.robot.description import parse_robot
 
 
 @pytest.fixture
@@ -134,33 +134,18 @@ SG_MUL_VAL_ 2147484672 three outer 0-0, 4-15;
 SIG_VALTYPE_ 5 four : 1;
 """
 
-ROBOT = """
-name = "muxed"
-clock = "host"
-joints = [{ name = "joint01", plane = "horizontal" }]
-
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-
-[bus]
-databases = ["mux.dbc"]
-bitrate = 500_000
-signals = [
-  { message = "mux", signal = "one", direction = "rx", target = "joint01", quantity = "position", unit = "rad" },
-  { message = "mux", signal = "two", direction = "rx", target = "joint01", quantity = "velocity", unit = "rad/s", scale = 2.0, offset = 1.0 },
-  { message = "mux", signal = "three", direction = "rx", target = "joint01", quantity = "current", unit = "A" },
-  { message = "mux", signal = "always", direction = "rx", target = "joint01", quantity = "voltage", unit = "V" },
-  { message = "plain", signal = "four", direction = "rx", target = "joint01", quantity = "effort", unit = "N m" },
+SIGNALS = [
+    ("mux", "one", "rx", "position", "rad", ""),
+    ("mux", "two", "rx", "velocity", "rad/s", "scale = 2.0\noffset = 1.0"),
+    ("mux", "three", "rx", "current", "A", ""),
+    ("mux", "always", "rx", "voltage", "V", ""),
+    ("plain", "four", "rx", "effort", "N m", ""),
 ]
-"""  # noqa: E501  TOML has inline tables on one line
 
 
 @pytest.fixture(scope="module")
 def muxed():
-    return parse_robot(ROBOT, "muxed.toml", {"mux.dbc": MULTIPLEXED})
+    return bus_robot(MULTIPLEXED, SIGNALS)
 
 
 def some_frames(count, id_flags, dlc=8, way=DIR_RX):
@@ -266,7 +251,7 @@ def test_no_frame_goes_unaccounted_for(muxed):
     assert shares == len(frames) == tally.frames
 
 
-def test_a_frame_too_short_for_its_multiplexer_counts_as_short(muxed):
+def test_a_frame_too_short_for_its_multiplexer_is_counted(muxed):
     samples, tally = BusDecoder(muxed).decode(some_frames(1, 1024 | EXTENDED_FLAG, dlc=0))
     assert samples == ()
     assert set(tally.short) == {"mux.one", "mux.two", "mux.three", "mux.always"}

@@ -11,6 +11,7 @@ from cantools.database.conversion import BaseConversion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from support.bus_robots import bus_robot
 from undulog.capture import load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.bus.encoding import BusEncoder
@@ -139,8 +140,8 @@ def test_what_is_out_of_range_or_unknown_has_numbers_of_its_own():
     robot = load_robot("snake25")
     (frame,) = BusEncoder(robot, Direction.RX).encode({("ir01", Quantity.RANGE, ""): math.inf})
     database = cantools.database.load_string(dict(robot.databases)["snake25.dbc"], "dbc")
-    told = database.decode_message("ranges_1", frame["data"].tobytes())
-    assert told == {
+    codes = database.decode_message("ranges_1", frame["data"].tobytes())
+    assert codes == {
         "ir01": "nothing in range",
         **dict.fromkeys(("ir02", "ir03", "ir04"), "unknown"),
     }
@@ -183,32 +184,9 @@ def test_initial_values_fill_what_the_map_does_not_name():
         'BA_DEF_ SG_ "GenSigStartValue" FLOAT 0 100000;\nBA_DEF_DEF_ "GenSigStartValue" 0;\n'
         'BA_ "GenSigStartValue" SG_ 5 mode 7;\nBA_ "GenSigStartValue" SG_ 5 limit 21;\n'
     )
-    robot = parse_robot(BUS_ROBOT, source="one.toml", databases={"one.dbc": text})
+    robot = bus_robot(text, [("m", "q", "tx", "command", "deg", "")])
     (frame,) = BusEncoder(robot, Direction.TX).encode({("joint01", Quantity.COMMAND, ""): 0.0})
     assert frame["data"].tolist()[:3] == [0, 7, 21]  # start values are raw
-
-
-BUS_ROBOT = """
-name = "one"
-description = "one joint"
-clock = "device"
-joints = [{ name = "joint01", plane = "horizontal" }]
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-[bus]
-databases = ["one.dbc"]
-bitrate = 1000000
-[[bus.signals]]
-message = "m"
-signal = "q"
-direction = "tx"
-target = "joint01"
-quantity = "command"
-unit = "deg"
-"""
 
 
 def test_a_robot_without_a_bus_is_refused():

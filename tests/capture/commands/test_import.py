@@ -23,47 +23,45 @@ def trace(tmp_path: Path):
     return path
 
 
-def test_there_and_back(trace, tmp_path: Path, capsys):
+@pytest.fixture
+def cli(trace, capsys):
+    """Runs a line with {log} and {dir}; returns exit code, output and errors."""
+
+    def run(line):
+        words = [word.format(log=trace, dir=trace.parent) for word in line.split()]
+        code = undulog.run(words)
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def test_there_and_back(cli, tmp_path: Path):
     run, back = tmp_path / "run.mcap", tmp_path / "back.log"
-    assert undulog.run(["import", str(trace), "-o", str(run), "--robot", "snake25"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == f"{run}: 0.0 s of snake25, 10 CAN frames, verdict good"
+    code, out, _ = cli("import {log} -o {dir}/run.mcap --robot snake25")
+    lines = out.splitlines()
+    assert (code, lines[0]) == (0, f"{run}: 0.0 s of snake25, 10 CAN frames, verdict good")
     assert "  /joint_commands        5 messages" in lines
-    assert undulog.run(["log", "export", str(run), "-o", str(back)]) == 0
-    assert capsys.readouterr().out == f"{back}: 10 frames of can0, in the format of candump -L\n"
+    code, out, _ = cli("log export {dir}/run.mcap -o {dir}/back.log")
+    assert (code, out) == (0, f"{back}: 10 frames of can0, in the format of candump -L\n")
     assert back.read_text() == LOG
-
-
-def test_reports_as_json(trace, tmp_path: Path, capsys):
-    run = tmp_path / "run.mcap"
-    arguments = ["import", str(trace), "-o", str(run), "--robot", "snake25", "--json"]
-    assert undulog.run(arguments) == 0
-    report = json.loads(capsys.readouterr().out)
+    _, out, _ = cli("import {log} -o {dir}/run.mcap --robot snake25 --force --json")
+    report = json.loads(out)
     assert (report["frames"], report["verdict"], report["robot"]) == (10, "good", "snake25")
     assert report["messages"]["/joint_commands"] == 5
-    back = str(tmp_path / "back.log")
-    assert undulog.run(["log", "export", str(run), "-o", back, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {
-        "source": str(run),
-        "output": back,
-        "frames": 10,
-        "buses": {"can0": 10},
-        "warnings": [],
-    }
+    _, out, _ = cli("log export {dir}/run.mcap -o {dir}/back.log --force --json")
+    paths = {"source": str(run), "output": str(back)}
+    assert json.loads(out) == {**paths, "frames": 10, "buses": {"can0": 10}, "warnings": []}
 
 
-def test_a_csv_by_options_and_by_file(tmp_path: Path, capsys):
-    source = tmp_path / "joint.csv"
-    source.write_text("time,angle\n0,170\n1,-170\n")
-    options = ["--map", "time=time:s", "--map", "angle=joint01.position:deg,wrap=360"]
-    common = ["import", str(source), "--robot", "snake13"]
-    assert undulog.run([*common, "-o", str(tmp_path / "a.mcap"), *options]) == 0
+def test_a_csv_by_options_and_by_file(cli, tmp_path: Path):
+    (tmp_path / "joint.csv").write_text("time,angle\n0,170\n1,-170\n")
+    common = "import {dir}/joint.csv --robot snake13"
+    options = "--map time=time:s --map angle=joint01.position:deg,wrap=360"
+    assert cli(f"{common} -o {{dir}}/a.mcap {options}")[0] == 0
     with Session.open(tmp_path / "a.mcap") as session:
         (tmp_path / "map.toml").write_bytes(session.attachments["columns.toml"])
-    columns = ["--columns", str(tmp_path / "map.toml")]
-    assert undulog.run([*common, "-o", str(tmp_path / "b.mcap"), *columns]) == 0
+    assert cli(common + " -o {dir}/b.mcap --columns {dir}/map.toml")[0] == 0
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-    capsys.readouterr()
 
 
 WRONG = [
@@ -79,48 +77,40 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("code", "line", "message"), WRONG)
-def test_what_is_wrong_is_said(code, line, message, trace, capsys):
-    folder = trace.parent
-    (folder / "a.csv").write_text("t,a\n0,1\n")
-    (folder / "bad.log").write_text("no log\n")
-    arguments = [word.format(log=trace, dir=folder) for word in line.split()]
-    assert undulog.run(["import", *arguments]) == code
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert message in said.err
-    assert not (folder / "x.mcap").exists()
+def test_what_is_wrong_is_reported(code, line, message, cli, tmp_path: Path):
+    (tmp_path / "a.csv").write_text("t,a\n0,1\n")
+    (tmp_path / "bad.log").write_text("no log\n")
+    found, out, err = cli(f"import {line}")
+    assert (found, out) == (code, "")
+    assert message in err
+    assert not (tmp_path / "x.mcap").exists()
 
 
-def test_what_is_there_is_kept_without_force(trace, tmp_path: Path, capsys):
-    run = tmp_path / "run.mcap"
-    arguments = ["import", str(trace), "-o", str(run), "--robot", "snake25"]
-    assert [undulog.run(arguments), undulog.run(arguments)] == [0, 2]
-    assert "run.mcap exists already; choose another name or give --force" in capsys.readouterr().err
-    assert undulog.run([*arguments, "--force"]) == 0
-    back = tmp_path / "back.log"
-    back.write_text("precious")
-    assert undulog.run(["log", "export", str(run), "-o", str(back)]) == 2
-    assert back.read_text() == "precious"
+def test_an_output_is_kept_without_force(cli):
+    line = "import {log} -o {dir}/run.mcap --robot snake25"
+    assert cli(line)[0] == 0
+    code, _, err = cli(line)
+    assert code == 2
+    assert "run.mcap exists already; choose another name or give --force" in err
+    assert cli(f"{line} --force")[0] == 0
 
 
-def test_what_export_cannot_do_is_said(trace, tmp_path: Path, capsys):
-    run = tmp_path / "run.mcap"
-    undulog.run(["import", str(trace), "-o", str(run), "--robot", "snake25"])
-    capsys.readouterr()
-    assert undulog.run(["log", "export", str(run), "-o", str(tmp_path / "x.trc")]) == 2
-    assert "no format has the suffix '.trc'; valid: .log, .blf" in capsys.readouterr().err
-    assert (
-        undulog.run(["log", "export", str(run), "-o", str(tmp_path / "x.log"), "--bus", "b"]) == 1
-    )
-    assert "has no bus b; it has can0" in capsys.readouterr().err
-    source = tmp_path / "a.csv"
-    source.write_text("t,a\n0,1\n")
-    options = ["--map", "t=time:s", "--map", "a=joint01.position:rad"]
-    arguments = ["import", str(source), "-o", str(tmp_path / "csv.mcap"), "--robot", "snake13"]
-    undulog.run([*arguments, *options])
-    capsys.readouterr()
-    assert undulog.run(["log", "export", str(tmp_path / "csv.mcap"), "-o", "x.log"]) == 1
-    assert "has no raw CAN frames; it has /joint_states" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("code", "line", "message"),
+    [
+        (2, "{dir}/run.mcap -o {dir}/x.trc", "no format has the suffix '.trc'; valid: .log, .blf"),
+        (1, "{dir}/run.mcap -o {dir}/x.log --bus b", "has no bus b; it has can0"),
+        (1, "{dir}/csv.mcap -o x.log", "has no raw CAN frames; it has /joint_states"),
+    ],
+)
+def test_what_export_cannot_do_is_reported(code, line, message, cli, tmp_path: Path):
+    (tmp_path / "a.csv").write_text("t,a\n0,1\n")
+    columns = "--map t=time:s --map a=joint01.position:rad"
+    cli("import {log} -o {dir}/run.mcap --robot snake25")
+    cli("import {dir}/a.csv -o {dir}/csv.mcap --robot snake13 " + columns)
+    found, _, err = cli(f"log export {line}")
+    assert found == code
+    assert message in err
 
 
 def test_help_shows_an_example(capsys):

@@ -67,7 +67,7 @@ def make(path, channels=CHANNELS, count=20, library="foreign 1.0", **options):
     return path
 
 
-def told(path, capsys):
+def described(path, capsys):
     """The object, and the text."""
     assert undulog.run(["log", "info", str(path), "--json"]) == 0
     captured = capsys.readouterr()
@@ -101,7 +101,7 @@ MAKES = {
 
 @pytest.mark.parametrize("options", MAKES.values(), ids=MAKES)
 def test_files_of_other_makes(options, tmp_path: Path, capsys):
-    facts, text = told(make(tmp_path / "x.mcap", **options), capsys)
+    facts, text = described(make(tmp_path / "x.mcap", **options), capsys)
     topics = {topic["topic"]: topic for topic in facts["topics"]}
     # A channel without messages stands in no chunk's index; only a summary or a look inside has it.
     assert topics.keys() == CHANNELS.keys()
@@ -129,7 +129,7 @@ def test_files_of_other_makes(options, tmp_path: Path, capsys):
 
 
 def test_a_file_without_messages_has_no_start(tmp_path: Path, capsys):
-    facts, text = told(make(tmp_path / "x.mcap", count=0), capsys)
+    facts, text = described(make(tmp_path / "x.mcap", count=0), capsys)
     assert (facts["session"]["start_ns"], facts["session"]["start_utc"]) == (None, None)
     assert text.startswith("x: no robot, no messages, ")
     assert "1970" not in text
@@ -137,7 +137,7 @@ def test_a_file_without_messages_has_no_start(tmp_path: Path, capsys):
 
 def test_a_file_of_one_message_and_an_unnamed_writer(tmp_path: Path, capsys):
     channels = {"/schemaless": CHANNELS["/schemaless"]}
-    facts, text = told(make(tmp_path / "x.mcap", channels, count=1, library=""), capsys)
+    facts, text = described(make(tmp_path / "x.mcap", channels, count=1, library=""), capsys)
     assert facts["topics"][0]["rate_hz"] is None
     assert "1 topic is not of ROS 2" in text
     assert "written by an unnamed program" in text
@@ -149,13 +149,13 @@ def test_a_cut_file_says_so(options, tmp_path: Path, capsys):
     whole = path.read_bytes()
     for cut in (len(whole) - 20, len(whole) * 3 // 4, len(whole) // 2):
         path.write_bytes(whole[:cut])
-        facts, text = told(path, capsys)
+        facts, text = described(path, capsys)
         assert any("cut short" in warning for warning in facts["warnings"])
         assert "warning: the file is cut short" in text
 
 
 def test_two_channels_of_one_topic(tmp_path: Path, capsys):
-    """Several publishers, and two types: the first is counted, the other told."""
+    """Several publishers, and two types: the first is counted, the other reported."""
     path = tmp_path / "x.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -168,6 +168,6 @@ def test_two_channels_of_one_topic(tmp_path: Path, capsys):
         for i, channel in itertools.product(range(5), ids):
             writer.add_message(channel, T0 + i, b"{}", T0 + i)
         writer.finish()
-    facts, _ = told(path, capsys)
+    facts, _ = described(path, capsys)
     assert [(t["type"], t["messages"]) for t in facts["topics"]] == [("a", 10)]
     assert facts["warnings"] == ["/x has several types, a, b: a is read"]

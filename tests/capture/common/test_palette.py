@@ -8,26 +8,23 @@ import pytest
 from undulog.capture.common.palette import joint_colors, joint_hex
 
 
-def lightness(colors: np.ndarray) -> np.ndarray:
-    """CIE L* of sRGB colours (CIE 15:2004, IEC 61966-2-1)."""
+def luminance(colors: np.ndarray) -> np.ndarray:
+    """Relative luminance of sRGB colours (IEC 61966-2-1)."""
     rgb = colors[:, :3] / 255.0
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    y = linear @ [0.2126, 0.7152, 0.0722]
-    return 116 * np.cbrt(y) - 16
+    return linear @ [0.2126, 0.7152, 0.0722]
 
 
 def contrast(colors: np.ndarray, background: float) -> np.ndarray:
     """WCAG 2.2 contrast ratio against a grey background of linear luminance 0 or 1."""
-    rgb = colors[:, :3] / 255.0
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    y = linear @ [0.2126, 0.7152, 0.0722]
+    y = luminance(colors)
     high, low = np.maximum(y, background), np.minimum(y, background)
     return (high + 0.05) / (low + 0.05)
 
 
 @pytest.mark.parametrize("count", [12, 25, 60])
 def test_lightness_rises_from_head_to_tail(count: int) -> None:
-    assert (np.diff(lightness(joint_colors(count))) > 0).all()
+    assert (np.diff(luminance(joint_colors(count))) > 0).all()
 
 
 def test_colours_read_on_black_and_on_white() -> None:

@@ -29,15 +29,17 @@ print(tick, flush=True)
 """
 
 
+def started(code, *arguments):
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_ends_between_samples_and_leaves_a_whole_file(
     tmp_path: Path, number: signal.Signals
 ) -> None:
     path = tmp_path / "s.mcap"
-    process = subprocess.Popen(
-        [sys.executable, "-c", RECORDER, str(path)], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
+    process = started(RECORDER, path)
     assert process.stdout.readline() == "recording\n"
     process.send_signal(number)
     ticks = int(process.communicate(timeout=30)[0])
@@ -56,8 +58,7 @@ def test_the_second_signal_acts_as_usual() -> None:
         "    print('asked', flush=True)\n"
         "    time.sleep(60)\n"
     )
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
+    process = started(code)
     assert process.stdout.readline() == "in\n"
     process.send_signal(signal.SIGTERM)
     assert process.stdout.readline() == "asked\n"

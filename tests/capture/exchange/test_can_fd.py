@@ -1,6 +1,5 @@
 """CAN FD frames: kept exactly, on a topic of their own, from and to other tools."""
 
-import json
 import threading
 import time
 from pathlib import Path
@@ -16,7 +15,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 import undulog
-from support.written_frames import T0, imported, write_frames
+from support.bus_robots import bus_robot
+from support.written_frames import T0, every_kind, imported, write_frames
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError
 from undulog.capture.common.process import StopRequest
@@ -37,33 +37,12 @@ from undulog.capture.log.messages.frames import (
 )
 from undulog.capture.recorder.loop import Ending, Recorder
 from undulog.capture.recorder.status import SessionClock
-from undulog.capture.robot.description import parse_robot
 from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.contract import SourceContext
 
 S = 1_000_000_000
 FD = "/can_fd/can0"
 FIELDS = ("t_host_ns", "id_flags", "len", "dir", "fd_flags", "data")
-
-
-def every_kind(start_ns=T0, step_ns=1_000_000):
-    """Each identifier, way, length and flag that CAN FD has, one frame a step."""
-    rng = np.random.default_rng(7)
-    kinds = [
-        (identifier, way, length, flags)
-        for identifier in (0, 0x14B, 0x7FF, EXTENDED_FLAG, EXTENDED_FLAG | 0x1FFF_FFFF)
-        for way in (DIR_RX, DIR_TX)
-        for length in CAN_FD_DLC
-        for flags in (0, FD_BRS, FD_ESI, FD_BRS | FD_ESI)
-    ]
-    frames = empty_fd_frames(len(kinds))
-    for frame, (identifier, way, length, flags) in zip(frames, kinds, strict=True):
-        frame["id_flags"], frame["dir"], frame["len"] = identifier, way, length
-        frame["fd_flags"] = flags
-        frame["data"][:length] = list(rng.bytes(length))
-    frames = frames[rng.permutation(len(frames))]
-    frames["t_host_ns"] = start_ns + step_ns * np.arange(len(frames))
-    return frames
 
 
 def classic_frames(count, start_ns, step_ns):
@@ -101,7 +80,7 @@ def test_what_is_written_is_read_the_same(data, tmp_path_factory):
 
 
 def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path: Path):
-    frames = every_kind()[:5]
+    frames = every_kind(fd=True)[:5]
     path = write_frames(tmp_path / "x.mcap", {"/can_fd/can0": frames})
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -127,7 +106,7 @@ def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path: Path):
 
 def test_the_kinds_are_not_mixed_up(tmp_path: Path):
     # 4 CAN FD frames have as many bytes as 11 classic ones: the label tells them apart.
-    topics = {"/can_fd/can0": every_kind()[:4], "/can/can0_fd": classic_frames(11, T0, 1000)}
+    topics = {"/can_fd/can0": every_kind(fd=True)[:4], "/can/can0_fd": classic_frames(11, T0, 1000)}
     path = write_frames(tmp_path / "x.mcap", topics)
     with Session.open(path) as session:
         with pytest.raises(DataError, match="/can_fd/can0 does not hold frames of 32 bytes"):
@@ -146,7 +125,7 @@ def test_the_check_counts_them(tmp_path: Path, capsys):
     # The classic frames pause for 3 s in which CAN FD frames come: the bus isn't silent.
     classic = classic_frames(200, T0, 10_000_000)
     classic["t_host_ns"][100:] += 3 * S
-    fd = every_kind(step_ns=10_000_000)
+    fd = every_kind(fd=True, step_ns=10_000_000)
     path = write_frames(tmp_path / "x.mcap", {"/can/can0": classic, "/can_fd/can0": fd})
     health = check_session(path)
     assert {bus.topic: bus.frames for bus in health.buses} == {
@@ -172,7 +151,7 @@ def test_the_check_counts_them(tmp_path: Path, capsys):
 
 @pytest.fixture(scope="module")
 def session_of_every_kind(tmp_path_factory):
-    frames = every_kind()
+    frames = every_kind(fd=True)
     folder = tmp_path_factory.mktemp("kinds")
     return write_frames(folder / "run.mcap", {"/can_fd/can0": frames}), frames
 
@@ -187,34 +166,6 @@ def test_frames_of_every_kind_come_back(suffix, session_of_every_kind, tmp_path:
     if suffix == ".asc":  # without the date
         expected["t_host_ns"] -= np.uint64(T0 // S * S - RELATIVE_EPOCH_NS)
     same(back, expected)
-
-
-READERS = {
-    ".log": can.CanutilsLogReader,
-    ".blf": can.BLFReader,
-    ".asc": lambda path: can.ASCReader(path, relative_timestamp=False),
-}
-
-
-@pytest.mark.parametrize("suffix", READERS)
-def test_python_can_reads_them(suffix, session_of_every_kind, tmp_path: Path):
-    source, frames = session_of_every_kind
-    export_log(source, tmp_path / f"x{suffix}")
-    reader = READERS[suffix](tmp_path / f"x{suffix}")
-    messages = list(reader)
-    reader.stop()
-    assert len(messages) == len(frames)
-    for message, frame in zip(messages, frames, strict=True):
-        id_flags = int(frame["id_flags"])
-        assert message.is_fd
-        assert not message.is_error_frame
-        assert message.arbitration_id == id_flags & 0x1FFF_FFFF
-        assert message.is_extended_id == bool(id_flags & EXTENDED_FLAG)
-        assert message.is_rx == (frame["dir"] == DIR_RX)
-        assert message.bitrate_switch == bool(frame["fd_flags"] & FD_BRS)
-        assert message.error_state_indicator == bool(frame["fd_flags"] & FD_ESI)
-        assert bytes(message.data) == bytes(frame["data"][: frame["len"]])
-        assert round(message.timestamp * 1e6) == frame["t_host_ns"] // 1000
 
 
 def some_messages(channel=0):
@@ -346,7 +297,7 @@ def test_a_candump_log_of_both_kinds_comes_back_bit_for_bit(tmp_path: Path):
 
 
 def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path: Path):
-    frames = every_kind()
+    frames = every_kind(fd=True)
     topics = {"/can_fd/can0": frames, "/can/can0": classic_frames(50, T0, 1000)}
     source = write_frames(tmp_path / "run.mcap", topics)
     report = export_log(source, tmp_path / "x.mcap")
@@ -358,7 +309,7 @@ def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path: Path):
 
 
 def test_what_a_format_loses_is_counted(tmp_path: Path):
-    frames = every_kind(start_ns=T0 + 7)[:10]
+    frames = every_kind(fd=True, start_ns=T0 + 7)[:10]
     frames["id_flags"][:3] |= REMOTE_FLAG  # there is no such thing in CAN FD
     frames["t_device_ns"] = frames["t_host_ns"] + 5
     source = write_frames(tmp_path / "run.mcap", {"/can_fd/can0": frames})
@@ -367,18 +318,6 @@ def test_what_a_format_loses_is_counted(tmp_path: Path):
         "10 CAN FD frames lose their time below 1 us",
         "10 frames lose their device time",
     ]
-
-
-def test_through_the_command_line(tmp_path: Path, capsys):
-    (tmp_path / "x.log").write_text(
-        "(1.000000) can0 123##1" + "AB" * 64 + " R\n(1.000001) can0 124#01 T\n"
-    )
-    run = tmp_path / "run.mcap"
-    arguments = ["import", str(tmp_path / "x.log"), "-o", str(run), "--robot", "snake13"]
-    assert undulog.run([*arguments, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["frames"] == 2
-    undulog.run(["log", "export", str(run), "-o", str(tmp_path / "y.log")])
-    assert (tmp_path / "y.log").read_text() == (tmp_path / "x.log").read_text()
 
 
 # -- decoding ------------------------------------------------------------------------------
@@ -395,26 +334,11 @@ BO_ 257 small: 2 a
  SG_ target : 0|16@1- (0.01,0) [0|0] "deg" b
 """
 
-ROBOT = """
-name = "big"
-clock = "host"
-joints = [{ name = "joint01", plane = "horizontal" }]
-
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-
-[bus]
-databases = ["big.dbc"]
-bitrate = 500_000
-signals = [
-  { message = "big", signal = "angle", direction = "rx", target = "joint01", quantity = "position", unit = "deg" },
-  { message = "big", signal = "torque", direction = "rx", target = "joint01", quantity = "effort", unit = "N m" },
-  { message = "small", signal = "target", direction = "tx", target = "joint01", quantity = "command", unit = "deg" },
+SIGNALS = [
+    ("big", "angle", "rx", "position", "deg", ""),
+    ("big", "torque", "rx", "effort", "N m", ""),
+    ("small", "target", "tx", "command", "deg", ""),
 ]
-"""  # noqa: E501  TOML has inline tables on one line
 
 
 def test_import_decodes_both_kinds(tmp_path: Path):
@@ -429,7 +353,7 @@ def test_import_decodes_both_kinds(tmp_path: Path):
         angles.append(angle)
         targets.append(target)
     (tmp_path / "x.log").write_text("".join(lines))
-    robot = parse_robot(ROBOT, "big.toml", {"big.dbc": BIG})
+    robot = bus_robot(BIG, SIGNALS)
     report = import_can(tmp_path / "x.log", tmp_path / "run.mcap", robot)
     assert report.problems == []
     with Session.open(tmp_path / "run.mcap") as session:
@@ -442,11 +366,11 @@ def test_import_decodes_both_kinds(tmp_path: Path):
     assert (state.t_ns - command.t_ns).tolist() == [500_000] * 200
 
 
-def test_a_frame_too_short_for_its_signal_is_told(tmp_path: Path):
+def test_a_frame_too_short_for_its_signal_is_reported(tmp_path: Path):
     (tmp_path / "x.log").write_text(
         "(1.000000) can0 100##1" + "00" * 48 + " R\n(1.000100) can0 100#" + "00" * 8 + " R\n"
     )
-    robot = parse_robot(ROBOT, "big.toml", {"big.dbc": BIG})
+    robot = bus_robot(BIG, SIGNALS)
     report = import_can(tmp_path / "x.log", tmp_path / "run.mcap", robot)
     assert report.problems == [
         "3 values missing from frames too short for them: big.angle (2), big.torque (1)"
@@ -458,7 +382,7 @@ def test_a_frame_too_short_for_its_signal_is_told(tmp_path: Path):
 
 def test_a_recording_keeps_and_decodes_both_kinds(tmp_path: Path):
     database = cantools.database.load_string(BIG, "dbc")
-    robot = parse_robot(ROBOT, "big.toml", {"big.dbc": BIG})
+    robot = bus_robot(BIG, SIGNALS)
     output, clock, count = tmp_path / "run.mcap", SessionClock(), 300
     bus = can.Bus(interface="virtual", channel="fd", ignore_config=True, preserve_timestamps=True)
     messages = []
@@ -505,7 +429,7 @@ def test_a_recording_keeps_and_decodes_both_kinds(tmp_path: Path):
             ],
         )
         sender = threading.Thread(target=send)
-        recorder.on_event(lambda *said: "connected" in said[3] and sender.start())
+        recorder.on_event(lambda *event: "connected" in event[3] and sender.start())
         recorder.run(StopRequest(), 60.0)
         sender.join()
     bus.shutdown()

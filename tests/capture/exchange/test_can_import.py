@@ -22,7 +22,6 @@ from undulog.capture.log.messages.frames import (
     DIR_TX,
     ERROR_FLAG,
     EXTENDED_FLAG,
-    REMOTE_FLAG,
 )
 
 RECORDING = ARCSNAKE / "linear_trajectory.candump.log"
@@ -112,66 +111,6 @@ def test_the_same_log_gives_the_same_bytes(arcsnake, tmp_path: Path):
 # -- foreign formats -----------------------------------------------------------------------
 
 
-def some_messages():
-    """Frames of every kind that a log can hold, one a millisecond."""
-    rng = np.random.default_rng(5)
-    messages = []
-    for i in range(300):
-        kind = i % 5
-        messages.append(
-            can.Message(
-                timestamp=T0 + i * 1e-3,
-                arbitration_id=0x18FEF100 + i if kind == 1 else 0x14B,
-                is_extended_id=kind == 1,
-                is_remote_frame=kind == 3,
-                dlc=4 if kind == 3 else None,
-                data=None if kind == 3 else rng.bytes(i % 9),
-                is_rx=i % 2 == 0,
-                channel=0,
-            )
-        )
-    return messages
-
-
-def expected(message):
-    flags = EXTENDED_FLAG if message.is_extended_id else 0
-    flags |= REMOTE_FLAG if message.is_remote_frame else 0
-    return message.arbitration_id | flags, message.dlc, bytes(message.data).ljust(8, b"\0")
-
-
-@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".trc", ".csv", ".db", ".asc.gz"])
-def test_frames_of_foreign_formats(suffix, tmp_path: Path):
-    messages = some_messages()
-    if suffix == ".trc":  # its writer has no remote frames
-        messages = [message for message in messages if not message.is_remote_frame]
-    source, output = tmp_path / f"log{suffix}", tmp_path / "run.mcap"
-    with can.Logger(str(source)) as writer:
-        for message in messages:
-            writer(message)
-    if suffix == ".log":  # its writer drops the length of remote frames
-        for message in messages:
-            message.dlc = 0 if message.is_remote_frame else message.dlc
-    report = import_can(source, output, load_robot("arcsnake-joint"))
-    assert report.frames == len(messages)
-    with Session.open(output) as session:
-        (topic,) = (topic for topic in session.channels if topic.startswith("/can/"))
-        frames = session.frames(topic)
-        facts = session.metadata["undulog"]
-    found = [(int(f["id_flags"]), int(f["dlc"]), bytes(f["data"])) for f in frames]
-    assert found == [expected(message) for message in messages]
-    has_directions = suffix not in {".csv", ".db"}
-    assert facts["import.directions"] == ("recorded" if has_directions else "none")
-    if has_directions:
-        assert frames["dir"].tolist() == [DIR_RX if m.is_rx else DIR_TX for m in messages]
-    start_ns = RELATIVE_EPOCH_NS if ".asc" in suffix else T0_NS
-    offsets = frames["t_host_ns"].astype(np.int64) - start_ns
-    steps = [round((message.timestamp - T0) * 1e3) * 1_000_000 for message in messages]
-    if suffix == ".trc":  # its start time is a number of days with ten decimals, good to 9 us
-        offsets -= offsets[0]
-        assert abs(int(frames["t_host_ns"][0]) - start_ns) < 1_000_000
-    assert offsets.tolist() == steps
-
-
 def test_error_and_fd_frames_of_a_blf(tmp_path: Path):
     source, output = tmp_path / "log.blf", tmp_path / "run.mcap"
     with can.BLFWriter(source) as writer:
@@ -189,11 +128,11 @@ def test_error_and_fd_frames_of_a_blf(tmp_path: Path):
         assert session.verdict == "degraded"
 
 
-def test_a_cut_blf_is_told(tmp_path: Path):
+def test_a_cut_blf_is_reported(tmp_path: Path):
     whole, cut = tmp_path / "whole.blf", tmp_path / "cut.blf"
     with can.BLFWriter(whole, max_container_size=1000) as writer:
-        for message in some_messages():
-            writer(message)
+        for i in range(300):
+            writer(can.Message(timestamp=T0 + i * 1e-3, data=np.random.default_rng(i).bytes(8)))
     data = whole.read_bytes()
     cut.write_bytes(data[: len(data) // 2])
     try:
@@ -233,11 +172,22 @@ ROUNDS = 40
 
 @pytest.fixture(scope="module")
 def polled(tmp_path_factory):
-    """25 servos told and asked in turn every 10 ms, by foreign encoder and writer (ASC)."""
+    """25 servos commanded and polled in turn every 10 ms, by foreign encoder and writer (ASC)."""
     folder = tmp_path_factory.mktemp("polled")
     robot = load_robot("snake25")
     database = cantools.database.load_string(robot.databases[0][1], "dbc")
     truth = {"command": [], "state": []}
+
+    def sent(name, values, t, *, is_rx=True):
+        message = database.get_message_by_name(name)
+        return can.Message(
+            timestamp=1.0 + t,
+            arbitration_id=message.frame_id,
+            is_extended_id=False,
+            data=message.encode(values),
+            is_rx=is_rx,
+        )
+
     with can.ASCWriter(folder / "poll.asc") as writer:
         for k in range(ROUNDS):
             t = k * 0.01
@@ -252,16 +202,7 @@ def polled(tmp_path_factory):
                         values |= {"velocity": 2 * angle, "torque": 3 * j, "current": -4 * j}
                         values |= {"temperature": 20 + j}
                     truth[kind].append((j, round(t * 1e6) * 1000, math.radians(angle)))
-                    message = database.get_message_by_name(f"{name}_{kind}")
-                    writer(
-                        can.Message(
-                            timestamp=1.0 + t,
-                            arbitration_id=message.frame_id,
-                            is_extended_id=False,
-                            data=message.encode(values),
-                            is_rx=is_rx,
-                        )
-                    )
+                    writer(sent(f"{name}_{kind}", values, t, is_rx=is_rx))
             t += FRAME_S
             for name, values in (
                 ("ranges_1", {f"ir{i:02d}": 100 * i + k for i in range(1, 5)}),
@@ -269,26 +210,22 @@ def polled(tmp_path_factory):
                 ("acceleration", {"x": 0, "y": -500, "z": 1000}),
                 ("magnetic_field", {"x": 20.5, "y": -30.25}),
             ):
-                message = database.get_message_by_name(name)
-                data = message.encode(values)
-                writer(
-                    can.Message(
-                        timestamp=1.0 + t,
-                        arbitration_id=message.frame_id,
-                        is_extended_id=False,
-                        data=data,
-                    )
-                )
+                writer(sent(name, values, t))
     report = import_can(folder / "poll.asc", folder / "run.mcap", robot)
     return folder / "run.mcap", report, truth
 
 
-def per_joint(samples):
-    return [[(t, a) for j, t, a in samples if j == joint] for joint in range(25)]
-
-
 # The writer counts from its first message, which is one frame after the first round's start.
 LOG_START_NS = RELATIVE_EPOCH_NS - round(FRAME_S * 1e6) * 1000
+
+
+def assert_samples(signals, truth):
+    for j, (all_ns, all_values) in enumerate(zip(signals.t_ns, signals.values, strict=True)):
+        kept = ~np.isnan(all_values)
+        t_ns, angles = zip(*((t, angle) for joint, t, angle in truth if joint == j), strict=True)
+        assert (all_ns[kept] - LOG_START_NS).tolist() == list(t_ns)
+        half = math.radians(0.005) * 1.001  # of the bus's 0.01 degree
+        np.testing.assert_allclose(all_values[kept], angles, rtol=0, atol=half)
 
 
 def test_polled_states_keep_their_own_times(polled):
@@ -296,16 +233,7 @@ def test_polled_states_keep_their_own_times(polled):
     assert report.verdict == "good"
     with Session.open(path) as session:
         signals = session.joints("/joint_states")
-        for j, expected_samples in enumerate(per_joint(truth["state"])):
-            kept = ~np.isnan(signals.values[j])
-            t_ns = signals.t_ns[j][kept] - LOG_START_NS
-            assert t_ns.tolist() == [t for t, _ in expected_samples]
-            np.testing.assert_allclose(
-                signals.values[j][kept],
-                [angle for _, angle in expected_samples],
-                rtol=0,
-                atol=math.radians(0.005) * 1.001,  # half of the bus's 0.01 degree
-            )
+        assert_samples(signals, truth["state"])
         assert np.isnan(signals.values[3]).sum() == 1
         velocity = session.joints("/joint_states", "velocity")
         kept = ~np.isnan(velocity.values[5])
@@ -320,12 +248,8 @@ def test_polled_states_keep_their_own_times(polled):
 def test_polled_commands_are_logged_with_their_own_offsets(polled):
     path, _, truth = polled
     with Session.open(path) as session:
-        commands = session.joints("/joint_commands")
         assert session.channels["/joint_command_offset"].metadata["unit"] == "s"
-    for j, expected_samples in enumerate(per_joint(truth["command"])):
-        kept = ~np.isnan(commands.values[j])
-        t_ns = commands.t_ns[j][kept] - LOG_START_NS
-        assert t_ns.tolist() == [t for t, _ in expected_samples]
+        assert_samples(session.joints("/joint_commands"), truth["command"])
 
 
 def test_sensors_on_the_bus(polled):
@@ -343,9 +267,8 @@ def test_sensors_on_the_bus(polled):
         assert compass["magnetic_field.z"].isna().all()
 
 
-def test_samples_of_one_stamp_and_other_frames_keep_their_times(tmp_path: Path):
+def test_samples_of_one_stamp_and_other_frames_keep_their_times(import_text):
     # A USB adapter may stamp several frames alike: two rounds then begin at one time.
-    robot = load_robot("snake25")
     lines = []
     for k in range(3):
         t = 100.0 + k * 0.01
@@ -353,9 +276,7 @@ def test_samples_of_one_stamp_and_other_frames_keep_their_times(tmp_path: Path):
             data = "0100000000000000" if name[0] == "2" else "0100"
             way = "R" if name[0] == "2" else "T"
             lines.append(f"({t + at * 1e-6:.6f}) can0 {name}#{data} {way}\n")
-    (tmp_path / "x.log").write_text("".join(lines))
-    import_can(tmp_path / "x.log", tmp_path / "run.mcap", robot)
-    with Session.open(tmp_path / "run.mcap") as session:
+    with Session.open(import_text("".join(lines)).output) as session:
         states = session.joints("/joint_states")
     assert (states.t_ns[1] - states.t_ns[0]).tolist() == [500_000] * 3
 
@@ -363,111 +284,109 @@ def test_samples_of_one_stamp_and_other_frames_keep_their_times(tmp_path: Path):
 # -- the rest ------------------------------------------------------------------------------
 
 
-def two_buses(path):
-    path.write_text(
-        "".join(
-            f"(100.{i:06d}) can{i % 2} {0x101 if i % 2 else 0x7FF:03X}#0000 T\n" for i in range(10)
-        )
-    )
+TWO_BUSES = "".join(
+    f"(100.{i:06d}) can{i % 2} {0x101 if i % 2 else 0x7FF:03X}#0000 T\n" for i in range(10)
+)
 
 
-def test_the_bus_to_decode_can_be_chosen(tmp_path: Path):
-    source, robot = tmp_path / "x.log", load_robot("snake25")
-    two_buses(source)
-    first = import_can(source, tmp_path / "a.mcap", robot)
+@pytest.fixture
+def import_text(tmp_path):
+    """Imports a candump log with a shipped robot; the report names the session."""
+
+    def run(text, robot="snake25", output="a.mcap", **options):
+        (tmp_path / "x.log").write_text(text)
+        return import_can(tmp_path / "x.log", tmp_path / output, load_robot(robot), **options)
+
+    return run
+
+
+def exported(report, **options):
+    back = report.output.with_suffix(".log")
+    export_log(report.output, back, **options)
+    return back.read_text()
+
+
+def test_the_bus_to_decode_can_be_chosen(import_text, tmp_path: Path):
+    first = import_text(TWO_BUSES)
     assert "/joint_commands" not in first.samples
     assert first.notes[-1] == "5 frames of bus can1 kept raw, not decoded"
-    other = import_can(source, tmp_path / "b.mcap", robot, bus="can1")
+    other = import_text(TWO_BUSES, output="b.mcap", bus="can1")
     assert other.samples["/joint_commands"] == 5
-    export_log(tmp_path / "b.mcap", tmp_path / "back.log")
-    assert (tmp_path / "back.log").read_text() == source.read_text()
-    export_log(tmp_path / "b.mcap", tmp_path / "can1.log", bus="can1")
-    assert (tmp_path / "can1.log").read_text().count("\n") == 5
+    assert exported(other) == TWO_BUSES
+    assert exported(other, bus="can1", force=True).count("\n") == 5
     with pytest.raises(ImportFormatError, match="has no frames of bus can9; it has can0, can1"):
-        import_can(source, tmp_path / "c.mcap", robot, bus="can9")
+        import_text(TWO_BUSES, output="c.mcap", bus="can9")
     assert not (tmp_path / "c.mcap").exists()
 
 
-def test_a_log_without_directions_comes_back_without(tmp_path: Path):
-    source = tmp_path / "x.log"
-    source.write_text("(100.000000) can0 101#E803\n(100.010000) can0 101#E803\n")
-    report = import_can(source, tmp_path / "a.mcap", load_robot("snake25"))
+def test_a_log_without_directions_comes_back_without(import_text):
+    text = "(100.000000) can0 101#E803\n(100.010000) can0 101#E803\n"
+    report = import_text(text)
     assert report.samples["/joint_commands"] == 2
     assert report.notes == ["the log has no directions: all frames count as received"]
-    export_log(tmp_path / "a.mcap", tmp_path / "back.log")
-    assert (tmp_path / "back.log").read_text() == source.read_text()
+    assert exported(report) == text
 
 
-def test_times_that_go_back_are_told_and_the_order_is_kept(tmp_path: Path):
-    source = tmp_path / "x.log"
-    source.write_text(
-        "".join(f"({t:.6f}) can0 7FF#{i:02X} R\n" for i, t in enumerate([100, 100.2, 100.1, 100.3]))
-    )
-    report = import_can(source, tmp_path / "a.mcap", load_robot("snake25"))
+def test_times_that_go_back_are_reported_and_the_order_is_kept(import_text):
+    times = [100, 100.2, 100.1, 100.3]
+    text = "".join(f"({t:.6f}) can0 7FF#{i:02X} R\n" for i, t in enumerate(times))
+    report = import_text(text)
     assert report.problems[0] == "1 frames are stamped before the one ahead"
-    export_log(tmp_path / "a.mcap", tmp_path / "back.log")
-    assert (tmp_path / "back.log").read_text() == source.read_text()
+    assert exported(report) == text
 
 
-def test_frames_of_another_robot_are_no_good_session(tmp_path: Path):
+def trace(identifiers, data="0102"):
+    lines = (f"({100 + i * 1e-3:.3f}) can0 {k:03X}#{data} R\n" for i, k in enumerate(identifiers))
+    return "".join(lines)
+
+
+def test_frames_of_another_robot_are_no_good_session(import_text):
     """8,400 frames of identifiers that snake25 doesn't have."""
-    source, output = tmp_path / "x.log", tmp_path / "a.mcap"
-    identifiers = [0x6A0 + i % 12 for i in range(8400)]
-    lines = (f"({100 + i * 1e-3:.3f}) can0 {k:03X}#0102 R\n" for i, k in enumerate(identifiers))
-    source.write_text("".join(lines))
-    report = import_can(source, output, load_robot("snake25"))
+    report = import_text(trace(0x6A0 + i % 12 for i in range(8400)))
     assert report.verdict == "degraded"
     (problem,) = report.problems
     assert problem.startswith("none of 8400 CAN frames can be decoded: the bus map of snake25 does")
     assert "not name 6A0 (700), 6A1 (700)" in problem
     assert "and 4 more" in problem
     assert "with the robot that sent them (--robot" in problem
-    health = check_session(output)
+    health = check_session(report.output)
     assert (health.verdict, health.reasons, health.stored) == ("degraded", (problem,), "degraded")
 
 
 @pytest.mark.parametrize(("joints", "verdict"), [(25, "good"), (24, "degraded")])
-def test_most_frames_may_be_of_other_devices_once_every_joint_is_there(joints, verdict, tmp_path):
-    source, output = tmp_path / "x.log", tmp_path / "a.mcap"
-    identifiers = [*range(0x201, 0x201 + joints), *[0x6A0] * 300]
-    lines = (
-        f"({100 + i * 1e-3:.3f}) can0 {k:03X}#{'01' * 8} R\n" for i, k in enumerate(identifiers)
-    )
-    source.write_text("".join(lines))
-    report = import_can(source, output, load_robot("snake25"))
+def test_most_frames_may_be_of_other_devices_once_every_joint_is_there(
+    joints, verdict, import_text
+):
+    report = import_text(trace([*range(0x201, 0x201 + joints), *[0x6A0] * 300], "01" * 8))
     assert report.verdict == verdict
     found = any(text.startswith("only 24 of 324 CAN frames") for text in report.problems)
     assert found == (verdict == "degraded")
-    assert any(text.startswith("only") for text in check_session(output).reasons) == found
+    assert any(text.startswith("only") for text in check_session(report.output).reasons) == found
 
 
-def test_a_robot_without_a_bus_keeps_the_frames(tmp_path: Path):
-    two_buses(tmp_path / "x.log")
-    report = import_can(tmp_path / "x.log", tmp_path / "a.mcap", load_robot("snake13"))
+def test_a_robot_without_a_bus_keeps_the_frames(import_text):
+    report = import_text(TWO_BUSES, "snake13")
     assert report.problems == ["nothing decoded: the robot snake13 has no bus map"]
     assert set(report.samples) == {"/can/can0", "/can/can1"}
 
 
-def test_nothing_is_overwritten(tmp_path: Path):
-    two_buses(tmp_path / "x.log")
+def test_nothing_is_overwritten(import_text, tmp_path: Path):
     output = tmp_path / "a.mcap"
     output.write_text("precious")
     with pytest.raises(OutputExistsError):
-        import_can(tmp_path / "x.log", output, load_robot("snake25"))
-    (tmp_path / "bad.log").write_text("(100.000000) can0 7FF#00 R\nnonsense\n")
+        import_text(TWO_BUSES)
     with pytest.raises(ImportFormatError):
-        import_can(tmp_path / "bad.log", output, load_robot("snake25"), force=True)
+        import_text("(100.000000) can0 7FF#00 R\nnonsense\n", force=True)
     assert output.read_text() == "precious"
 
 
-def test_a_stopped_import_leaves_a_whole_file(tmp_path: Path, monkeypatch):
+def test_a_stopped_import_leaves_a_whole_file(import_text, monkeypatch):
     monkeypatch.setattr("undulog.capture.exchange.frame_log.FRAMES_PER_BLOCK", 4)
     stop = StopRequest()
-    two_buses(tmp_path / "x.log")
     stop.signal = 15
-    report = import_can(tmp_path / "x.log", tmp_path / "a.mcap", load_robot("snake25"), stop=stop)
-    assert (report.complete, report.verdict) == (False, "degraded")
-    with Session.open(tmp_path / "a.mcap") as session:
+    report = import_text(TWO_BUSES, stop=stop)
+    assert (report.complete, report.verdict, report.frames) == (False, "degraded", 4)
+    with Session.open(report.output) as session:
         assert session.warnings == []
         assert session.verdict == "degraded"
 

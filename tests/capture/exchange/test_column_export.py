@@ -13,12 +13,9 @@ from support.paths import TRACE as RECORDING
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import (
     DataError,
-    LogWriteError,
     MissingChannelError,
     MissingExtraError,
-    UsageError,
 )
-from undulog.capture.common.process import StopRequest
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.csv_import import column_map_from_options, import_csv
 from undulog.capture.exchange.export import TABLE_FORMATS, export_columns
@@ -192,8 +189,8 @@ def test_the_verb(polled, tmp_path: Path, capsys):
     assert undulog.run(arguments) == 2
     assert "x.csv exists already" in capsys.readouterr().err
     assert undulog.run([*arguments, "--force", "--json", "--topics", "/gait"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (said["rows"], said["topics"], said["warnings"]) == (200, {"/gait": 200}, [])
+    report = json.loads(capsys.readouterr().out)
+    assert (report["rows"], report["topics"], report["warnings"]) == (200, {"/gait": 200}, [])
     assert undulog.run([*arguments, "--force", "--bus", "can0"]) == 2
     assert "--bus is for CAN frames; a .csv file has joint columns" in capsys.readouterr().err
 
@@ -205,25 +202,3 @@ def test_a_missing_package_is_named(polled, tmp_path: Path, monkeypatch, capsys)
     assert undulog.run(["log", "export", str(polled), "-o", str(tmp_path / "x.parquet")]) == 2
     assert "a .parquet table needs the package pyarrow" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_fails_leaves_nothing_behind(polled, tmp_path: Path, monkeypatch):
-    for suffix in TABLE_FORMATS:
-        output = tmp_path / f"x{suffix}"
-        output.write_text("precious")
-        with pytest.raises(UsageError, match="exists already"):
-            export_columns(polled, output)
-        stop = StopRequest()
-        stop.signal = 15
-        with pytest.raises(LogWriteError, match="stopped on request"):
-            export_columns(polled, output, force=True, stop=stop)
-        with monkeypatch.context() as patch:
-            patch.setattr("undulog.capture.exchange.export._sorted_blocks", full_disk)
-            with pytest.raises(LogWriteError, match="can't be written: No space left"):
-                export_columns(polled, output, force=True)
-        assert output.read_text() == "precious"
-    assert len(list(tmp_path.iterdir())) == len(TABLE_FORMATS)
-
-
-def full_disk(*_):
-    raise OSError(28, "No space left on device")

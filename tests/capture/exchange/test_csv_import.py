@@ -244,7 +244,7 @@ def test_options_and_file_say_the_same(tmp_path: Path):
     assert read_column_map(tmp_path / "map.toml", robot) == options
 
 
-def test_a_csv_of_can_frames_is_told_from_others(tmp_path: Path):
+def test_a_csv_of_can_frames_is_reported_from_others(tmp_path: Path):
     header = "timestamp,arbitration_id,extended,remote,error,dlc,data\n"
     assert is_frame_csv(csv_file(tmp_path, header))
     assert not is_frame_csv(csv_file(tmp_path, "time,a\n"))

@@ -200,7 +200,7 @@ FIELDS = {
 
 
 def losses(frames, held, *, sub_us):
-    """The sentences that must be said, from the truth alone."""
+    """The sentences that must be reported, from the truth alone."""
     counts = {}
     for each in frames:
         kept = held(each)
@@ -285,6 +285,7 @@ WRITTEN = {
     ".log": (held_by_python_cans_candump, 1000, ("data", "remote", "error")),
     ".blf": (held_by_blf, 1000, ("data", "remote", "error")),
     ".asc": (held_by_python_cans_asc, 1000, ("data", "remote", "error")),
+    ".asc.gz": (held_by_python_cans_asc, 1000, ("data", "remote", "error")),
     ".trc": (held_by_trc, 1500, ("data",)),
     ".csv": (held_by_csv, 1000, ("data", "remote", "error")),
     ".db": (held_by_csv, 1000, ("data", "remote", "error")),
@@ -310,6 +311,11 @@ def test_python_cans_writer_and_import(suffix, frames):
             for each in frames:
                 writer(message_of(each))
         back, report = imported(trace, folder)
+        with Session.open(folder / "back.mcap") as session:
+            directions = session.metadata["undulog"]["import.directions"]
+    # Candump has no directions if its first frame has none, as python-can's error frames.
+    without = suffix in {".csv", ".db"} or (suffix == ".log" and frames[0].kind == "error")
+    assert directions == ("none" if without else "recorded")
     kept = [held(each) for each in frames]
     expected = {}
     for each in kept:
@@ -319,9 +325,13 @@ def test_python_cans_writer_and_import(suffix, frames):
     assert report.frames == len(frames)
     same_but_time(back, expected)
     late = time_errors(back, expected)
-    if suffix in {".asc", ".trc"}:  # of the first frame's time, ASC has nothing, TRC 9 us
+    if suffix in {
+        ".asc",
+        ".asc.gz",
+        ".trc",
+    }:  # of the first frame's time, ASC has nothing, TRC 9 us
         first = min(each.t_ns for own in back.values() for each in own)
-        assert suffix == ".asc" or abs(first - kept[0].t_ns) < 10_000
+        assert suffix != ".trc" or abs(first - kept[0].t_ns) < 10_000
         assert suffix == ".trc" or first == RELATIVE_EPOCH_NS
         late -= first - kept[0].t_ns
     assert abs(late).max() <= error_ns

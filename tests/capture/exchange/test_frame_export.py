@@ -1,6 +1,5 @@
 """Traces for other tools: back through the import, and through readers of other makes."""
 
-import itertools
 import json
 import struct
 import zlib
@@ -16,12 +15,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import undulog
 from support.paths import TRACE as RECORDING
-from support.written_frames import T0, imported, write_frames
-from undulog.capture import Session, load_robot
+from support.written_frames import T0, every_kind, imported, write_frames
+from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.common.process import StopRequest
+from undulog.capture.exchange import export
 from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.export import export_log
+from undulog.capture.exchange.export import TABLE_FORMATS, export_columns, export_log
 from undulog.capture.exchange.frame_formats import FRAME_FORMATS, channel_numbers
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 from undulog.capture.log.messages.frames import (
@@ -29,6 +29,8 @@ from undulog.capture.log.messages.frames import (
     DIR_TX,
     ERROR_FLAG,
     EXTENDED_FLAG,
+    FD_BRS,
+    FD_ESI,
     REMOTE_FLAG,
     empty_frames,
 )
@@ -40,37 +42,9 @@ CAN_MSGS_FRAME = (
 )
 
 
-def every_kind(step_ns=1_000_000, start_ns=T0):
-    """Each identifier, kind, way and length that classic CAN has, one frame a step."""
-    rng = np.random.default_rng(3)
-    kinds = list(
-        itertools.product(
-            (0x000, 0x14B, 0x7FF, EXTENDED_FLAG, EXTENDED_FLAG | 0x1FFF_FFFF),
-            (0, REMOTE_FLAG),
-            (DIR_RX, DIR_TX),
-            range(9),
-        )
-    )
-    kinds += itertools.product((0x80, 0x1FFF_FFFF), (ERROR_FLAG,), (DIR_RX, DIR_TX), range(9))
-    frames = empty_frames(len(kinds))
-    for k, (identifier, flags, way, dlc) in enumerate(kinds):
-        frames[k]["id_flags"] = identifier | flags
-        frames[k]["dir"], frames[k]["dlc"] = way, dlc
-        if not flags & REMOTE_FLAG:
-            frames[k]["data"][:dlc] = list(rng.bytes(dlc))
-    frames = frames[rng.permutation(len(frames))]
-    frames["t_host_ns"] = start_ns + step_ns * np.arange(len(frames))
-    return frames
-
-
 def write_session(path, frames_of_bus, **options):
     topics = {f"/can/{bus}": frames for bus, frames in frames_of_bus.items()}
     return write_frames(path, topics, **options)
-
-
-def masks(frames):
-    error = (frames["id_flags"] & ERROR_FLAG) != 0
-    return error, ~error
 
 
 @pytest.fixture(scope="module")
@@ -79,68 +53,40 @@ def session_of_every_kind(tmp_path_factory):
     return write_session(tmp_path_factory.mktemp("kinds") / "run.mcap", {"can0": frames}), frames
 
 
-# What each format loses of the 36 error frames: 18 were sent, 32 have data.
-LOST = {
-    ".log": [],
-    ".blf": ["18 error frames lose their direction"],
-    ".asc": [
-        "32 error frames lose their data",
-        "18 error frames lose their direction",
-        "36 error frames lose their identifier",
-        "32 error frames lose their length code",
-    ],
+READERS = {
+    ".log": can.CanutilsLogReader,
+    ".blf": can.BLFReader,
+    ".asc": lambda path: can.ASCReader(path, relative_timestamp=False),
 }
 
 
-KEPT_OF_ERRORS = {
-    ".log": ("id_flags", "dlc", "data", "dir"),
-    ".blf": ("id_flags", "dlc", "data"),
-    ".asc": (),
-}
-
-
-@pytest.mark.parametrize("suffix", LOST)
-def test_frames_of_every_kind_come_back(suffix, session_of_every_kind, tmp_path: Path):
-    source, frames = session_of_every_kind
-    report = export_log(source, tmp_path / f"x{suffix}")
-    assert report.buses == {"can0": len(frames)}
-    back = imported(tmp_path / f"x{suffix}", tmp_path)[1]
-    error, other = masks(frames)
-    for name in ("id_flags", "dlc", "data", "dir"):
-        assert back[name][other].tolist() == frames[name][other].tolist()
-    assert ((back["id_flags"] & ERROR_FLAG) != 0).tolist() == error.tolist()
-    # ASC has times since its date, which it gives as local time; imports leave the date alone.
-    start_ns = T0 // S * S - RELATIVE_EPOCH_NS if suffix == ".asc" else 0
-    assert (back["t_host_ns"] + start_ns).tolist() == frames["t_host_ns"].tolist()
-    for name in KEPT_OF_ERRORS[suffix]:
-        assert back[name][error].tolist() == frames[name][error].tolist()
-    assert report.warnings == LOST[suffix]
-
-
-@pytest.mark.parametrize("suffix", [".blf", ".asc"])
-def test_python_can_reads_them(suffix, session_of_every_kind, tmp_path: Path):
-    source, frames = session_of_every_kind
-    trace = tmp_path / f"x{suffix}"
-    export_log(source, trace)
-    options = {"relative_timestamp": False} if suffix == ".asc" else {}
-    reader = {".blf": can.BLFReader, ".asc": can.ASCReader}[suffix](trace, **options)
-    messages = list(reader)
-    reader.stop()
+@pytest.mark.parametrize("suffix", READERS)
+@pytest.mark.parametrize("fd", [False, True])
+def test_python_can_reads_them(suffix, fd, tmp_path: Path):
+    frames = every_kind(fd=fd)
+    source = write_frames(tmp_path / "run.mcap", {"/can_fd/can0" if fd else "/can/can0": frames})
+    export_log(source, tmp_path / f"x{suffix}")
+    with READERS[suffix](tmp_path / f"x{suffix}") as reader:
+        messages = list(reader)
     times = [round(message.timestamp * 1e6) for message in messages]
     assert times == (frames["t_host_ns"] // 1000).tolist()
-    assert {message.channel for message in messages} == {0}
     for message, frame in zip(messages, frames, strict=True):
         id_flags = int(frame["id_flags"])
+        assert message.is_fd == fd
         assert message.is_error_frame == bool(id_flags & ERROR_FLAG)
         if message.is_error_frame:
             continue
         assert message.is_rx == (frame["dir"] == DIR_RX)
         assert message.arbitration_id == id_flags & 0x1FFF_FFFF
         assert message.is_extended_id == bool(id_flags & EXTENDED_FLAG)
-        assert message.is_remote_frame == bool(id_flags & REMOTE_FLAG)
-        assert message.dlc == frame["dlc"]
-        if not message.is_remote_frame:
-            assert bytes(message.data) == bytes(frame["data"][: message.dlc])
+        if fd:
+            assert message.bitrate_switch == bool(frame["fd_flags"] & FD_BRS)
+            assert message.error_state_indicator == bool(frame["fd_flags"] & FD_ESI)
+        else:
+            assert message.is_remote_frame == bool(id_flags & REMOTE_FLAG)
+            assert message.dlc == frame["dlc"]
+        if not id_flags & REMOTE_FLAG:
+            assert bytes(message.data) == bytes(frame["data"][: frame["len" if fd else "dlc"]])
 
 
 def blf_times(path):
@@ -174,28 +120,15 @@ def test_a_blf_has_each_nanosecond(tmp_path: Path):
     assert header == (2023, 11, 2, 14, 22, 13, 20, 0)  # UTC, as python-can and Vector's library
 
 
-def test_asc_rounds_to_microseconds_and_says_so(tmp_path: Path):
-    frames = every_kind(step_ns=1_000_100)
-    frames = frames[~masks(frames)[0]]
-    source = write_session(tmp_path / "run.mcap", {"can0": frames})
-    report = export_log(source, tmp_path / "x.asc")
-    back = imported(tmp_path / "x.asc", tmp_path)[1]["t_host_ns"] + (
-        T0 // S * S - RELATIVE_EPOCH_NS
-    )
-    difference = back.astype(np.int64) - frames["t_host_ns"].astype(np.int64)
-    assert abs(difference).max() <= 500
-    remote = (frames["id_flags"] & REMOTE_FLAG) != 0
-    counts = [int((difference[kind] != 0).sum()) for kind in (~remote, remote)]
-    assert report.warnings == [
-        f"{counts[0]} data frames lose their time below 1 us",
-        f"{counts[1]} remote frames lose their time below 1 us",
-    ]
+def test_asc_has_no_clock_of_this_machine(tmp_path: Path):
+    source = write_session(tmp_path / "run.mcap", {"can0": every_kind()})
+    export_log(source, tmp_path / "x.asc")
     text = (tmp_path / "x.asc").read_text()
     first, base, events, trigger, *_ = text.splitlines()
     assert first.replace("date", "Begin Triggerblock") == trigger
     assert (base, events) == ("base hex  timestamps absolute", "internal events logged")
     export_log(source, tmp_path / "x.asc", force=True)
-    assert (tmp_path / "x.asc").read_text() == text  # no clock of this machine in it
+    assert (tmp_path / "x.asc").read_text() == text
 
 
 def test_what_no_format_but_candump_has_is_counted(tmp_path: Path):
@@ -259,7 +192,7 @@ def test_rosbags_reads_them(session_of_every_kind, tmp_path: Path):
     assert [bytes(m.data) for _, m in messages] == [bytes(row) for row in frames["data"]]
 
 
-def test_names_that_a_format_has_not_are_told(tmp_path: Path):
+def test_names_that_a_format_has_not_are_reported(tmp_path: Path):
     frames = every_kind()[:20]
     buses = {"can3": frames, "left-arm": frames, "0": frames}
     source = write_session(tmp_path / "run.mcap", buses)
@@ -276,7 +209,7 @@ def test_names_that_a_format_has_not_are_told(tmp_path: Path):
 @pytest.mark.parametrize(
     ("suffix", "words"), [(".blf", "written as received"), (".mcap", "on from_can_bus")]
 )
-def test_directions_that_are_none_are_told(suffix, words, tmp_path: Path):
+def test_directions_that_are_none_are_reported(suffix, words, tmp_path: Path):
     facts = {"import.directions": "none"}
     source = write_session(tmp_path / "run.mcap", {"can0": every_kind()[:20]}, **facts)
     report = export_log(source, tmp_path / f"x{suffix}")
@@ -317,7 +250,7 @@ def test_stretches_make_no_difference(suffix, tmp_path: Path, monkeypatch):
         assert times == sorted(times)
     for bus, frames in buses.items() if suffix != ".mcap" else ():
         back = imported(tmp_path / f"parts{suffix}", tmp_path, f"/can/{bus}")[1]
-        keep = masks(frames)[1]
+        keep = (frames["id_flags"] & ERROR_FLAG) == 0
         for name in ("id_flags", "dlc", "data", "dir"):
             assert back[name][keep].tolist() == frames[name][keep].tolist()
 
@@ -335,7 +268,7 @@ def arcsnake(tmp_path_factory):
         return path, session.frames("/can/can0")
 
 
-@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc"])
+@pytest.mark.parametrize("suffix", [".blf", ".asc"])
 def test_a_real_trace_comes_back(suffix, arcsnake, tmp_path: Path):
     path, frames = arcsnake
     report = export_log(path, tmp_path / f"x{suffix}")
@@ -374,31 +307,43 @@ def test_the_verb_says_what_is_lost(session_of_every_kind, tmp_path: Path, capsy
     ]
     arguments = ["log", "export", str(source), "-o", str(output), "--force", "--json"]
     assert undulog.run(arguments) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["warnings"] == ["18 error frames lose their direction"]
-    assert said["buses"] == {"can0": len(frames)}
+    report = json.loads(capsys.readouterr().out)
+    assert report["warnings"] == ["18 error frames lose their direction"]
+    assert report["buses"] == {"can0": len(frames)}
     arguments = ["log", "export", str(source), "-o", str(output), "--force", "--topics", "/x"]
     assert undulog.run(arguments) == 2
     assert "--topics is for tables; a .blf file has CAN frames" in capsys.readouterr().err
 
 
-def test_what_fails_leaves_nothing_behind(session_of_every_kind, tmp_path: Path, monkeypatch):
-    source, _ = session_of_every_kind
-    for suffix in FRAME_FORMATS:
-        output = tmp_path / f"x{suffix}"
-        output.write_text("precious")
-        with pytest.raises(UsageError, match="exists already"):
-            export_log(source, output)
-        stop = StopRequest()
-        stop.signal = 15
-        with pytest.raises(LogWriteError, match="stopped on request"):
-            export_log(source, output, force=True, stop=stop)
-        with monkeypatch.context() as patch:
-            patch.setattr(type(FRAME_FORMATS[suffix]), "kept", full_disk)
-            with pytest.raises(LogWriteError, match="can't be written: No space left"):
-                export_log(source, output, force=True)
-        assert output.read_text() == "precious"
-    assert len(list(tmp_path.iterdir())) == len(FRAME_FORMATS)
+EXPORTS = [
+    *((export_log, suffix, type(known), "kept") for suffix, known in FRAME_FORMATS.items()),
+    *((export_columns, suffix, export, "_sorted_blocks") for suffix in TABLE_FORMATS),
+]
+
+
+@pytest.mark.parametrize("case", EXPORTS, ids=lambda case: case[1])
+def test_what_fails_leaves_nothing_behind(case, tmp_path: Path, monkeypatch):
+    exporter, suffix, owner, step = case
+    source, output = tmp_path / "run.mcap", tmp_path / f"x{suffix}"
+    with SessionWriter(source, session_id="s", epoch_ns=T0) as writer:
+        writer.joint_state("/joint_states", ["a"], unit="rad").write(T0, [1.0])
+        writer.frames("/can/can0").write(T0, every_kind())
+    output.write_text("precious")
+    with pytest.raises(UsageError, match="exists already"):
+        exporter(source, output)
+    stop = StopRequest()
+    stop.signal = 15
+    with pytest.raises(LogWriteError, match="stopped on request"):
+        exporter(source, output, force=True, stop=stop)
+    monkeypatch.setattr(owner, step, full_disk)
+    with pytest.raises(LogWriteError, match="can't be written: No space left"):
+        exporter(source, output, force=True)
+    assert output.read_text() == "precious"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_session_is_not_replaced_by_its_export(tmp_path: Path):
+    source = write_session(tmp_path / "run.mcap", {"can0": every_kind()[:1]})
     with pytest.raises(UsageError, match="is the session itself"):
         export_log(source, source, force=True)
 

@@ -17,12 +17,9 @@ from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.can_logs import open_frame_log
-from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
+from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS, joined
 from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
     ERROR_FLAG,
-    EXTENDED_FLAG,
     REMOTE_FLAG,
 )
 
@@ -31,7 +28,6 @@ from asammdf.blocks.v4_blocks import SourceInformation  # noqa: E402
 from asammdf.blocks.v4_constants import BUS_TYPE_CAN, SOURCE_BUS  # noqa: E402
 
 T0 = 1_700_000_000.25
-T0_NS = 1_700_000_000_250_000_000
 START = datetime(2024, 2, 29, 12, 0, 0, 125_000, tzinfo=UTC)
 START_NS = 1_709_208_000_125_000_000
 
@@ -40,7 +36,7 @@ def read(path: Path):
     """Everything in a file: frames, name of each one's bus, the log."""
     with open_frame_log(path) as log:
         blocks = list(log.blocks)
-        frames = np.concatenate([block.frames for block in blocks])
+        frames = joined(blocks).classic()
         buses = [log.buses[i] for block in blocks for i in block.bus]
     assert blocks[-1].done == pytest.approx(1.0)
     return frames, buses, log
@@ -72,63 +68,29 @@ def data_group(times, ids, data, *, way=None, bus=None, wide=None, dlc=None, wid
     return group("CAN_DataFrame", times, columns)
 
 
-def written(path: Path, *groups, start=START, compression=0):
+def written(path: Path, *groups, start=START, compression=0, ways=None):
+    """``ways``: conversion of the directions, as loggers have it: numbers that stand for texts."""
     mdf = asammdf.MDF(version="4.10")
     mdf.header.start_time = start
     for each in groups:
         mdf.append(each)
+    for each in mdf.groups if ways else ():
+        channel = next(c for c in each.channels if c.name == "CAN_DataFrame.Dir")
+        channel.conversion = asammdf.blocks.conversion_utils.from_dict(ways)
     mdf.save(path, compression=compression)
     mdf.close()
     return path
 
 
-@pytest.mark.parametrize("suffix", [".mf4", ".mf4.gz"])
-def test_every_kind_of_frame_of_python_cans_writer(suffix, tmp_path: Path):
-    rng = np.random.default_rng(3)
-    messages = []
-    for i in range(500):
-        kind = i % 6
-        messages.append(
-            can.Message(
-                timestamp=T0 + i * 1e-3,
-                arbitration_id=0x1800_0000 + i if kind == 1 else 0x80 + i,
-                is_extended_id=kind == 1,
-                is_remote_frame=kind == 3,
-                is_error_frame=kind == 5,
-                dlc=i % 9 if kind == 3 else 15 if kind == 4 else None,
-                data=None if kind == 3 else rng.bytes(8 if kind == 4 else i % 9),
-                is_rx=bool(rng.integers(2)),
-                channel=i % 3,
-                check=False,
-            )
-        )
-    plain = tmp_path / "log.mf4"
+def test_a_compressed_file_is_read_the_same(tmp_path: Path):
+    plain, packed = tmp_path / "log.mf4", tmp_path / "log.mf4.gz"
     with can.MF4Writer(plain) as writer:
-        for message in messages:
-            writer(message)
-    source = tmp_path / f"log{suffix}"
-    if suffix.endswith(".gz"):
-        source.write_bytes(gzip.compress(plain.read_bytes()))
-    frames, buses, log = read(source)
-    flags = [
-        EXTENDED_FLAG * (m.is_extended_id and not m.is_error_frame)
-        | REMOTE_FLAG * m.is_remote_frame
-        | ERROR_FLAG * m.is_error_frame
-        for m in messages
-    ]
-    assert frames["id_flags"].tolist() == [
-        m.arbitration_id | f for m, f in zip(messages, flags, strict=True)
-    ]
-    assert frames["dlc"].tolist() == [m.dlc for m in messages]
-    assert [bytes(row) for row in frames["data"]] == [
-        bytes(m.data).ljust(8, b"\0") for m in messages
-    ]
-    assert frames["dir"].tolist() == [DIR_RX if m.is_rx else DIR_TX for m in messages]
-    assert buses == [f"can{m.channel}" for m in messages]
-    assert (log.directions, log.problems) == (True, [])
-    # The writer keeps differences of Unix times as floating-point seconds: 0.24 us at worst.
-    late = frames["t_host_ns"].astype(np.int64) - [T0_NS + i * 1_000_000 for i in range(500)]
-    assert abs(late).max() <= 250
+        for i in range(500):
+            writer(can.Message(timestamp=T0 + i * 1e-3, arbitration_id=i, data=bytes(i % 9)))
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    frames, buses, log = read(packed)
+    assert frames.tobytes() == read(plain)[0].tobytes()
+    assert (len(frames), set(buses), log.problems) == (500, {"can0"}, [])
 
 
 @pytest.mark.parametrize("compression", [0, 1, 2])
@@ -153,16 +115,7 @@ def test_groups_of_a_logger_merge_by_time_to_the_nanosecond(compression, tmp_pat
         }
         groups.append(group("CAN_DataFrame", times[mine], columns))
         expected.append(np.stack([mine, ids, mine % 3 == 0, np.full(len(mine), bus)]))
-    path = tmp_path / "log.mf4"
-    mdf = asammdf.MDF(version="4.10")
-    mdf.header.start_time = START
-    for each in groups:
-        mdf.append(each)
-    for each in mdf.groups:  # as the makers of loggers have it: numbers that stand for texts
-        channel = next(c for c in each.channels if c.name == "CAN_DataFrame.Dir")
-        channel.conversion = asammdf.blocks.conversion_utils.from_dict(ways)
-    mdf.save(path, compression=compression)
-    mdf.close()
+    path = written(tmp_path / "log.mf4", *groups, compression=compression, ways=ways)
     frames, buses, log = read(path)
     truth = np.concatenate(expected, axis=1)
     truth = truth[:, np.argsort(truth[0])]
@@ -185,18 +138,13 @@ def test_fields_that_a_group_may_lack(tmp_path: Path):
     frames, buses, log = read(path)
     assert frames["id_flags"].tolist() == [0x123, ERROR_FLAG, 0x456, 7 | REMOTE_FLAG]
     assert frames["dlc"].tolist() == [2, 0, 0, 6]
-    assert [bytes(row[:3]) for row in frames["data"]] == [
-        b"\1\2\0",
-        b"\0\0\0",
-        b"\0\0\0",
-        b"\0\0\0",
-    ]
+    assert frames["data"].tolist() == [[1, 2] + [0] * 6, *[[0] * 8] * 3]
     assert (frames["t_host_ns"] - START_NS).tolist() == [5e8, 1e9, 1.5e9, 2e9]
     assert set(buses) == {"can0"}
     assert log.directions is False
 
 
-def test_what_is_left_out_is_told(tmp_path: Path):
+def test_what_is_left_out_is_reported(tmp_path: Path):
     long_columns = {
         "ID": (("<u4",), 2),
         "DLC": (("u1",), 15),
@@ -262,15 +210,12 @@ def test_files_that_hold_no_frames(tmp_path: Path):
     path.write_bytes((tmp_path / "old.mdf").read_bytes())
     with pytest.raises(ImportFormatError, match=r"version '3\.30'; bus logging began with MDF 4"):
         read(path)
-    path.write_bytes(b"MDF")
-    with pytest.raises(ImportFormatError, match="can't be read"):
-        read(path)
 
 
 def test_a_damaged_file_is_one_error_and_nothing_else(tmp_path: Path, capfd, monkeypatch):
     """Read or refused, whatever is damaged; neither asammdf nor the interpreter says a word."""
-    said = []
-    monkeypatch.setattr(sys, "unraisablehook", said.append)
+    messages = []
+    monkeypatch.setattr(sys, "unraisablehook", messages.append)
     path = tmp_path / "log.mf4"
     with can.MF4Writer(path) as writer:
         for i in range(300):
@@ -287,7 +232,7 @@ def test_a_damaged_file_is_one_error_and_nothing_else(tmp_path: Path, capfd, mon
             assert str(path) in str(error)  # noqa: PT017
             refused += 1
     assert refused > 20
-    assert said == []
+    assert messages == []
     assert capfd.readouterr() == ("", "")
 
 

@@ -61,6 +61,6 @@ def test_many_instants_at_once_are_the_same_as_one_by_one() -> None:
         np.testing.assert_array_equal(rotation[k], one[1])
 
 
-def test_a_wrong_number_of_angles_is_told() -> None:
+def test_a_wrong_number_of_angles_is_reported() -> None:
     with pytest.raises(DataError, match=r"shape \(3, 5\); the robot snake13 has 12 joints"):
         link_poses(ROBOT, np.zeros(3), np.eye(3), np.zeros((3, 5)))

@@ -61,7 +61,7 @@ def test_its_slope_is_that_of_its_value():
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "fault"),
     [
         ({"response": {"log_gain": [1, 2], "lag_rad": [0, 0, 0]}}, "response.log_gain.*3 finite"),
         ({"slope": {"log_gain": [[1, 2, 3]], "lag_rad": [[1, 2, 3]]}}, "slope.log_gain.*2 x 3"),
@@ -72,11 +72,11 @@ def test_its_slope_is_that_of_its_value():
         ({"format": "undulog null model 9"}, "format.*undulog null model 1"),
     ],
 )
-def test_faults_are_named(tmp_path, change, told):
+def test_faults_are_named(tmp_path, change, fault):
     path = tmp_path / "model.json"
     write_null_model(path, some_model())
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(NullModelError, match=told):
+    with pytest.raises(NullModelError, match=fault):
         read_null_model(path)
 
 

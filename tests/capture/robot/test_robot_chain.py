@@ -3,18 +3,11 @@
 import pytest
 from mcap.reader import make_reader
 
+from support.bus_robots import LINK
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import RobotFileError
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Plane
-
-LINK = """
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-"""
 
 CHAIN = (
     """

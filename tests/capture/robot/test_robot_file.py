@@ -6,6 +6,7 @@ from pathlib import Path
 import cantools
 import pytest
 
+from support.bus_robots import LINK
 from undulog.capture import load_robot, robot_names
 from undulog.capture.common.errors import RobotFileError, UsageError
 from undulog.capture.robot.description import parse_robot
@@ -23,17 +24,11 @@ from undulog.capture.robot.model import (
 )
 from undulog.sim.gate.limits import missing_limits, safety_example
 
-MINIMAL = """
+MINIMAL = f"""
 name = "worm"
 clock = "host"
-joints = [{ name = "joint01", plane = "horizontal" }, { name = "joint02", plane = "vertical" }]
-
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-"""
+joints = [{{ name = "joint01", plane = "horizontal" }}, {{ name = "joint02", plane = "vertical" }}]
+{LINK}"""
 
 DBC = """VERSION ""
 
@@ -96,7 +91,6 @@ def test_topics_are_those_of_the_log_contract():
 
 def test_snake25_has_one_command_and_one_state_frame_a_servo():
     robot = load_robot("snake25")
-    assert robot.bus is not None
     for name in robot.joint_names:
         own = [signal for signal in robot.bus.signals if signal.target == name]
         assert {(s.message, s.direction) for s in own} == {
@@ -120,7 +114,6 @@ def test_snake13_has_six_joints_a_plane():
 
 def test_arcsnake_databases_load_strictly_and_share_one_identifier():
     robot = load_robot("arcsnake-joint")
-    assert robot.bus is not None
     assert robot.bus.databases == ("rmd-x8-request.dbc", "rmd-x8-reply.dbc")
     ids = []
     for _, text in robot.databases:
@@ -230,47 +223,60 @@ signals = [
   { message = "state", signal = "angle", direction = "rx", target = "joint01", quantity = "position", unit = "deg" },
 ]
 """  # noqa: E501  TOML has inline tables on one line
+ENTRY = BUS.splitlines()[5]
 
 
 def test_a_bus_map_is_read():
     robot = parse_robot(MINIMAL + BUS, "worm.toml", {"worm.dbc": DBC, "other.dbc": "?"})
-    assert robot.bus is not None
     (signal,) = robot.bus.signals
     assert (signal.message, signal.signal, signal.target) == ("state", "angle", "joint01")
     assert (signal.direction, signal.quantity) == (Direction.RX, Quantity.POSITION)
     assert robot.databases == (("worm.dbc", DBC),)
 
 
+SENSOR = """
+[[sensors]]
+name = "compass"
+kind = "compass"
+link = "link01"
+position = [0, 0, 0]
+axes = ["x", "y"]
+"""
+COMPASS = SENSOR + BUS.replace("joint01", "compass").replace("position", "magnetic_field").replace(
+    '"deg"', '"uT"'
+)
+
+
 @pytest.mark.parametrize(
-    ("old", "new", "fault"),
+    ("old", "new", "faults"),
     [
         (
             '"state"',
             '"sate"',
-            '  bus.signals[0].message: found "sate"; valid: state (did you mean state?)',
+            'signals[0].message: found "sate"; valid: state (did you mean state?)',
         ),
         (
             '"angle"',
             '"angel"',
             (
-                '  bus.signals[0].signal: found "angel"; valid: a signal of state: angle, speed '
+                'signals[0].signal: found "angel"; valid: a signal of state: angle, speed '
                 "(did you mean angle?)"
             ),
         ),
-        ('"rx"', '"in"', '  bus.signals[0].direction: found "in"; valid: tx, rx'),
+        ('"rx"', '"in"', 'signals[0].direction: found "in"; valid: tx, rx'),
         (
             '"joint01"',
             '"joint03"',
             (
-                '  bus.signals[0].target: found "joint03"; valid: joint01, joint02, {joint} '
+                'signals[0].target: found "joint03"; valid: joint01, joint02, {joint} '
                 "(did you mean joint02?)"
             ),
         ),
         (
-            '"position"',
-            '"range"',
+            '"position", unit = "deg"',
+            '"range", unit = "m"',
             (
-                '  bus.signals[0].quantity: found "range"; valid: what joint01 has: command, '
+                'signals[0].quantity: found "range"; valid: what joint01 has: command, '
                 "position, velocity, effort, current, voltage, temperature"
             ),
         ),
@@ -278,34 +284,64 @@ def test_a_bus_map_is_read():
             '"deg"',
             '"dgr"',
             (
-                '  bus.signals[0].unit: found "dgr"; valid: for position: rad, mrad, deg, rev '
+                'signals[0].unit: found "dgr"; valid: for position: rad, mrad, deg, rev '
                 "(did you mean deg?)"
             ),
         ),
         (
-            'unit = "deg"',
-            'unit = "deg", scale = 0',
-            "  bus.signals[0].scale: found 0; valid: a finite number other than 0",
+            '"deg"',
+            '"deg", scale = 0',
+            "signals[0].scale: found 0; valid: a finite number other than 0",
         ),
         (
-            'unit = "deg"',
-            'unit = "deg", axis = "x"',
-            '  bus.signals[0].axis: found "x"; valid: leave it out: the target has no axes',
+            '"deg"',
+            '"deg", axis = "x"',
+            'signals[0].axis: found "x"; valid: leave it out: the target has no axes',
         ),
         (
             '"worm.dbc"',
             '"../worm.dbc"',
             (
-                "  bus.databases: ../worm.dbc: found no such file; valid: the name of a DBC file "
+                "databases: ../worm.dbc: found no such file; valid: the name of a DBC file "
                 "that lies beside the description"
             ),
         ),
-        ("500_000", "0", "  bus.bitrate: found 0; valid: a whole number >= 1"),
+        ("500_000", "0", "bitrate: found 0; valid: a whole number >= 1"),
+        (
+            '["worm.dbc"]',
+            '["worm.dbc", "again.dbc"]',
+            (
+                "databases: again.dbc: found a second message state; valid: message names that "
+                "are unique in all databases together"
+            ),
+        ),
+        (
+            ENTRY,
+            f"{ENTRY}\n{ENTRY}",
+            (
+                "signals[1].signal: found a repeated entry; valid: one entry a signal, target "
+                "and quantity"
+            ),
+        ),
+        (
+            '"deg"',
+            '"deg", unknown = -40000, out_of_range = 5',
+            (
+                "signals[0].out_of_range: found 5; valid: leave it out: only a range has it\n"
+                "signals[0].unknown: found -40000; valid: a whole number >= -32768"
+            ),
+        ),
+        (
+            '"deg"',
+            '"deg", unknown = 32768',
+            "signals[0].unknown: found 32768; valid: a raw number of 16 bits, -32768 to 32767",
+        ),
+        (BUS, COMPASS, "signals[0].axis: found nothing; valid: x, y"),
     ],
 )
-def test_faults_of_a_bus_map(old, new, fault):
-    lines = faults_of(MINIMAL + BUS.replace(old, new), {"worm.dbc": DBC})
-    assert fault in lines
+def test_faults_of_a_bus_map(old, new, faults):
+    lines = faults_of(MINIMAL + BUS.replace(old, new), {"worm.dbc": DBC, "again.dbc": DBC})
+    assert lines[1:] == [f"  bus.{fault}" for fault in faults.split("\n")]
 
 
 def test_a_faulty_database_is_one_fault_and_not_one_a_signal():
@@ -349,67 +385,22 @@ def test_a_file_that_is_not_text(tmp_path: Path):
         load_robot(path)
 
 
-def test_message_names_must_be_unique_in_all_databases_together():
-    text = MINIMAL + BUS.replace('["worm.dbc"]', '["worm.dbc", "again.dbc"]')
-    assert faults_of(text, {"worm.dbc": DBC, "again.dbc": DBC})[1:] == [
-        (
-            "  bus.databases: again.dbc: found a second message state; valid: message names that "
-            "are unique in all databases together"
-        )
-    ]
-
-
-def test_a_repeated_map_entry_is_a_fault():
-    entry = BUS.splitlines()[5]
-    lines = faults_of(MINIMAL + BUS.replace(entry, f"{entry}\n{entry}"), {"worm.dbc": DBC})
-    assert lines[1:] == [
-        (
-            "  bus.signals[1].signal: found a repeated entry; valid: one entry a signal, target "
-            "and quantity"
-        )
-    ]
-
-
-def test_vector_sensors_need_their_axes_on_the_bus():
-    sensor = """
-[[sensors]]
-name = "compass"
-kind = "compass"
-link = "link01"
-position = [0, 0, 0]
-axes = ["x", "y"]
-"""
-    entry = BUS.replace("joint01", "compass").replace("position", "magnetic_field")
-    entry = entry.replace('"deg"', '"uT"')
-    lines = faults_of(MINIMAL + sensor + entry, {"worm.dbc": DBC})
-    assert lines[1:] == ["  bus.signals[0].axis: found nothing; valid: x, y"]
-    good = entry.replace('"uT"', '"uT", axis = "y"')
-    robot = parse_robot(MINIMAL + sensor + good, "worm.toml", {"worm.dbc": DBC})
-    assert robot.bus is not None
-    assert robot.bus.signals[0].axis == "y"
-
-
-def test_numbers_with_a_meaning_of_their_own_must_fit_the_signal():
-    coded = BUS.replace('"deg"', '"deg", unknown = -40000, out_of_range = 5')
-    assert faults_of(MINIMAL + coded, {"worm.dbc": DBC})[1:] == [
-        "  bus.signals[0].out_of_range: found 5; valid: leave it out: only a range has it",
-        "  bus.signals[0].unknown: found -40000; valid: a whole number >= -32768",
-    ]
-    great = BUS.replace('"deg"', '"deg", unknown = 32768')
-    assert faults_of(MINIMAL + great, {"worm.dbc": DBC})[1:] == [
-        "  bus.signals[0].unknown: found 32768; valid: a raw number of 16 bits, -32768 to 32767"
-    ]
-    good = BUS.replace('"deg"', '"deg", unknown = -32768')
-    robot = parse_robot(MINIMAL + good, "worm.toml", {"worm.dbc": DBC})
-    assert robot.bus is not None
-    assert robot.bus.signals[0].unknown == -32768
+@pytest.mark.parametrize(
+    ("text", "name", "value"),
+    [
+        (COMPASS.replace('"uT"', '"uT", axis = "y"'), "axis", "y"),
+        (BUS.replace('"deg"', '"deg", unknown = -32768'), "unknown", -32768),
+    ],
+)
+def test_further_fields_of_a_bus_signal(text, name, value):
+    (signal,) = parse_robot(MINIMAL + text, "worm.toml", {"worm.dbc": DBC}).bus.signals
+    assert getattr(signal, name) == value
 
 
 @pytest.mark.parametrize("name", ["snake25", "snake13", "snake13-planar"])
 def test_shipped_snakes_can_be_armed(name):
     robot = load_robot(name)
     assert missing_limits(robot) == ()
-    assert robot.safety is not None
     assert robot.safety.on_fault is OnFault.RAMP_DOWN
     rate = robot.safety.values("max_rate", robot.joint_names)
     assert rate.tolist() == [4.0] * len(robot.joints)
@@ -458,7 +449,7 @@ def test_what_arming_lacks_is_named_with_an_example():
     assert "max_rate" in missing_limits(parse_robot(single, "worm.toml", {}))
 
 
-def test_faults_of_safety_are_told_together():
+def test_faults_of_safety_are_reported_together():
     text = (
         MINIMAL
         + """
@@ -471,11 +462,11 @@ on_fault = "jump"
 max_rate = 1.0
 """
     )
-    told = "\n".join(faults_of(text))
-    assert "safety.max_rate: found 0.0; valid: a finite number > 0" in told
-    assert "safety.max_curent: found an unknown key" in told
-    assert 'safety.on_fault: found "jump"; valid: hold, ramp-down' in told
-    assert "safety_of.joint03: found an unknown key" in told
+    text = "\n".join(faults_of(text))
+    assert "safety.max_rate: found 0.0; valid: a finite number > 0" in text
+    assert "safety.max_curent: found an unknown key" in text
+    assert 'safety.on_fault: found "jump"; valid: hold, ramp-down' in text
+    assert "safety_of.joint03: found an unknown key" in text
     alone = MINIMAL + "[safety_of.joint01]\nmax_rate = 1.0\n"
     assert "safety_of: found a table; valid: leave it out" in "\n".join(faults_of(alone))
 
