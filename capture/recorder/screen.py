@@ -31,6 +31,7 @@ from .status import (
     RecorderSnapshot,
     SourceSnapshot,
     TopicSnapshot,
+    combined,
     group_of,
     source_state,
 )
@@ -89,7 +90,7 @@ def screen(snapshot: RecorderSnapshot, width: int = 80, height: int | None = Non
     events = [_event(event, snapshot, width) for event in snapshot.events[-_EVENTS:]]
     if events:
         events = [Text(), Text("latest events", style="bold"), *events]
-    rows = [_topic_cells(name, topics) for name, topics in _rows(snapshot.topics)]
+    rows = [_topic_cells(row) for row in _rows(snapshot.topics)]
     room = len(rows)
     if height is not None:
         used = len(head) + 1 + len(sources) + 2 + len(events) + 1
@@ -121,8 +122,6 @@ def plain_line(snapshot: RecorderSnapshot) -> str:
         parts.append(f"{source.name} {state}{rate}")
     if snapshot.free is not None:
         parts.append(_room(snapshot))
-    if snapshot.trouble is not None:
-        parts.append(snapshot.trouble)
     if snapshot.reasons:
         parts.append(snapshot.reasons[0] + _more(len(snapshot.reasons) - 1))
     return plain("; ".join(parts))
@@ -186,10 +185,7 @@ def _headline(snapshot: RecorderSnapshot, width: int) -> list[Text]:
     if snapshot.free is not None:
         facts.append(_room(snapshot))
     second = Text(cut(" | ".join(facts), width))
-    lines = [first, second]
-    if snapshot.trouble is not None:
-        lines.append(Text(cut(snapshot.trouble, width), style=_LEVELS["error"]))
-    return lines
+    return [first, second]
 
 
 def _room(snapshot: RecorderSnapshot) -> str:
@@ -227,8 +223,8 @@ def _event(event: EventLine, snapshot: RecorderSnapshot, width: int) -> Text:
     return line
 
 
-def _rows(topics: Sequence[TopicSnapshot]) -> list[tuple[str, list[TopicSnapshot]]]:
-    """Topics by name; many sensors of one kind are one row, what has no rhythm is left out."""
+def _rows(topics: Sequence[TopicSnapshot]) -> list[TopicSnapshot]:
+    """Combine many sensors of one kind into one row; leave out topics without a rhythm."""
     groups: dict[str, list[TopicSnapshot]] = {}
     for topic in topics:
         if not has_rhythm(topic.topic):
@@ -236,12 +232,12 @@ def _rows(topics: Sequence[TopicSnapshot]) -> list[tuple[str, list[TopicSnapshot
         group = group_of(topic.topic)
         alone = group == "joints" or topic.topic.count("/") < 2
         groups.setdefault(topic.topic if alone else f"/{group}", []).append(topic)
-    rows: list[tuple[str, list[TopicSnapshot]]] = []
+    rows: list[TopicSnapshot] = []
     for name, members in groups.items():
         if len(members) <= _SHOWN_ALONE:
-            rows += [(member.topic, [member]) for member in members]
+            rows += members
         else:
-            rows.append((f"{name}/ ({len(members)})", members))
+            rows.append(combined(f"{name}/ ({len(members)})", members))
     return rows
 
 
@@ -268,29 +264,23 @@ def _source_cells(source: SourceSnapshot) -> Cells:
     ]
 
 
-def _topic_cells(name: str, topics: list[TopicSnapshot]) -> Cells:
-    """One row; of several topics the sums, and the worst of what has no sum."""
-    rates = [topic.rate_hz for topic in topics if topic.rate_hz is not None]
-    steady = [topic for topic in topics if topic.gaps is not None]
-    jitters = [topic.jitter for topic in steady if topic.jitter is not None]
-    counted = [topic.dropped for topic in topics if topic.dropped is not None]
-    at_limit = sorted({joint for topic in topics for joint in topic.at_limit})
-    frozen = sorted({joint for topic in topics for joint in topic.frozen})
-    said = [
-        *([f"{len(frozen)} frozen"] if frozen else []),
-        *([f"{len(at_limit)} at limits"] if at_limit else []),
-        *([f"{nan} NaN"] if (nan := sum(topic.nan for topic in topics)) else []),
-    ]
+def _topic_cells(row: TopicSnapshot) -> Cells:
+    conditions = {
+        f"{len(row.frozen)} frozen": row.frozen,
+        f"{len(row.at_limit)} at limits": row.at_limit,
+        f"{row.nan} NaN": row.nan,
+    }
+    faults = ", ".join(text for text, holds in conditions.items() if holds)
     return [
-        (name, ""),
-        (_rate(sum(rates) if rates else None), ""),
-        (f"{max(topic.age_s for topic in topics):.1f}", ""),
-        _counted(sum(topic.gaps or 0 for topic in steady) if steady else None),
-        _counted(sum(topic.missing or 0 for topic in steady) if steady else None),
-        (f"{max(jitters):.0%}" if jitters else _DASH, ""),
-        _counted(sum(counted) if counted else None),
-        (f"{sum(topic.count for topic in topics):,}", ""),
-        (", ".join(said) or _DASH, _LEVELS["warn"] if said else ""),
+        (row.topic, ""),
+        (_rate(row.rate_hz), ""),
+        (f"{row.age_s:.1f}", ""),
+        _counted(row.gaps),
+        _counted(row.missing),
+        (_DASH if row.jitter is None else f"{row.jitter:.0%}", ""),
+        _counted(row.dropped),
+        (f"{row.count:,}", ""),
+        (faults or _DASH, _LEVELS["warn"] if faults else ""),
     ]
 
 

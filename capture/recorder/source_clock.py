@@ -60,19 +60,8 @@ class ClockEstimate:
     resets: int
     out_of_range: int = 0
 
-    def as_metadata(self, name: str) -> dict[str, str]:
-        """Key-values for the session's metadata record ``undulog.clock``.
-
-        Args:
-            name: The source's name.
-
-        Returns:
-            Keys ``NAME.offset_ns`` and so on; what isn't known is left out.
-        """
-        return {f"{name}.{key}": value for key, value in self.facts().items()}
-
     def facts(self) -> dict[str, str]:
-        """The same, without the name of a source."""
+        """Return the known values as text, as in the metadata record ``undulog.clock``."""
         facts: dict[str, str] = {
             "samples": str(self.samples),
             "resets": str(self.resets),

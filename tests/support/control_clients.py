@@ -11,7 +11,6 @@ import time
 
 from support.processes import wait_for
 from undulog.capture.common.errors import DataError
-from undulog.capture.recorder.control import LATER
 
 PATIENCE_S = 60.0
 
@@ -25,7 +24,7 @@ def echo(request):
     if request.get("do") == "mistake":
         return {"value": float("nan")} if request.get("nan") else {}["none"]
     if request.get("do") == "later":
-        return LATER
+        return None
     return {"got": dict(request)}
 
 

@@ -11,7 +11,7 @@ from undulog.capture.common.errors import ControlError, DataError
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.recorder.control import ControlServer
 from undulog.capture.recorder.control_client import ControlClient
-from undulog.capture.recorder.control_requests import OPERATOR, OperatorLog, request_handler
+from undulog.capture.recorder.control_requests import OPERATOR, RequestHandler
 
 EPOCH_NS = 1_700_000_000_000_000_000
 
@@ -43,12 +43,10 @@ def session(tmp_path):
     actions, clock = Actions(), [EPOCH_NS]
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
         events = writer.log()
-        log = OperatorLog(
-            writer,
-            lambda level, who, text: events.write(clock[0], level, who, text),
-            lambda: clock[0],
+        handler = RequestHandler(
+            actions, writer, lambda *event: events.write(clock[0], *event), lambda: clock[0]
         )
-        server = ControlServer(tmp_path / "c.sock", request_handler(actions, log))
+        server = ControlServer(tmp_path / "c.sock", handler)
         yield path, writer, actions, server, clock
         server.close()
 
