@@ -47,12 +47,7 @@ _READ = 16 * 1024
 _MOST_FAULTS = 8
 
 
-def read_request(line: bytes) -> dict[str, Any]:
-    """Parse one line, with or without its newline.
-
-    Raises:
-        ControlError: If it is too long or not a JSON object.
-    """
+def _read_request(line: bytes) -> dict[str, Any]:
     if len(line) > BUFFER:
         raise ControlError(TOO_LONG)
     try:
@@ -68,23 +63,16 @@ def _no_constant(name: str) -> None:
     raise ValueError(f"{name} is no JSON number")
 
 
-def reply_line(reply: Reply) -> bytes:
-    """Return a reply as a line with its newline.
-
-    Raises:
-        ValueError: If it has a number that JSON doesn't have.
-        TypeError: If it has a value that JSON doesn't have.
-    """
+def _reply_line(reply: Reply) -> bytes:
     return json.dumps(reply, allow_nan=False).encode() + b"\n"
 
 
-def refusal(error: str) -> bytes:
-    """Return the reply to a request that can't be carried out."""
-    return reply_line({"ok": False, "error": error})
+def _refusal(error: str) -> bytes:
+    return _reply_line({"ok": False, "error": error})
 
 
 @dataclass(eq=False)
-class Connection:
+class _Client:
     """One client.
 
     Attributes:
@@ -108,12 +96,10 @@ class Connection:
 
     @property
     def has_room(self) -> bool:
-        """Whether a reply still fits."""
         return len(self.outgoing) < BUFFER
 
     @property
     def has_request(self) -> bool:
-        """Whether a whole request was received."""
         # The last one of a client that has ended may lack its newline.
         return b"\n" in self.incoming or (self.ended and bool(self.incoming))
 
@@ -151,7 +137,7 @@ class ControlServer:
         self._listener, self._identity = listen(path, backlog=MAX_CLIENTS)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
-        self._clients: dict[socket.socket, Connection] = {}
+        self._clients: dict[socket.socket, _Client] = {}
         self._polls = 0
         self._open = True
 
@@ -216,7 +202,7 @@ class ControlServer:
         release(self.path, self._listener, self._identity)
         for client in list(self._clients.values()):
             if client.waits and farewell is not None:
-                client.outgoing += reply_line({"ok": True, **farewell})
+                client.outgoing += _reply_line({"ok": True, **farewell})
             self._send(client)
             self._drop(client)
         self._selector.close()
@@ -251,14 +237,14 @@ class ControlServer:
                 return
             if len(self._clients) >= MAX_CLIENTS:
                 silent = min(self._clients.values(), key=lambda client: client.last_poll)
-                silent.outgoing += refusal(f"{MAX_CLIENTS} others are connected")
+                silent.outgoing += _refusal(f"{MAX_CLIENTS} others are connected")
                 self._send(silent)
                 self._drop(silent)
             connection.setblocking(False)
-            self._clients[connection] = Connection(connection, self._polls)
+            self._clients[connection] = _Client(connection, self._polls)
             self._selector.register(connection, selectors.EVENT_READ)
 
-    def _receive(self, client: Connection) -> None:
+    def _receive(self, client: _Client) -> None:
         try:
             data = client.socket.recv(_READ)
         except BlockingIOError:
@@ -272,7 +258,7 @@ class ControlServer:
         client.last_poll = self._polls
         client.incoming += data
 
-    def _answer(self, client: Connection, end_ns: int) -> None:
+    def _answer(self, client: _Client, end_ns: int) -> None:
         """Answer the whole requests, as far as budget and buffer allow."""
         client.more = False
         if client.waits:
@@ -286,26 +272,26 @@ class ControlServer:
                 client.more = not client.waits and client.has_request
                 return
         if len(client.incoming) > BUFFER:
-            client.outgoing += refusal(TOO_LONG)
+            client.outgoing += _refusal(TOO_LONG)
             client.incoming.clear()
             client.closing = True
 
     def _reply(self, line: bytes) -> bytes | None:
         self.requests += 1
         try:
-            reply = self._handler(read_request(line))
+            reply = self._handler(_read_request(line))
             if reply is None:
                 return None
-            data = reply_line({"ok": True, **reply})
+            data = _reply_line({"ok": True, **reply})
         except UndulogError as error:
-            return refusal(str(error))
+            return _refusal(str(error))
         except Exception as error:  # noqa: BLE001 - no request ends the recording
             if len(self._faults) < _MOST_FAULTS:
                 self._faults.append(f"a request failed with {error!r}: {line[:80]!r}")
-            return refusal(f"a mistake of the recorder's own: {error!r}")
-        return data if len(data) <= BUFFER else refusal(f"the reply has {len(data)} bytes")
+            return _refusal(f"a mistake of the recorder's own: {error!r}")
+        return data if len(data) <= BUFFER else _refusal(f"the reply has {len(data)} bytes")
 
-    def _send(self, client: Connection) -> None:
+    def _send(self, client: _Client) -> None:
         """Send without waiting; receive from the client only while it takes its replies."""
         try:
             while client.outgoing:
@@ -325,7 +311,7 @@ class ControlServer:
         wanted |= selectors.EVENT_WRITE if client.outgoing else 0
         self._watch(client, wanted)
 
-    def _watch(self, client: Connection, events: int) -> None:
+    def _watch(self, client: _Client, events: int) -> None:
         watched = self._selector.get_map().get(client.socket)
         if watched is not None and watched.events == events:
             return
@@ -334,7 +320,7 @@ class ControlServer:
         if events:
             self._selector.register(client.socket, events)
 
-    def _drop(self, client: Connection) -> None:
+    def _drop(self, client: _Client) -> None:
         if self._clients.pop(client.socket, None) is None:
             return
         with suppress(KeyError):  # not registered: full, or ended

@@ -2,14 +2,13 @@
 
 import contextlib
 import json
-import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
 
-from support.processes import wait_for
+from support.processes import start, wait_for
 from undulog.capture.common.errors import DataError
 
 PATIENCE_S = 60.0
@@ -82,7 +81,8 @@ def drain(server, client, count):
     return replies(data)
 
 
-def start_recorder(path, extra=""):
+@contextlib.contextmanager
+def started_recorder(path, extra="", first="ready\n"):
     """A process that serves the socket until it is killed; says 'ready' or why not."""
     code = (
         "import sys, time\n"
@@ -99,11 +99,10 @@ def start_recorder(path, extra=""):
         "    server.poll()\n"
         "    time.sleep(0.005)\n"
     )
-    return subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True
-    )
-
-
-def end(process):
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
+    process = start(sys.executable, "-c", code, stdin=subprocess.PIPE)
+    try:
+        assert process.stdout.readline() == first
+        yield process
+    finally:
+        process.kill()
+        process.communicate()

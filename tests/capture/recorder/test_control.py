@@ -19,11 +19,10 @@ from support.control_clients import (
     connected,
     drain,
     echo,
-    end,
     polled,
     polls,
     replies,
-    start_recorder,
+    started_recorder,
 )
 from support.processes import wait_for
 from undulog.capture.common.errors import ControlError
@@ -262,19 +261,14 @@ def test_the_reply_to_a_later_answer_comes_with_the_close(server):
 
 def test_a_client_is_told_when_the_recorder_dies_before_it_answers(tmp_path):
     path = tmp_path / "c.sock"
-    process = start_recorder(path)
-    try:
-        assert process.stdout.readline() == "ready\n"
-        with ControlClient(path) as client:
+    with started_recorder(path) as process, ControlClient(path) as client:
+        client.ask({"do": "x"})
+        process.send_signal(signal.SIGSTOP)
+        killer = threading.Timer(0.3, process.send_signal, [signal.SIGKILL])
+        killer.start()
+        with pytest.raises(ControlError, match="the recorder went"):
             client.ask({"do": "x"})
-            process.send_signal(signal.SIGSTOP)
-            killer = threading.Timer(0.3, process.send_signal, [signal.SIGKILL])
-            killer.start()
-            with pytest.raises(ControlError, match="the recorder went"):
-                client.ask({"do": "x"})
-            killer.join()
-    finally:
-        end(process)
+        killer.join()
 
 
 def test_a_recorder_that_hangs_is_told(tmp_path):
