@@ -72,7 +72,7 @@ class LiveHealth:
         self._scan = SessionScan(robot, horizon_s=HORIZON_S)
         self._schemas: dict[int, Schema] = {}
         self._topics: dict[int, _Topic] = {}
-        self._frames: dict[str, deque[tuple[int, int]]] = {}
+        self._sources: dict[str, _Topic] = {}
         self._measured: dict[int, ChannelMeasures] = {}
         self._scanned: set[int] = set()
         self._unmeasured: dict[int, int] = {}  # log time up to which a channel's measure goes
@@ -251,20 +251,18 @@ class LiveHealth:
         counts = source.counts
         topics = [prefix + source.name for prefix in FRAME_TOPIC_PREFIXES]
         buses: list[BusHealth] = [bus for bus in self.result().buses if bus.topic in topics]
-        rates = [
-            _Topic(topic, recent=self._frames[topic]).rate_hz()
-            for topic in topics
-            if self._frames.get(topic)
-        ]
-        rates = [rate for rate in rates if rate is not None]
+        frames = None if source.robot is not None and not counts.frames else counts.frames
+        recent = self._sources.setdefault(source.name, _Topic(source.name))
+        if frames is not None and self._now_ns:
+            recent.recent.append((self._now_ns, frames))
         last = max((t.last_ns for t in self._topics.values() if t.name in topics), default=0)
         return SourceSnapshot(
             name=source.name,
             address=address,
             connected=source.connected,
             finished=source.finished,
-            frames=None if source.robot is not None and not counts.frames else counts.frames,
-            rate_hz=sum(rates) if rates else None,
+            frames=frames,
+            rate_hz=recent.rate_hz(),
             age_s=max(self._now_ns - last, 0) / _NS if last else None,
             dropped=counts.dropped,
             malformed=counts.malformed,

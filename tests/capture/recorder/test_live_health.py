@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from undulog.capture.log.sinks.mcap_sink import Description, McapSink, MessageSi
 from undulog.capture.recorder import health as live_health
 from undulog.capture.recorder.health import LiveHealth
 from undulog.capture.recorder.storage import TappedSink
+from undulog.capture.sources.contract import SourceCounts
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NS = 1_000_000_000
@@ -253,6 +255,20 @@ def test_rates_ages_and_gaps_are_those_of_the_last_seconds(tmp_path: Path) -> No
         topics = {topic.topic: topic for topic in health.topics()}
         assert topics["/joint_states"].age_s == pytest.approx(3.0)
         assert topics["/joint_states"].rate_hz < 50.0
+
+
+def test_the_frame_rate_of_a_source_is_that_of_the_last_seconds() -> None:
+    health = LiveHealth(None)
+    counts = SourceCounts()
+    source = SimpleNamespace(name="can0", robot=None, counts=counts, connected=True, finished=False)
+    rates: list[float | None] = []
+    for second in range(20):
+        health.update(EPOCH_NS + second * NS)
+        rates.append(health.source(source, "can:socketcan:can0", None).rate_hz)
+        counts.frames += 800 if second < 10 else 400
+    assert rates[0] is None
+    assert rates[1:11] == [800.0] * 10
+    assert rates[-1] == 400.0
 
 
 def test_stepping_looks_at_one_channel_a_tick_and_loses_none(tmp_path: Path) -> None:
