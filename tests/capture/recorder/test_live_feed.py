@@ -131,12 +131,7 @@ def messages(records):
 @given(
     st.lists(
         st.tuples(
-            st.integers(0, 2**16 - 1),
-            st.integers(0, 2**32 - 1),
-            st.integers(0, 2**64 - 1),
-            st.integers(0, 2**64 - 1),
-            st.integers(0, 2**64 - 1),
-            st.binary(max_size=300),
+            *(st.integers(0, 2**n - 1) for n in (16, 32, 64, 64, 64)), st.binary(max_size=300)
         ),
         max_size=20,
     ),

@@ -100,16 +100,23 @@ def test_frames_come_back_exactly_and_mean_what_the_map_says(output, bus):
         ).all()
 
 
-def test_the_verdict_at_the_end_is_that_of_a_check(output, bus):
+def test_unknown_identifiers_and_losses_are_told_and_the_verdict_is_that_of_a_check(output, bus):
     frames, _ = polling(300)
-    lost = np.ones(len(frames), dtype=bool)
-    lost[5000:7000] = False
+    frames = np.delete(frames, slice(5000, 7000))
+    frames["id_flags"][::50] = 0x7AB
+    unknown = len(frames[::50])
     with recording(output, f"can0=unix:{bus}", "--robot", "snake25") as process:
-        send(bus, frames[lost])
+        send(bus, frames)
         report, _ = ended(process, signal.SIGTERM)
     health = check_session(output)
     assert report["verdict"] == health.verdict == health.stored != "good"
     assert tuple(report["reasons"]) == health.reasons == health.stored_reasons
+    text = "identifiers that are in no database: 7AB"
+    assert {("can0", text), ("can0", f"{unknown} frames with {text} ({unknown})")} <= {
+        *events(output)
+    }
+    with Session.open(output) as session:
+        assert (session.frames("/can/can0")["id_flags"] == 0x7AB).sum() == unknown
 
 
 def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
@@ -124,19 +131,6 @@ def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
         np.testing.assert_array_equal(np.diff(states.t_ns[0]), 10_000_000)
         assert len(states.t_ns[0]) == report["sources"]["flat"]["frames"] == 401
         assert {"scenario.toml", "robot.urdf", "robot.toml"} <= set(session.attachments)
-
-
-def test_unknown_identifiers_are_told_and_kept(output, bus):
-    frames, _ = polling(200)
-    frames["id_flags"][::50] = 0x7AB
-    with recording(output, f"can0=unix:{bus}", "--robot", "snake25") as process:
-        send(bus, frames)
-        ended(process, signal.SIGINT)
-    said = events(output)
-    assert ("can0", "identifiers that are in no database: 7AB") in said
-    assert ("can0", "200 frames with identifiers that are in no database: 7AB (200)") in said
-    with Session.open(output) as session:
-        assert (session.frames("/can/can0")["id_flags"] == 0x7AB).sum() == 200
 
 
 # -- the end ----------------------------------------------------------------------------------

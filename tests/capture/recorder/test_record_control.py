@@ -104,13 +104,6 @@ def test_a_recording_from_status_to_stop(recorder, place, capsys):
     assert find_sockets(os.environ) == []
 
 
-def test_stop_without_wait_answers_at_once_and_the_recorder_ends(recorder, capsys):
-    process = recorder("run")
-    assert said(capsys, "stop") == (0, "stopping\n", "")
-    process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 0
-
-
 def test_of_several_recorders_one_must_be_named(recorder, place, capsys):
     first, second = recorder("one"), recorder("two")
     code, out, _ = said(capsys, "status")
@@ -127,6 +120,9 @@ def test_of_several_recorders_one_must_be_named(recorder, place, capsys):
     assert "one.mcap" in out
     assert "two.mcap" not in out
     assert first.poll() is None
+    assert said(capsys, "stop") == (0, "stopping\n", "")  # without --wait at once
+    first.communicate(timeout=PATIENCE_S)
+    assert (first.returncode, second.returncode) == (0, 0)
 
 
 def test_a_recorder_that_is_killed_while_we_wait_is_told(recorder, capsys):

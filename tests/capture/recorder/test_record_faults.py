@@ -5,6 +5,7 @@ The senders here know what they sent; joint states are counted with mcap's own r
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import socket
@@ -114,32 +115,19 @@ def test_a_failure_of_decoding_costs_the_frames_that_cause_it(
     stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every 200th frame makes one stage raise, as a fault of the program would."""
-    decode, add, write = BusDecoder.decode, SourceClock.add, JointStateChannel.write
-    mapped: list[int] = []
+    owner, method, fails = {
+        "decode": (BusDecoder, "decode", lambda _, args: (args[0]["t_device_ns"] % 200 == 1).any()),
+        "map": (SourceClock, "add", lambda call, _: call % 3 == 0),
+        "write": (JointStateChannel, "write", lambda call, _: call % 11 == 0),
+    }[stage]
+    original, calls = getattr(owner, method), itertools.count(1)
 
-    def failing_decode(self: BusDecoder, frames: FrameArray) -> Any:
-        if (frames["t_device_ns"] % 200 == 1).any():
-            raise ZeroDivisionError("decode")
-        return decode(self, frames)
+    def failing(self: Any, *args: Any, **options: Any) -> Any:
+        if fails(next(calls), args):
+            raise ZeroDivisionError(stage)
+        return original(self, *args, **options)
 
-    def failing_add(self: SourceClock, device: Any, host: Any) -> Any:
-        mapped.append(len(device))
-        if len(mapped) % 3 == 0:
-            raise ZeroDivisionError("map")
-        return add(self, device, host)
-
-    def failing_write(self: JointStateChannel, t_ns: int, *fields: Any, **options: Any) -> None:
-        mapped.append(1)
-        if len(mapped) % 11 == 0:
-            raise ZeroDivisionError("write")
-        write(self, t_ns, *fields, **options)
-
-    if stage == "decode":
-        monkeypatch.setattr(BusDecoder, "decode", failing_decode)
-    elif stage == "map":
-        monkeypatch.setattr(SourceClock, "add", failing_add)
-    else:
-        monkeypatch.setattr(JointStateChannel, "write", failing_write)
+    monkeypatch.setattr(owner, method, failing)
     frames = polling()
     odd = np.arange(len(frames)) % (20 * 2 * JOINTS) == 77  # in every 20th cycle
     frames["t_device_ns"] += 200 - frames["t_device_ns"] % 200 + odd
