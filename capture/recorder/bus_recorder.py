@@ -1,9 +1,9 @@
-"""One bus of a recording: its raw frames at once, and what they mean a little later.
+"""One bus of a recording: its raw frames are written at once, and decoded a little later.
 
-A raw frame is safe as soon as it is written; decoding can wait, since it can be done again from
+A raw frame is safe as soon as it is written; decoding can wait, since it can be repeated from
 the raw frames at any time. So a burst fills the queue of frames to decode and delays nothing else.
-Frames that can't be decoded, for a reason that nobody foresaw, are tried again in smaller pieces;
-single frames that still fail are kept raw only.
+Frames whose decoding fails unexpectedly are tried again in smaller pieces; single frames that
+still fail are kept raw only.
 """
 
 from __future__ import annotations
@@ -28,10 +28,7 @@ from .source_clock import SourceClock
 
 
 def robot_of(settings: RecordSettings, sources: Sequence[Source]) -> Robot | None:
-    """The robot that is recorded: named by the settings, or brought by a source.
-
-    Returns:
-        The robot; None where nobody says which.
+    """Return the robot of the settings, or that of a source, or None.
 
     Raises:
         UsageError: If there would be several.
@@ -54,16 +51,10 @@ def robot_of(settings: RecordSettings, sources: Sequence[Source]) -> Robot | Non
 def decoded_source(
     settings: RecordSettings, sources: Sequence[Source], robot: Robot | None
 ) -> str | None:
-    """The source whose frames are the robot's bus; the others are kept raw.
-
-    Args:
-        settings: The settings; ``bus`` names it.
-
-    Returns:
-        Its name; None where no frames can be decoded.
+    """Return the name of the source that is the robot's bus; None if no frames can be decoded.
 
     Raises:
-        UsageError: If there is no such source, or it is not clear which one it is.
+        UsageError: If there is no such source, or several are possible.
     """
     buses = [source.name for source in sources if source.robot is None]
     if settings.bus is not None:
@@ -107,8 +98,8 @@ class BusRecorder:
 
         Args:
             clock: Maps the device's times onto the session's clock.
-            robot: Whose bus this is: its frames are decoded. None: they are only kept.
-            directions: Whether the frames tell sent from received.
+            robot: Its bus map decodes the frames; None to keep them raw only.
+            directions: Whether the frames distinguish sent from received.
 
         Raises:
             DataError: If the robot has no bus map.
@@ -134,16 +125,16 @@ class BusRecorder:
 
     @property
     def behind(self) -> bool:
-        """Whether decoded messages are to be written, or frames to be decoded for a whole slice."""
+        """Whether decoded messages wait to be written, or a whole slice of frames to be decoded."""
         return bool(self._messages or self._again) or self.backlog >= self._slice_size
 
     @property
     def decodes(self) -> bool:
-        """Whether the frames are decoded, too."""
+        """Whether the frames are decoded."""
         return self._decoder is not None
 
     def add(self, frames: FrameArray) -> None:
-        """Take frames; they are not written yet.
+        """Queue frames for :meth:`write_raw`.
 
         Args:
             frames: Records of :data:`.FRAME_DTYPE` or, CAN FD frames, of
@@ -152,29 +143,19 @@ class BusRecorder:
         self._fresh.append(frames)
 
     def keep(self, frames: FrameArray, now_ns: Callable[[], int]) -> None:
-        """Write classic frames that are not to be decoded, after those taken before.
+        """Write classic frames that are not decoded, behind those of :meth:`add`.
 
         Args:
             frames: Records of :data:`.FRAME_DTYPE`, shape (n,), e.g. commands
                 that the session has anyway.
             now_ns: The session's clock.
-
-        Raises:
-            LogWriteError: If they can't be written.
         """
         self.write_raw(now_ns)
         for batch in _batches([frames]):
             self._raw.write(now_ns(), batch)
 
     def write_raw(self, now_ns: Callable[[], int]) -> None:
-        """Write the frames taken since the last call.
-
-        Args:
-            now_ns: The session's clock.
-
-        Raises:
-            LogWriteError: If they can't be written.
-        """
+        """Write the frames added since the last call; ``now_ns`` is the session's clock."""
         if not self._fresh:
             return
         fresh, self._fresh = self._fresh, []
@@ -190,7 +171,7 @@ class BusRecorder:
             self._raw.write(now_ns(), batch)
         for batch in _batches(fd):
             self._raw_fd.write(now_ns(), batch)
-        # Sources hand out the kinds one after the other; on the bus they took turns.
+        # Sources return the kinds one after the other; on the bus they are mixed.
         both = in_one(fresh)
         self._wait(both[np.lexsort((both["t_device_ns"], both["t_host_ns"]))])
 
@@ -199,16 +180,13 @@ class BusRecorder:
         self.backlog += len(frames)
 
     def decode(self, now_ns: Callable[[], int], until_ns: int, *, rest: bool = True) -> None:
-        """Decode what waits, slice by slice, and write what was decoded.
+        """Decode the waiting frames, slice by slice, and write the messages.
 
         Args:
             now_ns: The session's clock.
             until_ns: No message is written after this time [Unix ns], and no slice is begun that
-                would last longer; but one slice at least, so that it goes on.
-            rest: Also decode fewer frames than make a whole slice: these cost more each.
-
-        Raises:
-            LogWriteError: If the messages can't be written.
+                would last longer, except for the first of the call.
+            rest: Also decode the frames of an incomplete slice, which cost more each.
         """
         now, idle = now_ns(), True
         while True:
@@ -247,7 +225,7 @@ class BusRecorder:
             self._slice_size = min(self._slice_size * 2, _FRAMES_PER_SLICE)
 
     def take_faults(self) -> list[str]:
-        """Failures to decode since the last call, one sentence for each kind."""
+        """Return the failures of decoding since the last call, one sentence for each kind."""
         faults, self._faults = self._faults, Counter()
         return [
             f"decoding failed with {fault} and goes on; {count} frames are kept raw only"
@@ -255,7 +233,7 @@ class BusRecorder:
         ]
 
     def _mapped(self) -> FrameArray:
-        """The next frames to decode, at their times on the session's clock."""
+        """Return the next frames to decode, at their times on the session's clock."""
         frames = self._slice()
         try:
             frames["t_host_ns"] = self._clock.add(frames["t_device_ns"], frames["t_host_ns"])
@@ -265,7 +243,7 @@ class BusRecorder:
         return frames
 
     def _try_again(self, frames: FrameArray, fault: str) -> None:
-        """Decode frames that failed once more, in pieces; a single one is given up."""
+        """Queue failed frames again, in pieces; a single one is given up."""
         self._faults[fault] += 0
         if len(frames) > 1:
             size = -(-len(frames) // _PIECES)
@@ -280,7 +258,7 @@ class BusRecorder:
             self._failures = 0
 
     def _slice(self) -> FrameArray:
-        """The next frames to decode: few enough for one tick."""
+        """Return the next frames to decode, few enough for one tick."""
         slices, room = list[FrameArray](), self._slice_size
         while self._waiting and room:
             batch = self._waiting.popleft()
@@ -293,14 +271,7 @@ class BusRecorder:
         return in_one(slices)
 
     def finish(self, now_ns: Callable[[], int]) -> None:
-        """Write everything that is left.
-
-        Args:
-            now_ns: The session's clock.
-
-        Raises:
-            LogWriteError: If it can't be written.
-        """
+        """Write and decode the rest; ``now_ns`` is the session's clock."""
         self.write_raw(now_ns)
         self.decode(now_ns, 1 << 63)
         if self._topics is None:
@@ -325,7 +296,7 @@ class BusRecorder:
 
 
 def _batches(fresh: list[FrameArray]) -> Iterator[FrameArray]:
-    """Frames of one kind, few enough for a message each."""
+    """Join frames of one kind and cut them into batches of a message each."""
     if not fresh:
         return
     frames = fresh[0] if len(fresh) == 1 else np.concatenate(fresh)

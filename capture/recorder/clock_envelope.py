@@ -1,11 +1,9 @@
-"""The lower envelope of what a device's clock lags behind the host's: a line under all delays.
+"""The lower envelope of the lag of a device's clock behind the host's: a line below all delays.
 
-A frame arrives after it was sampled, never before, and mostly by more than it must: the delays are
-positive, come in bursts and are stretched by polling. So a line through the middle of the points
-(device time, host minus device time) is late by the mean delay and leans with the load. The line
-that lies under all points and as near to them as can be is neither; where delays are exponential
-it is the likeliest one. It is the edge of the lower convex hull above or below the mean device
-time.
+The delays of frames are positive, come in bursts and are extended by polling. So a line through the
+middle of the points (device time, host minus device time) is late by the mean delay and changes
+with the load. The nearest line below all points does neither; for exponential delays it is the most
+likely one. It is the edge of the lower convex hull at the mean device time.
 
 Sources: Zhang, Liu, Xia, "Clock synchronization algorithms for network measurements", INFOCOM
 2002; Moon, Skelly, Towsley, "Estimation and removal of clock skew from network delay
@@ -19,42 +17,42 @@ from collections import deque
 from dataclasses import dataclass
 
 BUCKETS = 120
-"""Points that are kept: each is the least delayed sample of half a second, so a minute. Over a
-minute a quartz keeps its rate to far better than 1 ppm, over an hour in the sun it does not."""
+"""Number of points: each is the least delayed sample of half a second, so a minute. Over a minute a
+quartz keeps its rate to far better than 1 ppm, over an hour in the sun it does not."""
 
 BUCKET_NS = 500_000_000
 
 MIN_BUCKETS = 4
-"""Fewer points give no rate."""
+"""Least number of points for a rate."""
 
 PRIOR = 1e-4
-"""Rates that are expected before anything is known: 100 ppm, a plain quartz. The rate is drawn
-towards nothing as far as the points are less certain than this."""
+"""Standard deviation of the rate before the first points: 100 ppm, a plain quartz. The rate is
+drawn towards 0 as far as the points are less certain than this."""
 
 SAME_DEVICE = 2e-5
-"""The same after the clock was set or restarted: it is most likely the same quartz."""
+"""The same after the clock was set or restarted: most likely it is the same quartz."""
 
 MAX_RATE = 0.02
-"""Further off than this is no clock; a cheap RC oscillator is within 2 %."""
+"""Largest rate; a cheap RC oscillator is within 2 %."""
 
 STEP_NS = 3_000_000.0
-"""A line that has to move by more than this, and by more than :data:`STEP_SPREADS`, was true of
-another time: the points before are forgotten."""
+"""A line that has to move by more than this [ns], and by more than :data:`STEP_SPREADS`, is
+outdated: the points before are dropped."""
 
 STEP_SPREADS = 10.0
 """Mean distances of the points from the line."""
 
 STEP_BUCKETS = 10
-"""Points in a row that lie above before they are believed: a loaded host is late for a while."""
+"""Number of consecutive points above the line for a step: a loaded host is late for a while."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """What to add to a device time: ``offset_ns + rate * (device - origin)``.
+    """Difference between host and device time: ``offset_ns + rate * (device - origin)``.
 
     Attributes:
         offset_ns: At the origin [ns].
-        rate: Host seconds a device second, less one.
+        rate: Host seconds a device second, minus one.
         uncertainty: Of the rate, one standard deviation.
         spread_ns: Mean distance of the points from the line [ns].
     """
@@ -68,16 +66,16 @@ class Line:
 class Envelope:
     """The least delayed points of the last minute and the line below them.
 
-    Coordinates are relative to an origin that the owner chooses; x is the device time, y is host
-    minus device time, both in ns.
+    Coordinates are relative to an origin of the caller's; x is the device time, y is host minus
+    device time, both in ns.
     """
 
     def __init__(self, rate: float = 0.0, sigma: float = PRIOR) -> None:
         """Start without points.
 
         Args:
-            rate: What the rate is expected to be.
-            sigma: How well that is known.
+            rate: Expected rate.
+            sigma: Its standard deviation.
         """
         self.line = Line(0.0, rate, sigma, 0.0)
         self._prior = (rate, sigma)
@@ -86,7 +84,7 @@ class Envelope:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no point yet."""
+        """Whether it has no point yet."""
         return self._least is None and not self._points
 
     @property
@@ -95,12 +93,7 @@ class Envelope:
         return len(self._points) >= MIN_BUCKETS
 
     def take(self, x: float, y: float) -> None:
-        """Take the point that lies lowest above the line among the latest samples.
-
-        Args:
-            x: Device time [ns].
-            y: Host minus device time [ns].
-        """
+        """Add the point that is lowest above the line among the latest samples."""
         line = self.line
         height = y - line.offset_ns - line.rate * x
         if self.empty:
@@ -108,14 +101,14 @@ class Envelope:
         elif height < 0.0:
             step = max(STEP_NS, STEP_SPREADS * line.spread_ns)
             if -height > step and len(self._points) >= STEP_BUCKETS:
-                self._forget(0)
+                self._drop_before(0)
             self.line = Line(line.offset_ns + height, *_rest(self.line))
         least = self._least
         if least is None or y - line.rate * x < least[1] - line.rate * least[0]:
             self._least = (x, y)
 
     def close_bucket(self) -> None:
-        """Half a second is over: its least delayed sample becomes a point of the envelope."""
+        """Make the least delayed sample of half a second a point of the envelope."""
         if self._least is None:
             return
         self._points.append(self._least)
@@ -128,14 +121,14 @@ class Envelope:
         heights = [self._height(x, y) for x, y in self._points]
         spread = sum(heights[:before]) / before
         if min(heights[before:]) > max(STEP_NS, STEP_SPREADS * spread):
-            self._forget(STEP_BUCKETS)
+            self._drop_before(STEP_BUCKETS)
             self._fit()
 
     def _height(self, x: float, y: float) -> float:
         return y - self.line.offset_ns - self.line.rate * x
 
-    def _forget(self, kept: int) -> None:
-        """Drop all but the last points; what is known of the rate stays as an expectation."""
+    def _drop_before(self, kept: int) -> None:
+        """Drop all but the last points; the rate becomes the expected one."""
         line = self.line
         sigma = max(3.0 * line.uncertainty, 1e-6) if self.settled else self._prior[1]
         self._prior = (line.rate, min(sigma, PRIOR))
@@ -166,11 +159,11 @@ def _rest(line: Line) -> tuple[float, float, float]:
 
 
 def _edge_rate(points: list[tuple[float, float]]) -> float:
-    """Slope of the lower hull's edge at the mean x: the line under all points and nearest."""
+    """Return the slope of the lower hull's edge at the mean x, the nearest line below."""
     hull: list[tuple[float, float]] = []
     for x, y in points:
         if hull and hull[-1][0] == x:
-            continue  # sorted: the one that is there is lower
+            continue  # sorted: the present one is lower
         while len(hull) >= 2 and _turns_down(hull[-2], hull[-1], (x, y)):
             hull.pop()
         hull.append((x, y))

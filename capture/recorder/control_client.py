@@ -1,4 +1,4 @@
-"""A client of the control socket: for the command line, and for controllers that tell their gait.
+"""A client of the control socket: for the command line, and for controllers that log their gait.
 
 A controller keeps its connection::
 
@@ -37,7 +37,7 @@ Identity = tuple[int, int]
 
 
 def socket_folder(environ: Mapping[str, str]) -> Path:
-    """Where a recorder puts its socket: one folder a user, so that a client finds them all.
+    """Return the folder of the sockets of all recorders of this user.
 
     Returns:
         ``$RUNTIME_DIRECTORY`` (a service: below ``/run/undulog``), else
@@ -52,10 +52,10 @@ def socket_folder(environ: Mapping[str, str]) -> Path:
 
 
 def default_sockets(output: Path, environ: Mapping[str, str]) -> tuple[Path, Path]:
-    """The usual sockets of a recording, named after its output; makes the folder.
+    """Return the default sockets of a recording, named after its output; make their folder.
 
     Returns:
-        The path, e.g. ``/run/user/1000/undulog/run.sock``, and the one to use where a recorder
+        The path, e.g. ``/run/user/1000/undulog/run.sock``, and a second one in case that a recorder
         into another folder listens there, e.g. ``run-1c291ca3.sock``.
 
     Raises:
@@ -75,34 +75,27 @@ def default_sockets(output: Path, environ: Mapping[str, str]) -> tuple[Path, Pat
 
 
 def find_sockets(environ: Mapping[str, str]) -> list[Path]:
-    """The control sockets of running recorders that this user can see.
-
-    Returns:
-        Those where somebody listens, sorted; of this user, and of services.
-    """
+    """Return the control sockets of the running recorders of this user and of services, sorted."""
     folder = socket_folder(environ)
     found = {path for where in (folder, _SYSTEM_FOLDER) for path in _sockets_below(where)}
-    return sorted(path for path in found if _somebody_listens(path))
+    return sorted(path for path in found if _is_in_use(path))
 
 
 def listen(
     path: Path, *, backlog: int, patience_s: float = LOCK_PATIENCE_S
 ) -> tuple[socket.socket, Identity]:
-    """Make a socket that only this user can reach, from its first moment.
+    """Make a non-blocking socket that only this user can connect to, from its first moment.
 
-    A stale one, left by a recorder that was killed, is replaced; a lock on the folder keeps two
-    recorders from replacing each other's.
+    The stale socket of a killed recorder is replaced; a lock on the folder keeps two recorders from
+    replacing each other's.
 
     Args:
-        backlog: How many callers may wait.
-        patience_s: Longest wait for another recorder that is at it just now [s].
-
-    Returns:
-        The non-blocking socket, and what its file is, for :func:`release`.
+        backlog: Number of callers that may wait.
+        patience_s: Longest wait for the lock [s].
 
     Raises:
-        SocketInUseError: If somebody listens there.
-        ControlError: If it is no socket, or it can't be made.
+        SocketInUseError: If another recorder listens there.
+        ControlError: If another file is there, or the socket can't be made.
     """
     if len(os.fsencode(path)) > _LONGEST_PATH:
         raise ControlError(
@@ -125,12 +118,8 @@ def listen(
 
 
 def release(path: Path, listener: socket.socket, identity: Identity) -> None:
-    """Close the socket and remove its file, if that is still ours.
-
-    Args:
-        identity: What :func:`listen` said of it.
-    """
-    with suppress(OSError):  # a folder that has gone took the file along
+    """Close the socket and remove its file, unless that was replaced."""
+    with suppress(OSError):  # removed with its folder
         found = path.lstat()
         if (found.st_dev, found.st_ino) == identity:
             path.unlink()
@@ -144,32 +133,32 @@ def _remove_stale(path: Path) -> None:
         return
     if not stat.S_ISSOCK(found.st_mode):
         raise ControlError(f"{path} is there and no socket; name another with --socket")
-    if _somebody_listens(path):
+    if _is_in_use(path):
         raise SocketInUseError(
             f"{path}: another recorder listens there; end it, or name another with --socket"
         )
     path.unlink()
 
 
-def _somebody_listens(path: Path) -> bool:
+def _is_in_use(path: Path) -> bool:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as caller:
         caller.setblocking(False)
-        # A full backlog (EAGAIN) and another user's socket (EACCES) are somebody's too.
+        # A full backlog (EAGAIN) and another user's socket (EACCES) are in use too.
         return caller.connect_ex(os.fspath(path)) not in (errno.ECONNREFUSED, errno.ENOENT)
 
 
 def _sockets_below(folder: Path) -> list[Path]:
-    """Sockets in a folder and the folders in it (a service has one each)."""
+    """Return the sockets in a folder and in its folders (of services)."""
     found: list[Path] = []
     for pattern in (f"*{_SUFFIX}", f"*/*{_SUFFIX}"):
-        with suppress(OSError):  # a folder that is not there, or not ours to read
+        with suppress(OSError):  # no such folder, or not readable
             found += [path for path in folder.glob(pattern) if path.is_socket()]
     return found
 
 
 @contextmanager
 def _locked(folder: Path, patience_s: float) -> Generator[None]:
-    """Hold the folder's lock; it goes with the process, whatever becomes of that."""
+    """Hold the folder's lock, which the kernel releases if the process dies."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         deadline = time.monotonic() + patience_s
@@ -187,7 +176,7 @@ def _locked(folder: Path, patience_s: float) -> Generator[None]:
 
 
 PATIENCE_S = 10.0
-"""So long a client waits for a reply by default [s]: a recorder answers within a few ticks."""
+"""Default time limit of a reply [s]: a recorder answers within a few ticks."""
 
 
 class ControlClient:
@@ -200,7 +189,7 @@ class ControlClient:
             patience_s: Longest wait for a reply [s]; None for ever.
 
         Raises:
-            ControlError: If nobody listens there, or the socket is another user's.
+            ControlError: If no recorder listens there, or the socket is another user's.
         """
         self.path = path
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -208,15 +197,14 @@ class ControlClient:
         self._buffer = bytearray()
         try:
             self._socket.connect(os.fspath(path))
-        except (FileNotFoundError, ConnectionRefusedError) as error:
-            self._socket.close()
-            raise ControlError(f"{path}: no recorder listens there") from error
         except OSError as error:
             self._socket.close()
-            raise ControlError(f"{path}: can't be reached: {error}") from error
+            absent = isinstance(error, FileNotFoundError | ConnectionRefusedError)
+            reason = "no recorder listens there" if absent else f"can't be reached: {error}"
+            raise ControlError(f"{path}: {reason}") from error
 
     def __enter__(self) -> Self:
-        """Nothing to do: it is connected."""
+        """Return the connected client."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -233,22 +221,22 @@ class ControlClient:
             The reply without its ``ok``.
 
         Raises:
-            ControlError: If the recorder refuses, doesn't answer in time, or ends before it has.
+            ControlError: If the recorder refuses, exceeds the time limit, or ends before its reply.
         """
         return self.ask_all([request])[0]
 
     def ask_all(self, requests: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """Send several requests at once and wait for all replies: a recorder answers once a tick.
+        """Send several requests at once, as a recorder answers once a tick, and wait.
 
         Args:
-            requests: See :mod:`.recorder.control_requests`; some 100 at most, so that neither
-                side's buffer is full before the other one reads.
+            requests: As for :meth:`ask`; some 100 at most, so that neither side's buffer is full
+                before the other one reads.
 
         Returns:
             The replies without their ``ok``, in order.
 
         Raises:
-            ControlError: If the recorder refuses one, doesn't answer in time, or ends before.
+            ControlError: As :meth:`ask`.
         """
         lines = [json.dumps(request, allow_nan=False).encode() + b"\n" for request in requests]
         try:
@@ -260,7 +248,7 @@ class ControlClient:
                 self._buffer += data
         except TimeoutError as error:
             patience_s = self._socket.gettimeout()
-            self.close()  # a late answer would pass for that to the next request
+            self.close()  # a late answer would be taken for that to the next request
             raise ControlError(f"{self.path}: no answer in {patience_s:g} s") from error
         except OSError as error:
             raise ControlError(f"{self.path}: the recorder went: {error}") from error
@@ -273,7 +261,7 @@ class ControlClient:
         return replies
 
     def _read(self, line: bytes) -> dict[str, Any]:
-        """A reply, with its ``ok``."""
+        """Parse a reply."""
         try:
             reply = cast("dict[str, Any]", json.loads(line))
             reply["ok"] = bool(reply["ok"])

@@ -1,15 +1,15 @@
-"""What a running recording can be asked: requests checked and carried out.
+"""Requests to a running recording: checked and carried out.
 
 ======== ============================================ ==============================================
-``do``   further keys                                 what happens
+``do``   further keys                                 effect
 ======== ============================================ ==============================================
-status                                                the reply says how the recording goes
+status                                                the reply has the state of the recording
 mark     ``text``, ``level`` (both optional)          ``/rosout``; a ring is written to a file
 note     ``text``, ``level`` (optional)               ``/rosout``
 split                                                 a new part begins
 stop     ``wait`` (optional)                          the recording ends; with ``wait`` the reply
                                                       comes when the file is whole
-gait     ``values``, ``t_ns`` (optional)              ``/gait``: what a controller meant, and when
+gait     ``values``, ``t_ns`` (optional)              ``/gait``: commanded parameters and their time
 mode     ``text``                                     ``/gait/mode``
 ======== ============================================ ==============================================
 """
@@ -25,10 +25,10 @@ from ..common.errors import ControlError
 from ..common.strict_table import finite_number, listed, shown
 from ..log.write.channels import JointStateChannel, StringChannel
 from ..log.write.writer import SessionWriter
-from .control import LATER, Handler
+from .control import Reply
 
 OPERATOR = "operator"
-"""Who says on ``/rosout`` what came in by the control socket."""
+"""Name on ``/rosout`` of the events that come through the control socket."""
 
 _PLANES = ("horizontal", "vertical")
 GAIT_NAMES = tuple(
@@ -37,14 +37,14 @@ GAIT_NAMES = tuple(
     for quantity in ("A", "omega", "lag", "offset", "phase")
 )
 """Values of a plane that ``/gait`` can have; see the log contract. Further values, of joints or of
-what a controller does, have names of the same form: ``joint03.A``, ``steer.offset``."""
+a controller, have names of the same form: ``joint03.A``, ``steer.offset``."""
 
 _FURTHER = re.compile(r"[A-Za-z][A-Za-z0-9_-]*(?:\.[A-Za-z0-9_-]+)+", re.ASCII)
 
 _GAIT_UNIT = "rad, omega in rad/s"
 _LEVELS = ("info", "warn", "error")
 _LONGEST_TEXT = 4096
-_CLOCK_SLACK_NS = 3_600_000_000_000  # a reader takes stamps further off for another clock's
+_CLOCK_SLACK_NS = 3_600_000_000_000  # readers attribute stamps further off to another clock
 
 _KEYS: Mapping[str, frozenset[str]] = {
     "status": frozenset(),
@@ -58,39 +58,22 @@ _KEYS: Mapping[str, frozenset[str]] = {
 
 
 class RecorderActions(Protocol):
-    """What the recorder itself does on request."""
+    """Actions of the recorder on request; each raises an UndulogError to refuse."""
 
-    def status(self) -> Mapping[str, Any]:
-        """How the recording goes, as plain JSON values.
-
-        Returns:
-            At least ``output`` (path), ``elapsed_s``, ``bytes``, ``verdict`` and ``reasons``.
-        """
+    def status(self) -> Reply:
+        """Return the state of the recording as plain JSON values."""
         ...
 
-    def mark(self, text: str) -> Mapping[str, Any]:
-        """Mark this moment; the event is in the log already.
+    def mark(self, text: str) -> Reply:
+        """Mark this moment; a ring is written to the ``file`` of the reply.
 
         Args:
-            text: What the operator says of it; may be empty.
-
-        Returns:
-            What the reply says, e.g. ``file`` that a ring writes.
-
-        Raises:
-            UndulogError: If it can't be done.
+            text: Remark of the operator, which may be empty; it is in the log already.
         """
         ...
 
-    def split(self) -> Mapping[str, Any]:
-        """Begin a new part.
-
-        Returns:
-            What the reply says, e.g. ``part``.
-
-        Raises:
-            UndulogError: If this recording has no parts.
-        """
+    def split(self) -> Reply:
+        """Begin a new part; the reply has its number, ``part``."""
         ...
 
     def stop(self) -> None:
@@ -98,63 +81,69 @@ class RecorderActions(Protocol):
         ...
 
 
-class OperatorLog:
-    """Writes what people and controllers say during a recording."""
+class RequestHandler:
+    """Carries out the requests of the control socket."""
 
     def __init__(
         self,
+        actions: RecorderActions,
         writer: SessionWriter,
         log_event: Callable[[str, str, str], None],
         now_ns: Callable[[], int],
     ) -> None:
-        """Nothing is written yet; channels open with their first message.
+        """Open no channel before its first message.
 
         Args:
-            say: Writes to ``/rosout``: level, who, text.
+            log_event: Writes to ``/rosout``: level, name, text.
             now_ns: The session's clock [Unix ns].
         """
-        self._writer, self._say, self._now_ns = writer, log_event, now_ns
+        self._actions, self._log_event = actions, log_event
+        self._writer, self._now_ns = writer, now_ns
         self._gait: tuple[tuple[str, ...], JointStateChannel] | None = None
         self._mode: StringChannel | None = None
 
-    def note(self, level: str, text: str) -> None:
-        """Write an event to ``/rosout``.
+    def __call__(self, request: Mapping[str, Any]) -> Reply | None:
+        """Carry out a request.
 
-        Args:
-            level: ``info``, ``warn`` or ``error``.
-
-        Raises:
-            LogWriteError: If it can't be written.
-        """
-        self._say(level, OPERATOR, text)
-
-    def mode(self, text: str) -> None:
-        """Write to ``/gait/mode``.
-
-        Args:
-            text: E.g. ``walk``.
+        Returns:
+            The reply; None if it comes with the end of the recording.
 
         Raises:
-            DataError: If a source writes that topic.
-            LogWriteError: If it can't be written.
+            UndulogError: If the request has a fault, or can't be carried out.
         """
+        do = _checked(request)
+        if do == "status":
+            return self._actions.status()
+        if do == "mark":
+            text, level = _text(request, default=""), _level(request)
+            self._log_event(level, OPERATOR, f"mark: {text}" if text else "mark")
+            return self._actions.mark(text)
+        if do == "split":
+            return self._actions.split()
+        if do == "stop":
+            return self._stop(request)
+        if do == "note":
+            self._log_event(_level(request), OPERATOR, _text(request))
+        elif do == "mode":
+            self._write_mode(_text(request))
+        else:
+            self._write_gait(_gait_values(request), _time(request))
+        return {}
+
+    def _stop(self, request: Mapping[str, Any]) -> Reply | None:
+        wait = request.get("wait", False)
+        if not isinstance(wait, bool):
+            raise _invalid("wait", wait, "true or false")
+        self._actions.stop()
+        return None if wait else {}
+
+    def _write_mode(self, text: str) -> None:
         if self._mode is None:
             self._mode = self._writer.string("/gait/mode")
         self._mode.write(self._now_ns(), text)
 
-    def gait(self, values: Mapping[str, float], t_ns: int | None) -> None:
-        """Write one sample to ``/gait``.
-
-        Args:
-            values: Name, see :data:`GAIT_NAMES`, to value; the same names throughout a session.
-            t_ns: When the controller meant it [Unix ns]; now if None.
-
-        Raises:
-            ControlError: If the names are not those of the first sample, or the time is not of
-                this session's clock.
-            DataError: If a source writes that topic.
-            LogWriteError: If it can't be written.
-        """
+    def _write_gait(self, values: Mapping[str, float], t_ns: int | None) -> None:
+        """Write one sample to ``/gait``; the names must be those of the session's first sample."""
         now_ns = self._now_ns()
         if t_ns is not None and abs(t_ns - now_ns) > _CLOCK_SLACK_NS:
             off_s = (t_ns - now_ns) / 1e9
@@ -176,43 +165,8 @@ class OperatorLog:
         channel.write(now_ns if t_ns is None else t_ns, row, log_time_ns=now_ns)
 
 
-def request_handler(actions: RecorderActions, log: OperatorLog) -> Handler:
-    """What a :class:`~.capture.recorder.control.ControlServer` hands its requests to.
-
-    Args:
-        log: Where notes, modes and gaits go.
-    """
-
-    def handle(request: Mapping[str, Any]) -> Any:
-        do = _checked(request)
-        reply: Any = {}
-        if do == "gait":
-            log.gait(_gait_values(request), _time(request))
-        elif do == "status":
-            reply = actions.status()
-        elif do == "mark":
-            text, level = _text(request, default=""), _level(request)
-            log.note(level, f"mark: {text}" if text else "mark")
-            reply = actions.mark(text)
-        elif do == "note":
-            log.note(_level(request), _text(request))
-        elif do == "mode":
-            log.mode(_text(request))
-        elif do == "split":
-            reply = actions.split()
-        else:
-            wait = request.get("wait", False)
-            if not isinstance(wait, bool):
-                raise _invalid("wait", wait, "true or false")
-            actions.stop()
-            reply = LATER if wait else {}
-        return reply
-
-    return handle
-
-
 def _checked(request: Mapping[str, Any]) -> str:
-    """What is to be done, with no key that it doesn't know."""
+    """Return the action of a request that has valid keys only."""
     do = request.get("do")
     if not isinstance(do, str) or do not in _KEYS:
         raise _invalid("do", do, listed(_KEYS, do))
@@ -253,8 +207,7 @@ def _time(request: Mapping[str, Any]) -> int | None:
 def _gait_values(request: Mapping[str, Any]) -> dict[str, float]:
     values: object = request.get("values")
     if not isinstance(values, dict) or not values:
-        found = cast("object", values)
-        raise _invalid("values", found, 'an object such as {"horizontal.A": 0.4}')
+        raise _invalid("values", cast("object", values), 'an object such as {"horizontal.A": 0.4}')
     checked: dict[str, float] = {}
     for name, value in cast("dict[str, object]", values).items():
         if not _is_gait_name(name):

@@ -1,13 +1,14 @@
-"""The health of a running recording, by the very rules that ``undulog log check`` goes by.
+"""The health of a running recording, by the rules of ``undulog log check``.
 
-Every message that was accepted is offered here; once a second those of the last second go through
-the same scan as the chunks of a file, one channel a tick, so the verdict at the end is the one that
-the file's data give. Memory is bounded: what is over for a minute is summed up.
+The sink offers each accepted message here; once a second those of the last second go through
+the same scan as the chunks of a file, one channel a tick, so the verdict at the end is that of the
+file's data. Memory is bounded: data older than a minute are summed up.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict, deque
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,19 +29,19 @@ from .source_clock import SourceClock
 from .status import SourceSnapshot, TopicSnapshot
 
 HORIZON_S = 60
-"""How far the stamps of a running recording may go back [s]: what is older is summed up."""
+"""How far the stamps of a running recording may go back [s]: older data are summed up."""
 
 PIECE = 1 << 17
-"""Bytes of messages that are looked at in one go, about: raw frames come in hundreds of kB."""
+"""Approximate bytes of messages in one step: raw frames come in hundreds of kB."""
 
 ROUND_NS = 1_000_000_000
-"""How often all channels are looked at [ns]."""
+"""Interval of scanning all channels [ns]."""
 
 MEASURE_EVERY = 4
-"""Rounds between two looks at the same channel; what it has gathered meanwhile waits."""
+"""Rounds between two measures of a channel."""
 
 RECENT = 6
-"""Rounds that a rate of the last seconds spans."""
+"""Rounds over which a rate is computed."""
 
 _NS = 1_000_000_000
 
@@ -49,7 +50,7 @@ _Message = tuple[int, int, bytes]  # log time, sequence number, payload
 
 @dataclass
 class _Topic:
-    """What a topic's rate is made of."""
+    """Message counts of a topic, for its rate."""
 
     name: str
     last_ns: int = 0
@@ -57,7 +58,6 @@ class _Topic:
     recent: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=RECENT))
 
     def rate_hz(self) -> float | None:
-        """Over the updates that are remembered."""
         if len(self.recent) < 2:
             return None
         (began, had), (ended, has) = self.recent[0], self.recent[-1]
@@ -65,20 +65,16 @@ class _Topic:
 
 
 class LiveHealth:
-    """Judges a recording while it runs; hears of its records as a listener of its sink."""
+    """Judges a recording while it runs, as a listener of its sink."""
 
     def __init__(self, robot: Robot | None) -> None:
-        """Start with nothing heard.
-
-        Args:
-            robot: The robot that is recorded: its limits, joints and bitrate.
-        """
+        """Start without messages; the robot has limits, joints and the bitrate."""
         self._scan = SessionScan(robot, horizon_s=HORIZON_S)
         self._schemas: dict[int, Schema] = {}
         self._topics: dict[int, _Topic] = {}
-        self._frames: dict[str, deque[tuple[int, int]]] = {}
+        self._sources: dict[str, _Topic] = {}
         self._measured: dict[int, ChannelMeasures] = {}
-        self._heard: set[int] = set()
+        self._scanned: set[int] = set()
         self._unmeasured: dict[int, int] = {}  # log time up to which a channel's measure goes
         self._round_end_ns = 0
         self._round_keys = frozenset[int]()
@@ -92,11 +88,7 @@ class LiveHealth:
         self._latest: SessionMeasures | None = None
 
     def define(self, record: Description) -> None:
-        """Hear of what explains later messages.
-
-        Args:
-            record: Schemas and channels count, the rest is of no concern.
-        """
+        """Take a schema or a channel; other definitions are ignored."""
         if isinstance(record, Schema):
             self._schemas[record.id] = record
         if not isinstance(record, Channel) or record.id in self._topics:
@@ -104,10 +96,8 @@ class LiveHealth:
         schema = self._schemas.get(record.schema_id)
         kind = None
         if schema is not None and (schema.encoding, record.message_encoding) == ("ros2msg", "cdr"):
-            try:
+            with suppress(DataError):  # then only times are examined, as in a file
                 kind = parse_message_type(schema.name, schema.data.decode("utf-8", "replace"))
-            except DataError:  # then only times are looked at, as in a file
-                kind = None
         name = schema.name if schema is not None else ""
         self._topics[record.id] = _Topic(record.topic)
         self._scan.define(record.id, record.topic, name, kind, record.metadata)
@@ -116,24 +106,15 @@ class LiveHealth:
         self,
         channel_id: int,
         log_time_ns: int,
-        publish_time_ns: int,  # noqa: ARG002 - a listener is told all
+        publish_time_ns: int,  # noqa: ARG002 - all listeners have the same arguments
         sequence: int,
         payload: bytes,
     ) -> None:
-        """Hear of a message; it is looked at when the next update comes.
-
-        Args:
-            log_time_ns: When it was recorded [Unix ns].
-            publish_time_ns: When it was sampled [Unix ns].
-            sequence: The channel's own counter.
-        """
+        """Keep a message for the next round; see :meth:`MessageSink.write`."""
         self._pending[channel_id].append((log_time_ns, sequence, payload))
 
     def step(self, now_ns: int) -> None:
-        """Look at messages of one channel, if a second has gone by since all were looked at.
-
-        To be called every tick: a second's work is spread over about as many ticks as there are
-        channels.
+        """Scan the messages of one channel, once a second each; called every tick.
 
         Args:
             now_ns: The session's clock [Unix ns].
@@ -153,7 +134,7 @@ class LiveHealth:
             self._begin_round()
 
     def update(self, now_ns: int | None = None) -> None:
-        """Look at all messages that came so far.
+        """Scan all messages so far.
 
         Args:
             now_ns: The session's clock [Unix ns]; the latest log time by default.
@@ -163,7 +144,7 @@ class LiveHealth:
         self._begin_round()
         while self._round:
             self._add(*self._round.pop())
-        for key in self._heard:
+        for key in self._scanned:
             self._measured[key] = self._scan.measure(key)
         self._unmeasured.clear()
         self._end_round(now_ns)
@@ -181,14 +162,14 @@ class LiveHealth:
         self._in_round = False
         self._rounds += 1
         for key in [key for key in self._unmeasured if key not in self._round_keys]:
-            self._measured[key] = self._scan.measure(key)  # it has fallen silent
+            self._measured[key] = self._scan.measure(key)  # without messages in this round
             del self._unmeasured[key]
         latest = self._round_end_ns = self._span[1] if self._span is not None else 0
         self._now_ns = max(self._now_ns, latest if now_ns is None else now_ns)
         for topic in self._topics.values():
             topic.recent.append((self._now_ns, topic.count))
         self._latest = None
-        self.result()  # it sums up what is over; the snapshot of this second shows it
+        self.result()  # sums up old data; the snapshot of this second uses it
 
     def _add(self, key: int, messages: list[_Message]) -> None:
         log_ns, sequence, payloads = zip(*messages, strict=True)
@@ -198,7 +179,7 @@ class LiveHealth:
         heads["length"] = lengths + FIXED_SIZE
         heads["channel"], heads["sequence"], heads["log"] = key, sequence, log_ns
         self._scan.add(key, b"".join(payloads), np.cumsum(lengths) - lengths - BODY_AT, heads)
-        self._heard.add(key)
+        self._scanned.add(key)
         low, high = min(log_ns), max(log_ns)
         topic = self._topics[key]
         topic.count += len(messages)
@@ -208,7 +189,7 @@ class LiveHealth:
         self._span = low, high
 
     def result(self) -> SessionMeasures:
-        """The verdict on what was looked at so far, with its reasons and all measures."""
+        """Return the verdict on the scanned messages, its reasons and all measures."""
         if self._latest is None:
             start_ns, end_ns = self._span or (0, 0)
             # A channel that was not measured lately is not a channel that ended early.
@@ -217,16 +198,16 @@ class LiveHealth:
         return self._latest
 
     def final(self) -> SessionMeasures:
-        """The verdict on all that came: what is stored when the session is closed.
+        """Return the verdict on all messages, which is stored when the session is closed.
 
-        ``undulog log check`` says the same of the finished file, its container apart, as long as
-        no stamp goes back by more than :data:`HORIZON_S`.
+        ``undulog log check`` of the finished file has the same result, except for faults of the
+        container, if no stamp goes back by more than :data:`HORIZON_S`.
         """
         self.update()
         return self.result()
 
     def topics(self) -> tuple[TopicSnapshot, ...]:
-        """Every topic with messages, when all were last looked at, by name."""
+        """Return the topics with messages at the last scan, by name."""
         joints: dict[str, list[JointHealth]] = {}
         for joint in self.result().joints:
             joints.setdefault(joint.topic, []).append(joint)
@@ -240,7 +221,7 @@ class LiveHealth:
     def _topic(
         self, topic: _Topic, measured: ChannelMeasures, joints: list[JointHealth]
     ) -> TopicSnapshot:
-        # Frames come when a batch is full: their messages have no rhythm of their own.
+        # Messages of frames are written per batch, without a rhythm of their own.
         framed = topic.name.startswith(FRAME_TOPIC_PREFIXES)
         timings = [] if framed else [series.timing for series in measured.series]
         steady = [timing for timing in timings if timing.regular]
@@ -261,32 +242,27 @@ class LiveHealth:
         )
 
     def source(self, source: Source, address: str, clock: SourceClock | None) -> SourceSnapshot:
-        """A source when all were last looked at.
+        """Return the state of a source at the last scan.
 
         Args:
-            address: As the command line named it.
+            address: Address on the command line.
             clock: Maps its times; None for a source that writes its own channels.
-
-        Returns:
-            What it and its frames say.
         """
         counts = source.counts
         topics = [prefix + source.name for prefix in FRAME_TOPIC_PREFIXES]
         buses: list[BusHealth] = [bus for bus in self.result().buses if bus.topic in topics]
-        rates = [
-            _Topic(topic, recent=self._frames[topic]).rate_hz()
-            for topic in topics
-            if self._frames.get(topic)
-        ]
-        rates = [rate for rate in rates if rate is not None]
+        frames = None if source.robot is not None and not counts.frames else counts.frames
+        recent = self._sources.setdefault(source.name, _Topic(source.name))
+        if frames is not None and self._now_ns:
+            recent.recent.append((self._now_ns, frames))
         last = max((t.last_ns for t in self._topics.values() if t.name in topics), default=0)
         return SourceSnapshot(
             name=source.name,
             address=address,
             connected=source.connected,
             finished=source.finished,
-            frames=None if source.robot is not None and not counts.frames else counts.frames,
-            rate_hz=sum(rates) if rates else None,
+            frames=frames,
+            rate_hz=recent.rate_hz(),
             age_s=max(self._now_ns - last, 0) / _NS if last else None,
             dropped=counts.dropped,
             malformed=counts.malformed,
@@ -298,7 +274,7 @@ class LiveHealth:
 
 
 def _pieces(messages: list[_Message]) -> list[list[_Message]]:
-    """Messages in their order, in pieces of about equal numbers."""
+    """Split messages into pieces of about equal numbers, in order."""
     count = -(-sum(len(payload) for _, _, payload in messages) // PIECE) or 1
     size = -(-len(messages) // count)
     return [messages[start : start + size] for start in range(0, len(messages), size)]

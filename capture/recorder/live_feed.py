@@ -1,10 +1,8 @@
-"""Feeds whoever watches, at no cost to the recording: what nobody takes is dropped.
+"""The live feed: sends messages to a relay process without ever delaying the recording.
 
-The recorder must not talk to a viewer itself: one that is frozen makes a send wait for ever. So
-the feed sends datagrams (:mod:`.capture.recorder.live_wire`) to a Unix socket that a relay process
-reads, and never waits: what the socket doesn't take stays in a bounded queue, and what the queue
-doesn't hold is dropped, oldest first. Nothing is sent, and next to nothing is done, while there is
-no relay.
+A send to a viewer that is frozen would block the recorder. So the feed sends datagrams
+(:mod:`.capture.recorder.live_wire`) to a Unix socket that a relay process reads. While the socket
+is full, messages wait in a bounded queue that drops the oldest. Without a relay nothing is sent.
 """
 
 from __future__ import annotations
@@ -20,6 +18,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -48,26 +47,25 @@ class RelayProcess:
     """A running relay, with its viewer if it has one."""
 
     def __init__(self, process: subprocess.Popen[bytes], complaints: Path) -> None:
-        """Wrap it.
+        """Take over a relay that leads a session of its own.
 
         Args:
-            process: The relay, leader of a session of its own.
-            complaints: The file that its standard error goes to.
+            complaints: File of its standard error.
         """
         self._process = process
         self._complaints = complaints
 
     @property
     def pid(self) -> int:
-        """Its process id, and that of its process group."""
+        """Process id, and that of its process group."""
         return self._process.pid
 
     def poll(self) -> int | None:
-        """Its exit code, or None while it runs; never waits."""
+        """Return its exit code, or None while it runs, without waiting."""
         return self._process.poll()
 
     def complaint(self) -> str:
-        """The last line that it wrote on its standard error; empty where there is none."""
+        """Return the last line of its standard error; may be empty."""
         try:
             lines = self._complaints.read_text(errors="replace").splitlines()
         except FileNotFoundError:
@@ -75,11 +73,10 @@ class RelayProcess:
         return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
     def close(self, *, leave_window: bool = False) -> None:
-        """End it and all that it started, within seconds; safe to call twice.
+        """End it and its child processes, within seconds; safe to call twice.
 
         Args:
-            leave_window: Leave it, so that the viewer's window can still be looked at; the relay
-                ends when the window is closed.
+            leave_window: Leave it running until the viewer's window is closed.
         """
         if not leave_window:
             self._end()
@@ -93,26 +90,21 @@ class RelayProcess:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
-        try:  # a viewer that a killed relay has left
+        with suppress(ProcessLookupError):  # a viewer that a killed relay has left
             os.killpg(self._process.pid, signal.SIGKILL)
-        except ProcessLookupError:
-            return
 
 
 def spawn_relay(path: Path, arguments: Sequence[str] = ()) -> RelayProcess:
     """Start ``undulog view --live PATH`` in a session of its own.
 
-    An interrupt in the recorder's terminal doesn't reach it: the recorder ends it, or leaves it.
+    An interrupt in the recorder's terminal doesn't reach it.
 
     Args:
         path: The socket that the relay will make.
         arguments: Further options of the command, e.g. ``--web``.
 
-    Returns:
-        The relay; look at :meth:`RelayProcess.poll` now and then.
-
     Raises:
-        MissingExtraError: If Rerun is not installed; a recording goes on without.
+        MissingExtraError: If Rerun is not installed.
         UndulogError: If the process can't be started.
     """
     if importlib.util.find_spec("rerun") is None:
@@ -135,9 +127,9 @@ def spawn_relay(path: Path, arguments: Sequence[str] = ()) -> RelayProcess:
 
 
 RENEW_NS = 2_000_000_000
-"""How often a relay is told all definitions again, and the path is looked up again [ns]."""
+"""Interval of sending all definitions again, and of looking up the path again [ns]."""
 RETRY_NS = 500_000_000
-"""How often a relay is looked for where there was none [ns]."""
+"""Interval of looking for a relay [ns]."""
 
 _BUDGET_NS = 300_000
 _FILL_NS = 20_000_000
@@ -150,13 +142,13 @@ _NEVER_NS = 1 << 63
 
 @dataclass
 class LiveCounts:
-    """What became of the messages.
+    """Counts of messages.
 
     Attributes:
-        dropped: Dropped because the relay was too slow, or gone while they waited.
-        thinned: Left out because their channel speaks more often than is shown.
-        too_big: Left out because they don't fit a datagram, definitions included.
-        connections: How often a relay was found.
+        dropped: Dropped because the relay was too slow, or ended while they waited.
+        thinned: Left out because of the highest rate of their channel.
+        too_big: Left out because they don't fit into a datagram, definitions included.
+        connections: Number of relays found.
     """
 
     sent: int = 0
@@ -167,14 +159,14 @@ class LiveCounts:
 
 
 class _Packed(NamedTuple):
-    """A datagram that the socket hasn't taken yet, and how many messages it has."""
+    """A datagram that is not sent yet, and its number of messages."""
 
     data: bytes
     messages: int
 
 
 class LiveFeed:
-    """The recorder's end; one thread calls it, and no call waits."""
+    """The recorder's end of the feed; one thread calls it, and no call waits."""
 
     def __init__(
         self,
@@ -184,27 +176,26 @@ class LiveFeed:
         max_bytes: int = 2 << 20,
         max_rate_hz: float = 200.0,
     ) -> None:
-        """Remember where the relay will be; it may come, go and come again.
+        """Set up a feed to a relay that may come and go at any time.
 
         Args:
             path: The relay's socket.
-            max_messages: How many messages wait at most, beside those of one datagram.
-            max_bytes: How many bytes wait at most, beside one datagram.
-            max_rate_hz: Most messages a second that are sent of a channel of samples; events are
-                never left out.
+            max_messages: Most messages that wait, beside those of one datagram.
+            max_bytes: Most bytes that wait, beside one datagram.
+            max_rate_hz: Highest rate of a channel of samples; events are never left out.
         """
         self.path = Path(path)
         self.counts = LiveCounts()
         self._max_messages, self._max_bytes = max_messages, max_bytes
-        self._words = LiveDefinitions(round(1e9 / max_rate_hz))
+        self._definitions = LiveDefinitions(round(1e9 / max_rate_hz))
         self._feed_id = int.from_bytes(os.urandom(8), "little")
         self._socket: socket.socket | None = None
-        self._periods = self._words.periods
-        self._due: dict[int, int] = {}  # empty while nobody watches
-        self._states = self._words.states
+        self._periods = self._definitions.periods
+        self._due: dict[int, int] = {}  # empty without a relay
+        self._states = self._definitions.states
         self._queue: deque[Queued] = deque()
         self._queued_bytes = 0
-        self._to_tell: deque[_Packed] = deque()
+        self._unsent_definitions: deque[_Packed] = deque()
         self._waiting: _Packed | None = None
         self._full = False
         self._now_ns = time.monotonic_ns()
@@ -213,32 +204,31 @@ class LiveFeed:
 
     @property
     def connected(self) -> bool:
-        """Whether there is a relay."""
+        """Whether a relay was found."""
         return self._socket is not None
 
     @property
     def queued(self) -> int:
-        """How many messages wait."""
+        """Number of messages that wait."""
         return len(self._queue) + (self._waiting.messages if self._waiting is not None else 0)
 
     def define(self, record: Description) -> None:
-        """Take what explains messages; kept, and told to every relay that comes.
+        """Keep a definition for every relay that comes; schemas before their channels.
 
-        Args:
-            record: Schemas before their channels. Of metadata only ``undulog`` is told, of
-                attachments only the robot's description and its bus databases.
+        Of metadata only ``undulog`` is sent, of attachments only the robot's description and its
+        bus databases.
         """
-        packed = self._words.pack(record)
+        packed = self._definitions.pack(record)
         if packed is None:
             return
         if len(packed) > MAX_DATAGRAM - HEAD_SIZE:
             self.counts.too_big += 1
             return
-        self._words.keep(record, packed)
+        self._definitions.keep(record, packed)
         if self._socket is not None:
-            if isinstance(record, Channel) and record.id in self._words.periods:
+            if isinstance(record, Channel) and record.id in self._definitions.periods:
                 self._due[record.id] = 0
-            self._to_tell.append(self._pack_definitions([packed]))
+            self._unsent_definitions.append(self._pack(Kind.DEFINITIONS, [packed]))
 
     def offer(
         self,
@@ -248,23 +238,14 @@ class LiveFeed:
         sequence: int,
         payload: bytes,
     ) -> None:
-        """Take one message, if anybody watches.
-
-        Args:
-            log_time_ns: When it was recorded [Unix ns].
-            publish_time_ns: When it was sampled [Unix ns].
-            sequence: The channel's own counter.
-        """
+        """Queue a message if a relay was found; see :meth:`MessageSink.write`."""
         due = self._due.get(channel_id)
-        if channel_id in self._states:
-            self._states[channel_id] = (
-                channel_id,
-                sequence,
-                log_time_ns,
-                publish_time_ns,
-                self._now_ns,
-                payload,
-            )
+        is_state = channel_id in self._states
+        if due is None and not is_state:
+            return
+        queued = (channel_id, sequence, log_time_ns, publish_time_ns, self._now_ns, payload)
+        if is_state:
+            self._states[channel_id] = queued
         if due is None:
             return
         if log_time_ns < due:
@@ -275,17 +256,15 @@ class LiveFeed:
             self.counts.too_big += 1
             return
         period = self._periods[channel_id]
-        if period:  # a late message doesn't push back those after it
+        if period:  # a late message doesn't delay the later ones
             self._due[channel_id] = max(due, log_time_ns - period) + period
-        self._queue.append(
-            (channel_id, sequence, log_time_ns, publish_time_ns, self._now_ns, payload)
-        )
+        self._queue.append(queued)
         self._queued_bytes += size + RECORD_SIZE
         if self._queued_bytes > self._max_bytes or len(self._queue) > self._max_messages:
             self._drop_oldest()
 
     def pump(self) -> None:
-        """Send what the socket takes, for 0.3 ms at most; call it once a tick."""
+        """Send waiting datagrams, for 0.3 ms at most; called once a tick."""
         now_ns = self._now_ns = time.monotonic_ns()
         if now_ns >= self._renew_at_ns:
             self._renew(now_ns)
@@ -298,34 +277,28 @@ class LiveFeed:
                 return
 
     def close(self) -> None:
-        """Send what is left and the end, if the relay takes it within 0.1 s; safe to call twice."""
+        """Send the rest and the end, if the relay takes it within 0.1 s; safe to call twice."""
         for _ in range(_END_TRIES):
             while self._send_one():
                 pass
-            if not self.connected or (self._is_empty and self._taken(self._end())):
+            if not self.connected or (self._is_empty and self._taken(self._pack(Kind.END))):
                 break
             time.sleep(_END_PAUSE_S)
         self._lose(time.monotonic_ns())
         self._renew_at_ns = _NEVER_NS
 
-    # -- what is told ----------------------------------------------------------------------
-
-    def _pack_definitions(self, records: list[bytes]) -> _Packed:
-        return _Packed(pack_datagram(self._head(Kind.DEFINITIONS, 0), records), 0)
-
-    def _end(self) -> _Packed:
-        return _Packed(pack_datagram(self._head(Kind.END, 0), ()), 0)
-
-    def _head(self, kind: Kind, messages: int) -> DatagramHead:
-        return DatagramHead(kind, messages, self._feed_id, self.counts.dropped)
+    def _pack(self, kind: Kind, records: Sequence[bytes] = ()) -> _Packed:
+        messages = len(records) if kind is Kind.MESSAGES else 0
+        head = DatagramHead(kind, messages, self._feed_id, self.counts.dropped)
+        return _Packed(pack_datagram(head, records), messages)
 
     # -- the queue -------------------------------------------------------------------------
 
     @property
     def _is_empty(self) -> bool:
-        """Whether nothing waits; an end that the socket didn't take is made anew."""
+        """Whether nothing waits, apart from an end that is packed again."""
         messages_wait = self._waiting is not None and self._waiting.messages > 0
-        return not (self._queue or self._to_tell or messages_wait)
+        return not (self._queue or self._unsent_definitions or messages_wait)
 
     def _drop_oldest(self) -> None:
         if self._waiting is not None and self._waiting.messages:
@@ -336,17 +309,19 @@ class LiveFeed:
             self.counts.dropped += 1
 
     def _ripe(self, now_ns: int) -> bool:
-        """Whether to send: a datagram is left to fill, and a full socket to itself, for 20 ms."""
+        """Whether to send: a datagram fills, and a full socket rests, for 20 ms."""
         if now_ns < self._send_at_ns:
-            return not self._full and (bool(self._to_tell) or self._queued_bytes >= _FILL)
-        return bool(self._queue or self._to_tell or self._waiting is not None)
+            return not self._full and (
+                bool(self._unsent_definitions) or self._queued_bytes >= _FILL
+            )
+        return bool(self._queue or self._unsent_definitions or self._waiting is not None)
 
     def _next(self) -> _Packed | None:
-        """The next datagram: what waits, then definitions, then the oldest messages."""
+        """Return the next datagram: one that waits, then definitions, then the oldest messages."""
         if self._waiting is not None:
             return self._waiting
-        if self._to_tell:
-            return self._to_tell.popleft()
+        if self._unsent_definitions:
+            return self._unsent_definitions.popleft()
         if not self._queue:
             return None
         records: list[bytes] = []
@@ -358,13 +333,12 @@ class LiveFeed:
             records.append(pack_message(self._queue.popleft()))
             size += length
         self._queued_bytes -= size
-        head = self._head(Kind.MESSAGES, len(records))
-        return _Packed(pack_datagram(head, records), len(records))
+        return self._pack(Kind.MESSAGES, records)
 
     # -- the socket ------------------------------------------------------------------------
 
     def _send_one(self) -> bool:
-        """Send one datagram; False where there is none, or the socket takes none."""
+        """Send one datagram; return False if there is none, or the socket is full."""
         packed = self._next()
         return packed is not None and self._taken(packed)
 
@@ -381,7 +355,7 @@ class LiveFeed:
                 self._waiting = None
                 self.counts.too_big += max(packed.messages, 1)
                 return True
-            self.counts.dropped += packed.messages  # it has gone
+            self.counts.dropped += packed.messages  # the relay has ended
             self._waiting = None
             self._lose(self._now_ns)
             return False
@@ -390,30 +364,26 @@ class LiveFeed:
         return True
 
     def _renew(self, now_ns: int) -> None:
-        """Find the relay that is there now, be it a new one, and tell it all definitions."""
-        link, found = self._socket, False
-        if link is None:
-            link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-            link.setblocking(False)
-            found = True
+        """Connect to the present relay, perhaps a new one, and queue all definitions for it."""
+        found = self._socket is None
+        if self._socket is None:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         try:
-            link.connect(str(self.path))
-        except OSError:  # none there, or it has gone: look again later
-            self._socket = link
+            self._socket.connect(str(self.path))
+        except OSError:  # no relay: looked for again later
             self._lose(now_ns)
             return
-        self._socket = link
         self._renew_at_ns = now_ns + RENEW_NS
         if found:
             self.counts.connections += 1
             self._due = dict.fromkeys(self._periods, 0)
-        if not self._to_tell:
-            self._to_tell.extend(
-                self._pack_definitions(group) for group in self._words.groups(_DATAGRAM)
+        if not self._unsent_definitions:
+            self._unsent_definitions.extend(
+                self._pack(Kind.DEFINITIONS, group) for group in self._definitions.groups(_DATAGRAM)
             )
 
     def _lose(self, now_ns: int) -> None:
-        """There is no relay any more: forget what was meant for it."""
+        """Disconnect, and drop the queue."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -421,6 +391,6 @@ class LiveFeed:
         self._waiting, self._full = None, False
         self._queue.clear()
         self._queued_bytes = 0
-        self._to_tell.clear()
+        self._unsent_definitions.clear()
         self._due = {}
         self._renew_at_ns = now_ns + RETRY_NS

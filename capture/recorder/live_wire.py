@@ -1,4 +1,4 @@
-"""Datagrams of the live feed: what the recorder tells whoever watches.
+"""Datagrams of the live feed.
 
 A datagram is a head and then whole records, so that each can be read without any other::
 
@@ -8,11 +8,11 @@ A datagram is a head and then whole records, so that each can be read without an
 
 All numbers are little-endian. ``kind`` of a record is the opcode of the MCAP record that it would
 be (https://mcap.dev/spec); the payload of a definition is that record's body, compressed with zlib.
-A datagram of definitions ends with the last messages of topics that speak only on change: they
-still hold, and one who comes later would not know.
+The definitions end with the last message of each topic that is published on change, which is valid
+until the next one.
 
-``offered`` is the monotonic clock of the machine when the message was taken, so that a reader on
-the same machine knows how late it is.
+``offered`` is the monotonic clock of the machine when the message was queued, so that a reader on
+the same machine can compute its delay.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterable
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -49,7 +48,7 @@ MAX_MESSAGE = MAX_DATAGRAM - HEAD_SIZE - RECORD_SIZE
 
 
 class Kind(IntEnum):
-    """What a datagram holds."""
+    """Content of a datagram."""
 
     MESSAGES = 0
     DEFINITIONS = 1
@@ -60,10 +59,10 @@ class LiveMessage(NamedTuple):
     """One message of the feed.
 
     Attributes:
-        sequence: The channel's own counter.
-        log_time_ns: When it was recorded [Unix ns].
-        publish_time_ns: When it was sampled [Unix ns].
-        offered_ns: When the feed took it, on the machine's monotonic clock [ns].
+        sequence: Number of the message in its channel.
+        log_time_ns: Time of recording [Unix ns].
+        publish_time_ns: Time of sampling [Unix ns].
+        offered_ns: Time of queueing, on the machine's monotonic clock [ns].
     """
 
     channel_id: int
@@ -74,14 +73,17 @@ class LiveMessage(NamedTuple):
     payload: bytes
 
 
-@dataclass(frozen=True)
-class DatagramHead:
-    """What stands before the records.
+Queued = tuple[int, int, int, int, int, bytes]
+"""The fields of a :class:`LiveMessage`."""
+
+
+class DatagramHead(NamedTuple):
+    """Head of a datagram.
 
     Attributes:
-        messages: How many messages it has.
-        feed_id: Random, one a recording: another one says that the recorder was started anew.
-        dropped: Messages that the feed has dropped so far.
+        messages: Number of messages in it.
+        feed_id: Random number of the recording: it changes with a restart of the recorder.
+        dropped: Number of messages that the feed has dropped so far.
     """
 
     kind: Kind
@@ -91,22 +93,12 @@ class DatagramHead:
 
 
 def pack_datagram(head: DatagramHead, records: Iterable[bytes]) -> bytes:
-    """A datagram.
-
-    Args:
-        head: What stands before the records.
-        records: As :func:`pack_message` and :func:`pack_description` give them.
-    """
-    packed = _HEAD.pack(_MAGIC, _VERSION, head.kind, head.messages, head.feed_id, head.dropped)
-    return b"".join([packed, *records])
+    """Return a datagram of records packed by :func:`pack_message` or :func:`pack_description`."""
+    return b"".join([_HEAD.pack(_MAGIC, _VERSION, *head), *records])
 
 
-def pack_message(message: LiveMessage | tuple[int, int, int, int, int, bytes]) -> bytes:
-    """A message as a record.
-
-    Args:
-        message: The message, or a tuple of the same fields.
-    """
+def pack_message(message: Queued) -> bytes:
+    """Return the record of a message."""
     channel_id, sequence, log_ns, publish_ns, offered_ns, payload = message
     length = len(payload)
     return (
@@ -116,24 +108,17 @@ def pack_message(message: LiveMessage | tuple[int, int, int, int, int, bytes]) -
 
 
 def pack_description(record: Description) -> bytes:
-    """What explains messages, as a record.
-
-    Args:
-        record: E.g. a channel.
-    """
+    """Return the record of a definition, e.g. of a channel."""
     kind, body = pack_definition(record)
     payload = zlib.compress(body)
     return _RECORD.pack(kind, 0, 0, len(payload), 0, 0, 0) + payload
 
 
 def read_head(data: bytes) -> DatagramHead:
-    """The head of a datagram.
-
-    Returns:
-        Its head.
+    """Read the head of a datagram.
 
     Raises:
-        DataError: If it is none of ours, or of another version.
+        DataError: If it is no datagram of this version.
     """
     if len(data) < HEAD_SIZE:
         raise DataError(f"a datagram of {len(data)} bytes is too short for the live feed")
@@ -144,13 +129,7 @@ def read_head(data: bytes) -> DatagramHead:
 
 
 def read_records(data: bytes) -> list[LiveMessage | Definition]:
-    """The records of a datagram.
-
-    Args:
-        data: The datagram, its head checked.
-
-    Returns:
-        Messages and definitions, in order.
+    """Return the messages and definitions of a datagram, in order.
 
     Raises:
         DataError: If it is cut short or a definition can't be read.
@@ -195,54 +174,39 @@ _STREAMS = {
     "tf2_msgs/msg/TFMessage",
     "sensor_msgs/msg/TimeReference",
 }
-"""Types whose messages are samples of something that goes on: fewer show the same."""
+"""Types of samples, whose rate may be reduced."""
 
 _STATES = {"std_msgs/msg/String"}
-"""Types whose last message holds until the next: told to a relay that comes later."""
-
-Queued = tuple[int, int, int, int, int, bytes]
-"""The fields of a :class:`.capture.recorder.live_wire.LiveMessage`."""
+"""Types published on change, whose last message is sent to a new relay."""
 
 
 class LiveDefinitions:
-    """Definitions, and the last messages of topics that speak only on change."""
+    """Definitions, and the last messages of topics that are published on change.
+
+    Attributes:
+        periods: Channels that are sent, and the least time between messages [ns], 0 for none.
+        states: Channels published on change, and their last messages.
+    """
 
     def __init__(self, period_ns: int) -> None:
-        """Know nothing yet.
+        """Start without definitions.
 
         Args:
             period_ns: Least time between two messages of a channel of samples [ns].
         """
         self.periods: dict[int, int] = {}
-        """Channels that are shown, and the least time between messages [ns], 0 for any."""
-        self.states: dict[int, Queued | LiveMessage | None] = {}
-        """Channels whose last message holds, and that message."""
+        self.states: dict[int, Queued | None] = {}
         self._period_ns = period_ns
         self._schemas: dict[int, str] = {}
-        self._packed: dict[tuple[str, object], bytes] = {}
+        self._packed: dict[tuple[str, object] | None, bytes] = {}
 
     def pack(self, record: Description) -> bytes | None:
-        """A definition as it is told, or None for one that isn't.
-
-        Args:
-            record: Of metadata only ``undulog`` is told, of attachments only the robot's
-                description and its bus databases.
-
-        Returns:
-            A record of a datagram.
-        """
+        """Return a definition as a record, or None for one that isn't sent."""
         return None if _key(record) is None else pack_description(record)
 
     def keep(self, record: Description, packed: bytes) -> None:
-        """Keep a definition that is told.
-
-        Args:
-            record: The definition; it replaces one of the same name or number.
-        """
-        key = _key(record)
-        if key is None:
-            return
-        self._packed[key] = packed
+        """Keep a definition that is sent; it replaces one of the same name or number."""
+        self._packed[_key(record)] = packed
         if isinstance(record, Schema):
             self._schemas[record.id] = record.name
         elif isinstance(record, Channel) and not record.topic.startswith(FRAME_TOPIC_PREFIXES):
@@ -252,28 +216,25 @@ class LiveDefinitions:
                 self.states.setdefault(record.id, None)
 
     def groups(self, size: int) -> list[list[bytes]]:
-        """All definitions and then the states that hold, in the order they are told.
+        """Return the records of all definitions and then of the states, a group a datagram.
 
         Args:
-            size: Most bytes of a group, unless one record alone is longer.
-
-        Returns:
-            Records, a group a datagram.
+            size: Most bytes of a group, unless one record alone is longer [B].
         """
         states = [pack_message(state) for state in self.states.values() if state is not None]
-        found: list[list[bytes]] = []
+        groups: list[list[bytes]] = []
         filled = 0
         for packed in [*self._packed.values(), *(one for one in states if len(one) <= size)]:
-            if not found or filled + len(packed) > size:
-                found.append([])
+            if not groups or filled + len(packed) > size:
+                groups.append([])
                 filled = 0
-            found[-1].append(packed)
+            groups[-1].append(packed)
             filled += len(packed)
-        return found
+        return groups
 
 
 def _key(record: Description) -> tuple[str, object] | None:
-    """What a definition replaces, or None for one that isn't told."""
+    """Return the identity of a definition, or None for one that isn't sent."""
     match record:
         case Schema():
             return "schema", record.id

@@ -1,7 +1,7 @@
 """The recorder's loop: one thread, a tick every 10 ms, and nothing in it that waits.
 
-Each tick takes what has come from every source and writes the raw frames; decoding follows in
-slices. What is due once a second is spread over the second's ticks, so that no tick is long.
+Each tick takes the new frames of every source and writes them raw; decoding follows in slices.
+Tasks of once a second are spread over the second's ticks, so that no tick is long.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from .source_clock import SourceClock
 from .status import EachSecond, SessionClock, TickTally
 
 TICK_NS = 10_000_000
-"""Sources are asked this often, and what they have is safe then [ns]."""
+"""Interval of polling the sources and writing their raw frames [ns]."""
 
 DECODE_TICKS = 10
-"""Frames are decoded every so many ticks, what was left over in the next one."""
+"""Ticks between two rounds of decoding; a backlog is decoded in the next tick."""
 
 WATCHED_TICKS = 4
-"""The same while somebody watches."""
+"""The same with a live view."""
 
 _PRESSED = 1000
-"""After so many frames in a tick the next one follows at once, and decoding waits: the kernel's
+"""After so many frames in a tick the next tick follows at once, and decoding waits: the kernel's
 buffers hold only milliseconds of a burst."""
 
-_BREATH_NS = 1_000_000
+_PAUSE_NS = 1_000_000
 _DRAIN_NS = 500_000_000
 _MOST_WAITING = 2_000_000
-"""So many frames may wait to be decoded, 64 MB; then the burst is no burst."""
+"""With more frames to decode (64 MB), decoding no longer waits for the end of a burst."""
 
 _DECODE_BUDGET_NS = 4_000_000
 _NS = 1_000_000_000
@@ -65,11 +65,11 @@ class Recorder:
     """Records sources into a session until something ends it.
 
     Attributes:
-        ticks: How long the ticks took.
-        overruns: Ticks that were left out because the one before took too long.
-        ending: Set to end the recording, from within one of the ``each_tick`` or ``each_second``.
-        watched: Whether somebody looks at what is decoded as it comes.
-        priority: What the recorder's threads have got.
+        ticks: Durations of the ticks.
+        overruns: Number of ticks left out after one that took too long.
+        ending: Set by a task to end the recording.
+        watched: Whether a live view is connected.
+        priority: Priority of the recorder's threads.
     """
 
     def __init__(
@@ -84,14 +84,11 @@ class Recorder:
         each_tick: Sequence[Callable[[], None]] = (),
         each_second: Sequence[Callable[[], object]] = (),
     ) -> None:
-        """Put a recording together; nothing is opened yet.
+        """Set up a recording; nothing is opened yet.
 
         Args:
             writer: The session; the recorder doesn't close it.
-            clock: The session's clock.
-            context: What the sources are given.
-            robot: The robot that is recorded, or None.
-            decoded: The source that is the robot's bus; None to keep all frames raw.
+            decoded: The source that is the robot's bus; None to decode no frames.
             each_tick: Called at the end of every tick.
             each_second: Called once a second, in different ticks.
         """
@@ -110,31 +107,24 @@ class Recorder:
         self._each_second = EachSecond(tasks, time.monotonic_ns())
         self._events = writer.log("/rosout")
         self._clock_channels: dict[str, TimeReferenceChannel] = {}
-        self._came = 0  # frames in the last poll
+        self._received = 0  # frames in the last poll
         self._failed: set[str] = set()
         self._end_ns: int | None = None  # when the recording ended [Unix ns]
         self._later: set[str] = set()  # sources of which frames came after it
         self._odd_clocks: set[str] = set()
-        self._told: dict[str, set[str]] = {source.name: set() for source in self._sources}
+        self._reported_ids: dict[str, set[str]] = {source.name: set() for source in self._sources}
         self._on_event: Callable[[int, str, str, str], None] | None = None
 
     def on_event(self, listener: Callable[[int, str, str, str], None]) -> None:
-        """Have events told to someone as well: time [Unix ns], level, who, text.
-
-        Args:
-            listener: Called after the event was written.
-        """
+        """Set a listener, called after each event: time [Unix ns], level, name, text."""
         self._on_event = listener
 
     def log_event(self, level: str, name: str, text: str, t_ns: int | None = None) -> None:
-        """Write an event.
+        """Write an event to ``/rosout``.
 
         Args:
             level: ``info``, ``warn`` or ``error``.
-            t_ns: When [Unix ns]; now by default.
-
-        Raises:
-            LogWriteError: If it can't be written.
+            t_ns: Time of the event [Unix ns]; now by default.
         """
         now_ns = self._clock.now_ns()
         at_ns = now_ns if t_ns is None else t_ns
@@ -144,14 +134,14 @@ class Recorder:
 
     @property
     def backlog(self) -> int:
-        """Frames that are safe and wait to be decoded."""
+        """Number of recorded frames that wait to be decoded."""
         return sum(bus.backlog for bus in self.buses.values())
 
     def run(self, stop: StopRequest, duration_s: float | None = None) -> Ending:
         """Record until something ends it.
 
         Args:
-            duration_s: Ends by itself after this time [s].
+            duration_s: Time after which it ends [s]; None for no limit.
 
         Returns:
             Why it ended. The session is whole then, but not closed.
@@ -161,7 +151,9 @@ class Recorder:
             LogWriteError: If the session can't be written; the sources are stopped then.
         """
         try:
-            with _tidied_by_hand():  # first: it takes long, and sources that listen want to be read
+            with (
+                _manual_collection()
+            ):  # first: it takes long, and the buffers of sources that listen fill
                 self._start()
                 with self._urgent():
                     self._loop(stop, duration_s)
@@ -176,7 +168,7 @@ class Recorder:
     # -- inside ----------------------------------------------------------------------------
 
     def _start(self) -> None:
-        # Last those that listen: to connect may take half a second, and senders wait for nobody.
+        # Last those that listen: connecting may take half a second, and senders don't wait.
         for source in sorted(self._sources, key=lambda each: isinstance(each, EndingSource)):
             try:
                 source.start(self._context)
@@ -190,7 +182,7 @@ class Recorder:
 
     @contextmanager
     def _urgent(self) -> Generator[None]:
-        """Ask for priority; not beside a twin, whose physics would have it, too."""
+        """Raise the priority; not beside a twin, whose physics would get it, too."""
         if any(source.robot is not None for source in self._sources):
             yield
             return
@@ -221,10 +213,10 @@ class Recorder:
             after_ns = time.monotonic_ns()
             self.ticks.add(after_ns - now_ns)
             tick += 1
-            due_ns = after_ns + _BREATH_NS if self._came >= _PRESSED else due_ns + TICK_NS
+            due_ns = after_ns + _PAUSE_NS if self._received >= _PRESSED else due_ns + TICK_NS
             if after_ns < due_ns:
                 select([], [], [], (due_ns - after_ns) / _NS)
-            elif after_ns > due_ns + _NS:  # stopped for a while: ticks are not made up for
+            elif after_ns > due_ns + _NS:  # stopped for a while: left-out ticks are not repeated
                 self.overruns += (after_ns - due_ns) // TICK_NS
                 due_ns = after_ns
 
@@ -233,7 +225,7 @@ class Recorder:
         for bus in self.buses.values():
             bus.write_raw(self._clock.now_ns)
         waits = self.backlog
-        pressed = self._came >= _PRESSED and waits < _MOST_WAITING
+        pressed = self._received >= _PRESSED and waits < _MOST_WAITING
         every = WATCHED_TICKS if self.watched else DECODE_TICKS
         due = tick % every == 1
         if not pressed and (due or any(bus.behind for bus in self.buses.values())):
@@ -246,10 +238,10 @@ class Recorder:
             each()
 
     def _drain(self) -> None:
-        """End at this instant: what came before is kept, what came later is left out.
+        """End at this instant: frames before it are kept, later ones are left out.
 
-        A source that can refuses from now on what its senders have. Of the others a frame that came
-        later proves that all before are here; as none takes so long, half a second does, too.
+        An :class:`EndingSource` refuses frames from now on. Of another source a later frame proves
+        that all earlier ones were received; so does half a second, as no frame takes so long.
         """
         self._end_ns = self._clock.now_ns()
         for source in self._sources:
@@ -263,7 +255,7 @@ class Recorder:
             late = self._clock.now_ns() >= until_ns
             if late or not any(self._has_more(source) for source in self._sources):
                 return
-            select([], [], [], _BREATH_NS / _NS)
+            select([], [], [], _PAUSE_NS / _NS)
 
     def _has_more(self, source: Source) -> bool:
         """Whether frames from before the end may still come."""
@@ -274,14 +266,14 @@ class Recorder:
         )
 
     def _poll(self) -> None:
-        self._came = 0
+        self._received = 0
         for source in self._sources:
             polled = self._asked(source)
             arrays = (*polled.frames, *polled.fd_frames)
             if self._end_ns is not None and not isinstance(source, EndingSource):
                 kept = [self._before(self._end_ns, source, frames) for frames in arrays]
                 arrays = tuple(frames for frames in kept if len(frames))
-            self._came += sum(map(len, arrays))
+            self._received += sum(map(len, arrays))
             for event in polled.events:
                 self.log_event(event.level, source.name, event.text, event.t_ns)
             for frames in arrays:
@@ -291,7 +283,7 @@ class Recorder:
                 bus.add(frames)
 
     def _before(self, end_ns: int, source: Source, frames: FrameArray) -> FrameArray:
-        """Those of a source's frames that came before the end; a twin's are of its own time."""
+        """Return a source's frames before the end; a twin's have a time of their own."""
         before = frames["t_host_ns"] <= np.uint64(end_ns)
         if source.robot is not None or before.all():
             return frames
@@ -300,11 +292,11 @@ class Recorder:
 
     @property
     def given_up(self) -> list[str]:
-        """Names of the sources that failed in a way nobody foresaw."""
+        """Names of the sources that failed unexpectedly."""
         return sorted(self._failed)
 
     def _asked(self, source: Source) -> Polled:
-        """What a source has; one that fails in a way nobody foresaw doesn't end the others."""
+        """Poll a source; one that fails unexpectedly doesn't end the others."""
         if source.name in self._failed:
             return Polled()
         try:
@@ -323,7 +315,7 @@ class Recorder:
         self.log_event("error", source.name, f"this source {why}")
 
     def _end_source(self, source: Source) -> None:
-        """End a source that can refuse what comes later; one that fails in that is given up."""
+        """End an :class:`EndingSource`; one that fails in that is given up."""
         try:
             if isinstance(source, EndingSource):
                 source.end()
@@ -370,7 +362,7 @@ class Recorder:
             self.log_event("warn", name, text)
 
     def _log_unknown_frames(self) -> None:
-        """Say once what nobody knows and what is too short; the counts come at the end."""
+        """Log each unknown identifier and too short frame once; the counts follow at the end."""
         for name, bus in self.buses.items():
             for text in bus.take_faults():
                 self.log_event("error", name, text)
@@ -380,15 +372,15 @@ class Recorder:
                 ("info", "identifiers that are in no database", bus.tally.unknown),
                 ("warn", "frames too short for", bus.tally.short),
             ):
-                fresh = set(found) - self._told[name]
+                fresh = set(found) - self._reported_ids[name]
                 if fresh:
-                    self._told[name] |= fresh
+                    self._reported_ids[name] |= fresh
                     listed = ", ".join(sorted(fresh)[:8])
                     more = f" and {len(fresh) - 8} more" if len(fresh) > 8 else ""
                     self.log_event(level, name, f"{what}: {listed}{more}")
 
     def _finish(self) -> None:
-        """Decode what waits, and say what became of the frames."""
+        """Decode the backlog, and log the counts of the frames."""
         for name, bus in self.buses.items():
             bus.finish(self._clock.now_ns)
             self._log_clock_events(name)
@@ -405,17 +397,17 @@ class Recorder:
 
 
 def _check(polled: Polled) -> None:
-    """Refuse what a plug-in may give and no source gives."""
+    """Check the frames of a plug-in."""
     for frames in (*polled.frames, *polled.fd_frames):
         if frames.dtype not in (FRAME_DTYPE, FD_FRAME_DTYPE):
             raise TypeError(f"poll() gave frames of the type {frames.dtype}")
 
 
 @contextmanager
-def _tidied_by_hand() -> Generator[None]:
-    """No collection of garbage at a moment of the interpreter's choosing: a full one takes long.
+def _manual_collection() -> Generator[None]:
+    """Disable automatic garbage collection, as a full one takes long.
 
-    What is there by now stays; the young generations are looked at once a second.
+    Present objects are exempt; the young generations are collected once a second.
     """
     gc.collect()
     gc.freeze()

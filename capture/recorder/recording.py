@@ -22,25 +22,22 @@ from ..sources.contract import SourceContext
 from .bus_recorder import decoded_source, robot_of
 from .control import ControlServer
 from .control_client import default_sockets
-from .control_requests import OperatorLog, request_handler
+from .control_requests import RequestHandler
 from .health import LiveHealth
 from .live_feed import LiveFeed
 from .loop import Ending, Recorder
 from .screen import plain_line
 from .settings import RecordSettings
 from .status import EventLine, RecorderSnapshot, SessionClock, statuses
-from .storage import TappedSink, open_storage
+from .storage import DiskStorage, RingStorage, TappedSink
 from .systemd import Notifier
 
 
 def free_space(path: Path) -> int:
-    """Bytes that are free for us where a file is.
-
-    Args:
-        path: The file, which need not be there yet.
+    """Return the free bytes [B] of the disk of a file, which need not exist yet.
 
     Raises:
-        LogWriteError: If the folder can't be asked.
+        LogWriteError: If its folder can't be used.
     """
     try:
         return shutil.disk_usage(path.parent).free
@@ -52,16 +49,15 @@ def free_space(path: Path) -> int:
 
 @dataclass(frozen=True)
 class RecordReport:
-    """What was recorded.
+    """Summary of a recording.
 
     Attributes:
         files: The session's files, in order.
         robot: Name of the robot, or None.
-        duration_s: Time from start to end [s].
         verdict: ``good``, ``degraded`` or ``bad``.
-        reasons: Why it is not better.
-        sources: By name: what became of the frames.
-        recorder: Of the recorder itself: ticks and so on.
+        reasons: Reasons for a verdict that is not good.
+        sources: Frame counts by name of the source.
+        recorder: Facts about the recorder itself: ticks and so on.
     """
 
     files: tuple[Path, ...]
@@ -77,7 +73,7 @@ class RecordReport:
     recorder: Mapping[str, Any]
 
     def as_json(self) -> dict[str, Any]:
-        """Plain JSON."""
+        """Return it as plain JSON."""
         return {
             "files": [str(file) for file in self.files],
             "session_id": self.session_id,
@@ -102,7 +98,7 @@ _RATE_UPDATES = 10
 
 
 class Recording:
-    """One recording at work; what the control socket can ask of it."""
+    """A running recording, and the actions that its control socket offers."""
 
     def __init__(
         self,
@@ -111,20 +107,18 @@ class Recording:
         *,
         notifier: Notifier | None = None,
     ) -> None:
-        """Open everything that must be there before the first sample.
+        """Open everything that must exist before the first sample.
 
         Args:
-            settings: What to record, and how.
-            notifier: Is told that it has begun, and then that it is alive.
+            notifier: Reports readiness and signs of life; None for no service manager.
 
         Raises:
-            UsageError: If the settings don't fit together, or the output is there.
+            UsageError: If the settings contradict each other, or the output exists.
             SourceError: If a source can never work.
             LogWriteError: If the session can't be created, or too little space is free.
             ControlError: If the control socket can't be made.
         """
         self._settings, self._stop = settings, stop
-        self._useless = False
         self._show: Callable[[RecorderSnapshot], None] | None = None
         self._notifier = notifier or Notifier({})
         self._sources = open_sources(settings.sources)
@@ -145,12 +139,12 @@ class Recording:
         self._events: deque[EventLine] = deque(maxlen=_EVENTS_SHOWN)
         self._sizes: deque[tuple[int, int]] = deque(maxlen=_RATE_UPDATES)
         self._snapshot: RecorderSnapshot | None = None
-        with ExitStack() as opened:  # what is open is closed again if the next thing fails
+        with ExitStack() as opened:  # closes in turn if a later step fails
             self._control = _control_of(settings)  # first: two recorders never share one
             opened.callback(self._control.close)
             self._feed = LiveFeed(self._control.path.with_suffix(".live"))
             opened.callback(self._feed.close)
-            self._storage = open_storage(settings)
+            self._storage = _storage_of(settings)
             self._writer = SessionWriter(
                 settings.output,
                 session_id=self._session_id,
@@ -166,54 +160,48 @@ class Recording:
                 writer=self._writer,
                 clock=self._clock,
                 sources=self._sources,
-                context=SourceContext(self._clock.now_ns, self._writer, _wishes(settings)),
+                context=SourceContext(self._clock.now_ns, self._writer, _twin_facts(settings)),
                 robot=robot,
                 decoded=decoded,
                 each_tick=(self._each_tick,),
-                each_second=(self._look, self._diagnose, self._publish_status, self._look_at_disk),
+                each_second=(self._look, self._diagnose, self._publish_status, self._check_disk),
             )
             self._recorder.on_event(self._note_event)
-            log = OperatorLog(self._writer, self._recorder.log_event, self._clock.now_ns)
-            self._control.serve(request_handler(self, log))
+            self._control.serve(
+                RequestHandler(self, self._writer, self._recorder.log_event, self._clock.now_ns)
+            )
             opened.pop_all()
-        # What a recording can do without; each is given up where it fails.
-        self._asides: dict[str, Callable[[], None]] = {
+        # The recording continues without a task of these that fails.
+        self._optional_tasks: dict[str, Callable[[], None]] = {
             _VIEW: self._feed.pump,
             _HEALTH: lambda: self._health.step(self._clock.now_ns()),
         }
 
     @property
     def live_socket(self) -> Path:
-        """Where a live view may listen."""
+        """Socket of the live view."""
         return self._feed.path
 
     def warn(self, name: str, text: str) -> None:
-        """Write a warning into the session; for what happens beside the recording.
-
-        Raises:
-            LogWriteError: If it can't be written.
-        """
+        """Write a warning to ``/rosout``."""
         self._recorder.log_event("warn", name, text)
 
     def run(self, show: Callable[[RecorderSnapshot], None] | None = None) -> RecordReport:
         """Record until something ends it, and finalise.
 
         Args:
-            show: Is shown the recording once a second.
-
-        Returns:
-            What was recorded; its ending says whether it had to end.
+            show: Displays the recording, once a second.
 
         Raises:
             SourceError: If a source can never work; no file is left then.
         """
-        ending = Ending("an error", failed=True)
+        ending, useless = Ending("an error", failed=True), False
         self._show = show
         try:
             self._notifier.ready(f"recording {self._settings.output}")
             ending = self._recorded()
         except SourceError:
-            self._useless = True
+            useless = True
             raise
         finally:
             self._notifier.stopping()
@@ -221,41 +209,26 @@ class Recording:
             self._feed.close()
             report = self._report(ending)
             self._control.close(report.as_json())
-            if self._useless:  # nothing was recorded: the name is free for another try
+            if useless:  # nothing was recorded: the name is free for another try
                 for file in report.files:
                     file.unlink(missing_ok=True)
         return report
 
-    # -- what the control socket asks ---------------------------------------------------------
+    # -- requests of the control socket --------------------------------------------------------
 
     def status(self) -> Mapping[str, Any]:
-        """How the recording goes, as plain JSON values."""
+        """See :meth:`.RecorderActions.status`."""
         snapshot = self._snapshot or self._look()
         facts = dataclasses.asdict(snapshot)
         path = facts.pop("path")
-        return {"output": path, "bytes": facts.pop("size"), **facts}
+        return {"output": path, "bytes": facts.pop("size"), **facts, "trouble": None}
 
     def mark(self, text: str) -> Mapping[str, Any]:
-        """Mark this moment; a ring writes what it has.
-
-        Args:
-            text: What the operator says of it.
-
-        Returns:
-            The file that a ring writes.
-
-        Raises:
-            LogWriteError: If that file can't be created.
-        """
+        """See :meth:`.RecorderActions.mark`."""
         return self._storage.mark(text)
 
     def split(self) -> Mapping[str, Any]:
-        """Begin a new part.
-
-        Raises:
-            UsageError: If a ring is kept.
-            LogWriteError: If the file can't be created; the recording goes on.
-        """
+        """See :meth:`.RecorderActions.split`."""
         return self._storage.split()
 
     def stop(self) -> None:
@@ -266,13 +239,13 @@ class Recording:
 
     def _each_tick(self) -> None:
         self._control.poll()
-        for name in tuple(self._asides):
+        for name in tuple(self._optional_tasks):
             try:
-                self._asides[name]()
+                self._optional_tasks[name]()
             except LogWriteError:
                 raise
             except Exception as error:  # noqa: BLE001 - the recording goes on without it
-                del self._asides[name]
+                del self._optional_tasks[name]
                 text = f"the {name} is given up: it failed with {error!r}"
                 self._recorder.log_event("error", "recorder", text)
         self._notifier.alive()
@@ -283,7 +256,37 @@ class Recording:
             self._recorder.log_event(level, "recorder", text)
         for text in self._control.take_faults():
             self._recorder.log_event("error", "recorder", text)
-        self._snapshot = self._new_snapshot("recording")
+        now_ns = self._clock.now_ns()
+        self._sizes.append((now_ns, self._storage.size))
+        (began, had), (ended, has) = self._sizes[0], self._sizes[-1]
+        measures, times = self._health.result(), self._recorder.ticks.result()
+        clocks = self._recorder.clocks
+        self._snapshot = RecorderSnapshot(
+            session_id=self._session_id,
+            path=str(self._storage.path),
+            robot=self._robot.name if self._robot is not None else None,
+            state="recording",
+            now_ns=now_ns,
+            elapsed_s=(now_ns - self._clock.epoch_ns) / _NS,
+            messages=self._storage.messages,
+            size=self._storage.size,
+            byte_rate=(has - had) * _NS / (ended - began) if ended > began else None,
+            free=free_space(self._settings.output),
+            part=self._storage.part,
+            verdict=measures.verdict,
+            reasons=measures.reasons,
+            notes=measures.notes,
+            sources=tuple(
+                self._health.source(source, text, clocks.get(source.name))
+                for text, source in zip(self._settings.sources, self._sources, strict=True)
+            ),
+            topics=self._health.topics(),
+            events=tuple(self._events),
+            tick_p99_s=times.p99_s,
+            tick_max_s=times.max_s,
+            backlog=self._recorder.backlog,
+            unsynced=self._storage.unsynced,
+        )
         return self._snapshot
 
     def _diagnose(self) -> None:
@@ -298,7 +301,7 @@ class Recording:
         if self._show is not None:
             self._show(self._snapshot)
 
-    def _look_at_disk(self) -> None:
+    def _check_disk(self) -> None:
         if self._storage.shortage is not None:
             raise self._storage.shortage
         free = free_space(self._settings.output)
@@ -324,12 +327,12 @@ class Recording:
             return Ending(str(error), failed=True)
 
     def _finalised(self, ending: Ending) -> Ending:
-        """Verdict and summary into the file; the ending, or what went wrong with it."""
+        """Write verdict and summary, and close; return the ending, or the error in it."""
         try:
             self._writer.note_at_end("undulog.clock", self._clock_facts())
             self._writer.note_at_end("undulog.recorder", self._recorder_facts(ending))
             self._diagnose_last(ending)
-            if _HEALTH in self._asides:
+            if _HEALTH in self._optional_tasks:
                 verdict = self._health.final()
                 self._writer.set_verdict(verdict.verdict, verdict.reasons)
             else:
@@ -343,7 +346,7 @@ class Recording:
         return ending
 
     def _diagnose_last(self, ending: Ending) -> None:
-        """The last state of the sources: a check of the file judges by it."""
+        """Write the last state of the sources, which a check of the file uses."""
         if ending.failed and self._storage.shortage is not None:
             return  # the disk takes no more; the last second's state is in the file
         self._look()
@@ -353,7 +356,7 @@ class Recording:
         facts: dict[str, str] = {}
         for name, clock in self._recorder.clocks.items():
             if clock.pair() is not None:
-                facts |= clock.result().as_metadata(name)
+                facts |= {f"{name}.{key}": text for key, text in clock.result().facts().items()}
         return facts
 
     def _recorder_facts(self, ending: Ending) -> dict[str, str]:
@@ -385,39 +388,6 @@ class Recording:
             facts |= {f"source.{source.name}.{k}": v for k, v in source.facts.items()}
         return facts | dict(self._settings.metadata)
 
-    def _new_snapshot(self, state: str) -> RecorderSnapshot:
-        now_ns = self._clock.now_ns()
-        self._sizes.append((now_ns, self._storage.size))
-        (began, had), (ended, has) = self._sizes[0], self._sizes[-1]
-        measures, times = self._health.result(), self._recorder.ticks.result()
-        clocks = self._recorder.clocks
-        return RecorderSnapshot(
-            session_id=self._session_id,
-            path=str(self._storage.path),
-            robot=self._robot.name if self._robot is not None else None,
-            state=state,
-            now_ns=now_ns,
-            elapsed_s=(now_ns - self._clock.epoch_ns) / _NS,
-            messages=self._storage.messages,
-            size=self._storage.size,
-            byte_rate=(has - had) * _NS / (ended - began) if ended > began else None,
-            free=free_space(self._settings.output),
-            part=self._storage.part,
-            verdict=measures.verdict,
-            reasons=measures.reasons,
-            notes=measures.notes,
-            sources=tuple(
-                self._health.source(source, text, clocks.get(source.name))
-                for text, source in zip(self._settings.sources, self._sources, strict=True)
-            ),
-            topics=self._health.topics(),
-            events=tuple(self._events),
-            tick_p99_s=times.p99_s,
-            tick_max_s=times.max_s,
-            backlog=self._recorder.backlog,
-            unsynced=self._storage.unsynced,
-        )
-
     def _report(self, ending: Ending) -> RecordReport:
         measures = self._health.result()
         files = self._storage.files()
@@ -439,8 +409,14 @@ class Recording:
         )
 
 
+def _storage_of(settings: RecordSettings) -> DiskStorage | RingStorage:
+    if settings.ring_s is not None:
+        return RingStorage(settings.output, settings.ring_s)
+    return DiskStorage(settings)
+
+
 def _control_of(settings: RecordSettings) -> ControlServer:
-    """The control socket: the one that was named, or the first usual one that is free."""
+    """Open the socket of the settings, or the first default one that is free."""
     if settings.socket is not None:
         return ControlServer(settings.socket)
     usual, other = default_sockets(settings.output, os.environ)
@@ -450,9 +426,8 @@ def _control_of(settings: RecordSettings) -> ControlServer:
         return ControlServer(other)
 
 
-def _wishes(settings: RecordSettings) -> dict[str, str]:
-    """What a scenario is told."""
-    wishes = {"fast": str(settings.fast).lower()}
+def _twin_facts(settings: RecordSettings) -> dict[str, str]:
+    facts = {"fast": str(settings.fast).lower()}
     if settings.duration_s is not None:
-        wishes["duration_s"] = repr(settings.duration_s)
-    return wishes
+        facts["duration_s"] = repr(settings.duration_s)
+    return facts

@@ -1,12 +1,10 @@
-"""A recording on one screen: the answer first, then what it is made of.
+"""A recording on one screen: the verdict first, then its details.
 
-State is said in words; colour only helps (blue, yellow and a reversed red: told apart by any eye).
-
-What an operator sees while a recording runs, on stderr.
+States are words; colours only help (blue, yellow and a reversed red, distinct also for the
+colour-blind).
 
 A terminal can stop taking text at any time (Ctrl-S, a dead connection, a full pipe), and a write to
-it waits then for as long as that lasts. A recording may not: so a thread of its own draws, always
-the latest state, and one that is stuck is left behind.
+it blocks then. So a thread of its own draws the latest state, and is abandoned if it is stuck.
 """
 
 from __future__ import annotations
@@ -31,6 +29,7 @@ from .status import (
     RecorderSnapshot,
     SourceSnapshot,
     TopicSnapshot,
+    combined,
     group_of,
     source_state,
 )
@@ -77,11 +76,8 @@ def screen(snapshot: RecorderSnapshot, width: int = 80, height: int | None = Non
     """Draw a recording.
 
     Args:
-        width: Characters in a line; no line is longer.
-        height: Lines on the screen; topics that don't fit are counted. None for no end.
-
-    Returns:
-        The screen's lines.
+        width: Most characters in a line.
+        height: Most lines; topics that don't fit are counted. None for no limit.
     """
     head = [*_headline(snapshot, width), *_verdict(snapshot, width)]
     cells = [_source_cells(each) for each in snapshot.sources]
@@ -89,7 +85,7 @@ def screen(snapshot: RecorderSnapshot, width: int = 80, height: int | None = Non
     events = [_event(event, snapshot, width) for event in snapshot.events[-_EVENTS:]]
     if events:
         events = [Text(), Text("latest events", style="bold"), *events]
-    rows = [_topic_cells(name, topics) for name, topics in _rows(snapshot.topics)]
+    rows = [_topic_cells(row) for row in _rows(snapshot.topics)]
     room = len(rows)
     if height is not None:
         used = len(head) + 1 + len(sources) + 2 + len(events) + 1
@@ -106,11 +102,7 @@ def screen(snapshot: RecorderSnapshot, width: int = 80, height: int | None = Non
 
 
 def plain_line(snapshot: RecorderSnapshot) -> str:
-    """The recording in one line, for what is no terminal.
-
-    Returns:
-        Time, verdict, size, the sources, the heaviest reason.
-    """
+    """Return time, verdict, size, sources and heaviest reason in one line."""
     parts = [
         f"{clock_time(snapshot.elapsed_s)} {snapshot.verdict}",
         f"{snapshot.messages:,} messages, {format_size(snapshot.size)}",
@@ -121,41 +113,25 @@ def plain_line(snapshot: RecorderSnapshot) -> str:
         parts.append(f"{source.name} {state}{rate}")
     if snapshot.free is not None:
         parts.append(_room(snapshot))
-    if snapshot.trouble is not None:
-        parts.append(snapshot.trouble)
     if snapshot.reasons:
         parts.append(snapshot.reasons[0] + _more(len(snapshot.reasons) - 1))
     return plain("; ".join(parts))
 
 
 def event_line(event: EventLine) -> str:
-    """An event in one line, for what is no terminal."""
+    """Return an event in one line."""
     return plain(f"{event.level}: {event.name}: {event.text}")
 
 
 def clock_time(time_s: float) -> str:
-    """A duration as a clock shows it.
-
-    Args:
-        time_s: [s].
-
-    Returns:
-        E.g. ``1:02:03``.
-    """
+    """Format a duration [s] as ``1:02:03``."""
     minutes, seconds = divmod(int(time_s), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}"
 
 
 def time_left(time_s: float) -> str:
-    """A duration in the one or two units that matter.
-
-    Args:
-        time_s: [s].
-
-    Returns:
-        E.g. ``3 h 20 min``.
-    """
+    """Format a duration [s] in its one or two largest units, e.g. ``3 h 20 min``."""
     minutes = int(time_s // 60)
     if minutes < 1:
         return f"{int(time_s)} s"
@@ -186,10 +162,7 @@ def _headline(snapshot: RecorderSnapshot, width: int) -> list[Text]:
     if snapshot.free is not None:
         facts.append(_room(snapshot))
     second = Text(cut(" | ".join(facts), width))
-    lines = [first, second]
-    if snapshot.trouble is not None:
-        lines.append(Text(cut(snapshot.trouble, width), style=_LEVELS["error"]))
-    return lines
+    return [first, second]
 
 
 def _room(snapshot: RecorderSnapshot) -> str:
@@ -227,8 +200,8 @@ def _event(event: EventLine, snapshot: RecorderSnapshot, width: int) -> Text:
     return line
 
 
-def _rows(topics: Sequence[TopicSnapshot]) -> list[tuple[str, list[TopicSnapshot]]]:
-    """Topics by name; many sensors of one kind are one row, what has no rhythm is left out."""
+def _rows(topics: Sequence[TopicSnapshot]) -> list[TopicSnapshot]:
+    """Combine many sensors of one kind into one row; leave out topics without a rhythm."""
     groups: dict[str, list[TopicSnapshot]] = {}
     for topic in topics:
         if not has_rhythm(topic.topic):
@@ -236,12 +209,12 @@ def _rows(topics: Sequence[TopicSnapshot]) -> list[tuple[str, list[TopicSnapshot
         group = group_of(topic.topic)
         alone = group == "joints" or topic.topic.count("/") < 2
         groups.setdefault(topic.topic if alone else f"/{group}", []).append(topic)
-    rows: list[tuple[str, list[TopicSnapshot]]] = []
+    rows: list[TopicSnapshot] = []
     for name, members in groups.items():
         if len(members) <= _SHOWN_ALONE:
-            rows += [(member.topic, [member]) for member in members]
+            rows += members
         else:
-            rows.append((f"{name}/ ({len(members)})", members))
+            rows.append(combined(f"{name}/ ({len(members)})", members))
     return rows
 
 
@@ -268,29 +241,23 @@ def _source_cells(source: SourceSnapshot) -> Cells:
     ]
 
 
-def _topic_cells(name: str, topics: list[TopicSnapshot]) -> Cells:
-    """One row; of several topics the sums, and the worst of what has no sum."""
-    rates = [topic.rate_hz for topic in topics if topic.rate_hz is not None]
-    steady = [topic for topic in topics if topic.gaps is not None]
-    jitters = [topic.jitter for topic in steady if topic.jitter is not None]
-    counted = [topic.dropped for topic in topics if topic.dropped is not None]
-    at_limit = sorted({joint for topic in topics for joint in topic.at_limit})
-    frozen = sorted({joint for topic in topics for joint in topic.frozen})
-    said = [
-        *([f"{len(frozen)} frozen"] if frozen else []),
-        *([f"{len(at_limit)} at limits"] if at_limit else []),
-        *([f"{nan} NaN"] if (nan := sum(topic.nan for topic in topics)) else []),
-    ]
+def _topic_cells(row: TopicSnapshot) -> Cells:
+    conditions = {
+        f"{len(row.frozen)} frozen": row.frozen,
+        f"{len(row.at_limit)} at limits": row.at_limit,
+        f"{row.nan} NaN": row.nan,
+    }
+    faults = ", ".join(text for text, holds in conditions.items() if holds)
     return [
-        (name, ""),
-        (_rate(sum(rates) if rates else None), ""),
-        (f"{max(topic.age_s for topic in topics):.1f}", ""),
-        _counted(sum(topic.gaps or 0 for topic in steady) if steady else None),
-        _counted(sum(topic.missing or 0 for topic in steady) if steady else None),
-        (f"{max(jitters):.0%}" if jitters else _DASH, ""),
-        _counted(sum(counted) if counted else None),
-        (f"{sum(topic.count for topic in topics):,}", ""),
-        (", ".join(said) or _DASH, _LEVELS["warn"] if said else ""),
+        (row.topic, ""),
+        (_rate(row.rate_hz), ""),
+        (f"{row.age_s:.1f}", ""),
+        _counted(row.gaps),
+        _counted(row.missing),
+        (_DASH if row.jitter is None else f"{row.jitter:.0%}", ""),
+        _counted(row.dropped),
+        (f"{row.count:,}", ""),
+        (faults or _DASH, _LEVELS["warn"] if faults else ""),
     ]
 
 
@@ -301,12 +268,12 @@ def _rate(rate_hz: float | None) -> str:
 
 
 def _counted(count: int | None) -> tuple[str, str]:
-    """A count of something that should not be, marked where it is."""
+    """Format a count of faults, marked unless it is zero."""
     return (_DASH, _MUTED) if count is None else (str(count), _LEVELS["warn"] if count else "")
 
 
 def _shorter(path: str, width: int) -> str:
-    """The end of a path, which tells more than its beginning."""
+    """Shorten a path to its end."""
     return path if len(path) <= max(width, 8) else "…" + path[1 - max(width, 8) :]
 
 
@@ -315,23 +282,19 @@ def _more(count: int) -> str:
 
 
 LINE_EVERY_S = 10.0
-"""How often a line is printed where there is no terminal [s] of the recording."""
+"""Interval of the lines without a terminal [s]."""
 
 PATIENCE_S = 1.0
-"""How long the end of a recording waits for what shows it [s]."""
+"""Longest wait for the drawing thread at the end of a recording [s]."""
 
-_TOLD = ("warn", "error", "fatal")
+_PRINTED = ("warn", "error", "fatal")
 
 
 class Terminal:
-    """Shows a recording: a screen on a terminal, else a line every ten seconds."""
+    """Displays a recording: a screen on a terminal, else a line every ten seconds."""
 
     def __init__(self, stream: TextIO, *, quiet: bool = False) -> None:
-        """Start to show; nothing is drawn before the first :meth:`show`.
-
-        Args:
-            stream: Where to, e.g. ``sys.stderr``.
-        """
+        """Display on a stream, e.g. ``sys.stderr``, from the first :meth:`show` on."""
         self._stream = stream
         self._quiet = quiet
         self._latest: RecorderSnapshot | None = None
@@ -340,7 +303,7 @@ class Terminal:
         self._thread: threading.Thread | None = None
 
     def show(self, snapshot: RecorderSnapshot) -> None:
-        """Hand over the latest state; returns at once, also where the terminal is stuck."""
+        """Display a state, without waiting for a stuck terminal."""
         if self._quiet:
             return
         with self._wake:
@@ -351,11 +314,10 @@ class Terminal:
             self._thread.start()
 
     def close(self) -> bool:
-        """End; what was drawn is cleared from a terminal, so that a report can follow.
+        """End, and clear the screen of a terminal.
 
         Returns:
-            Whether the terminal took everything; if not, nothing more should be written to it,
-            since that might wait for ever.
+            Whether all was written; if not, nothing more should be, since that might block.
         """
         if self._thread is None:
             return True
@@ -368,7 +330,7 @@ class Terminal:
     # -- the thread ------------------------------------------------------------------------
 
     def _run(self) -> None:
-        # The terminal may be gone, or the stream closed: a recording goes on without it.
+        # The terminal or the stream may be closed: the recording continues.
         with suppress(OSError, ValueError), self._own() as stream:
             if stream.isatty():
                 self._draw(stream)
@@ -377,9 +339,9 @@ class Terminal:
 
     @contextmanager
     def _own(self) -> Generator[TextIO]:
-        """A stream of our own to the same place.
+        """Open a second stream to the same file.
 
-        A stuck write holds the lock of its stream; were that stderr's, the interpreter could not
+        A stuck write holds the lock of its stream; with that of stderr the interpreter could not
         end.
         """
         try:
@@ -391,7 +353,7 @@ class Terminal:
             yield stream
 
     def _next(self) -> RecorderSnapshot | None:
-        """Wait for a state that was not shown yet; None at the end."""
+        """Wait for a new state; None at the end."""
         with self._wake:
             self._wake.wait_for(lambda: self._latest is not None or self._closing)
             latest, self._latest = self._latest, None
@@ -412,11 +374,11 @@ class Terminal:
 
     def _print(self, stream: TextIO) -> None:
         due_s = 0.0
-        told: EventLine | None = None
+        last: EventLine | None = None
         while (snapshot := self._next()) is not None:
-            for event in _after(snapshot.events, told):
-                told = event
-                if event.level in _TOLD:
+            for event in _after(snapshot.events, last):
+                last = event
+                if event.level in _PRINTED:
                     stream.write(event_line(event) + "\n")
             if snapshot.elapsed_s >= due_s:
                 due_s = snapshot.elapsed_s + LINE_EVERY_S
@@ -424,6 +386,6 @@ class Terminal:
             stream.flush()
 
 
-def _after(events: tuple[EventLine, ...], told: EventLine | None) -> tuple[EventLine, ...]:
-    """The events that came after one."""
-    return events[events.index(told) + 1 :] if told in events else events
+def _after(events: tuple[EventLine, ...], last: EventLine | None) -> tuple[EventLine, ...]:
+    """Return the events behind the last printed one."""
+    return events[events.index(last) + 1 :] if last in events else events

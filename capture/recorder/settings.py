@@ -1,9 +1,8 @@
-"""What a recording is to do: from the command line, the environment and a file, in that order.
+"""Settings of a recording: from the command line, the environment and a file, in that order.
 
-The command line beats the environment (``UNDULOG_RECORD_RING=30s``), which beats the file, which
-beats the defaults. All three use the same names and the same spelling of values, and a name that
-nobody knows is a fault wherever it stands: a mistyped setting never passes for a default. Values
-that another layer overrides are checked all the same.
+The command line overrides the environment (``UNDULOG_RECORD_RING=30s``), which overrides the file,
+which overrides the defaults. All three use the same names and the same spelling of values. An
+unknown name is a fault in each of them, and so is a wrong value that another layer overrides.
 
 A file::
 
@@ -26,8 +25,8 @@ A file::
     quiet = false                   # nothing on the terminal
     metadata = { place = "tank 2" } # further facts for the session
 
-Required are ``sources`` and ``output``. A parser takes what TOML, a text or the command line's own
-types give and returns the value, or raises a DataError whose text says what would be valid.
+Required are ``sources`` and ``output``. A parser takes a value of TOML, a text or a value of the
+command line and returns the setting, or raises a DataError whose text is a valid form.
 """
 
 from __future__ import annotations
@@ -152,7 +151,7 @@ ENVIRONMENT_PREFIX = "UNDULOG_RECORD_"
 """Begins the name of every environment variable that is a setting."""
 
 FILE_VARIABLE = f"{ENVIRONMENT_PREFIX}SETTINGS"
-"""Names the file where the command line doesn't."""
+"""Names the settings file unless the command line does."""
 
 DEFAULT_FLOOR = 500 * SIZE_UNITS["MB"]
 """A recording ends in good order when less disk is free [B]."""
@@ -160,20 +159,20 @@ DEFAULT_FLOOR = 500 * SIZE_UNITS["MB"]
 
 @dataclass(frozen=True)
 class RecordSettings:
-    """Everything that ``undulog record`` takes.
+    """The settings of ``undulog record``.
 
     Attributes:
         sources: Addresses of the sources, at least one.
         output: The session to write, ``.mcap``.
-        robot: A shipped robot or a robot TOML; None where a source brings it.
-        bus: Name of the source that is the robot's bus; None where that is clear.
+        robot: A shipped robot or a robot TOML; None for that of a source.
+        bus: Name of the source that is the robot's bus; None for the only one.
         force: Replace an existing output.
         duration_s: End by itself after this time [s]; None for never.
         split_size: A new part after this size [B]; None for no limit.
         split_time_s: A new part after this time [s]; None for no limit.
         ring_s: Keep so much in memory and write it when marked [s]; None to write everything.
         floor: End in good order when less disk is free [B].
-        socket: The control socket; None for the usual place.
+        socket: The control socket; None for the default one.
         live: Show the recording in Rerun.
         operator: Who records.
         notes: Free text for the session.
@@ -215,12 +214,12 @@ _FIELDS = {each.name.removesuffix("_s"): each for each in fields(RecordSettings)
 PARSERS: Mapping[str, Callable[[object], Any]] = MappingProxyType(
     {name: each.metadata["parse"] for name, each in _FIELDS.items()}
 )
-"""Name of a setting to what reads its value."""
+"""Name of a setting to the parser of its value."""
 
 
 @dataclass(frozen=True)
 class _Layer:
-    """One place where settings come from; an absent or None value isn't given there."""
+    """Settings of one origin; an absent or None value is not set."""
 
     origin: str
     values: Mapping[str, object]
@@ -234,20 +233,17 @@ def resolve(
     *,
     now_ns: int | None = None,
 ) -> RecordSettings:
-    """Put the layers together.
+    """Combine the layers.
 
     Args:
-        cli: Options as the command line has them, by the names of the file (``split_size``, not
-            ``split_size_bytes``); None for what was not given.
+        cli: Options of the command line, by the names of the file (``split_size``, not
+            ``split_size_bytes``); None for one that is not set.
         environ: The environment.
-        file: The settings file; ``UNDULOG_RECORD_SETTINGS`` names it where this is None.
+        file: The settings file; None for that of ``UNDULOG_RECORD_SETTINGS``, if any.
         now_ns: Unix time for ``{time}`` in the output [ns]; that of the call if None.
 
-    Returns:
-        The settings.
-
     Raises:
-        InputFileError: If the file isn't there or can't be read.
+        InputFileError: If the file doesn't exist or can't be read.
         SettingsError: If there are faults; lists all of them, of all layers.
         TypeError: If ``cli`` has a name that no setting has.
     """
@@ -281,7 +277,7 @@ def resolve(
 
 
 def _command_line(cli: Mapping[str, object]) -> _Layer:
-    # An option that can be repeated is an empty tuple when it was not given.
+    # An option that can be repeated is an empty tuple by default.
     given = {name: None if value == () else value for name, value in cli.items()}
 
     def spell(name: str) -> str:
@@ -330,7 +326,7 @@ def _file(path: Path, faults: Faults) -> _Layer:
 
 
 def _origin(file: Path) -> str:
-    return str(file.absolute())  # so that no file passes for another layer
+    return str(file.absolute())  # no file has the name of another layer then
 
 
 def _parsed(
@@ -345,7 +341,7 @@ def _parsed(
 
 
 def _check_together(given: Mapping[str, tuple[_Layer, object]], faults: Faults) -> None:
-    """What is missing, and what excludes each other."""
+    """Check for missing settings and for those that exclude each other."""
     for name, valid in (
         ("sources", "at least one, e.g. can:socketcan:can0"),
         ("output", "a file, e.g. --output run.mcap"),
@@ -371,7 +367,7 @@ def _shown(raw: object) -> str:
 
 
 def _beside(file: Path, robot: str) -> str:
-    """A robot's file beside the settings, where there is one."""
+    """Return the robot's file beside the settings if it exists, else its name."""
     there = file.parent / robot
     return str(there) if is_file(there) else robot
 

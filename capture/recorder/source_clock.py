@@ -1,7 +1,7 @@
-"""A device's clock against the session's: when a sample was taken, rather than when it came.
+"""Mapping of a device's clock to the session's, which gives the sampling times.
 
-Method: the line below all delays, :mod:`.capture.recorder.clock_envelope`. Arrival times can't show
-the least delay itself: mapped times are late by it, the same for all samples of a source.
+Method: the line below all delays, :mod:`.capture.recorder.clock_envelope`. Arrival times don't
+determine the least delay itself: mapped times are late by it, the same for all samples of a source.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from ..sources.contract import DEVICE_TIMES_END_NS
 from .clock_envelope import BUCKET_NS, PRIOR, SAME_DEVICE, Envelope
 
 JUMP_NS = 100_000_000
-"""A device time that goes back by more than this, or comes this much before it can have been, was
-set or restarted: no bus shuffles its frames so far."""
+"""A device clock whose time decreases by more than this, or is this much too early, was set or
+restarted [ns]: no bus reorders its frames so far."""
 
 _START_JUMP_NS = 1_000_000_000.0
-"""The same before the rate is known, when a backlog may still be running off."""
+"""The same before the rate is known, while a backlog may be processed."""
 
 SILENCE_NS = 120_000_000_000
-"""After a silence this long the offset is measured anew and only the rate is kept: a quartz wanders
-by more over it than the line is good for."""
+"""After a longer silence the offset is measured anew and only the rate is kept [ns]: a quartz
+drifts by more meanwhile than the line's uncertainty."""
 
 _WANDER = 2e-6  # of a rate over a silence
 
@@ -36,17 +36,17 @@ _DELAYS = 4096
 
 @dataclass(frozen=True)
 class ClockEstimate:
-    """What is known of a source's clock.
+    """Estimate of a source's clock.
 
     Attributes:
         own_clock: Whether the source has a clock of its own; without one the times are the host's.
         offset_ns: Host minus device time at the last sample [ns]; None without an own clock.
-        drift_ppm: How much faster the device's clock runs than the host's [ppm], over the last
-            minute; None where it isn't known yet.
+        drift_ppm: Rate of the device's clock relative to the host's, minus one [ppm], over the last
+            minute; None if it isn't known yet.
         drift_uncertainty_ppm: Its standard deviation [ppm].
         jitter_s: Standard deviation of arrival minus mapped time [s].
         delay_p99_s: 99 % point of arrival minus mapped time [s], within 9 %.
-        resets: How often the device's clock was set or restarted.
+        resets: Number of times that the device's clock was set or restarted.
         out_of_range: Samples whose device time is impossible.
     """
 
@@ -60,19 +60,8 @@ class ClockEstimate:
     resets: int
     out_of_range: int = 0
 
-    def as_metadata(self, name: str) -> dict[str, str]:
-        """Key-values for the session's metadata record ``undulog.clock``.
-
-        Args:
-            name: The source's name.
-
-        Returns:
-            Keys ``NAME.offset_ns`` and so on; what isn't known is left out.
-        """
-        return {f"{name}.{key}": value for key, value in self.facts().items()}
-
     def facts(self) -> dict[str, str]:
-        """The same, without the name of a source."""
+        """Return the known values as text, as in the metadata record ``undulog.clock``."""
         facts: dict[str, str] = {
             "samples": str(self.samples),
             "resets": str(self.resets),
@@ -90,11 +79,11 @@ class ClockEstimate:
 
 
 class SourceClock:
-    """Maps one source's device times to the session's clock, as the samples come.
+    """Maps one source's device times to the session's clock, as the samples arrive.
 
-    Mapped times never lie after the arrival, and go back only where the device's own do, by as
-    much: a sample that took longer than its neighbours comes late and keeps its time. Where the
-    estimate falls, times run at half speed until they meet it, so that samples stay apart.
+    Mapped times never lie after the arrival, and decrease only where the device's own do, by as
+    much: a sample with a longer delay than its neighbours keeps its time. Where the estimate
+    decreases, times run at half speed until they meet it, so that samples stay apart.
     """
 
     def __init__(self) -> None:
@@ -117,14 +106,14 @@ class SourceClock:
         self._bins = np.zeros(_BINS, np.int64)
 
     def add(self, t_device_ns: IntArray, t_host_ns: IntArray) -> IntArray:
-        """Take samples and map them.
+        """Map samples to the session's clock.
 
         Args:
-            t_device_ns: On the device's own clock, in the order they came, shape (n,); equal to
-                ``t_host_ns`` where a sample has no time of its own. Times that are not in
-                [0, :data:`~.capture.sources.contract.DEVICE_TIMES_END_NS`) are no device's: such
-                samples take the time of the one before, or of their arrival where none came
-                within 100 ms, and leave the estimate as it is.
+            t_device_ns: Times on the device's own clock, in the order of arrival, shape (n,); equal
+                to ``t_host_ns`` where a sample has none. Times that are not in
+                [0, :data:`~.capture.sources.contract.DEVICE_TIMES_END_NS`) are impossible: such
+                samples get the time of the one before, or of their arrival if none came within
+                100 ms, and don't change the estimate.
             t_host_ns: Arrival on the session's clock [Unix ns], not decreasing, shape (n,).
 
         Returns:
@@ -155,11 +144,11 @@ class SourceClock:
         return mapped
 
     def pair(self) -> tuple[int, int] | None:
-        """Device and host time of the latest sample [ns], raw; None before the first."""
+        """Return device and host time of the latest sample [ns]; None before the first."""
         return self._pair
 
     def take_events(self) -> list[str]:
-        """What happened to the clock since the last call, one sentence each."""
+        """Return the events of the clock since the last call, one sentence each."""
         events, self._events = self._events, []
         return events
 
@@ -169,7 +158,7 @@ class SourceClock:
         self._resets += 1
 
     def result(self) -> ClockEstimate:
-        """What is known of the clock so far."""
+        """Return the present estimate."""
         self._count_delays()
         line, known = self._envelope.line, self._own and self._envelope.settled
         offset = drift = unsure = None
@@ -198,7 +187,7 @@ class SourceClock:
     # -- mapping ---------------------------------------------------------------------------
 
     def _replace(self, device: IntArray, host: IntArray, odd: BoolArray) -> None:
-        """Put the last possible device time in place of each impossible one, or the arrival's."""
+        """Replace each impossible device time by the last possible one, or by the arrival's."""
         self._out_of_range += int(odd.sum())
         last = np.maximum.accumulate(np.where(odd, -1, np.arange(len(device))))
         if not self._own and not odd.all():
@@ -210,13 +199,13 @@ class SourceClock:
         self._possible_ns = int(came_ns[-1])
 
     def _in_order(self, t_ns: IntArray) -> IntArray:
-        """Times that are the host's own."""
+        """Map times of the host's clock."""
         mapped = np.maximum(np.maximum.accumulate(t_ns), self._last)
         self._last = int(mapped[-1])
         return mapped
 
     def _mixed(self, device: IntArray, host: IntArray, without: BoolArray) -> IntArray:
-        """Some samples have the device's time and some have none, e.g. echoes of what was sent."""
+        """Map samples of which some have no device time, e.g. echoes of sent frames."""
         cuts = np.flatnonzero(np.diff(without)) + 1
         parts: list[IntArray] = []
         starts: list[int] = [0, *cuts.tolist()]
@@ -226,7 +215,7 @@ class SourceClock:
         return np.concatenate(parts)
 
     def _map(self, device: IntArray, host: IntArray) -> IntArray:
-        """Samples with device times, cut where half a second ends or the clock jumps."""
+        """Map samples with device times, split at half seconds and at jumps of the clock."""
         if not self._own:
             self._own = True
             self._restart(int(device[0]), int(host[0]), Envelope())
@@ -240,7 +229,7 @@ class SourceClock:
             stop = len(host)
             if host[-1] >= self._bucket_ends:
                 stop = int(np.searchsorted(host, self._bucket_ends))
-                stop = max(stop, 1)  # arrivals that go back are not trusted to be sorted
+                stop = max(stop, 1)  # arrivals may decrease
             stop = self._take(device[:stop], host[:stop])
             if stop:
                 parts.append(self._place(device[:stop], host[:stop]))
@@ -250,7 +239,7 @@ class SourceClock:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _take(self, device: IntArray, host: IntArray) -> int:
-        """Let the envelope know samples up to a jump; how many that are."""
+        """Add the samples before a jump to the envelope; return their number."""
         stop = len(device)
         front = np.maximum(np.maximum.accumulate(device), self._front)
         back = device - front < -JUMP_NS
@@ -276,12 +265,12 @@ class SourceClock:
         return stop
 
     def _after_silence(self, device: IntArray, host: IntArray) -> None:
-        """Begin a new envelope where the old one leads to, if the clock was not set meanwhile."""
+        """Begin a new envelope with the old rate, unless the clock was set meanwhile."""
         line = self._envelope.line
         elapsed_ns = int(host[0]) - self._host
         lag_ns = elapsed_ns - (int(device[0]) - self._device) * (1.0 + line.rate)
         if abs(lag_ns) > JUMP_NS + 5.0 * max(line.uncertainty, _WANDER) * elapsed_ns:
-            return  # it was: what takes the samples will find that
+            return  # it was set: found when the samples are taken
         sigma = max(3.0 * line.uncertainty, _WANDER)
         self._restart(int(device[0]), int(host[0]), Envelope(line.rate, sigma))
 
@@ -303,7 +292,7 @@ class SourceClock:
         self._floor = self._last - device // 2
 
     def _place(self, device: IntArray, host: IntArray) -> IntArray:
-        """Map samples on the line, in the device's order and not after their arrival."""
+        """Map samples by the line, in the device's order and not after their arrival."""
         line, own = self._envelope.line, device
         device = np.maximum(np.maximum.accumulate(device), self._front)
         x = device - self._origin[0]

@@ -1,14 +1,7 @@
-"""A recording's state as the statuses of ``/diagnostics``, one message a second.
+"""A recording's state, its statuses on ``/diagnostics``, and its clock.
 
-``undulog log check`` reads the counts of the sources again from there; the names of their keys are
+``undulog log check`` reads the counts of the sources from the statuses; the names of their keys are
 those of :class:`.capture.log.health.sources.SourceHealth`.
-
-Time in the recorder: its clock, the duration of its ticks, tasks once a second.
-
-The clock of a recording: Unix time at its start, and monotonic time from there on.
-
-The wall clock may be set while a robot is being recorded (NTP, a user, a GPS fix); nothing of that
-may change an order or a duration in the session.
 """
 
 from __future__ import annotations
@@ -16,8 +9,9 @@ from __future__ import annotations
 import math
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from ..log.health.rules import GOOD_LOSS, VERDICTS, has_rhythm
 from ..log.health.sources import ELAPSED, RECORDER, SOURCE_PREFIX
@@ -27,7 +21,11 @@ from .source_clock import ClockEstimate
 
 
 class SessionClock:
-    """Unix time at the start plus monotonic time since."""
+    """Unix time at the start plus monotonic time since.
+
+    The wall clock may be set during a recording (NTP, a user, a GPS fix); that changes no order and
+    no duration in the session.
+    """
 
     def __init__(self) -> None:
         """Start now."""
@@ -36,7 +34,7 @@ class SessionClock:
         self._zero = self.epoch_ns - (before + time.monotonic_ns()) // 2
 
     def now_ns(self) -> int:
-        """The present time of the session [Unix ns]; never goes back."""
+        """Return the time of the session [Unix ns], which never decreases."""
         return self._zero + time.monotonic_ns()
 
 
@@ -44,29 +42,16 @@ _NS = 1_000_000_000
 
 
 class EachSecond:
-    """Runs tasks once a second each, at most one a call.
-
-    By the clock, not by counting calls: under load these come more often, or less.
-    """
+    """Runs tasks once a second each by the clock, at most one a call."""
 
     def __init__(self, tasks: Sequence[Callable[[], object]], now_ns: int) -> None:
-        """Begin in a second from now, in the order given.
-
-        Args:
-            now_ns: A monotonic clock [ns].
-        """
+        """Spread the tasks over the first second after ``now_ns`` [ns, monotonic]."""
         self._tasks = tuple(tasks)
         step_ns = _NS // (len(tasks) + 1)
         self._due_ns = [now_ns + (k + 1) * step_ns for k in range(len(tasks))]
 
     def run(self, now_ns: int) -> None:
-        """Run the task that has waited for longest, if one is due.
-
-        Args:
-            now_ns: The same clock [ns].
-        """
-        if not self._tasks:
-            return
+        """Run the task that is due for longest, if any."""
         k = min(range(len(self._due_ns)), key=self._due_ns.__getitem__)
         if self._due_ns[k] > now_ns:
             return
@@ -81,13 +66,7 @@ _EDGES_NS = [round(1e3 * 10 ** (k / _PER_DECADE)) for k in range(7 * _PER_DECADE
 
 @dataclass(frozen=True)
 class TickTimes:
-    """Durations of ticks.
-
-    Attributes:
-        p50_s: Median [s], 0 without ticks.
-        p99_s: 99 % point [s], to 6 %.
-        max_s: Longest [s].
-    """
+    """Durations of ticks: median, 99 % point (to 6 %) and maximum [s]; 0 without ticks."""
 
     count: int
     p50_s: float
@@ -104,21 +83,17 @@ class TickTally:
         self._count = self._longest_ns = 0
 
     def add(self, duration_ns: int) -> None:
-        """Count one tick.
-
-        Args:
-            duration_ns: How long it took [ns].
-        """
+        """Count one tick."""
         self._bins[bisect_right(_EDGES_NS, duration_ns)] += 1
         self._count += 1
         self._longest_ns = max(self._longest_ns, duration_ns)
 
     def result(self) -> TickTimes:
-        """What the ticks so far took."""
+        """Return the durations of the ticks so far."""
         return TickTimes(self._count, self._point(0.5), self._point(0.99), self._longest_ns * 1e-9)
 
     def _point(self, part: float) -> float:
-        """Upper edge of the bin that the quantile falls into [s]."""
+        """Return the upper edge of the bin of a quantile [s]."""
         wanted, seen = part * self._count, 0
         for edge, number in zip((*_EDGES_NS, self._longest_ns), self._bins, strict=True):
             seen += number
@@ -134,13 +109,13 @@ class TopicSnapshot:
     Attributes:
         rate_hz: Messages a second over the last seconds; None before there is a rate.
         age_s: Time since the last message [s].
-        gaps: Gaps in the rhythm so far; None where there is no steady rhythm.
-        missing: Samples missing in them; None the same.
-        jitter: Standard deviation of the intervals as a part of their median; None the same.
-        dropped: Messages dropped, as sequence numbers prove; None where they prove nothing.
-        at_limit: Joints that are held at their limits.
+        gaps: Gaps so far; None without a regular rhythm, as ``missing`` and ``jitter``.
+        missing: Samples missing in them.
+        jitter: Standard deviation of the intervals as a part of their median.
+        dropped: Missing sequence numbers; None without sequence numbers.
+        at_limit: Joints at their limits.
         frozen: Joints that stood while their commands moved.
-        nan: Numbers that are not a number.
+        nan: Values that are not a number.
     """
 
     topic: str
@@ -161,19 +136,18 @@ class SourceSnapshot:
     """One source.
 
     Attributes:
-        name: What the session calls it.
-        address: As the command line named it.
-        finished: Whether nothing will come any more.
-        frames: Frames so far; None for a source that writes topics of its own.
+        address: Address on the command line.
+        finished: Whether no more frames will come.
+        frames: Frames so far; None for a source that writes its own topics.
         rate_hz: Frames a second over the last seconds; None before there is a rate.
         age_s: Time since the last frame [s]; None before the first.
-        dropped: Frames lost before the recorder; None where the source can't tell.
+        dropped: Frames lost before the recorder; None if unknown.
         malformed: Packets that could not be read.
         error_frames: Frames that report a bus error.
         reconnects: How often the connection came back.
         load: Part of the bitrate in the last second, without and with the most stuff bits; None
             where the bitrate is not known.
-        clock: What is known of its clock; None before the first sample.
+        clock: None before the first sample.
     """
 
     name: str
@@ -193,10 +167,10 @@ class SourceSnapshot:
 
 @dataclass(frozen=True)
 class EventLine:
-    """An event, as it stands in ``/rosout``.
+    """An event of ``/rosout``.
 
     Attributes:
-        t_ns: When [Unix ns].
+        t_ns: Time [Unix ns].
         level: ``debug``, ``info``, ``warn``, ``error`` or ``fatal``.
     """
 
@@ -213,23 +187,20 @@ class RecorderSnapshot:
     Attributes:
         path: The file, or the part that is being written.
         robot: Name of the robot, or None.
-        state: What the recorder does: ``recording``, ``waiting`` (a ring that waits for its
-            trigger), ``stopping``.
         now_ns: The session's clock [Unix ns].
         elapsed_s: Time since the start [s].
-        byte_rate: Bytes written a second, over the last while; None before there is a rate.
-        free: Free bytes where the file is; None where that can't be said.
-        part: Number of the part, from 1; None where the session is not split.
-        verdict: ``good``, ``degraded`` or ``bad``, of what came so far.
-        reasons: Why it is not better, heaviest first.
-        notes: What is worth knowing and no fault.
+        byte_rate: Bytes written a second, over the last 10 snapshots; None before there is a rate.
+        free: Free bytes of the disk; None if unknown.
+        part: Number of the part, from 1; None for a ring.
+        verdict: ``good``, ``degraded`` or ``bad``, of the data so far.
+        reasons: Reasons for a verdict that is not good, heaviest first.
+        notes: Remarks that are no faults.
         sources: In the order of the command line.
         events: The latest ones, oldest first.
         tick_p99_s: 99 % point of the recorder's ticks [s].
         tick_max_s: The longest tick [s].
-        backlog: Frames that are safe and wait to be decoded.
+        backlog: Recorded frames that wait to be decoded.
         unsynced: Messages that power loss would cost.
-        trouble: What the recorder itself can't do, one sentence, or None.
     """
 
     session_id: str
@@ -253,11 +224,10 @@ class RecorderSnapshot:
     tick_max_s: float | None = None
     backlog: int = 0
     unsynced: int = 0
-    trouble: str | None = None
 
     @property
     def time_left_s(self) -> float | None:
-        """How long the disk lasts at this rate [s]; None where that can't be said."""
+        """Time until the disk is full at this rate [s]; None if unknown."""
         if self.free is None or not self.byte_rate or self.byte_rate <= 0.0:
             return None
         return self.free / self.byte_rate
@@ -273,17 +243,13 @@ NO_TIME_S = 60.0
 """Disk for less than this is an error."""
 
 SILENT_S = 1.0
-"""A source without a frame for longer has gone stale; ``log check`` calls it a silence."""
+"""A source without a frame for longer is stale [s]; ``log check`` reports a silence."""
 
 _REASONS = 8
 
 
 def statuses(snapshot: RecorderSnapshot) -> tuple[DiagnosticStatus, ...]:
-    """The statuses of one moment.
-
-    Returns:
-        The recorder, the session, each source, each group of topics.
-    """
+    """Return the statuses of the recorder, the session, each source and each group of topics."""
     groups: dict[str, list[TopicSnapshot]] = {}
     for topic in snapshot.topics:
         if has_rhythm(topic.topic):
@@ -297,19 +263,39 @@ def statuses(snapshot: RecorderSnapshot) -> tuple[DiagnosticStatus, ...]:
 
 
 def group_of(topic: str) -> str:
-    """Topics that are shown as one: all of the joints, all infrared sensors, each bus.
-
-    Args:
-        topic: E.g. ``/joint_states`` or ``/ir/07``.
-
-    Returns:
-        E.g. ``joints`` or ``ir``.
-    """
+    """Return the group of a topic: ``joints`` of ``/joint_states``, ``ir`` of ``/ir/07``."""
     if topic.startswith("/joint_"):
         return "joints"
     if topic.startswith(FRAME_TOPIC_PREFIXES):
         return topic.removeprefix("/")
     return topic.removeprefix("/").split("/")[0]
+
+
+def combined(name: str, topics: Sequence[TopicSnapshot]) -> TopicSnapshot:
+    """Combine topics into one: sums of the counts and rates, the worst of the other values."""
+
+    def known(key: str) -> list[Any]:
+        return [value for each in topics if (value := getattr(each, key)) is not None]
+
+    def total(key: str) -> int | None:
+        return sum(known(key)) if known(key) else None
+
+    def joints(key: str) -> tuple[str, ...]:
+        return tuple(sorted({joint for each in topics for joint in getattr(each, key)}))
+
+    return TopicSnapshot(
+        topic=name,
+        count=sum(each.count for each in topics),
+        rate_hz=math.fsum(known("rate_hz")) if known("rate_hz") else None,
+        age_s=max(each.age_s for each in topics),
+        gaps=total("gaps"),
+        missing=total("missing"),
+        jitter=max(known("jitter"), default=None),
+        dropped=total("dropped"),
+        at_limit=joints("at_limit"),
+        frozen=joints("frozen"),
+        nan=sum(each.nan for each in topics),
+    )
 
 
 def _recorder(snapshot: RecorderSnapshot) -> DiagnosticStatus:
@@ -320,55 +306,41 @@ def _recorder(snapshot: RecorderSnapshot) -> DiagnosticStatus:
     if left_s is not None and left_s < LOW_TIME_S:
         level = ERROR if left_s < NO_TIME_S else WARN
         message = f"the disk is full in {left_s:.0f} s"
-    if snapshot.trouble is not None:
-        level, message = ERROR, snapshot.trouble
     values = {
         ELAPSED: f"{snapshot.elapsed_s:.3f}",
         "state": snapshot.state,
-        "messages": str(snapshot.messages),
-        "size_bytes": str(snapshot.size),
-        "free_bytes": _number(snapshot.free),
-        "part": _number(snapshot.part),
-        "tick_p99_s": _number(snapshot.tick_p99_s),
-        "tick_max_s": _number(snapshot.tick_max_s),
-        "backlog_frames": str(snapshot.backlog),
-        "unsynced_messages": str(snapshot.unsynced),
+        "messages": snapshot.messages,
+        "size_bytes": snapshot.size,
+        "free_bytes": snapshot.free,
+        "part": snapshot.part,
+        "tick_p99_s": snapshot.tick_p99_s,
+        "tick_max_s": snapshot.tick_max_s,
+        "backlog_frames": snapshot.backlog,
+        "unsynced_messages": snapshot.unsynced,
     }
-    return _status(level, RECORDER, message, "", values)
+    return _status(level, RECORDER, message, values)
 
 
 def _session(snapshot: RecorderSnapshot) -> DiagnosticStatus:
-    message = snapshot.verdict
-    if snapshot.reasons:
-        message = f"{snapshot.verdict}: {snapshot.reasons[0]}"
-    values = {"verdict": snapshot.verdict, "reasons": str(len(snapshot.reasons))}
+    message = ": ".join((snapshot.verdict, *snapshot.reasons[:1]))
+    values = {"verdict": snapshot.verdict, "reasons": len(snapshot.reasons)}
     values |= {f"reason.{k + 1}": text for k, text in enumerate(snapshot.reasons[:_REASONS])}
     level = (OK, WARN, ERROR)[VERDICTS.index(snapshot.verdict)]
-    return _status(level, "session", message, "", values)
+    return _status(level, "session", message, values)
 
 
 def _source(source: SourceSnapshot) -> DiagnosticStatus:
     level, message = source_state(source)
-    values = {
-        "frames": _number(source.frames),
-        "rate_hz": _number(source.rate_hz),
-        "dropped": _number(source.dropped),
-        "malformed": str(source.malformed),
-        "error_frames": str(source.error_frames),
-        "reconnects": str(source.reconnects),
-        "load": _number(source.load[1] if source.load is not None else None),
-    }
+    counts = ("frames", "rate_hz", "dropped", "malformed", "error_frames", "reconnects")
+    values = {key: getattr(source, key) for key in counts}
+    values["load"] = source.load[1] if source.load is not None else None
     if source.clock is not None:
         values |= {f"clock_{key}": value for key, value in source.clock.facts().items()}
-    return _status(level, SOURCE_PREFIX + source.name, message, source.address, values)
+    return _status(level, SOURCE_PREFIX + source.name, message, values, source.address)
 
 
 def source_state(source: SourceSnapshot) -> tuple[int, str]:
-    """What a source's state is called.
-
-    Returns:
-        Level of :mod:`.capture.log.messages.definitions` and a few words.
-    """
+    """Return the level of a source's state, as in diagnostics, and its description."""
     if source.finished:
         return OK, "ended"
     if not source.connected:
@@ -381,42 +353,39 @@ def source_state(source: SourceSnapshot) -> tuple[int, str]:
 
 
 def _group(name: str, topics: Sequence[TopicSnapshot]) -> DiagnosticStatus:
-    missing = sum(topic.missing or 0 for topic in topics)
-    dropped = sum(topic.dropped or 0 for topic in topics)
-    count = sum(topic.count for topic in topics)
-    jitters = [topic.jitter for topic in topics if topic.jitter is not None]
-    at_limit = sorted({joint for topic in topics for joint in topic.at_limit})
-    frozen = sorted({joint for topic in topics for joint in topic.frozen})
-    said = {
-        f"{missing} samples missing": missing > GOOD_LOSS * (count + missing),
+    group = combined(name, topics)
+    missing, dropped = group.missing or 0, group.dropped or 0
+    conditions = {
+        f"{missing} samples missing": missing > GOOD_LOSS * (group.count + missing),
         f"{dropped} messages dropped": dropped > 0,
-        f"frozen: {', '.join(frozen)}": bool(frozen),
-        f"at their limits: {', '.join(at_limit)}": bool(at_limit),
+        f"frozen: {', '.join(group.frozen)}": bool(group.frozen),
+        f"at their limits: {', '.join(group.at_limit)}": bool(group.at_limit),
     }
-    wrong = [text for text, holds in said.items() if holds]
+    wrong = [text for text, holds in conditions.items() if holds]
     values = {
-        "topics": str(len(topics)),
-        "messages": str(count),
-        "rate_hz": _number(math.fsum(topic.rate_hz or 0.0 for topic in topics)),
-        "oldest_s": _number(max(topic.age_s for topic in topics)),
-        "gaps": str(sum(topic.gaps or 0 for topic in topics)),
-        "missing": str(missing),
-        "dropped": str(dropped),
-        "jitter": _number(max(jitters, default=None)),
-        "nan": str(sum(topic.nan for topic in topics)),
+        "topics": len(topics),
+        "messages": group.count,
+        "rate_hz": group.rate_hz or 0.0,
+        "oldest_s": group.age_s,
+        "gaps": group.gaps or 0,
+        "missing": missing,
+        "dropped": dropped,
+        "jitter": group.jitter,
+        "nan": group.nan,
     }
-    return _status(WARN if wrong else OK, f"topics {name}", "; ".join(wrong) or "ok", "", values)
+    return _status(WARN if wrong else OK, f"topics {name}", "; ".join(wrong) or "ok", values)
 
 
 def _status(
-    level: int, name: str, message: str, hardware: str, values: dict[str, str]
+    level: int,
+    name: str,
+    message: str,
+    values: Mapping[str, float | str | None],
+    hardware: str = "",
 ) -> DiagnosticStatus:
-    known = {key: value for key, value in values.items() if value}
-    return DiagnosticStatus(level, name, message, hardware, known)
+    texts = {key: _text(value) for key, value in values.items() if value not in (None, "")}
+    return DiagnosticStatus(level, name, message, hardware, texts)
 
 
-def _number(value: float | None) -> str:
-    """A number as text, empty where it isn't known."""
-    if value is None:
-        return ""
-    return str(value) if isinstance(value, int) else f"{value:.6g}"
+def _text(value: float | str | None) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,10 +1,10 @@
-"""Where a recording is kept: a session on disk, in parts if wanted, or a ring in memory."""
+"""Storage of a recording: a session on disk, in parts if requested, or a ring in memory."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from mcap.records import Metadata
 
@@ -14,49 +14,25 @@ from ..log.file.parts import part_path
 from ..log.sinks.durable_sink import DurableSink
 from ..log.sinks.mcap_sink import Description, MessageSink
 from ..log.sinks.ring_sink import RingSink
+from .health import LiveHealth
+from .live_feed import LiveFeed
 from .settings import RecordSettings
 
-
-class Listener(Protocol):
-    """Is told of records after the sink has accepted them; must not wait and must not fail."""
-
-    def define(self, record: Description) -> None:
-        """Hear of what explains later messages."""
-        ...
-
-    def offer(
-        self,
-        channel_id: int,
-        log_time_ns: int,
-        publish_time_ns: int,
-        sequence: int,
-        payload: bytes,
-    ) -> None:
-        """Hear of a message; the arguments are those of :meth:`MessageSink.write`."""
-        ...
+_NS = 1_000_000_000
 
 
 class TappedSink:
-    """Passes everything to a sink, and what that accepted to the listeners."""
+    """Passes records to a sink, and those that it accepted to listeners, which never wait."""
 
-    def __init__(self, sink: MessageSink, listeners: Sequence[Listener]) -> None:
-        """Listen to a sink.
-
-        Args:
-            sink: Where everything goes first; what it refuses nobody hears of.
-            listeners: Who hears of it then.
-        """
+    def __init__(self, sink: MessageSink, listeners: Sequence[LiveHealth | LiveFeed]) -> None:
+        """Connect a sink with its listeners."""
         self._sink = sink
         self._write = sink.write
         self._listeners = tuple(listeners)
         self._offers = tuple(listener.offer for listener in listeners)
 
     def define(self, record: Description) -> None:
-        """Take what explains later messages.
-
-        Raises:
-            LogWriteError: If the sink can't keep it.
-        """
+        """See :meth:`MessageSink.define`."""
         self._sink.define(record)
         for listener in self._listeners:
             listener.define(record)
@@ -75,59 +51,47 @@ class TappedSink:
             offer(channel_id, log_time_ns, publish_time_ns, sequence, payload)
 
     def close(self, last: tuple[Metadata, ...]) -> None:
-        """Finalise the sink.
-
-        Args:
-            last: Metadata that belong at the end.
-
-        Raises:
-            LogWriteError: If it can't be finalised.
-        """
+        """See :meth:`MessageSink.close`."""
         self._sink.close(last)
 
 
-_NS = 1_000_000_000
-
-
 class RingStorage:
-    """A ring in memory, written to a file when marked."""
+    """A ring in memory, written to a file when marked.
+
+    Attributes:
+        path: Output of the recording, which names the marks: ``run.mcap`` gives
+            ``run_mark0001.mcap`` and so on.
+        size: Bytes of all marks so far.
+    """
 
     part: int | None = None
     shortage: LogWriteError | None = None
 
     def __init__(self, output: Path, ring_s: float) -> None:
-        """Start with an empty ring.
-
-        Args:
-            output: Names the marks: ``run.mcap`` gives ``run_mark0001.mcap`` and so on.
-            ring_s: How much to keep [s].
+        """Start with an empty ring of the last ``ring_s`` [s].
 
         Raises:
-            LogWriteError: If its folder isn't there.
+            LogWriteError: If the output's folder doesn't exist.
         """
         if not output.parent.is_dir():
             raise LogWriteError(output, f"the folder {output.parent} doesn't exist")
         self.path = output
         self.sink = RingSink(output, round(ring_s * _NS))
-        self.size = 0  # bytes of all marks so far
+        self.size = 0
         self._dropped = 0
 
     @property
     def messages(self) -> int:
-        """Messages accepted."""
+        """Number of messages accepted."""
         return self.sink.accepted
 
     @property
     def unsynced(self) -> int:
-        """Messages that power loss would cost: all that the ring holds."""
+        """Number of messages that power loss would cost: all that the ring holds."""
         return self.sink.messages
 
     def tick(self) -> list[tuple[str, str]]:
-        """Look what became of the marks; called once a second. A failed one ends nothing.
-
-        Returns:
-            What there is to say: level (``info``, ``warn``, ``error``) and one sentence each.
-        """
+        """Return events of the marks: level and one sentence each; called once a second."""
         events: list[tuple[str, str]] = []
         for mark in self.sink.take_marks():
             if mark.error is not None:
@@ -135,8 +99,8 @@ class RingStorage:
                 continue
             size = mark.path.stat().st_size if mark.path.exists() else 0
             self.size += size
-            said = f"{mark.path.name} is written: {mark.messages} messages, {format_size(size)}"
-            events.append(("info", said))
+            text = f"{mark.path.name} is written: {mark.messages} messages, {format_size(size)}"
+            events.append(("info", text))
         if self.sink.dropped and not self._dropped:
             held_s = self.sink.span_ns / _NS
             events.append(("warn", f"the ring is full of bytes and holds only {held_s:.1f} s"))
@@ -144,10 +108,10 @@ class RingStorage:
         return events
 
     def mark(self, text: str = "") -> Mapping[str, Any]:
-        """Write what the ring holds.
+        """Write the messages of the ring.
 
         Returns:
-            The file that is being written, and how much is in it.
+            The ``file`` that is being written, its number of ``messages`` and its ``seconds``.
 
         Raises:
             LogWriteError: If too many marks wait already.
@@ -157,15 +121,11 @@ class RingStorage:
         return {"file": str(path), "messages": messages, "seconds": round(held_s, 3)}
 
     def split(self) -> Mapping[str, Any]:
-        """A ring has no parts.
-
-        Raises:
-            UsageError: Always.
-        """
+        """Raise a UsageError: a ring has no parts."""
         raise UsageError("a ring has no parts; 'undulog record mark' writes what it holds")
 
     def files(self) -> tuple[Path, ...]:
-        """The marks that are whole, in order."""
+        """Return the marks that are whole, in order."""
         return tuple(mark.path for mark in self.sink.marks if mark.error is None)
 
 
@@ -176,7 +136,7 @@ class DiskStorage:
         """Create the first file.
 
         Raises:
-            OutputExistsError: If it is there and ``force`` is not given.
+            OutputExistsError: If it exists and ``force`` is not set.
             LogWriteError: If it can't be created.
         """
         split_s = settings.split_time_s
@@ -186,7 +146,7 @@ class DiskStorage:
             split_size=settings.split_size,
             split_ns=None if split_s is None else round(split_s * _NS),
         )
-        self._told = ""
+        self._reported = ""
 
     @property
     def path(self) -> Path:
@@ -200,7 +160,7 @@ class DiskStorage:
 
     @property
     def messages(self) -> int:
-        """Messages accepted."""
+        """Number of messages accepted."""
         return self.sink.messages
 
     @property
@@ -210,7 +170,7 @@ class DiskStorage:
 
     @property
     def unsynced(self) -> int:
-        """Messages that power loss would cost."""
+        """Number of messages that power loss would cost."""
         return self.sink.unsynced
 
     @property
@@ -219,52 +179,36 @@ class DiskStorage:
         return self.sink.shortage
 
     def tick(self) -> list[tuple[str, str]]:
-        """Flush what has waited for long; called once a second.
+        """Flush old data; called once a second.
 
         Returns:
-            Level and one sentence for a part that could not be begun, once each.
+            Level and one sentence, once for each failure to begin a part.
 
         Raises:
             LogWriteError: If a part that is due can't be begun.
         """
         self.sink.tick()
         trouble = self.sink.split_trouble
-        if trouble is None or str(trouble) == self._told:
+        if trouble is None or str(trouble) == self._reported:
             return []
-        self._told = str(trouble)
+        self._reported = str(trouble)
         return [("error", f"the next part could not be begun, this one goes on: {trouble}")]
 
     def mark(self, text: str = "") -> Mapping[str, Any]:
-        """Nothing to do: everything is written, the mark with it."""
+        """Return no facts: the mark is in the session like every event."""
         del text
         return {}
 
     def split(self) -> Mapping[str, Any]:
-        """Begin the next part.
+        """Begin the next part; return its number and file.
 
         Raises:
-            LogWriteError: If it can't be created; the recording goes on in the one before.
+            LogWriteError: If it can't be created; the recording continues in the present one.
         """
         path = self.sink.split()
         return {"part": self.sink.part, "file": str(path)}
 
     def files(self) -> tuple[Path, ...]:
-        """The parts, in order."""
+        """Return the parts, in order."""
         first = self.sink.path
         return (first, *(part_path(first, k) for k in range(2, self.sink.part + 1)))
-
-
-Storage = DiskStorage | RingStorage
-"""Where a recording is kept."""
-
-
-def open_storage(settings: RecordSettings) -> Storage:
-    """Create what the settings ask for.
-
-    Raises:
-        OutputExistsError: If the output is there and ``force`` is not given.
-        LogWriteError: If it can't be created.
-    """
-    if settings.ring_s is not None:
-        return RingStorage(settings.output, settings.ring_s)
-    return DiskStorage(settings)

@@ -1,11 +1,9 @@
-"""systemd: the unit that comes with the recorder, and sd_notify.
+"""systemd: the unit that comes with the recorder, and notifications of the service manager.
 
-Telling the service manager how it goes, by the sd_notify protocol.
-
-https://www.freedesktop.org/software/systemd/man/latest/sd_notify.html: datagrams of ``KEY=VALUE``
-lines to the socket that ``NOTIFY_SOCKET`` names. Where that is not set, nothing is sent. Sending
-never waits and never ends a recording: what the manager doesn't take is counted, and its own
-watchdog acts if it hears nothing.
+Protocol: https://www.freedesktop.org/software/systemd/man/latest/sd_notify.html, datagrams of
+``KEY=VALUE`` lines to the socket that ``NOTIFY_SOCKET`` names. Without it nothing is sent. Sending
+never waits and never fails: datagrams that can't be sent are counted, and the manager's watchdog
+acts on missing ones.
 """
 
 from __future__ import annotations
@@ -25,19 +23,15 @@ _WATCHDOG_PART = 0.5  # of the time after which the manager gives us up, as sd_n
 
 
 class Notifier:
-    """Speaks to the service manager, if there is one.
+    """Notifies the service manager, if there is one.
 
     Attributes:
-        failed: Messages that could not be sent.
-        watchdog_ns: The manager acts after so long a silence [ns]; None where it doesn't watch.
+        failed: Number of messages that could not be sent.
+        watchdog_ns: Silence after which the manager acts [ns]; None without a watchdog.
     """
 
     def __init__(self, environ: Mapping[str, str]) -> None:
-        """Look who wants to be told.
-
-        Args:
-            environ: The environment: ``NOTIFY_SOCKET``, ``WATCHDOG_USEC``, ``WATCHDOG_PID``.
-        """
+        """Read ``NOTIFY_SOCKET``, ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` of the environment."""
         self.failed = 0
         self.watchdog_ns = _watchdog_ns(environ)
         self._address = _address(environ.get("NOTIFY_SOCKET", ""))
@@ -48,35 +42,22 @@ class Notifier:
         self._next_beat_ns = 0
         self._status = ""
 
-    @property
-    def active(self) -> bool:
-        """Whether anybody listens."""
-        return self._socket is not None
-
     def ready(self, status: str = "") -> None:
-        """Say that the recording has begun.
-
-        Args:
-            status: One sentence for ``systemctl status``.
-        """
+        """Report that the recording has begun; ``status`` is for ``systemctl status``."""
         self._send("READY=1", *self._status_line(status))
 
     def status(self, text: str) -> None:
-        """Say how it goes; nothing is sent while the text stays the same.
-
-        Args:
-            text: One sentence for ``systemctl status``.
-        """
+        """Report a changed status, one sentence for ``systemctl status``."""
         if text != self._status:
             self._send(*self._status_line(text))
 
     def alive(self, now_ns: int | None = None) -> None:
-        """Say that the loop is alive, as often as the manager's watchdog needs it.
+        """Report a sign of life, as often as the manager's watchdog needs it.
 
-        Called every tick from the very loop that must not hang, never from a thread of its own.
+        Called every tick by the loop that must not hang, never by another thread.
 
         Args:
-            now_ns: A monotonic clock [ns]; the system's by default.
+            now_ns: Monotonic clock [ns]; the system's by default.
         """
         if self.watchdog_ns is None or self._socket is None:
             return
@@ -86,12 +67,12 @@ class Notifier:
             self._send("WATCHDOG=1")
 
     def stopping(self) -> None:
-        """Say that the recording ends."""
+        """Report that the recording ends."""
         self._status = ""
         self._send("STOPPING=1")
 
     def close(self) -> None:
-        """Release the socket; nothing is sent any more. Safe to call twice."""
+        """Close the socket; nothing is sent any more. Safe to call twice."""
         if self._socket is not None:
             self._socket.close()
         self._socket = None
@@ -106,12 +87,12 @@ class Notifier:
             return
         try:
             self._socket.sendto("\n".join(lines).encode("utf-8", "replace"), self._address)
-        except OSError:  # full, or gone: the manager's trouble, never the recording's
+        except OSError:  # full, or closed: no reason to end the recording
             self.failed += 1
 
 
 def _address(name: str) -> bytes | None:
-    """The socket's address; None where it is none that a Unix socket can have."""
+    """Return the socket's address; None if it is not that of a Unix socket."""
     if name.startswith("@"):  # abstract: no file
         return b"\0" + os.fsencode(name[1:])
     return os.fsencode(name) if name.startswith("/") else None
@@ -120,31 +101,25 @@ def _address(name: str) -> bytes | None:
 def _watchdog_ns(environ: Mapping[str, str]) -> int | None:
     text, owner = environ.get("WATCHDOG_USEC", ""), environ.get("WATCHDOG_PID", "")
     if owner and owner != str(os.getpid()):
-        return None  # meant for another process that we inherited it from
+        return None  # inherited, for another process
     return int(text) * 1000 if text.isascii() and text.isdigit() and int(text) > 0 else None
 
 
 UNIT_NAME = "undulog-record@.service"
-"""File name of the unit; what stands after the @ names the settings."""
+"""File name of the unit; the part after the @ names the settings."""
 
 HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - named, not used
 """Folders that the unit hides from the recorder."""
 
-_REFUSED = "\"'\\*?["  # systemd takes no program's name with these
+_REFUSED = "\"'\\*?["  # not allowed in a program's name by systemd
 _SHIPPED_PROGRAM = "/usr/local/bin/undulog"
 
 
 def unit_text(program: Path) -> str:
-    """The unit for a program at that path.
-
-    Args:
-        program: Absolute path of the ``undulog`` command.
-
-    Returns:
-        The unit file's text.
+    """Return the text of the unit for the ``undulog`` command at an absolute path.
 
     Raises:
-        UsageError: If the path can't stand in a unit.
+        UsageError: If a unit can't contain the path.
     """
     text = str(program)
     odd = [letter for letter in text if letter in _REFUSED or not letter.isprintable()]
@@ -160,10 +135,10 @@ def unit_text(program: Path) -> str:
 
 
 def installed_program() -> Path:
-    """The ``undulog`` command beside the interpreter that runs this.
+    """Return the ``undulog`` command beside the running interpreter.
 
     Raises:
-        UsageError: If there is none: not installed as a package.
+        UsageError: If there is none, as undulog is not installed as a package.
     """
     program = Path(sys.executable).parent / "undulog"
     if not program.is_file():
@@ -172,11 +147,7 @@ def installed_program() -> Path:
 
 
 def hidden_folder(program: Path) -> str | None:
-    """The folder above a program that the unit hides, so that the service could not start.
-
-    Returns:
-        One of :data:`HIDDEN`, or None.
-    """
+    """Return the one of :data:`HIDDEN` that contains a program, or None."""
     where = (program.absolute(), program.resolve())
     return next(
         (folder for folder in HIDDEN if any(Path(folder) in p.parents for p in where)), None

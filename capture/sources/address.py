@@ -17,10 +17,10 @@ _NO = {"0", "false", "no", "off"}
 
 
 def only(address: SourceAddress, valid: Iterable[str]) -> None:
-    """See that there are no other options than these.
+    """Check that an address has valid options only.
 
     Raises:
-        UsageError: If there is another one; lists those that are valid.
+        UsageError: If it has another one; lists the valid ones.
     """
     names = sorted(valid)
     for key in address.options:
@@ -29,16 +29,10 @@ def only(address: SourceAddress, valid: Iterable[str]) -> None:
 
 
 def number(address: SourceAddress, key: str, default: int) -> int:
-    """A whole number.
-
-    Args:
-        default: If it isn't given.
-
-    Returns:
-        The number, not negative.
+    """Return an option that is a whole number, at least 0.
 
     Raises:
-        UsageError: If it is something else.
+        UsageError: If it has another value.
     """
     value = address.options.get(key)
     if value is None:
@@ -49,16 +43,10 @@ def number(address: SourceAddress, key: str, default: int) -> int:
 
 
 def flag(address: SourceAddress, key: str, *, default: bool) -> bool:
-    """Yes or no.
-
-    Args:
-        default: If it isn't given.
-
-    Returns:
-        True for 1, true, yes and on; False for 0, false, no and off.
+    """Return an option that is 1, true, yes or on, or 0, false, no or off.
 
     Raises:
-        UsageError: If it is something else.
+        UsageError: If it has another value.
     """
     value = address.options.get(key)
     if value is None:
@@ -69,7 +57,7 @@ def flag(address: SourceAddress, key: str, *, default: bool) -> bool:
 
 
 FORM = "[NAME=]SCHEME:REST[?KEY=VALUE&...]"
-"""What an address looks like, for messages."""
+"""Form of an address, for messages."""
 
 _EXAMPLES = "can:socketcan:can0, can:slcan:/dev/ttyACM0?bitrate=1000000, unix:/run/snake.sock"
 _NAME = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*")
@@ -78,16 +66,9 @@ _PREFIX = re.compile(r"([^:?=]*)=(.*)", re.DOTALL)
 
 
 def parse_address(text: str) -> SourceAddress:
-    """Take an address apart.
+    """Parse an address such as ``front=can:slcan:/dev/ttyACM0?bitrate=500000``.
 
-    Without a name, the source is called after what it is connected to: a CAN bus after the last
-    piece of its channel, a socket after its file, what brings its own robot after its scenario.
-
-    Args:
-        text: E.g. ``front=can:slcan:/dev/ttyACM0?bitrate=500000``.
-
-    Returns:
-        The address; nothing is opened or looked up.
+    The default name is the last part of a CAN channel, the file of a socket, or the scenario.
 
     Raises:
         UsageError: If it isn't of that form, or the name can't be part of a topic.
@@ -99,7 +80,7 @@ def parse_address(text: str) -> SourceAddress:
     if not colon or not scheme or not rest:
         raise UsageError(f"{text!r} is no source: expected {FORM}, e.g. {_EXAMPLES}")
     if name is None:
-        name = default_name(scheme, rest)
+        name = _default_name(scheme, rest)
     elif not _NAME.fullmatch(name):
         raise UsageError(
             f"{text!r}: a source can't be called {name!r}, as the name becomes part of topics; "
@@ -108,16 +89,10 @@ def parse_address(text: str) -> SourceAddress:
     return SourceAddress(text, name, scheme, rest, _options(text, query))
 
 
-def default_name(scheme: str, rest: str) -> str:
-    """What a source is called that was given no name.
+def _default_name(scheme: str, rest: str) -> str:
+    """Return the name of a source without one: other characters become underscores.
 
-    Args:
-        scheme: E.g. ``can``.
-        rest: E.g. ``socketcan:can0``.
-
-    Returns:
-        A valid name: what can't be part of one becomes an underscore, and a name that would begin
-        with something else than a letter gets the scheme before it.
+    A name that would not begin with a letter gets the scheme before it.
     """
     if scheme == "can":
         last = PurePosixPath(rest.partition(":")[2]).name
@@ -146,15 +121,12 @@ _EXTRAS = {"pybullet": "sim", "mujoco": "mujoco"}
 
 
 def schemes() -> tuple[str, ...]:
-    """The schemes that are installed, sorted."""
+    """Return the installed schemes, sorted."""
     return tuple(sorted(entry_points(group=ENTRY_POINTS).names))
 
 
 def open_source(address: SourceAddress) -> Source:
-    """Make the source that an address names; it is not started.
-
-    Args:
-        address: From :func:`.capture.sources.address.parse_address`.
+    """Make the source of an address; it is not started.
 
     Raises:
         UsageError: If there is no such scheme or its options are wrong.
@@ -169,13 +141,7 @@ def open_source(address: SourceAddress) -> Source:
 
 
 def open_sources(texts: Iterable[str]) -> list[Source]:
-    """Make all the sources of a recording; none is started.
-
-    Args:
-        texts: Addresses as the command line has them.
-
-    Returns:
-        The sources, in that order.
+    """Make the sources of a recording from their addresses; none is started.
 
     Raises:
         UsageError: If there is none, one is wrong, or two have one name.

@@ -1,16 +1,10 @@
 """Sources with the scheme ``can``: ``can:INTERFACE:CHANNEL[?KEY=VALUE&...]``.
 
 slcan adapters, socketcand servers and the kernel's own interfaces are read in bulk; every other
-interface through python-can.
+interface through python-can, by a thread: its ``recv`` waits and returns one frame at a time.
 
-What python-can's interfaces offer a recorder: listening only, and times of their own.
-
-Looked up in python-can 4.6.1; an interface that isn't named here is opened as it comes.
-
-Any interface of python-can, read by a thread.
-
-python-can offers one frame at a time, by a call that waits; so a thread waits, and the recorder
-takes what has gathered.
+The tables of interfaces are those of python-can 4.6.1; an interface that isn't in them is opened
+with its defaults.
 """
 
 from __future__ import annotations
@@ -43,13 +37,13 @@ from ..log.messages.frames import (
     empty_frames,
 )
 from ..robot.model import ClockDomain
-from .address import flag, number, only
+from .address import flag, only
 from .contract import DEVICE_TIMES_END_NS, Source, SourceAddress
 from .events import IMPLAUSIBLE_TIME, Tally
 from .link import LinkedSource
-from .slcan import SlcanSettings, slcan_source
+from .slcan import slcan_source
 from .socketcan import socketcan_source
-from .socketcand import server_of, socketcand_source
+from .socketcand import socketcand_source
 
 _WAIT_S = 0.1
 _JOIN_S = 1.0
@@ -58,13 +52,10 @@ _TIMES_END_S = DEVICE_TIMES_END_NS / 1e9
 
 
 def bus_class(text: str, interface: str) -> type[can.BusABC]:
-    """The class of an interface.
-
-    Args:
-        interface: E.g. ``pcan``; one that is known.
+    """Return the class of a known interface, e.g. ``pcan``.
 
     Raises:
-        SourceError: If what it needs is not installed.
+        SourceError: If its driver is not installed.
     """
     module, name = BACKENDS[interface]
     try:
@@ -81,7 +72,7 @@ class PythonCanLink:
 
         Args:
             device_time: Whether the messages' times are the device's.
-            detail: What is worth telling of it.
+            detail: Description for messages.
         """
         self.detail = detail
         self._bus = bus
@@ -89,7 +80,7 @@ class PythonCanLink:
         self._device_time = device_time
         self._held: deque[tuple[int, can.Message]] = deque()
         self._lost = 0
-        self._told = 0
+        self._reported = 0
         self._error: OSError | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="undulog-can", daemon=True)
@@ -101,8 +92,8 @@ class PythonCanLink:
         count = len(self._held)
         if not count and error is not None:
             raise error
-        if self._lost > self._told:
-            lost, self._told = self._lost - self._told, self._lost
+        if self._lost > self._reported:
+            lost, self._reported = self._lost - self._reported, self._lost
             self._tally.lost("frame dropped: it was not fetched in time", lost)
         if not count:
             return ()
@@ -124,7 +115,7 @@ class PythonCanLink:
             self._thread.join(_JOIN_S)
 
     def _run(self) -> None:
-        found: OSError | None = None
+        lost: OSError | None = None
         try:
             while not self._stop.is_set():
                 message = self._bus.recv(_WAIT_S)
@@ -135,16 +126,16 @@ class PythonCanLink:
                 else:
                     self._lost += 1
         except Exception as error:  # noqa: BLE001 (a driver's fault is the end of its connection)
-            found = failure(error)
+            lost = failure(error)
         try:
             self._bus.shutdown()
         except Exception as error:  # noqa: BLE001 (a dead device can't be closed: it is lost)
-            found = found or failure(error)
-        self._error = found  # last, so that nobody who sees it has to wait for the driver
+            lost = lost or failure(error)
+        self._error = lost  # last: whoever reads it needs not wait for the driver
 
 
 def _is_fd(message: can.Message) -> bool:
-    """Whether it is a CAN FD frame, also from a driver that doesn't say so."""
+    """Whether it is a CAN FD frame, also from a driver that doesn't mark it."""
     return (message.is_fd or len(message.data) > 8) and not message.is_error_frame
 
 
@@ -191,7 +182,7 @@ def frames_of(
 
 
 def failure(error: Exception) -> OSError:
-    """An error of a driver as the loss of a connection."""
+    """Convert an error of a driver into the loss of a connection."""
     if isinstance(error, OSError):
         return error
     code = getattr(error, "error_code", None)
@@ -203,11 +194,11 @@ def open_bus(text: str, bus: type[can.BusABC], options: Mapping[str, object]) ->
     """Open a bus.
 
     Args:
-        options: What to give it, the channel among them.
+        options: Its arguments, the channel among them.
 
     Raises:
         OSError: If it can't be opened now.
-        SourceError: If it never can: a driver missing, an option that it doesn't know.
+        SourceError: If it never can: a missing driver, an unknown option.
     """
     try:
         return bus(**options)  # type: ignore[arg-type]
@@ -265,14 +256,13 @@ _PARAM = re.compile(r":param\s+(?:[^:\n]*?\s)?(\w+):")
 
 
 def check_interface(text: str, interface: str) -> None:
-    """See that python-can knows an interface.
+    """Check that python-can has an interface.
 
     Args:
         text: The address, for the message.
-        interface: E.g. ``pcan``.
 
     Raises:
-        UsageError: If not; lists those that it knows.
+        UsageError: If it has not; lists those that it has.
     """
     if interface not in BACKENDS:
         valid = listed(sorted(BACKENDS), interface)
@@ -280,11 +270,7 @@ def check_interface(text: str, interface: str) -> None:
 
 
 def known_options(bus: type[can.BusABC]) -> set[str]:
-    """The options that an interface's class names in its signature or its documentation.
-
-    Returns:
-        Their names, without the channel.
-    """
+    """Return the options in the signature or the documentation of an interface's class."""
     names = set(inspect.signature(bus.__init__).parameters)
     for documented in (bus, bus.__init__):
         names |= set(_PARAM.findall(documented.__doc__ or ""))
@@ -292,13 +278,7 @@ def known_options(bus: type[can.BusABC]) -> set[str]:
 
 
 def open_can(address: SourceAddress) -> Source:
-    """Make the source that a ``can:`` address names.
-
-    Args:
-        address: E.g. of ``can:slcan:/dev/ttyACM0?bitrate=1000000``.
-
-    Returns:
-        The source; nothing is opened.
+    """Make the source of an address such as ``can:slcan:/dev/ttyACM0``; nothing is opened.
 
     Raises:
         UsageError: If there is no such interface, or an option is unknown or has no valid value.
@@ -308,48 +288,13 @@ def open_can(address: SourceAddress) -> Source:
     check_interface(address.text, interface)
     if not channel:
         raise UsageError(f"{address.text!r}: no channel; expected can:INTERFACE:CHANNEL")
-    return _OPENERS.get(interface, _open_other)(address, interface, channel)
-
-
-def _open_slcan(address: SourceAddress, interface: str, channel: str) -> Source:
-    valid = ("bitrate", "listen_only", "timestamps", "tty_baud", "rtscts")
-    only(address, valid)
-    settings = SlcanSettings(
-        bitrate=number(address, "bitrate", 0) or None,
-        listen_only=flag(address, "listen_only", default=True),
-        timestamps=flag(address, "timestamps", default=False),
-        tty_baud=number(address, "tty_baud", SlcanSettings.tty_baud),
-        rtscts=flag(address, "rtscts", default=False),
-    )
-    facts = _facts(interface, channel, settings.listen_only)
-    if settings.bitrate is not None:
-        facts["bitrate"] = str(settings.bitrate)
-    facts["timestamps"] = "adapter, 1 ms" if settings.timestamps else "host"
-    return slcan_source(address, channel, settings, facts)
-
-
-def _open_socketcand(address: SourceAddress, interface: str, channel: str) -> Source:
-    host, port = server_of(address)
-    facts = _facts(interface, channel, None) | {"host": host, "port": str(port)}
-    return socketcand_source(address, host, port, channel, facts)
-
-
-def _open_socketcan(address: SourceAddress, interface: str, channel: str) -> Source:
-    if "bitrate" in address.options:
-        raise UsageError(
-            f"{address.text!r}: the bit rate of a kernel interface is set when it is brought up: "
-            f"ip link set {channel} up type can bitrate {address.options['bitrate']} listen-only on"
-        )
-    only(address, ("directions",))
-    return socketcan_source(
-        address,
-        channel,
-        _facts(interface, channel, None),
-        directions=flag(address, "directions", default=False),
-    )
+    if interface in _OWN_LINKS:
+        return _OWN_LINKS[interface](address, channel)
+    return _open_other(address, interface, channel)
 
 
 def _open_other(address: SourceAddress, interface: str, channel: str) -> Source:
+    """Make the source of an interface that python-can reads."""
     bus = bus_class(address.text, interface)
     own = ("listen_only", "device_time")
     given = {key: value for key, value in address.options.items() if key not in own}
@@ -366,12 +311,10 @@ def _open_other(address: SourceAddress, interface: str, channel: str) -> Source:
     options |= {key: _converted(address, key, value) for key, value in given.items()}
     if listen_only:
         options |= LISTEN_ONLY[interface]
-    if interface in NO_CONTROLLER:
-        detail = "never transmits"
-        facts = _facts(interface, channel, None)
-    else:
+    facts, detail = {"interface": interface, "channel": channel}, "never transmits"
+    if interface not in NO_CONTROLLER:
+        facts["listen_only"] = "yes" if listen_only else "no"
         detail = "listen-only" if listen_only else "acknowledges frames"
-        facts = _facts(interface, channel, listen_only)
     facts |= given
     device_time = flag(address, "device_time", default=interface in DEVICE_TIME)
     return LinkedSource(
@@ -385,22 +328,15 @@ def _open_other(address: SourceAddress, interface: str, channel: str) -> Source:
     )
 
 
-_OPENERS: Mapping[str, Callable[[SourceAddress, str, str], Source]] = {
-    "slcan": _open_slcan,
-    "socketcand": _open_socketcand,
-    "socketcan": _open_socketcan,
+_OWN_LINKS: Mapping[str, Callable[[SourceAddress, str], Source]] = {
+    "slcan": slcan_source,
+    "socketcand": socketcand_source,
+    "socketcan": socketcan_source,
 }
 
 
-def _facts(interface: str, channel: str, listen_only: bool | None) -> dict[str, str]:
-    facts = {"interface": interface, "channel": channel}
-    if listen_only is not None:
-        facts["listen_only"] = "yes" if listen_only else "no"
-    return facts
-
-
 def _converted(address: SourceAddress, key: str, value: str) -> object:
-    """An option's value as python-can converts those of its configuration files."""
+    """Convert an option's value as python-can does in its configuration files."""
     if key == "fd":
         return flag(address, key, default=False)
     if key == "state":

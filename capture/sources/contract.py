@@ -1,24 +1,20 @@
-"""What a source is: something that is asked, many times a second, for what has come since.
+"""The contract of a source, which the recorder polls many times a second.
 
 A source is found by the scheme of its address (``can:socketcan:can0``, ``unix:/run/snake.sock``,
 ``twin:flat``) among the entry points of the group :data:`ENTRY_POINTS`; each names a function that
-takes a :class:`SourceAddress` and gives a :class:`Source`. All methods are called from the
-recorder's one thread, and none may block: whatever has to wait (a connect, a device that only
-offers a blocking read) waits in a thread of the source's own.
+takes a :class:`SourceAddress` and returns a :class:`Source`. All methods are called from the
+recorder's one thread, and none may block: calls that wait (a connect, a device with a blocking read
+only) belong into a thread of the source's own.
 
-Frames packed one by one: for a few dozen at a time, cheaper than numpy's columns.
-
-What a packet to a ``unix:`` source looks like.
-
-::
+A packet to a ``unix:`` source::
 
     [sequence:u64 dropped:u64]   optional head, 16 bytes, little-endian
     record[0..256]               32 bytes each: capture.log.frames.FRAME_DTYPE
 
-``sequence`` is the running number of the packet's first frame among all that the sender had, from
-0 at the connection's start; ``dropped`` how many of them it could not send. A head alone is a valid
-packet: it tells of frames dropped after the last one sent. Whether there is a head is told by the
-size.
+``sequence`` is the running number of the packet's first frame among all frames of the sender, from
+0 at the connection's start; ``dropped`` is the number of those that it could not send. A head alone
+is a valid packet: it reports frames dropped after the last packet. The size shows whether there is
+a head.
 """
 
 from __future__ import annotations
@@ -57,26 +53,15 @@ pack_fd_record = struct.Struct("<QQIBBBx64s").pack
 
 
 def records(packed: Iterable[bytes]) -> FrameArray:
-    """Put packed records together.
+    """Join records of :data:`pack_record` into a writeable array, shape (n,).
 
-    Args:
-        packed: What :data:`pack_record` gave.
-
-    Returns:
-        Shape (n,), writeable.
+    For a few dozen frames this is faster than filling numpy's columns.
     """
     return frames_from_bytes(memoryview(bytearray().join(packed)))
 
 
 def fd_records(packed: Iterable[bytes]) -> FrameArray:
-    """Put packed records of CAN FD frames together.
-
-    Args:
-        packed: What :data:`pack_fd_record` gave.
-
-    Returns:
-        Shape (n,), writeable.
-    """
+    """Join records of :data:`pack_fd_record` into a writeable array, shape (n,)."""
     return np.frombuffer(bytearray().join(packed), dtype=FD_FRAME_DTYPE)
 
 
@@ -93,10 +78,10 @@ class SourceAddress:
     """A source as the command line names it: ``[NAME=]SCHEME:REST[?KEY=VALUE&...]``.
 
     Attributes:
-        text: As it was given, for messages.
-        name: What the session calls the source, e.g. the bus ``can0`` of ``/can/can0``.
-        scheme: Which kind of source, e.g. ``can``.
-        rest: What follows the scheme, without the options.
+        text: The whole address, for messages.
+        name: Name of the source in the session, e.g. ``can0`` of ``/can/can0``.
+        scheme: Kind of source, e.g. ``can``.
+        rest: The part between scheme and options.
         options: The options, e.g. ``{"bitrate": "1000000"}``.
     """
 
@@ -109,10 +94,10 @@ class SourceAddress:
 
 @dataclass(frozen=True)
 class SourceEvent:
-    """Something that happened to a source: it goes to ``/rosout``.
+    """An event of a source, for ``/rosout``.
 
     Attributes:
-        t_ns: When [ns], on the session's clock.
+        t_ns: Time on the session's clock [ns].
         level: ``info``, ``warn`` or ``error``.
     """
 
@@ -123,14 +108,13 @@ class SourceEvent:
 
 @dataclass(frozen=True)
 class Polled:
-    """What came since the last poll.
+    """Frames and events since the last poll.
 
     Attributes:
-        frames: Arrays of records of :data:`.FRAME_DTYPE`, in the order they
-            came. ``t_host_ns`` is the arrival on the session's clock, ``t_device_ns`` the device's
-            own time, on the device's own clock and below :data:`DEVICE_TIMES_END_NS`, or equal to
-            ``t_host_ns`` where it gives none.
-        fd_frames: The same of CAN FD frames: records of :data:`.FD_FRAME_DTYPE`.
+        frames: Arrays of records of :data:`.FRAME_DTYPE`, in the order of arrival. ``t_host_ns`` is
+            the arrival on the session's clock, ``t_device_ns`` the time on the device's own clock,
+            below :data:`DEVICE_TIMES_END_NS`, or equal to ``t_host_ns`` without one.
+        fd_frames: The same for CAN FD frames: records of :data:`.FD_FRAME_DTYPE`.
     """
 
     frames: tuple[FrameArray, ...] = ()
@@ -140,11 +124,11 @@ class Polled:
 
 @dataclass
 class SourceCounts:
-    """What became of a source's frames, since the start.
+    """Counts of a source's frames since the start.
 
     Attributes:
-        dropped: Frames that the source's own sequence numbers or counters prove lost before us;
-            None where the source has no such thing.
+        dropped: Frames lost before the recorder, by the source's own sequence numbers or counters;
+            None without these.
         malformed: Packets or lines that could not be read, frames with impossible device times.
         error_frames: Frames that report a bus error.
         reconnects: How often the connection came back.
@@ -159,13 +143,13 @@ class SourceCounts:
 
 @dataclass(frozen=True)
 class SourceContext:
-    """What a recording gives its sources.
+    """Context of a recording for its sources.
 
     Attributes:
         now_ns: The session's clock: Unix time at the start plus monotonic time since [ns].
         writer: The session, for a source that has channels of its own (the twin); frames are
             written by the recorder.
-        facts: Wishes for a twin: ``fast`` (``true``: as fast as it can), ``duration_s``.
+        facts: Settings of a twin: ``fast`` (``true``: as fast as it can), ``duration_s``.
     """
 
     now_ns: Callable[[], int]
@@ -178,68 +162,68 @@ class Source(Protocol):
 
     @property
     def name(self) -> str:
-        """What the session calls it."""
+        """Its name in the session."""
         ...
 
     @property
     def clock(self) -> ClockDomain:
-        """Whose clock ``t_device_ns`` is on."""
+        """Clock of ``t_device_ns``."""
         ...
 
     @property
     def robot(self) -> Robot | None:
-        """The robot that it brings, or None."""
+        """The robot that it defines, or None."""
         ...
 
     @property
     def directions(self) -> bool:
-        """Whether its frames tell those that the robot's computer sent from those it received.
+        """Whether its frames distinguish those that the robot's computer sent from received ones.
 
-        A node that only listens can't tell: to it, all frames are received.
+        To a node that only listens, all frames are received.
         """
         ...
 
     @property
     def facts(self) -> Mapping[str, str]:
-        """What the session's metadata should say of it, e.g. the bitrate; no secrets."""
+        """Facts for the session's metadata, e.g. the bitrate; no secrets."""
         ...
 
     @property
     def counts(self) -> SourceCounts:
-        """What became of its frames so far."""
+        """Counts of its frames so far."""
         ...
 
     @property
     def connected(self) -> bool:
-        """Whether data can come at the moment."""
+        """Whether data can arrive at present."""
         ...
 
     @property
     def finished(self) -> bool:
-        """Whether nothing will come any more (a scenario that has ended)."""
+        """Whether no more data will come (a scenario that has ended)."""
         ...
 
     def start(self, context: SourceContext) -> None:
-        """Begin: connect, or begin to try.
+        """Connect, or begin to try.
 
         Raises:
-            SourceError: If it can never work: no such device type, a path that is not ours.
+            SourceError: If it can never work: no such device type, a path of another user.
         """
         ...
 
     def poll(self) -> Polled:
-        """Take what has come; returns at once."""
+        """Return new frames and events, without waiting."""
         ...
 
     def stop(self) -> None:
-        """End and release everything; safe to call twice. Never raises for a dead device."""
+        """End and release everything, also a dead device; safe to call twice."""
         ...
 
 
 @runtime_checkable
 class EndingSource(Protocol):
-    """A source that can end at an instant, so that its senders know what was accepted."""
+    """A source that can end at an instant: its senders get an error from then on."""
 
     def end(self) -> None:
-        """Accept nothing more. What was accepted comes with the next polls; then it is finished."""
+        """Accept no more frames. Those accepted come with the next polls; then it is finished."""
         ...

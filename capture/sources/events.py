@@ -1,6 +1,4 @@
-"""What happened to a source, told without flooding: one text at most once a second.
-
-What error frames say: a node in trouble, a controller off the bus and back.
+"""Events of a source, one text at most once a second, and the meaning of error frames.
 
 An error frame is one with :data:`.ERROR_FLAG`; its identifier holds the classes
 of error and its data the details, as in ``linux/can/error.h``.
@@ -25,7 +23,7 @@ _PAUSE_NS = 1_000_000_000
 
 @dataclass
 class _Repeats:
-    told_ns: int
+    logged_ns: int
     level: str
     held: int = 0
 
@@ -33,67 +31,55 @@ class _Repeats:
 class EventLog:
     """Collects the events of one source, from any of its threads.
 
-    The first of its kind is told at once. Those that follow within a second are counted, and told
-    together when it is over.
+    The first of its kind is reported at once. Those that follow within a second are counted, and
+    reported together at its end.
     """
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
-        """Start with none.
-
-        Args:
-            now_ns: The session's clock [Unix ns].
-        """
+        """Start without events; ``now_ns`` is the session's clock [Unix ns]."""
         self._now_ns = now_ns
         self._lock = threading.Lock()
         self._repeats: dict[str, _Repeats] = {}
         self._events: list[SourceEvent] = []
 
     def log_event(self, level: str, text: str, count: int = 1) -> None:
-        """Note an event.
+        """Log an event.
 
         Args:
             level: ``info``, ``warn`` or ``error``.
-            text: One sentence, the same for the same kind of event: no numbers that change.
+            text: One sentence, the same for all events of a kind: no numbers that change.
         """
         now = self._now_ns()
         with self._lock:
             repeats = self._repeats.get(text)
             if repeats is None:
                 self._repeats[text] = _Repeats(now, level)
-                self._tell(now, level, text, count)
+                self._append(now, level, text, count)
             else:
                 repeats.held += count
 
     def take(self) -> tuple[SourceEvent, ...]:
-        """Hand out the events that are due.
-
-        Returns:
-            In the order they happened; each is handed out once.
-        """
+        """Remove and return the events that are due, in order."""
         if not self._repeats:
             return ()
         now = self._now_ns()
         with self._lock:
             for text, repeats in list(self._repeats.items()):
-                if now - repeats.told_ns < _PAUSE_NS:
+                if now - repeats.logged_ns < _PAUSE_NS:
                     continue
                 if repeats.held:
-                    self._tell(now, repeats.level, text, repeats.held)
-                    repeats.told_ns, repeats.held = now, 0
+                    self._append(now, repeats.level, text, repeats.held)
+                    repeats.logged_ns, repeats.held = now, 0
                 else:
                     del self._repeats[text]
             return self._drain()
 
     def flush(self) -> tuple[SourceEvent, ...]:
-        """Hand out all events, those held back for their second too.
-
-        Returns:
-            In the order they happened.
-        """
+        """Remove and return all events in order, with those held back."""
         with self._lock:
             for text, repeats in self._repeats.items():
                 if repeats.held:
-                    self._tell(self._now_ns(), repeats.level, text, repeats.held)
+                    self._append(self._now_ns(), repeats.level, text, repeats.held)
                     repeats.held = 0
             return self._drain()
 
@@ -101,44 +87,31 @@ class EventLog:
         events, self._events = tuple(self._events), []
         return events
 
-    def _tell(self, now_ns: int, level: str, text: str, count: int) -> None:
+    def _append(self, now_ns: int, level: str, text: str, count: int) -> None:
         times = f" ({count} times)" if count > 1 else ""
         self._events.append(SourceEvent(now_ns, level, text + times))
 
 
 @dataclass
 class Tally:
-    """What a connection reports to: the source's counts, its events and the session's clock.
-
-    Attributes:
-        now_ns: The session's clock [Unix ns].
-        counts: What became of the frames.
-    """
+    """Counts and events of a source, and the session's clock, ``now_ns`` [Unix ns]."""
 
     now_ns: Callable[[], int]
     counts: SourceCounts = field(default_factory=SourceCounts)
     events: EventLog = field(init=False)
 
     def __post_init__(self) -> None:
-        """Give the events the same clock."""
+        """Set up the events with the same clock."""
         self.events = EventLog(self.now_ns)
 
     def lost(self, text: str, count: int, level: str = "warn") -> None:
-        """Count frames that were dropped; a source that can tell has a count, if it is 0.
-
-        Args:
-            text: How one was dropped.
-        """
+        """Count dropped frames, and log the text unless there are none."""
         self.counts.dropped = (self.counts.dropped or 0) + count
         if count:
             self.events.log_event(level, text, count)
 
     def malformed(self, text: str, count: int) -> None:
-        """Count what could not be read, and say so.
-
-        Args:
-            count: How many; nothing happens for none.
-        """
+        """Count and log malformed data, if any."""
         if count:
             self.counts.malformed += count
             self.events.log_event("warn", text, count)
@@ -172,59 +145,48 @@ _CONTROLLER_STATES = {
 
 
 class BusWatch:
-    """Counts error frames, and tells what they mean, and impossible device times."""
+    """Counts and logs error frames and impossible device times."""
 
     def __init__(self) -> None:
-        """Start with a bus that is well."""
+        """Start with a controller on the bus."""
         self._off = False
 
     def look(self, frames: FrameArray, tally: Tally) -> None:
-        """Look through frames.
-
-        Args:
-            frames: What came, in order.
-            tally: Where to count and tell.
-        """
+        """Check new frames, in order."""
         t_ns = frames["t_device_ns"]
         if t_ns.max(initial=0) >= DEVICE_TIMES_END_NS:
             odd = int((t_ns >= np.uint64(DEVICE_TIMES_END_NS)).sum())
             tally.malformed(IMPLAUSIBLE_TIME, odd)
         ids = frames["id_flags"]
         if not np.bitwise_or.reduce(ids) & ERROR_FLAG:
-            if self._off and len(ids):
-                self._back(tally)
+            if len(ids):
+                self._end_bus_off(tally)
             return
-        is_error = (ids & ERROR_FLAG) != 0
-        places = np.flatnonzero(is_error).tolist()
-        tally.counts.error_frames += len(places)
+        errors = np.flatnonzero(ids & ERROR_FLAG).tolist()
+        tally.counts.error_frames += len(errors)
         before = -1
-        for place in places:
-            if place > before + 1:
-                self._hear(tally)
-            frame = frames[place]
-            self._tell(int(frame["id_flags"]) & ID_MASK, frame["data"].tolist(), tally)
-            before = place
+        for k in errors:
+            if k > before + 1:  # an ordinary frame in between
+                self._end_bus_off(tally)
+            self._log_error(int(ids[k]) & ID_MASK, frames["data"][k].tolist(), tally)
+            before = k
         if len(frames) > before + 1:
-            self._hear(tally)
+            self._end_bus_off(tally)
 
-    def _hear(self, tally: Tally) -> None:
-        """An ordinary frame came: whoever was off the bus is on it."""
-        if self._off:
-            self._back(tally)
-
-    def _tell(self, classes: int, data: list[int], tally: Tally) -> None:
+    def _log_error(self, classes: int, data: list[int], tally: Tally) -> None:
         if classes & RESTARTED:
-            self._off = True  # even if the frame that said so was missed
-            self._back(tally)
+            self._off = True  # even if its bus-off frame was missed
+            self._end_bus_off(tally)
         if classes & BUS_OFF and not self._off:
             self._off = True
             tally.events.log_event("error", "bus-off: the controller left the bus")
-        said = [text for bit, text in _CLASSES.items() if classes & bit]
+        names = [text for bit, text in _CLASSES.items() if classes & bit]
         if classes & _CONTROLLER:
-            said += [text for bit, text in _CONTROLLER_STATES.items() if data[1] & bit]
-        if said or not classes & (RESTARTED | BUS_OFF):
-            tally.events.log_event("warn", f"error frame: {', '.join(said) or 'no class given'}")
+            names += [text for bit, text in _CONTROLLER_STATES.items() if data[1] & bit]
+        if names or not classes & (RESTARTED | BUS_OFF):
+            tally.events.log_event("warn", f"error frame: {', '.join(names) or 'no class given'}")
 
-    def _back(self, tally: Tally) -> None:
-        self._off = False
-        tally.events.log_event("info", "the controller is back on the bus")
+    def _end_bus_off(self, tally: Tally) -> None:
+        if self._off:
+            self._off = False
+            tally.events.log_event("info", "the controller is back on the bus")

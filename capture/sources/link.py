@@ -1,8 +1,8 @@
 """A source over one connection that may break and come back.
 
-A :class:`Link` is an open connection. A :class:`LinkedSource` opens one, reads it, and when it
-breaks tries again, ever more seldom. Opening may block (a name to look up, an adapter that answers
-slowly), so each attempt has a thread of its own; reading never does.
+A :class:`Link` is an open connection. A :class:`LinkedSource` opens one, reads it, and opens it
+again after a break, with growing pauses. Opening may block (a name to look up, an adapter that
+answers slowly), so each attempt has a thread of its own; reading never does.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from __future__ import annotations
 import errno
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, InvalidStateError, wait
+from contextlib import suppress
 from typing import Protocol
 
 from ..common.errors import SourceError
@@ -18,55 +20,38 @@ from ..robot.model import ClockDomain, Robot
 from .contract import Polled, SourceAddress, SourceContext, SourceCounts
 from .events import BusWatch, Tally
 
-FIRST_NS = 100_000_000
-"""Pause before the first new attempt [ns]."""
-LONGEST_NS = 5_000_000_000
-"""Longest pause between two attempts [ns]."""
+_FIRST_NS = 100_000_000
+_LONGEST_NS = 5_000_000_000
 _STEADY_NS = 1_000_000_000
 
 
 class Backoff:
-    """Doubling pauses; a connection that held for a second starts them anew.
+    """Pauses between attempts: 0.1 s, doubled up to 5 s.
 
-    One that breaks down at once doesn't, so that a device that comes and goes is not hammered.
+    A connection that held for a second resets them; a shorter one doesn't.
     """
 
     def __init__(self) -> None:
-        """Start so that the first attempt is due at once."""
-        self._pause_ns = FIRST_NS
+        """Make the first attempt due at once."""
+        self._pause_ns = _FIRST_NS
         self._due_ns = 0
         self._opened_ns: int | None = None
 
     def due(self, now_ns: int) -> bool:
-        """Whether an attempt may be made.
-
-        Args:
-            now_ns: The session's clock [ns].
-
-        Returns:
-            True from the end of the pause on.
-        """
+        """Whether the pause is over."""
         return now_ns >= self._due_ns
 
     def opened(self, now_ns: int) -> None:
-        """Note that an attempt succeeded.
-
-        Args:
-            now_ns: The session's clock [ns].
-        """
+        """Note a successful attempt."""
         self._opened_ns = now_ns
 
     def failed(self, now_ns: int) -> None:
-        """Note that an attempt failed or a connection was lost.
-
-        Args:
-            now_ns: The session's clock [ns].
-        """
+        """Note a failed attempt or a lost connection."""
         if self._opened_ns is not None and now_ns - self._opened_ns >= _STEADY_NS:
-            self._pause_ns = FIRST_NS
+            self._pause_ns = _FIRST_NS
         self._opened_ns = None
         self._due_ns = now_ns + self._pause_ns
-        self._pause_ns = min(2 * self._pause_ns, LONGEST_NS)
+        self._pause_ns = min(2 * self._pause_ns, _LONGEST_NS)
 
 
 _FIRST_ATTEMPT_S = 0.5
@@ -79,33 +64,30 @@ _ABSENT = {
     errno.ECONNREFUSED,
     errno.ECONNRESET,
 }
-"""What an unplugged device or an ended server answers."""
+"""Errors of an unplugged device or an ended server."""
 
 
 class Link(Protocol):
-    """An open connection; one thread uses it after the one that opened it."""
+    """An open connection; after the thread that opened it, one thread uses it."""
 
     @property
     def detail(self) -> str:
-        """What is worth telling of it, e.g. ``listen-only``; may be empty."""
+        """Description for messages, e.g. ``listen-only``; may be empty."""
         ...
 
     def read(self, now_ns: int) -> Sequence[FrameArray]:
-        """Take what has come, without blocking.
+        """Return the received frames, without blocking.
 
         Args:
             now_ns: The session's clock [Unix ns].
 
-        Returns:
-            The frames. Those that came before a break are returned first.
-
         Raises:
-            OSError: If the connection is broken.
+            OSError: If the connection is broken, after all frames were returned.
         """
         ...
 
     def close(self) -> None:
-        """Release it; never raises for a dead device, safe to call twice."""
+        """Release it, also a dead device; safe to call twice."""
         ...
 
 
@@ -113,53 +95,24 @@ OpenLink = Callable[[Tally], Link]
 """Opens a connection; may block. OSError: try again later. SourceError: it can never work."""
 
 
-class _Attempt:
-    """One try to open a connection, in a thread of its own."""
+def _open_in_thread(open_link: OpenLink, tally: Tally) -> Future[Link]:
+    """Open a connection in a thread of its own; one that is cancelled is closed."""
+    opening: Future[Link] = Future()
 
-    def __init__(self, open_link: OpenLink, tally: Tally) -> None:
-        self._lock = threading.Lock()
-        self._abandoned = False
-        self._link: Link | None = None
-        self._error: Exception | None = None
-        self._thread = threading.Thread(
-            target=self._run, args=(open_link, tally), name="undulog-connect", daemon=True
-        )
-        self._thread.start()
-
-    def wait(self, timeout_s: float) -> None:
-        self._thread.join(timeout_s)
-
-    @property
-    def done(self) -> bool:
-        return not self._thread.is_alive()
-
-    def result(self) -> Link:
-        """The connection, or the error that was raised."""
-        if self._error is not None:
-            raise self._error
-        if self._link is None:
-            raise RuntimeError("the attempt has not ended")
-        return self._link
-
-    def abandon(self) -> None:
-        """Nobody waits any more: what was or will be opened is closed."""
-        with self._lock:
-            self._abandoned = True
-        if self._link is not None:
-            self._link.close()
-
-    def _run(self, open_link: OpenLink, tally: Tally) -> None:
+    def run() -> None:
         try:
             link = open_link(tally)
         except Exception as error:  # noqa: BLE001 (raised again by result(), in the recorder's thread)
-            self._error = error
+            with suppress(InvalidStateError):  # cancelled
+                opening.set_exception(error)
             return
-        with self._lock:
-            abandoned = self._abandoned
-            if not abandoned:
-                self._link = link
-        if abandoned:
+        try:
+            opening.set_result(link)
+        except InvalidStateError:  # cancelled
             link.close()
+
+    threading.Thread(target=run, name="undulog-connect", daemon=True).start()
+    return opening
 
 
 class LinkedSource:
@@ -180,22 +133,22 @@ class LinkedSource:
         """Describe the source; nothing is opened.
 
         Args:
-            place: What it is connected to, for messages.
-            clock: Whose clock the frames' device times are on.
-            facts: What the session's metadata say of it.
-            directions: Whether the frames tell sent from received.
+            place: Device or server, for messages.
+            clock: Clock of the frames' device times.
+            facts: Facts for the session's metadata.
+            directions: Whether the frames distinguish sent from received.
         """
         self.name = address.name
         self.clock = clock
         self.facts = facts
         self.directions = directions
-        self.finished = False  # it was found that it can never work, or it was stopped
+        self.finished = False  # it can never work, or it was stopped
         self._open_link = open_link
         self._place = place
         self._tally = Tally(lambda: 0)
         self._watch = BusWatch()
         self._backoff = Backoff()
-        self._attempt: _Attempt | None = None
+        self._opening: Future[Link] | None = None
         self._link: Link | None = None
         self._was_up = False
         self._lost_ns: int | None = None
@@ -203,7 +156,7 @@ class LinkedSource:
 
     @property
     def counts(self) -> SourceCounts:
-        """What became of its frames so far."""
+        """Counts of its frames so far."""
         return self._tally.counts
 
     @property
@@ -212,15 +165,14 @@ class LinkedSource:
         return self._link is not None
 
     def start(self, context: SourceContext) -> None:
-        """Begin to connect, and wait a moment for what is there to answer.
+        """Begin to connect, and wait a moment for the result.
 
         Raises:
-            SourceError: If it can never work. What is only absent is waited for.
+            SourceError: If it can never work. An absent device or server is waited for.
         """
         self._tally = Tally(context.now_ns)
-        self._attempt = _Attempt(self._open_link, self._tally)
-        self._attempt.wait(_FIRST_ATTEMPT_S)
-        if self._attempt.done:
+        self._opening = _open_in_thread(self._open_link, self._tally)
+        if wait([self._opening], _FIRST_ATTEMPT_S).done:
             try:
                 self._connect(context.now_ns())
             except SourceError:
@@ -228,7 +180,7 @@ class LinkedSource:
                 raise
 
     def poll(self) -> Polled:
-        """Take what has come."""
+        """Return new frames and events."""
         if self.finished:
             return Polled((), self._tally.events.flush())
         now = self._tally.now_ns()
@@ -249,50 +201,51 @@ class LinkedSource:
     def stop(self) -> None:
         """End and release everything."""
         self.finished = True
-        if self._attempt is not None:
-            self._attempt.abandon()
-            self._attempt = None
+        if self._opening is not None:
+            if not self._opening.cancel() and self._opening.exception() is None:
+                self._opening.result().close()
+            self._opening = None
         if self._link is not None:
             self._link.close()
             self._link = None
 
     def _connect(self, now_ns: int) -> None:
-        """Begin an attempt that is due, or take the result of one that ended."""
-        if self._attempt is None:
+        """Begin an attempt that is due, or take the result of a finished one."""
+        if self._opening is None:
             if self._backoff.due(now_ns):
-                self._attempt = _Attempt(self._open_link, self._tally)
+                self._opening = _open_in_thread(self._open_link, self._tally)
             return
-        if not self._attempt.done:
+        if not self._opening.done():
             return
-        attempt, self._attempt = self._attempt, None
+        opening, self._opening = self._opening, None
         try:
-            self._link = attempt.result()
+            self._link = opening.result()
         except SourceError as error:
             if not self._was_up:
                 raise
-            self._backoff.failed(now_ns)  # what has worked may work again
-            self._complain(str(error))
-            return
+            complaint = str(error)  # a device that has worked may work again
         except OSError as error:
-            self._backoff.failed(now_ns)
-            if not (self._was_up and error.errno in _ABSENT):  # its loss was told
-                self._complain(f"waits for {self._place}: {_reason(error)}")
-            return
+            complaint = f"waits for {self._place}: {_reason(error)}"
+            if self._was_up and error.errno in _ABSENT:  # its loss is reported already
+                complaint = self._complaint
         except Exception as error:  # noqa: BLE001 (a fault of one source ends no recording)
-            self._backoff.failed(now_ns)
-            self._complain(f"can't open {self._place}: {error!r}")
+            complaint = f"can't open {self._place}: {error!r}"
+        else:
+            self._connected(self._link, now_ns)
             return
+        self._backoff.failed(now_ns)
+        self._complain(complaint)
+
+    def _connected(self, link: Link, now_ns: int) -> None:
         self._backoff.opened(now_ns)
         self._complaint = ""
-        detail = f" ({self._link.detail})" if self._link.detail else ""
-        if not self._was_up:
-            self._tally.events.log_event("info", f"connected to {self._place}{detail}")
-        else:
+        text = f"connected to {self._place}"
+        if self._was_up:
             self._tally.counts.reconnects += 1
             away_s = (now_ns - (self._lost_ns or now_ns)) / 1e9
-            self._tally.events.log_event(
-                "info", f"{self._place} is back after {away_s:.1f} s{detail}"
-            )
+            text = f"{self._place} is back after {away_s:.1f} s"
+        detail = f" ({link.detail})" if link.detail else ""
+        self._tally.events.log_event("info", text + detail)
         self._was_up = True
 
     def _read(self, now_ns: int) -> tuple[FrameArray, ...]:
@@ -312,7 +265,7 @@ class LinkedSource:
         return ()
 
     def _complain(self, text: str) -> None:
-        """Tell why there is no connection, once for each new reason."""
+        """Report why there is no connection, once for each new reason."""
         if text != self._complaint:
             self._complaint = text
             self._tally.events.log_event("warn", text)

@@ -1,17 +1,15 @@
-"""A socket emptied by a thread that waits in the kernel.
+"""Connections emptied by threads, so that no frames are lost while the recorder's loop is delayed.
 
-The recorder's loop looks once a tick, and may be held up: by another program that has the
-processor, by a disk, by decoding. An ``AF_UNIX`` socket holds 30 ms of a busy bus with one frame a
-packet. So a thread lends the kernel room for up to a thousand packets in one ``recvmmsg`` that
-waits for them all: the kernel fills row after row as packets come, without a line of Python and
-without the interpreter's lock, and the loop takes the rows that are filled while the call goes on.
-The lock is only needed when the room is full.
+The loop polls once a tick, and may be delayed by another program that has the processor, by a disk,
+or by decoding. A serial device or a raw CAN socket holds some ten or hundred milliseconds of a busy
+bus: :class:`DrainedLink` reads such a link in a thread, and stamps frames without a time closer to
+their arrival.
 
-A connection emptied by a thread of its own, as soon as something comes.
-
-The recorder looks once a tick, and may be held up for longer by a disk that is slow. A serial
-device or a raw CAN socket holds some ten or hundred milliseconds of a busy bus; then frames are
-lost. The thread takes them meanwhile, and stamps what carries no time closer to its arrival.
+An ``AF_UNIX`` socket holds 30 ms of a busy bus with one frame a packet. So the thread of
+:class:`ReceiveThread` gives the kernel room for up to a thousand packets in one ``recvmmsg`` that
+waits for them all: the kernel fills row after row as packets arrive, without Python code and
+without the interpreter's lock, and the loop takes the filled rows while the call continues. The
+lock is only needed when the room is full.
 """
 
 from __future__ import annotations
@@ -40,24 +38,24 @@ _MOST_HELD = 2_000_000  # frames: 64 MB, four minutes of a busy bus
 
 
 class LinkWithFile(Link, Protocol):
-    """A link that can be waited for."""
+    """A link with a file descriptor to wait for."""
 
     def fileno(self) -> int:
-        """What to wait for."""
+        """Return its file descriptor."""
         ...
 
 
 class DrainedLink:
-    """The :class:`.capture.sources.link.Link` that empties another one."""
+    """The :class:`.capture.sources.link.Link` that reads another one in a thread."""
 
     def __init__(self, link: LinkWithFile, tally: Tally, *, pause_s: float) -> None:
         """Take over an open link, and begin.
 
         Args:
             link: From now on, only the thread uses it.
-            tally: Where to count; the link may have the same.
-            pause_s: How long to let frames gather after some came [s]: what carries no time is
-                stamped at most this much later.
+            tally: Counts lost frames; the link may have the same.
+            pause_s: Pause after each read [s]: frames without a time are stamped at most this much
+                later.
         """
         self.detail = link.detail
         self._link = link
@@ -85,7 +83,7 @@ class DrainedLink:
         return found
 
     def close(self) -> None:
-        """End the thread and release the link."""
+        """End the thread and close the link."""
         if self._closed:
             return
         self._closed = True
@@ -125,7 +123,7 @@ class _Rows:
     """Room for packets.
 
     Attributes:
-        count: How many rows were filled in the end; None while the kernel fills them.
+        count: Number of filled rows; None while the kernel fills them.
     """
 
     def __init__(self, rows: int, longest: int) -> None:
@@ -135,17 +133,17 @@ class _Rows:
 
 
 class ReceiveThread:
-    """Takes what comes to one socket, with the kernel's times."""
+    """Receives the packets of one socket, with the kernel's times."""
 
     def __init__(self, sock: socket.socket, longest: int) -> None:
         """Begin.
 
         Args:
             sock: The socket; from now on only the thread receives from it.
-            longest: Bytes of a packet at most; of a stream, bytes that share a time.
+            longest: Most bytes of a packet; of a stream, most bytes that share a time.
         """
         self.error: OSError | None = None
-        """Why the connection ended; None where the other end closed it in good order."""
+        """Why the connection broke; None if the other end closed it."""
         self._sock = sock
         self._longest = longest
         self._most_waiting = max(2, _MOST_BYTES // (longest * _MOST))
@@ -165,21 +163,20 @@ class ReceiveThread:
 
     @property
     def ended(self) -> bool:
-        """Whether nothing will come any more, and all was taken."""
+        """Whether the connection has ended, and all was taken."""
         return self._ended and not self._filled
 
     @property
     def pending(self) -> bool:
-        """Whether the kernel has bytes that the thread has yet to take."""
+        """Whether the kernel has bytes that the thread has not received yet."""
         size = array("i", (0,))
         fcntl.ioctl(self._sock.fileno(), termios.FIONREAD, size)
         return size[0] > 0
 
     def take(self, most: int) -> list[Batch]:
-        """Take what has come.
+        """Return the received packets, at least ``most`` if there are so many.
 
-        Returns:
-            The packets in order; good until the next call.
+        They are valid until the next call.
         """
         for rows in self._used:
             rows.room.clear()
@@ -202,7 +199,7 @@ class ReceiveThread:
         return found
 
     def end(self) -> None:
-        """Let nothing more in: senders here get an error; what came before is kept."""
+        """Receive no more: local senders get an error; received packets are kept."""
         try:
             self._sock.shutdown(socket.SHUT_RD)
         except OSError:  # the other end was faster
@@ -216,7 +213,7 @@ class ReceiveThread:
         self._sock.close()
 
     def _run(self) -> None:
-        # The main thread is the one whose waiting a signal has to interrupt.
+        # Signals must interrupt the main thread.
         signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
         share_priority()
         try:
@@ -239,14 +236,14 @@ class ReceiveThread:
         return _Rows(self._rows, self._longest)
 
     def _fill(self, rows: _Rows) -> bool:
-        """Wait for packets; True if there was nothing but empty ones, as behind a sender's last."""
+        """Wait for packets; return whether all were empty, as after a sender's last."""
         self._filled.append(rows)
         begun = time.monotonic()
         count = 0
         try:
             count = rows.room.fill(self._sock.fileno())
         except ConnectionError as error:
-            self.error = error  # what came before it is still to be fetched
+            self.error = error  # earlier packets are still to be fetched
         finally:
             rows.count = count
         if count == self._rows and time.monotonic() - begun < _BRIEF_S:

@@ -1,8 +1,8 @@
 """Many packets in one system call: Linux ``recvmmsg``, with the kernel's time of each packet.
 
 Python's ``recv_into`` costs more than a microsecond a packet, and with the time of arrival twice
-that. One call for all that have come is several times cheaper, and a packet's time is that of its
-arrival, not of our looking.
+that. One call for all received packets is several times cheaper, and a packet's time is that of its
+arrival, not of the call.
 """
 
 from __future__ import annotations
@@ -61,14 +61,14 @@ _RECVMMSG = ctypes.CDLL(None, use_errno=True).recvmmsg
 
 @dataclass(frozen=True)
 class Batch:
-    """Packets of one call. Lists, as there are mostly few: they cost less than numpy's columns.
+    """Packets of one call. Lists, as they are mostly short: they cost less than numpy's columns.
 
     Attributes:
-        packets: Their bytes, shape (n, longest); good until the next call.
-        sizes: How many bytes each has.
+        packets: Their bytes, shape (n, longest); valid until the next call.
+        sizes: Number of bytes of each.
         flags: Of each: ``MSG_TRUNC`` if it was longer, ``MSG_DONTROUTE`` and others.
-        stamps_ns: Arrival [Unix ns, on the computer's wall clock]; 0 where the kernel gave none.
-        drops: The kernel's count of dropped packets, modulo 2**32; None if it told none.
+        stamps_ns: Arrival [Unix ns, on the computer's wall clock]; 0 if unknown.
+        drops: The kernel's count of dropped packets, modulo 2**32; None if unknown.
     """
 
     packets: NDArray[np.uint8]
@@ -79,14 +79,14 @@ class Batch:
 
 
 class ReceiveMany:
-    """Buffers for up to so many packets at a time; made once, used for any socket."""
+    """Buffers for many packets of any socket."""
 
     def __init__(self, packets: int, longest: int) -> None:
         """Make the buffers.
 
         Args:
-            packets: How many packets to take at most in one call.
-            longest: Of how many bytes at most.
+            packets: Most packets of one call.
+            longest: Most bytes of a packet.
         """
         self.capacity = packets
         self._packets = np.zeros((packets, longest), dtype=np.uint8)
@@ -107,10 +107,7 @@ class ReceiveMany:
         self._drops = drops.view(_DROPS)[:, 0]
 
     def receive(self, fileno: int) -> Batch:
-        """Take what a socket has, up to the capacity, without waiting.
-
-        Returns:
-            The packets; none if there are none.
+        """Receive the packets of a socket, up to the capacity, without waiting.
 
         Raises:
             OSError: As ``recvmmsg`` has it.
@@ -120,11 +117,11 @@ class ReceiveMany:
     def fill(self, fileno: int) -> int:
         """Wait for packets in the kernel, the interpreter's lock released, until all rows are full.
 
-        Meanwhile :meth:`arrived` and :meth:`batch` give another thread what is there already.
-        :meth:`clear` comes before.
+        Meanwhile another thread gets the received packets by :meth:`arrived` and :meth:`batch`.
+        :meth:`clear` must be called before.
 
         Returns:
-            How many rows are filled: fewer after a signal or in front of an error.
+            Number of filled rows: fewer after a signal or before an error.
 
         Raises:
             OSError: As ``recvmmsg`` has it.
@@ -132,33 +129,26 @@ class ReceiveMany:
         return self._received(fileno, 0)
 
     def clear(self) -> None:
-        """Forget what is there, before the next :meth:`fill`."""
+        """Empty the rows, before the next :meth:`fill`."""
         self._sizes[:] = _EMPTY
         self._heads["controllen"] = _CONTROL
 
     def arrived(self, start: int) -> int:
-        """How far a :meth:`fill` has come.
+        """Return the number of rows filled so far by :meth:`fill`, of which ``start`` are known.
 
-        The kernel stores the bytes of a packet before its size, and the calls between this look
-        and the reading of the bytes take longer than a store needs to be seen by another core.
-
-        Args:
-            start: Rows known to be filled.
+        The kernel stores the bytes of a packet before its size, and the calls between this check
+        and the reading of the bytes take longer than a store needs to reach another core.
         """
         empty = self._sizes[start:] == _EMPTY
         return start + int(empty.argmax()) if empty.any() else self.capacity
 
     def sizes(self, count: int) -> list[int]:
-        """Sizes of the first packets.
-
-        Returns:
-            Bytes of each.
-        """
+        """Return the sizes of the first packets [B]."""
         sizes: list[int] = self._sizes[:count].tolist()
         return sizes
 
     def batch(self, start: int, stop: int) -> Batch:
-        """Packets that are there."""
+        """Return received packets."""
         if start == stop:
             return Batch(self._packets[:0], [], [], [], None)
         heads = self._heads[start:stop]
@@ -171,10 +161,10 @@ class ReceiveMany:
         drops = None
         if max(used) > _STAMP.itemsize:
             rows = zip(self._drops[start:stop].tolist(), used, strict=True)
-            told = [
+            counts = [
                 n for (_, kind, n), room in rows if kind == _DROPS_KIND and room > _STAMP.itemsize
             ]
-            drops = told[-1] if told else None
+            drops = counts[-1] if counts else None
         return Batch(
             packets=self._packets[start:stop],
             sizes=heads["size"].tolist(),
@@ -194,10 +184,10 @@ class ReceiveMany:
 
 
 class ArrivalClock:
-    """Brings the kernel's times, on the wall clock, to the session's clock.
+    """Converts the kernel's times, on the wall clock, to the session's clock.
 
-    The two clocks are read one after the other, and a process may be held up in between; so the
-    offset between them is only moved as far as a reading proves it wrong.
+    The two clocks are read one after the other, and a process may be delayed in between; so the
+    offset between them is only changed as far as a reading contradicts it.
     """
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
@@ -217,8 +207,8 @@ class ArrivalClock:
         Args:
             stamps_ns: Arrival on the wall clock [Unix ns], 0 where unknown, in the order of one
                 socket's queue.
-            floor_ns: Before this time none came, on the session's clock [Unix ns]: the socket was
-                empty then, or gave an earlier packet. It bounds the harm of a wall clock that is
+            floor_ns: Lower limit of the arrivals on the session's clock [Unix ns]: the socket was
+                empty then, or gave an earlier packet. It limits the error after the wall clock was
                 set.
 
         Returns:
@@ -229,9 +219,9 @@ class ArrivalClock:
         times: list[int] = []
         latest = after
         for stamp in reversed(stamps_ns):
-            # A packet that came before stamps were asked for is stamped when it is fetched, but
-            # the queue keeps the order: it came no later than those behind it. One that would lie
-            # long before the floor can't be true: the wall clock was set in between.
+            # A packet that came before stamps were enabled is stamped when it is fetched, but the
+            # queue keeps the order: it came no later than those behind it. A time long before the
+            # floor is wrong: the wall clock was set in between.
             if stamp and floor_ns - _SLACK_NS < stamp + offset < latest:
                 latest = max(stamp + offset, floor_ns)
             times.append(latest)
@@ -240,7 +230,7 @@ class ArrivalClock:
 
 
 def enlarge_buffer(sock: socket.socket, force: int, option: int, size: int) -> None:
-    """Make a socket's buffer as large as we may.
+    """Enlarge a socket's buffer as far as permitted.
 
     Args:
         force: :data:`SO_SNDBUFFORCE` or :data:`SO_RCVBUFFORCE`.

@@ -1,4 +1,4 @@
-"""How another process hands frames to a recorder: through the socket of a ``unix:`` source.
+"""Sends frames of another process to a recorder, through the socket of a ``unix:`` source.
 
 >>> sender = FrameSender("/run/user/1000/snake.sock")
 >>> sender.send(frames)          # an array of FRAME_DTYPE; never waits
@@ -28,18 +28,18 @@ _PAUSE_S = 0.1
 
 
 class FrameSender:
-    """Sends frames to a recorder that may not be there yet, may be slow, and may come back.
+    """Sends frames to a recorder that may start later, be slow, and restart.
 
-    What is not accepted is not kept: real time goes on. It is counted, and the recorder is told.
+    Frames that are not accepted are not kept; their count is reported to the recorder.
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Note where the recorder listens; the first :meth:`send` connects."""
+        """Set the path of the recorder; the first :meth:`send` connects."""
         self.path = Path(path)
         self.accepted = 0
-        """Frames handed over, over all connections."""
+        """Frames accepted, over all connections."""
         self.refused = 0
-        """Frames that were not accepted: no recorder, or its buffer full."""
+        """Frames not accepted: no recorder, or its buffer is full."""
         self._socket: socket.socket | None = None
         self._sequence = 0
         self._dropped = 0
@@ -47,18 +47,18 @@ class FrameSender:
 
     @property
     def connected(self) -> bool:
-        """Whether a recorder was there when last tried."""
+        """Whether the last attempt to connect succeeded."""
         return self._socket is not None
 
     def send(self, frames: FrameArray) -> int:
-        """Hand frames over, without waiting.
+        """Send frames, without waiting.
 
         Args:
             frames: Records of :data:`.FRAME_DTYPE`, shape (n,). ``t_device_ns``
                 is the sampling time on the sender's own clock; ``t_host_ns`` is set on receipt.
 
         Returns:
-            How many were accepted: the first ones. The others are lost, and counted.
+            Number of accepted frames, from the first one on. The others are lost, and counted.
 
         Raises:
             DataError: If the array is of another type.
@@ -84,13 +84,13 @@ class FrameSender:
         return done
 
     def close(self) -> None:
-        """Tell of the last dropped frames, if there is room, and disconnect; safe to call twice."""
+        """Report the last dropped frames, if possible, and disconnect; safe to call twice."""
         if self._socket is not None and self._dropped:
             self._put(self._socket, b"")
         self._disconnect()
 
     def __enter__(self) -> Self:
-        """Nothing to do: the first send connects."""
+        """Return the sender; its first :meth:`send` connects."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -98,7 +98,7 @@ class FrameSender:
         self.close()
 
     def _put(self, sock: socket.socket, records: bytes) -> bool:
-        """Send one packet; False if there is no room or nobody."""
+        """Send one packet; return False if there is no room or no recorder."""
         try:
             sock.send(HEAD.pack(self._sequence, self._dropped) + records)
         except BlockingIOError:

@@ -1,18 +1,14 @@
-"""Serial adapters that speak slcan (Lawicel), read in bulk from the terminal device.
+"""Serial adapters with the slcan protocol (Lawicel), read in bulk from the terminal device.
 
 python-can reads such an adapter byte by byte, 130 us a frame; a bus at 8,000 frames a second has
-one every 125. Here a read takes all there is and one expression takes it apart.
-
-The serial line protocol of slcan adapters (Lawicel).
+one every 125 us. Here a read takes all received bytes, and one expression finds the frames.
 
 A frame is a line ended by a carriage return: ``t`` (11-bit identifier, three digits) or ``T``
 (29-bit, eight), a length digit, two digits for each data byte, and, if the adapter stamps its
 frames, four digits of milliseconds that start again after a minute. ``r`` and ``R`` are remote
-requests; ``d`` and ``D`` CAN FD frames, ``b`` and ``B`` such whose data have the second bit rate,
-all four with a length code up to ``F``. A bell character is the adapter's way to say that something
-went wrong.
-
-One expression finds all frames of a chunk; a chunk with anything else in it is read line by line.
+requests; ``d`` and ``D`` CAN FD frames, ``b`` and ``B`` those with the second bit rate, all four
+with a length code up to ``F``. A bell character reports an error of the adapter. A chunk with
+anything else than frames is read line by line.
 """
 
 from __future__ import annotations
@@ -26,8 +22,8 @@ import select
 import stat
 import termios
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from ..common.errors import SourceError, UsageError
@@ -41,6 +37,7 @@ from ..log.messages.frames import (
     empty_fd_frames,
 )
 from ..robot.model import ClockDomain
+from .address import flag, number, only
 from .contract import SourceAddress, fd_records, pack_fd_record, pack_record, records
 from .events import Tally
 from .link import LinkedSource
@@ -64,25 +61,20 @@ _NS_PER_MS = 1_000_000
 
 
 class SlcanText:
-    """Turns what an adapter sends into frames; keeps a line's beginning until its end comes."""
+    """Turns an adapter's bytes into frames; keeps the beginning of an unfinished line."""
 
     def __init__(self, *, stamps: bool) -> None:
         """Start at the beginning of a line.
 
         Args:
-            stamps: Whether the adapter was asked to stamp its frames, so that their device time
-                is taken from it.
+            stamps: Whether to take the device times from the adapter's stamps.
         """
         self._stamps = StampClock() if stamps else None
         self._rest = b""
         self._has_fd = False
 
     def feed(self, chunk: bytes, t_ns: int, tally: Tally) -> tuple[FrameArray, FrameArray]:
-        """Take what was read.
-
-        Args:
-            t_ns: When they were read [Unix ns].
-            tally: Where to count what is malformed.
+        """Parse bytes that were read at ``t_ns`` [Unix ns].
 
         Returns:
             The frames whose lines have ended, classic ones and CAN FD ones.
@@ -105,7 +97,7 @@ class SlcanText:
         return records(record for record in packed if len(record) == size), fd_records(fd)
 
     def _record(self, head: str, digit: str, rest: str, t_ns: int) -> bytes | None:
-        """A frame's record; None if its line is malformed."""
+        """Return a frame's record; None if its line is malformed."""
         kind = head[0]
         flags = int(head[1:], 16)
         length = _FD_LENGTHS[int(digit, 16)]
@@ -136,7 +128,7 @@ class SlcanText:
 
 
 class StampClock:
-    """Counts the minutes that an adapter's stamps leave out."""
+    """Adds the minutes to an adapter's stamps, which start again after each."""
 
     def __init__(self) -> None:
         """Start before the first stamp."""
@@ -144,15 +136,15 @@ class StampClock:
         self._last_host_ns = 0
 
     def time_ns(self, stamp: str, host_ns: int) -> int | None:
-        """The device's time of a frame.
+        """Return the device's time of a frame.
 
         Args:
-            stamp: Four digits of milliseconds; empty if the adapter gave none.
-            host_ns: When the frame was read [Unix ns]: it tells how many minutes a pause took.
+            stamp: Four hexadecimal digits of milliseconds; may be empty.
+            host_ns: Time of reading [Unix ns]: it gives the number of minutes of a pause.
 
         Returns:
-            Time on the adapter's clock [ns]; the host's if it never gave a stamp; None if it did,
-            but not now, or if the stamp is beyond a minute.
+            Time on the adapter's clock [ns]; ``host_ns`` if no frame had a stamp yet; None if the
+            stamp is missing or beyond a minute.
         """
         if not stamp:
             return host_ns if self._last_ms is None else None
@@ -169,7 +161,7 @@ class StampClock:
 
 
 def _line_by_line(text: str, tally: Tally) -> list[tuple[str, str, str]]:
-    """The fields of the frames in a chunk that has other things in it too."""
+    """Return the fields of the frames in a chunk that has other lines too."""
     tally.malformed("the adapter reports an error (bell)", text.count("\a"))
     found: list[tuple[str, str, str]] = []
     malformed = 0
@@ -209,12 +201,12 @@ _WRITE_S = 1.0
 
 @dataclass(frozen=True)
 class SlcanSettings:
-    """How to open an adapter.
+    """Settings of an adapter.
 
     Attributes:
-        bitrate: Of the bus [bit/s]; None leaves the adapter's own.
-        timestamps: Ask the adapter to stamp frames.
-        tty_baud: Speed of the serial line [bit/s]; without meaning for USB.
+        bitrate: Of the bus [bit/s]; None for the adapter's own.
+        timestamps: Let the adapter stamp frames.
+        tty_baud: Speed of the serial line [bit/s]; without effect on USB.
         rtscts: Hardware handshake on the serial line.
     """
 
@@ -223,22 +215,6 @@ class SlcanSettings:
     timestamps: bool = False
     tty_baud: int = 115_200
     rtscts: bool = False
-
-    def check(self, text: str) -> None:
-        """See that the adapter and the serial line know these numbers.
-
-        Args:
-            text: The address, for the message.
-
-        Raises:
-            UsageError: If not; lists those that are valid.
-        """
-        if self.bitrate is not None and self.bitrate not in BITRATES:
-            valid = ", ".join(map(str, sorted(BITRATES)))
-            raise UsageError(f"{text!r}: bitrate {self.bitrate} is not one of {valid}")
-        if _speed(self.tty_baud) is None:
-            valid = ", ".join(map(str, _speeds()))
-            raise UsageError(f"{text!r}: tty_baud {self.tty_baud} is not one of {valid}")
 
 
 class SlcanLink:
@@ -327,23 +303,31 @@ def open_slcan(path: str, settings: SlcanSettings, tally: Tally) -> SlcanLink:
     return SlcanLink(fileno, first, settings, tally)
 
 
-def slcan_source(
-    address: SourceAddress, path: str, settings: SlcanSettings, facts: Mapping[str, str]
-) -> LinkedSource:
-    """Make the source of an adapter.
+def slcan_source(address: SourceAddress, path: str) -> LinkedSource:
+    """Make the source of an adapter; nothing is opened.
 
     Args:
         path: The device, e.g. ``/dev/ttyACM0``.
-        facts: For the session's metadata.
-
-    Returns:
-        The source; nothing is opened.
 
     Raises:
-        UsageError: If a setting has no valid value.
-        SourceError: If the path is something else than a device.
+        UsageError: If an option is unknown or has no valid value.
+        SourceError: If the path is not that of a device.
     """
-    settings.check(address.text)
+    only(address, [field.name for field in fields(SlcanSettings)])
+    settings = SlcanSettings(
+        bitrate=number(address, "bitrate", 0) or None,
+        listen_only=flag(address, "listen_only", default=True),
+        timestamps=flag(address, "timestamps", default=False),
+        tty_baud=number(address, "tty_baud", SlcanSettings.tty_baud),
+        rtscts=flag(address, "rtscts", default=False),
+    )
+    facts = {"interface": "slcan", "channel": path}
+    facts["listen_only"] = "yes" if settings.listen_only else "no"
+    if settings.bitrate is not None:
+        _check_option(address, "bitrate", settings.bitrate, sorted(BITRATES))
+        facts["bitrate"] = str(settings.bitrate)
+    _check_option(address, "tty_baud", settings.tty_baud, _speeds())
+    facts["timestamps"] = "adapter, 1 ms" if settings.timestamps else "host"
     device = Path(path)
     if device.exists() and not stat.S_ISCHR(device.stat().st_mode):
         raise SourceError(address.text, f"{path} is no serial device")
@@ -356,13 +340,15 @@ def slcan_source(
     )
 
 
+def _check_option(address: SourceAddress, key: str, value: int, valid: list[int]) -> None:
+    if value not in valid:
+        listed = ", ".join(map(str, valid))
+        raise UsageError(f"{address.text!r}: {key} {value} is not one of {listed}")
+
+
 def _speeds() -> list[int]:
     names = [name[1:] for name in dir(termios) if name.startswith("B") and name[1:].isdigit()]
     return sorted(int(name) for name in names if name != "0")
-
-
-def _speed(baud: int) -> int | None:
-    return getattr(termios, f"B{baud}") if baud in _speeds() else None
 
 
 def _make_raw(fileno: int, settings: SlcanSettings) -> None:
@@ -370,7 +356,7 @@ def _make_raw(fileno: int, settings: SlcanSettings) -> None:
     flags = termios.CS8 | termios.CREAD | termios.CLOCAL
     if settings.rtscts:
         flags |= termios.CRTSCTS
-    speed = _speed(settings.tty_baud) or termios.B115200
+    speed = getattr(termios, f"B{settings.tty_baud}")
     characters = attributes[6]
     characters[termios.VMIN] = 1  # so that an empty read means that it hung up
     characters[termios.VTIME] = 0
@@ -394,7 +380,7 @@ def _hung_up() -> OSError:
 
 
 def _receive(fileno: int, timeout_s: float) -> bytes:
-    """What comes next; empty if nothing does in time."""
+    """Return the next bytes; none after the time limit."""
     if not select.select([fileno], [], [], timeout_s)[0]:
         return b""
     chunk = os.read(fileno, _CHUNK)
@@ -404,14 +390,14 @@ def _receive(fileno: int, timeout_s: float) -> bytes:
 
 
 def _settle(fileno: int) -> None:
-    """Let pass what was on its way, until it is quiet (a closed channel sends nothing)."""
+    """Discard late bytes until none come (a closed channel sends nothing)."""
     until = time.monotonic() + 10 * _QUIET_S
     while time.monotonic() < until and _receive(fileno, _QUIET_S):
         pass
 
 
 def _command(fileno: int, command: bytes, refused: str) -> bytes:
-    """Give a command; returns what followed the answer. Some adapters give none."""
+    """Send a command; return the bytes behind its answer, which some adapters don't send."""
     _write(fileno, command + b"\r")
     answer = _receive(fileno, _ANSWER_S)
     if answer.startswith(b"\a"):
@@ -421,11 +407,8 @@ def _command(fileno: int, command: bytes, refused: str) -> bytes:
 
 def _release(fileno: int) -> None:
     """Close the channel if the adapter still takes it, then the device."""
-    try:
+    with contextlib.suppress(OSError):  # an unplugged device
         os.write(fileno, b"C\r")
         fcntl.ioctl(fileno, termios.TIOCNXCL)
-    except OSError:
-        pass  # gone already: nothing to close
-    finally:
-        with contextlib.suppress(OSError):
-            os.close(fileno)
+    with contextlib.suppress(OSError):
+        os.close(fileno)

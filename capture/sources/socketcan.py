@@ -1,7 +1,7 @@
 """CAN interfaces of the Linux kernel, drained in bulk from a raw socket.
 
-The kernel stamps each frame when it comes and counts what it had to drop because nobody fetched
-it, so a stall of the recorder neither blurs times nor hides losses. The socket is never written to;
+The kernel stamps each frame at its arrival and counts the frames that it had to drop, so a stall of
+the recorder changes no times and hides no losses. The socket is never written to;
 whether the controller itself is listen-only is set when the interface is brought up
 (``ip link set can0 type can bitrate 1000000 listen-only on``).
 """
@@ -11,13 +11,14 @@ from __future__ import annotations
 import os
 import socket
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from ..common.errors import SourceError
+from ..common.errors import SourceError, UsageError
 from ..log.messages.frames import DIR_RX, DIR_TX, FrameArray, empty_fd_frames, empty_frames
 from ..robot.model import ClockDomain
+from .address import flag, only
 from .contract import SourceAddress
 from .events import Tally
 from .link import LinkedSource
@@ -49,14 +50,11 @@ _PAUSE_S = 0.005  # the kernel has the times
 
 
 def frames_of(batch: Batch, times_ns: Sequence[int], *, fd: bool = False) -> FrameArray:
-    """Turn the kernel's frames of one kind, classic or CAN FD, into ours.
+    """Convert the kernel's frames of one kind, classic or CAN FD.
 
     Args:
         batch: Packets of a raw CAN socket; those of another kind are left out.
-        times_ns: Their arrival [Unix ns].
-
-    Returns:
-        The frames; device and host time are both the arrival.
+        times_ns: Their arrival [Unix ns], which becomes device and host time.
     """
     mtu, layout = (CANFD_MTU, _CANFD_FRAME) if fd else (CAN_MTU, _CAN_FRAME)
     rows = [row for row, size in enumerate(batch.sizes) if size == mtu]
@@ -168,23 +166,22 @@ def _set_up(sock: socket.socket, interface: str) -> None:
         raise OSError(code, os.strerror(code))
 
 
-def socketcan_source(
-    address: SourceAddress, channel: str, facts: Mapping[str, str], *, directions: bool
-) -> LinkedSource:
-    """Make the source of an interface.
+def socketcan_source(address: SourceAddress, channel: str) -> LinkedSource:
+    """Make the source of an interface, e.g. ``can0``; nothing is opened.
 
-    Args:
-        channel: The interface, e.g. ``can0``.
-        facts: For the session's metadata.
-        directions: Whether this computer is the robot's own: then the frames that it sends are
-            commands, and the kernel tells them apart.
-
-    Returns:
-        The source; nothing is opened.
+    Its option ``directions`` states that this computer is the robot's own: then the frames that it
+    sends are commands, which the kernel marks.
 
     Raises:
+        UsageError: If an option is unknown or has no valid value.
         SourceError: If this computer's kernel has no CAN sockets.
     """
+    if "bitrate" in address.options:
+        raise UsageError(
+            f"{address.text!r}: the bit rate of a kernel interface is set when it is brought up: "
+            f"ip link set {channel} up type can bitrate {address.options['bitrate']} listen-only on"
+        )
+    only(address, ("directions",))
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as error:
@@ -198,6 +195,6 @@ def socketcan_source(
         lambda tally: DrainedLink(open_socketcan(channel, tally), tally, pause_s=_PAUSE_S),
         place=channel,
         clock=ClockDomain.HOST,
-        facts=facts,
-        directions=directions,
+        facts={"interface": "socketcan", "channel": channel},
+        directions=flag(address, "directions", default=False),
     )

@@ -2,13 +2,11 @@
 
 The server's own times of the frames are kept, to the microsecond, as the device's clock.
 
-The raw mode of socketcand.
-
 A frame is ``< frame 123 1700000000.123456 1122AABB >``: an identifier of three digits (11 bit) or
 eight (29 bit), the server's time, the data, with some servers with blanks between the bytes. One
-expression finds them all. What is rare is read one by one: remote requests
+expression finds them all. Rare messages are read one by one: remote requests
 ``< rtr 123 TIME LENGTH >``, error frames ``< error CLASSES TIME >``, times with another number of
-decimals or out of range, and whatever is broken.
+decimals or out of range, and malformed ones.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ import errno
 import re
 import socket
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import accumulate
 
 import numpy as np
@@ -45,38 +43,26 @@ _ANY = re.compile(
 )
 _TIME = re.compile(r"(\d{1,10})(?:\.(\d{1,9}))?", re.ASCII)
 _WORD = re.compile(r"< *(hi|ok|echo) *>")
-_TOLD = re.compile(r"< *(error\b[^>]*?) *>")
+_ERROR = re.compile(r"< *(error\b[^>]*?) *>")
 _LONGEST = 400  # a CAN FD frame with 64 bytes and blanks has about 220
 _HIGHEST_STANDARD = 0x7FF
 
 
 class SocketcandText:
-    """Turns what a server sends into frames; keeps a message's beginning until its end comes."""
+    """Turns a server's bytes into frames; keeps the beginning of an unfinished message."""
 
     def __init__(self) -> None:
         """Start between two messages."""
         self._rest = b""
 
     def feed(self, chunk: bytes, t_ns: int, tally: Tally) -> FrameArray:
-        """Take what was read at once.
-
-        Args:
-            t_ns: When they were read [Unix ns].
-            tally: Where to count what is malformed.
-
-        Returns:
-            The frames whose messages have ended.
-        """
+        """Return the frames of bytes that came at ``t_ns`` [Unix ns]."""
         return self.feed_pieces((chunk,), (t_ns,), tally)
 
     def feed_pieces(
         self, pieces: Sequence[bytes], times_ns: Sequence[int], tally: Tally
     ) -> FrameArray:
-        """Take what came in pieces.
-
-        Args:
-            times_ns: When each piece came [Unix ns].
-            tally: Where to count what is malformed.
+        """Parse pieces that came at ``times_ns`` [Unix ns].
 
         Returns:
             The frames whose messages have ended, with the time of the piece that ended them.
@@ -135,9 +121,8 @@ def _record(message: str, t_host_ns: int, tally: Tally) -> bytes | None:
     """Read one message; None if it is no frame."""
     found = _ANY.fullmatch(message)
     if found is None:
-        told = _TOLD.fullmatch(message)
-        if told is not None:
-            tally.events.log_event("warn", f"the server answered: {told[1]!r}")
+        if (error := _ERROR.fullmatch(message)) is not None:
+            tally.events.log_event("warn", f"the server answered: {error[1]!r}")
         elif not _WORD.fullmatch(message):
             tally.malformed("malformed message", 1)
         return None
@@ -192,11 +177,7 @@ class SocketcandLink:
     detail = "never transmits"
 
     def __init__(self, sock: socket.socket, first: bytes, tally: Tally) -> None:
-        """Take over a connection.
-
-        Args:
-            first: What came already behind the last answer.
-        """
+        """Take over a connection; ``first`` are the bytes behind the last answer."""
         self._first = first
         self._text = SocketcandText()
         self._tally = tally
@@ -236,10 +217,7 @@ class SocketcandLink:
 
 
 def server_of(address: SourceAddress) -> tuple[str, int]:
-    """Where an address says that its server is.
-
-    Args:
-        address: E.g. of ``can:socketcand:can0?host=192.168.7.2``.
+    """Return host and port of an address such as ``can:socketcand:can0?host=192.168.7.2``.
 
     Raises:
         UsageError: If an option is unknown or has no valid value.
@@ -251,41 +229,19 @@ def server_of(address: SourceAddress) -> tuple[str, int]:
     return address.options.get("host", "localhost"), port
 
 
-def open_socketcand(host: str, port: int, channel: str, tally: Tally) -> SocketcandLink:
-    """Connect, open the bus and go to raw mode.
-
-    Args:
-        host: Name or address.
-        channel: The bus, as the server calls it.
-
-    Raises:
-        OSError: If the server isn't there, has no such bus, or speaks something else.
-    """
-    sock, rest = connect(host, port)
-    try:
-        rest = enter_raw_mode(sock, rest, channel)
-    except OSError:
-        sock.close()
-        raise
-    return SocketcandLink(sock, rest, tally)
-
-
 def connect(host: str, port: int) -> tuple[socket.socket, bytes]:
-    """Connect and be greeted.
-
-    Args:
-        host: Name or address.
+    """Connect and wait for the greeting.
 
     Returns:
-        The socket, with a time limit, and what came already behind the greeting.
+        The socket, with a time limit, and the bytes behind the greeting.
 
     Raises:
-        OSError: If the server isn't there, or speaks something else.
+        OSError: If no server answers there, or it has another protocol.
     """
     sock = socket.create_connection((host, port), timeout=_CONNECT_S)
     try:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # A server whose computer lost its power says no farewell: ask, after 5 s of silence.
+        # A server whose computer lost its power closes nothing: probe it after 5 s of silence.
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 5)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 2)
@@ -297,16 +253,13 @@ def connect(host: str, port: int) -> tuple[socket.socket, bytes]:
 
 
 def enter_raw_mode(sock: socket.socket, rest: bytes, channel: str) -> bytes:
-    """Open a bus and go to raw mode.
+    """Open a bus and change to raw mode; return the bytes behind the last answer.
 
     Args:
-        channel: The bus, as the server calls it.
-
-    Returns:
-        What came already behind the last answer.
+        channel: The server's name of the bus.
 
     Raises:
-        OSError: If the server has no such bus, or speaks something else.
+        OSError: If the server has no such bus, or has another protocol.
     """
     sock.sendall(b"< open %s >" % channel.encode())
     rest = _expect(sock, rest, b"ok")
@@ -314,25 +267,32 @@ def enter_raw_mode(sock: socket.socket, rest: bytes, channel: str) -> bytes:
     return _expect(sock, rest, b"ok")
 
 
-def socketcand_source(
-    address: SourceAddress, host: str, port: int, channel: str, facts: Mapping[str, str]
-) -> LinkedSource:
-    """Make the source of a served bus.
+def socketcand_source(address: SourceAddress, channel: str) -> LinkedSource:
+    """Make the source of a served bus; nothing is opened.
 
     Args:
-        host: Name or address of the server.
-        channel: The bus, as the server calls it.
-        facts: For the session's metadata.
+        channel: The server's name of the bus.
 
-    Returns:
-        The source; nothing is opened.
+    Raises:
+        UsageError: If an option is unknown or has no valid value.
     """
+    host, port = server_of(address)
+
+    def open_link(tally: Tally) -> SocketcandLink:
+        sock, rest = connect(host, port)
+        try:
+            rest = enter_raw_mode(sock, rest, channel)
+        except OSError:
+            sock.close()
+            raise
+        return SocketcandLink(sock, rest, tally)
+
     return LinkedSource(
         address,
-        lambda tally: open_socketcand(host, port, channel, tally),
+        open_link,
         place=f"{channel} at {host}:{port}",
         clock=ClockDomain.DEVICE,
-        facts=facts,
+        facts={"interface": "socketcand", "channel": channel, "host": host, "port": str(port)},
     )
 
 
@@ -340,7 +300,7 @@ def read_answer(sock: socket.socket, rest: bytes) -> tuple[str, bytes]:
     """Wait for an answer.
 
     Returns:
-        What stands in its brackets, blanks around it removed, and what came behind it.
+        The text between its brackets, stripped, and the bytes behind it.
 
     Raises:
         OSError: If none comes.
@@ -357,11 +317,11 @@ def read_answer(sock: socket.socket, rest: bytes) -> tuple[str, bytes]:
 
 
 def _expect(sock: socket.socket, rest: bytes, word: bytes) -> bytes:
-    """Wait for an answer; returns what came behind it."""
+    """Wait for an answer; return the bytes behind it."""
     answer, rest = read_answer(sock, rest)
     if answer != word.decode():
         with contextlib.suppress(OSError):
             sock.shutdown(socket.SHUT_RDWR)
-        said = answer[:80]
-        raise OSError(errno.EPROTO, f"the server answered {said!r}, not '< {word.decode()} >'")
+        fault = f"the server answered {answer[:80]!r}, not '< {word.decode()} >'"
+        raise OSError(errno.EPROTO, fault)
     return rest

@@ -1,8 +1,8 @@
 """Sources with the scheme ``unix``: frames from other processes of this computer.
 
-The recorder listens at a path; whoever may write there connects and sends packets as
-:mod:`.capture.sources.contract` describes them. It is the fast way in: up to 256 frames a packet,
-and the kernel stamps each packet's arrival.
+The recorder listens at a path; processes of the same user connect and send packets as
+:mod:`.capture.sources.contract` describes them, of up to 256 frames. The kernel stamps the arrival
+of each packet.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ from .events import BusWatch, Tally
 from .reader_thread import ReceiveThread
 from .receive_many import ArrivalClock, Batch
 
-_MOST_PACKETS = 8192  # in one poll, of one sender: others want to be heard too
+_MOST_PACKETS = 8192  # in one poll, of one sender
 _BACKLOG = 64
 MOST_SENDERS = 64
-"""Connections at once. One more takes the place of the sender that was silent longest."""
+"""Most connections. A further one replaces the sender that was silent for longest."""
 _PAUSE_S = 0.1
 _ORDER_S = 0.002  # in one poll,
 _MOST_WAIT_S = 0.02  # and over several: a thread that gets no processor
@@ -68,7 +68,7 @@ class _Sender:
     last_ns: int
     expected: int | None = None
     dropped: int = 0
-    spoke: bool = False
+    active: bool = False
     leaves: bool = False
 
 
@@ -83,9 +83,9 @@ class UnixSource:
         """Describe the source; nothing is opened.
 
         Args:
-            address: What was asked for; its rest is the path.
-            clock: Whose clock the senders' ``t_device_ns`` is on.
-            directions: Whether the senders tell sent frames from received ones.
+            address: Its rest is the path.
+            clock: Clock of the senders' ``t_device_ns``.
+            directions: Whether the senders distinguish sent from received frames.
         """
         self.name = address.name
         self.clock = clock
@@ -108,7 +108,7 @@ class UnixSource:
 
     @property
     def counts(self) -> SourceCounts:
-        """What became of its frames so far."""
+        """Counts of its frames so far."""
         return self._tally.counts
 
     @property
@@ -118,15 +118,15 @@ class UnixSource:
 
     @property
     def finished(self) -> bool:
-        """Whether it was stopped, or ended and handed out all: a sender may come at any time."""
+        """Whether it was stopped, or has ended and returned all frames."""
         return self._finished or (self._ending and not self._senders and not self._new)
 
     def start(self, context: SourceContext) -> None:
         """Listen.
 
         Raises:
-            SourceError: If something else is at the path, another program listens there, or it
-                can't be made.
+            SourceError: If another file is at the path, another program listens there, or the
+                socket can't be made.
         """
         self._tally = Tally(context.now_ns)
         self._arrivals = ArrivalClock(context.now_ns)
@@ -150,47 +150,40 @@ class UnixSource:
         self._tally.events.log_event("info", f"listens at {self._path}")
 
     def poll(self) -> Polled:
-        """Take what has come.
-
-        Returns:
-            Frames, of all senders in the order of their arrival, and events.
-        """
+        """Return the frames of all senders in the order of their arrival, and events."""
         if self._finished:
             return Polled((), self._tally.events.flush())
         while self._new:
-            self._welcome(self._new.popleft())
+            self._add(self._new.popleft())
         found: list[FrameArray] = []
-        heard = 0
+        with_frames = 0
         if self._out_of_step():
             return Polled((), self._tally.events.take())
         for sender in tuple(self._senders):
             before = len(found)
             self._drain(sender, found)
-            heard += len(found) > before
+            with_frames += len(found) > before
         if not found:
             return Polled((), self._tally.events.take())
         frames = found[0] if len(found) == 1 else np.concatenate(found)
-        if heard > 1:
+        if with_frames > 1:
             frames = frames[np.argsort(frames["t_host_ns"], kind="stable")]
         self._tally.counts.frames += len(frames)
         self._watch.look(frames, self._tally)
         return Polled((frames,), self._tally.events.take())
 
     def end(self) -> None:
-        """See :meth:`.capture.sources.contract.EndingSource.end`: senders get an error from now on.
-
-        What they could send before comes with the next polls.
-        """
+        """See :meth:`.capture.sources.contract.EndingSource.end`."""
         if self._ending or self._listener is None or self._acceptor is None:
             return
-        self._listener.shutdown(socket.SHUT_RD)  # who waits is still let in
+        self._listener.shutdown(socket.SHUT_RD)  # waiting senders are still accepted
         self._acceptor.join()
         for sender in (*self._new, *self._senders):
             sender.receiver.end()
         self._ending = True
 
     def stop(self) -> None:
-        """Disconnect everybody and remove the socket."""
+        """Disconnect all senders and remove the socket."""
         self.end()
         self._finished = True
         for sender in (*self._new, *self._senders):
@@ -206,7 +199,7 @@ class UnixSource:
                     self._path.unlink()
 
     def _accept(self, listener: socket.socket) -> None:
-        """Let senders in and begin to receive at once: their buffers hold only milliseconds."""
+        """Accept senders and begin to receive at once: their buffers hold only milliseconds."""
         share_priority()
         while True:
             try:
@@ -222,7 +215,7 @@ class UnixSource:
             now_ns = self._tally.now_ns()
             self._new.append(_Sender(ReceiveThread(sock, LONGEST + 1), now_ns, now_ns))
 
-    def _welcome(self, sender: _Sender) -> None:
+    def _add(self, sender: _Sender) -> None:
         back = self._had_sender and not self._senders
         self._had_sender = True
         self._tally.counts.reconnects += back
@@ -230,11 +223,11 @@ class UnixSource:
         self._senders.append(sender)
         stay = [each for each in self._senders if not each.leaves]
         if len(stay) > MOST_SENDERS:
-            longest = min(stay, key=lambda each: (each.spoke, each.last_ns))
+            longest = min(stay, key=lambda each: (each.active, each.last_ns))
             text = f"more than {MOST_SENDERS} senders: the one silent for longest is disconnected"
             self._tally.events.log_event("warn", text)
             longest.leaves = True
-            longest.receiver.end()  # what it could send before is still taken
+            longest.receiver.end()  # its earlier packets are still taken
 
     def _out_of_step(self) -> bool:
         """Whether to wait for a sender's thread, so that the frames of all stay in order."""
@@ -251,21 +244,21 @@ class UnixSource:
         return False
 
     def _drain(self, sender: _Sender, found: list[FrameArray]) -> None:
-        """Take a sender's packets; afterwards let it go if it has gone."""
+        """Take a sender's packets; remove it if it has disconnected."""
         looked_ns = self._tally.now_ns()
         batches = sender.receiver.take(_MOST_PACKETS)
-        gone = sender.receiver.ended
+        ended = sender.receiver.ended
         for batch in batches:
             times = self._arrivals.times(batch.stamps_ns, sender.floor_ns)
             sender.floor_ns = times[-1]
             frames = self._unpack(sender, batch, times)
             if len(frames):
                 found.append(frames)
-                sender.spoke, sender.last_ns = True, times[-1]
+                sender.active, sender.last_ns = True, times[-1]
         if not batches:
             sender.floor_ns = max(sender.floor_ns, looked_ns - _LATEST_NS)
-        if gone:
-            self._forget(sender)
+        if ended:
+            self._remove(sender)
 
     def _unpack(self, sender: _Sender, batch: Batch, times: list[int]) -> FrameArray:
         flat = batch.packets.reshape(-1).data
@@ -285,7 +278,7 @@ class UnixSource:
             count, head = shape
             start = row * width
             if head:
-                self._prove(sender, flat[start : start + head], count)
+                self._count_lost(sender, flat[start : start + head], count)
             pieces.append(flat[start + head : start + size])
             arrivals.append(time_ns)
             counts.append(count)
@@ -294,8 +287,8 @@ class UnixSource:
         frames["t_host_ns"] = np.repeat(np.array(arrivals, dtype=np.uint64), counts)
         return frames
 
-    def _prove(self, sender: _Sender, head: memoryview, count: int) -> None:
-        """Count what a head proves lost."""
+    def _count_lost(self, sender: _Sender, head: memoryview, count: int) -> None:
+        """Count the frames that a head proves lost."""
         sequence, dropped = HEAD.unpack(head)
         if sender.expected is None:
             # Its counters may be older than the connection: only what it dropped since counts.
@@ -305,20 +298,14 @@ class UnixSource:
         sender.expected, sender.dropped = sequence + count, dropped
         self._tally.lost("frame lost before it reached us", lost)
 
-    def _forget(self, sender: _Sender) -> None:
+    def _remove(self, sender: _Sender) -> None:
         self._senders.remove(sender)
         sender.receiver.close()
         self._tally.events.log_event("warn", "a sender disconnected")
 
 
 def open_unix(address: SourceAddress) -> Source:
-    """Make the source that a ``unix:`` address names.
-
-    Args:
-        address: E.g. of ``unix:/run/user/1000/snake.sock?clock=host``.
-
-    Returns:
-        The source; nothing is opened.
+    """Make the source of an address such as ``unix:/run/user/1000/snake.sock?clock=host``.
 
     Raises:
         UsageError: If an option is unknown or has no valid value.
@@ -333,7 +320,7 @@ def open_unix(address: SourceAddress) -> Source:
 
 
 def _clear(text: str, path: Path) -> None:
-    """Remove a socket that a recorder left behind; anything else stays."""
+    """Remove the socket of a killed recorder; refuse any other file."""
     try:
         there = path.lstat()
     except FileNotFoundError:

@@ -1,5 +1,6 @@
 """What the tests of sources share: a recording, random bus traffic, and patience."""
 
+import socket
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -90,6 +91,18 @@ def listen(context: SourceContext) -> Iterator[Callable[[Source], Heard]]:
     for source in started:
         source.stop()
         source.stop()  # safe to call twice
+
+
+@pytest.fixture
+def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
+    """A bound datagram socket and one connected to it."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as theirs,
+    ):
+        ours.bind(("127.0.0.1", 0))
+        theirs.connect(ours.getsockname())
+        yield ours, theirs
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import signal
 import socket
 import subprocess
 import sys
@@ -11,24 +10,8 @@ import time
 
 from support.processes import start, wait_for
 from undulog.capture.common.errors import DataError
-from undulog.capture.recorder.control import LATER
 
 PATIENCE_S = 60.0
-RECORDER = """
-import sys, time
-from pathlib import Path
-from undulog.capture.recorder.control import ControlServer
-from undulog.capture.common.errors import ControlError
-{extra}
-try:
-    server = ControlServer(Path({path!r}), lambda request: {{}})
-except ControlError as error:
-    sys.exit(print(error, flush=True))
-print('ready', flush=True)
-while True:
-    server.poll()
-    time.sleep(0.005)
-"""
 
 
 def echo(request):
@@ -40,7 +23,7 @@ def echo(request):
     if request.get("do") == "mistake":
         return {"value": float("nan")} if request.get("nan") else {}["none"]
     if request.get("do") == "later":
-        return LATER
+        return None
     return {"got": dict(request)}
 
 
@@ -98,12 +81,28 @@ def drain(server, client, count):
     return replies(data)
 
 
-def start_recorder(path, extra=""):
+@contextlib.contextmanager
+def started_recorder(path, extra="", first="ready\n"):
     """Start a process that serves the socket until it is killed; it prints 'ready' or the error."""
-    code = RECORDER.format(extra=extra, path=str(path))
-    return start(sys.executable, "-c", code, stdin=subprocess.PIPE, stderr=None)
-
-
-def end(process):
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
+    code = (
+        "import sys, time\n"
+        "from pathlib import Path\n"
+        "from undulog.capture.recorder.control import ControlServer\n"
+        "from undulog.capture.common.errors import ControlError\n"
+        f"{extra}\n"
+        "try:\n"
+        f"    server = ControlServer(Path({str(path)!r}), lambda request: {{}})\n"
+        "except ControlError as error:\n"
+        "    sys.exit(print(error, flush=True))\n"
+        "print('ready', flush=True)\n"
+        "while True:\n"
+        "    server.poll()\n"
+        "    time.sleep(0.005)\n"
+    )
+    process = start(sys.executable, "-c", code, stdin=subprocess.PIPE)
+    try:
+        assert process.stdout.readline() == first
+        yield process
+    finally:
+        process.kill()
+        process.communicate()

@@ -1,10 +1,13 @@
 """Recorders in processes of their own, and what tests send to them and read of them."""
 
+import json
 import socket
 import time
+from collections import Counter
 from contextlib import contextmanager
 
 import numpy as np
+from mcap.reader import make_reader
 
 from support import processes
 from support.paths import ROOT
@@ -18,10 +21,10 @@ def command(output, *arguments):
 
 
 @contextmanager
-def recording(output, *arguments, env=None, floor="0"):
+def recording(output, *arguments, env=None, floor="0", before=()):
     """Run a recorder in another process; it is running when the block begins."""
     process = processes.start(
-        *command(output, *arguments), "--floor", floor, "--json", cwd=ROOT, env=env
+        *before, *command(output, *arguments), "--floor", floor, "--json", cwd=ROOT, env=env
     )
     try:
         control = output.with_name("control.sock")
@@ -31,6 +34,30 @@ def recording(output, *arguments, env=None, floor="0"):
         if process.poll() is None:
             process.kill()
         process.communicate()
+
+
+def ended(process, number=None):
+    """The report of a recorder that ends, after a signal if one is given, and its errors."""
+    if number is not None:
+        process.send_signal(number)
+    out, err = process.communicate(timeout=60)
+    assert "Traceback" not in err, err
+    return json.loads(out) if out else None, err
+
+
+def counts(path):
+    """Messages of each topic, as mcap's own reader counts them."""
+    with path.open("rb") as stream:
+        found = make_reader(stream, validate_crcs=True).iter_messages()
+        return Counter(channel.topic for _, channel, _ in found)
+
+
+def greet(client, listening=b"< hi >"):
+    """What a socketcand server says until its client is in raw mode."""
+    client.sendall(listening)
+    for _ in range(2):
+        client.recv(4096)
+        client.sendall(b"< ok >")
 
 
 def events(path):

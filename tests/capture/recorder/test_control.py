@@ -19,11 +19,10 @@ from support.control_clients import (
     connected,
     drain,
     echo,
-    end,
     polled,
     polls,
     replies,
-    start_recorder,
+    started_recorder,
 )
 from support.processes import wait_for
 from undulog.capture.common.errors import ControlError
@@ -40,13 +39,18 @@ def server(tmp_path):
     server.close()
 
 
+@pytest.fixture
+def client(server):
+    with connected(server) as client:
+        yield client
+
+
 # -- requests and replies ------------------------------------------------------------------------
 
 
-def test_each_request_gets_its_reply_in_order_on_one_connection(server):
-    with connected(server) as client:
-        client.sendall(b"".join(b'{"do": "n", "k": %d}\n' % k for k in range(500)))
-        assert [reply["got"]["k"] for reply in drain(server, client, 500)] == list(range(500))
+def test_each_request_gets_its_reply_in_order_on_one_connection(server, client):
+    client.sendall(b"".join(b'{"do": "n", "k": %d}\n' % k for k in range(500)))
+    assert [reply["got"]["k"] for reply in drain(server, client, 500)] == list(range(500))
     assert server.requests == 500
 
 
@@ -62,21 +66,19 @@ def test_a_socket_can_be_claimed_before_it_is_served(tmp_path):
     server.close()
 
 
-def test_a_request_may_come_in_pieces(server):
-    with connected(server) as client:
-        for byte in b'{"do": "x"}\n':
-            client.sendall(bytes([byte]))
-            server.poll()
-        assert drain(server, client, 1) == [{"ok": True, "got": {"do": "x"}}]
+def test_a_request_may_come_in_pieces(server, client):
+    for byte in b'{"do": "x"}\n':
+        client.sendall(bytes([byte]))
+        server.poll()
+    assert drain(server, client, 1) == [{"ok": True, "got": {"do": "x"}}]
 
 
-def test_a_client_that_ends_its_side_still_hears_the_reply_even_without_a_newline(server):
-    with connected(server) as client:
-        client.sendall(b'{"do": "a"}\n{"do": "b"}')
-        client.shutdown(socket.SHUT_WR)
-        assert [reply["got"]["do"] for reply in drain(server, client, 2)] == ["a", "b"]
-        polls(server, lambda: server.clients == 0)
-        assert client.recv(10) == b""
+def test_a_client_that_ends_its_side_still_hears_the_reply_even_without_a_newline(server, client):
+    client.sendall(b'{"do": "a"}\n{"do": "b"}')
+    client.shutdown(socket.SHUT_WR)
+    assert [reply["got"]["do"] for reply in drain(server, client, 2)] == ["a", "b"]
+    polls(server, lambda: server.clients == 0)
+    assert client.recv(10) == b""
 
 
 @pytest.mark.parametrize(
@@ -93,22 +95,20 @@ def test_a_client_that_ends_its_side_still_hears_the_reply_even_without_a_newlin
         (b'{"do": "big", "size": 70000}', "the reply has"),
     ],
 )
-def test_a_bad_request_gets_an_error_and_the_connection_lives(server, line, why):
-    with connected(server) as client:
-        client.sendall(line + b"\n" + b'{"do": "x"}\n')
-        bad, good = drain(server, client, 2)
-        assert not bad["ok"]
-        assert why in bad["error"]
-        assert good["ok"]
+def test_a_bad_request_gets_an_error_and_the_connection_lives(server, client, line, why):
+    client.sendall(line + b"\n" + b'{"do": "x"}\n')
+    bad, good = drain(server, client, 2)
+    assert not bad["ok"]
+    assert why in bad["error"]
+    assert good["ok"]
 
 
-def test_a_mistake_of_ours_is_told_and_ends_nothing(server):
-    with connected(server) as client:
-        client.sendall(b'{"do": "mistake"}\n{"do": "mistake", "nan": true}\n{"do": "x"}\n')
-        first, second, third = drain(server, client, 3)
-        assert "KeyError" in first["error"]
-        assert "ValueError" in second["error"]
-        assert third["ok"]
+def test_a_mistake_of_ours_is_told_and_ends_nothing(server, client):
+    client.sendall(b'{"do": "mistake"}\n{"do": "mistake", "nan": true}\n{"do": "x"}\n')
+    first, second, third = drain(server, client, 3)
+    assert "KeyError" in first["error"]
+    assert "ValueError" in second["error"]
+    assert third["ok"]
     told = server.take_faults()
     assert len(told) == 2
     assert all("mistake" in text for text in told)
@@ -164,21 +164,20 @@ def test_a_client_that_never_reads_costs_bounded_memory_and_no_one_else_s_time(s
         assert all(len(reply["text"]) == 9000 for reply in replies(whole))
 
 
-def test_a_request_without_end_is_refused_and_the_client_let_go(server):
-    with connected(server) as client:
-        client.setblocking(False)
-        data = b""
-        for _ in range(1000):
-            with contextlib.suppress(BlockingIOError, BrokenPipeError):
-                client.send(b"x" * 8192)
-            server.poll()
-            if server.clients == 0 and data:
-                break
-            with contextlib.suppress(BlockingIOError):
-                data += client.recv(4096)
-        (reply,) = replies(data)
-        assert "longer than 65536 bytes" in reply["error"]
-        assert server.clients == 0
+def test_a_request_without_end_is_refused_and_the_client_let_go(server, client):
+    client.setblocking(False)
+    data = b""
+    for _ in range(1000):
+        with contextlib.suppress(BlockingIOError, BrokenPipeError):
+            client.send(b"x" * 8192)
+        server.poll()
+        if server.clients == 0 and data:
+            break
+        with contextlib.suppress(BlockingIOError):
+            data += client.recv(4096)
+    (reply,) = replies(data)
+    assert "longer than 65536 bytes" in reply["error"]
+    assert server.clients == 0
 
 
 def test_silent_clients_make_room_for_the_next_the_longest_silent_first(server):
@@ -199,15 +198,14 @@ def test_silent_clients_make_room_for_the_next_the_longest_silent_first(server):
     polls(server, lambda: server.clients == 0)
 
 
-def test_a_flood_is_taken_in_portions(server, monkeypatch):
+def test_a_flood_is_taken_in_portions(server, client, monkeypatch):
     """With no budget left, one request a client and poll."""
     monkeypatch.setattr(control, "BUDGET_NS", -1)
-    with connected(server) as client:
-        client.sendall(b'{"do": "x"}\n' * 50)
-        counts = []
-        polls(server, lambda: counts.append(server.requests) or server.requests == 50)
-        assert all(b - a <= 1 for a, b in pairwise(counts))
-        assert len(drain(server, client, 50)) == 50
+    client.sendall(b'{"do": "x"}\n' * 50)
+    counts = []
+    polls(server, lambda: counts.append(server.requests) or server.requests == 50)
+    assert all(b - a <= 1 for a, b in pairwise(counts))
+    assert len(drain(server, client, 50)) == 50
 
 
 def test_clients_that_vanish_leave_nothing_behind(server):
@@ -262,19 +260,14 @@ def test_the_reply_to_a_later_answer_comes_with_the_close(server):
 
 def test_a_client_is_told_when_the_recorder_dies_before_it_answers(tmp_path):
     path = tmp_path / "c.sock"
-    process = start_recorder(path)
-    try:
-        assert process.stdout.readline() == "ready\n"
-        with ControlClient(path) as client:
+    with started_recorder(path) as process, ControlClient(path) as client:
+        client.ask({"do": "x"})
+        process.send_signal(signal.SIGSTOP)
+        killer = threading.Timer(0.3, process.send_signal, [signal.SIGKILL])
+        killer.start()
+        with pytest.raises(ControlError, match="the recorder went"):
             client.ask({"do": "x"})
-            process.send_signal(signal.SIGSTOP)
-            killer = threading.Timer(0.3, process.send_signal, [signal.SIGKILL])
-            killer.start()
-            with pytest.raises(ControlError, match="the recorder went"):
-                client.ask({"do": "x"})
-            killer.join()
-    finally:
-        end(process)
+        killer.join()
 
 
 def test_a_recorder_that_hangs_is_told(tmp_path):

@@ -11,7 +11,7 @@ from undulog.capture.common.errors import ControlError, DataError
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.recorder.control import ControlServer
 from undulog.capture.recorder.control_client import ControlClient
-from undulog.capture.recorder.control_requests import OPERATOR, OperatorLog, request_handler
+from undulog.capture.recorder.control_requests import OPERATOR, RequestHandler
 
 EPOCH_NS = 1_700_000_000_000_000_000
 
@@ -36,44 +36,54 @@ class Actions:
         self.done.append(("stop",))
 
 
-@pytest.fixture
-def session(tmp_path):
-    """A server of a real session: path of the file, writer, actions, server, and its clock."""
-    path = tmp_path / "run.mcap"
-    actions, clock = Actions(), [EPOCH_NS]
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
-        events = writer.log()
-        log = OperatorLog(
-            writer,
-            lambda level, who, text: events.write(clock[0], level, who, text),
-            lambda: clock[0],
+class Stage:
+    """A server of a real session, and its clock."""
+
+    def __init__(self, folder):
+        self.path, self.actions, self.now_ns = folder / "run.mcap", Actions(), EPOCH_NS
+        self.writer = SessionWriter(self.path, session_id="s", epoch_ns=EPOCH_NS)
+        events = self.writer.log()
+        handler = RequestHandler(
+            self.actions,
+            self.writer,
+            lambda *event: events.write(self.now_ns, *event),
+            lambda: self.now_ns,
         )
-        server = ControlServer(tmp_path / "c.sock", request_handler(actions, log))
-        yield path, writer, actions, server, clock
-        server.close()
+        self.server = ControlServer(folder / "c.sock", handler)
+
+    def read(self, topic):
+        """Log time and decoded message of each, by a foreign reader."""
+        self.writer.close()
+        with self.path.open("rb") as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+            found = reader.iter_decoded_messages([topic])
+            return [(message.log_time, decoded) for _, _, message, decoded in found]
 
 
-def read(path, topic):
-    """Log time and decoded message of each, by a foreign reader."""
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        found = reader.iter_decoded_messages([topic])
-        return [(message.log_time, decoded) for _, _, message, decoded in found]
+@pytest.fixture
+def stage(tmp_path):
+    stage = Stage(tmp_path)
+    yield stage
+    stage.server.close()
+    stage.writer.close()
 
 
-def test_a_controller_s_gait_is_in_the_session_as_it_was_said(session):
-    path, writer, _, server, clock = session
+@pytest.fixture
+def ask(stage):
+    """Sends one request of a client to the server, which is polled meanwhile."""
+    with polled(stage.server, pause_s=0), ControlClient(stage.server.path) as client:
+        yield lambda do, **keys: client.ask({"do": do, **keys})
+
+
+def test_a_controller_s_gait_is_in_the_session_as_it_was_said(stage, ask):
     said = []
-    with polled(server, pause_s=0), ControlClient(server.path) as client:
-        for k in range(1000):
-            clock[0] = EPOCH_NS + k * 10_000_000
-            values = {"horizontal.phase": 0.1 * k, "horizontal.A": 0.4 + k / 7}
-            t_ns = clock[0] - 3_000_001 if k % 2 else None
-            request = {"do": "gait", "values": values}
-            assert client.ask(request if t_ns is None else {**request, "t_ns": t_ns}) == {}
-            said.append((clock[0], t_ns or clock[0], values))
-    writer.close()
-    found = read(path, "/gait")
+    for k in range(1000):
+        stage.now_ns = EPOCH_NS + k * 10_000_000
+        values = {"horizontal.phase": 0.1 * k, "horizontal.A": 0.4 + k / 7}
+        t_ns = stage.now_ns - 3_000_001 if k % 2 else stage.now_ns
+        assert ask("gait", values=values, **({"t_ns": t_ns} if k % 2 else {})) == {}
+        said.append((stage.now_ns, t_ns, values))
+    found = stage.read("/gait")
     assert len(found) == 1000
     for (log_ns, t_ns, values), (found_ns, state) in zip(said, found, strict=True):
         assert dict(zip(state.name, state.position, strict=True)) == values
@@ -82,41 +92,33 @@ def test_a_controller_s_gait_is_in_the_session_as_it_was_said(session):
     assert list(found[0][1].name) == ["horizontal.A", "horizontal.phase"]
 
 
-def test_values_of_joints_and_of_a_controller_come_behind_those_of_the_planes(session):
-    path, writer, _, server, _ = session
+def test_values_of_joints_and_of_a_controller_come_behind_those_of_the_planes(stage, ask):
     values = {"steer.offset": 0.1, "joint03.A": None, "horizontal.omega": 3.0, "horizontal.A": 0.4}
-    with polled(server), ControlClient(server.path) as client:
-        client.ask({"do": "gait", "values": values})
-    writer.close()
-    ((_, state),) = read(path, "/gait")
+    ask("gait", values=values)
+    ((_, state),) = stage.read("/gait")
     assert list(state.name) == ["horizontal.A", "horizontal.omega", "steer.offset", "joint03.A"]
     assert list(state.position[:3]) == [0.4, 3.0, 0.1]
     assert math.isnan(state.position[3])  # null: it has none
 
 
-def test_notes_marks_and_modes_are_in_the_session(session):
-    path, writer, actions, server, clock = session
-    with polled(server), ControlClient(server.path) as client:
-        assert client.ask({"do": "status"}) == {"output": "run.mcap", "elapsed_s": 1.5}
-        client.ask({"do": "note", "text": "wet sand"})
-        assert client.ask({"do": "mark", "text": "slipped", "level": "warn"}) == {
-            "file": "run_mark0001.mcap"
-        }
-        client.ask({"do": "mark"})
-        client.ask({"do": "mode", "text": "walk"})
-        clock[0] += 7
-        client.ask({"do": "mode", "text": "avoid"})
-        client.ask({"do": "stop"})
-    writer.close()
-    events = [(event.name, event.level, event.msg) for _, event in read(path, "/rosout")]
+def test_notes_marks_and_modes_are_in_the_session(stage, ask):
+    assert ask("status") == {"output": "run.mcap", "elapsed_s": 1.5}
+    ask("note", text="wet sand")
+    assert ask("mark", text="slipped", level="warn") == {"file": "run_mark0001.mcap"}
+    ask("mark")
+    ask("mode", text="walk")
+    stage.now_ns += 7
+    ask("mode", text="avoid")
+    ask("stop")
+    events = [(event.name, event.level, event.msg) for _, event in stage.read("/rosout")]
     assert events == [
         (OPERATOR, 20, "wet sand"),
         (OPERATOR, 30, "mark: slipped"),
         (OPERATOR, 20, "mark"),
     ]
-    modes = [(log_ns, mode.data) for log_ns, mode in read(path, "/gait/mode")]
+    modes = [(log_ns, mode.data) for log_ns, mode in stage.read("/gait/mode")]
     assert modes == [(EPOCH_NS, "walk"), (EPOCH_NS + 7, "avoid")]
-    assert actions.done == [("mark", "slipped"), ("mark", ""), ("stop",)]
+    assert stage.actions.done == [("mark", "slipped"), ("mark", ""), ("stop",)]
 
 
 @pytest.mark.parametrize(
@@ -148,43 +150,32 @@ def test_notes_marks_and_modes_are_in_the_session(session):
         ({"do": "gait", "values": {"horizontal.A": 1}, "t_ns": -(10**30)}, "off this recorder"),
     ],
 )
-def test_a_wrong_request_says_what_would_be_right(session, request_, why):
-    path, writer, actions, server, _ = session
-    with polled(server), ControlClient(server.path) as client:
-        with pytest.raises(ControlError) as refused:
-            client.ask(request_)
-        assert why in str(refused.value)
-        client.ask({"do": "status"})
-    writer.close()
-    assert actions.done == []
-    assert [*read(path, "/rosout"), *read(path, "/gait"), *read(path, "/gait/mode")] == []
+def test_a_wrong_request_says_what_would_be_right(stage, ask, request_, why):
+    with pytest.raises(ControlError) as refused:
+        ask(**{"do": None} | request_)
+    assert why in str(refused.value)
+    ask("status")
+    assert stage.actions.done == []
+    topics = ("/rosout", "/gait", "/gait/mode")
+    assert [message for topic in topics for message in stage.read(topic)] == []
 
 
-def test_an_infinite_number_is_no_gait(session):
-    *_, server, _ = session
-    with connected(server) as client:
+def test_an_infinite_number_is_no_gait(stage):
+    with connected(stage.server) as client:
         client.sendall(b'{"do": "gait", "values": {"horizontal.A": 1e999}}\n')
-        (reply,) = drain(server, client, 1)
+        (reply,) = drain(stage.server, client, 1)
         assert "a finite number" in reply["error"]
 
 
-def test_other_names_than_at_first_are_refused_and_the_first_go_on(session):
-    path, writer, _, server, _ = session
-    with polled(server), ControlClient(server.path) as client:
-        client.ask({"do": "gait", "values": {"horizontal.A": 1.0}})
-        with pytest.raises(ControlError, match="the names that this session's gait began with"):
-            client.ask({"do": "gait", "values": {"horizontal.A": 1.0, "vertical.A": 2.0}})
-        client.ask({"do": "gait", "values": {"horizontal.A": 3.0}})
-    writer.close()
-    assert [state.position[0] for _, state in read(path, "/gait")] == [1.0, 3.0]
+def test_other_names_than_at_first_are_refused_and_the_first_go_on(stage, ask):
+    ask("gait", values={"horizontal.A": 1.0})
+    with pytest.raises(ControlError, match="the names that this session's gait began"):
+        ask("gait", values={"horizontal.A": 1.0, "vertical.A": 2.0})
+    ask("gait", values={"horizontal.A": 3.0})
+    assert [state.position[0] for _, state in stage.read("/gait")] == [1.0, 3.0]
 
 
-def test_a_gait_that_a_source_writes_is_not_taken_from_outside(session):
-    _, writer, _, server, _ = session
-    writer.joint_state("/gait", ["horizontal.A"], unit="rad")
-    with (
-        polled(server),
-        ControlClient(server.path) as client,
-        pytest.raises(ControlError, match="/gait is open already"),
-    ):
-        client.ask({"do": "gait", "values": {"horizontal.A": 1.0}})
+def test_a_gait_that_a_source_writes_is_not_taken_from_outside(stage, ask):
+    stage.writer.joint_state("/gait", ["horizontal.A"], unit="rad")
+    with pytest.raises(ControlError, match="/gait is open already"):
+        ask("gait", values={"horizontal.A": 1.0})

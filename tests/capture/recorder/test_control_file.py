@@ -10,15 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from support.control_clients import (
-    connected,
-    drain,
-    echo,
-    end,
-    polled,
-    polls,
-    start_recorder,
-)
+from support.control_clients import connected, drain, echo, polled, polls, started_recorder
 from support.processes import wait_for
 from undulog.capture.common.errors import ControlError
 from undulog.capture.recorder.control import TEND_POLLS, ControlServer
@@ -62,15 +54,11 @@ def test_only_its_user_can_reach_it_from_the_first_moment(tmp_path):
 
 def test_a_second_recorder_is_refused_while_the_first_lives_and_succeeds_it_after_a_kill(tmp_path):
     path = tmp_path / "c.sock"
-    first = start_recorder(path)
-    try:
-        assert first.stdout.readline() == "ready\n"
+    with started_recorder(path):
         with pytest.raises(ControlError, match="another recorder listens there"):
             ControlServer(path, echo)
         with ControlClient(path) as client:
             assert client.ask({"do": "x"}) == {}
-    finally:
-        end(first)
     assert path.is_socket(), "a killed recorder leaves its socket"
     with pytest.raises(ControlError, match="no recorder listens there"):
         ControlClient(path)
@@ -84,10 +72,8 @@ def test_of_many_recorders_that_find_a_stale_socket_one_gets_it(tmp_path):
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as stale:
             stale.bind(str(path))
         go = "print('up', flush=True); sys.stdin.readline()"
-        racers = [start_recorder(path, go) for _ in range(6)]
-        try:
-            for racer in racers:
-                assert racer.stdout.readline() == "up\n"
+        with contextlib.ExitStack() as started:
+            racers = [started.enter_context(started_recorder(path, go, "up\n")) for _ in range(6)]
             for racer in racers:
                 racer.stdin.write("go\n")
                 racer.stdin.flush()
@@ -96,9 +82,6 @@ def test_of_many_recorders_that_find_a_stale_socket_one_gets_it(tmp_path):
             assert sum("another recorder listens" in line for line in said) == 5
             with ControlClient(path) as client:
                 assert client.ask({"do": "x"}) == {}
-        finally:
-            for racer in racers:
-                end(racer)
         path.unlink()
 
 

@@ -4,7 +4,6 @@ import contextlib
 import os
 import signal
 import socket
-import subprocess
 import sys
 import time
 
@@ -13,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from support.processes import wait_for
+from support.processes import process, wait_for
 from undulog.capture.common.errors import DataError
 from undulog.capture.recorder import live_feed
-from undulog.capture.recorder.live_feed import LiveFeed
+from undulog.capture.recorder.live_feed import LiveCounts, LiveFeed
 from undulog.capture.recorder.live_wire import (
     MAX_DATAGRAM,
     MAX_MESSAGE,
@@ -49,39 +48,34 @@ def path(tmp_path):
     return tmp_path / "live.sock"
 
 
+def bound(path):
+    """A socket at the path, as a relay has it."""
+    path.unlink(missing_ok=True)
+    link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    link.bind(str(path))
+    link.setblocking(False)
+    return link
+
+
 @pytest.fixture
 def listen(path):
     """Binds the path, as a relay would; closed at the end."""
-    open_sockets = []
-
-    def bind():
-        path.unlink(missing_ok=True)
-        link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        link.bind(str(path))
-        link.setblocking(False)
-        open_sockets.append(link)
-        return link
-
-    yield bind
-    for link in open_sockets:
-        link.close()
+    with contextlib.ExitStack() as links:
+        yield lambda: links.enter_context(bound(path))
 
 
 @pytest.fixture
 def make(path):
     """Makes feeds with all definitions; closed at the end."""
-    feeds = []
+    with contextlib.ExitStack() as feeds:
 
-    def make_feed(**options):
-        feed = LiveFeed(path, **options)
-        for record in DEFINITIONS:
-            feed.define(record)
-        feeds.append(feed)
-        return feed
+        def make_feed(**options):
+            feed = feeds.enter_context(contextlib.closing(LiveFeed(path, **options)))
+            for record in DEFINITIONS:
+                feed.define(record)
+            return feed
 
-    yield make_feed
-    for feed in feeds:
-        feed.close()
+        yield make_feed
 
 
 def received(link):
@@ -100,6 +94,31 @@ def pump_until(feed, condition):
     wait_for(condition, each=feed.pump)
 
 
+@pytest.fixture
+def watched(make, listen):
+    """Makes a feed and a socket that has its definitions."""
+
+    def connect(**options):
+        feed, link = make(**options), listen()
+        pump_until(feed, lambda: feed.connected)
+        received(link)
+        return feed, link
+
+    return connect
+
+
+def all_sent(feed, link):
+    """The records of all that waits, pumped and received in turn."""
+    seen = []
+
+    def nothing_waits():
+        seen.extend(received(link)[1])
+        return feed.queued == 0
+
+    pump_until(feed, nothing_waits)
+    return seen + received(link)[1]
+
+
 def offer(feed, number, channel=1, payload=b"data", step_ns=STEP_NS):
     t_ns = EPOCH_NS + number * step_ns
     feed.offer(channel, t_ns, t_ns - 5, number, payload)
@@ -112,12 +131,7 @@ def messages(records):
 @given(
     st.lists(
         st.tuples(
-            st.integers(0, 2**16 - 1),
-            st.integers(0, 2**32 - 1),
-            st.integers(0, 2**64 - 1),
-            st.integers(0, 2**64 - 1),
-            st.integers(0, 2**64 - 1),
-            st.binary(max_size=300),
+            *(st.integers(0, 2**n - 1) for n in (16, 32, 64, 64, 64)), st.binary(max_size=300)
         ),
         max_size=20,
     ),
@@ -163,13 +177,7 @@ def test_nothing_is_kept_while_nobody_watches(make):
         feed.pump()
     assert not feed.connected
     assert feed.queued == 0
-    assert vars(feed.counts) == {
-        "sent": 0,
-        "dropped": 0,
-        "thinned": 0,
-        "too_big": 0,
-        "connections": 0,
-    }
+    assert feed.counts == LiveCounts()
 
 
 def test_relay_that_comes_late_gets_definitions_first_and_then_every_message(make, listen):
@@ -184,34 +192,28 @@ def test_relay_that_comes_late_gets_definitions_first_and_then_every_message(mak
     assert {head.kind for head in heads} == {Kind.DEFINITIONS}
     for number in range(100, 300):
         offer(feed, number)
-    pump_until(feed, lambda: feed.queued == 0)
-    _, records = received(link)
+    records = all_sent(feed, link)
     assert [one.sequence for one in messages(records)] == list(range(100, 300))
     assert messages(records)[0][2:4] == (EPOCH_NS + 100 * STEP_NS, EPOCH_NS + 100 * STEP_NS - 5)
     assert feed.counts.sent == 200
     assert feed.counts.dropped == 0
 
 
-def test_offered_time_is_this_machines_monotonic_clock(make, listen):
-    feed, link = make(), listen()
-    pump_until(feed, lambda: feed.connected)
+def test_offered_time_is_this_machines_monotonic_clock(watched):
+    feed, link = watched()
     before = time.monotonic_ns()
     feed.pump()
     offer(feed, 0)
-    pump_until(feed, lambda: feed.queued == 0)
-    (message,) = messages(received(link)[1])
+    (message,) = messages(all_sent(feed, link))
     assert before <= message.offered_ns <= time.monotonic_ns()
 
 
-def test_definitions_of_later_channels_come_before_their_messages(make, listen):
-    feed, link = make(), listen()
-    pump_until(feed, lambda: feed.connected)
-    received(link)
+def test_definitions_of_later_channels_come_before_their_messages(watched):
+    feed, link = watched()
     late = Channel(id=9, topic="/odom", message_encoding="cdr", metadata={}, schema_id=1)
     feed.define(late)
     offer(feed, 0, channel=9)
-    pump_until(feed, lambda: feed.queued == 0)
-    _, records = received(link)
+    records = all_sent(feed, link)
     assert records[0] == late
     assert records[1].channel_id == 9
 
@@ -245,55 +247,40 @@ def test_a_state_that_holds_is_told_to_a_relay_that_comes_later(make, listen):
     assert feed.counts.sent == 0  # as a message: it was told, like the definitions
 
 
-def test_raw_frames_are_not_sent(make, listen):
-    link, feed = listen(), make()
-    pump_until(feed, lambda: feed.connected)
+def test_raw_frames_are_not_sent(watched):
+    feed, link = watched()
     offer(feed, 0, channel=3)
     feed.pump()
     time.sleep(0.03)
-    pump_until(feed, lambda: feed.queued == 0)
-    assert messages(received(link)[1]) == []
+    assert messages(all_sent(feed, link)) == []
 
 
-def test_samples_are_thinned_and_events_are_not(make, listen):
-    feed, link = make(max_rate_hz=100.0), listen()
-    pump_until(feed, lambda: feed.connected)
+def test_samples_are_thinned_and_events_are_not(watched):
+    feed, link = watched(max_rate_hz=100.0)
     for number in range(1000):  # one second at 1 kHz
         offer(feed, number, channel=1, step_ns=1_000_000)
         offer(feed, number, channel=2, step_ns=1_000_000)
-    seen = []
-
-    def all_sent():
-        seen.extend(messages(received(link)[1]))
-        return feed.queued == 0
-
-    pump_until(feed, all_sent)
-    seen.extend(messages(received(link)[1]))
+    seen = messages(all_sent(feed, link))
     by_channel = {n: [m for m in seen if m.channel_id == n] for n in (1, 2)}
     assert len(by_channel[2]) == 1000
     assert 100 <= len(by_channel[1]) <= 102
     assert feed.counts.thinned == 1000 - len(by_channel[1])
 
 
-def test_a_jittering_channel_at_the_highest_rate_is_not_thinned(make, listen):
-    feed = make(max_rate_hz=100.0)
-    listen()
-    pump_until(feed, lambda: feed.connected)
+def test_a_jittering_channel_at_the_highest_rate_is_not_thinned(watched):
+    feed, _ = watched(max_rate_hz=100.0)
     for number in range(1000):
         jitter = 3_000_000 if number % 2 else -3_000_000
         feed.offer(1, EPOCH_NS + number * STEP_NS + jitter, 0, number, b"")
     assert feed.counts.thinned <= 1
 
 
-def test_a_message_beyond_a_datagram_is_left_out_and_counted(make, listen):
-    feed, link = make(), listen()
-    pump_until(feed, lambda: feed.connected)
-    received(link)
+def test_a_message_beyond_a_datagram_is_left_out_and_counted(watched):
+    feed, link = watched()
     offer(feed, 0, payload=bytes(MAX_MESSAGE + 1))
     offer(feed, 1, payload=bytes(MAX_MESSAGE))
     offer(feed, 2)
-    pump_until(feed, lambda: feed.queued == 0)
-    assert [one.sequence for one in messages(received(link)[1])] == [1, 2]
+    assert [one.sequence for one in messages(all_sent(feed, link))] == [1, 2]
     assert feed.counts.too_big == 1
 
 
@@ -305,38 +292,22 @@ def test_a_message_beyond_a_datagram_is_left_out_and_counted(make, listen):
 )
 def test_what_is_dropped_is_always_the_oldest(tmp_path_factory, count, max_messages, sizes):
     path = tmp_path_factory.mktemp("drop") / "s"
-    link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    link.bind(str(path))
-    link.setblocking(False)
     feed = LiveFeed(path, max_messages=max_messages, max_bytes=20_000)
-    try:
+    with contextlib.closing(feed), bound(path) as link:
         for record in DEFINITIONS:
             feed.define(record)
         pump_until(feed, lambda: feed.connected)
         for number in range(count):
             offer(feed, number, payload=bytes(sizes[number % len(sizes)]))
         assert feed.queued <= max_messages
-        seen = []
-
-        def all_sent():
-            seen.extend(messages(received(link)[1]))
-            return feed.queued == 0
-
-        pump_until(feed, all_sent)
-        seen.extend(messages(received(link)[1]))
-    finally:
-        feed.close()
-        link.close()
-    numbers = [one.sequence for one in seen]
+        numbers = [one.sequence for one in messages(all_sent(feed, link))]
     assert numbers == list(range(count - len(numbers), count))
     assert len(numbers) + feed.counts.dropped == count
     assert numbers
 
 
-def test_a_full_socket_drops_the_oldest_and_every_tick_completes(make, listen):
-    feed, link = make(max_messages=100), listen()
-    pump_until(feed, lambda: feed.connected)
-    received(link)
+def test_a_full_socket_drops_the_oldest_and_every_tick_completes(watched):
+    feed, link = watched(max_messages=100)
     ticks = 0
     for number in range(20_000):  # nobody reads
         offer(feed, number, payload=bytes(500))
@@ -345,25 +316,16 @@ def test_a_full_socket_drops_the_oldest_and_every_tick_completes(make, listen):
             ticks += 1
     assert ticks == 2000
     assert feed.queued <= 100 + (32 << 10) // 500  # and one datagram
-    seen = []
-
-    def all_sent():
-        seen.extend(messages(received(link)[1]))
-        return feed.queued == 0
-
-    pump_until(feed, all_sent)
-    seen.extend(messages(received(link)[1]))
-    numbers = [one.sequence for one in seen]
+    numbers = [one.sequence for one in messages(all_sent(feed, link))]
     assert numbers == sorted(numbers)
     assert numbers[-1] == 19_999
     assert len(numbers) + feed.counts.dropped == 20_000
-    assert read_head(pack_datagram(feed._head(Kind.END, 0), ())).dropped == feed.counts.dropped
+    assert read_head(feed._pack(Kind.END).data).dropped == feed.counts.dropped
 
 
-def test_a_relay_that_is_replaced_is_found_and_told_everything(make, listen, monkeypatch):
+def test_a_relay_that_is_replaced_is_found_and_told_everything(watched, listen, monkeypatch):
     monkeypatch.setattr(live_feed, "RENEW_NS", 50_000_000)
-    feed, first = make(), listen()
-    pump_until(feed, lambda: feed.connected)
+    feed, first = watched()
     second = listen()  # the first is still there, bound to nothing any more
     seen = []
 
@@ -376,10 +338,9 @@ def test_a_relay_that_is_replaced_is_found_and_told_everything(make, listen, mon
     first.close()
 
 
-def test_a_relay_that_goes_and_comes_again_is_found(make, listen, path, monkeypatch):
+def test_a_relay_that_goes_and_comes_again_is_found(watched, listen, monkeypatch):
     monkeypatch.setattr(live_feed, "RETRY_NS", 10_000_000)
-    feed, link = make(), listen()
-    pump_until(feed, lambda: feed.connected)
+    feed, link = watched()
     link.close()
 
     def lost():
@@ -394,9 +355,8 @@ def test_a_relay_that_goes_and_comes_again_is_found(make, listen, path, monkeypa
     assert feed.counts.connections == 2
 
 
-def test_the_end_is_told(make, listen):
-    feed, link = make(), listen()
-    pump_until(feed, lambda: feed.connected)
+def test_the_end_is_told(watched):
+    feed, link = watched()
     offer(feed, 0)
     feed.close()
     feed.close()
@@ -410,10 +370,8 @@ def test_the_end_is_told(make, listen):
     assert not feed.connected
 
 
-def test_closing_does_not_wait_for_a_relay_that_takes_nothing(make, listen):
-    feed = make()
-    listen()
-    pump_until(feed, lambda: feed.connected)
+def test_closing_does_not_wait_for_a_relay_that_takes_nothing(watched):
+    feed, _ = watched()
     for number in range(3000):
         offer(feed, number, payload=bytes(1000))
         feed.pump()
@@ -435,20 +393,15 @@ while True:
 @pytest.fixture
 def reader(path):
     """Starts a process that reads the socket; ended at the end."""
-    started = []
+    with contextlib.ExitStack() as started:
 
-    def start():
-        path.unlink(missing_ok=True)
-        process = subprocess.Popen([sys.executable, "-c", _READER, path], stdout=subprocess.PIPE)
-        started.append(process)
-        assert process.stdout.readline() == b"bound\n"
-        return process
+        def start():
+            path.unlink(missing_ok=True)
+            running = started.enter_context(process(sys.executable, "-c", _READER, path))
+            assert running.stdout.readline() == "bound\n"
+            return running
 
-    yield start
-    for process in started:
-        process.kill()
-        process.wait()
-        process.stdout.close()
+        yield start
 
 
 def test_reader_frozen_killed_and_started_again_never_holds_a_tick(make, reader, monkeypatch):

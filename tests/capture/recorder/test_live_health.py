@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import gc
+import itertools
 import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +28,7 @@ from undulog.capture.log.sinks.mcap_sink import Description, McapSink, MessageSi
 from undulog.capture.recorder import health as live_health
 from undulog.capture.recorder.health import LiveHealth
 from undulog.capture.recorder.storage import TappedSink
+from undulog.capture.sources.contract import SourceCounts
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NS = 1_000_000_000
@@ -53,18 +60,26 @@ class Lossy:
 class Faults:
     """What goes wrong in a recording, as parts of the ticks or as whole ticks."""
 
-    seed: int
-    ticks: int
-    lost: float
-    skipped: float
-    nan: float
-    frozen: int
-    back: float
-    late: float
-    clipped: bool
-    gap: int
-    dropped: int
-    updates: float
+    seed: int = 1
+    ticks: int = 800
+    lost: float = 0.0
+    skipped: float = 0.0
+    nan: float = 0.0
+    frozen: int = 0
+    back: float = 0.0
+    late: float = 0.0
+    clipped: bool = False
+    gap: int = 0
+    dropped: int = 0
+    updates: float = 0.2
+
+
+@contextmanager
+def judged(path: Path, health: LiveHealth) -> Iterator[SessionWriter]:
+    """A session that is judged while it is written."""
+    sink = TappedSink(McapSink(path), [health])
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, sink=sink) as writer:
+        yield writer
 
 
 faults = st.builds(
@@ -165,24 +180,21 @@ def test_the_live_verdict_is_that_of_the_finished_file(
         assert (checked.verdict, checked.reasons) == (live.verdict, live.reasons)
 
 
-NOTHING = Faults(1, 800, 0.0, 0.0, 0.0, 0, 0.0, 0.0, clipped=False, gap=0, dropped=0, updates=0.2)
-
-
 def test_a_clean_recording_is_good(tmp_path: Path) -> None:
-    live = record(tmp_path / "s.mcap", NOTHING)
+    live = record(tmp_path / "s.mcap", Faults())
     assert (live.verdict, live.reasons) == ("good", ())
     assert live.sources[0].name == "can0"
 
 
 def test_pieces_keep_the_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_health, "PIECE", 2000)
-    wrong = replace(NOTHING, back=0.01, nan=0.002, lost=0.01, updates=1.0)
+    wrong = Faults(back=0.01, nan=0.002, lost=0.01, updates=1.0)
     live = record(tmp_path / "s.mcap", wrong)
     assert without_rounding(live) == without_rounding(check_session(tmp_path / "s.mcap"))
 
 
 def test_frames_lost_before_the_recorder_are_held_against_the_session(tmp_path: Path) -> None:
-    live = record(tmp_path / "s.mcap", replace(NOTHING, dropped=12))
+    live = record(tmp_path / "s.mcap", Faults(dropped=12))
     assert live.reasons == (
         "source can0 lost 84 of 10584 frames before the recorder (0.79%)",
     )  # at tick 700: 700 * 15 taken, 7 * 12 lost
@@ -197,14 +209,9 @@ def test_a_later_part_answers_for_its_own_losses_only(tmp_path: Path) -> None:
         diagnostics = writer.diagnostics()
         for second, dropped in ((100, 50), (101, 50), (102, 53)):
             counts = {"frames": str(1000 * second), "dropped": str(dropped)}
-            recorder = {"elapsed_s": str(second)}
-            diagnostics.write(
-                EPOCH_NS + second * NS,
-                [
-                    DiagnosticStatus(OK, "recorder", "", "", recorder),
-                    DiagnosticStatus(OK, "source can0", "", "", counts),
-                ],
-            )
+            found = {"recorder": {"elapsed_s": str(second)}, "source can0": counts}
+            statuses = [DiagnosticStatus(OK, name, "", "", found[name]) for name in found]
+            diagnostics.write(EPOCH_NS + second * NS, statuses)
     (source,) = check_session(path).sources
     assert (source.frames, source.dropped) == (2000, 3)
 
@@ -222,8 +229,7 @@ def test_other_people_s_diagnostics_are_no_sources(tmp_path: Path) -> None:
 
 def test_rates_ages_and_gaps_are_those_of_the_last_seconds(tmp_path: Path) -> None:
     health = LiveHealth(ROBOT)
-    sink = TappedSink(McapSink(tmp_path / "s.mcap"), [health])
-    with SessionWriter(tmp_path / "s.mcap", session_id="s", epoch_ns=EPOCH_NS, sink=sink) as writer:
+    with judged(tmp_path / "s.mcap", health) as writer:
         states = writer.joint_state("/joint_states", NAMES, unit="rad")
         sonar = writer.string("/gait/mode")
         bus = writer.frames("/can/can0")
@@ -251,10 +257,23 @@ def test_rates_ages_and_gaps_are_those_of_the_last_seconds(tmp_path: Path) -> No
         assert topics["/joint_states"].rate_hz < 50.0
 
 
+def test_the_frame_rate_of_a_source_is_that_of_the_last_seconds() -> None:
+    health = LiveHealth(None)
+    counts = SourceCounts()
+    source = SimpleNamespace(name="can0", robot=None, counts=counts, connected=True, finished=False)
+    rates: list[float | None] = []
+    for second in range(20):
+        health.update(EPOCH_NS + second * NS)
+        rates.append(health.source(source, "can:socketcan:can0", None).rate_hz)
+        counts.frames += 800 if second < 10 else 400
+    assert rates[0] is None
+    assert rates[1:11] == [800.0] * 10
+    assert rates[-1] == 400.0
+
+
 def test_stepping_looks_at_one_channel_a_tick_and_loses_none(tmp_path: Path) -> None:
     health = LiveHealth(None)
-    sink = TappedSink(McapSink(tmp_path / "s.mcap"), [health])
-    with SessionWriter(tmp_path / "s.mcap", session_id="s", epoch_ns=EPOCH_NS, sink=sink) as writer:
+    with judged(tmp_path / "s.mcap", health) as writer:
         channels = [writer.string(f"/text/{k}") for k in range(5)]
         for tick in range(1000):
             t_ns = EPOCH_NS + tick * 5_000_000
@@ -270,15 +289,14 @@ def test_stepping_looks_at_one_channel_a_tick_and_loses_none(tmp_path: Path) -> 
 # -- bounded memory ----------------------------------------------------------------------------
 
 
-def longest(flags: np.ndarray) -> tuple[int, int]:
-    """Longest run of true flags and where it begins, the slow way."""
-    best = (0, 0)
-    for start in range(len(flags)):
-        stop = start
-        while stop < len(flags) and flags[stop]:
-            stop += 1
-        if stop - start > best[0]:
-            best = (stop - start, start)
+def longest(flags: list[bool]) -> tuple[int, int]:
+    """Longest run of true flags and where the first such begins."""
+    best, start = (0, 0), 0
+    for flag, run in itertools.groupby(flags):
+        count = len(list(run))
+        if flag and count > best[0]:
+            best = (count, start)
+        start += count
     return best
 
 
@@ -305,7 +323,7 @@ def test_a_freeze_is_the_same_whether_seconds_are_forgotten_or_kept(
                 tally.forget(closed)
                 assert len(tally.result(2).second) <= 6
     found = freeze.result(measured.result(2), command.result(2), None)
-    lasted, since = longest(np.array([stands and moves for stands, moves in seconds]))
+    lasted, since = longest([stands and moves for stands, moves in seconds])
     assert freeze.columns == (1,)
     assert found[0].tolist() == [lasted]
     assert found[1].tolist() == [EPOCH_NS // NS + since if lasted else 0]
@@ -313,8 +331,6 @@ def test_a_freeze_is_the_same_whether_seconds_are_forgotten_or_kept(
 
 def test_a_day_takes_no_more_memory_than_ten_minutes(tmp_path: Path) -> None:
     """What is kept is counted after 30 and after 180 minutes of a slow recording."""
-    import gc
-    import sys
 
     def kept() -> int:
         gc.collect()
@@ -330,8 +346,7 @@ def test_a_day_takes_no_more_memory_than_ten_minutes(tmp_path: Path) -> None:
 
     health = LiveHealth(ROBOT)
     sizes: list[int] = []
-    sink = TappedSink(McapSink(tmp_path / "s.mcap"), [health])
-    with SessionWriter(tmp_path / "s.mcap", session_id="s", epoch_ns=EPOCH_NS, sink=sink) as writer:
+    with judged(tmp_path / "s.mcap", health) as writer:
         commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
         states = writer.joint_state("/joint_states", NAMES, unit="rad")
         bus, said, diagnostics = writer.frames("/can/can0"), writer.log(), writer.diagnostics()
@@ -356,8 +371,7 @@ def test_a_day_takes_no_more_memory_than_ten_minutes(tmp_path: Path) -> None:
 def test_the_verdict_meanwhile_is_that_of_a_good_recording(tmp_path: Path) -> None:
     """Channels are measured in turn; none of them seems to end before the others for that."""
     health = LiveHealth(ROBOT)
-    sink = TappedSink(McapSink(tmp_path / "s.mcap"), [health])
-    with SessionWriter(tmp_path / "s.mcap", session_id="s", epoch_ns=EPOCH_NS, sink=sink) as writer:
+    with judged(tmp_path / "s.mcap", health) as writer:
         topics = ["/joint_commands", "/joint_states", "/joint_current", "/joint_voltage", "/gait"]
         channels = [writer.joint_state(topic, NAMES, unit="rad") for topic in topics]
         said = set[tuple[str, tuple[str, ...]]]()

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from mcap.reader import make_reader
@@ -14,7 +13,9 @@ from mcap_ros2.decoder import DecoderFactory
 
 import undulog
 from support import processes
-from support.processes import UNDULOG, run, wait_for
+from support.processes import UNDULOG, python, wait_for
+from support.processes import undulog as undulog_command
+from undulog.capture import Session
 from undulog.capture.recorder.control_client import ControlClient, find_sockets
 
 PATIENCE_S = 60.0
@@ -34,20 +35,16 @@ def place(tmp_path, monkeypatch):
 @pytest.fixture
 def recorder(place):
     """Starts recorders of a source that nobody feeds, and waits until they can be asked."""
-    started = []
+    with contextlib.ExitStack() as started:
 
-    def start(name, *options):
-        command = [sys.executable, "-m", "undulog", "record", f"unix:{place}/{name}.frames"]
-        command += ["-o", str(place / f"{name}.mcap"), "--quiet", *options]
-        started.append(processes.start(*command))
-        path = place / "r" / "undulog" / f"{name}.sock"
-        wait_for(lambda: path in find_sockets(os.environ), alive=[started[-1]])
-        return started[-1]
+        def start(name, *options):
+            running = len(find_sockets(os.environ))
+            words = (f"unix:{place}/{name}.frames", "-o", place / f"{name}.mcap", "--quiet")
+            process = started.enter_context(processes.process(*UNDULOG, "record", *words, *options))
+            wait_for(lambda: len(find_sockets(os.environ)) > running, alive=[process])
+            return process
 
-    yield start
-    for process in started:
-        process.kill()
-        process.communicate()
+        yield start
 
 
 def said(capsys, *words):
@@ -57,12 +54,16 @@ def said(capsys, *words):
     return code, out, err
 
 
-def events(path):
-    """Who said what on /rosout, by a foreign reader."""
+def decoded(path, topic):
+    """Messages by a foreign reader."""
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        found = reader.iter_decoded_messages(["/rosout"])
-        return [(event.name, event.level, event.msg) for *_, event in found]
+        return [message for *_, message in reader.iter_decoded_messages([topic])]
+
+
+def events(path):
+    """Who said what on /rosout."""
+    return [(event.name, event.level, event.msg) for event in decoded(path, "/rosout")]
 
 
 def test_without_a_recorder_there_is_nobody_to_ask(place, capsys):
@@ -76,7 +77,7 @@ def test_without_a_recorder_there_is_nobody_to_ask(place, capsys):
 
 
 def test_a_recording_from_status_to_stop(recorder, place, capsys):
-    process = recorder("run")
+    process = recorder("run", "--operator", "Ada")
     code, out, _ = said(capsys, "status")
     assert code == 0
     assert out.startswith(f"{place}/run.mcap: recording, ")
@@ -96,16 +97,11 @@ def test_a_recording_from_status_to_stop(recorder, place, capsys):
     assert ("operator", 20, "mark: slipped on sand") in events(first)
     assert ("operator", 30, "battery changed") in events(first)
     events(second)
+    with Session.open(first) as session:
+        assert session.metadata["undulog"]["operator"] == "Ada"
     process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
     assert find_sockets(os.environ) == []
-
-
-def test_stop_without_wait_answers_at_once_and_the_recorder_ends(recorder, capsys):
-    process = recorder("run")
-    assert said(capsys, "stop") == (0, "stopping\n", "")
-    process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 0
 
 
 def test_of_several_recorders_one_must_be_named(recorder, place, capsys):
@@ -124,6 +120,9 @@ def test_of_several_recorders_one_must_be_named(recorder, place, capsys):
     assert "one.mcap" in out
     assert "two.mcap" not in out
     assert first.poll() is None
+    assert said(capsys, "stop") == (0, "stopping\n", "")  # without --wait at once
+    first.communicate(timeout=PATIENCE_S)
+    assert (first.returncode, second.returncode) == (0, 0)
 
 
 def test_a_recorder_that_is_killed_while_we_wait_is_told(recorder, capsys):
@@ -143,8 +142,8 @@ def test_a_second_recording_at_that_socket_is_refused_and_leaves_nothing(recorde
     recorder("run")
     (place / "b").mkdir()
     socket = place / "r" / "undulog" / "run.sock"
-    command = [sys.executable, "-m", "undulog", "record", f"unix:{place}/b.frames"]
-    done = run(*command, "-o", place / "b" / "run.mcap", "--socket", socket)
+    words = (f"unix:{place}/b.frames", "-o", place / "b" / "run.mcap", "--socket", socket)
+    done = undulog_command("record", *words)
     assert done.returncode == 1
     assert "another recorder listens there; end it, or name another with --socket" in done.stderr
     assert list((place / "b").iterdir()) == []
@@ -164,16 +163,10 @@ def test_a_controller_in_another_process_tells_its_gait_for_a_while(recorder, pl
         "        values = {'horizontal.A': 0.4, 'horizontal.phase': math.pi * k / 100}\n"
         "        recorder.ask({'do': 'gait', 'values': values})\n"
     )
-    subprocess.run(
-        [sys.executable, "-c", controller, f"{place}/r/undulog/run.sock"],
-        check=True,
-        timeout=PATIENCE_S,
-    )
+    assert python(controller, place / "r" / "undulog" / "run.sock").returncode == 0
     assert said(capsys, "stop", "--wait")[0] == 0
     process.communicate(timeout=PATIENCE_S)
-    with (place / "run.mcap").open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        found = [state for *_, state in reader.iter_decoded_messages(["/gait"])]
+    found = decoded(place / "run.mcap", "/gait")
     assert len(found) == 200
     assert found[50].position[1] == pytest.approx(1.5707963267948966, rel=1e-15)
 
@@ -210,28 +203,15 @@ def test_the_unit_is_printed_with_this_installation_s_command(place, capsys):
     assert f"ExecStart={sys.prefix}/bin/undulog record --settings /etc/undulog/%i.toml" in out
 
 
-def test_two_outputs_of_one_name_in_two_folders(place, capsys):
-    processes = []
+def test_two_outputs_of_one_name_in_two_folders(recorder, place, capsys):
+    started = []
     for folder in ("a", "b"):
         (place / folder).mkdir()
-        command = [sys.executable, "-m", "undulog", "record", f"unix:{place}/{folder}.frames"]
-        command += ["-o", str(place / folder / "run.mcap"), "--quiet", "--floor", "0"]
-        processes.append(subprocess.Popen(command, stderr=subprocess.PIPE, text=True))
-    try:
-        deadline = time.monotonic() + PATIENCE_S
-        while len(find_sockets(os.environ)) < 2:
-            assert time.monotonic() < deadline
-            for process in processes:
-                assert process.poll() is None, process.communicate()
-            time.sleep(0.02)
-        _, out, _ = said(capsys, "status", "--json")
-        found = {each["output"]: each["socket"] for each in json.loads(out)["recordings"]}
-        assert set(found) == {str(place / folder / "run.mcap") for folder in ("a", "b")}
-        assert f"{place}/r/undulog/run.sock" in found.values()
-        for socket in found.values():
-            assert said(capsys, "stop", "--wait", "--socket", socket)[0] == 0
-        assert [process.wait(PATIENCE_S) for process in processes] == [0, 0]
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
+        started.append(recorder(f"{folder}/run", "--floor", "0"))
+    _, out, _ = said(capsys, "status", "--json")
+    found = {each["output"]: each["socket"] for each in json.loads(out)["recordings"]}
+    assert set(found) == {str(place / folder / "run.mcap") for folder in ("a", "b")}
+    assert f"{place}/r/undulog/run.sock" in found.values()
+    for socket in found.values():
+        assert said(capsys, "stop", "--wait", "--socket", socket)[0] == 0
+    assert [process.wait(PATIENCE_S) for process in started] == [0, 0]

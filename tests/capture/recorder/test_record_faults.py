@@ -5,11 +5,10 @@ The senders here know what they sent; joint states are counted with mcap's own r
 
 from __future__ import annotations
 
-import json
+import itertools
 import os
 import signal
 import socket
-import subprocess
 import threading
 import time
 from pathlib import Path
@@ -17,11 +16,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 from support.paths import ROOT
 from support.processes import wait_for
-from support.recorders import events, recording, send
+from support.recorders import counts, ended, events, greet, recording, send
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.log.messages.frames import DIR_TX, FrameArray, empty_frames
@@ -46,23 +44,6 @@ def polling() -> FrameArray:
     return frames
 
 
-def report_of(process: subprocess.Popen[str]) -> dict[str, Any]:
-    """The recorder's report."""
-    said, trouble = process.communicate(timeout=60)
-    assert "Traceback" not in trouble, trouble
-    assert said, trouble
-    return json.loads(said)
-
-
-def counts(path: Path) -> dict[str, int]:
-    """Messages of each topic, as mcap's own reader counts them."""
-    found: dict[str, int] = {}
-    with path.open("rb") as stream:
-        for _, channel, _ in make_reader(stream, validate_crcs=True).iter_messages():
-            found[channel.topic] = found.get(channel.topic, 0) + 1
-    return found
-
-
 # -- impossible times ---------------------------------------------------------------------------
 
 ODD_NS = (1 << 63, (1 << 63) + 18 * 10**17 - 1, 1 << 62, (1 << 63) - 1, 2**64 - 1)
@@ -75,8 +56,7 @@ def test_an_impossible_device_time_ends_no_decoding(first: int, tmp_path: Path) 
     odd["t_device_ns"] = np.resize(np.array(ODD_NS, dtype=np.uint64), len(odd))
     with recording(tmp_path / "run.mcap", f"can0=unix:{bus}", "--robot", "snake25") as process:
         send(bus, frames, pause_s=0.004)
-        process.send_signal(signal.SIGTERM)
-        report = report_of(process)
+        report, _ = ended(process, signal.SIGTERM)
     assert counts(tmp_path / "run.mcap")["/joint_states"] == CYCLES
     assert report["sources"]["can0"]["malformed"] == len(odd)
     with Session.open(tmp_path / "run.mcap") as session:
@@ -109,10 +89,7 @@ def test_an_impossible_time_of_socketcand_ends_no_decoding(first: int, tmp_path:
     def serve() -> None:
         client, _ = listener.accept()
         with client:
-            client.sendall(b"< hi >")
-            for _ in range(2):
-                client.recv(1000)
-                client.sendall(b"< ok >")
+            greet(client)
             for start in range(0, len(lines), JOINTS):
                 client.sendall(b"".join(lines[start : start + JOINTS]))
                 time.sleep(0.004)
@@ -121,13 +98,9 @@ def test_an_impossible_time_of_socketcand_ends_no_decoding(first: int, tmp_path:
     server = threading.Thread(target=serve)
     server.start()
     address = f"can0=can:socketcand:can0?host=127.0.0.1&port={listener.getsockname()[1]}"
-    with (
-        listener,
-        recording(
-            tmp_path / "run.mcap", address, "--robot", "snake25", "--duration", "4"
-        ) as process,
-    ):
-        report = report_of(process)
+    options = ("--robot", "snake25", "--duration", "4")
+    with listener, recording(tmp_path / "run.mcap", address, *options) as process:
+        report, _ = ended(process)
     server.join()
     assert counts(tmp_path / "run.mcap")["/joint_states"] == CYCLES
     assert report["sources"]["can0"]["frames"] == len(frames)
@@ -142,32 +115,19 @@ def test_a_failure_of_decoding_costs_the_frames_that_cause_it(
     stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every 200th frame makes one stage raise, as a fault of the program would."""
-    decode, add, write = BusDecoder.decode, SourceClock.add, JointStateChannel.write
-    mapped: list[int] = []
+    owner, method, fails = {
+        "decode": (BusDecoder, "decode", lambda _, args: (args[0]["t_device_ns"] % 200 == 1).any()),
+        "map": (SourceClock, "add", lambda call, _: call % 3 == 0),
+        "write": (JointStateChannel, "write", lambda call, _: call % 11 == 0),
+    }[stage]
+    original, calls = getattr(owner, method), itertools.count(1)
 
-    def failing_decode(self: BusDecoder, frames: FrameArray) -> Any:
-        if (frames["t_device_ns"] % 200 == 1).any():
-            raise ZeroDivisionError("decode")
-        return decode(self, frames)
+    def failing(self: Any, *args: Any, **options: Any) -> Any:
+        if fails(next(calls), args):
+            raise ZeroDivisionError(stage)
+        return original(self, *args, **options)
 
-    def failing_add(self: SourceClock, device: Any, host: Any) -> Any:
-        mapped.append(len(device))
-        if len(mapped) % 3 == 0:
-            raise ZeroDivisionError("map")
-        return add(self, device, host)
-
-    def failing_write(self: JointStateChannel, t_ns: int, *fields: Any, **options: Any) -> None:
-        mapped.append(1)
-        if len(mapped) % 11 == 0:
-            raise ZeroDivisionError("write")
-        write(self, t_ns, *fields, **options)
-
-    if stage == "decode":
-        monkeypatch.setattr(BusDecoder, "decode", failing_decode)
-    elif stage == "map":
-        monkeypatch.setattr(SourceClock, "add", failing_add)
-    else:
-        monkeypatch.setattr(JointStateChannel, "write", failing_write)
+    monkeypatch.setattr(owner, method, failing)
     frames = polling()
     odd = np.arange(len(frames)) % (20 * 2 * JOINTS) == 77  # in every 20th cycle
     frames["t_device_ns"] += 200 - frames["t_device_ns"] % 200 + odd
@@ -230,7 +190,7 @@ def test_a_duration_ends_sources_of_simulated_time(tmp_path: Path) -> None:
         tmp_path / "run.mcap", f"can0=unix:{bus}?clock=simulated", "--duration", "1.5"
     ) as process:
         wait_for(bus.exists, "the source's socket")
-        report = report_of(process)
+        report, _ = ended(process)
     assert process.returncode == 0
     assert report["ended"] == "1.5 s are over"
     assert 1.5 <= report["duration_s"] < 10
@@ -301,8 +261,7 @@ def test_a_plug_in_that_fails_later_is_given_up_alone(
     sources = [f"can0=unix:{bus}", f"bad=faulty:{where}"]
     with recording(tmp_path / "run.mcap", *sources, env=plugged) as process:
         send(bus, frames, pause_s=0.004)
-        process.send_signal(signal.SIGTERM)
-        report = report_of(process)
+        report, _ = ended(process, signal.SIGTERM)
     assert process.returncode == 1
     assert "given up before, see /rosout: bad" in report["ended"]
     assert report["sources"]["can0"]["frames"] == len(frames)

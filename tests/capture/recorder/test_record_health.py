@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import socket
-import sys
 import time
 from pathlib import Path
 
@@ -13,8 +11,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from support.paths import ROOT
-from support.processes import start, wait_for
+from support.processes import wait_for
+from support.recorders import ended, recording
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.sources.contract import HEAD
@@ -43,18 +41,11 @@ def send(path: Path, seconds: float, lost: int) -> int:
 @pytest.mark.slow
 def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path: Path) -> None:
     output, source = tmp_path / "run.mcap", tmp_path / "snake.sock"
-    command = [sys.executable, "-m", "undulog", "record", f"bus=unix:{source}", "-o", str(output)]
-    command += ["--socket", str(tmp_path / "control.sock"), "--floor", "0", "--json"]
-    with start(*command, cwd=ROOT) as recorder:
-        try:
-            wait_for(lambda: source.exists() or recorder.poll() is not None, "the source")
-            sent = send(source, seconds=10.0, lost=12)
-            recorder.send_signal(signal.SIGINT)
-            said, trouble = recorder.communicate(timeout=60)
-        finally:
-            recorder.kill()
+    with recording(output, f"bus=unix:{source}") as recorder:
+        wait_for(source.exists, "the source", alive=[recorder])
+        sent = send(source, seconds=10.0, lost=12)
+        report, trouble = ended(recorder, signal.SIGINT)
     assert recorder.returncode == 0, trouble
-    report = json.loads(said)
     health = check_session(output)
     assert (health.stored, health.stored_reasons) == (health.verdict, health.reasons)
     assert (report["verdict"], tuple(report["reasons"])) == (health.verdict, health.reasons)

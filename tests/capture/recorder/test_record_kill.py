@@ -4,14 +4,13 @@ The senders are other processes, and their own logs say what the recorder's sock
 when; what is in the session is held against those logs and against the frames they made.
 """
 
-import os
 import random
-import signal
 import struct
-import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
+from subprocess import DEVNULL
 
 import numpy as np
 import pytest
@@ -19,7 +18,8 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from support.paths import ROOT
-from support.processes import run, wait_for
+from support.processes import process, run, undulog, wait_for
+from support.recorders import counts, recording
 from undulog.capture import Session
 
 SENDER = ROOT / "bench" / "bus_sender.py"
@@ -41,43 +41,23 @@ def record_and_kill(folder, seed, *options):
     chance = random.Random(seed)
     session = folder / "run.mcap"
     sockets = [folder / f"{name}.sock" for name in ("front", "rear")]
-    command = [sys.executable, "-m", "undulog", "record", *(f"unix:{path}" for path in sockets)]
-    command += ["--robot", "snake25", "--bus", "front", "-o", str(session), "--floor", "0"]
-    started = []
-    try:
-        with (folder / "recorder.err").open("wb") as errors:
-            recorder = subprocess.Popen(
-                [*command, *options, "--quiet", "--socket", str(folder / "control.sock")],
-                cwd=ROOT,
-                stderr=errors,
-            )
-        started.append(recorder)
-        logs = [path.with_suffix(".accepted") for path in sockets]
+    logs = [path.with_suffix(".accepted") for path in sockets]
+    sources = [f"unix:{path}" for path in sockets]
+    words = (*sources, "--robot", "snake25", "--bus", "front", *options, "--quiet")
+    with ExitStack() as senders, recording(session, *words) as recorder:
         for path, log in zip(sockets, logs, strict=True):
-            sender = [sys.executable, str(SENDER), "unix", str(path), "--rate", str(RATE)]
-            started.append(
-                subprocess.Popen(
-                    [*sender, "--seconds", "120", "--log", str(log)],
-                    cwd=ROOT,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                )
-            )
-
-        def under_load():
-            assert recorder.poll() is None, (folder / "recorder.err").read_text()
-            return all(log.exists() and log.stat().st_size >= 16 * 50 for log in logs)
-
-        wait_for(under_load, "the senders")
+            words = ("unix", path, "--rate", RATE, "--seconds", 120, "--log", log)
+            silent = {"cwd": ROOT, "stdout": DEVNULL, "stderr": DEVNULL}
+            senders.enter_context(process(sys.executable, SENDER, *words, **silent))
+        wait_for(
+            lambda: all(log.exists() and log.stat().st_size >= 16 * 50 for log in logs),
+            "the senders",
+            alive=[recorder],
+        )
         time.sleep(chance.uniform(0.0, 2.0))
         killed_ns = time.monotonic_ns()
-        os.kill(recorder.pid, signal.SIGKILL)
+        recorder.kill()
         recorder.wait(timeout=30)
-    finally:
-        for process in started:
-            if process.poll() is None:
-                process.kill()
-            process.wait(timeout=30)
     return session, [accepted_before(log, killed_ns - SAFE_NS) for log in logs]
 
 
@@ -100,25 +80,18 @@ def check_kill(folder, seed, *options):
         assert any("recover" in warning for warning in session.warnings)
     assert {file: file.read_bytes() for file in folder.rglob("*.mcap")} == before
     repaired = folder / "repaired.mcap"
-    undulog = [sys.executable, "-m", "undulog"]
-    subprocess.run(
-        [*undulog, "log", "recover", str(path), "-o", str(repaired)],
-        check=True,
-        cwd=ROOT,
-        capture_output=True,
-    )
+    assert undulog("log", "recover", path, "-o", repaired, cwd=ROOT).returncode == 0
     with Session.open(repaired) as session:
         check_frames(session, accepted)
     files = sorted(folder.glob("repaired*.mcap"))
     for file in files:
-        counts = {}
+        found = counts(file)
         with file.open("rb") as stream:
             for _, channel, message in make_reader(stream).iter_messages():
-                counts[channel.topic] = counts.get(channel.topic, 0) + 1
                 if channel.topic.startswith("/can/"):
                     assert struct.unpack_from("<I", message.data, 4)[0] == 2  # dimensions
         with AnyReader([file]) as reader:
-            assert {c.topic: c.msgcount for c in reader.connections if c.msgcount} == counts
+            assert {c.topic: c.msgcount for c in reader.connections if c.msgcount} == found
     return files
 
 

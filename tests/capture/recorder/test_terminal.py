@@ -9,12 +9,10 @@ import pty
 import re
 import select
 import struct
-import subprocess
-import sys
 import termios
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 
 import pytest
@@ -22,6 +20,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
+from support.paths import ROOT
+from support.processes import python
 from undulog.capture.log.health.sources import measure_sources, read_statuses
 from undulog.capture.log.messages.definitions import ERROR, OK, STALE, WARN
 from undulog.capture.recorder.screen import Terminal, clock_time, plain_line, screen, time_left
@@ -132,7 +132,6 @@ def test_no_screen_is_wider_than_the_terminal_whatever_names_say(
         SNAPSHOT,
         path=path,
         reasons=(reason, "the second"),
-        trouble=said,
         events=(EventLine(EPOCH_NS, "warn", path, said),),
         sources=(replace(CAN, name=said), IMU),
     )
@@ -174,11 +173,8 @@ def terminal() -> Iterator[tuple[int, io.TextIOWrapper]]:
     """A real terminal of 100 x 30: the end of whoever looks at it, and the stream."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 30, 100, 0, 0))
-    with os.fdopen(theirs, "w") as stream:
-        try:
-            yield ours, stream
-        finally:
-            os.close(ours)
+    with os.fdopen(theirs, "w") as stream, os.fdopen(ours, "rb"):
+        yield ours, stream
 
 
 def read_until(number: int, wanted: str, patience_s: float = 30.0) -> str:
@@ -241,15 +237,9 @@ def test_a_process_whose_terminal_is_stuck_can_end() -> None:
     source += f"'tests_snapshot', {__file__!r})\nmodule = importlib.util.module_from_spec(spec)\n"
     source += "sys.modules['tests_snapshot'] = module\nspec.loader.exec_module(module)\n"
     with terminal() as (_, stream):
-        done = subprocess.run(
-            [sys.executable, "-c", source + program],
-            stderr=stream,
-            stdout=subprocess.PIPE,
-            env=os.environ | {"TERM": "xterm-256color"},
-            timeout=60,
-            check=False,
-        )
-    assert (done.returncode, done.stdout) == (0, b"False\n")
+        environment = os.environ | {"TERM": "xterm-256color", "PYTHONPATH": f"{ROOT}/tests"}
+        done = python(source + program, stderr=stream, env=environment)
+    assert (done.returncode, done.stdout) == (0, "False\n")
 
 
 def test_a_pipe_gets_a_line_every_ten_seconds_and_each_trouble_once() -> None:
@@ -267,11 +257,8 @@ def test_a_pipe_gets_a_line_every_ten_seconds_and_each_trouble_once() -> None:
     with os.fdopen(number) as rest:
         said += rest.read()
     lines = said.splitlines()
-    assert [line.split()[0] for line in lines if line[0].isdigit()] == [
-        "0:00:00",
-        "0:00:10",
-        "0:00:20",
-    ]
+    times = [line.split()[0] for line in lines if line[0].isdigit()]
+    assert times == ["0:00:00", "0:00:10", "0:00:20"]
     assert lines.count("error: imu: the connection is lost") == 1
     assert lines.count("warn: can0: a late one") == 1
     assert not any(line.startswith("info") for line in lines)
@@ -303,14 +290,8 @@ def test_the_line_says_what_matters() -> None:
 
 def test_the_statuses_say_what_the_screen_says() -> None:
     found = {status.name: status for status in statuses(SNAPSHOT)}
-    assert list(found) == [
-        "recorder",
-        "session",
-        "source can0",
-        "source imu",
-        "topics ir",
-        "topics joints",
-    ]
+    names = "recorder, session, source can0, source imu, topics ir, topics joints"
+    assert list(found) == names.split(", ")
     assert found["recorder"].level == OK
     assert found["session"].level == WARN
     assert found["session"].values["reason.2"] == "reason 1"
@@ -325,10 +306,8 @@ def test_a_silent_source_is_stale_and_a_full_disk_an_error() -> None:
     snapshot = replace(SNAPSHOT, sources=(silent,), free=1_000_000)
     found = {status.name: status for status in statuses(snapshot)}
     assert (found["source can0"].level, found["source can0"].message) == (STALE, "silent for 3 s")
-    assert (found["recorder"].level, found["recorder"].message) == (
-        ERROR,
-        "the disk is full in 28 s",
-    )
+    recorder = found["recorder"]
+    assert (recorder.level, recorder.message) == (ERROR, "the disk is full in 28 s")
 
 
 def test_what_is_written_is_what_a_check_reads(tmp_path) -> None:
@@ -339,24 +318,19 @@ def test_what_is_written_is_what_a_check_reads(tmp_path) -> None:
     from undulog.capture.log.messages.definitions import message_type
 
     path = tmp_path / "s.mcap"
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
-        writer.diagnostics().write(EPOCH_NS, statuses(SNAPSHOT))
-    log_file = LogFile(path)
-    try:
-        _, message, kind = Topics(log_file, print).first("/diagnostics")
-    finally:
-        log_file.close()
+
+    def written(snapshot):
+        with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, force=True) as writer:
+            writer.diagnostics().write(EPOCH_NS, statuses(snapshot))
+        with closing(LogFile(path)) as log_file:
+            _, message, kind = Topics(log_file, print).first("/diagnostics")
+        return kind, message
+
+    kind, message = written(SNAPSHOT)
     assert kind.name == message_type("diagnostic_msgs/msg/DiagnosticArray").name
     assert read_statuses(kind, message) == statuses(SNAPSHOT)
     assert measure_sources(kind, message, message) == ()  # one moment, long after the start
-    started = replace(SNAPSHOT, elapsed_s=1.0)
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, force=True) as writer:
-        writer.diagnostics().write(EPOCH_NS, statuses(started))
-    log_file = LogFile(path)
-    try:
-        _, message, kind = Topics(log_file, print).first("/diagnostics")
-    finally:
-        log_file.close()
+    kind, message = written(replace(SNAPSHOT, elapsed_s=1.0))
     can, imu = measure_sources(kind, message, message)
     assert (can.frames, can.dropped, can.malformed, can.clock_resets) == (1_348_123, 12, 3, 1)
     assert (imu.frames, imu.dropped) == (72, None)

@@ -6,12 +6,12 @@ import shutil
 import signal
 import socket
 import subprocess
-import time
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
 
-from support.processes import run, undulog
+from support.processes import process, run, undulog
 from undulog.capture.common.errors import UsageError
 from undulog.capture.recorder.systemd import UNIT_NAME, hidden_folder, installed_program, unit_text
 
@@ -55,10 +55,14 @@ def test_systemd_finds_nothing_wrong(systemd_analyze, unit):
     assert said == []
 
 
+def judged(systemd_analyze, unit):
+    """What systemd says of a unit's security."""
+    threshold = f"--threshold={EXPOSURE * 10:.0f}"
+    return run(systemd_analyze, "security", "--offline=true", "--no-pager", threshold, unit)
+
+
 def test_systemd_finds_it_well_hardened(systemd_analyze, unit):
-    command = [systemd_analyze, "security", "--offline=true", "--no-pager"]
-    command += [f"--threshold={EXPOSURE * 10:.0f}", str(unit)]
-    done = run(*command)
+    done = judged(systemd_analyze, unit)
     if "unrecognized option" in done.stderr:
         pytest.skip("this systemd-analyze can't judge a file")
     assert done.returncode == 0, done.stdout
@@ -71,10 +75,7 @@ def test_a_weaker_unit_would_not_pass(systemd_analyze, unit):
     weak = unit.read_text().replace("DynamicUser=yes", "User=root")
     weak = re.sub(r"(?m)^(CapabilityBoundingSet|SystemCallFilter|ProtectSystem)=.*$", "", weak)
     unit.write_text(weak)
-    command = [systemd_analyze, "security", "--offline=true", "--no-pager"]
-    command += [f"--threshold={EXPOSURE * 10:.0f}", str(unit)]
-    done = run(*command)
-    assert done.returncode != 0
+    assert judged(systemd_analyze, unit).returncode != 0
 
 
 def test_what_the_recorder_relies_on_is_there(unit):
@@ -91,12 +92,10 @@ def test_what_the_recorder_relies_on_is_there(unit):
 
 
 def test_the_program_s_path_stands_in_the_unit():
-    assert "ExecStart=/opt/undulog/bin/undulog record " in unit_text(
-        Path("/opt/undulog/bin/undulog")
-    )
-    assert 'ExecStart="/opt/a 50%%/$HOME/undulog" record ' in unit_text(
-        Path("/opt/a 50%/$HOME/undulog")
-    )
+    text = unit_text(Path("/opt/undulog/bin/undulog"))
+    assert "ExecStart=/opt/undulog/bin/undulog record " in text
+    text = unit_text(Path("/opt/a 50%/$HOME/undulog"))
+    assert 'ExecStart="/opt/a 50%%/$HOME/undulog" record ' in text
     for path in ("bin/undulog", "/opt/two\nlines/undulog", '/opt/a"b/undulog', "/opt/a*/undulog"):
         with pytest.raises(UsageError, match="an absolute path"):
             unit_text(Path(path))
@@ -150,38 +149,27 @@ def service(unit, tmp_path):
 
     Yields a function that takes the settings and gives the process and the manager's socket.
     """
-    started = []
     state, runtime = tmp_path / "state", tmp_path / "runtime"
     state.mkdir()
     runtime.mkdir()
-    manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    manager.bind(str(tmp_path / "notify"))
+    environ = {
+        "PATH": os.environ["PATH"],
+        "NOTIFY_SOCKET": str(tmp_path / "notify"),
+        "WATCHDOG_USEC": "200000",
+        "RUNTIME_DIRECTORY": str(runtime),
+        "STATE_DIRECTORY": str(state),
+    }
+    with ExitStack() as started, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
 
-    def start(settings):
-        (tmp_path / "snake.toml").write_text(settings)
-        command = start_command(unit, "snake")
-        at = command.index("/etc/undulog/snake.toml")
-        command[at] = str(tmp_path / "snake.toml")
-        command = [*without_capabilities(), *command]
-        environ = {
-            "PATH": os.environ["PATH"],
-            "NOTIFY_SOCKET": str(tmp_path / "notify"),
-            "WATCHDOG_USEC": "200000",
-            "RUNTIME_DIRECTORY": str(runtime),
-            "STATE_DIRECTORY": str(state),
-        }
-        started.append(
-            subprocess.Popen(
-                command, cwd=state, env=environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-            )
-        )
-        return started[-1], manager
+        def start(settings=f'sources = ["unix:{tmp_path}/frames.sock"]\noutput = "run.mcap"\n'):
+            file = tmp_path / "snake.toml"
+            file.write_text(f"[record]\n{settings}")
+            command = [*without_capabilities(), *start_command(unit, "snake")]
+            command[command.index("/etc/undulog/snake.toml")] = file
+            return started.enter_context(process(*command, cwd=state, env=environ)), manager
 
-    yield start
-    for process in started:
-        process.kill()
-        process.communicate()
-    manager.close()
+        yield start
 
 
 def control(runtime, *words):
@@ -191,8 +179,7 @@ def control(runtime, *words):
 
 
 def test_a_service_says_ready_feeds_its_watchdog_and_ends_whole_on_sigterm(service, tmp_path):
-    settings = f'[record]\nsources = ["unix:{tmp_path}/frames.sock"]\noutput = "run.mcap"\n'
-    process, manager = service(settings)
+    process, manager = service()
     heard(manager, "READY=1")
     for _ in range(3):
         heard(manager, "WATCHDOG=1")
@@ -204,33 +191,28 @@ def test_a_service_says_ready_feeds_its_watchdog_and_ends_whole_on_sigterm(servi
     heard(manager, "STOPPING=1")
     output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
-    assert output == b"", "--quiet"
+    assert output == "", "--quiet"
     raw = (tmp_path / "state" / "run.mcap").read_bytes()
     assert raw.endswith(b"\x89MCAP0\r\n")
     assert not (tmp_path / "runtime" / "run.sock").exists()
 
 
-def test_a_loop_that_hangs_feeds_its_watchdog_no_more(service, tmp_path):
-    settings = f'[record]\nsources = ["unix:{tmp_path}/frames.sock"]\noutput = "run.mcap"\n'
-    process, manager = service(settings)
+def test_a_loop_that_hangs_feeds_its_watchdog_no_more(service):
+    process, manager = service()
     heard(manager, "READY=1")
     heard(manager, "WATCHDOG=1")
     process.send_signal(signal.SIGSTOP)
     manager.settimeout(2.0)
-    silent = False
-    deadline = time.monotonic() + PATIENCE_S
-    while not silent and time.monotonic() < deadline:
-        try:
-            manager.recv(65536)  # what was sent before
-        except TimeoutError:
-            silent = True
-    assert silent
+    with suppress(TimeoutError):  # behind what was sent before
+        for _ in range(1000):
+            manager.recv(65536)
+        pytest.fail("its watchdog is fed")
     process.send_signal(signal.SIGCONT)
     heard(manager, "WATCHDOG=1")
 
 
 def test_wrong_settings_end_with_2_so_that_they_are_not_tried_again(service):
-    process, _ = service("[record]\nsauces = []\n")
+    process, _ = service("sauces = []\n")
     _, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
-    assert b"record.sauces: found an unknown key" in errors
+    assert "record.sauces: found an unknown key" in errors

@@ -19,25 +19,9 @@ from undulog.capture.sources.socketcan import SocketcanLink
 FRAME = bytes.fromhex("23010000020000001122000000000000")
 
 
-@pytest.fixture
-def sockets():
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as theirs,
-    ):
-        ours.bind(("127.0.0.1", 0))
-        theirs.connect(ours.getsockname())
-        yield ours, theirs
-
-
 def source_of(open_link) -> LinkedSource:
-    return LinkedSource(
-        parse_address("can:test:can0"),
-        open_link,
-        place="can0",
-        clock=ClockDomain.HOST,
-        facts={},
-    )
+    address = parse_address("can:test:can0")
+    return LinkedSource(address, open_link, place="can0", clock=ClockDomain.HOST, facts={})
 
 
 def test_a_fault_of_an_opener_is_told_and_tried_again(sockets, listen) -> None:
@@ -87,8 +71,8 @@ def test_a_fault_of_a_link_is_a_lost_connection(sockets, listen) -> None:
 
 def test_what_the_thread_took_and_what_the_kernel_dropped_is_all(sockets, listen) -> None:
     ours, theirs = sockets
-    ours.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-    ours.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+    for option in (SO_TIMESTAMPNS, SO_RXQ_OVFL):
+        ours.setsockopt(socket.SOL_SOCKET, option, 1)
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     heard = listen(
         source_of(lambda tally: DrainedLink(SocketcanLink(ours, tally), tally, pause_s=0.01))
@@ -97,13 +81,15 @@ def test_what_the_thread_took_and_what_the_kernel_dropped_is_all(sockets, listen
     sent = 3000
     for _ in range(sent):  # nobody polls, and the socket holds a few at a time
         theirs.send(FRAME)
-    deadline = time.monotonic() + 60
-    while len(heard.frames) + (heard.source.counts.dropped or 0) != sent:
-        assert time.monotonic() < deadline
+
+    def send_one():
+        nonlocal sent
         theirs.send(FRAME)  # drops are told with the next packet
         sent += 1
         time.sleep(0.05)
         heard.poll()
+
+    wait_for(lambda: len(heard.frames) + (heard.source.counts.dropped or 0) == sent, each=send_one)
     assert heard.source.counts.dropped
     assert heard.source.counts.frames == len(heard.frames)
 

@@ -4,16 +4,9 @@ import can
 import numpy as np
 import pytest
 
+from support.can_messages import can_message
 from undulog.capture.common.errors import SourceError, UsageError
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    ID_MASK,
-    REMOTE_FLAG,
-)
+from undulog.capture.log.messages.frames import DIR_RX, ERROR_FLAG, FD_ESI
 from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.can import (
@@ -28,19 +21,6 @@ from undulog.capture.sources.can import (
 )
 
 
-def message_of(frame) -> can.Message:
-    flags, length = int(frame["id_flags"]), int(frame["dlc"])
-    return can.Message(
-        arbitration_id=flags & ID_MASK,
-        is_extended_id=bool(flags & EXTENDED_FLAG),
-        is_remote_frame=bool(flags & REMOTE_FLAG),
-        dlc=length,
-        data=None if flags & REMOTE_FLAG else frame["data"][:length].tolist(),
-        timestamp=int(frame["t_device_ns"]) / 1e9,
-        check=True,
-    )
-
-
 @pytest.fixture
 def bus():
     with can.Bus(
@@ -49,17 +29,28 @@ def bus():
         yield bus
 
 
-def source_at(query: str = ""):
-    return open_source(parse_address(f"can:virtual:snake{query}"))
+def source_at(query: str = "", interface: str = "virtual:snake"):
+    return open_source(parse_address(f"can:{interface}{query}"))
 
 
-def test_twenty_thousand_frames_arrive_as_sent(bus, listen, traffic, same) -> None:
+@pytest.fixture
+def connect(listen):
+    """Starts the source, and waits until it is connected."""
+
+    def start(query: str = ""):
+        heard = listen(source_at(query))
+        heard.until_event("connected to virtual snake (never transmits)")
+        return heard
+
+    return start
+
+
+def test_twenty_thousand_frames_arrive_as_sent(bus, connect, traffic, same) -> None:
     truth = traffic(20_000)
-    heard = listen(source_at())
-    heard.until_event("connected to virtual snake (never transmits)")
+    heard = connect()
     for start in range(0, len(truth), 500):
         for frame in truth[start : start + 500]:
-            bus.send(message_of(frame))
+            bus.send(can_message(frame))
         heard.poll()
     found = heard.until_frames(len(truth))
     assert same(found, truth)
@@ -72,13 +63,12 @@ def test_twenty_thousand_frames_arrive_as_sent(bus, listen, traffic, same) -> No
     assert bus.recv(0) is None  # it sent nothing
 
 
-def test_the_devices_times_to_the_microsecond(bus, listen, traffic) -> None:
+def test_the_devices_times_to_the_microsecond(bus, connect, traffic) -> None:
     truth = traffic(2000)
-    heard = listen(source_at("?device_time=1&preserve_timestamps=1"))
-    heard.until_event("connected")
+    heard = connect("?device_time=1&preserve_timestamps=1")
     assert heard.source.clock is ClockDomain.DEVICE
     for frame in truth:
-        bus.send(message_of(frame))
+        bus.send(can_message(frame))
     found = heard.until_frames(2000)
     assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
 
@@ -89,9 +79,8 @@ def test_a_driver_without_times_gets_those_of_arrival() -> None:
     assert frames["t_device_ns"].tolist() == [123, 1_500_000_000]
 
 
-def test_impossible_times_are_replaced_by_the_arrivals_and_counted(bus, listen) -> None:
-    heard = listen(source_at("?device_time=1&preserve_timestamps=1"))
-    heard.until_event("connected")
+def test_impossible_times_are_replaced_by_the_arrivals_and_counted(bus, connect) -> None:
+    heard = connect("?device_time=1&preserve_timestamps=1")
     times = (float("nan"), float("inf"), -1.5, 1e300, 9.3e9, 4611686018.5)
     for k, time_s in enumerate((*times, 5.25)):
         bus.send(can.Message(arbitration_id=k, timestamp=time_s))
@@ -102,9 +91,8 @@ def test_impossible_times_are_replaced_by_the_arrivals_and_counted(bus, listen) 
     assert heard.source.counts.reconnects == 0
 
 
-def test_error_frames(bus, listen) -> None:
-    heard = listen(source_at())
-    heard.until_event("connected")
+def test_error_frames(bus, connect) -> None:
+    heard = connect()
     bus.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=[0] * 8))
     bus.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=[7]))
     found = heard.until_frames(2)
@@ -115,24 +103,13 @@ def test_error_frames(bus, listen) -> None:
     heard.until_event("back on the bus")
 
 
-def test_can_fd_frames(bus, listen, traffic, fd_traffic, same) -> None:
+def test_can_fd_frames(bus, connect, traffic, fd_traffic, same) -> None:
     truth, fd_truth = traffic(500), fd_traffic(500)
     fd_truth["fd_flags"][::3] |= FD_ESI
-    heard = listen(source_at())
-    heard.until_event("connected")
+    heard = connect()
     for frame, fd_frame in zip(truth, fd_truth, strict=True):
-        bus.send(message_of(frame))
-        bus.send(
-            can.Message(
-                arbitration_id=int(fd_frame["id_flags"]) & ID_MASK,
-                is_extended_id=bool(fd_frame["id_flags"] & EXTENDED_FLAG),
-                is_fd=True,
-                bitrate_switch=bool(fd_frame["fd_flags"] & FD_BRS),
-                error_state_indicator=bool(fd_frame["fd_flags"] & FD_ESI),
-                data=fd_frame["data"][: fd_frame["len"]].tolist(),
-                check=True,
-            )
-        )
+        bus.send(can_message(frame))
+        bus.send(can_message(fd_frame))
     assert same(heard.until_frames(500), truth)
     heard.until(lambda: len(heard.fd_frames) >= 500)
     assert same(heard.fd_frames, fd_truth)
@@ -148,10 +125,9 @@ def test_a_driver_that_does_not_say_can_fd(same) -> None:
     )
 
 
-def test_a_bus_that_fails_is_opened_again(listen, context) -> None:
+def test_a_bus_that_fails_is_opened_again(connect) -> None:
     """The driver is closed under the reading thread: what an unplugged adapter looks like."""
-    heard = listen(source_at())
-    heard.until_event("connected")
+    heard = connect()
     heard.source._link._bus.shutdown()
     heard.until_event("lost virtual snake")
     heard.until_event("is back after")
@@ -161,34 +137,34 @@ def test_a_bus_that_fails_is_opened_again(listen, context) -> None:
         assert heard.until_frames(1)["id_flags"].tolist() == [5]
 
 
-def test_options_are_converted_and_unknown_ones_refused(context) -> None:
-    with pytest.raises(UsageError, match=r"no option 'rx_queue'.*did you mean rx_queue_size"):
-        source_at("?rx_queue=5")
-    with pytest.raises(UsageError, match="no listen-only for virtual; it does for cantact, kvaser"):
-        source_at("?listen_only=1")
-    with pytest.raises(UsageError, match="state LOUD is not valid; valid: ACTIVE, PASSIVE, ERROR"):
-        open_source(parse_address("can:pcan:PCAN_USBBUS1?state=LOUD"))
-    with pytest.raises(UsageError, match="fd=maybe is neither 1 nor 0"):
-        open_source(parse_address("can:pcan:PCAN_USBBUS1?fd=maybe"))
-    source = open_source(parse_address("can:udp_multicast:239.74.163.2?receive_own_messages=1"))
+@pytest.mark.parametrize(
+    ("address", "match"),
+    [
+        ("virtual:snake?rx_queue=5", r"no option 'rx_queue'.*did you mean rx_queue_size"),
+        ("virtual:snake?listen_only=1", "no listen-only for virtual; it does for cantact, kvaser"),
+        ("pcan:PCAN_USBBUS1?state=LOUD", "LOUD is not valid; valid: ACTIVE, PASSIVE, ERROR"),
+        ("pcan:PCAN_USBBUS1?fd=maybe", "fd=maybe is neither 1 nor 0"),
+        ("socketcam:can0", r"no CAN interface 'socketcam'.*did you mean socketcand?"),
+        ("pcan", "no channel"),
+        ("socketcan:can0?bitrate=500000", "ip link set can0 up type can bitrate 500000"),
+    ],
+)
+def test_wrong_interfaces_and_options_are_refused(address, match) -> None:
+    with pytest.raises(UsageError, match=match):
+        source_at(interface=address)
+
+
+def test_options_are_converted(context) -> None:
+    source = source_at("?receive_own_messages=1", "udp_multicast:239.74.163.2")
     with pytest.raises(SourceError, match=r"can:udp_multicast.*receive"):
         source.start(context)
     assert source.finished
 
 
-def test_unknown_interfaces_list_those_there_are() -> None:
-    with pytest.raises(UsageError, match=r"no CAN interface 'socketcam'.*did you mean socketcand?"):
-        open_source(parse_address("can:socketcam:can0"))
-    with pytest.raises(UsageError, match="no channel"):
-        open_source(parse_address("can:pcan"))
-    with pytest.raises(UsageError, match=r"ip link set can0 up type can bitrate 500000"):
-        open_source(parse_address("can:socketcan:can0?bitrate=500000"))
-
-
 def test_an_interface_that_can_not_be_loaded_says_why(context) -> None:
     with pytest.raises(SourceError, match="python-can can't load canalystii: No module named"):
-        open_source(parse_address("can:canalystii:0"))
-    source = open_source(parse_address("can:kvaser:0"))
+        source_at(interface="canalystii:0")
+    source = source_at(interface="kvaser:0")
     with pytest.raises(SourceError, match="can:kvaser:0: "):
         source.start(context)
 

@@ -3,7 +3,6 @@
 The senders are other processes; what ``send()`` returned to them is the truth.
 """
 
-import json
 import os
 import re
 import shutil
@@ -17,9 +16,8 @@ import bus_sender
 import numpy as np
 import pytest
 
-from support import processes
-from support.paths import ROOT
-from support.processes import wait_for
+from support.processes import python, start, wait_for
+from support.recorders import ended, greet, recording
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.process import raised_priority
 from undulog.capture.log.messages.frames import empty_frames
@@ -55,12 +53,14 @@ class Sender:
     """A sender in another process."""
 
     def __init__(self, path):
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", SENDER, str(path)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        self.process = start(sys.executable, "-c", SENDER, path, stdin=subprocess.PIPE)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.communicate()
 
     def start(self, count):
         self.process.stdin.write(f"{count}\n")
@@ -70,10 +70,6 @@ class Sender:
         """Frames accepted since the start, refused of the last ones, when each was sent."""
         accepted, refused, *times = map(int, self.process.stdout.readline().split())
         return accepted, refused, times
-
-    def close(self):
-        self.process.kill()
-        self.process.communicate()
 
 
 def hold_the_interpreter(seconds):
@@ -92,8 +88,7 @@ def test_packets_are_taken_while_the_interpreter_is_held(tmp_path):
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
         listener.bind(str(tmp_path / "s"))
         listener.listen()
-        sender = Sender(tmp_path / "s")
-        try:
+        with Sender(tmp_path / "s") as sender:
             receiver = ReceiveThread(listener.accept()[0], 100)
             sizes, stamps = [], []
 
@@ -116,31 +111,23 @@ def test_packets_are_taken_while_the_interpreter_is_held(tmp_path):
             apart = np.array(stamps[before:]) - np.array(sent_ns)
             assert np.percentile(apart, 90) <= 0  # the kernel's time, not ours
             receiver.close()
-        finally:
-            sender.close()
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_what_was_accepted_before_the_end_is_in_the_session(seed, tmp_path):
     path, output = tmp_path / "bus.sock", tmp_path / "run.mcap"
-    recorder = start_recorder(output, f"bus=unix:{path}")
-    sender = Sender(path)
-    try:
+    with recording(output, f"bus=unix:{path}") as recorder, Sender(path) as sender:
         wait_for(path.exists, "the recorder")
         sender.start(1_000_000)
         wait_for((output.parent / "run.mcap.wal").exists, "the log")
         time.sleep(1.0 + seed / 7)
-        recorder.send_signal(signal.SIGINT)
-        out, err = recorder.communicate(timeout=60)
+        report, err = ended(recorder, signal.SIGINT)
         accepted, _, _ = sender.result()  # its send() failed: it knows that nobody records
-    finally:
-        stop(recorder)
-        sender.close()
     assert recorder.returncode == 0, err
     with Session.open(output) as session:
         numbers = session.frames("/can/bus")["t_device_ns"]
     np.testing.assert_array_equal(numbers, np.arange(accepted))
-    assert json.loads(out)["sources"]["bus"]["frames"] == accepted
+    assert report["sources"]["bus"]["frames"] == accepted
 
 
 def test_a_stream_is_kept_up_to_the_end(tmp_path):
@@ -148,26 +135,19 @@ def test_a_stream_is_kept_up_to_the_end(tmp_path):
     output = tmp_path / "run.mcap"
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        recorder = start_recorder(output, f"bus=can:socketcand:can0?host=127.0.0.1&port={port}")
-        try:
-            client, _ = server.accept()
-            with client:
-                client.sendall(b"< hi >")
-                for _ in range(2):
-                    client.recv(4096)
-                    client.sendall(b"< ok >")
-                for number in range(4000):
-                    if number == 3000:
-                        recorder.send_signal(signal.SIGINT)
-                        signalled_ns = time.time_ns()
-                    try:
-                        client.sendall(b"< frame 1 %d.000000 11 >" % number)
-                    except OSError:
-                        break
-                    time.sleep(0.0002)
-                _, err = recorder.communicate(timeout=60)
-        finally:
-            stop(recorder)
+        address = f"bus=can:socketcand:can0?host=127.0.0.1&port={port}"
+        with recording(output, address) as recorder, server.accept()[0] as client:
+            greet(client)
+            for number in range(4000):
+                if number == 3000:
+                    recorder.send_signal(signal.SIGINT)
+                    signalled_ns = time.time_ns()
+                try:
+                    client.sendall(b"< frame 1 %d.000000 11 >" % number)
+                except OSError:
+                    break
+                time.sleep(0.0002)
+            _, err = ended(recorder)
     assert recorder.returncode == 0, err
     with Session.open(output) as session:
         frames = session.frames("/can/bus")
@@ -212,18 +192,6 @@ def raw(session, topic):
         yield from (message for _, _, message in make_reader(stream).iter_messages([topic]))
 
 
-def start_recorder(output, source, *before):
-    command = [*before, sys.executable, "-m", "undulog", "record", source, "-o", str(output)]
-    command += ["--floor", "0", "--quiet", "--json"]
-    return processes.start(*command, "--socket", output.with_name("control.sock"), cwd=ROOT)
-
-
-def stop(process):
-    if process.poll() is None:
-        process.kill()
-        process.wait()
-
-
 root_only = pytest.mark.skipif(
     os.geteuid() != 0 or shutil.which("setpriv") is None, reason="needs root and setpriv"
 )
@@ -231,9 +199,7 @@ root_only = pytest.mark.skipif(
 
 def permitted(call):
     """Whether the system lets a process of ours do this."""
-    code = f"import os; os.{call}"
-    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True)
-    return done.returncode == 0
+    return python(f"import os; os.{call}").returncode == 0
 
 
 def test_priority_is_what_the_system_grants_and_is_given_back():
@@ -248,8 +214,7 @@ def test_priority_is_what_the_system_grants_and_is_given_back():
         assert policy == (os.SCHED_RR if real_time and not alone else before[0])
         if nicer and not real_time and not alone:
             assert os.getpriority(os.PRIO_PROCESS, 0) == min(before[1], -10)
-        child = "import os; print(os.sched_getscheduler(0))"
-        done = subprocess.run([sys.executable, "-c", child], check=True, capture_output=True)
+        done = python("import os; print(os.sched_getscheduler(0))")
         assert int(done.stdout) == (before[0] if alone else os.SCHED_OTHER)
     after = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
     assert (after, os.getpriority(os.PRIO_PROCESS, 0)) == before
@@ -266,15 +231,11 @@ def test_priority_is_what_the_system_grants_and_is_given_back():
 def test_the_recorder_reports_its_priority(before, text, tmp_path):
     output, path = tmp_path / "run.mcap", tmp_path / "bus.sock"
     usual = ("nice", "-n", str(-os.nice(0)))  # the tests may run at a lower priority
-    recorder = start_recorder(output, f"bus=unix:{path}", *usual, *before)
-    try:
+    with recording(output, f"bus=unix:{path}", before=(*usual, *before)) as recorder:
         wait_for(path.exists, "the recorder")
         time.sleep(0.5)
-        recorder.send_signal(signal.SIGINT)
-        out, _ = recorder.communicate(timeout=60)
-    finally:
-        stop(recorder)
-    assert json.loads(out)["recorder"]["priority"] == text
+        report, _ = ended(recorder, signal.SIGINT)
+    assert report["recorder"]["priority"] == text
     with Session.open(output) as session:
         said = [message.msg for _, message in session.messages("/rosout")]
     assert any("priority was refused" in line for line in said) == text.startswith("refused")

@@ -9,38 +9,39 @@ import time
 import tty
 from pathlib import Path
 
-import can
 import numpy as np
 import pytest
 from can.util import len2dlc
 
+from support.can_messages import can_message, cut_at_random, received
 from support.processes import wait_for
 from undulog.capture.common.errors import SourceError, UsageError
-from undulog.capture.log.messages.frames import (
-    EXTENDED_FLAG,
-    FD_BRS,
-    ID_MASK,
-    REMOTE_FLAG,
-    empty_frames,
-)
+from undulog.capture.log.messages.frames import EXTENDED_FLAG, FD_BRS, ID_MASK, REMOTE_FLAG
 from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.slcan import STAMP_PERIOD_MS, SlcanText
 
 
-def lines(frames, stamps_ms=None) -> bytes:
-    """Frames as the protocol's description has them."""
+def lines(frames, stamps_ms=None) -> list[bytes]:
+    """Frames as the protocol's description has them, and CAN FD frames as its extension does."""
     out = []
+    fd = "len" in frames.dtype.names
     for number, frame in enumerate(frames):
-        flags, length = int(frame["id_flags"]), int(frame["dlc"])
-        extended, remote = flags & EXTENDED_FLAG, flags & REMOTE_FLAG
-        letter = "tTrR"[bool(extended) + 2 * bool(remote)]
+        flags, length = int(frame["id_flags"]), int(frame["len" if fd else "dlc"])
+        extended = bool(flags & EXTENDED_FLAG)
+        special = bool(frame["fd_flags"] & FD_BRS if fd else flags & REMOTE_FLAG)
+        letter = ("dDbB" if fd else "tTrR")[extended + 2 * special]
         identifier = f"{flags & ID_MASK:0{8 if extended else 3}X}"
-        data = "" if remote else bytes(frame["data"][:length]).hex().upper()
+        data = "" if special and not fd else bytes(frame["data"][:length]).hex().upper()
         stamp = "" if stamps_ms is None else f"{int(stamps_ms[number]) % STAMP_PERIOD_MS:04X}"
-        out.append(f"{letter}{identifier}{length}{data}{stamp}\r")
-    return "".join(out).encode()
+        digit = f"{len2dlc(length):X}"
+        out.append(f"{letter}{identifier}{digit}{data}{stamp}\r".encode())
+    return out
+
+
+def stream(frames, stamps_ms=None) -> bytes:
+    return b"".join(lines(frames, stamps_ms))
 
 
 class Adapter:
@@ -115,48 +116,60 @@ def source_at(tmp_path: Path, query: str = "bitrate=1000000"):
     return open_source(parse_address(f"can:slcan:{tmp_path}/ttyACM0?{query}"))
 
 
-def test_twenty_thousand_frames_arrive_as_sent(plug, tmp_path, listen, traffic, same) -> None:
-    adapter = plug()
+@pytest.fixture
+def connect(plug, listen, tmp_path):
+    """Plugs an adapter in and starts its source; both."""
+
+    def start(query="bitrate=1000000", **options):
+        adapter = plug(**options)
+        heard = listen(source_at(tmp_path, query))
+        heard.until_event("connected")
+        return adapter, heard
+
+    return start
+
+
+def commands(adapter) -> list[bytes]:
+    """What the adapter was told, apart from closing."""
+    return [command for command in adapter.commands if command != b"C"]
+
+
+def test_twenty_thousand_frames_arrive_as_sent(connect, traffic, same) -> None:
+    adapter, heard = connect()
     truth = traffic(20_000)
-    heard = listen(source_at(tmp_path))
-    heard.until_event("connected")
     assert heard.source.connected
     assert heard.source.clock is ClockDomain.HOST
-    adapter.send(lines(truth))
+    adapter.send(stream(truth))
     found = heard.until_frames(len(truth))
     assert same(found, truth)
     assert np.array_equal(found["t_device_ns"], found["t_host_ns"])
     assert (np.diff(found["t_host_ns"].astype(np.int64)) >= 0).all()
-    assert heard.source.counts.frames == 20_000
-    assert heard.source.counts.malformed == 0
-    assert heard.source.counts.dropped is None
+    counts = heard.source.counts
+    assert (counts.frames, counts.malformed, counts.dropped) == (20_000, 0, None)
 
 
-def test_it_listens_only_and_never_transmits(plug, tmp_path, listen, traffic) -> None:
-    adapter = plug()
-    heard = listen(source_at(tmp_path))
-    assert "listen-only, 1000000 bit/s" in heard.until_event("connected").text
-    adapter.send(lines(traffic(100)))
+def test_it_listens_only_and_never_transmits(connect, traffic) -> None:
+    adapter, heard = connect()
+    assert "listen-only, 1000000 bit/s" in heard.texts[-1]
+    adapter.send(stream(traffic(100)))
     heard.until_frames(100)
     heard.source.stop()
     heard.until(lambda: adapter.commands[-1] == b"C")
-    assert [c for c in adapter.commands if c != b"C"] == [b"S8", b"L"]
+    assert commands(adapter) == [b"S8", b"L"]
     assert heard.source.finished
     assert not heard.source.connected
 
 
-def test_the_adapters_clock_runs_on_over_the_minute(plug, tmp_path, listen, traffic, same) -> None:
-    adapter = plug()
+def test_the_adapters_clock_runs_on_over_the_minute(connect, traffic, same) -> None:
+    adapter, heard = connect("bitrate=500000&timestamps=1")
     truth = traffic(20_000)
     stamps_ms = 51_234 + 7 * np.arange(len(truth))
-    heard = listen(source_at(tmp_path, "bitrate=500000&timestamps=1"))
-    heard.until_event("connected")
-    adapter.send(lines(truth, stamps_ms))
+    adapter.send(stream(truth, stamps_ms))
     found = heard.until_frames(len(truth))
     assert same(found, truth)
     assert heard.source.clock is ClockDomain.DEVICE
     assert np.array_equal(found["t_device_ns"], stamps_ms * 1_000_000)
-    assert [c for c in adapter.commands if c != b"C"] == [b"S6", b"Z1", b"L"]
+    assert commands(adapter) == [b"S6", b"Z1", b"L"]
 
 
 def test_minutes_of_silence_are_counted_by_the_hosts_clock() -> None:
@@ -176,23 +189,23 @@ def test_stamps_that_are_missing_or_not_asked_for_are_no_times_and_no_data(
     asked, given, traffic, same
 ) -> None:
     truth = traffic(50)
-    frames, _ = SlcanText(stamps=asked).feed(lines(truth, given), 77, Tally(lambda: 0))
+    frames, _ = SlcanText(stamps=asked).feed(stream(truth, given), 77, Tally(lambda: 0))
     assert same(frames, truth)
     assert set(frames["t_device_ns"].tolist()) == {77}
 
 
-def test_a_recorder_that_is_held_up_loses_nothing(plug, tmp_path, listen, traffic, same) -> None:
+def test_a_recorder_that_is_held_up_loses_nothing(connect, traffic, same) -> None:
+    adapter, heard = connect()
     truth = traffic(20_000)  # half a megabyte: several times what the terminal holds
-    adapter = plug()
-    heard = listen(source_at(tmp_path))
-    adapter.send(lines(truth))
+    adapter.send(stream(truth))
     wait_for(lambda: not adapter.queue)  # nobody polls
     found = heard.until_frames(len(truth))
     assert same(found, truth)
     assert len(np.unique(found["t_host_ns"])) > 5  # each stamped when it was read
 
 
-def test_noise_costs_its_own_line_only(plug, tmp_path, listen, traffic, same) -> None:
+def test_noise_costs_its_own_line_only(connect, traffic, same) -> None:
+    adapter, heard = connect()
     truth = traffic(1000)
     noise = [
         b"\xff\xfe\x80\r",  # no text in any encoding
@@ -205,16 +218,13 @@ def test_noise_costs_its_own_line_only(plug, tmp_path, listen, traffic, same) ->
         b"q\r",
         b"X" * 5000 + b"\r",
     ]
-    good = lines(truth).split(b"\r")[:-1]
     rng = np.random.default_rng(0)
     places = set(rng.choice(1000, len(noise), replace=False).tolist())
     mixed, left = b"", list(noise)
-    for number, line in enumerate(good):
+    for number, line in enumerate(lines(truth)):
         if number in places:
             mixed += left.pop()
-        mixed += line + b"\r" + (b"z\r" if number % 100 == 0 else b"\r")
-    adapter = plug()
-    heard = listen(source_at(tmp_path))
+        mixed += line + (b"z\r" if number % 100 == 0 else b"\r")
     adapter.send(mixed + b"\a")
     assert same(heard.until_frames(1000), truth)
     heard.until(lambda: heard.source.counts.malformed == len(noise) + 1)
@@ -224,44 +234,19 @@ def test_noise_costs_its_own_line_only(plug, tmp_path, listen, traffic, same) ->
 
 
 def test_any_way_of_cutting_the_stream_gives_the_same(traffic) -> None:
-    truth = traffic(300)
-    stream = lines(truth) + b"\xff\r" + lines(truth)
-    whole, _ = SlcanText(stamps=False).feed(stream, 5, Tally(lambda: 0))
+    whole_stream = stream(traffic(300)) + b"\xff\r" + stream(traffic(300))
+    whole, _ = SlcanText(stamps=False).feed(whole_stream, 5, Tally(lambda: 0))
     for seed in range(20):
-        rng = np.random.default_rng(seed)
-        cuts = np.sort(rng.integers(0, len(stream), rng.integers(1, 400)))
         text, tally = SlcanText(stamps=False), Tally(lambda: 0)
-        borders = [0, *cuts.tolist(), len(stream)]
-        parts = [text.feed(stream[a:b], 5, tally)[0] for a, b in itertools.pairwise(borders)]
+        parts = [text.feed(piece, 5, tally)[0] for piece in cut_at_random(whole_stream, seed)]
         assert np.concatenate(parts).tobytes() == whole.tobytes()
         assert tally.counts.malformed == 1
 
 
-def fd_lines(frames) -> list[bytes]:
-    """CAN FD frames as the protocol's extension has them."""
-    out = []
-    for frame in frames:
-        flags = int(frame["id_flags"])
-        extended = bool(flags & EXTENDED_FLAG)
-        letter = "dDbB"[extended + 2 * bool(frame["fd_flags"] & FD_BRS)]
-        identifier = f"{flags & ID_MASK:0{8 if extended else 3}X}"
-        length = int(frame["len"])
-        data = bytes(frame["data"][:length]).hex().upper()
-        out.append(f"{letter}{identifier}{len2dlc(length):X}{data}\r".encode())
-    return out
-
-
-@pytest.fixture
-def both(traffic, fd_traffic):
-    return traffic(2000), fd_traffic(2000)
-
-
-def test_can_fd_frames_among_the_others(plug, tmp_path, listen, both, same) -> None:
-    truth, fd_truth = both
-    classic = [line + b"\r" for line in lines(truth).split(b"\r")[:-1]]
-    adapter = plug()
-    heard = listen(source_at(tmp_path))
-    mixed = itertools.chain.from_iterable(zip(classic, fd_lines(fd_truth), strict=True))
+def test_can_fd_frames_among_the_others(connect, traffic, fd_traffic, same) -> None:
+    adapter, heard = connect()
+    truth, fd_truth = traffic(2000), fd_traffic(2000)
+    mixed = itertools.chain.from_iterable(zip(lines(truth), lines(fd_truth), strict=True))
     adapter.send(b"".join(mixed) + b"d1238" + b"00" * 9 + b"\r" + b"DFFFFFFFF0\r" + b"d12\r")
     assert same(heard.until_frames(2000), truth)
     heard.until(lambda: len(heard.fd_frames) >= 2000 and heard.source.counts.malformed == 3)
@@ -271,20 +256,19 @@ def test_can_fd_frames_among_the_others(plug, tmp_path, listen, both, same) -> N
 
 def test_an_adapter_stamps_can_fd_frames_too(fd_traffic, same) -> None:
     truth = fd_traffic(100)
-    stream = b"".join(line[:-1] + b"%04X\r" % (10 * k) for k, line in enumerate(fd_lines(truth)))
     tally = Tally(lambda: 0)
-    classic, frames = SlcanText(stamps=True).feed(stream, 10**18, tally)
+    stamped = stream(truth, 10 * np.arange(100))
+    classic, frames = SlcanText(stamps=True).feed(stamped, 10**18, tally)
     assert (len(classic), tally.counts.malformed) == (0, 0)
     assert same(frames, truth)
     assert frames["t_device_ns"].tolist() == [10_000_000 * k for k in range(100)]
     assert set(frames["t_host_ns"].tolist()) == {10**18}
 
 
-def test_unplugged_and_plugged_in_again(plug, tmp_path, listen, traffic, same) -> None:
+def test_unplugged_and_plugged_in_again(connect, plug, traffic, same) -> None:
     first, second = traffic(500), traffic(700)
-    adapter = plug()
-    heard = listen(source_at(tmp_path))
-    adapter.send(lines(first))
+    adapter, heard = connect()
+    adapter.send(stream(first))
     heard.until_frames(500)
     adapter.unplug()
     heard.until_event("lost")
@@ -293,7 +277,7 @@ def test_unplugged_and_plugged_in_again(plug, tmp_path, listen, traffic, same) -
         heard.poll()
     adapter = plug()
     heard.until_event("is back after")
-    adapter.send(lines(second))
+    adapter.send(stream(second))
     assert same(heard.until_frames(1200), np.concatenate([first, second]))
     assert heard.source.counts.reconnects == 1
     assert [event.level for event in heard.events] == ["info", "warn", "info"]
@@ -307,7 +291,7 @@ def test_an_adapter_that_is_not_there_yet_is_waited_for(
     assert "No such file" in heard.until_event("waits for").text
     assert not heard.source.connected
     truth = traffic(100)
-    plug().send(lines(truth))
+    plug().send(stream(truth))
     assert same(heard.until_frames(100), truth)
     assert heard.source.counts.reconnects == 0
 
@@ -319,21 +303,19 @@ def test_an_adapter_without_listen_only_is_not_opened_otherwise(plug, tmp_path, 
     assert b"O" not in adapter.commands
 
 
-def test_listen_only_can_be_given_up(plug, tmp_path, listen, traffic, same) -> None:
-    adapter = plug(refuses=b"L")
+def test_listen_only_can_be_given_up(connect, traffic, same) -> None:
+    adapter, heard = connect("listen_only=0", refuses=b"L")
     truth = traffic(100)
-    heard = listen(source_at(tmp_path, "listen_only=0"))
-    assert "acknowledges" in heard.until_event("connected").text
-    adapter.send(lines(truth))
+    assert "acknowledges" in heard.texts[-1]
+    adapter.send(stream(truth))
     assert same(heard.until_frames(100), truth)
-    assert [c for c in adapter.commands if c != b"C"] == [b"O"]
+    assert commands(adapter) == [b"O"]
 
 
-def test_an_adapter_that_never_answers(plug, tmp_path, listen, traffic, same) -> None:
-    adapter = plug(answers=False)
+def test_an_adapter_that_never_answers(connect, traffic, same) -> None:
+    adapter, heard = connect(answers=False)
     truth = traffic(100)
-    heard = listen(source_at(tmp_path))
-    adapter.send(lines(truth))
+    adapter.send(stream(truth))
     assert same(heard.until_frames(100), truth)
 
 
@@ -360,24 +342,12 @@ def test_python_cans_own_client_reads_the_same(plug, tmp_path, listen, traffic, 
     bus = slcanBus(str(tmp_path / "ttyACM0"), bitrate=500_000, sleep_after_open=0, listen_only=True)
     while adapter.commands.count(b"L") < 2:  # it opens twice; an answer must not split a frame
         time.sleep(0.01)
-    adapter.send(lines(truth))
-    theirs = []
-    while len(theirs) < len(truth):
-        message = bus.recv(60)
-        assert message is not None
-        theirs.append(message)
-    bus.shutdown()
-    frames = empty_frames(len(theirs))
-    frames["id_flags"] = [
-        m.arbitration_id | m.is_extended_id * EXTENDED_FLAG | m.is_remote_frame * REMOTE_FLAG
-        for m in theirs
-    ]
-    frames["dlc"] = [m.dlc for m in theirs]
-    frames["data"] = [list(bytes(m.data).ljust(8, b"\0")) for m in theirs]
+    adapter.send(stream(truth))
+    _, frames = received(bus, len(truth))
     assert same(frames, truth)
     heard = listen(source_at(tmp_path))
     heard.until_event("connected")
-    adapter.send(lines(truth))
+    adapter.send(stream(truth))
     assert same(heard.until_frames(1000), frames)
 
 
@@ -391,14 +361,7 @@ def test_can_fd_frames_as_python_cans_own_client_writes_them(
     adapter = plug(answers=False)
     bus = slcanBus(str(tmp_path / "ttyACM0"), bitrate=500_000, sleep_after_open=0)
     for frame in truth:
-        message = can.Message(
-            is_fd=True,
-            arbitration_id=int(frame["id_flags"]) & ID_MASK,
-            is_extended_id=bool(frame["id_flags"] & EXTENDED_FLAG),
-            bitrate_switch=bool(frame["fd_flags"] & FD_BRS),
-            data=frame["data"][: frame["len"]].tolist(),
-        )
-        bus.send(message)
+        bus.send(can_message(frame, error_state_indicator=False))
     bus.shutdown()
     while len(sent := [line for line in adapter.commands if line[:1] in b"dDbB"]) < len(truth):
         time.sleep(0.01)
@@ -406,4 +369,4 @@ def test_can_fd_frames_as_python_cans_own_client_writes_them(
     _, found = SlcanText(stamps=False).feed(b"\r".join(sent) + b"\r", 5, tally)
     assert tally.counts.malformed == 0
     assert same(found, truth)
-    assert same(found, SlcanText(stamps=False).feed(b"".join(fd_lines(truth)), 5, tally)[1])
+    assert same(found, SlcanText(stamps=False).feed(stream(truth), 5, tally)[1])

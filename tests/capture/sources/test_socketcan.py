@@ -8,22 +8,13 @@ frames are packed by python-can.
 import socket
 import time
 
-import can
 import numpy as np
 import pytest
 from can.interfaces.socketcan.socketcan import build_can_frame
 
+from support.can_messages import can_message
 from undulog.capture.common.errors import SourceError
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    ID_MASK,
-    REMOTE_FLAG,
-)
+from undulog.capture.log.messages.frames import DIR_RX, DIR_TX, FD_BRS, FD_ESI
 from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.events import Tally
@@ -38,31 +29,15 @@ from undulog.capture.sources.socketcan import SocketcanLink, frames_of
 
 
 def packed(frame) -> bytes:
-    flags, length = int(frame["id_flags"]), int(frame["dlc"])
-    return build_can_frame(
-        can.Message(
-            arbitration_id=flags & ID_MASK,
-            is_extended_id=bool(flags & EXTENDED_FLAG),
-            is_remote_frame=bool(flags & REMOTE_FLAG),
-            is_error_frame=bool(flags & ERROR_FLAG),
-            dlc=length,
-            data=None if flags & REMOTE_FLAG else frame["data"][:length].tolist(),
-        )
-    )
+    return build_can_frame(can_message(frame))
 
 
 @pytest.fixture
-def pair():
+def pair(sockets):
     """A bound datagram socket that stamps and counts drops, and one connected to it."""
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as theirs,
-    ):
-        ours.bind(("127.0.0.1", 0))
-        ours.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        ours.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
-        theirs.connect(ours.getsockname())
-        yield ours, theirs
+    for option in (SO_TIMESTAMPNS, SO_RXQ_OVFL):
+        sockets[0].setsockopt(socket.SOL_SOCKET, option, 1)
+    return sockets
 
 
 def test_twenty_thousand_frames_as_packed_by_python_can(pair, traffic, same) -> None:
@@ -125,18 +100,7 @@ def test_can_fd_frames_and_what_is_no_frame(pair, traffic, fd_traffic, same) -> 
     link = SocketcanLink(ours, tally)
     theirs.send(packed(truth[0]))
     for frame in fd_truth:
-        theirs.send(
-            build_can_frame(
-                can.Message(
-                    is_fd=True,
-                    arbitration_id=int(frame["id_flags"]) & ID_MASK,
-                    is_extended_id=bool(frame["id_flags"] & EXTENDED_FLAG),
-                    bitrate_switch=bool(frame["fd_flags"] & FD_BRS),
-                    error_state_indicator=bool(frame["fd_flags"] & FD_ESI),
-                    data=frame["data"][: frame["len"]].tolist(),
-                )
-            )
-        )
+        theirs.send(packed(frame))
     for odd in (b"", b"x" * 15, b"x" * 200):
         theirs.send(odd)
     theirs.send(packed(truth[1]))
@@ -155,13 +119,7 @@ def test_can_fd_frames_and_what_is_no_frame(pair, traffic, fd_traffic, same) -> 
 
 def test_frames_of_this_computer_are_told_apart(traffic) -> None:
     raw = np.frombuffer(b"".join(packed(f) for f in traffic(2)), dtype=np.uint8).reshape(2, 16)
-    batch = Batch(
-        packets=raw,
-        sizes=[16, 16],
-        flags=[0, socket.MSG_DONTROUTE],
-        stamps_ns=[5, 6],
-        drops=None,
-    )
+    batch = Batch(raw, [16, 16], [0, socket.MSG_DONTROUTE], [5, 6], None)
     frames = frames_of(batch, [5, 6])
     assert frames["dir"].tolist() == [DIR_RX, DIR_TX]
 

@@ -1,8 +1,6 @@
 """A real socketcand server over TCP, read by us and by python-can's own client."""
 
-import itertools
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -11,14 +9,10 @@ import can
 import numpy as np
 import pytest
 
+from support.can_messages import cut_at_random, received
+from support.processes import start
 from undulog.capture.common.errors import UsageError
-from undulog.capture.log.messages.frames import (
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    ID_MASK,
-    REMOTE_FLAG,
-    empty_frames,
-)
+from undulog.capture.log.messages.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG
 from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.events import Tally
@@ -132,16 +126,7 @@ def test_python_cans_own_client_reads_the_same(serve, listen, traffic, same) -> 
     server = serve(pause_s=0.3)  # it can't bear frames right behind the last answer
     server.stream = messages(truth)
     bus = can.Bus(interface="socketcand", host="127.0.0.1", port=server.port, channel="can0")
-    theirs = []
-    while len(theirs) < len(truth):
-        message = bus.recv(60)
-        assert message is not None
-        theirs.append(message)
-    bus.shutdown()
-    frames = empty_frames(len(theirs))
-    frames["id_flags"] = [m.arbitration_id | m.is_extended_id * EXTENDED_FLAG for m in theirs]
-    frames["dlc"] = [m.dlc for m in theirs]
-    frames["data"] = [list(bytes(m.data).ljust(8, b"\0")) for m in theirs]
+    theirs, frames = received(bus, len(truth))
     heard = listen(source_at(server.port))
     found = heard.until_frames(len(truth))
     assert same(found, frames)
@@ -182,11 +167,8 @@ def test_any_way_of_cutting_the_stream_gives_the_same(traffic) -> None:
     whole = SocketcandText().feed(stream, 5, Tally(lambda: 0))
     assert len(whole) == 400
     for seed in range(20):
-        rng = np.random.default_rng(seed)
-        cuts = np.sort(rng.integers(0, len(stream), rng.integers(1, 400)))
         text, tally = SocketcandText(), Tally(lambda: 0)
-        borders = [0, *cuts.tolist(), len(stream)]
-        parts = [text.feed(stream[a:b], 5, tally) for a, b in itertools.pairwise(borders)]
+        parts = [text.feed(piece, 5, tally) for piece in cut_at_random(stream, seed)]
         assert np.concatenate(parts).tobytes() == whole.tobytes()
         assert tally.counts.malformed == 1
 
@@ -257,36 +239,20 @@ time.sleep(600)
 """
 
 
-def spawn(port: int, stream: bytes) -> tuple[subprocess.Popen[str], int]:
-    process = subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(port), stream.decode()],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
-    return process, int(process.stdout.readline())
-
-
 def test_the_server_is_killed_and_comes_back(listen, traffic, same) -> None:
     first, second = traffic(100), traffic(200)
-    process, port = spawn(0, messages(first))
-    try:
+    with start(sys.executable, "-c", KILLED, 0, messages(first).decode()) as process:
+        port = int(process.stdout.readline())
         heard = listen(source_at(port))
         heard.until_frames(100)
         process.kill()
         heard.until_event("lost can0 at 127.0.0.1")
-        assert not heard.source.connected
-        for _ in range(100):
-            heard.poll()
-    finally:
-        process.kill()
-        process.communicate()
-    process, _ = spawn(port, messages(second))
-    try:
+    assert not heard.source.connected
+    for _ in range(100):
+        heard.poll()
+    with start(sys.executable, "-c", KILLED, port, messages(second).decode()) as process:
         assert same(heard.until_frames(300), np.concatenate([first, second]))
-    finally:
         process.kill()
-        process.communicate()
     assert heard.source.counts.reconnects == 1
     levels = [event.level for event in heard.events]
     assert levels[:3] == ["info", "warn", "info"]
@@ -311,10 +277,14 @@ def test_something_else_at_the_port_or_another_bus_is_told(listen, serve) -> Non
     assert "could not open bus" in heard.until_event("waits for").text
 
 
-def test_options_are_checked() -> None:
-    with pytest.raises(UsageError, match="port=x is not a whole number"):
-        open_source(parse_address("can:socketcand:can0?port=x"))
-    with pytest.raises(UsageError, match="port 70000 is not one of"):
-        open_source(parse_address("can:socketcand:can0?port=70000"))
-    with pytest.raises(UsageError, match="no option 'hots'; valid: host, port"):
-        open_source(parse_address("can:socketcand:can0?hots=x"))
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ("port=x", "port=x is not a whole number"),
+        ("port=70000", "port 70000 is not one of"),
+        ("hots=x", "no option 'hots'; valid: host, port"),
+    ],
+)
+def test_options_are_checked(options, match) -> None:
+    with pytest.raises(UsageError, match=match):
+        open_source(parse_address(f"can:socketcand:can0?{options}"))

@@ -5,16 +5,15 @@ import os
 import socket
 import stat
 import struct
-import subprocess
 import sys
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from support.processes import wait_for
+from support.processes import python, start, wait_for
 from undulog.capture.common.errors import DataError, SourceError, UsageError
 from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
 from undulog.capture.robot.model import ClockDomain
@@ -62,42 +61,40 @@ def foreign_truth(first: int, count: int):
     return frames
 
 
-def spawn(code: str, *args: object) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, args)], stdout=subprocess.PIPE, text=True
-    )
-
-
 def source_at(path: Path, query: str = ""):
     return open_source(parse_address(f"unix:{path}{query}"))
 
 
 @pytest.fixture
-def peer(tmp_path):
-    """A connected socket of this process."""
-    opened = []
+def path(tmp_path):
+    return tmp_path / "snake.sock"
 
-    def connect() -> socket.socket:
-        opened.append(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
-        opened[-1].connect(str(tmp_path / "snake.sock"))
-        return opened[-1]
 
-    yield connect
-    for sock in opened:
-        sock.close()
+@pytest.fixture
+def heard(path, listen):
+    """A source at that path."""
+    return listen(source_at(path))
+
+
+@pytest.fixture
+def peer(path):
+    """Connects sockets of this process."""
+    with ExitStack() as opened:
+
+        def connect() -> socket.socket:
+            sock = opened.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+            sock.connect(str(path))
+            return sock
+
+        yield connect
 
 
 @pytest.mark.parametrize(("per_packet", "head"), [(256, 1), (1, 0), (7, 1)])
-def test_twenty_thousand_frames_of_a_foreign_process(
-    tmp_path, listen, same, per_packet, head
-) -> None:
-    path = tmp_path / "snake.sock"
-    heard = listen(source_at(path))
-    process = spawn(FOREIGN, path, 0, 20_000, per_packet, head)
+def test_twenty_thousand_frames_of_a_foreign_process(path, heard, same, per_packet, head) -> None:
     truth = foreign_truth(0, 20_000)
-    found = heard.until_frames(20_000)
-    assert process.wait(60) == 0
-    process.communicate()
+    with start(sys.executable, "-c", FOREIGN, path, 0, 20_000, per_packet, head) as process:
+        found = heard.until_frames(20_000)
+        assert process.wait(60) == 0
     assert same(found, truth)
     assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
     assert (np.diff(found["t_host_ns"].astype(np.int64)) >= 0).all()
@@ -108,14 +105,12 @@ def test_twenty_thousand_frames_of_a_foreign_process(
     assert heard.source.clock is ClockDomain.DEVICE
 
 
-def test_what_our_sender_offers_arrives(tmp_path, listen, traffic, same) -> None:
+def test_what_our_sender_offers_arrives(tmp_path, path, heard, traffic, same) -> None:
     truth = traffic(20_000)
     np.save(tmp_path / "frames.npy", truth)
-    path = tmp_path / "snake.sock"
-    heard = listen(source_at(path))
-    process = spawn(OURS, tmp_path / "frames.npy", path)
-    found = heard.until_frames(20_000)
-    accepted, refused = json.loads(process.communicate(timeout=60)[0])
+    with start(sys.executable, "-c", OURS, tmp_path / "frames.npy", path) as process:
+        found = heard.until_frames(20_000)
+        accepted, refused = json.loads(process.communicate(timeout=60)[0])
     heard.until_event("disconnected")
     assert accepted == 20_000
     assert same(found, truth)
@@ -124,10 +119,9 @@ def test_what_our_sender_offers_arrives(tmp_path, listen, traffic, same) -> None
     assert heard.source.counts.dropped == refused - before  # refused before it was connected
 
 
-def test_frames_that_found_no_room_are_proved_lost(tmp_path, listen, traffic, same) -> None:
+def test_frames_that_found_no_room_are_proved_lost(path, heard, traffic, same) -> None:
     truth = traffic(200)
-    heard = listen(source_at(tmp_path / "snake.sock"))
-    sender = FrameSender(tmp_path / "snake.sock")
+    sender = FrameSender(path)
     sent = []
     while sender.refused == 0:  # faster than it is read: the buffer fills
         sent.append(truth[: sender.send(truth)])
@@ -141,10 +135,9 @@ def test_frames_that_found_no_room_are_proved_lost(tmp_path, listen, traffic, sa
     sender.close()
 
 
-def test_the_last_losses_are_told_on_leaving(tmp_path, listen, traffic) -> None:
+def test_the_last_losses_are_told_on_leaving(path, heard, traffic) -> None:
     truth = traffic(200)
-    heard = listen(source_at(tmp_path / "snake.sock"))
-    sender = FrameSender(tmp_path / "snake.sock")
+    sender = FrameSender(path)
     while sender.refused == 0:
         sender.send(truth)
     heard.until_frames(sender.accepted)
@@ -153,8 +146,7 @@ def test_the_last_losses_are_told_on_leaving(tmp_path, listen, traffic) -> None:
     assert heard.source.counts.dropped == sender.refused > 0
 
 
-def test_a_gap_in_the_numbers_is_a_loss(tmp_path, listen, peer) -> None:
-    heard = listen(source_at(tmp_path / "snake.sock"))
+def test_a_gap_in_the_numbers_is_a_loss(heard, peer) -> None:
     sock, record = peer(), bytes(empty_frames(1).tobytes())
     for sequence, dropped in ((1000, 5), (1001, 5), (1012, 5), (1013, 8), (1014, 8), (0, 0)):
         sock.send(struct.pack("<QQ", sequence, dropped) + record)
@@ -162,9 +154,8 @@ def test_a_gap_in_the_numbers_is_a_loss(tmp_path, listen, peer) -> None:
     assert heard.source.counts.dropped == 10 + 3
 
 
-def test_malformed_packets_are_counted_and_told(tmp_path, listen, peer, traffic, same) -> None:
+def test_malformed_packets_are_counted_and_told(heard, peer, traffic, same) -> None:
     truth = traffic(3)
-    heard = listen(source_at(tmp_path / "snake.sock"))
     sock = peer()
     sock.send(truth[:1].tobytes())
     for bad in (b"x", b"x" * 31, b"x" * 33, b"", bytes(32 * 257), bytes(100_000)):
@@ -177,8 +168,7 @@ def test_malformed_packets_are_counted_and_told(tmp_path, listen, peer, traffic,
     assert heard.source.connected
 
 
-def test_arrival_is_when_it_came_not_when_it_was_fetched(tmp_path, listen, peer, context) -> None:
-    heard = listen(source_at(tmp_path / "snake.sock"))
+def test_arrival_is_when_it_came_not_when_it_was_fetched(heard, peer, context) -> None:
     sock = peer()
     heard.until_event("connected")
     record = empty_frames(1).tobytes()
@@ -195,8 +185,7 @@ def test_arrival_is_when_it_came_not_when_it_was_fetched(tmp_path, listen, peer,
         assert low_ns - slack_ns <= t_ns <= high_ns + slack_ns
 
 
-def test_two_senders_are_put_in_the_order_of_arrival(tmp_path, listen, peer) -> None:
-    heard = listen(source_at(tmp_path / "snake.sock"))
+def test_two_senders_are_put_in_the_order_of_arrival(heard, peer) -> None:
     one, two = peer(), peer()
     heard.until(lambda: len(heard.source._senders) == 2)
     frames = empty_frames(40)
@@ -209,15 +198,12 @@ def test_two_senders_are_put_in_the_order_of_arrival(tmp_path, listen, peer) -> 
     assert found["id_flags"].tolist() == list(range(40))
 
 
-def test_a_sender_may_leave_and_come_back(tmp_path, listen, same) -> None:
-    path = tmp_path / "snake.sock"
-    heard = listen(source_at(path))
+def test_a_sender_may_leave_and_come_back(path, heard, same) -> None:
     for first in (0, 100):
-        process = spawn(FOREIGN, path, first, 100, 10, 1)
-        heard.until_frames(first + 100)
-        heard.until(lambda: not heard.source.connected)
-        assert process.wait(60) == 0
-        process.communicate()
+        with start(sys.executable, "-c", FOREIGN, path, first, 100, 10, 1) as process:
+            heard.until_frames(first + 100)
+            heard.until(lambda: not heard.source.connected)
+            assert process.wait(60) == 0
     assert same(heard.frames, foreign_truth(0, 200))
     assert heard.source.counts.reconnects == 1
     heard.until_event("is back")
@@ -225,34 +211,25 @@ def test_a_sender_may_leave_and_come_back(tmp_path, listen, same) -> None:
     assert not heard.source.finished
 
 
-def test_a_killed_sender_loses_nothing_that_it_sent(tmp_path, listen, same) -> None:
-    path = tmp_path / "snake.sock"
-    heard = listen(source_at(path))
+def test_a_killed_sender_loses_nothing_that_it_sent(path, heard, same) -> None:
     code = FOREIGN.replace("peer.close()", "import os; os.kill(os.getpid(), 9)")
-    process = spawn(code, path, 0, 200, 1, 1)
-    assert process.wait(60) == -9
-    process.communicate()
+    assert python(code, path, 0, 200, 1, 1).returncode == -9
     assert same(heard.until_frames(200), foreign_truth(0, 200))
     heard.until_event("disconnected")
     assert heard.source.counts.malformed == 0
 
 
-def test_our_sender_waits_for_a_recorder_and_for_the_next_one(tmp_path, context, traffic) -> None:
-    path, truth = tmp_path / "snake.sock", traffic(10)
-    sender = FrameSender(path)
+def test_our_sender_waits_for_a_recorder_and_for_the_next_one(path, listen, traffic) -> None:
+    truth, sender = traffic(10), FrameSender(path)
     assert sender.send(truth) == 0
     assert not sender.connected
     for _ in range(2):
-        source = source_at(path)
-        source.start(context)
+        heard = listen(source_at(path))
         wait_for(lambda: sender.send(truth) != 0)
-        deadline, count = time.monotonic() + 60, 0
-        while count < 10:
-            assert time.monotonic() < deadline
-            count += sum(map(len, source.poll().frames))
-        assert count == 10
-        assert source.counts.dropped == 0  # what was refused without a recorder is not its loss
-        source.stop()
+        assert len(heard.until_frames(10)) == 10
+        # What was refused without a recorder is not its loss.
+        assert heard.source.counts.dropped == 0
+        heard.source.stop()
         while sender.connected:
             sender.send(truth)
     sender.close()
@@ -260,10 +237,7 @@ def test_our_sender_waits_for_a_recorder_and_for_the_next_one(tmp_path, context,
         sender.send(np.zeros(3))
 
 
-def test_senders_that_never_leave_hold_a_bounded_number_of_descriptors(
-    tmp_path, listen, peer
-) -> None:
-    heard = listen(source_at(tmp_path / "snake.sock"))
+def test_senders_that_never_leave_hold_a_bounded_number_of_descriptors(heard, peer) -> None:
     worker = peer()
     worker.send(foreign_truth(0, 3).tobytes())
     heard.until_frames(3)
@@ -285,9 +259,8 @@ def test_senders_that_never_leave_hold_a_bounded_number_of_descriptors(
     heard.until_frames(8)
 
 
-def test_no_frame_of_a_sender_that_gives_its_place_is_lost(tmp_path, listen, peer) -> None:
+def test_no_frame_of_a_sender_that_gives_its_place_is_lost(heard, peer) -> None:
     """Every sender's packets are counted by itself; none that was accepted is missing."""
-    heard = listen(source_at(tmp_path / "snake.sock"))
     accepted = 0
     senders = []
     for _ in range(3 * MOST_SENDERS):
@@ -300,8 +273,7 @@ def test_no_frame_of_a_sender_that_gives_its_place_is_lost(tmp_path, listen, pee
     assert len(heard.until_frames(accepted)) == accepted > 3 * MOST_SENDERS
 
 
-def test_error_frames_are_counted(tmp_path, listen, peer) -> None:
-    heard = listen(source_at(tmp_path / "snake.sock"))
+def test_error_frames_are_counted(heard, peer) -> None:
     frames = empty_frames(2)
     frames["id_flags"] = [ERROR_FLAG | 0x4, 5]
     frames["dlc"] = 8
@@ -312,8 +284,7 @@ def test_error_frames_are_counted(tmp_path, listen, peer) -> None:
     heard.until_event("controller problem, reception error passive")
 
 
-def test_only_we_may_send_and_the_socket_goes_with_the_source(tmp_path, context) -> None:
-    path = tmp_path / "snake.sock"
+def test_only_we_may_send_and_the_socket_goes_with_the_source(path, context) -> None:
     source = source_at(path)
     source.start(context)
     mode = path.lstat().st_mode
@@ -327,16 +298,13 @@ def test_only_we_may_send_and_the_socket_goes_with_the_source(tmp_path, context)
     assert source.finished
 
 
-def test_a_socket_left_behind_is_replaced_and_nothing_else(tmp_path, context) -> None:
-    path = tmp_path / "snake.sock"
+def test_a_socket_left_behind_is_replaced_and_nothing_else(path, context) -> None:
     code = (
         "import os, socket, sys\n"
         "s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)\n"
         "s.bind(sys.argv[1]); s.listen(); os.kill(os.getpid(), 9)\n"
     )
-    process = spawn(code, path)
-    assert process.wait(60) == -9
-    process.communicate()
+    assert python(code, path).returncode == -9
     assert path.exists()
     source = source_at(path)
     source.start(context)
@@ -357,8 +325,7 @@ def test_a_socket_left_behind_is_replaced_and_nothing_else(tmp_path, context) ->
             source_at(path).start(context)
 
 
-def test_the_successors_socket_is_not_removed(tmp_path, context) -> None:
-    path = tmp_path / "snake.sock"
+def test_the_successors_socket_is_not_removed(path, context) -> None:
     first, second = source_at(path), source_at(path)
     first.start(context)
     path.unlink()
