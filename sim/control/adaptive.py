@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
 AVOID, HASTEN, SHRINK, TURN = "avoid", "hasten", "shrink", "turn"
 _MODE_HOLD_S = 0.5
-_TURNING = 0.05
-"""Offsets of the head above this are turns [rad]."""
+_TURNING = 0.05  # offsets of the head above this are turns [rad]
 
 
 class AdaptiveGait:

@@ -236,13 +236,16 @@ _CHANGED = 1e-12  # rad; the same as the clamp's
 
 
 class NotedGait:
-    """A gait, and its first command, and what it had to cut itself."""
+    """A gait, and its first command, and what it had to cut itself.
+
+    Attributes:
+        first: Its first command [rad], shape (m,); NaN before it.
+    """
 
     def __init__(self, gait: Gait, robot: Robot) -> None:
         """Wrap a gait."""
         self._gait = gait
         self.first: FloatArray = np.full(len(robot.joints), np.nan)
-        """Its first command [rad], shape (m,); NaN before it."""
         self._cut: dict[str, None] = {}
         self._asked = False
 

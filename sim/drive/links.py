@@ -59,7 +59,12 @@ _GAIT_QUANTITIES = {*_OF_JOINTS, Quantity.RANGE, *_VECTORS}
 
 
 class BusReadings:
-    """Gathers decoded frames; ask :meth:`readings` once a control tick."""
+    """Gathers decoded frames; ask :meth:`readings` once a control tick.
+
+    Attributes:
+        tally: What became of the frames so far.
+        angles: Angles received of each joint so far, shape (m,).
+    """
 
     def __init__(self, robot: Robot, oldest_s: float = OLDEST_S) -> None:
         """Know nothing yet.
@@ -86,9 +91,7 @@ class BusReadings:
             q: {} for q in _VECTORS
         }
         self.tally = FrameTally()
-        """What became of the frames so far."""
         self.angles: IntArray = np.zeros(count, dtype=np.int64)
-        """Angles received of each joint so far, shape (m,)."""
 
     def add(self, frames: FrameArray, time_s: float) -> None:
         """Take frames, in the order in which they came.

@@ -165,17 +165,17 @@ class CommandReplay:
         return GaitTick(command, values, mode, clamped)
 
 
+# Attachments of recorded commands that say what they were made from: they go on to the run.
 _EXPLAINS = ("plan.toml", "gait.toml")
-"""Attachments of recorded commands that say what they were made from: they go on to the run."""
 
 _HEADING = "heading_rad"
+# Keys of a plan's record: by how much the robot is turned [rad], and the number of the run.
 _RUN = "run"
-"""Keys of a plan's record: by how much the robot is turned [rad], and the number of the run."""
 
 _Number = TypeVar("_Number", int, float)
 
+# Metadata records of recorded commands that say what they are for: likewise.
 _RECORDS = ("undulog.plan",)
-"""Metadata records of recorded commands that say what they are for: likewise."""
 
 
 @dataclass(frozen=True)

@@ -30,9 +30,9 @@ from undulog.capture.sources.socketcand import server_of
 
 from .links import VirtualRobotLink, find_virtual_robot, wait_until
 
+# So long a full transmit queue may hold a frame up [s]; of 25 frames on 1 Mbit/s the last one waits
+# 3 ms.
 _SEND_S = 0.02
-"""So long a full transmit queue may hold a frame up [s]; of 25 frames on 1 Mbit/s the last one
-waits 3 ms."""
 
 
 class _Complaints(logging.Handler):

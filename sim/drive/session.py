@@ -121,10 +121,10 @@ class GaitPublisher:
 
 _EVENTS_OF = "drive"
 _DECODE_TICKS = 10  # many frames at once cost little more than a few
+# So much has to be free [byte]: what the write-ahead log reserves, and a part of a minute.
 _ROOM = 48 << 20
-"""So much has to be free [byte]: what the write-ahead log reserves, and a part of a minute."""
+# So much of an ending is kept on a full disk [byte]: more than ten seconds of 25 joints.
 _LAST_WORDS = 4 << 20
-"""So much of an ending is kept on a full disk [byte]: more than ten seconds of 25 joints."""
 
 
 class BusSession:

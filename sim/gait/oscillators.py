@@ -283,8 +283,7 @@ class Approach:
         self._target = target
 
 
-_STRONGEST = float(CONTROL_RATE_HZ)
-"""Greatest coupling, feedback and rate of an oscillator [1/s]."""
+_STRONGEST = float(CONTROL_RATE_HZ)  # greatest coupling, feedback and rate of an oscillator [1/s]
 
 Numbers: TypeAlias = float | tuple[float, ...]
 """One number for all, or one for each."""
@@ -294,8 +293,7 @@ PositiveRate: TypeAlias = Annotated[float, above(0.0), at_most(_STRONGEST)]
 
 _KICK_SEED = 1
 
-_SAME_TIME_S = 1e-9
-"""Rounding of times: a kick comes no tick late for it."""
+_SAME_TIME_S = 1e-9  # rounding of times: a kick comes no tick late for it
 
 
 class OscillatorKind(StrEnum):

@@ -34,13 +34,13 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray, IntArray
 
+# Rounds of requests under way, of a bus that answers within 20 ms; one of a slower bus.
 _MOST_ROUNDS = 2
-"""Rounds of requests under way, of a bus that answers within 20 ms; one of a slower bus."""
 _FIRST_PATIENCE = 8  # ticks, before the reply interval is known
 _MOST_PATIENCE = 50
+# Rounds after which a count that lags all the time is taken for lost replies, by rounds under way:
+# with one, a request before a reply is sent only after a time without.
 _LAGGING = {1: 2, 2: 16}
-"""Rounds after which a count that lags all the time is taken for lost replies, by rounds under way:
-with one, a request before a reply is sent only after a time without."""
 _NS = 1e9
 
 

@@ -37,7 +37,12 @@ _IDENTIFIERS_SHOWN = 6
 
 
 class BusCheck:
-    """Counts what is heard by identifier, and finds what must not be there."""
+    """Counts what is heard by identifier, and finds what must not be there.
+
+    Attributes:
+        known: Frames that the robot's databases know.
+        strange: Identifier to number of frames that they don't.
+    """
 
     def __init__(self, robot: Robot) -> None:
         """Hear nothing yet.
@@ -58,9 +63,7 @@ class BusCheck:
         # Where a request and its reply share an identifier, hearing it tells nothing.
         self._commands = _sorted(requests - replies)
         self.known = 0
-        """Frames that the robot's databases know."""
         self.strange: Counter[int] = Counter()
-        """Identifier to number of frames that they don't."""
 
     def add(self, frames: FrameArray) -> GateFault | None:
         """Take what came.

@@ -48,7 +48,18 @@ _PERIOD_S = 1.0 / CONTROL_RATE_HZ
 
 
 class Gate:
-    """Asked once a tick; see the module."""
+    """Asked once a tick; see the module.
+
+    Attributes:
+        outcome: How it ended; None until it has.
+        gait_error: What the gait raised, if it did; to be raised when the robot is at rest.
+        run_from: The tick at which the gait began; None before.
+        run_ticks: Ticks that the gait commanded.
+        run_s: The gait's time [s].
+        silence: Whether the bus is silent.
+        held_ticks: Ticks in which nothing was sent as the bus was silent, those left out among
+            them.
+    """
 
     def __init__(
         self,
@@ -70,19 +81,12 @@ class Gate:
         """
         self.phase = Phase.POSE
         self.outcome: Outcome | None = None
-        """How it ended; None until it has."""
         self.gait_error: Exception | None = None
-        """What the gait raised, if it did; to be raised when the robot is at rest."""
         self.run_from: int | None = None
-        """The tick at which the gait began; None before."""
         self.run_ticks = 0
-        """Ticks that the gait commanded."""
         self.run_s = 0.0
-        """The gait's time [s]."""
         self.silence = Silence()
-        """Whether the bus is silent."""
         self.held_ticks = 0
-        """Ticks in which nothing was sent as the bus was silent, those left out among them."""
         self._silent_ticks = 0  # those of the silence that were counted by then
         self._received_again = False  # in the tick before this one, while holding
         self._gait, self._limits, self._place = gait, limits, place

@@ -255,6 +255,10 @@ class Clamp:
     most what the greatest rate allows in one control period, also where ticks were left out. What
     was late is caught up step by step and never by a jump; that the steps are a period apart in
     true time, too, is for :mod:`.sim.gate.limits`.
+
+    Attributes:
+        last: What was commanded last, at first the pose [rad], shape (m,).
+        cuts: Commands of single joints that were changed, by why.
     """
 
     def __init__(self, limits: GateLimits, pose: FloatArray, period_s: float) -> None:
@@ -271,9 +275,7 @@ class Clamp:
             raise ValueError("the pose to start from has angles that are not known")
         self._limits, self._reach = limits, limits.rate * period_s
         self.last: FloatArray = np.clip(pose, limits.lower, limits.upper)
-        """What was commanded last, at first the pose [rad], shape (m,)."""
         self.cuts: dict[str, int] = dict.fromkeys(Clamped._fields[1:], 0)
-        """Commands of single joints that were changed, by why."""
 
     def apply(
         self, wanted: FloatArray, bounds: tuple[FloatArray, FloatArray] | None = None
@@ -310,7 +312,11 @@ _PEAK = 1.5  # greatest slope of 3 x^2 - 2 x^3
 
 
 class Ramp:
-    """A straight way between two poses, with no rate at either end."""
+    """A straight way between two poses, with no rate at either end.
+
+    Attributes:
+        duration_s: How long it takes [s].
+    """
 
     def __init__(self, start: FloatArray, target: FloatArray, rate: FloatArray) -> None:
         """Plan it.
@@ -322,7 +328,6 @@ class Ramp:
         """
         self._start, self._way = start.copy(), target - start
         self.duration_s = _PEAK * float(np.max(np.abs(self._way) / rate, initial=0.0))
-        """How long it takes [s]."""
 
     def at(self, time_s: float) -> FloatArray:
         """The pose at a time.
@@ -347,6 +352,10 @@ class Ending:
 
     It starts from the present pose: a joint's last command where the joint is near it, else the
     angle that the joint has, so that a blocked servo stops pushing.
+
+    Attributes:
+        duration_s: How long it takes [s], with the way of the commands back to where the joints
+            are.
     """
 
     def __init__(self, limits: GateLimits, last: FloatArray, status: JointStatus) -> None:
@@ -364,7 +373,6 @@ class Ending:
         self._ramp = Ramp(start, target, limits.ramp_rate)
         back_s = float(np.max(np.abs(start - last) / limits.rate, initial=0.0))
         self.duration_s = back_s + self._ramp.duration_s + HOLD_S
-        """How long it takes [s], with the way of the commands back to where the joints are."""
 
     def at(self, time_s: float) -> FloatArray:
         """What is wanted at a time.

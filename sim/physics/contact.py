@@ -68,8 +68,7 @@ def out_of_frames(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
     return vector + 2.0 * w * turned + 2.0 * cross(u, turned)
 
 
-_TINY = 1e-300
-"""Makes 0/0 a zero."""
+_TINY = 1e-300  # makes 0/0 a zero
 
 
 def normal_force(

@@ -28,8 +28,7 @@ from .contact import cross
 from .engine import BodyState
 
 _AXES = {Plane.HORIZONTAL: (0.0, 0.0, 1.0), Plane.VERTICAL: (0.0, 1.0, 0.0)}
-_SCALAR_LAST = [1, 2, 3, 0]
-"""From MuJoCo's order w, x, y, z."""
+_SCALAR_LAST = [1, 2, 3, 0]  # from MuJoCo's order w, x, y, z
 
 
 class MujocoEngine:

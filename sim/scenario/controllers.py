@@ -171,13 +171,13 @@ class Controller:
     course: RandomTurns | TargetHeading | None = None
 
 
+# What the kinds have beside what all have.
 _PARTS: dict[ControllerKind, dict[str, type[Any]]] = {
     ControllerKind.RANDOM_WALK: {"course": RandomTurns},
     ControllerKind.TARGET_FOLLOWING: {"course": TargetHeading},
     ControllerKind.CORRIDOR: {"side": SideShrinking},
     ControllerKind.AVOIDANCE: {"side": SideShrinking, "tail": TailHaste},
 }
-"""What the kinds have beside what all have."""
 
 
 def read_controller(

@@ -35,6 +35,10 @@ class ReplyEncoder:
     A frame's device time is the sampling time of what it carries. A frame that carries several
     joints has the time of the last of them; sensors that share a frame and were not read at the
     same time have a frame each, with the others unknown.
+
+    Attributes:
+        made_up: What the frames have to carry, the twin doesn't have and the map can't call
+            unknown.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -76,7 +80,6 @@ class ReplyEncoder:
                 if quantity not in offered and (target, quantity) not in coded
             }
         )
-        """What the frames have to carry, the twin doesn't have and the map can't call unknown."""
 
     def identifiers(self, target: str = "") -> IntArray:
         """Identifiers of frames, with flags.
@@ -161,7 +164,12 @@ _PROTOCOL_VIOLATION, _BUS_ERROR = 0x008, 0x080  # linux/can/error.h
 
 
 class FaultLine:
-    """What stands between a healthy robot and its bus."""
+    """What stands between a healthy robot and its bus.
+
+    Attributes:
+        lost: Replies that were lost.
+        hit: Transmissions that were hit by noise.
+    """
 
     def __init__(
         self, faults: Sequence[BusFault], robot: Robot, replies: ReplyEncoder, seed: int
@@ -181,9 +189,7 @@ class FaultLine:
         self._off = False
         self._late: list[tuple[int, FrameArray]] = []
         self.lost = 0
-        """Replies that were lost."""
         self.hit = 0
-        """Transmissions that were hit by noise."""
 
     def command(self, command: FloatArray, angle: FloatArray, time_s: float) -> FloatArray:
         """What the servos make of their commands.

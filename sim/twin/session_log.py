@@ -132,16 +132,16 @@ GAIT_UNIT = "rad, omega in rad/s"
 
 _TF_EVERY = 5  # ticks: 20 Hz, a view aid
 _TICK_NS = 1_000_000_000 // CONTROL_RATE_HZ
+# Rows of :attr:`.sim.twin.twin.Sample.joint_energy` whose rates of change are logged.
 _POWER_TERMS = {
     PowerTopic.MECHANICAL: JOINT_TERMS.index("mechanical_net"),
     PowerTopic.MECHANICAL_PLUS: JOINT_TERMS.index("mechanical_plus"),
     PowerTopic.ELECTRICAL: JOINT_TERMS.index("electrical_net"),
     PowerTopic.ELECTRICAL_PLUS: JOINT_TERMS.index("electrical_plus"),
 }
-"""Rows of :attr:`.sim.twin.twin.Sample.joint_energy` whose rates of change are logged."""
 
+# Powers are rounded to 60 nW, without bias: the digits beyond would be half of their bytes.
 _POWER_PER_W = float(2**24)
-"""Powers are rounded to 60 nW, without bias: the digits beyond would be half of their bytes."""
 
 
 def session_facts(scenario: Scenario, kernels: Kernels = Kernels.NUMPY) -> Mapping[str, str]:

@@ -24,8 +24,7 @@ from ..scenario.scenario_file import load_scenario
 from .session_log import SessionLog, session_facts
 from .twin import Sample, Twin
 
-_AHEAD = 100
-"""Samples that the twin may be ahead of the recording."""
+_AHEAD = 100  # samples that the twin may be ahead of the recording
 
 _PERIOD_NS = 1_000_000_000 // CONTROL_RATE_HZ
 
