@@ -68,9 +68,7 @@ class DryRun:
     """How a dry run went.
 
     Attributes:
-        kind: ``gait``, ``plan`` or ``commands``.
-        world: The scenario that it was in.
-        planned_s: How long it was to be [s].
+        scenario: The scenario that it was in, with its planned duration.
         duration_s: How long the gait commanded [s].
         joints: What was asked of each joint, head to tail.
         first_pose: The first commands [rad], shape (m,).
@@ -85,11 +83,8 @@ class DryRun:
         path: The session that was written, or None.
     """
 
-    driven: str
-    kind: str
-    robot: str
-    world: str
-    planned_s: float
+    driven: MotionSource
+    scenario: Scenario
     duration_s: float
     joints: tuple[JointDemand, ...]
     first_pose: FloatArray
@@ -118,13 +113,9 @@ class DryRun:
     @property
     def closest(self) -> tuple[str, Demand] | None:
         """The joint and the quantity that come closest to a limit, or go farthest beyond it."""
-        found = [
-            (joint.name, demand)
-            for joint in self.joints
-            for demand in joint.demands
-            if math.isfinite(demand.share)
-        ]
-        return max(found, key=lambda one: one[1].share, default=None)
+        demands = ((joint.name, demand) for joint in self.joints for demand in joint.demands)
+        finite = (one for one in demands if math.isfinite(one[1].share))
+        return max(finite, key=lambda one: one[1].share, default=None)
 
     @property
     def energy_j(self) -> tuple[float, float, float]:
@@ -207,11 +198,8 @@ def dry_run(
             why = "it was stopped" if outcome is None else outcome.why
             session.finish(None if complete else why)
     return DryRun(
-        driven=driven.name,
-        kind=driven.kind,
-        robot=robot.name,
-        world=planned.name,
-        planned_s=planned.duration_s,
+        driven=driven,
+        scenario=planned,
         duration_s=gate.run_s,
         joints=gait.tally.joints(),
         first_pose=first,

@@ -61,25 +61,25 @@ class BusPlan:
 def bus_plan(
     driven: MotionSource,
     on: str,
-    *,
+    output: Path,
     robot: Robot | None = None,
     duration_s: float | None = None,
-    output: Path,
+    *,
     recorder: Path | None = None,
     force: bool = False,
 ) -> BusPlan:
-    """Check what was asked for.
+    """Check the arguments of a drive.
 
     Args:
         on: The bus, ``can:INTERFACE:CHANNEL[...]``.
-        robot: On which robot; the one that it was made for if None.
-        duration_s: How long [s]; its own length if None.
+        robot: The robot on the bus; the one that the motion was made for if None.
+        duration_s: Duration [s]; that of the motion if None.
         recorder: Control socket of a recorder, or None.
 
     Raises:
-        UsageError: If the address is none, the robot has no bus or lacks limits, a joint can't
-            be commanded or tells no angle, the commands are of other joints, or the duration
-            can't be.
+        UsageError: If the address is not that of a bus, the robot has no bus or lacks limits, a
+            joint takes no commands or reports no angle, the commands are for other joints, or the
+            duration is out of range.
     """
     address = bus_address(on)
     robot = robot or driven.robot
@@ -162,8 +162,18 @@ def drive_bus(
         virtual = _virtual(link, plan)
         lockstep = virtual is not None and virtual.lockstep
         epoch_ns = Scenario.epoch_s * _NS if lockstep else clock.epoch_ns
-        session = _session(plan, link, epoch_ns, gait.names)
+        session = BusSession(
+            plan.output,
+            plan.driven,
+            robot=robot,
+            address=plan.address,
+            clock=link.clock,
+            epoch_ns=epoch_ns,
+            gait_names=gait.names,
+            force=plan.force,
+        )
         opened.callback(session.close)
+        session.writer.note("undulog.gate", plan.limits.facts())
         teller = None
         if plan.recorder is not None:
             teller = GaitPublisher(plan.recorder, gait.names)
@@ -232,25 +242,6 @@ def _virtual(link: Link, plan: BusPlan) -> VirtualRobotLink | None:
             f"{plan.robot.name}; nothing was sent"
         )
     return link
-
-
-def _session(plan: BusPlan, link: Link, epoch_ns: int, names: tuple[str, ...]) -> BusSession:
-    bus = plan.address.name
-    session = BusSession(
-        plan.output,
-        robot=plan.robot,
-        bus=bus,
-        clock=link.clock,
-        epoch_ns=epoch_ns,
-        gait_names=names,
-        facts={**plan.driven.facts, "armed": "yes", f"source.{bus}": plan.address.text},
-        settle_s=plan.driven.settle_s,
-        attachments=plan.driven.attachments,
-        records=plan.driven.records,
-        force=plan.force,
-    )
-    session.writer.note("undulog.gate", plan.limits.facts())
-    return session
 
 
 def _unwritten(

@@ -28,12 +28,13 @@ from undulog.capture.recorder.bus_recorder import BusRecorder
 from undulog.capture.recorder.control_client import ControlClient
 from undulog.capture.recorder.source_clock import SourceClock
 from undulog.capture.robot.model import ClockDomain, Robot
-from undulog.capture.sources.contract import DEVICE_TIMES_END_NS
+from undulog.capture.sources.contract import DEVICE_TIMES_END_NS, SourceAddress
 
 from ..gait.contract import GaitTick
 from ..gate.outcome import DriveEnding, GateEvent, Outcome
 from ..twin.session_log import GAIT_UNIT
 from .loop import BusTick
+from .motion import MotionSource
 
 _MOST_HELD = 1000
 _AT_ONCE = 64
@@ -138,36 +139,31 @@ class BusSession:
     def __init__(
         self,
         path: Path,
+        driven: MotionSource,
         *,
         robot: Robot,
-        bus: str,
+        address: SourceAddress,
         clock: ClockDomain,
         epoch_ns: int,
         gait_names: tuple[str, ...],
-        facts: Mapping[str, str],
-        settle_s: float | None,
-        attachments: Mapping[str, bytes],
-        records: Mapping[str, Mapping[str, str]],
         force: bool = False,
     ) -> None:
         """Open the session.
 
         Args:
-            bus: The bus's name.
-            clock: Whose clock the frames' device times are on.
+            robot: The robot on the bus.
+            address: The bus.
+            clock: Clock of the frames' device times.
             epoch_ns: Unix time of its start [ns].
             gait_names: Names of the gait's values.
-            settle_s: The first part of the gait that is not fit for steady-state analysis [s],
-                None where it isn't known.
-            attachments: File name to TOML text that explains what is driven.
-            records: Other metadata records that explain it, by name.
 
         Raises:
-            OutputExistsError: If the file is there and ``force`` is not given, or what a drive
+            OutputExistsError: If the file exists and ``force`` is not given, or what a drive
                 that was killed left of it.
             LogWriteError: If it can't be created, or there is no room for it.
             DataError: If the robot has no bus.
         """
+        bus = address.name
         require_space(path, _ROOM)
         self._sink = DurableSink(path, force=force, last_words=_LAST_WORDS)
         self.writer = SessionWriter(
@@ -176,10 +172,10 @@ class BusSession:
             epoch_ns=epoch_ns,
             robot=robot,
             clock={bus: clock},
-            metadata=facts,
+            metadata={**driven.facts, "armed": "yes", f"source.{bus}": address.text},
             sink=self._sink,
         )
-        self.writer.explain(attachments, records)
+        self.writer.explain(driven.attachments, driven.records)
         names = robot.joint_names
         self._commands = self.writer.joint_state("/joint_commands", names, unit="rad")
         self._wanted = self.writer.joint_state("/gate/wanted", names, unit="rad")
@@ -190,7 +186,7 @@ class BusSession:
         self._phase = self.writer.string("/gate/phase")
         self._events = self.writer.log("/rosout")
         self._frames = BusRecorder(bus, self.writer, SourceClock(), robot, directions=True)
-        self._settle_s = settle_s
+        self._settle_s = driven.settle_s
         self._last = {"mode": "", "phase": ""}
         self._said: set[str] = set()
         self._epoch_ns = self._t_ns = epoch_ns

@@ -13,7 +13,7 @@ from ..gait.contract import CONTROL_RATE_HZ
 from ..scenario.scenario import Kernels, Scenario
 from ..scenario.world import Ground, pushes_during
 from .contact import GroundContact
-from .engine import engine_type
+from .engine import BodyStart, engine_type
 from .obstacle_contact import obstacle_law
 from .servo import Servos
 from .steps import Step, Steps
@@ -154,14 +154,9 @@ class Plant:
             if world.obstacles
             else None
         )
-        self._engine = engine_type(scenario.engine, kernels)(
-            robot,
-            gravity=world.gravity,
-            height=_resting_height(scenario),
-            heading=world.heading,
-            velocity=world.velocity,
-            dt=self.dt,
-        )
+        height = _resting_height(scenario)
+        start = BodyStart(world.gravity, height, world.heading, world.velocity, self.dt)
+        self._engine = engine_type(scenario.engine, kernels)(robot, start)
         count = scenario.physics_rate_hz // CONTROL_RATE_HZ
         self._period = Steps.empty(count + 1, len(robot.links), len(robot.joints))
         self._rows = tuple(self._period)

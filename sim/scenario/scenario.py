@@ -98,14 +98,9 @@ class Modules:
             if MASS_FACTOR in fields
         }
 
-    def tables(self) -> dict[str, dict[str, object]]:
+    def tables(self) -> dict[str, Any]:
         """The tables of a scenario file that say this; empty ones are left out."""
-        tables: dict[str, dict[str, object]] = {
-            "servo": dict(self.servo),
-            "servo_of": {name: dict(one) for name, one in self.servo_of.items()},
-            "link_of": {name: dict(one) for name, one in self.link_of.items()},
-        }
-        return {name: table for name, table in tables.items() if table}
+        return {name: table for name, table in write(self).items() if table}
 
 
 def read_modules(top: Table, robot: Robot | None) -> Modules:
@@ -166,6 +161,9 @@ Length: TypeAlias = Annotated[float, at_least(1 / CONTROL_RATE_HZ), at_most(LONG
 PhysicsRate: TypeAlias = Annotated[int, at_least(2 * CONTROL_RATE_HZ)]
 Epoch: TypeAlias = Annotated[int, at_least(1_000_000_000)]
 """Unix time from 2001 on [s]: viewers misread stamps near zero."""
+
+
+_PLAIN = ("duration_s", "settle_s", "seed", "epoch_s", "physics_rate_hz", "engine")
 
 
 @dataclass(frozen=True)
@@ -257,12 +255,7 @@ class Scenario:
             "name": self.name,
             "description": self.description,
             "robot": self.robot_name,
-            "duration_s": self.duration_s,
-            "settle_s": self.settle_s,
-            "seed": self.seed,
-            "epoch_s": self.epoch_s,
-            "physics_rate_hz": self.physics_rate_hz,
-            "engine": self.engine,
+            **{key: getattr(self, key) for key in _PLAIN},
             "gait": gait_table(self.gait),
             "world": world_table(self.world),
             "noise": write(self.noise),

@@ -17,6 +17,7 @@ step.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -251,18 +252,13 @@ def _kinds(scenario: Scenario) -> list[_Kind]:
     dt, seed = 1.0 / scenario.physics_rate_hz, scenario.seed
     caster = RayCaster(world.obstacles, ground=world.ground is not None)
 
-    def having(kind: SensorKind) -> tuple[Sensor, ...]:
-        return tuple(one for one in robot.sensors if one.kind is kind)
-
-    kinds: list[_Kind] = []
-    if sensors := having(SensorKind.IR):
-        kinds.append(Infrared(models.ir, sensors, robot, caster, dt=dt, seed=seed))
-    if sensors := having(SensorKind.SONAR):
-        kinds.append(Sonar(models.sonar, sensors, robot, caster, dt=dt, seed=seed))
-    if sensors := having(SensorKind.ACCELEROMETER):
-        kinds.append(
-            Accelerometer(models.accelerometer, sensors, robot, world.gravity, dt=dt, seed=seed)
-        )
-    if sensors := having(SensorKind.COMPASS):
-        kinds.append(Compass(models.compass, sensors, robot, dt=dt, seed=seed))
-    return kinds
+    build: dict[SensorKind, Callable[[list[Sensor]], _Kind]] = {
+        SensorKind.IR: lambda own: Infrared(models.ir, own, robot, caster, dt=dt, seed=seed),
+        SensorKind.SONAR: lambda own: Sonar(models.sonar, own, robot, caster, dt=dt, seed=seed),
+        SensorKind.ACCELEROMETER: lambda own: Accelerometer(
+            models.accelerometer, own, robot, world.gravity, dt=dt, seed=seed
+        ),
+        SensorKind.COMPASS: lambda own: Compass(models.compass, own, robot, dt=dt, seed=seed),
+    }
+    sensors = {kind: [one for one in robot.sensors if one.kind is kind] for kind in build}
+    return [build[kind](own) for kind, own in sensors.items() if own]
