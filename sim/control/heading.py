@@ -1,4 +1,4 @@
-"""Where the robot wants to go when nothing is in the way: at random, or to a target."""
+"""Heading policies on free ground: at random, or to a target."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RANDOM_STREAM = 300
 
 
 class HeadingPolicy(Protocol):
-    """Says how to bend when nothing is in the way."""
+    """Sets the offset of the head when nothing is in the way."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -29,7 +29,7 @@ class HeadingPolicy(Protocol):
 
     @property
     def values(self) -> FloatArray:
-        """What it meant at the last step, in the order of the names."""
+        """Values at the last step, in the order of the names."""
         ...
 
     def step(self, now: ControlInput) -> float:
@@ -48,11 +48,7 @@ class StraightOn:
     values: FloatArray = np.zeros(0)
 
     def step(self, now: ControlInput) -> float:  # noqa: ARG002 - straight whatever is known
-        """Go straight on.
-
-        Returns:
-            0.
-        """
+        """Go straight on."""
         return 0.0
 
 
@@ -74,11 +70,7 @@ class RandomHeadingPolicy:
         return np.array([self._offset])
 
     def step(self, now: ControlInput) -> float:
-        """Go on, or draw anew.
-
-        Returns:
-            Offset of the head [rad].
-        """
+        """Go on, or draw anew."""
         if now.time_s >= self._until_s:
             law = self._parameters
             self._offset = float(self._random.uniform(-law.largest, law.largest))
@@ -87,12 +79,11 @@ class RandomHeadingPolicy:
 
 
 class TargetHeadingPolicy:
-    """Towards a target that the robot was told of, by compass and dead reckoning.
+    """Towards a target at a known position, by compass and dead reckoning.
 
-    The robot knows where the target lies from its start, and reckons where it is from compass and
-    encoders; no sensor tells it where the target is, or that it is met. The compass swings with
-    the head, and tells its field late; so it only puts right, slowly, the heading that the
-    encoders tell, and the way that the path goes is taken from that.
+    The target's position is given from the start; the robot's own comes from compass and encoders,
+    and no sensor measures the target. The compass swings with the head and is late; so it only
+    corrects, slowly, the heading from the encoders, and the heading of the path is that one.
     """
 
     names = ("course.heading", "course.bearing", "course.x", "course.y")
@@ -129,11 +120,7 @@ class TargetHeadingPolicy:
         return self._values
 
     def step(self, now: ControlInput) -> float:
-        """Steer to where the target must be.
-
-        Returns:
-            Offset of the head [rad]; 0 before the compass has told anything.
-        """
+        """Steer to where the target must be."""
         start = self._start_from_north(now)
         moved, self._before = now.pose.place - self._before, now.pose.place
         if math.isnan(start):

@@ -11,6 +11,7 @@ import numpy as np
 from undulog.capture.common.console import Column, table
 
 from ..gate.limits import safety_example
+from ..gate.outcome import some_names
 from .dry_run import DryRun, Verdict
 from .dry_run_gait import Demand, JointDemand
 
@@ -153,9 +154,8 @@ def _clamps(run: DryRun) -> str:
     named = [
         f"{joint.name} {joint.clamped:.0%} of the time" for joint in run.joints if joint.clamped
     ]
-    more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
     cut = f"cut to the joint limits: {', '.join(run.cut)}" if run.cut else ""
-    return "; ".join(part for part in (", ".join(named[:_NAMED]) + more, cut) if part)
+    return "; ".join(part for part in (some_names(named, _NAMED), cut) if part)
 
 
 def _remarks(run: DryRun) -> Iterator[str]:

@@ -1,9 +1,8 @@
-"""The session of a drive over a bus: what was wanted, what was sent, and what came.
+"""The session of a drive over a bus: requested and sent commands, and received frames.
 
-Telling a running recorder what the controller means: ``/gait`` and ``/gait/mode``.
-
-The recorder answers once a tick of its own, so a thread asks: the control loop only leaves what is
-to be told. A recorder that goes, refuses or is slow never holds the loop up.
+A running recorder receives the gait's values for ``/gait`` and ``/gait/mode``. It answers once a
+tick of its own, so a thread sends the requests: the control loop only queues them. A recorder that
+exits, refuses or is slow never delays the loop.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class GaitPublisher:
     Attributes:
         told: Samples of the gait that the recorder took.
         dropped: Samples that it had no time for.
-        error: Why it is told nothing any more; None while it is.
+        error: Why nothing more is sent; None while it is.
     """
 
     def __init__(self, path: Path, names: Sequence[str]) -> None:
@@ -72,7 +71,7 @@ class GaitPublisher:
         self._thread.start()
 
     def note(self, text: str, level: str = "info") -> None:
-        """Leave a remark for ``/rosout``.
+        """Queue an event for ``/rosout``.
 
         Args:
             level: ``info``, ``warn`` or ``error``.
@@ -80,7 +79,7 @@ class GaitPublisher:
         self._held.append({"do": "note", "text": text, "level": level})
 
     def publish(self, tick: GaitTick, t_ns: int) -> None:
-        """Leave what the gait says, without waiting.
+        """Queue the gait's values, without waiting.
 
         Args:
             t_ns: From when on it holds [Unix ns].
@@ -99,7 +98,7 @@ class GaitPublisher:
         self._held.append({"do": "gait", "values": named, "t_ns": t_ns})
 
     def close(self) -> None:
-        """Tell what is left, for a few seconds, and disconnect; safe to call twice."""
+        """Send the rest, for a few seconds, and disconnect; safe to call twice."""
         self._ended.set()
         self._thread.join(_LAST_S)
         self._client.close()
@@ -273,10 +272,10 @@ class BusSession:
             self._events.write(self._t_ns, level, _EVENTS_OF, text)
 
     def finish(self, outcome: Outcome, remarks: Sequence[GateEvent]) -> None:
-        """Say how it went.
+        """Write the outcome.
 
         Args:
-            remarks: What is worth a line, the warnings among them as reasons for the verdict.
+            remarks: Events; the warnings among them are reasons for the verdict.
         """
         level = "error" if outcome.how is DriveEnding.FAULT else "info"
         why = f": {outcome.why}" if outcome.why else ""
@@ -290,7 +289,7 @@ class BusSession:
             self.writer.set_verdict("degraded" if reasons else "good", reasons)
 
     def fail(self, text: str) -> None:
-        """Say why it failed."""
+        """Write the failure."""
         self.log_event("error", text)
         self.writer.set_verdict("bad", [text])
 

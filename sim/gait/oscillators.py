@@ -13,8 +13,8 @@ eps (g_i sin(delta_i) - b_i), and a steady b_i = g_i sin(delta_i) removes what i
 The angles are those last reported, so delta_i holds their age too; a joint that has reported
 nothing yet is not fed back.
 
-Locked phases tell nothing of what couples them. Kicks do: every so often each phase jumps by a
-random amount, and the way back shows the coupling.
+Locked phases contain no information on their coupling. Kicks reveal it: at intervals each phase
+jumps by a random amount, and the way back shows the coupling.
 
 Chains of coupled oscillators, Eq. 1 of Meister, Stepanenko & Kernbach 2011, integrated.
 
@@ -353,7 +353,7 @@ class OscillatorChains:
 
 
 class OscillatorGait(WaveGenerator):
-    """The oscillator generator; it always tells every joint's own values."""
+    """The oscillator generator; it always logs the values of every joint."""
 
     def __init__(self, parameters: OscillatorChains, robot: Robot) -> None:
         """Start at time zero with straight joints.

@@ -1,4 +1,4 @@
-r"""What a bus has confirmed of the commands sent, where its joints answer requests.
+r"""Commands confirmed by the bus, where its joints answer requests.
 
 A command is confirmed by a reply to a request that was sent after it: requests and commands keep
 their order, so the command was at the robot before the request. Replies carry no number. They are
@@ -63,7 +63,7 @@ class Confirmation:
     """
 
     def __init__(self, rate: FloatArray, period_s: float, now_ns: Callable[[], int]) -> None:
-        """Nothing was asked yet.
+        """Start without requests.
 
         Args:
             rate: Greatest rates [rad/s], shape (m,).
@@ -87,7 +87,7 @@ class Confirmation:
         self._sent: list[_Sent] = []
 
     def arm(self, interval: int, limit: int, longest: int) -> None:
-        """Take what was measured of the bus; from here on commands may be sent.
+        """Set the measured properties of the bus; from here on commands may be sent.
 
         Args:
             interval: Reply interval [control ticks].

@@ -128,14 +128,7 @@ class BulletEngine:
             self._client = -1
 
     def read(self, into: BodyState | None = None) -> BodyState:
-        """The present state.
-
-        Args:
-            into: Arrays to be filled in; new ones by default.
-
-        Returns:
-            Positions and velocities of links and joints, in these arrays.
-        """
+        """The present state."""
         state = into or BodyState.empty(len(self._joints) + 1, len(self._joints))
         client = self._client
         position, turn = pybullet.getBasePositionAndOrientation(self._body, client)
@@ -152,12 +145,7 @@ class BulletEngine:
         return state
 
     def push(self, force: FloatArray, point: FloatArray) -> None:
-        """Apply forces to the links during the next step; calls add up.
-
-        Args:
-            force: In the world [N], shape (3, n).
-            point: Points of action in the world [m], shape (3, n).
-        """
+        """Apply forces to the links during the next step; calls add up."""
         n = force.shape[1]
         calls = map(
             pybullet.applyExternalForce,
@@ -167,11 +155,7 @@ class BulletEngine:
         deque(calls, maxlen=0)  # runs them all, without a loop of ours
 
     def step(self, torque: FloatArray) -> None:
-        """Advance the body by one step.
-
-        Args:
-            torque: Of the joints [N m], shape (m,).
-        """
+        """Advance the body by one step."""
         self._advance(torque.tolist())
 
     def _advance(self, torque: list[float]) -> None:

@@ -1,4 +1,4 @@
-"""What a physics engine has to offer the twin: articulated-body dynamics, and nothing else.
+"""Interface of physics engines: articulated-body dynamics, and nothing else.
 
 Ground, obstacles and servos are this package's own, so that every engine runs under the same force
 laws and their results can be held against each other.

@@ -48,14 +48,7 @@ class MujocoEngine:
         """Nothing to do: the physics world is freed with this object."""
 
     def read(self, into: BodyState | None = None) -> BodyState:
-        """The present state.
-
-        Args:
-            into: Arrays to be filled in; new ones by default.
-
-        Returns:
-            Positions and velocities of links and joints, in these arrays.
-        """
+        """The present state."""
         data = self._data  # its first body is the world
         state = into or BodyState.empty(len(data.xipos) - 1, len(data.qpos) - 7)
         state.position[...] = data.xipos[1:].T
@@ -69,22 +62,13 @@ class MujocoEngine:
         return state
 
     def push(self, force: FloatArray, point: FloatArray) -> None:
-        """Apply forces to the links during the next step; calls add up.
-
-        Args:
-            force: In the world [N], shape (3, n).
-            point: Points of action in the world [m], shape (3, n).
-        """
+        """Apply forces to the links during the next step; calls add up."""
         data = self._data
         data.xfrc_applied[1:, :3] += force.T
         data.xfrc_applied[1:, 3:] += cross(point - data.xipos[1:].T, force).T
 
     def step(self, torque: FloatArray) -> None:
-        """Advance by one step, semi-implicit Euler.
-
-        Args:
-            torque: Of the joints [N m], shape (m,).
-        """
+        """Advance by one step, semi-implicit Euler."""
         model, data = self._model, self._data
         data.qfrc_applied[6:] = torque
         mujoco.mj_fwdAcceleration(model, data)

@@ -243,7 +243,7 @@ class Target:
 
 @dataclass(frozen=True)
 class ObstacleMaterial:
-    """What obstacles are made of.
+    """Properties of the obstacles' surfaces.
 
     Attributes:
         stiffness: Of the contact spring [N/m].

@@ -1,4 +1,4 @@
-"""Scenarios: what the twin is to run, complete.
+"""Scenarios: complete runs of the twin.
 
 The TOML form is described in :mod:`.sim.scenario.scenario_file`.
 
@@ -99,7 +99,7 @@ class Modules:
         }
 
     def tables(self) -> dict[str, Any]:
-        """The tables of a scenario file that say this; empty ones are left out."""
+        """The tables of a scenario file for these modules; empty ones are left out."""
         return {name: table for name, table in write(self).items() if table}
 
 
@@ -173,16 +173,16 @@ class Scenario:
     Attributes:
         robot_name: The robot as the scenario names it.
         robot: The robot, with the scenario's modules.
-        gait: What it is commanded to do.
+        gait: Its gait.
         settle_s: The first part of it that is not fit for steady-state analysis.
         noise: What the servos' readings carry.
         modules: Its servos and links that differ from the robot's own.
         seed: Of all that is drawn at random.
         epoch_s: Unix time at which the session starts [s].
         physics_rate_hz: Steps a second, a multiple of twice :data:`CONTROL_RATE_HZ`.
-        engine: Who solves the body's dynamics.
-        faults: What goes wrong on its bus, where it is served on one.
-        controller: What changes the gait by what the sensors say; None: nothing does.
+        engine: The engine that solves the body's dynamics.
+        faults: Faults of its bus, where it is served on one.
+        controller: Changes the gait by the sensor readings; None: no controller.
     """
 
     name: Name

@@ -1,4 +1,4 @@
-"""What the robot's sensors deliver: samples with their own times, released when they arrive.
+"""Sensor samples with their own times, released when they arrive.
 
 The twin hands over every control period's physics steps; the sensors give back the samples that
 reach the robot's computer by the end of it, and keep what is known so far for the controller. The
@@ -112,10 +112,10 @@ class Schedule:
         self._done = 0
 
     def due(self, stop: int) -> tuple[IntArray, IntArray]:
-        """The measurements before a step that were not asked for yet.
+        """Return the measurements due before a step, each once.
 
         Args:
-            stop: The first step that is not asked for.
+            stop: The first step that is not included.
 
         Returns:
             Steps and sensors, in order of time, each of shape (p,).
@@ -188,7 +188,7 @@ class Sensing(Protocol):
 
     @property
     def readings(self) -> Readings:
-        """What the robot's computer knows by now."""
+        """Newest readings of the robot's computer."""
         ...
 
     def observe(self, steps: Steps) -> list[SensorSample]:

@@ -95,7 +95,7 @@ class JointPolling:
         return [self._sample()] if self._next < self._ended else []
 
     def flush(self) -> list[JointSample]:
-        """End the run: the cycles that are not told yet, the last one of the end's instant.
+        """End the run: return the remaining cycles, the last one at the end's instant.
 
         Joints whose turn comes after the end are sampled at the end, and their offsets say so.
 
@@ -148,7 +148,7 @@ class JointPolling:
         )
 
     def _encoded(self, angle: FloatArray) -> FloatArray:
-        """What the encoders tell of an angle, given what they told last."""
+        """Return the encoders' angles, given their last ones."""
         if self._servos.dead_band > 0.0:
             still = np.abs(angle - self._told) <= self._servos.dead_band  # false at the start
             angle = np.where(still, self._told, angle)
@@ -174,7 +174,7 @@ class _Kind(Protocol):
 
 
 class Senses:
-    """The sensors that a scenario asks for."""
+    """The sensors of a scenario."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Start before the first control period.
@@ -199,19 +199,11 @@ class Senses:
 
     @property
     def readings(self) -> Readings:
-        """What the robot's computer knows by now."""
+        """Newest readings of the robot's computer."""
         return self._readings
 
     def observe(self, steps: Steps) -> list[SensorSample]:
-        """Take in one control period.
-
-        Args:
-            steps: Its physics steps from its start to its end, both included.
-
-        Returns:
-            The samples that arrive by the end of the period, in the order of their times; the
-            servos' cycle, which is older, comes last.
-        """
+        """Take in one control period."""
         start = self._start
         self._start += len(steps) - 1
         measured = [one for kind in self._kinds for one in kind.observe(steps, start)]
@@ -219,11 +211,7 @@ class Senses:
         return self._known([*measured, *self._polling.observe(steps)])
 
     def flush(self) -> list[SensorSample]:
-        """End the run.
-
-        Returns:
-            Samples that were taken and have not arrived yet.
-        """
+        """End the run."""
         return self._known([*self._polling.flush()])
 
     def _known(self, samples: list[SensorSample]) -> list[SensorSample]:

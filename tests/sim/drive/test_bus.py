@@ -201,21 +201,6 @@ def test_asked_to_stop_it_ends_as_the_robots_file_says(tmp_path, how):
     assert said[-1].startswith("stopped: stop requested (Ctrl-C); the joints were ")
 
 
-def test_asked_twice_nothing_more_is_sent(tmp_path):
-    stop = StopRequest()
-
-    def ask(tick):
-        stop.signal = signal.SIGINT if tick.tick >= 20 else None
-        stop.again = tick.tick >= 25
-
-    with alive(weak(9.0)) as (on, _):
-        plan = planned("weak-servo-pi3", on, tmp_path / "a.mcap", duration_s=9.0)
-        report = drive_bus(plan, stop=stop, on_tick=ask)
-    assert report.tally.sent == 25 * 26
-    assert report.outcome.how is DriveEnding.STOPPED
-    assert report.outcome.ended.startswith("nothing more was sent")
-
-
 def test_a_session_that_can_not_be_written_brings_the_robot_to_rest_first(tmp_path):
     path = tmp_path / "a.mcap"
 

@@ -105,25 +105,6 @@ def test_without_ground_nothing_is_lost_to_it(make_scenario, make_robot):
     assert abs(energy["mechanical_residual"]) < 1e-2 * energy["mechanical_abs"]
 
 
-def test_runs_of_the_same_scenario_are_identical(make_scenario, make_robot):
-    scenario = make_scenario(make_robot(9), ramp_s=0.2, duration_s=0.5)
-    first, second = simulate(scenario), simulate(scenario)
-    assert all(np.array_equal(a.energy, b.energy) for a, b in zip(first, second, strict=True))
-    assert len(first) == 51
-    assert first[-1].time_s == 0.5
-
-
-def test_a_failure_names_time_link_and_cause(make_scenario, make_robot):
-    world = World(ground=Ground(stiffness=1e7))
-    scenario = make_scenario(make_robot(5), ramp_s=0.0, duration_s=2.0, world=world)
-    with pytest.raises(SimulationError) as caught:
-        simulate(scenario)
-    message = str(caught.value)
-    assert "the twin failed at 0." in message
-    assert "link0" in message
-    assert "likely cause: world.ground.stiffness is too stiff for steps of 1 ms" in message
-
-
 def test_a_failure_without_a_stiff_part_says_so(make_scenario, make_robot):
     world = World(velocity=(11.0, 0.0, 0.0))
     with pytest.raises(
