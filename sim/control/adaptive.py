@@ -58,6 +58,8 @@ class AdaptiveGait:
         self._haste = TailSpeedUp(controller.tail, roles) if controller.tail else None
         parts = (self._steering, self._shrinking, self._haste, course)
         self._parts = [part for part in parts if part is not None]
+        own = (name for part in self._parts for name in part.names)
+        self.names: tuple[str, ...] = (*generator.names, *own)
         self._horizontal = robot.joint_indices(Plane.HORIZONTAL)
         self._phase_at = generator.names.index(f"{Plane.HORIZONTAL}.phase")
         self._lag_at = generator.names.index(f"{Plane.HORIZONTAL}.lag")
@@ -66,12 +68,6 @@ class AdaptiveGait:
         self._time_s = 0.0
         self._mode = WALK
         self._mode_since_s = 0.0
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values: those of the generator, then those of the controller."""
-        own = (name for part in self._parts for name in part.names)
-        return (*self._generator.names, *own)
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:
         """Change the generator by the readings, and step it."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,28 +17,6 @@ from .obstacle_monitor import ControlInput
 
 RANDOM_STREAM = 300
 """Of the scenario's seed; random turns draw from it and nothing else does."""
-
-
-class HeadingPolicy(Protocol):
-    """Sets the offset of the head when nothing is in the way."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values."""
-        ...
-
-    @property
-    def values(self) -> FloatArray:
-        """Values at the last step, in the order of the names."""
-        ...
-
-    def step(self, now: ControlInput) -> float:
-        """Advance to a tick.
-
-        Returns:
-            Offset of the head [rad], positive to the right.
-        """
-        ...
 
 
 class StraightOn:
@@ -62,20 +40,15 @@ class RandomHeadingPolicy:
         self._parameters = parameters
         self._random = np.random.default_rng([seed, RANDOM_STREAM])
         self._until_s = -math.inf
-        self._offset = 0.0
-
-    @property
-    def values(self) -> FloatArray:
-        """The offset [rad]."""
-        return np.array([self._offset])
+        self.values: FloatArray = np.zeros(1)
 
     def step(self, now: ControlInput) -> float:
         """Go on, or draw anew."""
         if now.time_s >= self._until_s:
             law = self._parameters
-            self._offset = float(self._random.uniform(-law.largest, law.largest))
+            self.values = self._random.uniform(-law.largest, law.largest, 1)
             self._until_s = now.time_s + float(self._random.uniform(law.shortest_s, law.longest_s))
-        return self._offset
+        return float(self.values[0])
 
 
 class TargetHeadingPolicy:
@@ -86,6 +59,7 @@ class TargetHeadingPolicy:
     corrects, slowly, the heading from the encoders, and the heading of the path is that one.
     """
 
+    # Heading and bearing of the target from magnetic north [rad], and the robot's position [m].
     names = ("course.heading", "course.bearing", "course.x", "course.y")
 
     def __init__(
@@ -112,12 +86,7 @@ class TargetHeadingPolicy:
         self._north: LowPass[FloatArray] | None = None
         self._before = np.zeros(2)
         self._place = np.zeros(2)
-        self._values = np.full(len(self.names), math.nan)
-
-    @property
-    def values(self) -> FloatArray:
-        """Heading and bearing of the target from magnetic north [rad], reckoned place [m]."""
-        return self._values
+        self.values: FloatArray = np.full(len(self.names), math.nan)
 
     def step(self, now: ControlInput) -> float:
         """Steer to where the target must be."""
@@ -128,7 +97,7 @@ class TargetHeadingPolicy:
         self._place = self._place + turned(moved, start)
         way = self._target - self._place
         heading, bearing = start + now.pose.way, math.atan2(way[1], way[0])
-        self._values = np.array([heading, bearing, *self._place])
+        self.values = np.array([heading, bearing, *self._place])
         error = math.remainder(bearing - heading, TURN)
         if self._inside_turn(math.hypot(*way), abs(error)):
             return 0.0  # no turn leads there: first away from it
@@ -152,3 +121,7 @@ class TargetHeadingPolicy:
             self._north = LowPass(self._law.filter_s, told)
         x, y = self._north.step(now.elapsed_s, told)
         return math.atan2(y, x)
+
+
+HeadingPolicy: TypeAlias = StraightOn | RandomHeadingPolicy | TargetHeadingPolicy
+"""Sets the offset of the head when nothing is in the way, and logs values by name."""

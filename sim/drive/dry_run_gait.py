@@ -244,15 +244,10 @@ class NotedGait:
 
     def __init__(self, gait: Gait, robot: Robot) -> None:
         """Wrap a gait."""
-        self._gait = gait
+        self._gait, self.names = gait, gait.names
         self.first: FloatArray = np.full(len(robot.joints), np.nan)
         self._cut: dict[str, None] = {}
         self._asked = False
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values."""
-        return self._gait.names
 
     @property
     def cut(self) -> tuple[str, ...]:

@@ -43,6 +43,7 @@ class FadingGait:
             fade_s: T [s].
         """
         self._gait, self._fade_s = gait, fade_s
+        self.names = gait.names
         waves = {*Plane, *robot.joint_names}
         parts = [name.rpartition(".") for name in gait.names]
         faded = [wave in waves and value in _FADED for wave, _, value in parts]
@@ -51,11 +52,6 @@ class FadingGait:
         self._asked = False
         self._begun_s: float | None = None
         self._passed = 0.0  # share of the fade's time
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values: the gait's own."""
-        return self._gait.names
 
     @property
     def at_rest(self) -> bool:

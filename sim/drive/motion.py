@@ -129,14 +129,10 @@ class CommandReplay:
         self._lower, self._upper = robot.limits()
         self._rest = np.clip(np.zeros(len(robot.joints)), self._lower, self._upper)
         self._gait = _Held(recorded.gait) if recorded.gait is not None else None
+        self.names: tuple[str, ...] = self._gait.names if self._gait is not None else ()
         self._since_ns = [t_ns for t_ns, _ in recorded.modes]
         self._modes = [REPLAY, *(mode for _, mode in recorded.modes)]
         self._start_ns, self._end_ns = held.span()
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values: those that the session's controller meant, perhaps none."""
-        return self._gait.names if self._gait is not None else ()
 
     @property
     def duration_s(self) -> float:
@@ -213,12 +209,6 @@ class MotionSource:
     heading_rad: float = 0.0
     run: int = 0
     as_run: bool = False
-
-    @property
-    def session_facts(self) -> Mapping[str, str]:
-        """Metadata for a session without a scenario."""
-        settled = {} if self.settle_s is None else {"settle_s": repr(self.settle_s)}
-        return {**self.facts, **settled}
 
     def check_fits(self, robot: Robot) -> None:
         """Check that a robot on a bus has the joints and the planes of the motion.

@@ -215,7 +215,11 @@ class _PlanePart:
 
 
 class WaveGenerator:
-    """A generator made of one rhythm a plane; joints of the other planes are held straight."""
+    """A generator made of one rhythm a plane; joints of the other planes are held straight.
+
+    Attributes:
+        names: Names of the values: each driven plane's, then perhaps those of its joints.
+    """
 
     def __init__(
         self, rhythms: Mapping[Plane, Rhythm], robot: Robot, *, per_joint: bool = False
@@ -237,17 +241,13 @@ class WaveGenerator:
             self._parts.append(part)
         unlike = any(np.ptp(part.lower) + np.ptp(part.upper) > 0.0 for part in self._parts)
         self._per_joint = per_joint or unlike
-        self._modulation = Modulation.none(len(robot.joints))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values: each driven plane's, then perhaps those of its joints."""
-        names: list[str] = []
+        values: list[str] = []
         for part in self._parts:
-            names += [f"{part.plane}.{key}" for key in VALUE_NAMES]
+            values += [f"{part.plane}.{key}" for key in VALUE_NAMES]
             if self._per_joint:
-                names += [f"{joint}.{key}" for key in JOINT_VALUE_NAMES for joint in part.names]
-        return tuple(names)
+                values += [f"{joint}.{key}" for key in JOINT_VALUE_NAMES for joint in part.names]
+        self.names = tuple(values)
+        self._modulation = Modulation.none(len(robot.joints))
 
     def modulate(self, modulation: Modulation) -> None:
         """Change the generator from the next step on."""

@@ -9,17 +9,15 @@ hold the same columns.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray, IntArray, frozen
 from undulog.capture.robot.model import Robot, Sensor
 
-from ..gait.contract import Readings
 from ..physics.contact import out_of_frames
 from ..physics.engine import BodyState
-from ..physics.steps import Steps
 
 
 def quantised(values: FloatArray, step: float) -> FloatArray:
@@ -181,33 +179,3 @@ class VectorSample(NamedTuple):
 
 
 SensorSample: TypeAlias = JointSample | RangeSample | VectorSample
-
-
-class Sensing(Protocol):
-    """All sensors of a robot in its world."""
-
-    @property
-    def readings(self) -> Readings:
-        """Newest readings of the robot's computer."""
-        ...
-
-    def observe(self, steps: Steps) -> list[SensorSample]:
-        """Take in one control period.
-
-        Args:
-            steps: Its physics steps from its start to its end, both included; the last one of a
-                period is the first one of the next.
-
-        Returns:
-            The samples that arrive by the end of the period, in the order of their arrival.
-        """
-        ...
-
-    def flush(self) -> list[SensorSample]:
-        """End the run: samples that were taken and have not arrived yet.
-
-        Returns:
-            These samples; a mean over a period that the run does not cover to its end is taken
-            over the part that it does.
-        """
-        ...

@@ -1,4 +1,4 @@
-"""All sensors of the robot in its world, as :class:`.sim.sensing.contract.Sensing` has them.
+"""All sensors of the robot in its world.
 
 The servos, polled in turn: each joint's sample has its own time.
 
@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -29,12 +29,16 @@ from ..gait.contract import CONTROL_RATE_HZ, Readings
 from ..physics.steps import Steps
 from ..scenario.scenario import Scenario
 from ..scenario.sensors import Noise, ServoPolling
-from .contract import JointSample, RangeSample, SensorSample, VectorSample, quantised
+from .contract import JointSample, RangeSample, SensorSample, quantised
 from .inertial import Accelerometer, Compass
 from .ranging import Infrared, RayCaster, Sonar
 
 STREAM = 1
 """Number of the random stream that the servos' noise is drawn from."""
+
+
+_Sensors: TypeAlias = Infrared | Sonar | Accelerometer | Compass
+"""All sensors of one kind."""
 
 
 class _Period(NamedTuple):
@@ -165,16 +169,12 @@ def _between(series: FloatArray, at: FloatArray) -> FloatArray:
     return before + (at - low) * (after - before)
 
 
-class _Kind(Protocol):
-    """All sensors of one kind."""
-
-    def observe(self, steps: Steps, start: int) -> list[RangeSample] | list[VectorSample]:
-        """Measure during one control period, whose first step has a number."""
-        ...
-
-
 class Senses:
-    """The sensors of a scenario."""
+    """The sensors of a scenario.
+
+    Attributes:
+        readings: Newest readings of the robot's computer.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         """Start before the first control period.
@@ -194,13 +194,8 @@ class Senses:
         self._accelerometers = frozenset(
             one.name for one in scenario.robot.sensors if one.kind is SensorKind.ACCELEROMETER
         )
-        self._readings = Readings.nothing(scenario.robot)
+        self.readings = Readings.nothing(scenario.robot)
         self._start = 0  # number of the next period's first step
-
-    @property
-    def readings(self) -> Readings:
-        """Newest readings of the robot's computer."""
-        return self._readings
 
     def observe(self, steps: Steps) -> list[SensorSample]:
         """Take in one control period."""
@@ -218,7 +213,7 @@ class Senses:
         """Take samples into the readings; returns them."""
         if not samples:
             return samples
-        old = self._readings
+        old = self.readings
         angle, velocity = old.angle, old.velocity
         ranges, acceleration, field = {**old.ranges}, {**old.acceleration}, {**old.magnetic_field}
         for sample in samples:
@@ -230,17 +225,17 @@ class Senses:
                 acceleration[sample.name] = sample.vector
             else:
                 field[sample.name] = sample.vector
-        self._readings = Readings(angle, velocity, ranges, acceleration, field)
+        self.readings = Readings(angle, velocity, ranges, acceleration, field)
         return samples
 
 
-def _kinds(scenario: Scenario) -> list[_Kind]:
+def _kinds(scenario: Scenario) -> list[_Sensors]:
     """The sensors that the robot has, by kind."""
     robot, world, models = scenario.robot, scenario.world, scenario.sensing
     dt, seed = 1.0 / scenario.physics_rate_hz, scenario.seed
     caster = RayCaster(world.obstacles, ground=world.ground is not None)
 
-    build: dict[SensorKind, Callable[[list[Sensor]], _Kind]] = {
+    build: dict[SensorKind, Callable[[list[Sensor]], _Sensors]] = {
         SensorKind.IR: lambda own: Infrared(models.ir, own, robot, caster, dt=dt, seed=seed),
         SensorKind.SONAR: lambda own: Sonar(models.sonar, own, robot, caster, dt=dt, seed=seed),
         SensorKind.ACCELEROMETER: lambda own: Accelerometer(

@@ -51,7 +51,7 @@ class TwinSource:
         self._log: SessionLog | None = None
         self._twin: Twin | None = None
         self._context: SourceContext | None = None
-        self._finished = False
+        self.finished = False
 
     @property
     def facts(self) -> Mapping[str, str]:
@@ -61,12 +61,7 @@ class TwinSource:
     @property
     def connected(self) -> bool:
         """Whether the twin runs."""
-        return self._thread is not None and not self._finished
-
-    @property
-    def finished(self) -> bool:
-        """Whether the scenario has ended and all its samples are written."""
-        return self._finished
+        return self._thread is not None and not self.finished
 
     def start(self, context: SourceContext) -> None:
         """Set the robot on the ground and let it go."""
@@ -85,7 +80,7 @@ class TwinSource:
     def poll(self) -> Polled:
         """Write the samples that are due."""
         events: list[SourceEvent] = []
-        while not self._finished and self._log is not None and self._context is not None:
+        while not self.finished and self._log is not None and self._context is not None:
             try:
                 item = self._queue.get_nowait()
             except Empty:
@@ -95,7 +90,7 @@ class TwinSource:
                 self.counts.dropped = item.tick - self.counts.frames  # ticks are numbered from 0
                 self.counts.frames += 1
                 continue
-            self._finished = True
+            self.finished = True
             if self._twin is not None:
                 self._log.receive(self._twin.flush())
             level, text = "error", str(item)

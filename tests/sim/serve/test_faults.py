@@ -26,10 +26,7 @@ BASE = SNAKE25.replace("2.0", "0.1")
         ("lost:0.5@2", BusFault(FaultKind.LOST, "", 0.5, 2.0)),
         ("stuck:joint01@5", BusFault(FaultKind.STUCK, "joint01", 0.0, 5.0)),
         ("frozen:joint25@5+2.5", BusFault(FaultKind.FROZEN, "joint25", 0.0, 5.0, 2.5)),
-        (
-            "over-current:joint07:1.5@5",
-            BusFault(FaultKind.OVER_CURRENT, "joint07", 1.5, 5.0),
-        ),
+        ("over-current:joint07:1.5@5", BusFault(FaultKind.OVER_CURRENT, "joint07", 1.5, 5.0)),
         ("bus-off@5+2", BusFault(FaultKind.BUS_OFF, "", 0.0, 5.0, 2.0)),
         ("noise:1e-3", BusFault(FaultKind.NOISE, "", 0.001)),
         ("delay:0.02", BusFault(FaultKind.DELAY, "", 0.02)),
