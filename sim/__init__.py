@@ -30,37 +30,19 @@ if TYPE_CHECKING:
     from .twin.recording import record
     from .twin.twin import Twin
 
+_HOMES = {
+    "gait.contract": "Gait GaitTick Readings",
+    "gait.wave": "PlaneGait Serpentine SerpentineGait Wave",
+    "scenario.obstacles": "Box Cylinder ObstacleMaterial RandomField Target Wall",
+    "scenario.scenario": "Scenario",
+    "scenario.scenario_file": "load_scenario parse_scenario scenario_names",
+    "scenario.sensors": "AccelerometerModel CompassModel InfraredModel Noise SensorModels"
+    " ServoPolling SonarModel",
+    "scenario.world": "FrictionLaw Ground World",
+    "twin.recording": "record",
+    "twin.twin": "Twin",
+}
+
 __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
-    __name__,
-    {
-        "AccelerometerModel": "scenario.sensors",
-        "Box": "scenario.obstacles",
-        "CompassModel": "scenario.sensors",
-        "Cylinder": "scenario.obstacles",
-        "FrictionLaw": "scenario.world",
-        "Gait": "gait.contract",
-        "GaitTick": "gait.contract",
-        "Ground": "scenario.world",
-        "InfraredModel": "scenario.sensors",
-        "Noise": "scenario.sensors",
-        "ObstacleMaterial": "scenario.obstacles",
-        "PlaneGait": "gait.wave",
-        "RandomField": "scenario.obstacles",
-        "Readings": "gait.contract",
-        "Scenario": "scenario.scenario",
-        "SensorModels": "scenario.sensors",
-        "Serpentine": "gait.wave",
-        "SerpentineGait": "gait.wave",
-        "ServoPolling": "scenario.sensors",
-        "SonarModel": "scenario.sensors",
-        "Target": "scenario.obstacles",
-        "Twin": "twin.twin",
-        "Wall": "scenario.obstacles",
-        "Wave": "gait.wave",
-        "World": "scenario.world",
-        "load_scenario": "scenario.scenario_file",
-        "parse_scenario": "scenario.scenario_file",
-        "record": "twin.recording",
-        "scenario_names": "scenario.scenario_file",
-    },
+    __name__, {name: module for module, names in _HOMES.items() for name in names.split()}
 )

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
+from undulog.capture.common.console import echo, emit_json, refuse_existing
 from undulog.capture.common.errors import UsageError
-from undulog.capture.common.process import interruptible
+
+from .run import check_session_name, with_progress
 
 if TYPE_CHECKING:
     from ..drive.motion import MotionSource
@@ -58,14 +59,12 @@ def drive(
         force: Replace the output if it is there.
         json: Print one JSON object instead of text.
     """
+    from ..drive.in_process import drive_twin
     from ..drive.motion import find_motion
     from ..scenario.scenario_file import load_scenario
 
     if output is not None:
-        if output.suffix != ".mcap":
-            raise UsageError(
-                f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
-            )
+        check_session_name(output)
         refuse_existing(output, force=force)
     scheme, colon, rest = on.partition(":")
     if scheme == _TWIN and colon and not rest:
@@ -95,33 +94,15 @@ def drive(
         )
     world = load_scenario(rest) if rest else None
     driven = find_motion(what, world)
-    return _on_twin(driven, driven.scenario(world, duration), output, force=force, as_json=json)
-
-
-def _on_twin(
-    driven: MotionSource, scenario: Scenario, output: Path | None, *, force: bool, as_json: bool
-) -> int:
-    from ..drive.in_process import drive_twin
-
+    scenario = driven.scenario(world, duration)
     if output is None:
         raise UsageError(
             "a run of the twin is recorded: name the session with -o, e.g. -o run.mcap"
         )
-    refuse_existing(output, force=force)
-    start = time.monotonic()
-    with interruptible() as stop, progress(driven.name, scenario.duration_s) as bar:
-        recording = drive_twin(
-            driven,
-            scenario,
-            output,
-            force=force,
-            stop=stop,
-            on_sample=lambda sample: bar.update(
-                sample.time_s, f"{sample.time_s / (time.monotonic() - start):.1f} x real time"
-            ),
-        )
-    factor = recording.duration_s / (time.monotonic() - start)
-    if as_json:
+    recording, factor = with_progress(
+        driven.name, scenario, partial(drive_twin, driven, scenario, output, force=force)
+    )
+    if json:
         emit_json(_reported(driven, scenario, recording, factor))
     else:
         echo(*_summary(driven, scenario, recording, factor))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,13 +15,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
+from undulog.capture.common.console import UNLIMITED, echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import interruptible
 
 if TYPE_CHECKING:
-    from ..scenario.scenario import Scenario
+    from ..scenario.scenario import Kernels, Scenario
     from ..twin.recording import Recording
+    from ..twin.twin import Sample
 
 
 def null(
@@ -51,7 +53,6 @@ def null(
     """
     from undulog.capture.robot.null_model import write_null_model
 
-    from ..scenario.scenario import Kernels
     from ..scenario.scenario_file import load_scenario
     from ..twin.null_model import null_model
 
@@ -61,13 +62,12 @@ def null(
         raise UsageError(f"--spread {spread:g}: give a share between 0 and 1")
     chosen = load_scenario(scenario)
     refuse_existing(output, force=force)
-    compiled = kernels == "numba" or (kernels == "auto" and find_spec("numba") is not None)
     with progress(f"null model of {chosen.name}", 1.0) as bar:
         model = null_model(
             chosen,
             made_by=f"undulog {version('undulog')} sim null {chosen.name} ({chosen.session_id})",
             spread=spread,
-            kernels=Kernels.NUMBA if compiled else Kernels.NUMPY,
+            kernels=_kernels(kernels),
             on_run=lambda done, total: bar.update(done / total, f"run {done} of {total}"),
         )
     write_null_model(output, model)
@@ -94,9 +94,6 @@ def null(
         )
 
 
-_UNWRAPPED = 1000  # columns: one scenario a line, for grep and the like
-
-
 def list_scenarios(*, json: bool = False) -> None:
     """List the shipped scenarios by robot: name, duration, and what each is about.
 
@@ -111,7 +108,7 @@ def list_scenarios(*, json: bool = False) -> None:
     if json:
         emit_json([_described(scenario) for scenario in scenarios])
         return
-    columns = get_terminal_size().columns if sys.stdout.isatty() else _UNWRAPPED
+    columns = get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED
     echo(*_listed(scenarios, columns))
 
 
@@ -146,37 +143,71 @@ def run(
         force: Replace the output if it is there.
         json: Print one JSON object instead of text.
     """
-    from ..scenario.scenario import Kernels
     from ..scenario.scenario_file import load_scenario, read_changes
     from ..twin.recording import record
 
-    if output.suffix != ".mcap":
-        raise UsageError(
-            f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
-        )
+    check_session_name(output)
     chosen = load_scenario(scenario, read_changes(change or [])).changed(
         duration_s=duration, seed=seed
     )
     refuse_existing(output, force=force)
-    compiled = kernels == "numba" or (kernels == "auto" and find_spec("numba") is not None)
-    start = time.monotonic()
-    with interruptible() as stop, progress(chosen.name, chosen.duration_s) as bar:
-        recording = record(
-            chosen,
-            output,
-            force=force,
-            stop=stop,
-            kernels=Kernels.NUMBA if compiled else Kernels.NUMPY,
-            on_sample=lambda sample: bar.update(
-                sample.time_s, f"{sample.time_s / (time.monotonic() - start):.1f} x real time"
-            ),
-        )
-    factor = recording.duration_s / (time.monotonic() - start)
+    recording, factor = with_progress(
+        chosen.name,
+        chosen,
+        partial(record, chosen, output, force=force, kernels=_kernels(kernels)),
+    )
     if json:
         emit_json(_reported(chosen, recording, factor))
     else:
         echo(*_summary(chosen, recording, factor))
     return 0 if recording.complete else 1
+
+
+def _kernels(choice: Literal["numpy", "numba", "auto"]) -> Kernels:
+    from ..scenario.scenario import Kernels
+
+    if choice == "auto":
+        return Kernels.NUMPY if find_spec("numba") is None else Kernels.NUMBA
+    return Kernels(choice)
+
+
+def check_session_name(output: Path) -> None:
+    """Check that the name of a session to be written ends in ``.mcap``."""
+    if output.suffix != ".mcap":
+        raise UsageError(
+            f"{output}: sessions are MCAP files; name it {output.with_suffix('.mcap')}"
+        )
+
+
+def speed_text(time_s: float, start: float) -> str:
+    """Return the speed of a simulation as text.
+
+    Args:
+        time_s: Simulated time [s].
+        start: Time of the monotonic clock at its start [s].
+    """
+    return f"{time_s / max(time.monotonic() - start, 1e-3):.1f} x real time"
+
+
+def with_progress(
+    name: str, scenario: Scenario, run: Callable[..., Recording]
+) -> tuple[Recording, float]:
+    """Record a run of the twin with a progress bar, until its end or a signal.
+
+    Args:
+        run: Records the scenario, given ``stop`` and ``on_sample``.
+
+    Returns:
+        The recording and its speed, in multiples of real time.
+    """
+    start = time.monotonic()
+    with interruptible() as stop, progress(name, scenario.duration_s) as bar:
+
+        def show(sample: Sample) -> None:
+            bar.update(sample.time_s, speed_text(sample.time_s, start))
+
+        recording = run(stop=stop, on_sample=show)
+    return recording, recording.duration_s / (time.monotonic() - start)
 
 
 def _listed(scenarios: Sequence[Scenario], columns: int) -> list[str]:
@@ -235,6 +266,7 @@ def _reported(scenario: Scenario, recording: Recording, factor: float) -> dict[s
 
 def _summary(scenario: Scenario, recording: Recording, factor: float) -> list[str]:
     energy, closure = recording.energy, _closure(recording)
+    robot = scenario.robot
     if recording.complete:
         first = f"{recording.path}: {recording.duration_s:g} s of {scenario.name}"
     else:
@@ -242,13 +274,10 @@ def _summary(scenario: Scenario, recording: Recording, factor: float) -> list[st
             f"stopped at {recording.duration_s:g} s of {scenario.duration_s:g} s; "
             f"{recording.path} is complete up to there"
         )
-    who = f"{scenario.robot.name}, {recording.sample_count} samples of "
-    who += f"{len(scenario.robot.joints)} joints, session {recording.session_id}"
-    work = f"mechanical work {energy['mechanical_net']:.3g} J net, "
-    work += (
-        f"{energy['mechanical_abs']:.3g} J absolute; electrical {energy['electrical_net']:.3g} J"
-    )
-    lines = [first, who, work]
+    who = f"{robot.name}, {recording.sample_count} samples of {len(robot.joints)} joints"
+    work = f"mechanical work {energy['mechanical_net']:.3g} J net, {energy['mechanical_abs']:.3g} J"
+    electrical = f"electrical {energy['electrical_net']:.3g} J"
+    lines = [first, f"{who}, session {recording.session_id}", f"{work} absolute; {electrical}"]
     if closure is not None:
         lines.append(f"energy ledger closes within {100 * closure:.2g} % of the absolute work")
     if scenario.world.obstacles:
@@ -262,5 +291,7 @@ def _touched(contact_s: dict[str, float]) -> str:
     if not contact_s:
         return "no link touched an obstacle"
     longest = max(contact_s, key=contact_s.__getitem__)
-    links = "1 link" if len(contact_s) == 1 else f"{len(contact_s)} links"
-    return f"{links} touched obstacles, {longest} longest: {contact_s[longest]:.3g} s"
+    links = "link" if len(contact_s) == 1 else "links"
+    return (
+        f"{len(contact_s)} {links} touched obstacles, {longest} longest: {contact_s[longest]:.3g} s"
+    )

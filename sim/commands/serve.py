@@ -97,9 +97,9 @@ def serve(
         lockstep=lockstep,
         wait=wait or lockstep,
         fast=fast,
+        json=json,
     )
-    report = _Report(plan, json=json)
-    return _run(plan, report)
+    return _run(plan)
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,10 @@ class _Plan:
     lockstep: bool
     wait: bool
     fast: bool
+    json: bool
 
 
-def _run(plan: _Plan, report: _Report) -> int:
+def _run(plan: _Plan) -> int:
     from undulog.capture.common.process import interruptible
     from undulog.capture.sources.events import EventLog
     from undulog.capture.sources.sender import FrameSender
@@ -142,72 +143,70 @@ def _run(plan: _Plan, report: _Report) -> int:
                 lockstep=plan.lockstep,
                 wait=plan.wait,
                 log_event=events.log_event,
-                each_tick=lambda: report.events(events.take()),
+                each_tick=lambda: _complain(events.take()),
                 stop=stop,
             )
             address = server.address if server else None
-            served = robot.run(lambda: report.ready(address, pacer.epoch_ns))
+            served = robot.run(lambda: _print_ready(plan, address, pacer.epoch_ns))
         finally:
             bus.close()
-            report.events(events.flush())
-    report.end(served, bus, server, sender)
+            _complain(events.flush())
+    _print_end(plan, served, bus, server, sender)
     return 0
 
 
-class _Report:
-    """What is printed: on stdout that it is ready and how it went, on stderr what happens."""
+def _complain(events: Iterable[SourceEvent]) -> None:
+    for event in events:
+        complain(f"{event.level}: {event.text}")
 
-    def __init__(self, plan: _Plan, *, json: bool) -> None:
-        self._plan, self._json = plan, json
 
-    def events(self, events: Iterable[SourceEvent]) -> None:
-        for event in events:
-            complain(f"{event.level}: {event.text}")
+def _print(plan: _Plan, facts: dict[str, Any], lines: list[str]) -> None:
+    echo(*([dumps(facts)] if plan.json else lines))
 
-    def ready(self, address: tuple[str, int] | None, epoch_ns: int) -> None:
-        plan = self._plan
-        facts = {
-            "event": "ready",
-            "robot": plan.scenario.robot.name,
-            "scenario": plan.scenario.name,
-            "bus": plan.bus,
-            "host": address[0] if address else None,
-            "port": address[1] if address else None,
-            "unix": str(plan.unix) if plan.unix is not None else None,
-            "waits": plan.wait,
-            "epoch_ns": None if plan.fast else epoch_ns,
-        }
-        places = [f"{address[0]}:{address[1]}"] if address else []
-        places += [str(plan.unix)] if plan.unix is not None else []
-        text = f"{plan.scenario.robot.name} is on {plan.bus} at {' and '.join(places)}"
-        self._say(facts, [text + ("; it waits for commands" if plan.wait else "")])
 
-    def end(
-        self,
-        served: Served,
-        bus: VirtualBus,
-        server: SocketcandServer | None,
-        sender: FrameSender | None,
-    ) -> None:
-        facts = {
-            "event": "end",
-            "duration_s": served.duration_s,
-            "complete": served.complete,
-            "start_s": served.start_ns * 1e-9,
-            **asdict(served.pace),
-            "frames": bus.sent,
-            "heard": bus.heard,
-            "commands": served.commands,
-            "lost": served.lost,
-            "hit": served.hit,
-            "dropped_clients": server.dropped if server else 0,
-            "unix_accepted": sender.accepted if sender else None,
-            "unix_refused": sender.refused if sender else None,
-        }
-        self._say(facts, _summary(self._plan, served, bus, sender))
+def _print_ready(plan: _Plan, address: tuple[str, int] | None, epoch_ns: int) -> None:
+    host, port = address or (None, None)
+    robot = plan.scenario.robot.name
+    facts = {
+        "event": "ready",
+        "robot": robot,
+        "scenario": plan.scenario.name,
+        "bus": plan.bus,
+        "host": host,
+        "port": port,
+        "unix": str(plan.unix) if plan.unix is not None else None,
+        "waits": plan.wait,
+        "epoch_ns": None if plan.fast else epoch_ns,
+    }
+    places = [f"{host}:{port}"] if address else []
+    places += [str(plan.unix)] if plan.unix is not None else []
+    text = f"{robot} is on {plan.bus} at {' and '.join(places)}"
+    _print(plan, facts, [text + ("; it waits for commands" if plan.wait else "")])
 
-    def _say(self, facts: dict[str, Any], lines: list[str]) -> None:
-        echo(*([dumps(facts)] if self._json else lines))
+
+def _print_end(
+    plan: _Plan,
+    served: Served,
+    bus: VirtualBus,
+    server: SocketcandServer | None,
+    sender: FrameSender | None,
+) -> None:
+    facts = {
+        "event": "end",
+        "duration_s": served.duration_s,
+        "complete": served.complete,
+        "start_s": served.start_ns * 1e-9,
+        **asdict(served.pace),
+        "frames": bus.sent,
+        "heard": bus.heard,
+        "commands": served.commands,
+        "lost": served.lost,
+        "hit": served.hit,
+        "dropped_clients": server.dropped if server else 0,
+        "unix_accepted": sender.accepted if sender else None,
+        "unix_refused": sender.refused if sender else None,
+    }
+    _print(plan, facts, _summary(plan, served, bus, sender))
 
 
 def _summary(plan: _Plan, served: Served, bus: VirtualBus, sender: FrameSender | None) -> list[str]:

@@ -1,4 +1,4 @@
-"""A gait under a controller: the generator's wave, changed by what the robot's sensors say."""
+"""A gait under a controller: the generator's wave, changed by the sensor readings."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
 AVOID, HASTEN, SHRINK, TURN = "avoid", "hasten", "shrink", "turn"
 _MODE_HOLD_S = 0.5
-_TURNING = 0.05
-"""Offsets of the head above this are turns [rad]."""
+_TURNING = 0.05  # offsets of the head above this are turns [rad]
 
 
 class AdaptiveGait:
@@ -43,7 +42,7 @@ class AdaptiveGait:
 
         Args:
             generator: Makes the wave; it must drive the horizontal plane.
-            controller: What to react to, and how.
+            controller: Parameters of the reactions.
         """
         roles = layout(robot)
         self._generator = generator
@@ -59,6 +58,8 @@ class AdaptiveGait:
         self._haste = TailSpeedUp(controller.tail, roles) if controller.tail else None
         parts = (self._steering, self._shrinking, self._haste, course)
         self._parts = [part for part in parts if part is not None]
+        own = (name for part in self._parts for name in part.names)
+        self.names: tuple[str, ...] = (*generator.names, *own)
         self._horizontal = robot.joint_indices(Plane.HORIZONTAL)
         self._phase_at = generator.names.index(f"{Plane.HORIZONTAL}.phase")
         self._lag_at = generator.names.index(f"{Plane.HORIZONTAL}.lag")
@@ -68,19 +69,8 @@ class AdaptiveGait:
         self._mode = WALK
         self._mode_since_s = 0.0
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values: the generator's, then what the controller meant."""
-        own = (name for part in self._parts for name in part.names)
-        return (*self._generator.names, *own)
-
     def step(self, time_s: float, readings: Readings) -> GaitTick:
-        """React to what the sensors say, and go on.
-
-        Args:
-            time_s: Time since the start [s], never less than in the call before.
-            readings: What the robot has told by then.
-        """
+        """Change the generator by the readings, and step it."""
         if self._wave is None:  # the first tick tells phase and lag; from the next on it reacts
             tick = self._generator.step(time_s, readings)
             lag = float(tick.values[self._lag_at])
@@ -129,11 +119,11 @@ class AdaptiveGait:
 
 
 def build_gait(scenario: Scenario) -> Gait:
-    """The gait that a scenario asks for, on the twin or on a bus.
+    """Return the gait of a scenario, for the twin or a bus.
 
     Args:
-        scenario: Gait, controller and robot; of its world and its sensors only what the robot is
-            told beforehand: where the target lies from its start, and which way north is there.
+        scenario: Gait, controller and robot; of its world only the target's position, and of its
+            sensors the direction of north.
 
     Returns:
         The gait, at time zero.

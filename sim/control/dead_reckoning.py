@@ -1,6 +1,4 @@
-"""Where the robot is and which way it goes, by its encoders alone.
-
-How far the robot has come, from its encoders and its compass.
+"""Position and heading of the robot from its encoders alone.
 
 A snake that undulates goes where its links slip least across the body. With the joint angles and
 rates known, the motion of the head (v_x, v_y, omega) is what makes the sum over the links of
@@ -92,7 +90,7 @@ class Pose(NamedTuple):
 
 
 class DeadReckoning:
-    """Adds up what the odometry says; what it gets wrong stays wrong."""
+    """Integrates the odometry; errors accumulate."""
 
     def __init__(self, calibration: Calibration, robot: Robot) -> None:
         """Start at the origin.
@@ -111,7 +109,7 @@ class DeadReckoning:
             elapsed_s: Since the last tick [s].
             phase: The gait's phase [rad].
             offset: Of the head, as the last tick set it [rad].
-            readings: What the encoders have told by now; nothing moves until they have.
+            readings: Newest readings; nothing moves before the first angles.
         """
         if not np.isnan(readings.angle).any():
             motion = self._odometry.velocity(readings.angle, readings.velocity) * elapsed_s

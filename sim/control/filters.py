@@ -1,4 +1,4 @@
-"""What stands between a distance and a joint: low pass, latched side, memory of near readings.
+"""Filters of the controllers: low pass, latched side, memory of near readings, delays in phase.
 
 Looking back along the gait's phase rather than along time.
 
@@ -21,7 +21,7 @@ TURN = 2.0 * math.pi
 
 
 class PhaseHistory:
-    """A vector as a function of the phase, as far back as asked, straight between its samples."""
+    """A vector as a function of the past phase, linear between its samples."""
 
     def __init__(self, span: float) -> None:
         """Start with nothing.
@@ -227,7 +227,7 @@ class SideLatch:
 
 
 class NearMemory:
-    """Distances of sensors that fold back: what comes nearer than they can tell reads as farther.
+    """Distances of sensors that fold back: an object closer than their peak reads as farther.
 
     An infrared triangulation sensor (Sharp GP2Y0A02 class) gives its highest voltage at its
     shortest range; nearer than that the voltage falls again. One reading can't tell the two

@@ -1,9 +1,9 @@
-"""Where the robot wants to go when nothing is in the way: at random, or to a target."""
+"""Heading policies on free ground: at random, or to a target."""
 
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
@@ -19,28 +19,6 @@ RANDOM_STREAM = 300
 """Of the scenario's seed; random turns draw from it and nothing else does."""
 
 
-class HeadingPolicy(Protocol):
-    """Says how to bend when nothing is in the way."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values."""
-        ...
-
-    @property
-    def values(self) -> FloatArray:
-        """What it meant at the last step, in the order of the names."""
-        ...
-
-    def step(self, now: ControlInput) -> float:
-        """Advance to a tick.
-
-        Returns:
-            Offset of the head [rad], positive to the right.
-        """
-        ...
-
-
 class StraightOn:
     """No course: on as the body lies."""
 
@@ -48,11 +26,7 @@ class StraightOn:
     values: FloatArray = np.zeros(0)
 
     def step(self, now: ControlInput) -> float:  # noqa: ARG002 - straight whatever is known
-        """Go straight on.
-
-        Returns:
-            0.
-        """
+        """Go straight on."""
         return 0.0
 
 
@@ -66,35 +40,26 @@ class RandomHeadingPolicy:
         self._parameters = parameters
         self._random = np.random.default_rng([seed, RANDOM_STREAM])
         self._until_s = -math.inf
-        self._offset = 0.0
-
-    @property
-    def values(self) -> FloatArray:
-        """The offset [rad]."""
-        return np.array([self._offset])
+        self.values: FloatArray = np.zeros(1)
 
     def step(self, now: ControlInput) -> float:
-        """Go on, or draw anew.
-
-        Returns:
-            Offset of the head [rad].
-        """
+        """Go on, or draw anew."""
         if now.time_s >= self._until_s:
             law = self._parameters
-            self._offset = float(self._random.uniform(-law.largest, law.largest))
+            self.values = self._random.uniform(-law.largest, law.largest, 1)
             self._until_s = now.time_s + float(self._random.uniform(law.shortest_s, law.longest_s))
-        return self._offset
+        return float(self.values[0])
 
 
 class TargetHeadingPolicy:
-    """Towards a target that the robot was told of, by compass and dead reckoning.
+    """Towards a target at a known position, by compass and dead reckoning.
 
-    The robot knows where the target lies from its start, and reckons where it is from compass and
-    encoders; no sensor tells it where the target is, or that it is met. The compass swings with
-    the head, and tells its field late; so it only puts right, slowly, the heading that the
-    encoders tell, and the way that the path goes is taken from that.
+    The target's position is given from the start; the robot's own comes from compass and encoders,
+    and no sensor measures the target. The compass swings with the head and is late; so it only
+    corrects, slowly, the heading from the encoders, and the heading of the path is that one.
     """
 
+    # Heading and bearing of the target from magnetic north [rad], and the robot's position [m].
     names = ("course.heading", "course.bearing", "course.x", "course.y")
 
     def __init__(
@@ -121,19 +86,10 @@ class TargetHeadingPolicy:
         self._north: LowPass[FloatArray] | None = None
         self._before = np.zeros(2)
         self._place = np.zeros(2)
-        self._values = np.full(len(self.names), math.nan)
-
-    @property
-    def values(self) -> FloatArray:
-        """Heading and bearing of the target from magnetic north [rad], reckoned place [m]."""
-        return self._values
+        self.values: FloatArray = np.full(len(self.names), math.nan)
 
     def step(self, now: ControlInput) -> float:
-        """Steer to where the target must be.
-
-        Returns:
-            Offset of the head [rad]; 0 before the compass has told anything.
-        """
+        """Steer to where the target must be."""
         start = self._start_from_north(now)
         moved, self._before = now.pose.place - self._before, now.pose.place
         if math.isnan(start):
@@ -141,7 +97,7 @@ class TargetHeadingPolicy:
         self._place = self._place + turned(moved, start)
         way = self._target - self._place
         heading, bearing = start + now.pose.way, math.atan2(way[1], way[0])
-        self._values = np.array([heading, bearing, *self._place])
+        self.values = np.array([heading, bearing, *self._place])
         error = math.remainder(bearing - heading, TURN)
         if self._inside_turn(math.hypot(*way), abs(error)):
             return 0.0  # no turn leads there: first away from it
@@ -165,3 +121,7 @@ class TargetHeadingPolicy:
             self._north = LowPass(self._law.filter_s, told)
         x, y = self._north.step(now.elapsed_s, told)
         return math.atan2(y, x)
+
+
+HeadingPolicy: TypeAlias = StraightOn | RandomHeadingPolicy | TargetHeadingPolicy
+"""Sets the offset of the head when nothing is in the way, and logs values by name."""

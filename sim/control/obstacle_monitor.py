@@ -1,4 +1,4 @@
-"""What is in the way, from the echoes of one sweep of the head.
+"""Obstacles in the way, from the echoes of one sweep of the head.
 
 The head of a snake that undulates swings by half a radian and more, so most of the time its
 sensors look past what is in the way. What each of them saw during the last gait period is kept,
@@ -31,7 +31,7 @@ class ControlInput(NamedTuple):
         elapsed_s: Since the tick before [s].
         phase: The gait's phase, of the horizontal plane's first joint [rad].
         pose: Where the robot reckons it is.
-        readings: What it has been told by now.
+        readings: Newest readings.
     """
 
     time_s: float
@@ -116,7 +116,7 @@ class ObstacleMonitor:
         self._seen: list[tuple[float, FloatArray]] = []
 
     def step(self, now: ControlInput) -> InTheWay:
-        """Look, and forget what is old.
+        """Add new echoes and remove old ones.
 
         Returns:
             What is in the way: echoes within 45 degrees of it and not beside it.

@@ -1,4 +1,4 @@
-"""What obstacles do to the gait: the head steers, the sides shrink, the tail hastens.
+"""Reactions of the gait to obstacles: steering, amplitude reduction, tail speed-up.
 
 The adaptive control laws of Meister, Stepanenko & Kernbach 2011: distance in, gait out.
 
@@ -85,11 +85,11 @@ class Steering:
         self.values = np.array([0.0, parameters.range_m, 1.0])
 
     def step(self, now: ControlInput, seen: InTheWay, course: float) -> float:
-        """Steer; :attr:`avoiding` says whether an obstacle is in the way.
+        """Steer; sets :attr:`avoiding` if an obstacle is in the way.
 
         Args:
             seen: What is in the way.
-            course: The offset that the course wants [rad]; it fades as an obstacle comes near.
+            course: The offset of the course [rad]; it fades as an obstacle comes near.
 
         Returns:
             The offset of the head [rad].
@@ -130,7 +130,7 @@ class AmplitudeReduction:
         self.values = np.ones(len(self._joints))
 
     def step(self, now: ControlInput, distances: Distances) -> FloatArray:
-        """Shrink; :attr:`shrinking` says whether some joint has lost a tenth of its amplitude.
+        """Shrink; sets :attr:`shrinking` if a joint has lost a tenth of its amplitude.
 
         The body sweeps to and fro beside a wall, so the distance that counts is the shortest of
         the last gait period.
@@ -157,7 +157,7 @@ class TailSpeedUp:
     names = ("haste.factor", "haste.distance")
 
     def __init__(self, parameters: TailHaste, layout: Layout) -> None:
-        """Start without haste.
+        """Start with the gait's own frequency.
 
         Args:
             layout: Who looks where.
@@ -169,7 +169,7 @@ class TailSpeedUp:
         self.values = np.array([1.0, parameters.range_m])
 
     def step(self, now: ControlInput, distances: Distances) -> float:
-        """Hasten; :attr:`hastening` says whether an obstacle is near the tail.
+        """Speed up; sets :attr:`hastening` if an obstacle is near the tail.
 
         Args:
             distances: What is around the tail.

@@ -1,4 +1,4 @@
-"""A dry run: what is to be driven, in the twin of its robot, through the gate that a bus has.
+"""Dry run of a motion in the twin of its robot, through the gate of a bus.
 
 It is the same gate (:mod:`.sim.gate.gate`), state by state: it reads the pose of the twin's servos,
 ramps to the first pose, clamps, watches and ends. What the twin does not have (temperatures, supply
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import StrEnum
@@ -20,7 +20,6 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.common.process import StopRequest
-from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.model import Robot, Safety
 
 from ..gate.gate import POSE_S, Gate
@@ -31,7 +30,7 @@ from ..scenario.scenario_file import parse_scenario
 from ..twin.recording import Driver, open_session
 from ..twin.session_log import SessionLog
 from ..twin.stability import warnings
-from ..twin.twin import Sample, Twin
+from ..twin.twin import Twin
 from .dry_run_gait import Demand, GatedGait, JointDemand, NotedGait
 from .motion import MotionSource
 
@@ -49,7 +48,7 @@ _NO_LIMIT = {"min_voltage": -math.inf}
 
 
 class Verdict(StrEnum):
-    """What a dry run comes to."""
+    """Verdict of a dry run."""
 
     RUNS = "would run"
     CLAMPED = "would be clamped"
@@ -68,9 +67,7 @@ class DryRun:
     """How a dry run went.
 
     Attributes:
-        kind: ``gait``, ``plan`` or ``commands``.
-        world: The scenario that it was in.
-        planned_s: How long it was to be [s].
+        scenario: The scenario that it was in, with its planned duration.
         duration_s: How long the gait commanded [s].
         joints: What was asked of each joint, head to tail.
         first_pose: The first commands [rad], shape (m,).
@@ -85,11 +82,8 @@ class DryRun:
         path: The session that was written, or None.
     """
 
-    driven: str
-    kind: str
-    robot: str
-    world: str
-    planned_s: float
+    driven: MotionSource
+    scenario: Scenario
     duration_s: float
     joints: tuple[JointDemand, ...]
     first_pose: FloatArray
@@ -104,7 +98,7 @@ class DryRun:
 
     @property
     def verdict(self) -> Verdict:
-        """What it comes to."""
+        """The verdict."""
         if self.missing:
             return Verdict.REFUSED
         if self.fault is not None:
@@ -118,13 +112,9 @@ class DryRun:
     @property
     def closest(self) -> tuple[str, Demand] | None:
         """The joint and the quantity that come closest to a limit, or go farthest beyond it."""
-        found = [
-            (joint.name, demand)
-            for joint in self.joints
-            for demand in joint.demands
-            if math.isfinite(demand.share)
-        ]
-        return max(found, key=lambda one: one[1].share, default=None)
+        demands = ((joint.name, demand) for joint in self.joints for demand in joint.demands)
+        finite = (one for one in demands if math.isfinite(one[1].share))
+        return max(finite, key=lambda one: one[1].share, default=None)
 
     @property
     def energy_j(self) -> tuple[float, float, float]:
@@ -147,16 +137,16 @@ def dry_run(
     stop: StopRequest | None = None,
     on_time: Callable[[float], None] | None = None,
 ) -> DryRun:
-    """Run it in the twin, and say what it would take.
+    """Run a motion in the twin and report its demands.
 
     Args:
-        robot: On which robot; the one that it was made for if None.
-        world: Where; by default the world that it was made for, and flat ground if that is not
-            known.
-        duration_s: How long [s]; its own length if None.
+        robot: The robot; the one that the motion was made for if None.
+        world: The world; by default the one that the motion was made for, or flat ground if
+            unknown.
+        duration_s: Duration [s]; that of the motion if None.
         output: The session of the twin to write, or None.
-        stop: Looked at in each tick: the dry run ends.
-        on_time: Told of the gait's time in each tick [s].
+        stop: Ends the dry run at the next tick.
+        on_time: Called with the gait's time in each tick [s].
 
     Raises:
         UsageError: If the world's robot lacks a plane, or the duration can't be.
@@ -181,37 +171,37 @@ def dry_run(
     with ExitStack() as opened:
         twin = opened.enter_context(Twin(scenario, gait))
         gait.twin = twin
-        session = None
+        log = None
         if output is not None:
             facts = {"planned_duration_s": repr(planned.duration_s), "dry_run": "yes"}
             explained = driven.attachments, driven.records
             driver = Driver(gait, {**driven.facts, **facts}, *explained)
             writer = opened.enter_context(open_session(scenario, output, driver, force=force))
-            session = _Session(writer, twin)
+            log = SessionLog(writer, twin)
         try:
             for sample in twin.samples():
                 gait.book(sample)
-                if session is not None:
-                    session.write(sample, gait.fresh_remarks())
+                if log is not None:
+                    log.write(sample)
+                    for remark in gait.fresh_remarks():
+                        log.log_event(*remark)
                 if on_time is not None:
                     on_time(gate.run_s)
                 if gate.done or (stop is not None and stop.requested):
                     break
         except SimulationError as error:
-            if session is not None:
-                session.fail(str(error))
+            if log is not None:
+                log.end("bad", str(error))
+                log.log_event("error", str(error))
             raise
         outcome, first = gate.outcome, inner.first
         complete = outcome is not None and outcome.how is DriveEnding.COMPLETE
-        if session is not None:
+        if log is not None:
             why = "it was stopped" if outcome is None else outcome.why
-            session.finish(None if complete else why)
+            log.end("good" if complete else "bad", why)
     return DryRun(
-        driven=driven.name,
-        kind=driven.kind,
-        robot=robot.name,
-        world=planned.name,
-        planned_s=planned.duration_s,
+        driven=driven,
+        scenario=planned,
         duration_s=gate.run_s,
         joints=gait.tally.joints(),
         first_pose=first,
@@ -224,27 +214,6 @@ def dry_run(
         remarks=tuple(gait.remarks),
         path=output,
     )
-
-
-class _Session:
-    """The session of the twin."""
-
-    def __init__(self, writer: SessionWriter, twin: Twin) -> None:
-        self._writer, self._twin = writer, twin
-        self._log = SessionLog(writer, twin)
-
-    def write(self, sample: Sample, remarks: Iterable[GateEvent]) -> None:
-        self._log.write(sample)
-        for remark in remarks:
-            self._log.log_event(*remark)
-
-    def finish(self, why_bad: str | None) -> None:
-        self._log.receive(self._twin.flush())
-        self._writer.set_verdict("good" if why_bad is None else "bad", [why_bad] if why_bad else [])
-
-    def fail(self, why: str) -> None:
-        self.finish(why)
-        self._log.log_event("error", why)
 
 
 def nominal_world(robot: Robot) -> Scenario:
@@ -261,7 +230,7 @@ def nominal_world(robot: Robot) -> Scenario:
 
 
 def _unlimited(robot: Robot, missing: tuple[str, ...]) -> Robot:
-    """The robot without the limits that it lacks: what they would be is what is to be found out."""
+    """Return the robot with the missing limits set to infinity."""
     given = {name: _NO_LIMIT.get(name, math.inf) for name in missing}
     return dataclasses.replace(robot, safety=dataclasses.replace(robot.safety or Safety(), **given))
 

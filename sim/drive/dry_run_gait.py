@@ -1,6 +1,6 @@
-"""The gate as a gait of the twin: it hears what the twin's servos tell, and commands them.
+"""The gate as a gait of the twin: it reads the twin's servos and commands them.
 
-What a drive asks of each joint, added up tick by tick: ranges, rates, torques, energies.
+Demands on each joint over a drive: ranges, rates, torques, energies.
 
 Torques and currents are those that the servos report, means over a control period: it is them that
 the gate watches on a bus. Energies are the twin's own ledger, at the physics rate.
@@ -52,7 +52,7 @@ class Demand:
 
 @dataclass(frozen=True)
 class JointDemand:
-    """What is asked of one joint.
+    """Demands on one joint.
 
     Attributes:
         lower: Its lower limit [rad].
@@ -125,13 +125,13 @@ class JointDemand:
 
 
 class DemandTally:
-    """Adds up; :meth:`joints` says what came of it."""
+    """Accumulates the demands; :meth:`joints` returns them."""
 
     def __init__(self, robot: Robot, limits: GateLimits) -> None:
-        """Nothing is asked yet.
+        """Start without demands.
 
         Args:
-            limits: What the gate keeps to; infinite where there is no limit.
+            limits: Limits of the gate; infinite where there is none.
         """
         count = len(robot.joints)
         self._robot, self._limits = robot, limits
@@ -146,10 +146,10 @@ class DemandTally:
         self._begun = False
 
     def command(self, wanted: FloatArray, clamped: BoolArray) -> None:
-        """Take the commands of one tick; before the first one the joints rest in that pose.
+        """Add the commands of one tick; before the first one the joints rest in that pose.
 
         Args:
-            wanted: What the gait wants [rad], shape (m,).
+            wanted: Commands of the gait [rad], shape (m,).
             clamped: Whether the gate changes it, shape (m,).
         """
         past = self._wanted or [wanted, wanted]
@@ -164,7 +164,7 @@ class DemandTally:
         self._ticks += 1
 
     def measured(self, error: FloatArray) -> None:
-        """Take how far the joints are from their commands.
+        """Add the tracking errors.
 
         Args:
             error: [rad], NaN where it isn't known, shape (m,).
@@ -172,10 +172,10 @@ class DemandTally:
         self._error = np.fmax(self._error, np.abs(error))
 
     def receive(self, samples: Sequence[SensorSample]) -> None:
-        """Take what the servos report.
+        """Add the servos' reports.
 
         Args:
-            samples: What has arrived in this tick.
+            samples: Samples that arrived in this tick.
         """
         for sample in samples:
             if isinstance(sample, JointSample):
@@ -185,7 +185,7 @@ class DemandTally:
                 self._torque_count += 1
 
     def energy(self, flows: FloatArray) -> None:
-        """Take where the ledger stands; the first time is what is counted from.
+        """Take the ledger's state; energies count from the first call.
 
         Args:
             flows: Of each joint [J], as :attr:`.sim.twin.twin.Sample.joint_energy`, shape (9, m).
@@ -195,7 +195,7 @@ class DemandTally:
         self._energy = flows
 
     def joints(self) -> tuple[JointDemand, ...]:
-        """What was asked of each joint, head to tail."""
+        """Return the demands on each joint, head to tail."""
         robot, limits = self._robot, self._limits
         rate, error, current = (
             np.where(np.isfinite(limit), limit, np.nan)
@@ -236,32 +236,26 @@ _CHANGED = 1e-12  # rad; the same as the clamp's
 
 
 class NotedGait:
-    """A gait, and its first command, and what it had to cut itself."""
+    """Wraps a gait and keeps its first command and the names of clamped values.
+
+    Attributes:
+        first: Its first command [rad], shape (m,); NaN before it.
+    """
 
     def __init__(self, gait: Gait, robot: Robot) -> None:
         """Wrap a gait."""
-        self._gait = gait
+        self._gait, self.names = gait, gait.names
         self.first: FloatArray = np.full(len(robot.joints), np.nan)
-        """Its first command [rad], shape (m,); NaN before it."""
         self._cut: dict[str, None] = {}
         self._asked = False
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values."""
-        return self._gait.names
-
-    @property
     def cut(self) -> tuple[str, ...]:
-        """Names of what it cut to the joint limits, in the order in which it came to it."""
+        """Names of values that it clamped to the joint limits, in order of occurrence."""
         return tuple(self._cut)
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:
-        """Ask the gait.
-
-        Args:
-            time_s: Time since its start [s].
-        """
+        """Ask the gait."""
         said = self._gait.step(time_s, readings)
         if not self._asked:
             self._asked, self.first = True, said.command.copy()
@@ -270,12 +264,12 @@ class NotedGait:
 
 
 class GatedGait:
-    """Stands between a gait and the twin's servos.
+    """The gate between a gait and the twin's servos.
 
     Attributes:
         twin: Whose servos they are; to be set before it runs.
-        tally: What it asks of each joint while it runs.
-        remarks: What the gate had to say.
+        tally: Demands on each joint while it runs.
+        remarks: Events of the gate.
     """
 
     def __init__(self, gait: NotedGait, gate: Gate, robot: Robot, limits: GateLimits) -> None:
@@ -283,7 +277,7 @@ class GatedGait:
 
         Args:
             gate: Its gate, before the first tick.
-            limits: What the gate keeps to.
+            limits: Limits of the gate.
         """
         self.names = gait.names
         self.twin: Twin | None = None
@@ -299,15 +293,7 @@ class GatedGait:
         self._phase = Phase.POSE
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:  # noqa: ARG002 - ticks count
-        """Ask the gate.
-
-        Args:
-            time_s: Time since the twin's start [s].
-            readings: What the twin's servos told.
-
-        Returns:
-            What passes the gate; the command before it where nothing is sent.
-        """
+        """Ask the gate."""
         assert self.twin is not None  # noqa: S101 - it steps this
         for sample in self.twin.sensed:
             if isinstance(sample, JointSample):
@@ -346,6 +332,6 @@ class GatedGait:
             self.tally.energy(sample.joint_energy)
 
     def fresh_remarks(self) -> Iterator[GateEvent]:
-        """What the gate said since this was asked before."""
+        """Return the events of the gate since the last call."""
         told, self._told = self._told, len(self.remarks)
         yield from self.remarks[told:]

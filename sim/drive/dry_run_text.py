@@ -11,6 +11,7 @@ import numpy as np
 from undulog.capture.common.console import Column, table
 
 from ..gate.limits import safety_example
+from ..gate.outcome import some_names
 from .dry_run import DryRun, Verdict
 from .dry_run_gait import Demand, JointDemand
 
@@ -97,10 +98,8 @@ def summary_lines(run: DryRun, width: int) -> Iterator[str]:
     """
     yield from _answer(run)
     yield from _remarks(run)
-    yield (
-        f"{run.kind} in the twin of {run.robot} in {run.world}, {run.duration_s:g} s; nothing was "
-        "sent, and no bus opened"
-    )
+    where = f"{run.driven.kind} in the twin of {run.scenario.robot.name} in {run.scenario.name}"
+    yield f"{where}, {run.duration_s:g} s; nothing was sent, and no bus opened"
     yield _approach(run)
     seconds = max(run.duration_s, 1e-9)
     net, absolute, electrical = run.energy_j
@@ -115,7 +114,8 @@ def summary_lines(run: DryRun, width: int) -> Iterator[str]:
 
 
 def _answer(run: DryRun) -> Iterator[str]:
-    what, near = f"{run.driven} on {run.robot}", _nearest(run)
+    robot, near = run.scenario.robot.name, _nearest(run)
+    what = f"{run.driven.name} on {robot}"
     match run.verdict:
         case Verdict.RUNS:
             yield f"{what} would run as it is; {near}"
@@ -128,13 +128,11 @@ def _answer(run: DryRun) -> Iterator[str]:
         case Verdict.UNFINISHED:
             yield (
                 f"{what}: not known, the dry run was stopped at {run.duration_s:g} s of "
-                f"{run.planned_s:g} s; {near}"
+                f"{run.scenario.duration_s:g} s; {near}"
             )
         case Verdict.REFUSED:
-            yield (
-                f"{what} would not start: {run.robot} lacks the limits {', '.join(run.missing)}; "
-                f"{near}"
-            )
+            lacks = f"{robot} lacks the limits {', '.join(run.missing)}"
+            yield f"{what} would not start: {lacks}; {near}"
             yield "Its description needs this, with values of its own; --robot names the file:"
             yield from (f"  {line}" for line in safety_example(run.missing).splitlines())
 
@@ -156,9 +154,8 @@ def _clamps(run: DryRun) -> str:
     named = [
         f"{joint.name} {joint.clamped:.0%} of the time" for joint in run.joints if joint.clamped
     ]
-    more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
     cut = f"cut to the joint limits: {', '.join(run.cut)}" if run.cut else ""
-    return "; ".join(part for part in (", ".join(named[:_NAMED]) + more, cut) if part)
+    return "; ".join(part for part in (some_names(named, _NAMED), cut) if part)
 
 
 def _remarks(run: DryRun) -> Iterator[str]:
@@ -193,14 +190,14 @@ def reported(run: DryRun) -> dict[str, Any]:
     seconds = max(run.duration_s, 1e-9)
     return {
         "armed": False,
-        "driven": run.driven,
-        "kind": run.kind,
-        "robot": run.robot,
-        "world": run.world,
+        "driven": run.driven.name,
+        "kind": run.driven.kind,
+        "robot": run.scenario.robot.name,
+        "world": run.scenario.name,
         "verdict": str(run.verdict),
         "would_run": run.verdict.fit,
         "duration_s": run.duration_s,
-        "planned_duration_s": run.planned_s,
+        "planned_duration_s": run.scenario.duration_s,
         "stop": _stop(run),
         "missing_limits": list(run.missing),
         "closest": None if found is None else {"joint": found[0], **_demand(found[1])},

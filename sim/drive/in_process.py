@@ -1,4 +1,4 @@
-"""Driving the twin in process: as fast as it can, recorded like any run of the twin."""
+"""Drive the twin in process, as fast as possible, and record it like any run of the twin."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from ..twin.twin import Sample
 from .motion import MotionSource
 
 FADE_S = 1.0
-"""A gait that is to stop comes to rest within this time [s]."""
+"""Duration of the fade to rest [s]."""
 
 STOP = "stop"
-"""The mode of a gait that comes to rest."""
+"""Mode of a gait that comes to rest."""
 
 _ROUNDING_S = 1e-9  # a tick that is due when the fade ends is in time
 _FADED = ("A", "offset")  # of a plane or a joint, not of what a controller tells of itself
@@ -43,6 +43,7 @@ class FadingGait:
             fade_s: T [s].
         """
         self._gait, self._fade_s = gait, fade_s
+        self.names = gait.names
         waves = {*Plane, *robot.joint_names}
         parts = [name.rpartition(".") for name in gait.names]
         faded = [wave in waves and value in _FADED for wave, _, value in parts]
@@ -51,11 +52,6 @@ class FadingGait:
         self._asked = False
         self._begun_s: float | None = None
         self._passed = 0.0  # share of the fade's time
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values: the gait's own."""
-        return self._gait.names
 
     @property
     def at_rest(self) -> bool:
@@ -67,11 +63,7 @@ class FadingGait:
         self._asked = True
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:
-        """Advance to a time and say what to do from then on.
-
-        Args:
-            time_s: Time since the start [s], never less than in the call before.
-        """
+        """Return the commands at a time."""
         tick = self._gait.step(time_s, readings)
         if not self._asked:
             return tick
@@ -101,7 +93,7 @@ def drive_twin(
 
     Args:
         scenario: Where; from :meth:`.sim.drive.motion.MotionSource.scenario`.
-        on_sample: Told of each sample after it was written.
+        on_sample: Called with each sample after it is written.
 
     Raises:
         SimulationError: If the twin's state becomes impossible.

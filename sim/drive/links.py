@@ -1,4 +1,4 @@
-"""A robot's bus as the control loop sees it, and that of undulog's own virtual robot.
+"""A robot's bus as the control loop uses it, and that of undulog's virtual robot.
 
 The virtual robot runs on this computer and says what it is. A client that sends ``< undulog >`` is
 answered ``< undulog virtual-robot NAME PACE >``, and from then on gets ``< tick N >`` after the
@@ -59,10 +59,15 @@ _GAIT_QUANTITIES = {*_OF_JOINTS, Quantity.RANGE, *_VECTORS}
 
 
 class BusReadings:
-    """Gathers decoded frames; ask :meth:`readings` once a control tick."""
+    """Collects decoded frames; call :meth:`readings` once a control tick.
+
+    Attributes:
+        tally: Counts of frames by their decoding.
+        angles: Angles received of each joint so far, shape (m,).
+    """
 
     def __init__(self, robot: Robot, oldest_s: float = OLDEST_S) -> None:
-        """Know nothing yet.
+        """Start without values.
 
         Args:
             robot: The robot; it has a bus map.
@@ -86,9 +91,7 @@ class BusReadings:
             q: {} for q in _VECTORS
         }
         self.tally = FrameTally()
-        """What became of the frames so far."""
         self.angles: IntArray = np.zeros(count, dtype=np.int64)
-        """Angles received of each joint so far, shape (m,)."""
 
     def add(self, frames: FrameArray, time_s: float) -> None:
         """Take frames, in the order in which they came.
@@ -103,7 +106,7 @@ class BusReadings:
             self._take(decoded, time_s)
 
     def readings(self, time_s: float) -> Readings:
-        """What is known.
+        """Return the newest values.
 
         Args:
             time_s: Now, on the loop's clock [s].
@@ -122,7 +125,7 @@ class BusReadings:
         return Readings(angle, velocity, ranges, acceleration, field)
 
     def status(self, time_s: float) -> JointStatus:
-        """What is known of the servos.
+        """Return the newest values of the servos.
 
         Args:
             time_s: Now, on the loop's clock [s].
@@ -174,7 +177,7 @@ class BusReadings:
 
 
 def _with_gait_signals(robot: Robot) -> Robot:
-    """The robot with a bus map of what a gait is told: the rest costs time in every tick."""
+    """Return the robot with only the signals of a gait in its bus map, to save time."""
     if robot.bus is None:
         return robot
     signals = tuple(signal for signal in robot.bus.signals if signal.quantity in _GAIT_QUANTITIES)
@@ -201,7 +204,7 @@ class Link(Protocol):
         ...
 
     def receive(self) -> Sequence[FrameArray]:
-        """Take what has come, without waiting.
+        """Return the received frames, without waiting.
 
         Returns:
             Arrays of records of :data:`.FRAME_DTYPE`, in the order they came.
@@ -233,7 +236,7 @@ class Link(Protocol):
 
 
 def find_virtual_robot(address: SourceAddress, tally: Tally) -> VirtualRobotLink | None:
-    """Ask a socketcand server whether it is a virtual robot.
+    """Find out whether a socketcand server is a virtual robot.
 
     Args:
         address: ``can:socketcand:CHANNEL?port=PORT``.
@@ -263,7 +266,7 @@ def find_virtual_robot(address: SourceAddress, tally: Tally) -> VirtualRobotLink
 
 
 def _identity(sock: socket.socket, rest: bytes) -> tuple[re.Match[str] | None, bytes]:
-    """What a server on this computer says that it is, and what came behind."""
+    """Return the identity of a server on this computer, and the rest of its answer."""
     if not ipaddress.ip_address(sock.getpeername()[0]).is_loopback:
         return None, rest
     try:
@@ -309,11 +312,7 @@ class VirtualRobotLink:
         self._ticks: list[tuple[int, int]] = []  # tick, and how many of the ready arrays are of it
 
     def receive(self) -> Sequence[FrameArray]:
-        """Take what has come, without waiting; tick marks are passed over.
-
-        Raises:
-            SourceError: If the robot is gone.
-        """
+        """Return the received frames, without waiting; tick marks are skipped."""
         while select.select([self._socket], [], [], 0.0)[0]:
             self._read()
         found, self._ready, self._ticks = self._ready, [], []
@@ -343,19 +342,7 @@ class VirtualRobotLink:
         return tick, frames
 
     def send(self, frames: FrameArray, earliest_ns: IntArray | None = None) -> IntArray:
-        """Put frames on the bus, all of them at once.
-
-        Args:
-            frames: Records of :data:`.FRAME_DTYPE`, data frames, shape (n,).
-            earliest_ns: No frame is sent before its time on the session's clock [ns], shape (n,);
-                None: at once.
-
-        Returns:
-            When the bus had them, on the session's clock [ns], shape (n,).
-
-        Raises:
-            SourceError: If the robot is gone, or takes nothing.
-        """
+        """Put frames on the bus, all of them at once."""
         text = sent_text(frames)
         if earliest_ns is not None:
             wait_until(int(earliest_ns.max(initial=0)), self._tally.now_ns)
@@ -372,7 +359,7 @@ class VirtualRobotLink:
         self._socket.close()
 
     def _read(self) -> None:
-        """Take one piece of what has come."""
+        """Read one chunk of received text."""
         try:
             chunk = self._socket.recv(_CHUNK)
         except OSError as error:

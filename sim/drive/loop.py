@@ -1,4 +1,4 @@
-"""The control loop over a bus: read, ask the gate, encode, send; once a control period."""
+"""The control loop over a bus: read, step the gate, encode, send; once a control period."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _STREAMS = (0, 1, 2)
 
 
 class ConsoleWatch:
-    """Notices that a terminal hung up; one that never was is not missed."""
+    """Detects that a terminal hung up."""
 
     def __init__(self) -> None:
         """Look which of the standard streams are terminals."""
@@ -109,7 +109,7 @@ class LockstepPace:
     late_s = 0.0
 
     def __init__(self, link: VirtualRobotLink) -> None:
-        """The first tick that the robot tells is tick 0."""
+        """Take the robot's next tick as tick 0."""
         self._link = link
         self._first: int | None = None
 
@@ -183,7 +183,7 @@ class LoopTally:
         loop_s: Time of the last tick, from the first [s].
         overruns: Ticks left out because the one before took too long.
         commanded: Whether a command was among them.
-        untold: Ticks that the session could not take.
+        untold: Ticks that could not be written to the session.
         decoded: Frames of these with something that the robot's map names.
         late_s: How late each tick was [s], where the clock sets the pace.
     """
@@ -238,10 +238,10 @@ class ControlLoop:
         """Put it together.
 
         Args:
-            gate: Who decides what is sent.
+            gate: Decides what is sent.
             spacing: How closely commands may follow each other; None where the robot sets the
                 pace, and all ticks are a period apart.
-            confirmation: What replies confirm; None where the robot sets the pace.
+            confirmation: Commands confirmed by replies; None where the robot sets the pace.
 
         Raises:
             DataError: If the robot has no bus.
@@ -274,7 +274,7 @@ class ControlLoop:
 
         Args:
             stop: Looked at in each tick.
-            on_tick: Told of each tick after the commands are sent.
+            on_tick: Called with each tick after the commands are sent.
             console: The terminal whose loss ends the drive, if it has one.
 
         Raises:
@@ -339,7 +339,7 @@ class ControlLoop:
         )
 
     def _send(self, step: GateStep, heard: GateInput) -> FrameArray:
-        """Send the commands, then ask for the state where the robot doesn't tell it unasked.
+        """Send the commands, then the requests where the robot reports only on request.
 
         The requests follow the commands, so that a reply confirms these.
         """

@@ -1,4 +1,4 @@
-"""What is driven: a scenario's gait, a plan, or the commands of a session; found by its name.
+"""Motions to be driven: a scenario's gait, a plan, or the commands of a session.
 
 Recorded commands, given again at their own times: each joint's by zero-order hold.
 
@@ -72,11 +72,11 @@ class _Held:
 
 @dataclass(frozen=True)
 class RecordedCommands:
-    """What a session tells of its commands.
+    """The commands of a session.
 
     Attributes:
         commands: Joint angles [rad], of some or all of a robot's joints.
-        gait: What the controller meant by them, None where it was not recorded.
+        gait: The values of the gait, None where they were not recorded.
         modes: Its modes, with the times from which they were in force [Unix ns], in order.
     """
 
@@ -108,7 +108,7 @@ class CommandReplay:
 
         Args:
             recorded: The commands; joints without one are held straight.
-            robot: Who is to do it.
+            robot: The robot that executes them.
 
         Raises:
             JointSetError: If the robot lacks one of the joints.
@@ -129,14 +129,10 @@ class CommandReplay:
         self._lower, self._upper = robot.limits()
         self._rest = np.clip(np.zeros(len(robot.joints)), self._lower, self._upper)
         self._gait = _Held(recorded.gait) if recorded.gait is not None else None
+        self.names: tuple[str, ...] = self._gait.names if self._gait is not None else ()
         self._since_ns = [t_ns for t_ns, _ in recorded.modes]
         self._modes = [REPLAY, *(mode for _, mode in recorded.modes)]
         self._start_ns, self._end_ns = held.span()
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values: those that the session's controller meant, perhaps none."""
-        return self._gait.names if self._gait is not None else ()
 
     @property
     def duration_s(self) -> float:
@@ -145,14 +141,7 @@ class CommandReplay:
         return max(math.ceil(periods - 1e-6), 1) / CONTROL_RATE_HZ
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:  # noqa: ARG002 - recorded
-        """Say which commands were in force.
-
-        Args:
-            time_s: Time since the start [s].
-
-        Returns:
-            Commands, cut to the joint limits, and what was meant by them.
-        """
+        """Return the commands in force at a time."""
         t_ns = self._start_ns + round(time_s * _NS)
         wanted = self._rest.copy()
         given = self._commands.at(t_ns)
@@ -165,26 +154,26 @@ class CommandReplay:
         return GaitTick(command, values, mode, clamped)
 
 
+# Attachments of recorded commands that say what they were made from: they go on to the run.
 _EXPLAINS = ("plan.toml", "gait.toml")
-"""Attachments of recorded commands that say what they were made from: they go on to the run."""
 
 _HEADING = "heading_rad"
+# Keys of a plan's record: by how much the robot is turned [rad], and the number of the run.
 _RUN = "run"
-"""Keys of a plan's record: by how much the robot is turned [rad], and the number of the run."""
 
 _Number = TypeVar("_Number", int, float)
 
+# Metadata records of recorded commands that say what they are for: likewise.
 _RECORDS = ("undulog.plan",)
-"""Metadata records of recorded commands that say what they are for: likewise."""
 
 
 @dataclass(frozen=True)
 class MotionSource:
-    """What is driven.
+    """A motion to be driven.
 
     Attributes:
         kind: ``gait``, ``plan`` or ``commands``.
-        robot: Who it was made for.
+        robot: The robot that it was made for.
         world: Finds the scenario that it was made for, None where that isn't known.
         planes: The planes that it needs.
         make: Builds the gait, at time zero, for a robot; in a world if that is given, else in the
@@ -221,14 +210,8 @@ class MotionSource:
     run: int = 0
     as_run: bool = False
 
-    @property
-    def session_facts(self) -> Mapping[str, str]:
-        """What the metadata of a session without a scenario says of it."""
-        settled = {} if self.settle_s is None else {"settle_s": repr(self.settle_s)}
-        return {**self.facts, **settled}
-
     def check_fits(self, robot: Robot) -> None:
-        """See that a robot on a bus is one that it can be driven on: the same joints, the planes.
+        """Check that a robot on a bus has the joints and the planes of the motion.
 
         Raises:
             JointSetError: If its commands are of another joint set.
@@ -289,7 +272,7 @@ def find_motion(
     changes: Mapping[str, Any] | None = None,
     robot: Robot | None = None,
 ) -> MotionSource:
-    """Find what is to be driven.
+    """Find a motion by name.
 
     Args:
         word: Name of a shipped scenario, or a file: a scenario or a plan (TOML), or a session of
@@ -297,7 +280,7 @@ def find_motion(
         world: Where it will be run, if that is known: its robot takes recorded commands.
         changes: Of recorded commands: what to change of the world that they were recorded in, see
             :func:`.sim.scenario.scenario_file.parse_scenario`.
-        robot: Who takes recorded commands, whatever the session or the world say.
+        robot: The robot for recorded commands, in place of that of the session or world.
 
     Raises:
         UsageError: If there is no such thing.
@@ -416,5 +399,5 @@ def _planned(
 
 
 def _kernels(told: str | None) -> Kernels:
-    """What a session says of its kernels; the default where that is nothing we know."""
+    """Return the kernels of a session; the default if unknown."""
     return Kernels(told) if told in set(Kernels) else Kernels.NUMPY

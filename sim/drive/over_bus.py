@@ -40,12 +40,12 @@ _NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class BusPlan:
-    """What to do over a bus.
+    """Parameters of a drive over a bus.
 
     Attributes:
-        limits: What that robot may do.
+        limits: Limits of the robot.
         duration_s: Time of the gait's last tick.
-        recorder: Control socket of a recorder that is told the gait, or None.
+        recorder: Control socket of the recorder that receives the gait, or None.
     """
 
     driven: MotionSource
@@ -61,25 +61,25 @@ class BusPlan:
 def bus_plan(
     driven: MotionSource,
     on: str,
-    *,
+    output: Path,
     robot: Robot | None = None,
     duration_s: float | None = None,
-    output: Path,
+    *,
     recorder: Path | None = None,
     force: bool = False,
 ) -> BusPlan:
-    """Check what was asked for.
+    """Check the arguments of a drive.
 
     Args:
         on: The bus, ``can:INTERFACE:CHANNEL[...]``.
-        robot: On which robot; the one that it was made for if None.
-        duration_s: How long [s]; its own length if None.
+        robot: The robot on the bus; the one that the motion was made for if None.
+        duration_s: Duration [s]; that of the motion if None.
         recorder: Control socket of a recorder, or None.
 
     Raises:
-        UsageError: If the address is none, the robot has no bus or lacks limits, a joint can't
-            be commanded or tells no angle, the commands are of other joints, or the duration
-            can't be.
+        UsageError: If the address is not that of a bus, the robot has no bus or lacks limits, a
+            joint takes no commands or reports no angle, the commands are for other joints, or the
+            duration is out of range.
     """
     address = bus_address(on)
     robot = robot or driven.robot
@@ -94,7 +94,7 @@ def bus_plan(
 
 
 def check_drivable(driven: MotionSource, robot: Robot) -> None:
-    """See that it can be driven on a bus of the robot at all, armed or dry.
+    """Check that a motion can be driven on a bus of the robot, armed or dry.
 
     Raises:
         UsageError: If the robot has no bus, a joint can't be commanded or tells no angle, or the
@@ -115,7 +115,7 @@ def check_drivable(driven: MotionSource, robot: Robot) -> None:
 
 
 def bus_address(on: str) -> SourceAddress:
-    """What ``--on`` names, if it is a bus.
+    """Return the address of the bus that ``--on`` names.
 
     Args:
         on: ``can:INTERFACE:CHANNEL[...]``.
@@ -140,7 +140,7 @@ def drive_bus(
 
     Args:
         stop: The drive ends as the robot's file says when it is requested; at once if again.
-        on_tick: Told of each tick.
+        on_tick: Called with each tick.
         console: The terminal whose loss ends the drive likewise, if there is one.
 
     Returns:
@@ -162,8 +162,18 @@ def drive_bus(
         virtual = _virtual(link, plan)
         lockstep = virtual is not None and virtual.lockstep
         epoch_ns = Scenario.epoch_s * _NS if lockstep else clock.epoch_ns
-        session = _session(plan, link, epoch_ns, gait.names)
+        session = BusSession(
+            plan.output,
+            plan.driven,
+            robot=robot,
+            address=plan.address,
+            clock=link.clock,
+            epoch_ns=epoch_ns,
+            gait_names=gait.names,
+            force=plan.force,
+        )
         opened.callback(session.close)
+        session.writer.note("undulog.gate", plan.limits.facts())
         teller = None
         if plan.recorder is not None:
             teller = GaitPublisher(plan.recorder, gait.names)
@@ -223,7 +233,7 @@ def drive_bus(
 
 
 def _virtual(link: Link, plan: BusPlan) -> VirtualRobotLink | None:
-    """The bus, if it is the virtual robot's; None if it is any other."""
+    """Return the link if it is that of a virtual robot, else None."""
     if not isinstance(link, VirtualRobotLink):
         return None
     if link.robot_name != plan.robot.name:
@@ -234,29 +244,10 @@ def _virtual(link: Link, plan: BusPlan) -> VirtualRobotLink | None:
     return link
 
 
-def _session(plan: BusPlan, link: Link, epoch_ns: int, names: tuple[str, ...]) -> BusSession:
-    bus = plan.address.name
-    session = BusSession(
-        plan.output,
-        robot=plan.robot,
-        bus=bus,
-        clock=link.clock,
-        epoch_ns=epoch_ns,
-        gait_names=names,
-        facts={**plan.driven.facts, "armed": "yes", f"source.{bus}": plan.address.text},
-        settle_s=plan.driven.settle_s,
-        attachments=plan.driven.attachments,
-        records=plan.driven.records,
-        force=plan.force,
-    )
-    session.writer.note("undulog.gate", plan.limits.facts())
-    return session
-
-
 def _unwritten(
     error: LogWriteError, session: BusSession, gate: Gate, tally: LoopTally
 ) -> LogWriteError:
-    """A session that can't be written, with what became of the robot and what is missing."""
+    """Return the error of a session that can't be written, with the outcome of the drive."""
     try:
         session.close()
     except LogWriteError as later:  # says what is kept, and where
@@ -270,7 +261,7 @@ def _unwritten(
 
 
 def _feedback(gate: Gate, loop: ControlLoop) -> Feedback | None:
-    """What supervises the drive; None before it is armed."""
+    """Return the supervision of the drive; None before it is armed."""
     if (interval := gate.silence.interval) is None:
         return None
     period_s = 1.0 / CONTROL_RATE_HZ
@@ -299,7 +290,7 @@ def _report(gate: Gate, loop: ControlLoop, spacing: Spacing | None, bus: SourceC
 
 
 class _Telling:
-    """Everyone who is told what happens: session, recorder, screen."""
+    """Publishes the drive to the session, the recorder and the screen."""
 
     def __init__(
         self,
@@ -312,7 +303,7 @@ class _Telling:
         simulated_ns: int | None,
         on_tick: Callable[[BusTick], None] | None,
     ) -> None:
-        """Nothing is told yet; ``simulated_ns`` is the time of tick 0 of a robot in lockstep."""
+        """Start; ``simulated_ns`` is the time of tick 0 of a robot in lockstep."""
         self.first_frames: list[str] = []
         self._plan, self._session, self._teller = plan, session, teller
         self._events = tally.events
@@ -345,7 +336,7 @@ class _Telling:
             self._on_tick(tick)
 
     def feedback(self, feedback: Feedback | None) -> None:
-        """Write what supervises the drive, as it is armed and where it changes."""
+        """Write the supervision of the drive when it is armed and when it changes."""
         if feedback is None or feedback == self._feedback:
             return
         if self._feedback is not None:

@@ -132,7 +132,7 @@ class PlanGait(WaveGenerator):
         super().__init__(rhythms, robot, per_joint=per_joint)
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:
-        """Advance to a time and say what to do from then on."""
+        """Return the commands at a time."""
         segment = bisect_right(self._starts, time_s) - 1
         return super().step(time_s, readings)._replace(mode=self._modes[segment])
 
@@ -227,7 +227,7 @@ def _scenario(top: Table, folder: Path) -> Scenario | None:
 
 
 def _start(top: Table, scenario: Scenario | None) -> tuple[dict[Plane, PlaneGait], float]:
-    """What each plane does at time zero, and the ramp [s]."""
+    """Return the gait of each plane at time zero, and the ramp [s]."""
     robot = scenario.robot if scenario is not None else None
     given = "gait" in top
     if given:

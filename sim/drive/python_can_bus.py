@@ -1,4 +1,4 @@
-"""Any bus that python-can can open, to be driven on: heard by a thread, sent to from the loop."""
+"""Any bus that python-can can open: a thread receives, the control loop sends."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from undulog.capture.sources.socketcand import server_of
 
 from .links import VirtualRobotLink, find_virtual_robot, wait_until
 
+# So long a full transmit queue may hold a frame up [s]; of 25 frames on 1 Mbit/s the last one waits
+# 3 ms.
 _SEND_S = 0.02
-"""So long a full transmit queue may hold a frame up [s]; of 25 frames on 1 Mbit/s the last one
-waits 3 ms."""
 
 
 class _Complaints(logging.Handler):
@@ -110,11 +110,7 @@ class PythonCanBus:
         self._now_ns = tally.now_ns
 
     def receive(self) -> Sequence[FrameArray]:
-        """Take what has come, without waiting; CAN FD frames carry nothing of a bus map.
-
-        Raises:
-            SourceError: If the bus is lost.
-        """
+        """Take what has come, without waiting; CAN FD frames carry nothing of a bus map."""
         try:
             found = self._link.read(self._now_ns())
         except OSError as error:
@@ -122,19 +118,7 @@ class PythonCanBus:
         return [frames for frames in found if len(frames) and not holds_fd(frames)]
 
     def send(self, frames: FrameArray, earliest_ns: IntArray | None = None) -> IntArray:
-        """Put frames on the bus, one after the other.
-
-        Args:
-            frames: Records of :data:`.FRAME_DTYPE`, data frames, shape (n,).
-            earliest_ns: No frame is sent before its time on the session's clock [ns], shape (n,);
-                None: at once.
-
-        Returns:
-            When the bus had each of them, on the session's clock [ns], shape (n,).
-
-        Raises:
-            SourceError: If the bus doesn't take them.
-        """
+        """Put frames on the bus, one after the other."""
         sent_ns: list[int] = []
         times: list[int] = [0] * len(frames) if earliest_ns is None else earliest_ns.tolist()
         columns = (frames["id_flags"].tolist(), frames["dlc"].tolist(), frames["data"], times)
@@ -164,7 +148,7 @@ class PythonCanBus:
 
 
 def open_link(address: SourceAddress, tally: Tally) -> VirtualRobotLink | PythonCanBus:
-    """Open a bus: a virtual robot's where one says that it is there, else any of python-can's.
+    """Open a bus: that of a virtual robot if one answers, else one of python-can.
 
     Args:
         address: ``can:INTERFACE:CHANNEL``; for socketcand with ``plain=yes`` the server is not

@@ -1,9 +1,8 @@
-"""The session of a drive over a bus: what was wanted, what was sent, and what came.
+"""The session of a drive over a bus: requested and sent commands, and received frames.
 
-Telling a running recorder what the controller means: ``/gait`` and ``/gait/mode``.
-
-The recorder answers once a tick of its own, so a thread asks: the control loop only leaves what is
-to be told. A recorder that goes, refuses or is slow never holds the loop up.
+A running recorder receives the gait's values for ``/gait`` and ``/gait/mode``. It answers once a
+tick of its own, so a thread sends the requests: the control loop only queues them. A recorder that
+exits, refuses or is slow never delays the loop.
 """
 
 from __future__ import annotations
@@ -28,12 +27,13 @@ from undulog.capture.recorder.bus_recorder import BusRecorder
 from undulog.capture.recorder.control_client import ControlClient
 from undulog.capture.recorder.source_clock import SourceClock
 from undulog.capture.robot.model import ClockDomain, Robot
-from undulog.capture.sources.contract import DEVICE_TIMES_END_NS
+from undulog.capture.sources.contract import DEVICE_TIMES_END_NS, SourceAddress
 
 from ..gait.contract import GaitTick
 from ..gate.outcome import DriveEnding, GateEvent, Outcome
 from ..twin.session_log import GAIT_UNIT
 from .loop import BusTick
+from .motion import MotionSource
 
 _MOST_HELD = 1000
 _AT_ONCE = 64
@@ -47,7 +47,7 @@ class GaitPublisher:
     Attributes:
         told: Samples of the gait that the recorder took.
         dropped: Samples that it had no time for.
-        error: Why it is told nothing any more; None while it is.
+        error: Why nothing more is sent; None while it is.
     """
 
     def __init__(self, path: Path, names: Sequence[str]) -> None:
@@ -71,7 +71,7 @@ class GaitPublisher:
         self._thread.start()
 
     def note(self, text: str, level: str = "info") -> None:
-        """Leave a remark for ``/rosout``.
+        """Queue an event for ``/rosout``.
 
         Args:
             level: ``info``, ``warn`` or ``error``.
@@ -79,7 +79,7 @@ class GaitPublisher:
         self._held.append({"do": "note", "text": text, "level": level})
 
     def publish(self, tick: GaitTick, t_ns: int) -> None:
-        """Leave what the gait says, without waiting.
+        """Queue the gait's values, without waiting.
 
         Args:
             t_ns: From when on it holds [Unix ns].
@@ -98,7 +98,7 @@ class GaitPublisher:
         self._held.append({"do": "gait", "values": named, "t_ns": t_ns})
 
     def close(self) -> None:
-        """Tell what is left, for a few seconds, and disconnect; safe to call twice."""
+        """Send the rest, for a few seconds, and disconnect; safe to call twice."""
         self._ended.set()
         self._thread.join(_LAST_S)
         self._client.close()
@@ -121,10 +121,10 @@ class GaitPublisher:
 
 _EVENTS_OF = "drive"
 _DECODE_TICKS = 10  # many frames at once cost little more than a few
+# So much has to be free [byte]: what the write-ahead log reserves, and a part of a minute.
 _ROOM = 48 << 20
-"""So much has to be free [byte]: what the write-ahead log reserves, and a part of a minute."""
+# So much of an ending is kept on a full disk [byte]: more than ten seconds of 25 joints.
 _LAST_WORDS = 4 << 20
-"""So much of an ending is kept on a full disk [byte]: more than ten seconds of 25 joints."""
 
 
 class BusSession:
@@ -138,36 +138,31 @@ class BusSession:
     def __init__(
         self,
         path: Path,
+        driven: MotionSource,
         *,
         robot: Robot,
-        bus: str,
+        address: SourceAddress,
         clock: ClockDomain,
         epoch_ns: int,
         gait_names: tuple[str, ...],
-        facts: Mapping[str, str],
-        settle_s: float | None,
-        attachments: Mapping[str, bytes],
-        records: Mapping[str, Mapping[str, str]],
         force: bool = False,
     ) -> None:
         """Open the session.
 
         Args:
-            bus: The bus's name.
-            clock: Whose clock the frames' device times are on.
+            robot: The robot on the bus.
+            address: The bus.
+            clock: Clock of the frames' device times.
             epoch_ns: Unix time of its start [ns].
             gait_names: Names of the gait's values.
-            settle_s: The first part of the gait that is not fit for steady-state analysis [s],
-                None where it isn't known.
-            attachments: File name to TOML text that explains what is driven.
-            records: Other metadata records that explain it, by name.
 
         Raises:
-            OutputExistsError: If the file is there and ``force`` is not given, or what a drive
+            OutputExistsError: If the file exists and ``force`` is not given, or what a drive
                 that was killed left of it.
             LogWriteError: If it can't be created, or there is no room for it.
             DataError: If the robot has no bus.
         """
+        bus = address.name
         require_space(path, _ROOM)
         self._sink = DurableSink(path, force=force, last_words=_LAST_WORDS)
         self.writer = SessionWriter(
@@ -176,10 +171,10 @@ class BusSession:
             epoch_ns=epoch_ns,
             robot=robot,
             clock={bus: clock},
-            metadata=facts,
+            metadata={**driven.facts, "armed": "yes", f"source.{bus}": address.text},
             sink=self._sink,
         )
-        self.writer.explain(attachments, records)
+        self.writer.explain(driven.attachments, driven.records)
         names = robot.joint_names
         self._commands = self.writer.joint_state("/joint_commands", names, unit="rad")
         self._wanted = self.writer.joint_state("/gate/wanted", names, unit="rad")
@@ -190,7 +185,7 @@ class BusSession:
         self._phase = self.writer.string("/gate/phase")
         self._events = self.writer.log("/rosout")
         self._frames = BusRecorder(bus, self.writer, SourceClock(), robot, directions=True)
-        self._settle_s = settle_s
+        self._settle_s = driven.settle_s
         self._last = {"mode": "", "phase": ""}
         self._said: set[str] = set()
         self._epoch_ns = self._t_ns = epoch_ns
@@ -277,10 +272,10 @@ class BusSession:
             self._events.write(self._t_ns, level, _EVENTS_OF, text)
 
     def finish(self, outcome: Outcome, remarks: Sequence[GateEvent]) -> None:
-        """Say how it went.
+        """Write the outcome.
 
         Args:
-            remarks: What is worth a line, the warnings among them as reasons for the verdict.
+            remarks: Events; the warnings among them are reasons for the verdict.
         """
         level = "error" if outcome.how is DriveEnding.FAULT else "info"
         why = f": {outcome.why}" if outcome.why else ""
@@ -294,7 +289,7 @@ class BusSession:
             self.writer.set_verdict("degraded" if reasons else "good", reasons)
 
     def fail(self, text: str) -> None:
-        """Say why it failed."""
+        """Write the failure."""
         self.log_event("error", text)
         self.writer.set_verdict("bad", [text])
 

@@ -1,1 +1,1 @@
-"""Gaits: what the joints are commanded to do. :mod:`.sim.gait.contract` says what each offers."""
+"""Gaits: commands of the joints over time. :mod:`.sim.gait.contract` defines their interface."""

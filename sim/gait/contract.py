@@ -1,14 +1,14 @@
-"""What every gait generator offers, and what a controller may change of it.
+"""Interface of gait generators, and the changes that a controller may make to them.
 
-A gait is asked once a control tick, in order of time, with the readings that the robot's computer
-has by then; it answers with the joint commands and with what it meant by them. Each plane's phase
+A gait is stepped once a control tick, in order of time, with the newest readings of the robot's
+computer; it returns the joint commands and the values behind them. Each plane's phase
 is *integrated*, Phi' = omega, and never computed as omega t: the two differ as soon as omega
 changes.
 
-What the robot's computer knows at one control tick: the newest value of each sensor.
+Readings hold the newest value of each sensor at one control tick.
 
-Gaits and controllers see this and never the truth: values are noisy, quantised and late, as the
-sensors and the bus make them, and the same whether twin or robot sent them.
+Gaits and controllers use these and never the true state: values are noisy, quantised and late, as
+the sensors and the bus make them, and the same whether twin or robot sent them.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Readings:
 
     @classmethod
     def nothing(cls, robot: Robot) -> Readings:
-        """What is known before anything was reported."""
+        """Return readings without values."""
         unknown = frozen(np.full(len(robot.joints), np.nan))
         return cls(unknown, unknown)
 
@@ -57,11 +57,11 @@ WALK = "walk"
 
 
 class GaitTick(NamedTuple):
-    """What a gait says at one control tick.
+    """Output of a gait at one control tick.
 
     Attributes:
         command: Joint angles to be reached [rad], shape (m,).
-        values: What the gait meant, in the order of :attr:`Gait.names`, shape (k,).
+        values: Values of the gait, in the order of :attr:`Gait.names`, shape (k,).
         mode: One word for what the gait is about.
         clamped: Names of values that were cut to the joint limits: ``horizontal.A`` where it
             concerns all joints of the plane, ``joint03.A`` where it concerns some.
@@ -74,7 +74,7 @@ class GaitTick(NamedTuple):
 
 
 class Gait(Protocol):
-    """What the twin and the bus loop run: an open-loop generator, or one under a controller."""
+    """A gait of the twin or the bus loop: an open-loop generator, or one under a controller."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -82,18 +82,18 @@ class Gait(Protocol):
         ...
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:
-        """Advance to a time and say what to do from then on.
+        """Return the commands from a time on.
 
         Args:
             time_s: Time since the start [s], never less than in the call before.
-            readings: What the robot has told by then; an open-loop gait does not look.
+            readings: Newest readings; an open-loop gait ignores them.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Modulation:
-    """What a controller changes of a generator from one tick on; it may jump, the phase does not.
+    """Changes of a generator from one tick on; they may jump, the phase does not.
 
     Attributes:
         amplitude_factor: Multiplies each joint's amplitude, shape (m,).

@@ -79,7 +79,7 @@ class DelayBlocks:
 
 
 class DelayBlockGait(WaveGenerator):
-    """The delay-block generator; it always tells every joint's own values."""
+    """The delay-block generator; it always logs the values of every joint."""
 
     def __init__(self, parameters: DelayBlocks, robot: Robot) -> None:
         """Start at time zero with straight joints.

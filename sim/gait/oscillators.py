@@ -13,8 +13,8 @@ eps (g_i sin(delta_i) - b_i), and a steady b_i = g_i sin(delta_i) removes what i
 The angles are those last reported, so delta_i holds their age too; a joint that has reported
 nothing yet is not fed back.
 
-Locked phases tell nothing of what couples them. Kicks do: every so often each phase jumps by a
-random amount, and the way back shows the coupling.
+Locked phases contain no information on their coupling. Kicks reveal it: at intervals each phase
+jumps by a random amount, and the way back shows the coupling.
 
 Chains of coupled oscillators, Eq. 1 of Meister, Stepanenko & Kernbach 2011, integrated.
 
@@ -31,7 +31,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Annotated, Any, Protocol, TypeAlias, TypeVar
+from typing import Annotated, Any, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -144,40 +144,13 @@ def integrate(
     return x
 
 
-class OscillatorState(Protocol):
-    """A chain's state: phases, and radii in units of the limit cycle's."""
-
-    @property
-    def theta(self) -> FloatArray:
-        """Phases in the turning frame, without jumps [rad], shape (n,)."""
-        ...
-
-    @property
-    def radius(self) -> FloatArray:
-        """Radii, 1 on the limit cycle, shape (n,)."""
-        ...
-
-    def advance(self, span_s: float, extra: Extra, fastest: float) -> None:
-        """Go on for a time.
-
-        Args:
-            span_s: How long [s].
-            extra: Further rates of the phases.
-            fastest: Bound of the rates that these cause [1/s].
-        """
-        ...
-
-    def kick(self, turn: FloatArray) -> None:
-        """Turn each oscillator at once; radii stay.
-
-        Args:
-            turn: Added to the phases [rad], shape (n,).
-        """
-        ...
-
-
 class PhaseOscillators:
-    """phi_i' = omega + extra_i + sum_j K_ij sin(phi_j - phi_i - psi_ij)."""
+    """phi_i' = omega + extra_i + sum_j K_ij sin(phi_j - phi_i - psi_ij).
+
+    Attributes:
+        theta: Phases in the turning frame, without jumps [rad], shape (n,).
+        radius: Radii in units of the limit cycle's, shape (n,).
+    """
 
     def __init__(self, theta: FloatArray, coupling: Coupling) -> None:
         """Start at given phases.
@@ -189,7 +162,13 @@ class PhaseOscillators:
         self.radius = np.ones_like(theta)
 
     def advance(self, span_s: float, extra: Extra, fastest: float) -> None:
-        """Go on for a time, see :class:`OscillatorState`."""
+        """Advance the state.
+
+        Args:
+            span_s: For how long [s].
+            extra: Further rates of the phases.
+            fastest: Bound of the rates that these cause [1/s].
+        """
         coupling = self._coupling
 
         def rate(time_s: float, theta: FloatArray) -> FloatArray:
@@ -198,7 +177,7 @@ class PhaseOscillators:
         self.theta = integrate(rate, self.theta, span_s, fastest + coupling.fastest)
 
     def kick(self, turn: FloatArray) -> None:
-        """Turn each at once, see :class:`OscillatorState`."""
+        """Turn each oscillator at once, by angles [rad], shape (n,); radii stay."""
         self.theta = self.theta + turn
 
 
@@ -221,7 +200,7 @@ class HopfOscillators:
         return np.abs(self._z)
 
     def advance(self, span_s: float, extra: Extra, fastest: float) -> None:
-        """Go on for a time, see :class:`OscillatorState`."""
+        """Advance the state, as :meth:`PhaseOscillators.advance`."""
         coupling, attraction = self._coupling, self._attraction
 
         def rate(time_s: float, z: ComplexArray) -> ComplexArray:
@@ -234,7 +213,7 @@ class HopfOscillators:
         self.theta = self.theta + np.angle(self._z * np.conj(before))
 
     def kick(self, turn: FloatArray) -> None:
-        """Turn each at once, see :class:`OscillatorState`."""
+        """Turn each oscillator at once, by angles [rad], shape (n,); radii stay."""
         self._z = self._z * np.exp(1j * turn)
         self.theta = self.theta + turn
 
@@ -283,8 +262,7 @@ class Approach:
         self._target = target
 
 
-_STRONGEST = float(CONTROL_RATE_HZ)
-"""Greatest coupling, feedback and rate of an oscillator [1/s]."""
+_STRONGEST = float(CONTROL_RATE_HZ)  # greatest coupling, feedback and rate of an oscillator [1/s]
 
 Numbers: TypeAlias = float | tuple[float, ...]
 """One number for all, or one for each."""
@@ -294,8 +272,7 @@ PositiveRate: TypeAlias = Annotated[float, above(0.0), at_most(_STRONGEST)]
 
 _KICK_SEED = 1
 
-_SAME_TIME_S = 1e-9
-"""Rounding of times: a kick comes no tick late for it."""
+_SAME_TIME_S = 1e-9  # rounding of times: a kick comes no tick late for it
 
 
 class OscillatorKind(StrEnum):
@@ -355,7 +332,7 @@ class OscillatorChains:
 
 
 class OscillatorGait(WaveGenerator):
-    """The oscillator generator; it always tells every joint's own values."""
+    """The oscillator generator; it always logs the values of every joint."""
 
     def __init__(self, parameters: OscillatorChains, robot: Robot) -> None:
         """Start at time zero with straight joints.
@@ -388,7 +365,7 @@ class _OscillatorRhythm:
         start = np.arange(n, dtype=np.float64) * chain.signed_lag + np.broadcast_to(
             chain.start_phase, n
         )
-        self._oscillators: OscillatorState = (
+        self._oscillators = (
             HopfOscillators(start, coupling, chain.attraction)
             if chain.oscillator is OscillatorKind.HOPF
             else PhaseOscillators(start, coupling)

@@ -80,7 +80,7 @@ class Change(NamedTuple):
 
 
 class WaveState(NamedTuple):
-    """What the n joints of a plane are to do from one tick on: A sin(phase) + Y.
+    """Wave of the n joints of a plane from one tick on: A sin(phase) + Y.
 
     Attributes:
         amplitude: A, as wanted: not yet cut to the limits [rad], shape (n,).
@@ -101,15 +101,15 @@ class Rhythm(Protocol):
     """One plane's generator of phases, amplitudes and offsets."""
 
     def step(self, time_s: float, change: Change, readings: Readings) -> WaveState:
-        """Advance to a time and say what to do from then on.
+        """Return the wave from a time on.
 
         Args:
             time_s: Time since the start [s], never less than in the call before.
             change: In force from this time on.
-            readings: What the robot has told by then.
+            readings: Newest readings.
 
         Returns:
-            What the joints are to do.
+            Wave of the joints.
         """
         ...
 
@@ -215,7 +215,11 @@ class _PlanePart:
 
 
 class WaveGenerator:
-    """A generator made of one rhythm a plane; joints of the other planes are held straight."""
+    """A generator made of one rhythm a plane; joints of the other planes are held straight.
+
+    Attributes:
+        names: Names of the values: each driven plane's, then perhaps those of its joints.
+    """
 
     def __init__(
         self, rhythms: Mapping[Plane, Rhythm], robot: Robot, *, per_joint: bool = False
@@ -237,27 +241,16 @@ class WaveGenerator:
             self._parts.append(part)
         unlike = any(np.ptp(part.lower) + np.ptp(part.upper) > 0.0 for part in self._parts)
         self._per_joint = per_joint or unlike
+        values: list[str] = []
+        for part in self._parts:
+            values += [f"{part.plane}.{key}" for key in VALUE_NAMES]
+            if self._per_joint:
+                values += [f"{joint}.{key}" for key in JOINT_VALUE_NAMES for joint in part.names]
+        self.names = tuple(values)
         self._modulation = Modulation.none(len(robot.joints))
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values: each driven plane's, then perhaps those of its joints."""
-        names: list[str] = []
-        for part in self._parts:
-            names += [f"{part.plane}.{key}" for key in VALUE_NAMES]
-            if self._per_joint:
-                names += [f"{joint}.{key}" for key in JOINT_VALUE_NAMES for joint in part.names]
-        return tuple(names)
-
     def modulate(self, modulation: Modulation) -> None:
-        """Change the generator from the next step on.
-
-        Args:
-            modulation: What to change, until the next call.
-
-        Raises:
-            UsageError: If it is of another number of joints or has a value that is not finite.
-        """
+        """Change the generator from the next step on."""
         given = modulation.amplitude_factor, modulation.offset
         if any(values.shape != self._held.shape for values in given):
             raise UsageError(
@@ -270,12 +263,7 @@ class WaveGenerator:
         self._modulation = modulation
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:
-        """Advance to a time and say what to do from then on.
-
-        Args:
-            time_s: Time since the start [s], never less than in the call before.
-            readings: What the robot has told by then.
-        """
+        """Return the commands from a time on."""
         modulation = self._modulation
         command = self._held.copy()
         values: list[FloatArray] = []

@@ -1,4 +1,4 @@
-r"""What a bus has confirmed of the commands sent, where its joints answer requests.
+r"""Commands confirmed by the bus, where its joints answer requests.
 
 A command is confirmed by a reply to a request that was sent after it: requests and commands keep
 their order, so the command was at the robot before the request. Replies carry no number. They are
@@ -34,13 +34,13 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray, IntArray
 
+# Rounds of requests under way, of a bus that answers within 20 ms; one of a slower bus.
 _MOST_ROUNDS = 2
-"""Rounds of requests under way, of a bus that answers within 20 ms; one of a slower bus."""
 _FIRST_PATIENCE = 8  # ticks, before the reply interval is known
 _MOST_PATIENCE = 50
+# Rounds after which a count that lags all the time is taken for lost replies, by rounds under way:
+# with one, a request before a reply is sent only after a time without.
 _LAGGING = {1: 2, 2: 16}
-"""Rounds after which a count that lags all the time is taken for lost replies, by rounds under way:
-with one, a request before a reply is sent only after a time without."""
 _NS = 1e9
 
 
@@ -63,7 +63,7 @@ class Confirmation:
     """
 
     def __init__(self, rate: FloatArray, period_s: float, now_ns: Callable[[], int]) -> None:
-        """Nothing was asked yet.
+        """Start without requests.
 
         Args:
             rate: Greatest rates [rad/s], shape (m,).
@@ -87,7 +87,7 @@ class Confirmation:
         self._sent: list[_Sent] = []
 
     def arm(self, interval: int, limit: int, longest: int) -> None:
-        """Take what was measured of the bus; from here on commands may be sent.
+        """Set the measured properties of the bus; from here on commands may be sent.
 
         Args:
             interval: Reply interval [control ticks].

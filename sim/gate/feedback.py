@@ -1,4 +1,4 @@
-"""Feedback held against its limits, tick by tick.
+"""Feedback checked against its limits, tick by tick.
 
 Whether a bus is silent, measured against the interval at which its joints report.
 
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
@@ -31,16 +32,21 @@ from undulog.capture.robot.model import Direction, Robot
 from undulog.capture.sources.events import BUS_OFF
 
 from .limits import GateLimits
-from .outcome import FaultKind, GateFault, JointStatus
+from .outcome import FaultKind, GateFault, JointStatus, some_names
 
 _IDENTIFIERS_SHOWN = 6
 
 
 class BusCheck:
-    """Counts what is heard by identifier, and finds what must not be there."""
+    """Counts received frames by identifier and detects foreign ones.
+
+    Attributes:
+        known: Frames that the robot's databases know.
+        strange: Identifier to number of frames that they don't.
+    """
 
     def __init__(self, robot: Robot) -> None:
-        """Hear nothing yet.
+        """Start without frames.
 
         Args:
             robot: The robot; it has a bus map.
@@ -58,18 +64,16 @@ class BusCheck:
         # Where a request and its reply share an identifier, hearing it tells nothing.
         self._commands = _sorted(requests - replies)
         self.known = 0
-        """Frames that the robot's databases know."""
         self.strange: Counter[int] = Counter()
-        """Identifier to number of frames that they don't."""
 
     def add(self, frames: FrameArray) -> GateFault | None:
-        """Take what came.
+        """Add received frames.
 
         Args:
             frames: Records of :data:`.capture.log.messages.frames.FRAME_DTYPE`, shape (n,).
 
         Returns:
-            What must end a drive: bus-off, or commands that somebody else sends.
+            The fault that ends a drive: bus-off, or commands of another controller.
         """
         ids = frames["id_flags"]
         errors = (ids & ERROR_FLAG) != 0
@@ -93,7 +97,7 @@ class BusCheck:
         )
 
     def another_robot(self) -> str | None:
-        """Why this can't be the robot; None if it may be."""
+        """Return why the bus is that of another robot; None if it may be the right one."""
         if self.strange.total() <= self.known:
             return None
         listed = ", ".join(
@@ -187,7 +191,7 @@ class CurrentLimiter:
     """
 
     def __init__(self, limit: FloatArray) -> None:
-        """Give way nowhere.
+        """Start without reduction.
 
         Args:
             limit: Greatest currents [A], NaN where there is none, shape (m,).
@@ -201,7 +205,7 @@ class CurrentLimiter:
         return self._share < 1.0
 
     def apply(self, wanted: FloatArray, angle: FloatArray, current: FloatArray) -> FloatArray:
-        """Pull commands towards the measured angles where currents ask for it.
+        """Pull commands towards the measured angles where currents exceed their limits.
 
         Args:
             wanted: Joint angles [rad], shape (m,).
@@ -242,10 +246,10 @@ _EXCESSES = (
 
 
 class Watch:
-    """Looks at each tick's readings and says what is wrong, the first time that it is."""
+    """Checks the readings of each tick against the limits."""
 
     def __init__(self, limits: GateLimits) -> None:
-        """Nothing is wrong yet."""
+        """Start without a fault."""
         self._limits = limits
         self._bounds = {
             FaultKind.CURRENT: limits.current,
@@ -257,7 +261,7 @@ class Watch:
         self._since_s = {each.kind: np.full(count, np.nan) for each in _EXCESSES}
 
     def look(self, time_s: float, status: JointStatus, command: FloatArray) -> GateFault | None:
-        """Look at what is known at a tick.
+        """Check the readings at a tick.
 
         Args:
             time_s: Now, on the loop's clock [s].
@@ -318,9 +322,8 @@ class Watch:
 
 
 def _named(names: tuple[str, ...], chosen: BoolArray) -> str:
-    """Who, as the subject of a sentence."""
+    """Return the chosen names as the subject of a sentence."""
     if chosen.all():
         return "the robot is"
-    found = [name for name, is_one in zip(names, chosen, strict=True) if is_one]
-    more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
-    return ", ".join(found[:_SHOWN]) + more + (" is" if len(found) == 1 else " are")
+    found = list(compress(names, chosen))
+    return some_names(found, _SHOWN) + (" is" if len(found) == 1 else " are")

@@ -7,11 +7,11 @@
             |              +-> hold <-> ending -> done
             +-> refused
 
-It is asked once a control tick what to send. Until the pose of every joint is known it sends
+It decides once a control tick what is sent. Until the pose of every joint is known it sends
 nothing; then it ramps to the first pose, then lets the gait through, cut to what the robot may do
 (:mod:`.sim.gate.limits`). A fault or a request to stop leads to the ending that the robot's file
 names. While the bus is silent (:mod:`.sim.gate.feedback`) nothing is sent, and the servos hold; the
-ending begins when a joint is received again. It opens nothing and waits for nothing.
+ending begins when a joint is received again. It opens nothing and never blocks.
 """
 
 from __future__ import annotations
@@ -48,7 +48,18 @@ _PERIOD_S = 1.0 / CONTROL_RATE_HZ
 
 
 class Gate:
-    """Asked once a tick; see the module."""
+    """The state machine, stepped once a tick; see the module.
+
+    Attributes:
+        outcome: How it ended; None until it has.
+        gait_error: What the gait raised, if it did; to be raised when the robot is at rest.
+        run_from: The tick at which the gait began; None before.
+        run_ticks: Ticks that the gait commanded.
+        run_s: The gait's time [s].
+        silence: Whether the bus is silent.
+        held_ticks: Ticks in which nothing was sent as the bus was silent, those left out among
+            them.
+    """
 
     def __init__(
         self,
@@ -62,7 +73,7 @@ class Gate:
         """Begin by reading the pose.
 
         Args:
-            limits: What the robot may do.
+            limits: Limits of the robot.
             duration_s: Time of the gait's last tick.
             listen_s: So long the bus is listened to at least before anything is sent, to see whose
                 it is and to measure its reply interval [s]; 0: it is the robot's, which waits for
@@ -70,19 +81,12 @@ class Gate:
         """
         self.phase = Phase.POSE
         self.outcome: Outcome | None = None
-        """How it ended; None until it has."""
         self.gait_error: Exception | None = None
-        """What the gait raised, if it did; to be raised when the robot is at rest."""
         self.run_from: int | None = None
-        """The tick at which the gait began; None before."""
         self.run_ticks = 0
-        """Ticks that the gait commanded."""
         self.run_s = 0.0
-        """The gait's time [s]."""
         self.silence = Silence()
-        """Whether the bus is silent."""
         self.held_ticks = 0
-        """Ticks in which nothing was sent as the bus was silent, those left out among them."""
         self._silent_ticks = 0  # those of the silence that were counted by then
         self._received_again = False  # in the tick before this one, while holding
         self._gait, self._limits, self._place = gait, limits, place
@@ -111,7 +115,7 @@ class Gate:
     def step(
         self, tick: int, heard: GateInput, stop: str = "", *, at_once: bool = False
     ) -> GateStep:
-        """Say what to do.
+        """Return the command of a tick.
 
         Args:
             tick: Number of the control tick, from 0; never less than in the call before.
@@ -204,7 +208,7 @@ class Gate:
     def _wanted(
         self, tick: int, heard: GateInput, clamp: Clamp
     ) -> tuple[FloatArray, GaitTick | None]:
-        """What the phase wants to be commanded."""
+        """Return the requested command of the phase, before limits."""
         if self.phase is not Phase.RUN and self._way is not None:
             self._progress_s += _PERIOD_S  # also where it is late: no jump
             if self.phase is Phase.ENDING or self._progress_s < self._way.duration_s:
@@ -224,7 +228,7 @@ class Gate:
         return said.command, said
 
     def _end_in_time(self) -> None:
-        """See whether the last command was the last one."""
+        """End the drive if the last command was the final one."""
         if self.phase is Phase.RUN and self.run_s * CONTROL_RATE_HZ >= self._last - 1e-6:
             self.outcome = Outcome(DriveEnding.COMPLETE, "", "the servos hold their last commands")
             self._become(Phase.DONE)
@@ -242,7 +246,7 @@ class Gate:
     def _follow(
         self, tick: int, heard: GateInput, clamp: Clamp, stop: str, *, at_once: bool
     ) -> None:
-        """Change the phase where a fault, or who asks to stop, wants it."""
+        """Change the phase on a fault or a stop request."""
         found = self._trouble(tick, heard, clamp)
         if self.phase is Phase.HOLD and (found is None or found.kind not in MUTE):
             self._go_on_holding(clamp, heard.status, at_once=at_once)
@@ -299,7 +303,7 @@ class Gate:
         return GateFault(FaultKind.SILENT, text, "", silent_s, limit_s, since_s)
 
     def _go_on_holding(self, clamp: Clamp, status: JointStatus, *, at_once: bool) -> None:
-        """Hold until a joint is received, then end; not for ever, and not if asked twice.
+        """Hold until a joint is received, then end; not after a timeout or a second stop request.
 
         The ending begins one control tick later: what the stall held up arrives as the bus comes
         back, and the first command of the ending doesn't join it.
@@ -344,7 +348,7 @@ class Gate:
     # -- telling ---------------------------------------------------------------------------
 
     def _log_skipped(self, tick: int, late_s: float) -> None:
-        """Say what is skipped where the loop came late; the way of a ramp goes on where it was."""
+        """Log skipped ticks; a ramp continues where it was."""
         before, self._tick = self._tick, tick
         left_out = 0 if before is None else tick - before - 1
         if left_out > 0:
@@ -364,7 +368,7 @@ class Gate:
         return GateStep(self.phase, None, None, None, tuple(self._remarks))
 
     def _log_changes(self, given: Clamped) -> None:
-        """Say once for each joint what the gate changes."""
+        """Log once for each joint what the gate changes."""
         limits, names = self._limits, self._limits.joint_names
         reasons = (
             ("cut", given.by_position, "command cut to the limits of the joint"),

@@ -1,12 +1,12 @@
 """The limits of a drive, joint by joint.
 
-The last stage before the encoder: no command passes it that is beyond position or rate.
+The clamp is the last stage before the encoder: it limits position and rate of commands.
 
-How closely two commands may follow each other: rates hold in true time, not from tick to tick.
+Commands are spaced so that rates hold in real time, not only from tick to tick.
 
 The clamp bounds a step by what the greatest rate allows in one control period. Deadlines are
 anchored at the first tick, so behind a tick that came late the next one is due in less than a
-period: the servos would be told to go the same way in less time. The later command waits then until
+period: the servos would have to move as far in less time. The later command waits then until
 the rate allows its step. No step takes more than a period, so that no wait is longer.
 """
 
@@ -25,7 +25,7 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import JOINT_LIMITS, OnFault, Robot, Safety
 
 from ..gait.wave import smoothstep
-from .outcome import JointStatus
+from .outcome import JointStatus, some_names
 
 _EXAMPLES = {
     "max_rate": "4.0            # rad/s, of commands",
@@ -86,7 +86,7 @@ def safety_example(limits: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True)
 class GateLimits:
-    """What a drive keeps to; arrays have shape (m,), in the order of the robot's joints.
+    """Limits of a drive; arrays have shape (m,), in the order of the robot's joints.
 
     Attributes:
         lower: Lower limits of commands [rad].
@@ -217,7 +217,7 @@ class Spacing:
         return earliest
 
     def sent(self, command: FloatArray, sent_ns: IntArray) -> None:
-        """A command was sent.
+        """Note that a command was sent.
 
         Args:
             command: Joint angles [rad], shape (m,).
@@ -255,6 +255,10 @@ class Clamp:
     most what the greatest rate allows in one control period, also where ticks were left out. What
     was late is caught up step by step and never by a jump; that the steps are a period apart in
     true time, too, is for :mod:`.sim.gate.limits`.
+
+    Attributes:
+        last: What was commanded last, at first the pose [rad], shape (m,).
+        cuts: Commands of single joints that were changed, by why.
     """
 
     def __init__(self, limits: GateLimits, pose: FloatArray, period_s: float) -> None:
@@ -271,9 +275,7 @@ class Clamp:
             raise ValueError("the pose to start from has angles that are not known")
         self._limits, self._reach = limits, limits.rate * period_s
         self.last: FloatArray = np.clip(pose, limits.lower, limits.upper)
-        """What was commanded last, at first the pose [rad], shape (m,)."""
         self.cuts: dict[str, int] = dict.fromkeys(Clamped._fields[1:], 0)
-        """Commands of single joints that were changed, by why."""
 
     def apply(
         self, wanted: FloatArray, bounds: tuple[FloatArray, FloatArray] | None = None
@@ -310,7 +312,11 @@ _PEAK = 1.5  # greatest slope of 3 x^2 - 2 x^3
 
 
 class Ramp:
-    """A straight way between two poses, with no rate at either end."""
+    """A straight way between two poses, with no rate at either end.
+
+    Attributes:
+        duration_s: How long it takes [s].
+    """
 
     def __init__(self, start: FloatArray, target: FloatArray, rate: FloatArray) -> None:
         """Plan it.
@@ -322,7 +328,6 @@ class Ramp:
         """
         self._start, self._way = start.copy(), target - start
         self.duration_s = _PEAK * float(np.max(np.abs(self._way) / rate, initial=0.0))
-        """How long it takes [s]."""
 
     def at(self, time_s: float) -> FloatArray:
         """The pose at a time.
@@ -347,6 +352,10 @@ class Ending:
 
     It starts from the present pose: a joint's last command where the joint is near it, else the
     angle that the joint has, so that a blocked servo stops pushing.
+
+    Attributes:
+        duration_s: How long it takes [s], with the way of the commands back to where the joints
+            are.
     """
 
     def __init__(self, limits: GateLimits, last: FloatArray, status: JointStatus) -> None:
@@ -355,7 +364,7 @@ class Ending:
         Args:
             limits: Rates, position limits, and how to end.
             last: The last command [rad], shape (m,).
-            status: What the joints told by now.
+            status: Newest values of the joints.
         """
         far = np.abs(status.angle - last) > limits.tracking_error  # False where unknown
         start = np.clip(np.where(far, status.angle, last), limits.lower, limits.upper)
@@ -364,10 +373,9 @@ class Ending:
         self._ramp = Ramp(start, target, limits.ramp_rate)
         back_s = float(np.max(np.abs(start - last) / limits.rate, initial=0.0))
         self.duration_s = back_s + self._ramp.duration_s + HOLD_S
-        """How long it takes [s], with the way of the commands back to where the joints are."""
 
     def at(self, time_s: float) -> FloatArray:
-        """What is wanted at a time.
+        """Return the requested command at a time.
 
         Args:
             time_s: Since its start [s].
@@ -382,7 +390,7 @@ _SHOWN = 8
 
 
 def why_not_from(angle: FloatArray, limits: GateLimits, waited_s: float) -> str | None:
-    """Why a drive can't start from a pose.
+    """Return why a drive can't start from a pose.
 
     Args:
         angle: Measured angles [rad], NaN where none came, shape (m,).
@@ -395,7 +403,9 @@ def why_not_from(angle: FloatArray, limits: GateLimits, waited_s: float) -> str 
     names = limits.joint_names
     unknown = np.flatnonzero(np.isnan(angle)).tolist()
     if unknown:
-        silent = _listed([names[i] for i in unknown], len(names))
+        silent = some_names([names[i] for i in unknown], _SHOWN)
+        if len(unknown) == len(names):
+            silent = f"all {len(names)} joints"
         return (
             f"the pose is not known, {silent} reported no angle within {waited_s:.2g} s; is the "
             "robot switched on, and does it report unasked?"
@@ -408,10 +418,3 @@ def why_not_from(angle: FloatArray, limits: GateLimits, waited_s: float) -> str 
             "limits; bring it back by hand"
         )
     return None
-
-
-def _listed(names: list[str], of: int) -> str:
-    if len(names) == of:
-        return f"all {of} joints"
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -13,8 +14,14 @@ from undulog.capture.common.arrays import FloatArray
 from ..gait.contract import GaitTick, Readings
 
 
+def some_names(names: Sequence[str], most: int) -> str:
+    """Return a list of at most so many names, and the number of the others."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
 class FaultKind(StrEnum):
-    """What went wrong."""
+    """Kind of a fault."""
 
     LOST = "lost"
     SILENT = "silent"
@@ -31,7 +38,7 @@ class FaultKind(StrEnum):
 
 
 MUTE = frozenset({FaultKind.BUS_OFF, FaultKind.BUS, FaultKind.STRANGER})
-"""Faults after which nothing more is sent: nobody hears it, or somebody else commands."""
+"""Faults after which nothing more is sent: a lost bus, or another controller on it."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +181,7 @@ class JointStatus:
 
 
 class Phase(StrEnum):
-    """What the gate is about."""
+    """State of the gate."""
 
     POSE = "reading the pose"
     APPROACH = "approach"
@@ -186,10 +193,10 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True)
 class GateInput:
-    """What is known at a tick.
+    """Inputs of the gate at a tick.
 
     Attributes:
-        trouble: What the bus itself told: bus-off, or somebody else's commands.
+        trouble: Fault of the bus itself: bus-off, or commands of another controller.
         another_robot: Why this can't be the robot, None if it may be.
         late_s: How late the tick is [s].
         received: Whether the angle of a joint was received since the tick before.
@@ -215,14 +222,14 @@ class GateEvent(NamedTuple):
 
 
 class GateStep(NamedTuple):
-    """What to do at a tick.
+    """Output of the gate at a tick.
 
     Attributes:
-        phase: What the gate is about.
+        phase: State of the gate.
         command: What to send, joint angles [rad], shape (m,); None: nothing.
         wanted: What that was made from, before the gate changed anything; None likewise.
-        gait: What the gait said, while it runs.
-        remarks: What is worth a line in the log.
+        gait: The gait's tick, while it runs.
+        remarks: Events to be logged.
     """
 
     phase: Phase

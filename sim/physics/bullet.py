@@ -17,7 +17,7 @@ import os
 import struct
 import sys
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from itertools import repeat
 from operator import itemgetter
 
@@ -27,7 +27,7 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Plane, Robot
 
-from .engine import BodyState
+from .engine import BodyStart, BodyState
 
 MAX_JOINTS = 127
 """Links beside the base that the engine can hold."""
@@ -62,35 +62,15 @@ _angle, _rate = itemgetter(0), itemgetter(1)
 class BulletEngine:
     """A robot's links and joints in a physics world of their own; :meth:`close` it after use."""
 
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        gravity: Sequence[float],
-        height: float,
-        heading: float,
-        velocity: Sequence[float],
-        dt: float,
-    ) -> None:
-        """Build the body, straight, its head above the origin.
-
-        Args:
-            robot: The robot, at most :data:`MAX_JOINTS` joints.
-            gravity: Acceleration of gravity in the world [m/s^2], length 3.
-            height: Height of the links' centres [m].
-            heading: Direction of the head's x axis, about z [rad].
-            velocity: Of the whole body [m/s], length 3.
-            dt: Step [s].
-
-        Raises:
-            UsageError: If the engine cannot hold the robot.
-        """
+    def __init__(self, robot: Robot, start: BodyStart) -> None:
+        """Build the body; at most :data:`MAX_JOINTS` joints."""
         joints, links = robot.joints, robot.links
         if len(joints) > MAX_JOINTS:
             raise UsageError(
                 f"robot {robot.name} has {len(joints)} joints; the twin takes at most {MAX_JOINTS}"
             )
         self._client = pybullet.connect(pybullet.DIRECT)
+        heading = start.heading
         half = [link.length / 2 for link in links]
         # The engine wants each joint relative to the joint before it (to the centre for the base).
         joint_positions = [
@@ -100,7 +80,7 @@ class BulletEngine:
             baseMass=links[0].mass,
             baseCollisionShapeIndex=_NO_SHAPE,
             baseVisualShapeIndex=_NO_SHAPE,
-            basePosition=(0.0, 0.0, height),
+            basePosition=(0.0, 0.0, start.height),
             baseOrientation=(0.0, 0.0, np.sin(heading / 2), np.cos(heading / 2)),
             linkMasses=[link.mass for link in links[1:]],
             linkCollisionShapeIndices=[_NO_SHAPE] * len(joints),
@@ -136,10 +116,10 @@ class BulletEngine:
             physicsClientId=self._client,
         )
         pybullet.resetBaseVelocity(
-            self._body, velocity, (0.0, 0.0, 0.0), physicsClientId=self._client
+            self._body, start.velocity, (0.0, 0.0, 0.0), physicsClientId=self._client
         )
-        pybullet.setGravity(*gravity, physicsClientId=self._client)
-        pybullet.setTimeStep(dt, physicsClientId=self._client)
+        pybullet.setGravity(*start.gravity, physicsClientId=self._client)
+        pybullet.setTimeStep(start.dt, physicsClientId=self._client)
 
     def close(self) -> None:
         """Free the physics world; safe to call twice."""
@@ -148,14 +128,7 @@ class BulletEngine:
             self._client = -1
 
     def read(self, into: BodyState | None = None) -> BodyState:
-        """The present state.
-
-        Args:
-            into: Arrays to be filled in; new ones by default.
-
-        Returns:
-            Positions and velocities of links and joints, in these arrays.
-        """
+        """The present state."""
         state = into or BodyState.empty(len(self._joints) + 1, len(self._joints))
         client = self._client
         position, turn = pybullet.getBasePositionAndOrientation(self._body, client)
@@ -172,12 +145,7 @@ class BulletEngine:
         return state
 
     def push(self, force: FloatArray, point: FloatArray) -> None:
-        """Apply forces to the links during the next step; calls add up.
-
-        Args:
-            force: In the world [N], shape (3, n).
-            point: Points of action in the world [m], shape (3, n).
-        """
+        """Apply forces to the links during the next step; calls add up."""
         n = force.shape[1]
         calls = map(
             pybullet.applyExternalForce,
@@ -187,11 +155,7 @@ class BulletEngine:
         deque(calls, maxlen=0)  # runs them all, without a loop of ours
 
     def step(self, torque: FloatArray) -> None:
-        """Advance the body by one step.
-
-        Args:
-            torque: Of the joints [N m], shape (m,).
-        """
+        """Advance the body by one step."""
         self._advance(torque.tolist())
 
     def _advance(self, torque: list[float]) -> None:

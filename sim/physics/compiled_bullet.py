@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
 from operator import itemgetter
 
 import numpy as np
@@ -27,7 +26,7 @@ from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.robot.model import Plane, Robot
 
 from .bullet import BulletEngine, pybullet
-from .engine import BodyState
+from .engine import BodyStart, BodyState
 
 
 @njit(cache=True)
@@ -139,32 +138,9 @@ _angle, _rate = itemgetter(0), itemgetter(1)
 class CompiledBulletEngine(BulletEngine):
     """A robot's links and joints in a physics world of their own; :meth:`close` it after use."""
 
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        gravity: Sequence[float],
-        height: float,
-        heading: float,
-        velocity: Sequence[float],
-        dt: float,
-    ) -> None:
-        """Build the body, straight, its head above the origin.
-
-        Args:
-            robot: The robot, at most :data:`.sim.physics.bullet.MAX_JOINTS` joints.
-            gravity: Acceleration of gravity in the world [m/s^2], length 3.
-            height: Height of the links' centres [m].
-            heading: Direction of the head's x axis, about z [rad].
-            velocity: Of the whole body [m/s], length 3.
-            dt: Step [s].
-
-        Raises:
-            UsageError: If the engine cannot hold the robot.
-        """
-        super().__init__(
-            robot, gravity=gravity, height=height, heading=heading, velocity=velocity, dt=dt
-        )
+    def __init__(self, robot: Robot, start: BodyStart) -> None:
+        """Build the body; at most :data:`.sim.physics.bullet.MAX_JOINTS` joints."""
+        super().__init__(robot, start)
         self._half = np.array([link.length / 2 for link in robot.links])
         self._vertical = np.array([joint.plane is Plane.VERTICAL for joint in robot.joints])
         self._hinges = np.zeros((6, len(robot.joints)))

@@ -333,11 +333,7 @@ class CompiledLaws:
         self.command(k, self._reference)
 
     def follow(self, k: int) -> None:
-        """Complete a step whose body is there, and which follows the row before it.
-
-        Args:
-            k: Its row, not the first.
-        """
+        """Complete a step whose body is there, and which follows the row before it."""
         act(
             self._rows[k - 1],
             self._rows[k],
@@ -351,11 +347,6 @@ class CompiledLaws:
         )
 
     def command(self, k: int, reference: FloatArray) -> None:
-        """Give the servos a command, which they hold until the next.
-
-        Args:
-            k: Row of the step at which it comes.
-            reference: Joint angles q_ref [rad], shape (m,).
-        """
+        """Give the servos a command, which they hold until the next."""
         self._reference = np.ascontiguousarray(reference)
         drive_joints(self._rows[k], *self._sizes, self._reference, self._servos)

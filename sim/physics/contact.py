@@ -68,8 +68,7 @@ def out_of_frames(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
     return vector + 2.0 * w * turned + 2.0 * cross(u, turned)
 
 
-_TINY = 1e-300
-"""Makes 0/0 a zero."""
+_TINY = 1e-300  # makes 0/0 a zero
 
 
 def normal_force(
@@ -125,32 +124,15 @@ def _transeth(mu: FloatArray, slip_speed: float) -> PerNewton:
     return friction
 
 
-_LAWS: dict[FrictionLaw, Callable[[FloatArray, float], PerNewton]] = {
+FRICTION: dict[FrictionLaw, Callable[[FloatArray, float], PerNewton]] = {
     FrictionLaw.ELLIPSE: _ellipse,
     FrictionLaw.BOX: _box,
     FrictionLaw.TRANSETH: _transeth,
 }
+"""Coulomb's laws, given (mu_t, mu_n), shape (2, 1) or (2, n), and the slip speed eps [m/s].
 
-
-def friction_force(
-    slip: FloatArray, normal: FloatArray, mu: FloatArray, slip_speed: float, law: FrictionLaw
-) -> FloatArray:
-    """Friction along a link's tangential and normal axes.
-
-    With one component of slip alone, all three laws give -mu N v / sqrt(v^2 + eps^2), eps the
-    ``slip_speed``; they differ in oblique slip. None ever feeds energy into the body.
-
-    Args:
-        slip: Velocity of the contact points along (tangential, normal) [m/s], shape (2, n).
-        normal: Normal force [N], shape (n,).
-        mu: (mu_t, mu_n), shape (2, 1).
-        slip_speed: eps [m/s].
-        law: One of Coulomb's: how the two coefficients combine.
-
-    Returns:
-        Force along (tangential, normal) [N], shape (2, n).
-    """
-    return _LAWS[law](mu, slip_speed)(slip) * normal
+With one component of slip alone, all three give -mu N v / sqrt(v^2 + eps^2); they differ in oblique
+slip. None ever feeds energy into the body."""
 
 
 def drag_force(slip: FloatArray, depth: FloatArray, drag: FloatArray) -> FloatArray:
@@ -254,7 +236,7 @@ class GroundContact:
         self._friction = (
             None
             if surface.law is FrictionLaw.VISCOUS
-            else _LAWS[surface.law](mu, surface.slip_speed)
+            else FRICTION[surface.law](mu, surface.slip_speed)
         )
         self._radius, self._height = radius, body.position[2]
         self._quaternion, self._velocity = tuple(body.quaternion), tuple(body.velocity)

@@ -1,4 +1,4 @@
-"""What a physics engine has to offer the twin: articulated-body dynamics, and nothing else.
+"""Interface of physics engines: articulated-body dynamics, and nothing else.
 
 Ground, obstacles and servos are this package's own, so that every engine runs under the same force
 laws and their results can be held against each other.
@@ -6,9 +6,9 @@ laws and their results can be held against each other.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import NamedTuple, Protocol, cast
+from typing import NamedTuple, Protocol, TypeAlias, cast
 
 import numpy as np
 
@@ -86,33 +86,26 @@ class Engine(Protocol):
         ...
 
 
-class EngineType(Protocol):
-    """How an engine is made."""
+class BodyStart(NamedTuple):
+    """The world of a body and its start: straight, its head above the origin.
 
-    def __call__(
-        self,
-        robot: Robot,
-        *,
-        gravity: Sequence[float],
-        height: float,
-        heading: float,
-        velocity: Sequence[float],
-        dt: float,
-    ) -> Engine:
-        """Build the body, straight, its head above the origin.
+    Attributes:
+        gravity: Acceleration of gravity in the world [m/s^2], length 3.
+        height: Height of the links' centres [m].
+        heading: Direction of the head's x axis, about z [rad].
+        velocity: Of the whole body [m/s], length 3.
+        dt: Step [s].
+    """
 
-        Args:
-            gravity: Acceleration of gravity in the world [m/s^2], length 3.
-            height: Height of the links' centres [m].
-            heading: Direction of the head's x axis, about z [rad].
-            velocity: Of the whole body [m/s], length 3.
-            dt: Step [s].
+    gravity: Sequence[float]
+    height: float
+    heading: float
+    velocity: Sequence[float]
+    dt: float
 
-        Raises:
-            UsageError: If the engine cannot hold the robot.
-        """
-        ...
 
+EngineType: TypeAlias = Callable[[Robot, BodyStart], Engine]
+"""Builds a body; raises UsageError if the engine can't hold the robot."""
 
 _TYPES = {
     EngineKind.BULLET: ("undulog.sim.physics.bullet", "BulletEngine"),

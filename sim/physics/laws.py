@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -13,7 +14,7 @@ from ..gait.contract import CONTROL_RATE_HZ
 from ..scenario.scenario import Kernels, Scenario
 from ..scenario.world import Ground, pushes_during
 from .contact import GroundContact
-from .engine import engine_type
+from .engine import BodyStart, engine_type
 from .obstacle_contact import obstacle_law
 from .servo import Servos
 from .steps import Step, Steps
@@ -72,51 +73,16 @@ class NumpyLaws:
         self.command(k, self._reference)
 
     def follow(self, k: int) -> None:
-        """Complete a step whose body is there, and which follows the row before it.
-
-        Args:
-            k: Its row, not the first.
-        """
+        """Complete a step whose body is there, and which follows the row before it."""
         before = self._rows[k - 1]
         self._servos.advance(before.rotors, before.drive, self._dt, self._rows[k].rotors)
         self.start(k)
 
     def command(self, k: int, reference: FloatArray) -> None:
-        """Give the servos a command, which they hold until the next.
-
-        Args:
-            k: Row of the step at which it comes.
-            reference: Joint angles q_ref [rad], shape (m,).
-        """
+        """Give the servos a command, which they hold until the next."""
         self._reference = reference
         row = self._rows[k]
         self._servos.drive(reference, row.body.angle, row.body.rate, row.rotors, row.drive)
-
-
-def laws_for(
-    steps: Steps,
-    robot: Robot,
-    ground: Ground | None,
-    servos: Servos,
-    *,
-    dt: float,
-    kernels: Kernels,
-) -> Laws:
-    """The laws as they are to be computed.
-
-    Args:
-        steps: The table that is filled in.
-        ground: What carries it, if anything does.
-        dt: Step [s].
-
-    Raises:
-        ImportError: If numba is asked for and not installed.
-    """
-    if kernels is Kernels.NUMPY:
-        return NumpyLaws(steps, robot, ground, servos, dt)
-    from .compiled_kernels import CompiledLaws
-
-    return CompiledLaws(steps, robot, ground, servos, dt)
 
 
 class Plant:
@@ -154,23 +120,21 @@ class Plant:
             if world.obstacles
             else None
         )
-        self._engine = engine_type(scenario.engine, kernels)(
-            robot,
-            gravity=world.gravity,
-            height=_resting_height(scenario),
-            heading=world.heading,
-            velocity=world.velocity,
-            dt=self.dt,
-        )
+        height = _resting_height(scenario)
+        start = BodyStart(world.gravity, height, world.heading, world.velocity, self.dt)
+        self._engine = engine_type(scenario.engine, kernels)(robot, start)
         count = scenario.physics_rate_hz // CONTROL_RATE_HZ
         self._period = Steps.empty(count + 1, len(robot.links), len(robot.joints))
         self._rows = tuple(self._period)
         self._disturbances = scenario.disturbances
         self._link_names = [link.name for link in robot.links]
         self._periods = 0  # gone through
-        self._laws = laws_for(
-            self._period, robot, world.ground, self.servos, dt=self.dt, kernels=kernels
-        )
+        laws: Callable[[Steps, Robot, Ground | None, Servos, float], Laws] = NumpyLaws
+        if kernels is Kernels.NUMBA:
+            from .compiled_kernels import CompiledLaws
+
+            laws = CompiledLaws
+        self._laws = laws(self._period, robot, world.ground, self.servos, self.dt)
         self._look(0)
         self._laws.start(0)
 

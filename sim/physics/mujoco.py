@@ -25,57 +25,30 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Plane, Robot
 
 from .contact import cross
-from .engine import BodyState
+from .engine import BodyStart, BodyState
 
 _AXES = {Plane.HORIZONTAL: (0.0, 0.0, 1.0), Plane.VERTICAL: (0.0, 1.0, 0.0)}
-_SCALAR_LAST = [1, 2, 3, 0]
-"""From MuJoCo's order w, x, y, z."""
+_SCALAR_LAST = [1, 2, 3, 0]  # from MuJoCo's order w, x, y, z
 
 
 class MujocoEngine:
     """A robot's links and joints in a physics world of their own."""
 
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        gravity: Sequence[float],
-        height: float,
-        heading: float,
-        velocity: Sequence[float],
-        dt: float,
-    ) -> None:
-        """Build the body, straight, its head above the origin.
-
-        Args:
-            gravity: Acceleration of gravity in the world [m/s^2], length 3.
-            height: Height of the links' centres [m].
-            heading: Direction of the head's x axis, about z [rad].
-            velocity: Of the whole body [m/s], length 3.
-            dt: Step [s].
-
-        Raises:
-            UsageError: If the engine cannot hold the robot.
-        """
-        self._model = _model(robot, gravity, dt)
+    def __init__(self, robot: Robot, start: BodyStart) -> None:
+        """Build the body."""
+        self._model = _model(robot, start.gravity, start.dt)
         self._data = mujoco.MjData(self._model)
-        self._data.qpos[:3] = (0.0, 0.0, height)
-        self._data.qpos[3:7] = (math.cos(heading / 2), 0.0, 0.0, math.sin(heading / 2))
-        self._data.qvel[:3] = velocity
+        self._data.qpos[:3] = (0.0, 0.0, start.height)
+        half = start.heading / 2
+        self._data.qpos[3:7] = (math.cos(half), 0.0, 0.0, math.sin(half))
+        self._data.qvel[:3] = start.velocity
         self._derive()
 
     def close(self) -> None:
         """Nothing to do: the physics world is freed with this object."""
 
     def read(self, into: BodyState | None = None) -> BodyState:
-        """The present state.
-
-        Args:
-            into: Arrays to be filled in; new ones by default.
-
-        Returns:
-            Positions and velocities of links and joints, in these arrays.
-        """
+        """The present state."""
         data = self._data  # its first body is the world
         state = into or BodyState.empty(len(data.xipos) - 1, len(data.qpos) - 7)
         state.position[...] = data.xipos[1:].T
@@ -89,22 +62,13 @@ class MujocoEngine:
         return state
 
     def push(self, force: FloatArray, point: FloatArray) -> None:
-        """Apply forces to the links during the next step; calls add up.
-
-        Args:
-            force: In the world [N], shape (3, n).
-            point: Points of action in the world [m], shape (3, n).
-        """
+        """Apply forces to the links during the next step; calls add up."""
         data = self._data
         data.xfrc_applied[1:, :3] += force.T
         data.xfrc_applied[1:, 3:] += cross(point - data.xipos[1:].T, force).T
 
     def step(self, torque: FloatArray) -> None:
-        """Advance by one step, semi-implicit Euler.
-
-        Args:
-            torque: Of the joints [N m], shape (m,).
-        """
+        """Advance by one step, semi-implicit Euler."""
         model, data = self._model, self._data
         data.qfrc_applied[6:] = torque
         mujoco.mj_fwdAcceleration(model, data)

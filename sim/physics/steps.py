@@ -112,13 +112,8 @@ class Steps(Sequence[Step]):
 
     def copy(self) -> Steps:
         """The same steps in a table of their own."""
-        return Steps(
-            self.table.copy(),
-            self.link_count,
-            self.joint_count,
-            self.obstacles.copy(),
-            self.pushes,
-        )
+        sizes = self.link_count, self.joint_count
+        return Steps(self.table.copy(), *sizes, self.obstacles.copy(), self.pushes)
 
     def __len__(self) -> int:
         """Number of steps."""
@@ -130,16 +125,11 @@ class Steps(Sequence[Step]):
     def __getitem__(self, index: slice) -> Steps: ...
     def __getitem__(self, index: int | slice) -> Step | Steps:
         """One step, or a stretch of them; views, not copies."""
+        sizes = self.link_count, self.joint_count
         if isinstance(index, slice):
-            return Steps(
-                self.table[index],
-                self.link_count,
-                self.joint_count,
-                self.obstacles[index],
-                None if self.pushes is None else self.pushes[index],
-            )
-        step = _fields(self.table[index], self.link_count, self.joint_count)
-        return step._replace(obstacles=self.obstacles[index])
+            pushes = None if self.pushes is None else self.pushes[index]
+            return Steps(self.table[index], *sizes, self.obstacles[index], pushes)
+        return _fields(self.table[index], *sizes)._replace(obstacles=self.obstacles[index])
 
     @cached_property
     def stacked(self) -> Step:

@@ -1,4 +1,4 @@
-"""Faults of a bus and its servos, to order: what they are, as text and as TOML.
+"""Faults of a bus and its servos, and their forms as text and as TOML.
 
 On the command line a fault is ``KIND[:JOINT][:NUMBER][@FROM[+FOR]]``, times in s after the start::
 
@@ -31,7 +31,7 @@ from undulog.capture.robot.model import Robot
 
 
 class FaultKind(StrEnum):
-    """What goes wrong."""
+    """Kind of a fault."""
 
     LOST = "lost"
     STUCK = "stuck"
@@ -43,7 +43,7 @@ class FaultKind(StrEnum):
 
 
 class _Grammar(NamedTuple):
-    """What a kind of fault wants to know.
+    """Parameters of a kind of fault.
 
     Attributes:
         joint: Whether it is of a joint: never, if given, or always.
@@ -66,7 +66,7 @@ _GRAMMAR = {
 _SLACK_S = 1e-9  # ticks and sums of decimal fractions differ in the last bit
 _TEXT = re.compile(r"(?P<what>[^@]*)(@(?P<from>[^+@]*)(\+(?P<for>[^+@]*))?)?")
 FORM = "KIND[:JOINT][:NUMBER][@FROM[+FOR]], e.g. lost:joint07:0.1 or bus-off@5+2"
-"""What a fault looks like on the command line, for messages."""
+"""Form of a fault on the command line, for messages."""
 
 
 @dataclass(frozen=True)

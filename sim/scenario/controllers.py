@@ -33,7 +33,7 @@ class ControllerKind(StrEnum):
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a robot knows of its gait on free ground, by trying it out once.
+    """Calibration of a robot's gait on free ground.
 
     Attributes:
         slip_ratio: K of :class:`.sim.control.dead_reckoning.SlipOdometry`.
@@ -134,7 +134,7 @@ class RandomTurns:
 
 @dataclass(frozen=True)
 class TargetHeading:
-    """Holds the heading to a target whose place the robot was told.
+    """Holds the heading to a target at a known position.
 
     Attributes:
         gain: Offset per heading error.
@@ -153,7 +153,7 @@ class Controller:
 
     Attributes:
         near_hold_s: How long a reading near a sensor's fold is believed [s].
-        calibration: What it knows of its gait.
+        calibration: Calibration of the gait.
         lookout: What counts as in the way.
         head: Steering by the head's sensors.
         side: What walls beside the body do; None: nothing.
@@ -171,13 +171,13 @@ class Controller:
     course: RandomTurns | TargetHeading | None = None
 
 
+# What the kinds have beside what all have.
 _PARTS: dict[ControllerKind, dict[str, type[Any]]] = {
     ControllerKind.RANDOM_WALK: {"course": RandomTurns},
     ControllerKind.TARGET_FOLLOWING: {"course": TargetHeading},
     ControllerKind.CORRIDOR: {"side": SideShrinking},
     ControllerKind.AVOIDANCE: {"side": SideShrinking, "tail": TailHaste},
 }
-"""What the kinds have beside what all have."""
 
 
 def read_controller(

@@ -22,16 +22,15 @@ from ..gait.oscillators import (
 from ..gait.wave import PlaneGait, Serpentine, SerpentineGait
 
 GaitParameters: TypeAlias = Serpentine | DelayBlocks | OscillatorChains
-"""What a scenario says of its gait."""
+"""Gait parameters of a scenario."""
 
 
 def generator(parameters: GaitParameters, robot: Robot, *, per_joint: bool = False) -> Generator:
     """The generator of a gait, at time zero with straight joints.
 
     Args:
-        robot: Who is to do it.
-        per_joint: Tell every joint's own values too; a controller that sets joints apart asks for
-            it, so that the log tells what each joint was meant to do.
+        robot: The robot.
+        per_joint: Log the values of every joint, for a controller that sets joints apart.
     """
     if isinstance(parameters, DelayBlocks):
         return DelayBlockGait(parameters, robot)
@@ -61,7 +60,7 @@ def read_gait(table: Table, robot: Robot | None) -> GaitParameters:
 
     Args:
         table: The table ``[gait]``.
-        robot: Who is to do it; None where that is a fault already.
+        robot: The robot; None where that is a fault already.
 
     Returns:
         The parameters; of use only if no fault was noted.
@@ -70,13 +69,7 @@ def read_gait(table: Table, robot: Robot | None) -> GaitParameters:
     if kind is None:  # no way to tell which keys belong here
         return read_fields(table, Serpentine, planes=dict)
     gait, part = _KINDS[kind]
-
-    def plane(part_table: Table, count: int | None) -> PlaneParameters:
-        if part is OscillatorChain:
-            return _oscillator_chain(part_table, count)
-        return read(part_table, part)
-
-    return read(table, gait, planes=lambda: _planes(table, robot, plane))
+    return read(table, gait, planes=lambda: _planes(table, robot, part))
 
 
 def gait_table(parameters: GaitParameters) -> dict[str, Any]:
@@ -100,17 +93,17 @@ def gait_table(parameters: GaitParameters) -> dict[str, Any]:
 
 
 def _planes(
-    table: Table,
-    robot: Robot | None,
-    read_plane: Callable[[Table, int | None], PlaneParameters],
+    table: Table, robot: Robot | None, part: type[PlaneParameters]
 ) -> dict[Plane, PlaneParameters]:
-    """The driven planes."""
     planes: dict[Plane, PlaneParameters] = {}
     for plane in Plane:
         if plane not in table:
             continue
         count = None if robot is None else len(robot.joint_indices(plane))
-        planes[plane] = read_plane(table.table(plane), count)
+        own = table.table(plane)
+        planes[plane] = (
+            _oscillator_chain(own, count) if part is OscillatorChain else read(own, part)
+        )
         if robot is not None and not count:
             table.fault(plane, f"leave it out: {robot.name} has no {plane} joints")
     if not planes:

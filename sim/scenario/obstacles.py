@@ -22,8 +22,7 @@ from undulog.capture.common.arrays import FloatArray, frozen
 from undulog.capture.common.config import Count, Key, NonNegative, Positive
 from undulog.capture.common.strict_table import above, at_least
 
-_TINY = 1e-300
-"""Makes 0/0 a zero."""
+_TINY = 1e-300  # makes 0/0 a zero
 
 PositivePair: TypeAlias = Annotated[tuple[float, float], above(0.0)]
 
@@ -244,7 +243,7 @@ class Target:
 
 @dataclass(frozen=True)
 class ObstacleMaterial:
-    """What obstacles are made of.
+    """Properties of the obstacles' surfaces.
 
     Attributes:
         stiffness: Of the contact spring [N/m].

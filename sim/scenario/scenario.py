@@ -1,4 +1,4 @@
-"""Scenarios: what the twin is to run, complete.
+"""Scenarios: complete runs of the twin.
 
 The TOML form is described in :mod:`.sim.scenario.scenario_file`.
 
@@ -98,14 +98,9 @@ class Modules:
             if MASS_FACTOR in fields
         }
 
-    def tables(self) -> dict[str, dict[str, object]]:
-        """The tables of a scenario file that say this; empty ones are left out."""
-        tables: dict[str, dict[str, object]] = {
-            "servo": dict(self.servo),
-            "servo_of": {name: dict(one) for name, one in self.servo_of.items()},
-            "link_of": {name: dict(one) for name, one in self.link_of.items()},
-        }
-        return {name: table for name, table in tables.items() if table}
+    def tables(self) -> dict[str, Any]:
+        """The tables of a scenario file for these modules; empty ones are left out."""
+        return {name: table for name, table in write(self).items() if table}
 
 
 def read_modules(top: Table, robot: Robot | None) -> Modules:
@@ -168,6 +163,9 @@ Epoch: TypeAlias = Annotated[int, at_least(1_000_000_000)]
 """Unix time from 2001 on [s]: viewers misread stamps near zero."""
 
 
+_PLAIN = ("duration_s", "settle_s", "seed", "epoch_s", "physics_rate_hz", "engine")
+
+
 @dataclass(frozen=True)
 class Scenario:
     """One run of the twin, complete.
@@ -175,16 +173,16 @@ class Scenario:
     Attributes:
         robot_name: The robot as the scenario names it.
         robot: The robot, with the scenario's modules.
-        gait: What it is commanded to do.
+        gait: Its gait.
         settle_s: The first part of it that is not fit for steady-state analysis.
         noise: What the servos' readings carry.
         modules: Its servos and links that differ from the robot's own.
         seed: Of all that is drawn at random.
         epoch_s: Unix time at which the session starts [s].
         physics_rate_hz: Steps a second, a multiple of twice :data:`CONTROL_RATE_HZ`.
-        engine: Who solves the body's dynamics.
-        faults: What goes wrong on its bus, where it is served on one.
-        controller: What changes the gait by what the sensors say; None: nothing does.
+        engine: The engine that solves the body's dynamics.
+        faults: Faults of its bus, where it is served on one.
+        controller: Changes the gait by the sensor readings; None: no controller.
     """
 
     name: Name
@@ -257,12 +255,7 @@ class Scenario:
             "name": self.name,
             "description": self.description,
             "robot": self.robot_name,
-            "duration_s": self.duration_s,
-            "settle_s": self.settle_s,
-            "seed": self.seed,
-            "epoch_s": self.epoch_s,
-            "physics_rate_hz": self.physics_rate_hz,
-            "engine": self.engine,
+            **{key: getattr(self, key) for key in _PLAIN},
             "gait": gait_table(self.gait),
             "world": world_table(self.world),
             "noise": write(self.noise),

@@ -14,8 +14,7 @@ from undulog.capture.common.strict_table import Table, at_least, at_most
 from undulog.capture.robot.model import Robot, Sensor, SensorKind
 
 _RANGING = (SensorKind.IR, SensorKind.SONAR)
-_SIDEWAYS = math.radians(22.5)
-"""A sensor within this of square to the body looks sideways."""
+_SIDEWAYS = math.radians(22.5)  # A sensor within this of square to the body looks sideways
 
 
 @dataclass(frozen=True)

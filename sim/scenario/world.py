@@ -1,4 +1,4 @@
-"""Where the robot is: gravity, ground, obstacles, target, and how it starts."""
+"""The robot's world: gravity, ground, obstacles, target and start."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class FrictionLaw(StrEnum):
 
 @dataclass(frozen=True)
 class Ground:
-    """What the ground is made of.
+    """Properties of the ground.
 
     Attributes:
         stiffness: k of Eq. 7 [N/m].
@@ -131,7 +131,7 @@ def _read_push(table: Table, robot: Robot | None) -> Push:
 
 
 STANDARD_GRAVITY = 9.81
-"""Acceleration of gravity where nothing else is said [m/s^2]."""
+"""Default acceleration of gravity [m/s^2]."""
 
 
 @dataclass(frozen=True)

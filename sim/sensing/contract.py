@@ -1,4 +1,4 @@
-"""What the robot's sensors deliver: samples with their own times, released when they arrive.
+"""Sensor samples with their own times, released when they arrive.
 
 The twin hands over every control period's physics steps; the sensors give back the samples that
 reach the robot's computer by the end of it, and keep what is known so far for the controller. The
@@ -9,17 +9,15 @@ hold the same columns.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray, IntArray, frozen
 from undulog.capture.robot.model import Robot, Sensor
 
-from ..gait.contract import Readings
 from ..physics.contact import out_of_frames
 from ..physics.engine import BodyState
-from ..physics.steps import Steps
 
 
 def quantised(values: FloatArray, step: float) -> FloatArray:
@@ -112,10 +110,10 @@ class Schedule:
         self._done = 0
 
     def due(self, stop: int) -> tuple[IntArray, IntArray]:
-        """The measurements before a step that were not asked for yet.
+        """Return the measurements due before a step, each once.
 
         Args:
-            stop: The first step that is not asked for.
+            stop: The first step that is not included.
 
         Returns:
             Steps and sensors, in order of time, each of shape (p,).
@@ -181,33 +179,3 @@ class VectorSample(NamedTuple):
 
 
 SensorSample: TypeAlias = JointSample | RangeSample | VectorSample
-
-
-class Sensing(Protocol):
-    """All sensors of a robot in its world."""
-
-    @property
-    def readings(self) -> Readings:
-        """What the robot's computer knows by now."""
-        ...
-
-    def observe(self, steps: Steps) -> list[SensorSample]:
-        """Take in one control period.
-
-        Args:
-            steps: Its physics steps from its start to its end, both included; the last one of a
-                period is the first one of the next.
-
-        Returns:
-            The samples that arrive by the end of the period, in the order of their arrival.
-        """
-        ...
-
-    def flush(self) -> list[SensorSample]:
-        """End the run: samples that were taken and have not arrived yet.
-
-        Returns:
-            These samples; a mean over a period that the run does not cover to its end is taken
-            over the part that it does.
-        """
-        ...

@@ -27,11 +27,11 @@ with a circle in place of two of the slabs).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Robot, Sensor
 
 from ..physics.contact import out_of_frames
@@ -147,40 +147,41 @@ class Ranging:
         sensors: Sequence[Sensor],
         robot: Robot,
         caster: RayCaster,
-        schedule: Schedule,
         *,
+        period_s: float,
         bundles: FloatArray,
         sees_ground: bool,
         dt: float,
+        seed: Sequence[int],
     ) -> None:
-        """Look at a world.
+        """Start before the first control period; the sensors take turns.
 
         Args:
-            schedule: When each is due.
+            period_s: From one measurement of a sensor to its next [s].
             bundles: Unit vectors of each sensor's rays in its frame, shape (k, 3, r).
             sees_ground: Whether the ground stops the rays.
             dt: Physics step [s].
+            seed: Of the noise.
         """
-        self._names = [one.name for one in sensors]
+        self._names = [sensor.name for sensor in sensors]
         self._mounts = Mounts(sensors, robot)
         self._caster = caster
-        self._schedule = schedule
+        self._schedule = Schedule(period_s, len(sensors), dt)
         self._bundles = (self._mounts.rotation @ bundles).transpose(1, 0, 2)  # (3, k, r)
         self._sees_ground = sees_ground
         self._dt = dt
+        self._limits = np.array([(one.range_min, one.range_max) for one in sensors], np.float64)
+        self._random = np.random.default_rng(seed)
 
-    def observe(
-        self, steps: Steps, start: int, reported: Callable[[FloatArray, IntArray], FloatArray]
-    ) -> list[RangeSample]:
+    def observe(self, steps: Steps, start: int) -> list[RangeSample]:
         """Measure what is due in one control period.
 
         Args:
             steps: Its physics steps, both ends included; the last instant is the next period's.
             start: Number of the first one since the start of the run.
-            reported: True distances [m] and the sensors' numbers to what the sensors tell, (p,).
 
         Returns:
-            The samples, in order of time.
+            The samples, in order of time; +inf beyond a sensor's range (REP 117).
         """
         step, which = self._schedule.due(start + len(steps) - 1)
         if not len(step):
@@ -193,12 +194,17 @@ class Ranging:
             out_of_frames(np.repeat(quaternion, count, axis=1), ray),
             ground=self._sees_ground,
         )
-        nearest = way.reshape(-1, count).min(axis=1)
-        told = reported(nearest, which).tolist()
+        shortest, longest = self._limits[which].T
+        distance = self._measured(way.reshape(-1, count).min(axis=1), shortest)
+        reported = np.where(distance > longest, np.inf, distance).tolist()
         return [
-            RangeSample(self._names[i], float(k * self._dt), distance)
-            for k, i, distance in zip(step.tolist(), which.tolist(), told, strict=True)
+            RangeSample(self._names[i], float(k * self._dt), each)
+            for k, i, each in zip(step.tolist(), which.tolist(), reported, strict=True)
         ]
+
+    def _measured(self, distance: FloatArray, shortest: FloatArray) -> FloatArray:
+        """Return what sensors of some shortest ranges measure at true distances [m], (p,)."""
+        raise NotImplementedError
 
 
 IR_STREAM = 3
@@ -234,7 +240,7 @@ def decoded(volts: FloatArray) -> FloatArray:
     return _SCALE / (volts + _BIAS) - _SHIFT
 
 
-class Infrared:
+class Infrared(Ranging):
     """A robot's infrared sensors; each measures along one ray, its x axis."""
 
     def __init__(
@@ -247,44 +253,26 @@ class Infrared:
         dt: float,
         seed: int,
     ) -> None:
-        """Start before the first control period; the sensors' clocks are staggered evenly.
-
-        Args:
-            dt: Physics step [s].
-        """
-        count = len(sensors)
-        self._ranging = Ranging(
+        """Start before the first control period; the sensors' clocks are staggered evenly."""
+        self._model = model
+        super().__init__(
             sensors,
             robot,
             caster,
-            Schedule(model.hold_s, count, dt),
-            bundles=np.tile([[1.0], [0.0], [0.0]], (count, 1, 1)),
+            period_s=model.hold_s,
+            bundles=np.tile([[1.0], [0.0], [0.0]], (len(sensors), 1, 1)),
             sees_ground=True,
             dt=dt,
+            seed=[seed, IR_STREAM],
         )
-        self._model = model
-        self._longest = np.array([one.range_max for one in sensors], dtype=np.float64)
-        self._random = np.random.default_rng([seed, IR_STREAM])
 
-    def observe(self, steps: Steps, start: int) -> list[RangeSample]:
-        """Measure what is due in one control period.
-
-        Args:
-            steps: Its physics steps, both ends included.
-            start: Number of the first one since the start of the run.
-
-        Returns:
-            The samples, in order of time; +inf beyond a sensor's range (REP 117).
-        """
-        return self._ranging.observe(steps, start, self._reported)
-
-    def _reported(self, distance: FloatArray, which: IntArray) -> FloatArray:
+    def _measured(self, distance: FloatArray, shortest: FloatArray) -> FloatArray:  # noqa: ARG002
         model = self._model
         volts = voltage(distance, model.peak)
         volts = volts + model.noise_v * self._random.standard_normal(len(volts))
-        read = quantised(np.clip(volts, 0.0, model.adc_v), model.adc_v / (2**model.adc_bits - 1))
-        told = decoded(read)
-        return np.where(told > self._longest[which], np.inf, told)
+        return decoded(
+            quantised(np.clip(volts, 0.0, model.adc_v), model.adc_v / (2**model.adc_bits - 1))
+        )
 
 
 SONAR_STREAM = 4
@@ -308,8 +296,8 @@ def cone(count: int, angle: float) -> FloatArray:
     return np.array([np.cos(off), np.sin(off) * np.cos(turn), np.sin(off) * np.sin(turn)])
 
 
-class Sonar:
-    """A robot's sonars, mostly one."""
+class Sonar(Ranging):
+    """A robot's sonars, mostly one; what is nearer than the least range reads as that."""
 
     def __init__(
         self,
@@ -321,39 +309,19 @@ class Sonar:
         dt: float,
         seed: int,
     ) -> None:
-        """Start before the first control period.
-
-        Args:
-            dt: Physics step [s].
-        """
-        self._ranging = Ranging(
+        """Start before the first control period."""
+        self._model = model
+        super().__init__(
             sensors,
             robot,
             caster,
-            Schedule(1.0 / model.rate_hz, len(sensors), dt),
+            period_s=1.0 / model.rate_hz,
             bundles=np.array([cone(model.rays, one.field_of_view or 0.0) for one in sensors]),
             sees_ground=False,
             dt=dt,
+            seed=[seed, SONAR_STREAM],
         )
-        self._model = model
-        self._limits = np.array([(one.range_min, one.range_max) for one in sensors], np.float64)
-        self._random = np.random.default_rng([seed, SONAR_STREAM])
 
-    def observe(self, steps: Steps, start: int) -> list[RangeSample]:
-        """Measure what is due in one control period.
-
-        Args:
-            steps: Its physics steps, both ends included.
-            start: Number of the first one since the start of the run.
-
-        Returns:
-            The samples, in order of time; +inf beyond a sensor's range (REP 117), and its least
-            range for what is nearer.
-        """
-        return self._ranging.observe(steps, start, self._reported)
-
-    def _reported(self, distance: FloatArray, which: IntArray) -> FloatArray:
+    def _measured(self, distance: FloatArray, shortest: FloatArray) -> FloatArray:
         noise = self._model.noise * self._random.standard_normal(len(distance))
-        told = quantised(distance + noise, self._model.resolution)
-        shortest, longest = self._limits[which].T
-        return np.where(told > longest, np.inf, np.maximum(told, shortest))
+        return np.maximum(quantised(distance + noise, self._model.resolution), shortest)

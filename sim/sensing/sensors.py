@@ -1,4 +1,4 @@
-"""All sensors of the robot in its world, as :class:`.sim.sensing.contract.Sensing` has them.
+"""All sensors of the robot in its world.
 
 The servos, polled in turn: each joint's sample has its own time.
 
@@ -17,7 +17,8 @@ step.
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -28,12 +29,16 @@ from ..gait.contract import CONTROL_RATE_HZ, Readings
 from ..physics.steps import Steps
 from ..scenario.scenario import Scenario
 from ..scenario.sensors import Noise, ServoPolling
-from .contract import JointSample, RangeSample, SensorSample, VectorSample, quantised
+from .contract import JointSample, RangeSample, SensorSample, quantised
 from .inertial import Accelerometer, Compass
 from .ranging import Infrared, RayCaster, Sonar
 
 STREAM = 1
 """Number of the random stream that the servos' noise is drawn from."""
+
+
+_Sensors: TypeAlias = Infrared | Sonar | Accelerometer | Compass
+"""All sensors of one kind."""
 
 
 class _Period(NamedTuple):
@@ -94,7 +99,7 @@ class JointPolling:
         return [self._sample()] if self._next < self._ended else []
 
     def flush(self) -> list[JointSample]:
-        """End the run: the cycles that are not told yet, the last one of the end's instant.
+        """End the run: return the remaining cycles, the last one at the end's instant.
 
         Joints whose turn comes after the end are sampled at the end, and their offsets say so.
 
@@ -147,7 +152,7 @@ class JointPolling:
         )
 
     def _encoded(self, angle: FloatArray) -> FloatArray:
-        """What the encoders tell of an angle, given what they told last."""
+        """Return the encoders' angles, given their last ones."""
         if self._servos.dead_band > 0.0:
             still = np.abs(angle - self._told) <= self._servos.dead_band  # false at the start
             angle = np.where(still, self._told, angle)
@@ -164,16 +169,12 @@ def _between(series: FloatArray, at: FloatArray) -> FloatArray:
     return before + (at - low) * (after - before)
 
 
-class _Kind(Protocol):
-    """All sensors of one kind."""
-
-    def observe(self, steps: Steps, start: int) -> list[RangeSample] | list[VectorSample]:
-        """Measure during one control period, whose first step has a number."""
-        ...
-
-
 class Senses:
-    """The sensors that a scenario asks for."""
+    """The sensors of a scenario.
+
+    Attributes:
+        readings: Newest readings of the robot's computer.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         """Start before the first control period.
@@ -193,24 +194,11 @@ class Senses:
         self._accelerometers = frozenset(
             one.name for one in scenario.robot.sensors if one.kind is SensorKind.ACCELEROMETER
         )
-        self._readings = Readings.nothing(scenario.robot)
+        self.readings = Readings.nothing(scenario.robot)
         self._start = 0  # number of the next period's first step
 
-    @property
-    def readings(self) -> Readings:
-        """What the robot's computer knows by now."""
-        return self._readings
-
     def observe(self, steps: Steps) -> list[SensorSample]:
-        """Take in one control period.
-
-        Args:
-            steps: Its physics steps from its start to its end, both included.
-
-        Returns:
-            The samples that arrive by the end of the period, in the order of their times; the
-            servos' cycle, which is older, comes last.
-        """
+        """Take in one control period."""
         start = self._start
         self._start += len(steps) - 1
         measured = [one for kind in self._kinds for one in kind.observe(steps, start)]
@@ -218,18 +206,14 @@ class Senses:
         return self._known([*measured, *self._polling.observe(steps)])
 
     def flush(self) -> list[SensorSample]:
-        """End the run.
-
-        Returns:
-            Samples that were taken and have not arrived yet.
-        """
+        """End the run."""
         return self._known([*self._polling.flush()])
 
     def _known(self, samples: list[SensorSample]) -> list[SensorSample]:
         """Take samples into the readings; returns them."""
         if not samples:
             return samples
-        old = self._readings
+        old = self.readings
         angle, velocity = old.angle, old.velocity
         ranges, acceleration, field = {**old.ranges}, {**old.acceleration}, {**old.magnetic_field}
         for sample in samples:
@@ -241,28 +225,23 @@ class Senses:
                 acceleration[sample.name] = sample.vector
             else:
                 field[sample.name] = sample.vector
-        self._readings = Readings(angle, velocity, ranges, acceleration, field)
+        self.readings = Readings(angle, velocity, ranges, acceleration, field)
         return samples
 
 
-def _kinds(scenario: Scenario) -> list[_Kind]:
+def _kinds(scenario: Scenario) -> list[_Sensors]:
     """The sensors that the robot has, by kind."""
     robot, world, models = scenario.robot, scenario.world, scenario.sensing
     dt, seed = 1.0 / scenario.physics_rate_hz, scenario.seed
     caster = RayCaster(world.obstacles, ground=world.ground is not None)
 
-    def having(kind: SensorKind) -> tuple[Sensor, ...]:
-        return tuple(one for one in robot.sensors if one.kind is kind)
-
-    kinds: list[_Kind] = []
-    if sensors := having(SensorKind.IR):
-        kinds.append(Infrared(models.ir, sensors, robot, caster, dt=dt, seed=seed))
-    if sensors := having(SensorKind.SONAR):
-        kinds.append(Sonar(models.sonar, sensors, robot, caster, dt=dt, seed=seed))
-    if sensors := having(SensorKind.ACCELEROMETER):
-        kinds.append(
-            Accelerometer(models.accelerometer, sensors, robot, world.gravity, dt=dt, seed=seed)
-        )
-    if sensors := having(SensorKind.COMPASS):
-        kinds.append(Compass(models.compass, sensors, robot, dt=dt, seed=seed))
-    return kinds
+    build: dict[SensorKind, Callable[[list[Sensor]], _Sensors]] = {
+        SensorKind.IR: lambda own: Infrared(models.ir, own, robot, caster, dt=dt, seed=seed),
+        SensorKind.SONAR: lambda own: Sonar(models.sonar, own, robot, caster, dt=dt, seed=seed),
+        SensorKind.ACCELEROMETER: lambda own: Accelerometer(
+            models.accelerometer, own, robot, world.gravity, dt=dt, seed=seed
+        ),
+        SensorKind.COMPASS: lambda own: Compass(models.compass, own, robot, dt=dt, seed=seed),
+    }
+    sensors = {kind: [one for one in robot.sensors if one.kind is kind] for kind in build}
+    return [build[kind](own) for kind, own in sensors.items() if own]

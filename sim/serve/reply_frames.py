@@ -30,11 +30,15 @@ _PERIOD_NS = _NS // CONTROL_RATE_HZ
 
 
 class ReplyEncoder:
-    """What a robot's servos and sensors say on its bus.
+    """Encodes samples of a robot's servos and sensors as frames.
 
     A frame's device time is the sampling time of what it carries. A frame that carries several
     joints has the time of the last of them; sensors that share a frame and were not read at the
     same time have a frame each, with the others unknown.
+
+    Attributes:
+        made_up: What the frames have to carry, the twin doesn't have and the map can't call
+            unknown.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -76,7 +80,6 @@ class ReplyEncoder:
                 if quantity not in offered and (target, quantity) not in coded
             }
         )
-        """What the frames have to carry, the twin doesn't have and the map can't call unknown."""
 
     def identifiers(self, target: str = "") -> IntArray:
         """Identifiers of frames, with flags.
@@ -121,7 +124,7 @@ class ReplyEncoder:
         return np.concatenate(parts)
 
     def at_rest(self, angle: FloatArray, t_ns: int) -> FrameArray:
-        """What the servos of a robot that has not moved yet say.
+        """Encode the servos of a robot that has not moved yet.
 
         Args:
             angle: Joint angles [rad], shape (m,).
@@ -161,7 +164,12 @@ _PROTOCOL_VIOLATION, _BUS_ERROR = 0x008, 0x080  # linux/can/error.h
 
 
 class FaultLine:
-    """What stands between a healthy robot and its bus."""
+    """Applies faults to a robot and its bus.
+
+    Attributes:
+        lost: Replies that were lost.
+        hit: Transmissions that were hit by noise.
+    """
 
     def __init__(
         self, faults: Sequence[BusFault], robot: Robot, replies: ReplyEncoder, seed: int
@@ -169,7 +177,7 @@ class FaultLine:
         """Start with all faults ahead.
 
         Args:
-            faults: What is to go wrong.
+            faults: The faults.
             replies: Encodes what its joints report.
             seed: Of the random losses and errors.
         """
@@ -181,12 +189,10 @@ class FaultLine:
         self._off = False
         self._late: list[tuple[int, FrameArray]] = []
         self.lost = 0
-        """Replies that were lost."""
         self.hit = 0
-        """Transmissions that were hit by noise."""
 
     def command(self, command: FloatArray, angle: FloatArray, time_s: float) -> FloatArray:
-        """What the servos make of their commands.
+        """Apply the faults to commands.
 
         Args:
             command: Joint angles to be reached [rad], shape (m,).
@@ -207,7 +213,7 @@ class FaultLine:
         return command
 
     def samples(self, samples: Sequence[SensorSample], time_s: float) -> list[SensorSample]:
-        """What the sensors tell.
+        """Apply the faults to sensor samples.
 
         Args:
             time_s: Time since the start [s].
@@ -237,7 +243,7 @@ class FaultLine:
         return told
 
     def is_receiving(self, time_s: float) -> bool:
-        """Whether the robot hears the bus.
+        """Whether the robot receives frames.
 
         Args:
             time_s: Time since the start [s].
@@ -245,7 +251,7 @@ class FaultLine:
         return not any(fault.acts(time_s) for fault in self._of[FaultKind.BUS_OFF])
 
     def replies(self, frames: FrameArray, now_ns: int, time_s: float) -> FrameArray:
-        """What the bus shows of the robot's frames.
+        """Apply the faults to the robot's frames.
 
         Args:
             frames: What it sends now, shape (n,).

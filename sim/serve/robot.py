@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from undulog.capture.robot.model import Direction, Quantity, Robot
 from undulog.capture.sources.contract import records
 
 from ..gait.contract import CONTROL_RATE_HZ, GaitTick, Readings
+from ..gate.outcome import some_names
 from ..scenario.bus_faults import BusFault
 from ..scenario.scenario import Scenario
 from ..sensing.contract import SensorSample
@@ -33,7 +35,7 @@ from .socketcand_protocol import Sent
 from .socketcand_server import VirtualBus
 
 WATCHDOG_S = 0.5
-"""After so long without a command a servo's silence is told; it holds its angle all the while."""
+"""Time without commands after which a warning is logged [s]; the servo holds its angle."""
 
 _SLACK = 1e-9  # rad; a limit of 30 degrees and 30 degrees from the bus differ in the last bit
 
@@ -43,7 +45,7 @@ class CommandLatch:
 
     Attributes:
         frames: Frames with at least one command.
-        cut: Names of joints that were told to go beyond their limits.
+        cut: Names of joints that were commanded beyond their limits.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -79,7 +81,7 @@ class CommandLatch:
         Args:
             frames: What was sent on the bus, marked as sent by the computer, with device times;
                 what carries no command is passed over, shape (n,).
-            heard: Whether the servos hear them.
+            heard: Whether the servos receive them.
 
         Returns:
             Joints that were commanded, shape (m,).
@@ -120,11 +122,12 @@ PERIOD_NS = _NS // CONTROL_RATE_HZ
 """Control period [ns]."""
 
 _BEFORE_NS = 1_000_000  # the last pose at rest, before the first tick
+_NAMED = 8
 _PATIENCE_S = 1.0  # in lockstep, until it is said for whom the robot waits
 
 
 class _StoppedError(Exception):
-    """An end was asked for while the robot waited."""
+    """A stop was requested while the robot waited."""
 
 
 @dataclass(frozen=True)
@@ -170,12 +173,12 @@ class VirtualRobot:
 
         Args:
             scenario: The twin; its gait is not looked at.
-            faults: What is to go wrong, beside the scenario's own faults.
+            faults: Faults in addition to those of the scenario.
             lockstep: Wait at each tick until every servo has a command for it.
             wait: Begin with the first command; in lockstep it does so anyway.
-            say: Told what happens: level, text.
+            log_event: Called with level and text of an event.
             each_tick: Called once a tick, and while it waits.
-            stop: Looked at while it waits.
+            stop: Stops the robot, also while it waits.
 
         Raises:
             DataError: If the robot has no bus.
@@ -202,7 +205,7 @@ class VirtualRobot:
     """No values: what the controller meant is not on the bus."""
 
     def run(self, ready: Callable[[], None] = lambda: None) -> Served:
-        """Live until the scenario ends or a stop is asked for.
+        """Run until the scenario ends or a stop is requested.
 
         Args:
             ready: Called when the twin stands on the ground and the bus can be used.
@@ -234,15 +237,7 @@ class VirtualRobot:
         )
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:
-        """Wait for the tick, report, and take the newest commands.
-
-        Args:
-            time_s: Time since the start [s].
-            readings: What the encoders have told.
-
-        Returns:
-            The commands that are in force from here on.
-        """
+        """Wait for the tick, report, and take the newest commands."""
         tick = self._tick
         if not tick:
             # Nothing is told before it: a controller in lockstep may speak, and knows the pose.
@@ -332,11 +327,11 @@ class VirtualRobot:
             self._say("warn", f"{why}: simulated time stood still, and samples have a gap there")
 
     def _at_rest(self) -> FrameArray:
-        """What the servos say before the first command."""
+        """Return the servos' frames before the first command."""
         return self._replies.at_rest(self._latch.angle, self._pacer.now_ns())
 
     def _report(self, samples: Sequence[SensorSample], tick: int) -> FrameArray:
-        """Send what the sensors have told by a tick; gives what was sent."""
+        """Send the sensor samples of a tick; returns the frames."""
         time_s = tick / CONTROL_RATE_HZ
         frames = self._replies.frames(self._line.samples(samples, time_s), self._pacer.clock_ns)
         now_ns = self._pacer.clock_ns(tick * PERIOD_NS)
@@ -345,7 +340,7 @@ class VirtualRobot:
         return shown
 
     def _watch(self) -> None:
-        """Say when servos get no commands any more."""
+        """Log when servos get no commands any more."""
         now_ns, longest_ns = self._pacer.now_ns(), round(WATCHDOG_S * _NS)
         silent = self._latch.silent(now_ns, longest_ns)
         if bool(silent.any()) is not self._silent:
@@ -363,6 +358,4 @@ class VirtualRobot:
             self._say("warn", f"{name} was commanded beyond its limits, and stops there")
 
     def _listed(self, chosen: BoolArray) -> str:
-        """Some joints by name."""
-        names = [n for n, is_one in zip(self._robot.joint_names, chosen, strict=True) if is_one]
-        return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+        return some_names(list(compress(self._robot.joint_names, chosen)), _NAMED)

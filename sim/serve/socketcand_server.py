@@ -47,7 +47,7 @@ class SocketcandServer:
 
     Attributes:
         dropped: Clients whose connection was ended because they were too slow or made no sense.
-        identity: What a client that asks is told of the robot.
+        identity: Answer to clients that request the robot's identity.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class SocketcandServer:
 
         Args:
             frames: Records of :data:`.FRAME_DTYPE`, shape (n,); their device
-                times are told.
+                times are sent.
             but: Number of the client that sent them.
         """
         listening = [c for c in self._clients.values() if c.raw and c.number != but]
@@ -140,12 +140,12 @@ class SocketcandServer:
             self._give(client, text)
 
     def mark(self, tick: int, state: FrameArray | None = None) -> None:
-        """Tell those who asked that all frames of a control tick are out.
+        """Send the mark of a control tick to the clients that requested it.
 
         Args:
-            tick: Its number; a client that goes to raw mode later is told of the newest.
-            state: Frames that such a client is told before it, as it has not heard them; None
-                where it soon hears newer ones.
+            tick: Its number; a client that enters raw mode later receives the newest.
+            state: Frames that such a client receives before it, as it has missed them; None
+                where newer ones follow soon.
         """
         self._tick = tick
         self._state = b"" if state is None else frame_text(state)
@@ -339,7 +339,7 @@ class VirtualBus:
         return 0 if self._server is None else self._server.waiting
 
     def identify(self, identity: str) -> None:
-        """Say what clients are told that ask.
+        """Set the answer to clients that request the identity.
 
         Args:
             identity: E.g. ``virtual-robot snake25 paced``.
@@ -348,11 +348,11 @@ class VirtualBus:
             self._server.identity = identity
 
     def mark(self, tick: int, state: FrameArray | None = None) -> None:
-        """Tell clients that asked for it that all frames of a control tick are out.
+        """Send the mark of a control tick to the clients that requested it.
 
         Args:
-            state: The newest frames of the robot's state, for those who come later; None where they
-                soon hear newer ones.
+            state: The newest frames of the robot's state, for later clients; None where newer ones
+                follow soon.
         """
         if self._server is not None:
             self._server.mark(tick, state)
@@ -386,7 +386,7 @@ class VirtualBus:
         return list(itertools.islice(taken, most))
 
     def relay(self, sent: Sequence[Sent], t_ns: int) -> FrameArray:
-        """Let everyone but their senders hear frames of clients.
+        """Send frames of clients to everyone but their senders.
 
         Args:
             t_ns: The robot's clock [ns]: their time on the bus.
@@ -405,7 +405,7 @@ class VirtualBus:
         return frames
 
     def send(self, frames: FrameArray) -> None:
-        """Let everyone hear frames of the robot.
+        """Send frames of the robot to everyone.
 
         Args:
             frames: Records of :data:`.FRAME_DTYPE` with device times, (n,).
@@ -426,7 +426,7 @@ class VirtualBus:
         self._record(frames)
 
     def _record(self, frames: FrameArray) -> None:
-        """Hand frames to the recorder, and say so when it comes or goes."""
+        """Send frames to the recorder, and log its connection and disconnection."""
         if self._sender is None:
             return
         try:

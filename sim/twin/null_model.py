@@ -180,7 +180,7 @@ STEP = 0.1
 """h: every parameter is changed by a factor exp(+-0.1)."""
 
 REACH = 0.2
-"""The model is said to hold for factors exp(+-0.2)."""
+"""Range of validity of the model: factors exp(+-0.2)."""
 
 HELD_OUT = 4
 
@@ -197,10 +197,10 @@ def null_model(
 
     Args:
         scenario: A serpentine gait without a controller, settled for at least three cycles.
-        made_by: A sentence that says what it is made from.
+        made_by: A sentence on its origin.
         spread: Standard deviation of each ln theta, as known beforehand.
         kernels: What computes the force laws.
-        on_run: Told the runs done and how many there will be.
+        on_run: Called with the number of finished runs and of all runs.
 
     Raises:
         UsageError: If the scenario's gait has no steady rhythm, or its modules differ.

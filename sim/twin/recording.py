@@ -27,7 +27,7 @@ from .twin import Sample, Twin
 
 @contextmanager
 def quick_collections() -> Generator[None]:
-    """Garbage is looked for among new objects only: all of them at once take longer than a tick."""
+    """Restrict garbage collection to new objects: a full one takes longer than a tick."""
     gc.collect()
     gc.freeze()
     try:
@@ -60,7 +60,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Driver:
-    """Who commands the joints instead of the scenario's own gait.
+    """The gait that commands the joints in place of that of the scenario.
 
     Attributes:
         gait: The commands; a run that is stopped has come to rest by then.
@@ -99,8 +99,7 @@ def open_session(
     It appears under its name then; until then it is ``PATH.part``, which only a kill leaves behind.
 
     Args:
-        driver: Who commands the joints; the scenario's own gait if None.
-        kernels: What computes the force laws.
+        driver: The gait that commands the joints; that of the scenario if None.
 
     Yields:
         The session, with everything that explains the run and no sample.
@@ -180,7 +179,7 @@ def record(
 
     Args:
         driver: Who commands the joints; the scenario's own gait if None.
-        on_sample: Told of each sample after it was written, e.g. to show progress.
+        on_sample: Called with each sample after it is written.
         kernels: What computes the force laws.
 
     Raises:
@@ -202,24 +201,21 @@ def record(
                 if stop is not None and stop.requested:
                     break
         except SimulationError as error:
-            log.receive(twin.flush())
+            log.end("bad", str(error))
             log.log_event("error", str(error))
-            writer.set_verdict("bad", [str(error)])
             raise
-        log.receive(twin.flush())
         assert sample is not None  # noqa: S101 - a run has at least two samples
         complete = sample.tick == scenario.tick_count - 1
+        level, verdict, at = "info", "good", f"{sample.time_s:g} s"
         if complete:
-            log.log_event("info", f"end at {sample.time_s:g} s")
-            writer.set_verdict("good")
-        elif driver is not None:  # it was asked to come to rest, and has
-            planned = f"{scenario.duration_s:g} s"
-            log.log_event("info", f"at rest at {sample.time_s:g} s of {planned}: it was stopped")
-            writer.set_verdict("good")
+            text = f"end at {at}"
+        elif driver is not None:  # a stop request lets it come to rest first
+            text = f"at rest at {at} of {scenario.duration_s:g} s: it was stopped"
         else:
-            text = f"stopped at {sample.time_s:g} s of {scenario.duration_s:g} s"
-            log.log_event("warn", text)
-            writer.set_verdict("degraded", [text])
+            level, verdict = "warn", "degraded"
+            text = f"stopped at {at} of {scenario.duration_s:g} s"
+        log.end(verdict, text)
+        log.log_event(level, text)
     return Recording(
         path=Path(path),
         session_id=_session_id(scenario, driver, kernels),

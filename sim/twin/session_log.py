@@ -1,6 +1,6 @@
 """The twin's samples, written to the log contract.
 
-What the sensors tell is written when it arrives at the robot's computer: ``header.stamp`` is the
+Sensor samples are written when they arrive at the robot's computer: ``header.stamp`` is the
 sampling time (of joints the start of the polling cycle, and ``/joint_sample_offset`` has each
 joint's own turn after it), the log time is that of the arrival. Effort, current and voltage are
 means over one control period (:mod:`.sim.sensing.sensors`). Their products miss what happens within
@@ -132,20 +132,20 @@ GAIT_UNIT = "rad, omega in rad/s"
 
 _TF_EVERY = 5  # ticks: 20 Hz, a view aid
 _TICK_NS = 1_000_000_000 // CONTROL_RATE_HZ
+# Rows of :attr:`.sim.twin.twin.Sample.joint_energy` whose rates of change are logged.
 _POWER_TERMS = {
     PowerTopic.MECHANICAL: JOINT_TERMS.index("mechanical_net"),
     PowerTopic.MECHANICAL_PLUS: JOINT_TERMS.index("mechanical_plus"),
     PowerTopic.ELECTRICAL: JOINT_TERMS.index("electrical_net"),
     PowerTopic.ELECTRICAL_PLUS: JOINT_TERMS.index("electrical_plus"),
 }
-"""Rows of :attr:`.sim.twin.twin.Sample.joint_energy` whose rates of change are logged."""
 
+# Powers are rounded to 60 nW, without bias: the digits beyond would be half of their bytes.
 _POWER_PER_W = float(2**24)
-"""Powers are rounded to 60 nW, without bias: the digits beyond would be half of their bytes."""
 
 
 def session_facts(scenario: Scenario, kernels: Kernels = Kernels.NUMPY) -> Mapping[str, str]:
-    """What the session's metadata says about the run.
+    """Return the metadata of a run.
 
     Args:
         kernels: What computes the force laws.
@@ -178,6 +178,7 @@ class SessionLog:
             writer: The session; the log does not close it.
             epoch_ns: Unix time of the first sample [ns]; that of the scenario by default.
         """
+        self._writer, self._twin = writer, twin
         scenario = self._scenario = twin.scenario
         self._epoch_ns = scenario.epoch_ns if epoch_ns is None else epoch_ns
         robot = scenario.robot
@@ -230,12 +231,18 @@ class SessionLog:
             self._said.add(text)
             self._events.write(self._t_ns, level, "twin", text)
 
-    def write(self, sample: Sample) -> None:
-        """Write one sample to all channels.
+    def end(self, verdict: str, reason: str) -> None:
+        """Write the samples that have not arrived yet, and set the verdict.
 
         Args:
-            sample: The twin's sample.
+            verdict: ``good``, ``degraded`` or ``bad``.
+            reason: Its reason, where it isn't good.
         """
+        self.receive(self._twin.flush())
+        self._writer.set_verdict(verdict, [] if verdict == "good" else [reason])
+
+    def write(self, sample: Sample) -> None:
+        """Write one sample to all channels."""
         t_ns = self._t_ns = self._epoch_ns + sample.tick * _TICK_NS
         body = sample.step.body
         self._commands.write(t_ns, sample.gait.command)
@@ -259,7 +266,7 @@ class SessionLog:
         self._note(sample)
 
     def receive(self, samples: Sequence[SensorSample]) -> None:
-        """Write what the sensors told, as arrived by the time of the last sample written.
+        """Write sensor samples, as arrived by the time of the last sample written.
 
         Args:
             samples: From :attr:`Sample.sensed`, or from :meth:`Twin.flush` at the end of the run.
@@ -294,7 +301,7 @@ class SessionLog:
             self._powers[topic].write(middle_ns, power[row], log_time_ns=self._t_ns)
 
     def _note(self, sample: Sample) -> None:
-        """Say what deserves saying about a sample."""
+        """Log events of a sample."""
         if sample.tick == round(self._scenario.settle_s * CONTROL_RATE_HZ):
             self.log_event("info", f"settled: {self._scenario.settle_s:g} s have passed")
         target = self._scenario.world.target

@@ -24,8 +24,7 @@ from ..scenario.scenario_file import load_scenario
 from .session_log import SessionLog, session_facts
 from .twin import Sample, Twin
 
-_AHEAD = 100
-"""Samples that the twin may be ahead of the recording."""
+_AHEAD = 100  # samples that the twin may be ahead of the recording
 
 _PERIOD_NS = 1_000_000_000 // CONTROL_RATE_HZ
 
@@ -52,60 +51,36 @@ class TwinSource:
         self._log: SessionLog | None = None
         self._twin: Twin | None = None
         self._context: SourceContext | None = None
-        self._finished = False
+        self.finished = False
 
     @property
     def facts(self) -> Mapping[str, str]:
-        """What the session's metadata says of the run."""
+        """Metadata of the run for the session."""
         return session_facts(self._scenario)
 
     @property
     def connected(self) -> bool:
         """Whether the twin runs."""
-        return self._thread is not None and not self._finished
-
-    @property
-    def finished(self) -> bool:
-        """Whether the scenario has ended and all its samples are written."""
-        return self._finished
+        return self._thread is not None and not self.finished
 
     def start(self, context: SourceContext) -> None:
-        """Set the robot on the ground and let it go.
-
-        Args:
-            context: The recording; its fact ``fast`` lets the twin run as fast as it can, and
-                ``duration_s`` is how long it runs, rather than as long as the scenario says.
-
-        Raises:
-            SourceError: If the engine cannot hold the robot, or can't run so long.
-        """
+        """Set the robot on the ground and let it go."""
         self._context = context
         try:
-            self._begin(context)
+            if (duration_s := context.facts.get("duration_s")) is not None:
+                self._scenario = self._scenario.changed(duration_s=float(duration_s))
+            self._twin = Twin(self._scenario)
         except UsageError as error:
             raise SourceError(self._address.text, str(error)) from error
-
-    def _begin(self, context: SourceContext) -> None:
-        duration_s = context.facts.get("duration_s")
-        if duration_s is not None:
-            self._scenario = self._scenario.changed(duration_s=float(duration_s))
-        self._twin = Twin(self._scenario)
         self._log = SessionLog(context.writer, self._twin, epoch_ns=context.now_ns())
         fast = context.facts.get("fast") == "true"
         self._thread = threading.Thread(target=self._run, args=(fast,), name=self.name, daemon=True)
         self._thread.start()
 
     def poll(self) -> Polled:
-        """Write the samples that are due.
-
-        Returns:
-            Events only: the samples are on the twin's own channels by then.
-
-        Raises:
-            LogWriteError: If the session can't be written.
-        """
+        """Write the samples that are due."""
         events: list[SourceEvent] = []
-        while not self._finished and self._log is not None and self._context is not None:
+        while not self.finished and self._log is not None and self._context is not None:
             try:
                 item = self._queue.get_nowait()
             except Empty:
@@ -115,14 +90,13 @@ class TwinSource:
                 self.counts.dropped = item.tick - self.counts.frames  # ticks are numbered from 0
                 self.counts.frames += 1
                 continue
-            self._finished = True
+            self.finished = True
             if self._twin is not None:
                 self._log.receive(self._twin.flush())
-            now_ns = self._context.now_ns()
+            level, text = "error", str(item)
             if item is None:
-                events.append(SourceEvent(now_ns, "info", f"{self._scenario.name} has ended"))
-            else:
-                events.append(SourceEvent(now_ns, "error", str(item)))
+                level, text = "info", f"{self._scenario.name} has ended"
+            events.append(SourceEvent(self._context.now_ns(), level, text))
         return Polled(events=tuple(events))
 
     def stop(self) -> None:

@@ -106,7 +106,7 @@ def _verdict(use: Use, scenario: Scenario) -> str:
 
 
 def _sunk(scenario: Scenario) -> str | None:
-    """What to say where a link's weight presses it into the ground by more than its radius."""
+    """Return a warning where a link's weight presses it into the ground by more than its radius."""
     ground = scenario.world.ground
     if ground is None:
         return None

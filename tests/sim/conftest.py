@@ -34,6 +34,21 @@ def make_robot():
 
 
 @pytest.fixture(scope="session")
+def make_uneven(make_robot):
+    """Chain of links that differ in every respect, so that no mix-up goes unseen."""
+
+    def build(links):
+        robot = make_robot(links)
+        uneven = tuple(
+            Link(name, 0.05 + 0.01 * i, 0.02, 0.1 + 0.02 * i, (3e-5 + i * 1e-6, 5e-5, 6e-5))
+            for i, name in enumerate(link.name for link in robot.links)
+        )
+        return dataclasses.replace(robot, links=uneven)
+
+    return build
+
+
+@pytest.fixture(scope="session")
 def make_scenario(make_robot):
     """Lateral undulation of that chain; ``amplitude=0`` holds it straight."""
 

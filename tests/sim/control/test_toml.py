@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from undulog.capture.common.errors import ScenarioError
+from support.twin_runs import SNAKE13, SNAKE25, faults_of
 from undulog.sim import Readings, load_scenario, parse_scenario
 from undulog.sim.control.adaptive import build_gait
 from undulog.sim.scenario.controllers import (
@@ -23,27 +23,12 @@ from undulog.sim.scenario.controllers import (
     TargetHeading,
 )
 
-BASE = """
-description = "a test"
-robot = "snake25"
-duration_s = 2.0
-[gait.horizontal]
-amplitude = 0.3
-frequency_hz = 0.5
-lag = 0.5
-[world.target]
-position = [3.0, 1.0]
-"""
+TARGET = "[world.target]\nposition = [3.0, 1.0]\n"
+BASE = SNAKE25 + TARGET
 
 
-def parsed(text, base=BASE):
-    return parse_scenario(f"{base}\n{text}", "x.toml")
-
-
-def faults_of(text, base=BASE):
-    with pytest.raises(ScenarioError) as caught:
-        parsed(text, base)
-    return {fault.key: str(fault) for fault in caught.value.faults}
+def parsed(text):
+    return parse_scenario(BASE + text, "x.toml")
 
 
 @pytest.mark.parametrize("kind", list(ControllerKind))
@@ -57,7 +42,7 @@ def test_each_kind_has_its_parts_and_no_others(kind):
     for part in ("side", "tail", "course"):
         if getattr(controller, part) is None:
             text = f'[controller]\nkind = "{kind}"\n[controller.{part}]\n'
-            assert f"controller.{part}" in faults_of(text)
+            assert f"controller.{part}" in faults_of(BASE + text)
 
 
 POSITIVE = st.floats(1e-3, 1e3)
@@ -105,7 +90,7 @@ def test_what_is_written_reads_the_same(controller):
 
 def test_all_faults_are_listed_at_once():
     found = faults_of(
-        """
+        f"""{BASE}
 [controller]
 kind = "random-walk"
 near_hold = 1.0
@@ -126,20 +111,16 @@ longest_s = 2.0
     }
     assert "did you mean near_hold_s?" in found["controller.near_hold"]
     assert "at least shortest_s = 3" in found["controller.course.longest_s"]
-    assert "random-walk" in faults_of('[controller]\nkind = "random"')["controller.kind"]
+    assert "random-walk" in faults_of(f'{BASE}[controller]\nkind = "random"')["controller.kind"]
 
 
 def test_a_controller_needs_its_sensors_its_target_and_a_horizontal_gait():
     follow = '[controller]\nkind = "target-following"'
-    without_target = BASE.replace("[world.target]\nposition = [3.0, 1.0]", "")
-    assert "[world.target]" in faults_of(follow, without_target)["controller.kind"]
+    assert "[world.target]" in faults_of(SNAKE25 + follow)["controller.kind"]
     vertical = BASE.replace("gait.horizontal", "gait.vertical")
-    assert "horizontal" in faults_of(follow, vertical)["controller.kind"]
-    bare = BASE.replace("snake25", "snake13")
-    told = faults_of('[controller]\nkind = "avoidance"', bare)["controller.kind"]
-    assert "looks ahead" in told
-    assert "looks sideways" in told
-    assert "snake13" in told
+    assert "horizontal" in faults_of(vertical + follow)["controller.kind"]
+    told = faults_of(f'{SNAKE13}{TARGET}[controller]\nkind = "avoidance"')["controller.kind"]
+    assert all(part in told for part in ("looks ahead", "looks sideways", "snake13"))
 
 
 @pytest.mark.parametrize("gait", ["flat", "delay-blocks", "oscillators"])

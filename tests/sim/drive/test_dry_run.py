@@ -52,10 +52,11 @@ def robot():
     return parse_robot(ROBOT, "short.toml", {})
 
 
-def write(path, robot, commands):
-    """A session of commands, rows at 100 Hz."""
+def recorded(path, robot, commands):
+    """Commands of a session, rows at 100 Hz, to be driven."""
     clock = {"computer": "host"}
-    return write_commands(path, robot.joint_names, commands, robot=robot, clock=clock)
+    write_commands(path, robot.joint_names, commands, robot=robot, clock=clock)
+    return find_motion(str(path))
 
 
 def wave(robot, seconds, amplitude=0.2, frequency_hz=1.0, phase=0.5):
@@ -69,7 +70,7 @@ def waved(robot, tmp_path_factory):
     """A wave of 1.5 s, run dry, and the twin's session of it."""
     folder = tmp_path_factory.mktemp("dry")
     commands = wave(robot, 1.5)
-    driven = find_motion(str(write(folder / "wave.mcap", robot, commands)))
+    driven = recorded(folder / "wave.mcap", robot, commands)
     path = folder / "twin.mcap"
     return commands, dry_run(driven, output=path), path
 
@@ -95,7 +96,7 @@ def test_it_would_run_and_the_first_line_says_so(waved):
     _, run, _ = waved
     assert run.verdict is Verdict.RUNS
     assert run.verdict.fit
-    assert (run.duration_s, run.planned_s, run.missing, run.fault) == (1.5, 1.5, (), None)
+    assert (run.duration_s, run.scenario.duration_s, run.missing, run.fault) == (1.5, 1.5, (), None)
     lines = list(summary_lines(run, WIDE))
     assert lines[0].startswith("wave.mcap on short would run as it is; closest to a limit")
     joint, demand = run.closest
@@ -174,7 +175,7 @@ def test_json_has_si_units_and_nothing_that_is_no_number(waved):
 def test_a_step_would_be_clamped_to_the_greatest_rate(robot, tmp_path):
     commands = np.zeros((60, len(robot.joints)))
     commands[20:, 2] = 0.3
-    driven = find_motion(str(write(tmp_path / "step.mcap", robot, commands)))
+    driven = recorded(tmp_path / "step.mcap", robot, commands)
     path = tmp_path / "twin.mcap"
     run = dry_run(driven, output=path)
     assert run.verdict is Verdict.CLAMPED
@@ -194,7 +195,7 @@ def test_a_step_would_be_clamped_to_the_greatest_rate(robot, tmp_path):
 
 
 def test_a_servo_that_is_too_weak_would_stop_the_drive(robot, tmp_path):
-    driven = find_motion(str(write(tmp_path / "wave.mcap", robot, wave(robot, 3.0, 0.5))))
+    driven = recorded(tmp_path / "wave.mcap", robot, wave(robot, 3.0, 0.5))
     world = nominal_world(robot)
     joints = list(robot.joints)
     weak = dataclasses.replace(joints[2].servo, stall_torque=0.01)
@@ -215,7 +216,7 @@ def test_a_servo_that_is_too_weak_would_stop_the_drive(robot, tmp_path):
 
 def test_limits_that_are_missing_are_named_and_the_numbers_are_there_all_the_same(robot, tmp_path):
     bare = dataclasses.replace(robot, safety=Safety(max_rate=4.0))
-    driven = find_motion(str(write(tmp_path / "wave.mcap", robot, wave(robot, 0.5))))
+    driven = recorded(tmp_path / "wave.mcap", robot, wave(robot, 0.5))
     run = dry_run(driven, robot=bare)
     assert run.verdict is Verdict.REFUSED
     assert run.missing == ("ramp_rate", "max_tracking_error", "reply_timeout_s", "max_late_s")
@@ -268,13 +269,13 @@ def test_what_arming_would_refuse_the_dry_run_refuses_too(tmp_path, capsys):
     joints = ("joint01", "joint02")
     write_commands(few, joints, [np.zeros(2)], robot=whole, clock={"c": "host"})
     assert front.run(["drive", str(few), *on]) == 2
-    summary_lines = capsys.readouterr().err
-    assert "it commands 2 joints: joint01, joint02" in summary_lines
-    assert "snake25 has 25: joint01, joint02, joint03" in summary_lines
+    said = capsys.readouterr().err
+    assert "it commands 2 joints: joint01, joint02" in said
+    assert "snake25 has 25: joint01, joint02, joint03" in said
 
 
 def test_a_twin_that_fails_leaves_a_session_that_says_so(robot, tmp_path):
-    driven = find_motion(str(write(tmp_path / "wave.mcap", robot, wave(robot, 0.5))))
+    driven = recorded(tmp_path / "wave.mcap", robot, wave(robot, 0.5))
     world = dataclasses.replace(nominal_world(robot), physics_rate_hz=200)
     path = tmp_path / "twin.mcap"
     with pytest.raises(SimulationError, match="the twin failed at 0"):

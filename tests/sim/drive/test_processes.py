@@ -2,9 +2,7 @@
 
 import json
 import os
-import pty
 import signal
-import subprocess
 import time
 from contextlib import contextmanager
 
@@ -141,7 +139,8 @@ def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
     with served("flat", "--lockstep", "--fast") as (on, _):
         words = ("drive", "flat", "--on", on, "--arm", "--duration", "600", "-o", str(path))
         with process(*UNDULOG, *words, env=alone) as driving:
-            under_way(driving, path)
+            wait_for(lambda: path.exists() and path.stat().st_size > 0, alive=[driving])
+            time.sleep(1.0)
             driving.send_signal(number)
             told, complained = driving.communicate(timeout=60)
     assert driving.returncode == 1
@@ -157,49 +156,3 @@ def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
         commands = np.array(session.joints("/joint_commands").values)
         assert (session.verdict, session.warnings) == ("good", [])
     assert not commands[:, -1].any()
-
-
-def under_way(driving, path):
-    """Wait until a drive is in full swing."""
-    wait_for(lambda: path.exists() and path.stat().st_size > 0, alive=[driving])
-    time.sleep(1.0)
-
-
-def test_a_terminal_that_goes_ends_the_drive_and_the_session_is_whole(tmp_path, alone):
-    """A real pseudo-terminal: progress is written to it, its other end is closed."""
-    path = tmp_path / "a.mcap"
-    with served("flat", "--lockstep", "--fast") as (on, _):
-        words = ("drive", "flat", "--on", on, "--arm", "--duration", "600", "-o", str(path))
-        screen, terminal = pty.openpty()
-        with subprocess.Popen(
-            [*UNDULOG, *words], stdin=terminal, stdout=terminal, stderr=terminal, env=alone
-        ) as driving:
-            os.close(terminal)
-            deadline = time.monotonic() + 60
-            seen = b""
-            while b"run, " not in seen:
-                assert time.monotonic() < deadline, seen
-                seen += os.read(screen, 65536)
-            os.close(screen)  # no signal: it is no controlling terminal
-            assert driving.wait(60) == 1
-    with Session.open(path) as session:
-        commands = np.array(session.joints("/joint_commands").values)
-        said = [message.msg for _, message in session.messages("/rosout")]
-        assert session.verdict == "good"
-    assert not commands[:, -1].any()
-    assert said[-1].startswith("stopped: the console is gone; the joints were brought straight")
-
-
-def test_a_killed_robot_ends_the_drive_with_its_name(tmp_path, alone):
-    path = tmp_path / "a.mcap"
-    with served("flat", "--lockstep", "--fast") as (on, robot):
-        words = ("drive", "flat", "--on", on, "--arm", "--duration", "600", "-o", str(path))
-        with process(*UNDULOG, *words, env=alone) as driving:
-            under_way(driving, path)
-            robot.kill()
-            _, complained = driving.communicate(timeout=60)
-    assert driving.returncode == 1
-    assert complained.startswith(f"error: {on}: the robot ")
-    with Session.open(path) as session:
-        assert session.verdict == "bad"
-        assert session.channels["/joint_commands"].count > 1

@@ -1,12 +1,11 @@
 """Telling a recorder the gait: through a real control socket, and what follows when it goes."""
 
-import threading
-import time
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
+from support.control_clients import polled
 from support.processes import wait_for
 from undulog.capture.common.errors import ControlError
 from undulog.capture.recorder.control import ControlServer
@@ -22,8 +21,8 @@ def tick(k, mode="walk", count=5):
 
 @contextmanager
 def control_socket(path, refuse=()):
-    """A recorder's control socket that keeps what it is asked."""
-    heard, ended = [], threading.Event()
+    """A recorder's control socket that keeps the requests."""
+    heard = []
 
     def handle(request):
         heard.append(dict(request))
@@ -32,28 +31,15 @@ def control_socket(path, refuse=()):
         return {}
 
     server = ControlServer(path, handle)
-
-    def serve():
-        while not ended.is_set():
-            server.poll()
-            time.sleep(0.002)
-        server.close()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-
-    def end():
-        ended.set()
-        thread.join()
-
     try:
-        yield heard, end
+        with polled(server):
+            yield heard
     finally:
-        end()
+        server.close()
 
 
 def test_everything_is_told_in_order(tmp_path):
-    with control_socket(tmp_path / "a.sock") as (heard, _):
+    with control_socket(tmp_path / "a.sock") as heard:
         teller = GaitPublisher(tmp_path / "a.sock", NAMES)
         teller.note("drives")
         for k in range(300):
@@ -74,7 +60,7 @@ def test_everything_is_told_in_order(tmp_path):
 def test_what_json_has_no_number_for_is_null(tmp_path):
     names = (*NAMES, "joint01.A", "steer.distance")
     values = np.array([1.0, 2.0, 3.0, 4.0, 5.0, np.nan, np.inf])
-    with control_socket(tmp_path / "a.sock") as (heard, _):
+    with control_socket(tmp_path / "a.sock") as heard:
         teller = GaitPublisher(tmp_path / "a.sock", names)
         teller.publish(GaitTick(np.zeros(25), values, "walk", ()), 1)
         teller.close()
@@ -83,7 +69,7 @@ def test_what_json_has_no_number_for_is_null(tmp_path):
 
 
 def test_commands_without_a_gait_tell_their_mode_only(tmp_path):
-    with control_socket(tmp_path / "a.sock") as (heard, _):
+    with control_socket(tmp_path / "a.sock") as heard:
         teller = GaitPublisher(tmp_path / "a.sock", ())
         teller.publish(tick(0, "replay", count=0), 1)
         teller.close()
@@ -92,14 +78,13 @@ def test_commands_without_a_gait_tell_their_mode_only(tmp_path):
 
 
 def test_a_recorder_that_goes_or_refuses_is_told_nothing_more(tmp_path):
-    with control_socket(tmp_path / "a.sock") as (_, end):
+    with control_socket(tmp_path / "a.sock"):
         teller = GaitPublisher(tmp_path / "a.sock", NAMES)
         teller.publish(tick(0), 1)
-        teller_told(teller, 1)
-        end()
-        for k in range(5000):  # more than is held: nothing waits, nothing fails
-            teller.publish(tick(k), k)
-        teller.close()
+        wait_for(lambda: teller.told == 1)
+    for k in range(5000):  # more than is held: nothing waits, nothing fails
+        teller.publish(tick(k), k)
+    teller.close()
     assert teller.told == 1
     assert "went" in teller.error
     with control_socket(tmp_path / "b.sock", refuse=("gait",)):
@@ -107,10 +92,6 @@ def test_a_recorder_that_goes_or_refuses_is_told_nothing_more(tmp_path):
         teller.publish(tick(0), 1)
         teller.close()
     assert (teller.told, teller.error) == (0, "a source writes that topic")
-
-
-def teller_told(teller, count):
-    wait_for(lambda: teller.told >= count)
 
 
 def test_no_recorder_there_is_an_error(tmp_path):

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from undulog.capture import load_robot
 from undulog.capture.common.errors import UsageError
-from undulog.capture.robot.model import ClockDomain, Joint, Link, Plane, Robot
+from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, Wave
 from undulog.sim.gait.contract import Modulation
 from undulog.sim.gait.delay_blocks import DelayBlocks, DelayLine
@@ -21,18 +22,10 @@ STEP_S = 0.01
 
 
 def snake(limits=((-math.pi / 6, math.pi / 6),) * 7):
-    names = [f"{i + 1:02d}" for i in range(8)]
-    planes = [Plane.HORIZONTAL, Plane.VERTICAL] * 4
-    return Robot(
-        name="seven",
-        description="seven joints",
-        clock=ClockDomain.SIMULATED,
-        links=tuple(Link(f"link{n}", 0.06, 0.025, 0.1, (4e-5, 5e-5, 5e-5)) for n in names),
-        joints=tuple(
-            Joint(f"joint{n}", plane, *limit)
-            for n, plane, limit in zip(names[:-1], planes, limits, strict=False)
-        ),
-    )
+    robot = load_robot("snake13")
+    pairs = zip(robot.joints, limits, strict=False)
+    joints = [dataclasses.replace(one, lower=least, upper=most) for one, (least, most) in pairs]
+    return dataclasses.replace(robot, links=robot.links[:8], joints=tuple(joints))
 
 
 def both(plane):

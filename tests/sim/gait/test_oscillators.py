@@ -21,6 +21,7 @@ from undulog.sim.gait.oscillators import (
 OMEGA = math.pi
 PSI = math.pi / 6
 KINDS = list(OscillatorKind)
+UNCOUPLED = {"forward": 0.0, "backward": 0.0}
 
 
 def nothing(joint_count):
@@ -44,6 +45,11 @@ def run(robot, seconds, *, rate_hz=100, answer=None, **fields):
     return np.array(theta), np.array(commands), np.array(amplitudes)
 
 
+def chain(forward, backward, detuning, start):
+    fields = {"forward": forward, "backward": backward, "detuning": detuning, "start_phase": start}
+    return {name: tuple(values) for name, values in fields.items()}
+
+
 def scattered(n, size=0.8):
     return tuple(np.random.default_rng(4).uniform(-size, size, n).tolist())
 
@@ -55,13 +61,8 @@ def scattered(n, size=0.8):
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_a_bidirectional_chain_locks_at_the_lag_it_asks_for(make_robot, kind, sign):
     wave = Wave.TAIL_TO_HEAD if sign > 0 else Wave.HEAD_TO_TAIL
-    theta, _, _ = run(
-        make_robot(7, planar=True),
-        30.0,
-        oscillator=kind,
-        start_phase=scattered(6),
-        wave=wave,
-    )
+    robot, start = make_robot(7, planar=True), scattered(6)
+    theta, _, _ = run(robot, 30.0, oscillator=kind, start_phase=start, wave=wave)
     np.testing.assert_allclose(np.diff(theta[-1]), sign * PSI, atol=1e-6)
     assert np.abs(np.diff(theta[0]) - sign * PSI).max() > 0.3
 
@@ -89,13 +90,8 @@ def test_the_slowest_mode_decays_as_the_path_graph_says(make_robot, n):
     mode = np.cos((np.arange(n) + 0.5) * math.pi / n)
     K = 5.0
     expected = 4.0 * K * math.sin(math.pi / (2 * n)) ** 2
-    theta, _, _ = run(
-        make_robot(n + 1, planar=True),
-        3.0 / expected,
-        forward=K,
-        backward=K,
-        start_phase=tuple((1e-3 * mode).tolist()),
-    )
+    robot, start = make_robot(n + 1, planar=True), tuple((1e-3 * mode).tolist())
+    theta, _, _ = run(robot, 3.0 / expected, forward=K, backward=K, start_phase=start)
     share = (theta + PSI * np.arange(n)) @ mode
     t = np.arange(len(share)) / 100
     slope = np.polyfit(t, np.log(share), 1)[0]
@@ -104,9 +100,8 @@ def test_the_slowest_mode_decays_as_the_path_graph_says(make_robot, n):
 
 def test_a_one_way_chain_settles_in_sequence(make_robot):
     # Without anything from behind, joint i is done when all before it are: the head never moves.
-    theta, _, _ = run(
-        make_robot(9, planar=True), 20.0, forward=2.0, backward=0.0, start_phase=scattered(8)
-    )
+    robot, start = make_robot(9, planar=True), scattered(8)
+    theta, _, _ = run(robot, 20.0, forward=2.0, backward=0.0, start_phase=start)
     error = np.abs(theta + PSI * np.arange(8) - theta[:, :1])
     assert np.ptp(theta[:, 0]) < 1e-11
     last = [np.flatnonzero(error[:, i] > 0.01)[-1] for i in range(1, 8)]
@@ -125,9 +120,8 @@ def test_a_detuned_pair_locks_up_to_twice_the_coupling(make_robot, ratio):
     # the mean rate sqrt(dw^2 - (2K)^2) (Adler 1946).
     K = 1.0
     detuned = 2.0 * K * ratio
-    theta, _, _ = run(
-        make_robot(3, planar=True), 60.0, forward=K, backward=K, detuning=(0.0, detuned)
-    )
+    robot = make_robot(3, planar=True)
+    theta, _, _ = run(robot, 60.0, forward=K, backward=K, detuning=(0.0, detuned))
     d = theta[:, 1] - theta[:, 0] + PSI
     if ratio < 1.0:
         assert d[-1] == pytest.approx(math.asin(ratio), abs=1e-6)
@@ -164,14 +158,7 @@ def test_phases_against_scipy(make_robot):
     random = np.random.default_rng(8)
     forward, backward = random.uniform(-2.0, 8.0, (2, 7))
     detuning, start = random.uniform(-3.0, 3.0, (2, 8))
-    theta, _, _ = run(
-        make_robot(9, planar=True),
-        5.0,
-        forward=tuple(forward),
-        backward=tuple(backward),
-        detuning=tuple(detuning),
-        start_phase=tuple(start),
-    )
+    theta, _, _ = run(make_robot(9, planar=True), 5.0, **chain(forward, backward, detuning, start))
     times = np.arange(501) / 100
     pattern = -PSI * np.arange(8)
     foreign = foreign_phases(pattern + start, forward, backward, detuning, times=times)
@@ -210,23 +197,14 @@ def test_hopf_oscillators_against_scipy_and_the_paper_s_form(make_robot):
         amplitude=A,
         attraction=alpha,
         approach_rate=100.0,
-        forward=tuple(forward),
-        backward=tuple(backward),
-        detuning=tuple(detuning),
-        start_phase=tuple(start),
+        **chain(forward, backward, detuning, start),
     )
     np.testing.assert_allclose(commands[100:], foreign[100:, n:], atol=1e-7)
 
 
 def test_the_limit_cycle_has_its_radius_and_its_frequency(make_robot):
-    theta, _, amplitudes = run(
-        make_robot(4, planar=True),
-        8.0,
-        oscillator=OscillatorKind.HOPF,
-        forward=0.0,
-        backward=0.0,
-        detuning=(0.0, 0.5, -0.5),
-    )
+    fields = {"oscillator": OscillatorKind.HOPF, "detuning": (0.0, 0.5, -0.5)} | UNCOUPLED
+    theta, _, amplitudes = run(make_robot(4, planar=True), 8.0, **fields)
     np.testing.assert_allclose(amplitudes[-1], 0.4, atol=1e-9)
     np.testing.assert_allclose((theta[-1] - theta[0]) / 8.0, [0.0, 0.5, -0.5], atol=1e-6)
 
@@ -252,8 +230,9 @@ def test_the_approach_against_scipy_under_moving_targets():
 
 def test_a_change_of_amplitude_and_offset_does_not_jump(make_robot):
     robot = make_robot(7, planar=True)
-    chain = OscillatorChain(0.3, 0.5, PSI)
-    gait = OscillatorGait(OscillatorChains({Plane.HORIZONTAL: chain}), robot)
+    gait = OscillatorGait(
+        OscillatorChains({Plane.HORIZONTAL: OscillatorChain(0.3, 0.5, PSI)}), robot
+    )
     commands = []
     for k in range(800):
         if k == 400:
@@ -275,16 +254,9 @@ def test_feedback_against_scipy(make_robot):
     def answer(t, command):
         return gain * A * np.sin(OMEGA * t + delta - PSI * np.arange(n))
 
-    theta, _, _ = run(
-        make_robot(n + 1, planar=True),
-        4.0,
-        forward=0.5,
-        backward=0.5,
-        feedback=eps,
-        feedback_bias=tuple(bias),
-        start_phase=tuple(start),
-        answer=answer,
-    )
+    fields = {"forward": 0.5, "backward": 0.5, "feedback": eps, "feedback_bias": tuple(bias)}
+    fields |= {"start_phase": tuple(start), "answer": answer}
+    theta, _, _ = run(make_robot(n + 1, planar=True), 4.0, **fields)
 
     times = np.arange(401) / 100
     # Integrated tick by tick: what is reported at a tick is held until the next.
@@ -332,16 +304,9 @@ def test_feedback_of_an_answer_that_follows_slows_the_rhythm_in_second_order(mak
     # 2 eps cos(2 phi + delta) leaves -eps^2/2 omega in the mean.
     eps = 0.2
     bias = math.sin(-0.015 * OMEGA)  # the answer is the command itself, 10 to 20 ms old
-    theta, _, _ = run(
-        make_robot(4, planar=True),
-        30.0,
-        approach_rate=100.0,
-        forward=0.0,
-        backward=0.0,
-        feedback=eps,
-        feedback_bias=bias,
-        answer=lambda t, command: command,
-    )
+    fields = {"approach_rate": 100.0, "feedback": eps, "feedback_bias": bias} | UNCOUPLED
+    fields["answer"] = lambda t, command: command
+    theta, _, _ = run(make_robot(4, planar=True), 30.0, **fields)
     drift = (theta[-1] - theta[1000]).mean() / 20.0
     assert drift == pytest.approx(-(eps**2) / (2 * OMEGA), rel=0.05)
 
@@ -349,15 +314,8 @@ def test_feedback_of_an_answer_that_follows_slows_the_rhythm_in_second_order(mak
 @pytest.mark.parametrize("kind", KINDS)
 def test_kicks_turn_the_phases_at_their_times_only(make_robot, kind):
     # Uncoupled, nothing else moves a phase.
-    theta, _, _ = run(
-        make_robot(4, planar=True),
-        2.1,
-        oscillator=kind,
-        forward=0.0,
-        backward=0.0,
-        kick_every_s=0.7,
-        kick_size=1.2,
-    )
+    fields = {"oscillator": kind, "kick_every_s": 0.7, "kick_size": 1.2} | UNCOUPLED
+    theta, _, _ = run(make_robot(4, planar=True), 2.1, **fields)
     jumps = np.diff(theta, axis=0)
     moved = np.flatnonzero(np.abs(jumps).max(axis=1) > 1e-9)
     assert moved.tolist() == [69, 139, 209]
@@ -385,16 +343,15 @@ def test_a_joint_that_has_reported_nothing_is_not_fed_back(make_robot):
     def answer(t, command):
         return np.array([np.nan, 0.1, np.nan, np.nan])
 
-    uncoupled = {"forward": 0.0, "backward": 0.0, "feedback": 2.0}
-    half, _, _ = run(robot, 3.0, answer=answer, **uncoupled)
+    half, _, _ = run(robot, 3.0, answer=answer, feedback=2.0, **UNCOUPLED)
     moved = np.ptp(half, axis=0) > 1e-3
     assert moved.tolist() == [False, True, False, False]
 
 
 def test_the_frequency_factor_turns_every_oscillator(make_robot):
     robot = make_robot(4, planar=True)
-    chain = OscillatorChain(0.3, 0.5, PSI, forward=0.0, backward=0.0, detuning=(0.0, 0.5, -0.5))
-    gait = OscillatorGait(OscillatorChains({Plane.HORIZONTAL: chain}), robot)
+    one = OscillatorChain(0.3, 0.5, PSI, detuning=(0.0, 0.5, -0.5), **UNCOUPLED)
+    gait = OscillatorGait(OscillatorChains({Plane.HORIZONTAL: one}), robot)
     gait.modulate(dataclasses.replace(Modulation.none(3), frequency_factor=2.0))
     first, last = (gait.step(t, nothing(3)).values[-3:] for t in (0.0, 3.0))
     rates = 2.0 * (OMEGA + np.array([0.0, 0.5, -0.5]))

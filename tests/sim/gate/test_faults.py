@@ -11,7 +11,7 @@ import re
 import signal
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 import pytest
@@ -24,25 +24,45 @@ FAULT_AT_S = 1.5  # after the first command: the way to the first pose is over b
 ERROR = 40  # of rcl_interfaces/msg/Log
 
 
-def ended(on_stage, controller, path, *, code=1):
-    """Wait for the end, and look at all of it: (what the controller told, the new session)."""
-    out, err = controller.communicate(timeout=60)
-    assert controller.returncode == code, (out, err)
-    on_stage.settle()
-    lines = on_stage.lines
-    gate_stage.check_limits(lines)
-    return out, err, gate_stage.check_session(path, lines)
+class Driving:
+    """A drive over the bus of the small robot, with a listener."""
+
+    def __init__(self, stage, controller, path):
+        self.stage, self.controller, self.path = stage, controller, path
+
+    def begun(self, count=150):
+        self.stage.wait_for_commands(self.controller, count)
+
+    def signal(self, number, pause_s=0.0):
+        self.controller.send_signal(number)
+        time.sleep(pause_s)
+
+    def communicate(self):
+        out, err = self.controller.communicate(timeout=60)
+        self.stage.settle()
+        return out, err
+
+    def ended(self, code=1):
+        """Wait for the end, and check all of it; returns output, errors and the session."""
+        out, err = self.communicate()
+        assert self.controller.returncode == code, (out, err)
+        lines = self.stage.lines
+        gate_stage.check_limits(lines)
+        return out, err, gate_stage.check_session(self.path, lines)
 
 
-def after_fault(fault, scenario, session, tmp_path):
-    """A drive with a fault to come: what was complained of, and the new session."""
-    path = tmp_path / "a.mcap"
-    with (
-        staged(tmp_path, scenario, fault) as on_stage,
-        on_stage.replay(session, path) as controller,
-    ):
-        _, err, written = ended(on_stage, controller, path)
-    return err, written
+@pytest.fixture
+def driving(small, session, tmp_path):
+    @contextmanager
+    def start(*faults, scenario=small[1], recorded=session, plain=False):
+        path = tmp_path / "a.mcap"
+        with staged(tmp_path, scenario, *faults) as stage:
+            if plain:  # python-can's own socketcand: the robot isn't asked who it is
+                stage.on += "&plain=yes"
+            with stage.replay(recorded, path) as controller:
+                yield Driving(stage, controller, path)
+
+    return start
 
 
 def errors(written):
@@ -62,8 +82,9 @@ def check_told(written, reason):
 
 
 @pytest.mark.slow
-def test_a_stuck_servo_is_a_tracking_error_and_the_others_come_down(small, session, tmp_path):
-    err, written = after_fault(f"stuck:joint03@{FAULT_AT_S}", small[1], session, tmp_path)
+def test_a_stuck_servo_is_a_tracking_error_and_the_others_come_down(driving):
+    with driving(f"stuck:joint03@{FAULT_AT_S}") as drive:
+        _, err, written = drive.ended()
     assert err.startswith("error: joint03: tracking error 0.")
     # It lasts to the first tick that finds 0.5 s over, a little later on a busy computer.
     assert re.search(
@@ -74,28 +95,31 @@ def test_a_stuck_servo_is_a_tracking_error_and_the_others_come_down(small, sessi
 
 
 @pytest.mark.slow
-def test_lost_replies_end_it_and_name_the_joint(small, session, tmp_path):
-    err, written = after_fault(f"lost:joint02:1@{FAULT_AT_S}", small[1], session, tmp_path)
+def test_lost_replies_end_it_and_name_the_joint(driving):
+    with driving(f"lost:joint02:1@{FAULT_AT_S}") as drive:
+        _, err, written = drive.ended()
     assert err.startswith("error: joint02 is lost: no angle for more than 1 s; the joints were bro")
     check_told(written, "joint02 is lost: no angle for more than 1 s")
     gate_stage.check_ramp_down(written, "fault: ")
 
 
 @pytest.mark.slow
-def test_the_robots_file_can_say_that_joints_are_held(tmp_path):
+def test_the_robots_file_can_say_that_joints_are_held(driving, tmp_path):
     robot, scenario = gate_stage.robot_files(
         tmp_path / "holds", safety=SAFETY | {"on_fault": '"hold"'}
     )
     holding = gate_stage.commanded(tmp_path / "holding.mcap", robot, 60.0)
-    err, written = after_fault(f"lost:1@{FAULT_AT_S}", scenario, holding, tmp_path)
+    with driving(f"lost:1@{FAULT_AT_S}", scenario=scenario, recorded=holding) as drive:
+        _, err, written = drive.ended()
     assert err.startswith("error: the bus was silent: no joint was received for ")
     assert "nothing more was sent; the servos hold their last commands" in err
     gate_stage.check_hold(written, "fault: ")
 
 
 @pytest.mark.slow
-def test_after_bus_off_nothing_more_is_sent(small, session, tmp_path):
-    err, written = after_fault(f"bus-off@{FAULT_AT_S}+2", small[1], session, tmp_path)
+def test_after_bus_off_nothing_more_is_sent(driving):
+    with driving(f"bus-off@{FAULT_AT_S}+2") as drive:
+        _, err, written = drive.ended()
     assert err.startswith("error: bus-off: ")
     assert "nothing more was sent" in err
     check_told(written, "bus-off: ")
@@ -104,10 +128,9 @@ def test_after_bus_off_nothing_more_is_sent(small, session, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_servo_that_draws_too_much_gives_way_and_then_ends_it(small, session, tmp_path):
-    err, written = after_fault(
-        f"over-current:joint02:1.5@{FAULT_AT_S}", small[1], session, tmp_path
-    )
+def test_a_servo_that_draws_too_much_gives_way_and_then_ends_it(driving):
+    with driving(f"over-current:joint02:1.5@{FAULT_AT_S}") as drive:
+        _, err, written = drive.ended()
     assert err.startswith("error: joint02: current 1.5 A, more than 1.4 A for 0.")
     check_told(written, "joint02: current 1.5 A")
     yields = "gate: joint02: draws more than 1.4 A: its command gives way"
@@ -116,14 +139,12 @@ def test_a_servo_that_draws_too_much_gives_way_and_then_ends_it(small, session, 
 
 
 @pytest.mark.slow
-def test_a_process_that_comes_late_does_not_jump(small, session, tmp_path):
-    path = tmp_path / "a.mcap"
-    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
-        on_stage.wait_for_commands(controller)
-        controller.send_signal(signal.SIGSTOP)
-        time.sleep(2.2)
-        controller.send_signal(signal.SIGCONT)
-        _, err, written = ended(on_stage, controller, path)
+def test_a_process_that_comes_late_does_not_jump(driving):
+    with driving() as drive:
+        drive.begun()
+        drive.signal(signal.SIGSTOP, 2.2)
+        drive.signal(signal.SIGCONT)
+        _, err, written = drive.ended()
     assert err.startswith("error: a control tick was 2.")
     assert "s late, more than 1.5 s; the joints were brought straight within " in err
     check_told(written, "a control tick was 2.")
@@ -132,23 +153,15 @@ def test_a_process_that_comes_late_does_not_jump(small, session, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plain", [False, True])
-def test_a_process_that_stops_and_goes_on_tells_no_joint_to_be_too_fast(
-    plain, small, session, tmp_path
-):
+def test_a_process_that_stops_and_goes_on_tells_no_joint_to_be_too_fast(plain, driving):
     """It catches up at the greatest rate that the robot's file allows: in true time, too."""
-    path = tmp_path / "a.mcap"
-    with staged(tmp_path, small[1]) as on_stage:
-        if plain:  # frames are handed over one by one
-            on_stage.on += "&plain=yes"
-        with on_stage.replay(session, path) as controller:
-            on_stage.wait_for_commands(controller)
-            for _ in range(8):
-                controller.send_signal(signal.SIGSTOP)
-                time.sleep(0.3)
-                controller.send_signal(signal.SIGCONT)
-                time.sleep(0.4)
-            controller.send_signal(signal.SIGINT)
-            out, _, written = ended(on_stage, controller, path)
+    with driving(plain=plain) as drive:
+        drive.begun()
+        for _ in range(8):
+            drive.signal(signal.SIGSTOP, 0.3)
+            drive.signal(signal.SIGCONT, 0.4)
+        drive.signal(signal.SIGINT)
+        out, _, written = drive.ended()
     left_out = [text for _, _, text in written.said if " control ticks were left out" in text]
     assert sum("s of the gait" in text for text in left_out) >= 4
     assert any("command held back to 4 rad/s" in text for _, _, text in written.said)
@@ -212,9 +225,7 @@ def test_another_joint_set_and_another_robot_are_refused_and_nothing_is_sent(sma
 
 
 @pytest.mark.slow
-def test_another_robot_is_known_by_its_frames_where_nobody_says_who_is_there(
-    small, session, tmp_path
-):
+def test_another_robot_is_known_by_its_frames_where_nobody_says_who_is_there(driving, tmp_path):
     folder = tmp_path / "moved"
     _, scenario = gate_stage.robot_files(folder)
     database = folder / "snake25.dbc"
@@ -225,14 +236,10 @@ def test_another_robot_is_known_by_its_frames_where_nobody_says_who_is_there(
         flags=re.MULTILINE,
     )
     database.write_text(moved)
-    path = tmp_path / "a.mcap"
-    with staged(tmp_path, scenario) as on_stage:
-        on_stage.on += "&plain=yes"
-        with on_stage.replay(session, path) as controller:
-            _, err = controller.communicate(timeout=60)
-        on_stage.settle()
-        lines = on_stage.lines
-    assert controller.returncode == 2, err
+    with driving(scenario=scenario, plain=True) as drive:
+        _, err = drive.communicate()
+        lines = drive.stage.lines
+    assert drive.controller.returncode == 2, err
     assert "no command was sent: another robot is on this bus" in err
     assert "0 are of snake4; others have the identifiers 601" in err
     states = {1537, 1538, 1539, 1540}
@@ -242,12 +249,11 @@ def test_another_robot_is_known_by_its_frames_where_nobody_says_who_is_there(
 # -- who is in charge goes ----------------------------------------------------------------------
 
 
-def test_ctrl_c_brings_the_joints_down(small, session, tmp_path):
-    path = tmp_path / "a.mcap"
-    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
-        on_stage.wait_for_commands(controller, 60)
-        controller.send_signal(signal.SIGINT)
-        _, err, written = ended(on_stage, controller, path)
+def test_ctrl_c_brings_the_joints_down(driving):
+    with driving() as drive:
+        drive.begun(60)
+        drive.signal(signal.SIGINT)
+        _, err, written = drive.ended()
     assert err.startswith(
         "error: stop requested (Ctrl-C); the joints were brought straight within "
     )
@@ -256,14 +262,12 @@ def test_ctrl_c_brings_the_joints_down(small, session, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_second_ctrl_c_ends_it_at_once(small, session, tmp_path):
-    path = tmp_path / "a.mcap"
-    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
-        on_stage.wait_for_commands(controller)
-        controller.send_signal(signal.SIGINT)
-        time.sleep(0.2)
-        controller.send_signal(signal.SIGINT)
-        _, err, written = ended(on_stage, controller, path)
+def test_a_second_ctrl_c_ends_it_at_once(driving):
+    with driving() as drive:
+        drive.begun()
+        drive.signal(signal.SIGINT, 0.2)
+        drive.signal(signal.SIGINT)
+        _, err, written = drive.ended()
     assert "stop requested (Ctrl-C)" in err
     assert "nothing more was sent; the servos hold their last commands" in err
     ending = written.after("gate: ending")
@@ -290,28 +294,27 @@ def test_a_console_that_goes_brings_the_joints_down(kind, small, session, tmp_pa
         streams = {"stdin": slave, "stdout": slave, "stderr": slave, "start_new_session": True}
         with process(*words, **streams) as controller:
             os.close(slave)
-            on_stage.wait_for_commands(controller, 60)
+            drive = Driving(on_stage, controller, path)
+            drive.begun(60)
             shown = os.read(master, 1 << 16).decode()
             os.close(master)
-            _, _, written = ended(on_stage, controller, path)
+            _, _, written = drive.ended()
     assert "wave.mcap" in shown  # a progress bar was on it
     gate_stage.check_ramp_down(written, "gate: ending, the console is gone")
     assert not errors(written)
 
 
 @pytest.mark.slow
-def test_a_robot_that_is_gone_leaves_a_whole_session(small, session, tmp_path):
-    path = tmp_path / "a.mcap"
-    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
-        on_stage.wait_for_commands(controller)
-        on_stage.robot.kill()
-        _, err = controller.communicate(timeout=60)
-        on_stage.settle()
-        lines = on_stage.lines
-    assert controller.returncode == 1
-    assert err.startswith(f"error: {on_stage.on}: the robot ")
+def test_a_robot_that_is_gone_leaves_a_whole_session(driving):
+    with driving() as drive:
+        drive.begun()
+        drive.stage.robot.kill()
+        _, err = drive.communicate()
+        lines = drive.stage.lines
+    assert drive.controller.returncode == 1
+    assert err.startswith(f"error: {drive.stage.on}: the robot ")
     gate_stage.check_limits(lines)
-    written = Written(path)
+    written = Written(drive.path)
     assert written.metadata["undulog.health"]["verdict"] == "bad"
     assert len(written.commands) >= 150
 
@@ -321,14 +324,10 @@ def test_a_robot_that_is_gone_leaves_a_whole_session(small, session, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plain", [False, True])
-def test_without_a_fault_it_runs_to_its_end(plain, small, tmp_path):
-    path = tmp_path / "a.mcap"
+def test_without_a_fault_it_runs_to_its_end(plain, small, driving, tmp_path):
     short = gate_stage.commanded(tmp_path / "short.mcap", small[0], 3.0)
-    with staged(tmp_path, small[1]) as on_stage:
-        if plain:  # python-can's own socketcand: the robot isn't asked who it is
-            on_stage.on += "&plain=yes"
-        with on_stage.replay(short, path) as controller:
-            _, err, written = ended(on_stage, controller, path, code=0)
+    with driving(recorded=short, plain=plain) as drive:
+        _, err, written = drive.ended(code=0)
     assert "error" not in err
     assert not errors(written)
 

@@ -58,16 +58,13 @@ def heard(angle, *, current=0.0, temperature=30.0, voltage=np.nan, silence_s=0.0
     return GateInput(Readings(status.angle, all_of(0.0)), status, **more)
 
 
-def gate(gait, *, duration_s=1.0, limits=LIMITS, listen_s=0.0):
-    return Gate(gait, limits, duration_s=duration_s, place="can:test", listen_s=listen_s)
-
-
 class Bench:
     """A gate with a robot that is where it was told to be one tick before."""
 
-    def __init__(self, gait=None, start=0.0, **options):
+    def __init__(self, gait=None, start=0.0, *, duration_s=1.0, limits=LIMITS, **options):
         self.gait = gait or Wave()
-        self.gate = gate(self.gait, **options)
+        options |= {"duration_s": duration_s, "place": "can:test"}
+        self.gate = Gate(self.gait, limits, **options)
         self.angle = np.full(COUNT, start)
         self.tick = 0
         self.sent = []
@@ -90,6 +87,13 @@ class Bench:
             if self.gate.phase is phase:
                 return found
         raise AssertionError(f"never came to {phase}")
+
+    def running(self, ticks=0):
+        """Run the gait, so many ticks of it."""
+        self.until(Phase.RUN)
+        for _ in range(ticks):
+            self.step()
+        return self
 
 
 def test_from_the_pose_by_a_ramp_to_the_first_command_then_the_gait_as_it_is():
@@ -140,8 +144,7 @@ def test_a_bus_that_has_to_be_listened_to_is():
     ],
 )
 def test_before_the_first_command_trouble_is_a_refusal(more, error, told):
-    bench = Bench()
-    bench.gate = gate(bench.gait, listen_s=0.01)
+    bench = Bench(listen_s=0.01)
     if error is UsageError:
         bench.step(**more)  # it listens
     with pytest.raises(error, match=told):
@@ -178,8 +181,7 @@ def test_each_fault_is_found_in_its_time_and_ends_as_the_file_says(kind, how):
     change, more, text, after_s = CASES[kind]
     limits = dataclasses.replace(LIMITS, on_fault=how, voltage=np.full(COUNT, 5.0))
     bench = Bench(Wave(0.5), duration_s=60.0, limits=limits)
-    while bench.gate.phase is not Phase.RUN:
-        bench.step()
+    bench.until(Phase.RUN)
     while kind == "tracking" and abs(bench.angle[6]) < 0.36:
         bench.step()
     first = bench.tick
@@ -203,8 +205,7 @@ def test_each_fault_is_found_in_its_time_and_ends_as_the_file_says(kind, how):
 
 
 def test_an_excess_that_goes_away_in_time_is_no_fault():
-    bench = Bench(duration_s=3.0)
-    bench.until(Phase.RUN)
+    bench = Bench(duration_s=3.0).running()
     remarks = []
     for k in range(280):
         remarks += bench.step(current=1.5 if k % 29 < 28 else 1.0).remarks  # 0.28 s of 0.29 s
@@ -215,8 +216,7 @@ def test_an_excess_that_goes_away_in_time_is_no_fault():
 
 @pytest.mark.parametrize("kind", [FaultKind.BUS_OFF, FaultKind.STRANGER])
 def test_where_nobody_hears_or_another_commands_nothing_more_is_sent(kind):
-    bench = Bench(duration_s=60.0)
-    bench.until(Phase.RUN)
+    bench = Bench(duration_s=60.0).running()
     count = len(bench.sent)
     assert bench.step(trouble=GateFault(kind, "so")).command is None
     assert bench.gate.phase is Phase.DONE
@@ -225,8 +225,7 @@ def test_where_nobody_hears_or_another_commands_nothing_more_is_sent(kind):
 
 
 def test_a_late_tick_is_caught_up_without_a_jump_and_too_late_a_one_is_a_fault():
-    bench = Bench(Wave(0.5, 1.0), duration_s=60.0)
-    bench.until(Phase.RUN)
+    bench = Bench(Wave(0.5, 1.0), duration_s=60.0).running()
     for _ in range(5):
         for _ in range(20):
             bench.step()
@@ -241,10 +240,7 @@ def test_a_late_tick_is_caught_up_without_a_jump_and_too_late_a_one_is_a_fault()
 
 
 def test_asked_to_stop_it_ends_and_asked_again_at_once():
-    bench = Bench(duration_s=60.0)
-    bench.until(Phase.RUN)
-    for _ in range(50):
-        bench.step()
+    bench = Bench(duration_s=60.0).running(50)
     bench.step(stop="asked")
     assert bench.gate.phase is Phase.ENDING
     bench.step(stop="asked")
@@ -254,10 +250,7 @@ def test_asked_to_stop_it_ends_and_asked_again_at_once():
 
 
 def test_what_goes_wrong_while_it_ends_is_told_once_and_ends_nothing_twice():
-    bench = Bench(duration_s=60.0)
-    bench.until(Phase.RUN)
-    for _ in range(50):
-        bench.step()
+    bench = Bench(duration_s=60.0).running(50)
     remarks = list(bench.step(stop="asked").remarks)
     while bench.gate.phase is Phase.ENDING:
         remarks += bench.step(stop="asked", temperature=99.0).remarks
@@ -268,10 +261,7 @@ def test_what_goes_wrong_while_it_ends_is_told_once_and_ends_nothing_twice():
 
 
 def test_while_the_bus_is_silent_nothing_is_sent_and_then_it_ends():
-    bench = Bench(duration_s=60.0, listen_s=0.5)
-    bench.until(Phase.RUN)
-    for _ in range(50):
-        bench.step()
+    bench = Bench(duration_s=60.0, listen_s=0.5).running(50)
     sent, last = len(bench.sent), bench.sent[-1]
     found = [bench.step(received=False) for _ in range(200)]
     assert [step.command is not None for step in found] == [True] * 2 + [False] * 198
@@ -285,8 +275,7 @@ def test_while_the_bus_is_silent_nothing_is_sent_and_then_it_ends():
 
 
 def test_a_bus_that_stays_silent_gets_no_ramp():
-    bench = Bench(duration_s=60.0, listen_s=0.5)
-    bench.until(Phase.RUN)
+    bench = Bench(duration_s=60.0, listen_s=0.5).running()
     for k in range(int(HOLD_S * RATE_HZ)):
         bench.step(received=False, silence_s=k / RATE_HZ)
     assert bench.gate.phase is Phase.DONE
@@ -327,8 +316,7 @@ def test_a_gait_that_fails_and_a_log_that_can_not_be_written_end_as_a_fault_does
                 raise ZeroDivisionError("no range")
             return super().step(time_s, readings)
 
-    bench = Bench(Failing(), duration_s=60.0)
-    bench.until(Phase.RUN)
+    bench = Bench(Failing(), duration_s=60.0).running()
     if not from_the_gait:
         bench.gate.report(GateFault(FaultKind.LOG, "the disk is full"))
     bench.until(Phase.DONE)

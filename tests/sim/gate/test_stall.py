@@ -108,13 +108,6 @@ class Drive:
         with Session.open(self.path) as session:
             self.phases = [message.data for _, message in session.messages("/gate/phase")]
             self.verdict, self.facts = session.verdict, session.metadata["undulog.gate.feedback"]
-        print(f"burst {self.burst:.4f} beyond {self.beyond:.4f}", self.facts, self.phases)
-        print(
-            f"pause {self.pause_s:.3f}",
-            self.errors,
-            self.report["changed"],
-            self.report["overruns"],
-        )
 
     def check_bound(self):
         """What arrived within 5 ms is within the bound that the session gives."""

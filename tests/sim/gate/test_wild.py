@@ -7,32 +7,22 @@ once it is done it sends nothing; and an ending ends.
 import dataclasses
 import math
 
-import cantools
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from undulog.capture import load_robot
+from support.decoded_commands import ROBOT, on_the_bus
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.robot.model import OnFault
-from undulog.sim.drive.loop import CommandEncoder
 from undulog.sim.gait.contract import GaitTick, Readings
 from undulog.sim.gate.gate import Gate
 from undulog.sim.gate.limits import gate_limits
 from undulog.sim.gate.outcome import FaultKind, GateFault, GateInput, JointStatus, Phase
 
-ROBOT = load_robot("snake25")
 COUNT, RATE_HZ = len(ROBOT.joints), 100
 STEP = math.radians(0.01)  # of a command on the bus
 LIMIT, MAX_RATE = math.radians(30.0), 4.0  # as snake25.toml has them
-ENCODER = CommandEncoder(ROBOT)
-MESSAGES = {
-    message.frame_id: message
-    for message in cantools.database.load_string(
-        dict(ROBOT.databases)["snake25.dbc"], "dbc"
-    ).messages
-}
 
 anything = st.floats(allow_nan=True, allow_infinity=True, width=64)
 angles = arrays(np.float64, COUNT, elements=st.floats(-0.6, 0.6) | anything, fill=st.just(0.1))
@@ -66,16 +56,6 @@ class Drawn:
         return GaitTick(self.wish, np.empty(0), "drawn", ())
 
 
-def on_the_bus(command):
-    """What another decoder finds in the frames of a command [rad]."""
-    frames = ENCODER.frames(command)
-    told = [
-        MESSAGES[int(one["id_flags"])].decode(bytes(one["data"][: one["dlc"]])) for one in frames
-    ]
-    assert len(told) == COUNT
-    return np.radians([one["position"] for one in told])
-
-
 @settings(max_examples=50, deadline=None)
 @given(
     arrays(np.float64, COUNT, elements=st.floats(-0.7, 0.7), fill=st.just(0.0)),
@@ -86,29 +66,22 @@ def test_nothing_that_happens_makes_it_send_a_command_beyond_a_limit(pose, drawn
     gait = Drawn()
     limits = dataclasses.replace(gate_limits(ROBOT), on_fault=how)
     gate = Gate(gait, limits, duration_s=0.3, place="can:test")
-    sent, tick, last = [], 0, {"stop": "", "at_once": False}
+    sent, tick = [], 0
     unknown = np.full(COUNT, np.nan)
 
-    def step(angle, current, wish, **more):
+    def step(angle, current, wish, *, stop="", at_once=False, **more):
         nonlocal tick
         gait.wish = wish
         status = JointStatus(angle, current, unknown, unknown, np.zeros(COUNT))
-        heard = GateInput(
-            Readings(angle, unknown),
-            status,
-            trouble=more["trouble"],
-            late_s=more["late_s"],
-            received=more["received"],
-        )
-        found = gate.step(tick, heard, more["stop"], at_once=more["at_once"])
+        heard = GateInput(Readings(angle, unknown), status, **more)
+        found = gate.step(tick, heard, stop, at_once=at_once)
         tick += 1
         if found.command is not None:
             sent.append(on_the_bus(found.command))
 
     gate.silence.interval = 1
-    calm = {"trouble": None, "late_s": 0.0, "received": True, **last}
     try:
-        step(pose, np.zeros(COUNT), np.full(COUNT, 0.2), **calm)
+        step(pose, np.zeros(COUNT), np.full(COUNT, 0.2))
         for moment in drawn:
             tick += moment.pop("skip")
             step(**moment)
@@ -116,14 +89,14 @@ def test_nothing_that_happens_makes_it_send_a_command_beyond_a_limit(pose, drawn
         for _ in range(1200):  # it comes to its end: an ending, or the planned one
             if gate.phase is Phase.DONE:
                 break
-            step(pose, np.zeros(COUNT), wave, **calm)
+            step(pose, np.zeros(COUNT), wave)
     except (SourceError, UsageError):
         assert not sent  # refused: before the first command, or never
         return
     assert gate.phase is Phase.DONE
     assert gate.outcome is not None
     count = len(sent)
-    step(pose, np.zeros(COUNT), np.zeros(COUNT), **calm)
+    step(pose, np.zeros(COUNT), np.zeros(COUNT))
     assert len(sent) == count
     if sent:
         told = np.array(sent)

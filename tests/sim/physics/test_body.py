@@ -1,6 +1,5 @@
 """The body against rigid-body mechanics, our own kinematics, and its URDF read by the engine."""
 
-import dataclasses
 import math
 from xml.etree import ElementTree as ET
 
@@ -8,26 +7,22 @@ import numpy as np
 import pybullet
 import pytest
 
+from support.twin_runs import simulate
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
-from undulog.capture.robot.model import Link
 from undulog.sim.physics.bullet import BulletEngine
-from undulog.sim.physics.engine import engine_type
+from undulog.sim.physics.engine import BodyStart, engine_type
 from undulog.sim.physics.steps import Steps
 from undulog.sim.scenario.scenario import EngineKind, Kernels
 from undulog.sim.twin.session_log import frame_origins, urdf
 from undulog.sim.twin.twin import Twin
 
+AT_REST = BodyStart((0, 0, 0), 1.0, 0.0, (0, 0, 0), 1e-3)
+
 
 @pytest.fixture
-def uneven(make_robot):
-    """Links that differ in every respect, so that no mix-up goes unseen."""
-    robot = make_robot(5)
-    links = tuple(
-        Link(f"link{i}", 0.05 + 0.01 * i, 0.02, 0.1 + 0.02 * i, (3e-5 + i * 1e-6, 5e-5, 6e-5))
-        for i in range(5)
-    )
-    return dataclasses.replace(robot, links=links)
+def uneven(make_uneven):
+    return make_uneven(5)
 
 
 @pytest.fixture
@@ -36,9 +31,7 @@ def writhe(uneven):
 
     def swing(rate_hz=1000):
         dt = 1.0 / rate_hz
-        body = BulletEngine(
-            uneven, gravity=(0, 0, 0), height=0.3, heading=0.7, velocity=(0.2, 0.1, 0.0), dt=dt
-        )
+        body = BulletEngine(uneven, BodyStart((0, 0, 0), 0.3, 0.7, (0.2, 0.1, 0.0), dt))
         states = []
         for k in range(round(0.4 * rate_hz)):
             state = body.read()
@@ -93,8 +86,7 @@ def test_joints_cannot_change_the_momentum(uneven, writhe):
 
 def test_a_thrown_body_flies_a_parabola(make_robot):
     robot = make_robot(4)
-    start = {"height": 1.0, "heading": 0.3, "velocity": (1, 0, 2)}
-    body = BulletEngine(robot, gravity=(0, 0, -9.81), dt=1e-3, **start)
+    body = BulletEngine(robot, BodyStart((0, 0, -9.81), 1.0, 0.3, (1, 0, 2), 1e-3))
     for _ in range(500):
         body.step(np.zeros(3))
     state = body.read()
@@ -107,9 +99,7 @@ def test_a_thrown_body_flies_a_parabola(make_robot):
 @pytest.mark.parametrize("kind", EngineKind)
 @pytest.mark.parametrize("kernels", Kernels)
 def test_an_engine_may_be_closed_twice(make_robot, kind, kernels):
-    start = {"height": 1, "heading": 0, "velocity": (0, 0, 0)}
-    body = engine_type(kind, kernels)(make_robot(3), gravity=(0, 0, 0), dt=1e-3, **start)
-    other = engine_type(kind, kernels)(make_robot(4), gravity=(0, 0, 0), dt=1e-3, **start)
+    body, other = (engine_type(kind, kernels)(make_robot(n), AT_REST) for n in (3, 4))
     body.close()
     body.close()
     assert other.read().position.shape == (3, 4)  # nobody else's world was freed
@@ -135,9 +125,8 @@ def test_steps_are_views_of_one_table():
 
 
 def test_the_engine_cannot_hold_every_robot(make_robot):
-    start = {"height": 1, "heading": 0, "velocity": (0, 0, 0)}
     with pytest.raises(UsageError, match="has 128 joints; the twin takes at most 127"):
-        BulletEngine(make_robot(129), gravity=(0, 0, 0), dt=1e-3, **start)
+        BulletEngine(make_robot(129), AT_REST)
 
 
 def test_the_urdf_describes_the_same_body(uneven, tmp_path):
@@ -180,8 +169,7 @@ def test_the_urdf_is_plain_xml_with_shapes(uneven):
 
 def test_two_bodies_live_side_by_side(make_scenario, make_robot):
     small = make_scenario(make_robot(4), duration_s=0.2, ramp_s=0.0)
-    with Twin(small) as alone:
-        expected = [sample.step.body.angle for sample in alone.samples()]
+    expected = [sample.step.body.angle for sample in simulate(small)]
     with Twin(small) as one, Twin(make_scenario(make_robot(6), amplitude=0.0)) as other:
         both = zip(one.samples(), other.samples(), strict=False)
         found = [a.step.body.angle for a, _ in both]

@@ -6,46 +6,44 @@ import numpy as np
 import pytest
 
 from support.processes import python
+from support.twin_runs import simulate
 from undulog.capture import Session
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
-from undulog.capture.robot.model import Link
 from undulog.sim import FrictionLaw, Ground, World, load_scenario
 from undulog.sim.physics.bullet import BulletEngine
 from undulog.sim.physics.compiled_bullet import CompiledBulletEngine
 from undulog.sim.physics.compiled_kernels import CompiledLaws
+from undulog.sim.physics.engine import BodyStart
 from undulog.sim.physics.laws import NumpyLaws
 from undulog.sim.physics.servo import Servos
 from undulog.sim.physics.steps import Steps
 from undulog.sim.scenario.obstacles import Cylinder
 from undulog.sim.scenario.scenario import EngineKind, Kernels
 from undulog.sim.twin.recording import record
-from undulog.sim.twin.twin import Twin
 
-START = {"gravity": (0.3, 0, -9.81), "height": 0.3, "heading": 0.7, "velocity": (0.2, 0.1, 0.0)}
+START = BodyStart((0.3, 0, -9.81), 0.3, 0.7, (0.2, 0.1, 0.0), 1e-3)
 
 
 @pytest.fixture
-def uneven(make_robot):
-    """Links and servos that differ in every respect, so that no mix-up goes unseen."""
-    robot = make_robot(6)
-    links = tuple(
-        Link(f"link{i}", 0.05 + 0.01 * i, 0.02 + 1e-3 * i, 0.1 + 0.02 * i, (3e-5, 5e-5, 6e-5))
-        for i in range(6)
-    )
-    joints = tuple(
+def uneven(make_uneven):
+    """Servos and radii differ too."""
+    robot = make_uneven(6)
+    links = [dataclasses.replace(one, radius=0.02 + 1e-3 * i) for i, one in enumerate(robot.links)]
+    servos = [
         dataclasses.replace(
-            joint,
-            servo=dataclasses.replace(
-                joint.servo,
-                stall_torque=0.2 + 0.1 * i,
-                backlash=0.02 * (i % 2),
-                supply_v=6 + i,
-                static_friction=0.05 * (i % 3 == 0),
-            ),
+            joint.servo,
+            stall_torque=0.2 + 0.1 * i,
+            backlash=0.02 * (i % 2),
+            supply_v=6 + i,
+            static_friction=0.05 * (i % 3 == 0),
         )
         for i, joint in enumerate(robot.joints)
-    )
-    return dataclasses.replace(robot, links=links, joints=joints)
+    ]
+    joints = [
+        dataclasses.replace(joint, servo=servo)
+        for joint, servo in zip(robot.joints, servos, strict=True)
+    ]
+    return dataclasses.replace(robot, links=tuple(links), joints=tuple(joints))
 
 
 @pytest.mark.parametrize("law", FrictionLaw)
@@ -83,7 +81,7 @@ def test_without_ground_there_is_no_force(uneven):
 
 def test_the_chain_lies_where_the_kinematics_has_it_and_moves_as_the_engine_says(uneven):
     random = np.random.default_rng(5)
-    engines = [kind(uneven, dt=1e-3, **START) for kind in (BulletEngine, CompiledBulletEngine)]
+    engines = [kind(uneven, START) for kind in (BulletEngine, CompiledBulletEngine)]
     for _ in range(200):
         theirs, ours = (engine.read() for engine in engines)
         head = rotation_from_quaternion(ours.quaternion[:, 0])
@@ -106,17 +104,14 @@ def test_the_chain_lies_where_the_kinematics_has_it_and_moves_as_the_engine_says
     assert np.abs(theirs.angle).max() > 0.1
 
 
-def run(scenario, kernels):
-    with Twin(scenario, kernels=kernels) as twin:
-        return list(twin.samples())
-
-
 @pytest.mark.parametrize("engine", EngineKind)
 def test_a_run_is_the_same_within_rounding(make_scenario, uneven, engine):
     # No chaotic growth: a gait on the ground is a stable cycle, errors are damped as they arise.
     world = World(obstacles=(Cylinder((-0.2, 0.06), 0.03),))
     scenario = make_scenario(uneven, ramp_s=0.5, duration_s=2.0, engine=engine, world=world)
-    ours, theirs = (run(scenario, kernels) for kernels in (Kernels.NUMBA, Kernels.NUMPY))
+    ours, theirs = (
+        simulate(scenario, kernels=kernels) for kernels in (Kernels.NUMBA, Kernels.NUMPY)
+    )
     assert ours[-1].contact_s.any()
     for k in (1, 100, 200):
         one, two = ours[k], theirs[k]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from undulog.capture.robot.kinematics import rotation_from_quaternion
 from undulog.sim import FrictionLaw, Ground
-from undulog.sim.physics.contact import GroundContact, friction_force, normal_force, tangents
+from undulog.sim.physics.contact import FRICTION, GroundContact, normal_force, tangents
 from undulog.sim.physics.steps import Steps
 
 COULOMB = tuple(law for law in FrictionLaw if law is not FrictionLaw.VISCOUS)
@@ -46,7 +46,7 @@ def test_along_one_axis_every_law_is_smoothed_coulomb(law, axis):
     v = np.array([-2.0, -0.01, 0.0, 0.003, 1.0])
     slip = np.zeros((2, 5))
     slip[axis] = v
-    force = friction_force(slip, np.full(5, 3.0), MU, EPS, law)
+    force = FRICTION[law](MU, EPS)(slip) * np.full(5, 3.0)
     np.testing.assert_allclose(force[axis], -MU[axis] * 3.0 * v / np.hypot(v, EPS), rtol=1e-14)
     assert not force[1 - axis].any()
 
@@ -54,8 +54,8 @@ def test_along_one_axis_every_law_is_smoothed_coulomb(law, axis):
 @pytest.mark.parametrize("law", COULOMB)
 def test_without_coefficients_there_is_no_friction(law):
     slip = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    assert not friction_force(slip, np.ones(3), np.zeros((2, 1)), EPS, law).any()
-    slippery = friction_force(slip, np.ones(3), np.array([[0.0], [0.5]]), EPS, law)
+    assert not FRICTION[law](np.zeros((2, 1)), EPS)(slip).any()
+    slippery = FRICTION[law](np.array([[0.0], [0.5]]), EPS)(slip)
     assert slippery[1, 2] == pytest.approx(-0.5, rel=1e-3)
     assert not slippery[0].any()
 
@@ -63,7 +63,7 @@ def test_without_coefficients_there_is_no_friction(law):
 @given(vt=speeds, vn=speeds, law=st.sampled_from(COULOMB))
 def test_friction_dissipates_and_stays_inside_its_bound(vt, vn, law):
     slip = np.array([[vt], [vn]])
-    force = friction_force(slip, np.ones(1), MU, EPS, law)
+    force = FRICTION[law](MU, EPS)(slip)
     assert float((force * slip).sum()) <= 0.0
     share = np.abs(force / MU)[:, 0]
     bound = share.max() if law is FrictionLaw.BOX else math.hypot(*share)
@@ -74,7 +74,7 @@ def test_friction_dissipates_and_stays_inside_its_bound(vt, vn, law):
 def test_the_ellipse_dissipates_most(vt, vn):
     # Maximum dissipation: no force on the ellipse opposes this slip with more power.
     slip = np.array([[vt], [vn]])
-    force = friction_force(slip, np.ones(1), MU, 1e-9, FrictionLaw.ELLIPSE)
+    force = FRICTION[FrictionLaw.ELLIPSE](MU, 1e-9)(slip)
     around = np.linspace(0, 2 * np.pi, 3601)
     others = MU * np.array([np.cos(around), np.sin(around)])
     assert -(force * slip).sum() >= -(others * slip).sum(axis=0).min() - 1e-9

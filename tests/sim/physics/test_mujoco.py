@@ -3,20 +3,18 @@
 import dataclasses
 import math
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
+from support.processes import python
+from support.twin_runs import energies, simulate
 from undulog.capture.common.errors import SimulationError, UsageError
-from undulog.capture.robot.model import Link, Plane
+from undulog.capture.robot.model import Plane
 from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, World
-from undulog.sim.physics.engine import engine_type
-from undulog.sim.physics.ledger import TERMS
+from undulog.sim.physics.engine import BodyStart, engine_type
 from undulog.sim.scenario.obstacles import Box, Cylinder
 from undulog.sim.scenario.scenario import EngineKind
-from undulog.sim.twin.twin import Twin
 
 pytest.importorskip("mujoco")
 
@@ -31,13 +29,8 @@ ROLLING = {
 }
 
 
-def run(scenario, engine):
-    with Twin(dataclasses.replace(scenario, engine=engine)) as twin:
-        return list(twin.samples())
-
-
 def both(scenario):
-    return (run(scenario, engine) for engine in EngineKind)
+    return (simulate(dataclasses.replace(scenario, engine=engine)) for engine in EngineKind)
 
 
 def apart(ones, others):
@@ -77,8 +70,7 @@ def test_engines_agree_between_obstacles(make_scenario, make_robot):
     )
     scenario = make_scenario(make_robot(), world=World(obstacles=obstacles), duration_s=6.0)
     bullet, mujoco = both(scenario)
-    energy = dict(zip(TERMS, bullet[-1].energy, strict=True))
-    assert energy["obstacle_friction"] > 1e-3  # it has met them
+    assert energies(bullet[-1])["obstacle_friction"] > 1e-3  # it has met them
     assert apart(bullet, mujoco) < 1e-10
     np.testing.assert_allclose(mujoco[-1].energy, bullet[-1].energy, atol=1e-10)
 
@@ -93,24 +85,13 @@ def test_engines_agree_on_a_body_that_rolls_over(make_scenario, make_robot):
     assert apart(bullet, mujoco) < 1e-10
 
 
-@pytest.fixture
-def uneven(make_robot):
-    """Links that differ in every respect, so that no mix-up goes unseen."""
-    robot = make_robot(6)
-    links = tuple(
-        Link(f"link{i}", 0.05 + 0.01 * i, 0.02, 0.1 + 0.02 * i, (3e-5 + i * 1e-6, 5e-5, 6e-5))
-        for i in range(6)
-    )
-    return dataclasses.replace(robot, links=links)
-
-
-def test_engines_agree_on_an_uneven_body_that_tumbles(uneven):
+def test_engines_agree_on_an_uneven_body_that_tumbles(make_uneven):
     # No force law of ours: forces and torques of chance, anywhere on the links, in two portions.
-    start = {"gravity": (0.3, -0.2, -1.0), "height": 1.0, "heading": 0.7, "velocity": (0.2, 0.1, 0)}
+    start = BodyStart((0.3, -0.2, -1.0), 1.0, 0.7, (0.2, 0.1, 0), 1e-3)
     states = []
     for kind in EngineKind:
         random = np.random.default_rng(5)
-        body = engine_type(kind)(uneven, **start, dt=1e-3)
+        body = engine_type(kind)(make_uneven(6), start)
         for _ in range(1000):
             state = body.read()
             for _ in range(2):
@@ -136,17 +117,9 @@ with Twin(dataclasses.replace(scenario, engine=EngineKind.MUJOCO)) as twin:
     rows = [b"".join(part.tobytes() for part in s.step.body) for s in twin.samples()]
 print(hashlib.sha256(b"".join(rows)).hexdigest())
 """
-    found = {
-        subprocess.run(
-            [sys.executable, "-c", code],
-            env=os.environ | {"PYTHONHASHSEED": seed},
-            check=True,
-            capture_output=True,
-            text=True,
-        ).stdout
-        for seed in ("1", "2")
-    }
+    found = {python(code, env=os.environ | {"PYTHONHASHSEED": seed}).stdout for seed in ("1", "2")}
     assert len(found) == 1
+    assert len(*found) == 65
 
 
 def test_an_impossible_state_is_an_error_and_leaves_no_file(
@@ -154,15 +127,17 @@ def test_an_impossible_state_is_an_error_and_leaves_no_file(
 ):
     monkeypatch.chdir(tmp_path)
     world = World(ground=Ground(stiffness=1e7))
-    scenario = make_scenario(make_robot(5), ramp_s=0.0, duration_s=2.0, world=world)
+    engine = EngineKind.MUJOCO
+    robot = make_robot(5)
+    scenario = make_scenario(robot, ramp_s=0.0, duration_s=2.0, world=world, engine=engine)
     with pytest.raises(SimulationError, match="the twin failed at 0"):
-        run(scenario, EngineKind.MUJOCO)
+        simulate(scenario)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_body_that_cannot_be_is_refused(uneven):
+def test_a_body_that_cannot_be_is_refused(make_uneven):
     # A thin rod about x, but with two moments that no rod has: A + B >= C for every body.
-    links = (dataclasses.replace(uneven.links[0], inertia=(1e-5, 1e-5, 9e-5)), *uneven.links[1:])
-    start = {"gravity": (0, 0, -9.81), "height": 1.0, "heading": 0.0, "velocity": (0, 0, 0)}
+    robot, start = make_uneven(6), BodyStart((0, 0, -9.81), 1.0, 0.0, (0, 0, 0), 1e-3)
+    links = (dataclasses.replace(robot.links[0], inertia=(1e-5, 1e-5, 9e-5)), *robot.links[1:])
     with pytest.raises(UsageError, match=r"cannot hold robot chain: .*A \+ B >= C"):
-        engine_type(EngineKind.MUJOCO)(dataclasses.replace(uneven, links=links), **start, dt=1e-3)
+        engine_type(EngineKind.MUJOCO)(dataclasses.replace(robot, links=links), start)

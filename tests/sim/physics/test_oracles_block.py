@@ -6,11 +6,10 @@ import math
 import numpy as np
 import pytest
 
+from support.twin_runs import energies, simulate
 from undulog.sim import FrictionLaw, Ground, World
-from undulog.sim.physics.ledger import TERMS
 from undulog.sim.scenario.scenario import EngineKind
 from undulog.sim.scenario.world import tilted_gravity
-from undulog.sim.twin.twin import Twin
 
 G, MASS, RADIUS = 9.81, 0.1, 0.025
 STIFFNESS, SLIP_SPEED = Ground.stiffness, Ground.slip_speed
@@ -59,8 +58,7 @@ def slide(make_robot, make_scenario):
             engine=engine,
             **({"physics_rate_hz": 2000} | fields),
         )
-        with Twin(scenario) as twin:
-            return list(twin.samples())
+        return simulate(scenario)
 
     return build
 
@@ -121,7 +119,7 @@ def test_it_stops_after_v2_over_2_mu_g(slide, engine, axis, law):
     smoothed = (v * math.hypot(v, eps) + eps**2 * math.asinh(v / eps)) / (2 * mu * G)
     assert way == pytest.approx(smoothed - v / 2000 / 2, rel=1e-4)
     # All of its kinetic energy went into friction along that axis of the body.
-    energy = dict(zip(TERMS, samples[-1].energy - samples[0].energy, strict=True))
+    energy = energies(samples[-1], samples[0])
     taken = {"along": "friction_tangential", "across": "friction_normal"}
     other = energy[taken[{"along": "across", "across": "along"}[axis]]]
     assert energy[taken[axis]] == pytest.approx(0.5 * 4 * MASS * v**2, rel=1e-3)
@@ -156,10 +154,9 @@ def test_pushed_sideways_a_straight_robot_rolls_as_a_log(slide, engine):
 def test_thrown_up_it_leaves_its_energy_in_the_ground_s_damper(slide, engine):
     # It starts and ends m g / k deep, so spring and height hold the same in the end.
     first, *_, last = slide(engine, axis="along", lift=0.3, duration_s=0.6, physics_rate_hz=4000)
-    assert dict(zip(TERMS, first.energy, strict=True))["contact_spring"] == pytest.approx(
-        4 * (MASS * G) ** 2 / (2 * STIFFNESS), rel=1e-12
-    )
-    energy = dict(zip(TERMS, last.energy - first.energy, strict=True))
+    spring = 4 * (MASS * G) ** 2 / (2 * STIFFNESS)
+    assert energies(first)["contact_spring"] == pytest.approx(spring, rel=1e-12)
+    energy = energies(last, first)
     assert energy["kinetic"] == pytest.approx(-0.5 * 4 * MASS * 0.3**2, rel=1e-9)
     assert energy["contact_damping"] == pytest.approx(0.5 * 4 * MASS * 0.3**2, rel=2e-3)
     assert abs(energy["contact_spring"]) < 1e-9

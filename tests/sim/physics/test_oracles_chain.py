@@ -6,13 +6,13 @@ import math
 import numpy as np
 import pytest
 
+from support.twin_runs import simulate
 from undulog.capture.robot.model import Link, Plane
 from undulog.sim import PlaneGait, Serpentine, World
-from undulog.sim.physics.engine import engine_type
+from undulog.sim.physics.engine import BodyStart, engine_type
 from undulog.sim.scenario.scenario import EngineKind
-from undulog.sim.twin.twin import Twin
 
-IN_SPACE = {"gravity": (0, 0, 0), "height": 0.0, "heading": 0.4, "velocity": (0.1, 0.0, 0.0)}
+IN_SPACE = BodyStart((0, 0, 0), 0.0, 0.4, (0.1, 0.0, 0.0), 1e-3)
 
 
 def joint_mass(robot, turn):
@@ -56,10 +56,10 @@ def uneven(make_robot):
 @pytest.mark.parametrize("kind", EngineKind)
 def test_a_torque_speeds_joints_up_by_the_inverse_of_the_mass_matrix(uneven, kind):
     pytest.importorskip(kind.package)
-    dt, torque = 1e-3, np.array([0.3, -0.1, 0.2, 0.4, -0.2])
+    torque = np.array([0.3, -0.1, 0.2, 0.4, -0.2])
 
     def bent(last):
-        body = engine_type(kind)(uneven, **IN_SPACE, dt=dt)
+        body = engine_type(kind)(uneven, IN_SPACE)
         for k in range(300):
             body.step(0.02 * np.sin(0.02 * k + np.arange(5)))
         before = body.read()
@@ -72,7 +72,7 @@ def test_a_torque_speeds_joints_up_by_the_inverse_of_the_mass_matrix(uneven, kin
     _, left_alone = bent(np.zeros(5))  # the same motion, but for the last torque
     assert np.abs(state.angle).max() > 0.2
     turn = 2 * np.arctan2(state.quaternion[2], state.quaternion[3])
-    expected = dt * np.linalg.solve(joint_mass(uneven, turn), torque)
+    expected = IN_SPACE.dt * np.linalg.solve(joint_mass(uneven, turn), torque)
     np.testing.assert_allclose(pushed.rate - left_alone.rate, expected, rtol=1e-9)
 
 
@@ -110,8 +110,7 @@ def test_joints_respond_as_the_linear_chain(make_robot, make_scenario, stall_tor
             physics_rate_hz=rate_hz,
             duration_s=20.0,
         )
-        with Twin(scenario) as twin:
-            settled = list(twin.samples())[-301:-1]
+        settled = simulate(scenario)[-301:-1]
         turn = np.exp(-2j * math.pi * frequency_hz * np.arange(300) / 100) / 150
         command = turn @ np.array([sample.gait.command for sample in settled])
         return command, turn @ np.array([sample.step.body.angle for sample in settled])

@@ -13,13 +13,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from support.twin_runs import energies, simulate
 from undulog.capture.robot.model import Link, Plane
 from undulog.sim import PlaneGait, Serpentine, World, load_scenario
-from undulog.sim.physics.ledger import JOINT_TERMS, TERMS
-from undulog.sim.twin.twin import Twin
+from undulog.sim.physics.ledger import JOINT_TERMS
 
 MASS, LENGTH, INERTIA = 0.5, 0.2, 2e-3
 COMMAND, SECONDS = 1.0, 0.6
+WEAK = {"stall_torque": 0.25, "gear_stiffness": 10.0, "gear_damping": 0.2}
+STRONG = {"stall_torque": 1.5, "gear_stiffness": 20.0, "gear_damping": 0.02}
+STICKY = {"stall_torque": 0.5, "torque_constant": 0.3, "coulomb_friction": 0.1}
+STICKY |= {"gear_damping": 0.5}
 
 
 def exact(servo):
@@ -77,9 +81,7 @@ def folding(make_robot, make_scenario):
             physics_rate_hz=rate_hz,
             duration_s=SECONDS,
         )
-        with Twin(scenario) as twin:
-            *_, last = twin.samples()
-        return robot.joints[0].servo, dict(zip(TERMS, last.energy, strict=True))
+        return robot.joints[0].servo, energies(simulate(scenario)[-1])
 
     return run
 
@@ -87,24 +89,9 @@ def folding(make_robot, make_scenario):
 @pytest.mark.parametrize(
     "servo",
     [
-        pytest.param(
-            {"stall_torque": 0.25, "gear_stiffness": 10.0, "gear_damping": 0.2}, id="weak"
-        ),
-        pytest.param(
-            {"stall_torque": 1.5, "gear_stiffness": 20.0, "gear_damping": 0.02},
-            id="strong",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            {
-                "stall_torque": 0.5,
-                "torque_constant": 0.3,
-                "coulomb_friction": 0.1,
-                "gear_damping": 0.5,
-            },
-            id="sticky",
-            marks=pytest.mark.slow,
-        ),
+        pytest.param(WEAK, id="weak"),
+        pytest.param(STRONG, id="strong", marks=pytest.mark.slow),
+        pytest.param(STICKY, id="sticky", marks=pytest.mark.slow),
     ],
 )
 def test_every_flow_and_store_of_the_joints_is_exact(folding, servo):
@@ -125,9 +112,8 @@ def test_a_thrown_robot_changes_speed_into_height(make_robot, make_scenario):
     scenario = make_scenario(
         make_robot(n), amplitude=0.0, world=world, duration_s=seconds, physics_rate_hz=2000
     )
-    with Twin(scenario) as twin:
-        first, *_, last = twin.samples()
-    energy = dict(zip(TERMS, last.energy - first.energy, strict=True))
+    first, *_, last = simulate(scenario)
+    energy = energies(last, first)
     speed = rise - g * seconds
     assert energy["kinetic"] == pytest.approx(n * 0.1 * (speed**2 - rise**2) / 2, rel=1e-9)
     height = rise * seconds - g * seconds**2 / 2 - g * seconds * 5e-4 / 2  # half a step early
@@ -139,9 +125,7 @@ def test_a_thrown_robot_changes_speed_into_height(make_robot, make_scenario):
     "name", ["flat", "weak-servo-pi3", "snake13-vertical-pi3", "sidewinding", "rolling", "twist"]
 )
 def test_shipped_scenarios_close_their_ledger(name):
-    scenario = load_scenario(name).changed(duration_s=8.0)
-    with Twin(scenario) as twin:
-        samples = list(twin.samples())
-    flow = dict(zip(TERMS, samples[-1].energy - samples[400].energy, strict=True))
+    samples = simulate(load_scenario(name).changed(duration_s=8.0))
+    flow = energies(samples[-1], samples[400])
     assert abs(flow["mechanical_residual"]) < 1e-3 * flow["mechanical_abs"]
     assert abs(flow["electrical_residual"]) < 1e-3 * flow["mechanical_abs"]

@@ -6,16 +6,15 @@ written down here on its own. The slender body's formula is for an endless smoot
 the two is what a chain loses by its ends and by its being made of links.
 """
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 from scipy.special import j0
 
-from undulog.capture.robot.model import ClockDomain, Joint, Link, Plane, Robot, Servo
-from undulog.sim import FrictionLaw, Ground, PlaneGait, Scenario, Serpentine, World
-from undulog.sim.physics.ledger import TERMS
-from undulog.sim.twin.twin import Twin
+from support.twin_runs import energies, simulate
+from undulog.sim import FrictionLaw, Ground, World
 
 ANISOTROPY = 10.0  # K = c_n / c_t
 LENGTH, MASS = 0.06, 0.1
@@ -85,52 +84,43 @@ def overdamped_chain(links, lag, a, steps=200):
     return abs(complex(*state[:2]) + end - start), power / links
 
 
-def run_twin(links, lag, a, *, frequency_hz=0.05, rate_hz=400, settle_s=5.0):
+@pytest.fixture
+def run_twin(make_robot, make_scenario):
     """The same chain in the twin, with omega m / c_t = 0.01: speed, power, tracking."""
-    # Strong servos that follow their commands, and links that don't yield to the gear's springs.
-    servo = Servo(
-        stall_torque=1e3,
-        rotor_inertia=1.0,
-        viscous_friction=0.0,
-        coulomb_friction=0.0,
-        gear_stiffness=100.0,
-    )
-    names = [f"{i:02d}" for i in range(links)]
-    robot = Robot(
-        name="chain",
-        description="a planar chain that touches below its centres",
-        clock=ClockDomain.SIMULATED,
-        links=tuple(Link(f"link{n}", LENGTH, 1e-9, MASS, (1e-3, 1e-3, 1e-3)) for n in names),
-        joints=tuple(
-            Joint(f"joint{n}", Plane.HORIZONTAL, -math.pi, math.pi, 10.0, servo) for n in names[1:]
-        ),
-    )
+    frequency_hz, settle_s = 0.05, 5.0
     c_t = 2 * math.pi * frequency_hz * MASS / 0.01
     ground = Ground(law=FrictionLaw.VISCOUS, drag_tangential=c_t, drag_normal=ANISOTROPY * c_t)
-    wave = PlaneGait(joint_amplitude(a, lag), frequency_hz, lag)
-    scenario = Scenario(
-        name="viscous",
-        description="one cycle",
-        robot_name="chain",
-        robot=robot,
-        gait=Serpentine({Plane.HORIZONTAL: wave}, 2.0),
-        duration_s=settle_s + 1 / frequency_hz,
-        world=World(ground=ground),
-        physics_rate_hz=rate_hz,
-    )
-    with Twin(scenario) as twin:
-        samples = list(twin.samples())[round(100 * settle_s) :]
-    first, last = samples[0], samples[-1]
-    way = (last.step.body.position - first.step.body.position).mean(axis=1)
-    energy = dict(zip(TERMS, last.energy - first.energy, strict=True))
-    lost = energy["friction_tangential"] + energy["friction_normal"]
-    command = np.array([sample.gait.command for sample in samples[:-1]])
-    angle = np.array([sample.step.body.angle for sample in samples[:-1]])
-    turn = np.exp(-2j * np.pi * frequency_hz * 0.01 * np.arange(len(angle)))
-    # Per cycle and in units of link length; c_t per length is c_t / LENGTH.
-    speed = np.linalg.norm(way) / LENGTH
-    power = lost / (c_t * LENGTH**2 * frequency_hz * links)
-    return speed, power, (turn @ angle) / (turn @ command)
+    # Strong servos that follow their commands, and links that don't yield to the gear's springs.
+    servo = {"stall_torque": 1e3, "rotor_inertia": 1.0, "gear_stiffness": 100.0}
+    servo |= {"viscous_friction": 0.0, "coulomb_friction": 0.0}
+
+    def run(links, lag, a, *, rate_hz=400):
+        robot = make_robot(links, planar=True, limit=math.pi, **servo)
+        below = {"radius": 1e-9, "inertia": (1e-3, 1e-3, 1e-3)}  # touches below its centres
+        chain = tuple(dataclasses.replace(link, **below) for link in robot.links)
+        scenario = make_scenario(
+            dataclasses.replace(robot, links=chain),
+            amplitude=joint_amplitude(a, lag),
+            frequency_hz=frequency_hz,
+            lag=lag,
+            duration_s=settle_s + 1 / frequency_hz,
+            world=World(ground=ground),
+            physics_rate_hz=rate_hz,
+        )
+        samples = simulate(scenario)[round(100 * settle_s) :]
+        first, last = samples[0], samples[-1]
+        way = (last.step.body.position - first.step.body.position).mean(axis=1)
+        energy = energies(last, first)
+        lost = energy["friction_tangential"] + energy["friction_normal"]
+        command = np.array([sample.gait.command for sample in samples[:-1]])
+        angle = np.array([sample.step.body.angle for sample in samples[:-1]])
+        turn = np.exp(-2j * np.pi * frequency_hz * 0.01 * np.arange(len(angle)))
+        # Per cycle and in units of link length; c_t per length is c_t / LENGTH.
+        speed = np.linalg.norm(way) / LENGTH
+        power = lost / (c_t * LENGTH**2 * frequency_hz * links)
+        return speed, power, (turn @ angle) / (turn @ command)
+
+    return run
 
 
 @pytest.mark.parametrize(("case", "ratio"), CASES.items())
@@ -148,7 +138,7 @@ def test_a_long_and_finely_divided_chain_is_a_slender_body(a):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("case", "ratio"), CASES.items())
-def test_the_twin_swims_as_the_overdamped_chain(case, ratio):
+def test_the_twin_swims_as_the_overdamped_chain(run_twin, case, ratio):
     speed, power, tracking = run_twin(*case)
     # The joints follow: alike in amplitude, and all with the same delay.
     np.testing.assert_allclose(np.abs(tracking), 1.0, atol=1e-3)
@@ -161,7 +151,7 @@ def test_the_twin_swims_as_the_overdamped_chain(case, ratio):
 
 
 @pytest.mark.slow
-def test_what_is_left_over_goes_with_the_step():
+def test_what_is_left_over_goes_with_the_step(run_twin):
     case = (13, math.radians(90), 0.37)
     chain = overdamped_chain(*case, steps=1000)[0]
     whole, half = (run_twin(*case, rate_hz=rate)[0] - chain for rate in (400, 800))
@@ -170,7 +160,7 @@ def test_what_is_left_over_goes_with_the_step():
 
 
 @pytest.mark.slow
-def test_at_small_amplitude_speed_goes_with_its_square():
+def test_at_small_amplitude_speed_goes_with_its_square(run_twin):
     # Liljebäck et al., IROS 2010, of viscous ground: twice the amplitude, four times the speed.
     links, lag, a = 13, math.radians(30), 0.03
     small, large = (run_twin(links, lag, one)[0] for one in (a, 2 * a))

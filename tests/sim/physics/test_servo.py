@@ -44,26 +44,18 @@ def test_a_free_rotor_speeds_up_as_a_first_order_lag():
     np.testing.assert_allclose(found, expected, atol=1e-3 * final)
 
 
-def test_a_held_joint_winds_up_the_gear_to_the_motor_torque():
-    # Joint locked at 0, command 0.1: at rest k_g th = Kt Kp V 0.1 / R.
-    servo = Servo()
-    servos, state, zero = Servos([servo]), rotors(0.0), np.zeros(1)
-    for _ in range(3000):
-        drive = servos.drive(np.array([0.1]), zero, zero, state)
-        state = servos.advance(state, drive, 1e-3)
-    torque = servo.torque_constant * 8.0 * 0.1 * 6.0 / servo.resistance_ohm
-    assert drive.torque == pytest.approx([torque], rel=1e-9)
-    assert state.angle == pytest.approx([torque / servo.gear_stiffness], rel=1e-9)
-
-
-def test_a_gear_with_play_winds_up_by_half_of_it_more():
-    servos, state, zero = Servos([Servo(backlash=0.06)] * 2), rotors(0.0, 0.0), np.zeros(2)
+@pytest.mark.parametrize("backlash", [0.0, 0.06])
+def test_a_held_joint_winds_up_the_gear_to_the_motor_torque_and_half_its_play_more(backlash):
+    # Joint locked at 0, command +-0.1: at rest k_g (|th| - B / 2) = Kt Kp V 0.1 / R.
+    servo = Servo(backlash=backlash)
+    servos, state, zero = Servos([servo] * 2), rotors(0.0, 0.0), np.zeros(2)
     for _ in range(3000):
         drive = servos.drive(np.array([0.1, -0.1]), zero, zero, state)
         state = servos.advance(state, drive, 1e-3)
-    torque = 1.0 * 8.0 * 0.1 * 6.0 / Servo().resistance_ohm
+    torque = servo.torque_constant * 8.0 * 0.1 * 6.0 / servo.resistance_ohm
+    wound = torque / servo.gear_stiffness + backlash / 2
     assert drive.torque == pytest.approx([torque, -torque], rel=1e-9)
-    assert state.angle == pytest.approx([torque / 40.0 + 0.03, -torque / 40.0 - 0.03], rel=1e-9)
+    assert state.angle == pytest.approx([wound, -wound], rel=1e-9)
 
 
 def test_within_the_play_only_the_damper_acts():

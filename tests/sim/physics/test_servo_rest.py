@@ -7,15 +7,14 @@ import math
 import numpy as np
 import pytest
 
+from support.twin_runs import energies, simulate
 from undulog.capture.common.errors import ScenarioError
 from undulog.capture.robot.model import Plane, Servo
 from undulog.sim import PlaneGait, Serpentine, World
-from undulog.sim.physics.ledger import TERMS
 from undulog.sim.physics.servo import Rotors, Servos
 from undulog.sim.scenario.scenario import EngineKind, Kernels
 from undulog.sim.scenario.scenario_file import load_scenario, parse_scenario
 from undulog.sim.twin.stability import stability
-from undulog.sim.twin.twin import Twin
 
 DT = 1e-3
 
@@ -127,11 +126,10 @@ def test_rotors_rest_at_every_reversal_and_the_ledger_closes_on_all_engines_and_
     )
     angles = []
     for engine, kernels in itertools.product(EngineKind, Kernels):
-        with Twin(dataclasses.replace(scenario, engine=engine), kernels=kernels) as twin:
-            samples = list(twin.samples())
+        samples = simulate(dataclasses.replace(scenario, engine=engine), kernels=kernels)
         angle = np.array([one.step.rotors.angle for one in samples])
         still = np.array([one.step.rotors.speed == 0.0 for one in samples])
-        energy = dict(zip(TERMS, samples[-1].energy, strict=True))
+        energy = energies(samples[-1])
         assert (np.count_nonzero(still[20:], axis=0) >= 4).all()
         between = still[1:] & still[:-1]
         assert (np.diff(angle, axis=0)[between] == 0.0).mean() > 0.9  # but for a start between

@@ -4,19 +4,10 @@ import dataclasses
 
 import pytest
 
+from support.twin_runs import SNAKE13, faults_of
 from undulog.capture.common.errors import RobotFileError, ScenarioError, UsageError
 from undulog.capture.robot.model import Plane
 from undulog.sim import FrictionLaw, Wave, load_scenario, parse_scenario, scenario_names
-
-MINIMAL = """
-description = "a test"
-robot = "snake13"
-duration_s = 2.0
-[gait.horizontal]
-amplitude = 0.3
-frequency_hz = 0.5
-lag = 0.5
-"""
 
 FULL = """
 name = "full"
@@ -64,14 +55,8 @@ position = 1e-3
 """
 
 
-def faults_of(text):
-    with pytest.raises(ScenarioError) as caught:
-        parse_scenario(text, "x.toml")
-    return {fault.key: str(fault) for fault in caught.value.faults}
-
-
 def test_what_is_left_out_has_defaults():
-    scenario = parse_scenario(MINIMAL, "some/where/short.toml")
+    scenario = parse_scenario(SNAKE13, "some/where/short.toml")
     assert scenario.name == "short"
     assert scenario.robot.name == "snake13"
     assert scenario.gait.ramp_s == 2.0
@@ -114,7 +99,7 @@ def test_the_weak_servo_scenario_is_the_papers():
 
 
 def test_without_ground():
-    text = f'{MINIMAL}\n[world]\nsurface = "none"\n'
+    text = f'{SNAKE13}\n[world]\nsurface = "none"\n'
     scenario = parse_scenario(text, "x.toml")
     assert scenario.world.ground is None
     assert parse_scenario(scenario.toml(), "x.toml") == scenario
@@ -188,17 +173,17 @@ def test_all_faults_are_listed_at_once():
     ],
 )
 def test_faults_that_depend_on_other_keys(before, after, key):
-    assert set(faults_of(f"{before}\n{MINIMAL}\n{after}")) == {key}
+    assert set(faults_of(f"{before}\n{SNAKE13}\n{after}")) == {key}
 
 
 def test_a_gait_needs_a_plane_that_the_robot_has(tmp_path):
-    assert "gait.horizontal" in faults_of(MINIMAL.split("[gait", maxsplit=1)[0])
+    assert "gait.horizontal" in faults_of(SNAKE13.split("[gait", maxsplit=1)[0])
     (tmp_path / "planar.toml").write_text(
         'name = "planar"\nclock = "simulated"\n'
         'joints = [{ name = "joint01", plane = "horizontal" }]\n'
         "[defaults.link]\nlength = 0.06\nradius = 0.02\nmass = 0.1\ninertia = [4e-5, 5e-5, 5e-5]\n"
     )
-    text = MINIMAL.replace("snake13", "planar.toml")
+    text = SNAKE13.replace("snake13", "planar.toml")
     path = tmp_path / "s.toml"
     path.write_text(text)
     assert load_scenario(path).robot.name == "planar"  # a robot beside its scenario
@@ -230,14 +215,14 @@ def test_changes_are_checked_and_settle_is_cut():
 
 
 def test_the_session_id_changes_with_whatever_changes_the_run():
-    scenario = parse_scenario(MINIMAL, "x.toml")
+    scenario = parse_scenario(SNAKE13, "x.toml")
     other_robot = dataclasses.replace(scenario.robot, toml=scenario.robot.toml + "# later\n")
     variants = [
         scenario,
         scenario.changed(seed=2),
         scenario.changed(duration_s=1.0),
         dataclasses.replace(scenario, robot=other_robot),
-        parse_scenario(MINIMAL.replace("0.3", "0.31"), "x.toml"),
+        parse_scenario(SNAKE13.replace("0.3", "0.31"), "x.toml"),
     ]
     assert len({one.session_id for one in variants}) == len(variants)
-    assert parse_scenario(MINIMAL, "x.toml").session_id == scenario.session_id
+    assert parse_scenario(SNAKE13, "x.toml").session_id == scenario.session_id

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from undulog.capture.common.errors import ScenarioError, UsageError
+from support.twin_runs import SNAKE13, faults_of
+from undulog.capture.common.errors import UsageError
 from undulog.sim import (
     Box,
     Cylinder,
@@ -16,16 +17,6 @@ from undulog.sim import (
     Wall,
     parse_scenario,
 )
-
-HEAD = """
-description = "a test"
-robot = "snake13"
-duration_s = 2.0
-[gait.horizontal]
-amplitude = 0.3
-frequency_hz = 0.5
-lag = 0.5
-"""
 
 WORLD = """
 [world]
@@ -66,14 +57,8 @@ gap = 0.15
 """
 
 
-def faults_of(text):
-    with pytest.raises(ScenarioError) as caught:
-        parse_scenario(HEAD + text, "x.toml")
-    return {fault.key: str(fault) for fault in caught.value.faults}
-
-
 def test_obstacles_are_read_and_written_back():
-    scenario = parse_scenario(HEAD + WORLD, "x.toml")
+    scenario = parse_scenario(SNAKE13 + WORLD, "x.toml")
     world = scenario.world
     assert world.obstacles == (
         Cylinder((1.5, 0.2), 0.1, 0.4),
@@ -87,12 +72,14 @@ def test_obstacles_are_read_and_written_back():
 
 
 def test_a_slope_tilts_gravity():
-    gravity = parse_scenario(HEAD + WORLD, "x.toml").world.gravity
+    gravity = parse_scenario(SNAKE13 + WORLD, "x.toml").world.gravity
     assert math.hypot(*gravity) == pytest.approx(9.81)
     assert math.atan2(math.hypot(*gravity[:2]), -gravity[2]) == pytest.approx(0.1)
     assert math.atan2(gravity[1], gravity[0]) == pytest.approx(0.5)
-    assert "world.gravity" in faults_of("[world]\nslope = 0.1\ngravity = [0.0, 0.0, -1.0]\n")
-    assert "world.slope_heading" in faults_of("[world]\nslope_heading = 0.1\n")
+    assert "world.gravity" in faults_of(
+        SNAKE13 + "[world]\nslope = 0.1\ngravity = [0.0, 0.0, -1.0]\n"
+    )
+    assert "world.slope_heading" in faults_of(SNAKE13 + "[world]\nslope_heading = 0.1\n")
 
 
 def test_a_wall_is_a_box_along_it():
@@ -102,7 +89,8 @@ def test_a_wall_is_a_box_along_it():
 
 def test_faults_are_listed_at_once():
     found = faults_of(
-        """
+        SNAKE13
+        + """
         [world.obstacle_contact]
         stiffness = 0
         [world.target]
@@ -138,7 +126,7 @@ def test_faults_are_listed_at_once():
 
 @pytest.mark.parametrize("seed", range(1, 9))
 def test_a_field_keeps_its_distances(seed):
-    scenario = parse_scenario(f"seed = {seed}\n{HEAD}{FIELD}", "x.toml")
+    scenario = parse_scenario(f"seed = {seed}\n{SNAKE13}{FIELD}", "x.toml")
     placed = scenario.world.obstacles
     assert len(placed) == 12
     at = np.array([one.position for one in placed])
@@ -155,32 +143,28 @@ def test_a_field_keeps_its_distances(seed):
 
 
 def test_a_field_follows_the_seed_and_is_stored_as_its_obstacles():
-    scenario = parse_scenario(HEAD + FIELD, "x.toml")
+    scenario = parse_scenario(SNAKE13 + FIELD, "x.toml")
     assert "[world.field]" not in scenario.toml()
     assert parse_scenario(scenario.toml(), "y.toml") == scenario
     assert scenario.world.field == RandomField(
         12, (4.0, 3.0), (1.8, 0.0), (0.05, 0.12), clear=0.25, gap=0.15
     )
-    again = parse_scenario(HEAD + FIELD, "z.toml")
+    again = parse_scenario(SNAKE13 + FIELD, "z.toml")
     assert again.world.obstacles == scenario.world.obstacles
     other = scenario.changed(seed=9)
     assert (
         other.world.obstacles
-        == parse_scenario(f"seed = 9\n{HEAD}{FIELD}", "x.toml").world.obstacles
+        == parse_scenario(f"seed = 9\n{SNAKE13}{FIELD}", "x.toml").world.obstacles
     )
     assert other.world.obstacles != scenario.world.obstacles
     assert scenario.changed(duration_s=1.0).world.obstacles == scenario.world.obstacles
-    fixed = parse_scenario(f"{HEAD}{FIELD}seed = 4\n", "x.toml")
+    fixed = parse_scenario(f"{SNAKE13}{FIELD}seed = 4\n", "x.toml")
     assert fixed.changed(seed=9).world.obstacles == fixed.world.obstacles
 
 
 def test_a_field_stands_clear_of_what_is_there_and_joins_it():
-    text = (
-        HEAD
-        + FIELD
-        + "[[world.obstacles]]\nshape = 'box'\nposition = [2.0, 0.0]\nsize = [1.0, 1.0]\n"
-    )
-    world = parse_scenario(text, "x.toml").world
+    box = "[[world.obstacles]]\nshape = 'box'\nposition = [2.0, 0.0]\nsize = [1.0, 1.0]\n"
+    world = parse_scenario(SNAKE13 + FIELD + box, "x.toml").world
     assert world.obstacles[0] == Box((2.0, 0.0), (1.0, 1.0))
     for one in world.obstacles[1:]:
         x, y = (max(abs(c - m) - 0.5, 0.0) for c, m in zip(one.position, (2.0, 0.0), strict=True))
@@ -192,8 +176,8 @@ def test_a_field_stands_clear_of_what_is_there_and_joins_it():
 
 def test_no_room_is_told():
     text = FIELD.replace("[4.0, 3.0]", "[0.4, 0.4]")
-    assert "room for" in faults_of(text)["world.field"]
-    scenario = parse_scenario(HEAD + FIELD, "x.toml")
+    assert "room for" in faults_of(SNAKE13 + text)["world.field"]
+    scenario = parse_scenario(SNAKE13 + FIELD, "x.toml")
     tight = RandomField(12, (0.4, 0.4))
     with pytest.raises(UsageError, match=r"room for \d of 12"):
         scenario.world.scattered(tight, 1, 0.8)

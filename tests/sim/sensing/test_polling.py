@@ -38,6 +38,11 @@ def cycles(poll, run):
     return [sample for period in run for sample in poll.observe(period)] + poll.flush()
 
 
+def moving(count, angle=lambda t: np.zeros(JOINTS)):
+    """Angles alone; rates and drives are zero."""
+    return periods(count, angle, lambda t: np.zeros(JOINTS), lambda k: np.zeros((3, JOINTS)))
+
+
 SLOPE = np.arange(1.0, JOINTS + 1)
 
 
@@ -119,35 +124,20 @@ def test_the_encoder_tells_whole_steps():
 
 def test_within_its_dead_band_the_encoder_stands_still():
     swing, band = 0.02, 0.015
-    run = periods(
-        40,
-        angle=lambda t: np.full(JOINTS, swing * math.sin(2 * math.pi * 5 * t)),
-        rate=lambda t: np.zeros(JOINTS),
-        drive=lambda k: np.zeros((3, JOINTS)),
-    )
+    run = moving(40, lambda t: np.full(JOINTS, swing * math.sin(2 * math.pi * 5 * t)))
     told = np.array([s.position[0] for s in cycles(polling(ServoPolling(dead_band=band)), run)])
     true = swing * np.sin(2 * np.pi * 5 * 0.01 * np.arange(41))
     assert np.abs(told - true).max() <= band
     changes = np.diff(told)
     assert (np.abs(changes[changes != 0.0]) > band).all()
-    still = periods(
-        5,
-        angle=lambda t: np.full(JOINTS, 0.9 * band * math.sin(100 * t)),
-        rate=lambda t: np.zeros(JOINTS),
-        drive=lambda k: np.zeros((3, JOINTS)),
-    )
+    still = moving(5, lambda t: np.full(JOINTS, 0.9 * band * math.sin(100 * t)))
     for sample in cycles(polling(ServoPolling(dead_band=band)), still):
         np.testing.assert_array_equal(sample.position, 0.0)
 
 
 def test_noise_is_white_and_has_the_asked_deviation():
     noise = Noise(position=1e-3, velocity=1e-2, effort=0.1)
-    run = periods(
-        2000,
-        angle=lambda t: np.zeros(JOINTS),
-        rate=lambda t: np.zeros(JOINTS),
-        drive=lambda k: np.zeros((3, JOINTS)),
-    )
+    run = moving(2000)
     samples = cycles(polling(noise=noise), run)
     for name, sigma in (("position", 1e-3), ("velocity", 1e-2), ("effort", 0.1)):
         values = np.array([getattr(sample, name) for sample in samples])

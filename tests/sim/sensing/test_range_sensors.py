@@ -52,6 +52,17 @@ def robot(make_robot):
     return make_robot(2)
 
 
+@pytest.fixture
+def infrared_at(robot):
+    """An infrared sensor before a wall across its way, its face at some distance [m]."""
+
+    def build(face, model=EXACT, sensors=None, seed=1):
+        caster = RayCaster([Wall((face + 0.01, -5.0), (face + 0.01, 5.0), 0.02)], ground=True)
+        return Infrared(model, sensors or [infrared("ir01")], robot, caster, dt=DT, seed=seed)
+
+    return build
+
+
 @pytest.mark.parametrize(
     ("centimetres", "volts", "tolerance"),
     # Sharp GP2Y0A02YK0F: typical output, read off the data sheet's diagram; the last from its
@@ -85,11 +96,9 @@ def test_the_computer_inverts_the_falling_branch_and_is_fooled_before_the_peak()
 
 
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 50.0])
-def test_a_wall_at_an_angle_as_an_infrared_sensor_tells_it(robot, degrees):
-    caster = RayCaster([Wall((0.83, -5.0), (0.83, 5.0), 0.1)], ground=True)
+def test_a_wall_at_an_angle_as_an_infrared_sensor_tells_it(infrared_at, degrees):
     angle = math.radians(degrees)
-    sensor = infrared("ir01", rpy=(0.0, 0.0, angle))
-    samples = told(Infrared(EXACT, [sensor], robot, caster, dt=DT, seed=1), 20)
+    samples = told(infrared_at(0.78, sensors=[infrared("ir01", rpy=(0.0, 0.0, angle))]), 20)
     expected = (0.78 - 0.03) / math.cos(angle)
     assert [sample.distance for sample in samples] == pytest.approx([expected] * 6, rel=1e-5)
 
@@ -106,11 +115,9 @@ def test_the_mount_turns_and_moves_with_its_link(robot):
     assert told(kind, 1, pitch=pitch)[0].distance == pytest.approx(expected, rel=1e-5)
 
 
-def test_beyond_its_range_it_tells_infinity(robot):
-    for x, seen in ((1.5, True), (1.6, False)):
-        caster = RayCaster([Wall((x, -5.0), (x, 5.0), 0.02)], ground=True)
-        kind = Infrared(EXACT, [infrared("ir01")], robot, caster, dt=DT, seed=1)
-        assert (told(kind, 1)[0].distance < math.inf) is seen
+def test_beyond_its_range_it_tells_infinity(infrared_at):
+    for face, seen in ((1.49, True), (1.59, False)):
+        assert (told(infrared_at(face), 1)[0].distance < math.inf) is seen
 
 
 def test_a_new_value_comes_every_38_ms_and_the_sensors_take_turns(robot):
@@ -129,38 +136,32 @@ def test_a_new_value_comes_every_38_ms_and_the_sensors_take_turns(robot):
     assert times == sorted(times)
 
 
-def test_a_sample_is_of_its_own_time(robot):
+def test_a_sample_is_of_its_own_time(infrared_at):
     # Driving at a wall at 0.5 m/s: each distance is that of the instant of its stamp.
-    caster = RayCaster([Wall((1.01, -5.0), (1.01, 5.0), 0.02)], ground=True)
-    kind = Infrared(EXACT, [infrared("ir01")], robot, caster, dt=DT, seed=1)
-    for sample in told(kind, 100, forward=0.5):
+    for sample in told(infrared_at(1.0), 100, forward=0.5):
         assert sample.distance == pytest.approx(0.97 - 0.5 * sample.time_s, rel=1e-5)
 
 
-def test_the_converter_has_its_steps(robot):
-    caster = RayCaster([Wall((1.0, -5.0), (1.0, 5.0), 0.02)], ground=True)
-    model = InfraredModel(noise_v=0.05, adc_bits=8)
-    kind = Infrared(model, [infrared("ir01")], robot, caster, dt=DT, seed=1)
+def test_the_converter_has_its_steps(infrared_at):
+    kind = infrared_at(0.99, InfraredModel(noise_v=0.05, adc_bits=8))
     volts = voltage(np.array([s.distance for s in told(kind, 2000)]), 0.15)
     steps = volts / (3.3 / 255)
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)
     assert len(set(np.rint(steps))) > 5
 
 
-def test_the_noise_of_the_voltage_is_29_mv(robot):
-    caster = RayCaster([Wall((0.64, -5.0), (0.64, 5.0), 0.02)], ground=True)
+def test_the_noise_of_the_voltage_is_29_mv(infrared_at):
     sensors = [infrared(f"ir{i:02d}") for i in range(1, 16)]
-    kind = Infrared(InfraredModel(), sensors, robot, caster, dt=DT, seed=3)
-    volts = voltage(np.array([s.distance for s in told(kind, 1000)]), 0.15)
+    first, again = (
+        [s.distance for s in told(infrared_at(0.63, InfraredModel(), sensors, 3), periods)]
+        for periods in (1000, 5)
+    )
+    assert first[: len(again)] == again
+    volts = voltage(np.array(first), 0.15)
     assert len(volts) > 3900
     # Standard errors: 0.5 mV of the mean, 1.1 % of the deviation.
     assert volts.mean() == pytest.approx(voltage(np.array([0.6]), 0.15)[0], abs=2e-3)
     assert volts.std() == pytest.approx(0.029, rel=0.04)
-    again = Infrared(InfraredModel(), sensors, robot, caster, dt=DT, seed=3)
-    assert [s.distance for s in told(again, 5)] == [
-        s.distance
-        for s in told(Infrared(InfraredModel(), sensors, robot, caster, dt=DT, seed=3), 5)
-    ]
 
 
 QUIET = SonarModel(noise=0.0, resolution=0.0)

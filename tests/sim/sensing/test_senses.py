@@ -2,17 +2,17 @@
 
 import dataclasses
 import math
-import os
+import tomllib
 
 import numpy as np
 import pytest
 
-from support.processes import undulog
+from support.twin_runs import SNAKE25, faults_of, sensed, simulate
 from undulog.capture import Session
-from undulog.capture.common.errors import ScenarioError
 from undulog.capture.robot.model import Plane
 from undulog.sim import (
     Cylinder,
+    InfraredModel,
     Readings,
     SensorModels,
     ServoPolling,
@@ -24,14 +24,7 @@ from undulog.sim.sensing.contract import JointSample, RangeSample, VectorSample
 from undulog.sim.twin.recording import record
 from undulog.sim.twin.twin import Twin
 
-SCENARIO = """
-description = "a test"
-robot = "snake25"
-duration_s = 0.6
-[gait.horizontal]
-amplitude = 0.3
-frequency_hz = 0.5
-lag = 0.5
+SCENARIO = f"""{SNAKE25.replace("2.0", "0.6")}
 [world]
 heading = 0.2
 [[world.obstacles]]
@@ -139,9 +132,7 @@ def test_polling_in_turn_changes_no_phase_where_each_joint_has_its_own_time(
             duration_s=4.0,
             sensing=SensorModels(servo),
         )
-        with Twin(scenario) as twin:
-            samples = [one for sample in twin.samples() for one in sample.sensed]
-        chosen = samples[-200:]  # two whole cycles
+        chosen = sensed(scenario)[-202:-2]  # two whole cycles
         angle = np.array([one.position for one in chosen])
         cycle = np.array([one.cycle for one in chosen])[:, None] / 100
         turn = 2 * np.pi * hz * (cycle + own_times * np.array([one.offset_s for one in chosen]))
@@ -162,54 +153,26 @@ def test_polling_in_turn_changes_no_phase_where_each_joint_has_its_own_time(
     np.testing.assert_allclose(careless - in_turn, expected, atol=0.02)
 
 
-def test_two_processes_write_the_same_bytes(tmp_path):
-    (tmp_path / "x.toml").write_text(SCENARIO)
-    for name in ("a", "b"):
-        done = undulog(
-            "sim",
-            "run",
-            "x.toml",
-            "-o",
-            f"{name}.mcap",
-            cwd=tmp_path,
-            env=os.environ | {"PYTHONHASHSEED": str(ord(name))},
-        )
-        assert done.returncode == 0, done.stderr
-    first, second = ((tmp_path / f"{name}.mcap").read_bytes() for name in "ab")
-    assert first == second
-
-
-def test_without_its_sensors_a_robot_has_its_servos_only(scenario):
-    mute = dataclasses.replace(
-        scenario, sensing=dataclasses.replace(scenario.sensing, enabled=False)
-    )
-    with Twin(mute) as twin:
-        told = [one for sample in twin.samples() for one in sample.sensed]
-    assert {type(one) for one in told} == {JointSample}
+def test_without_its_sensors_a_robot_has_its_servos_only_and_moves_alike(scenario, run):
+    quiet = dataclasses.replace(scenario.sensing, enabled=False)
+    mute = dataclasses.replace(scenario, sensing=quiet)
+    samples = simulate(mute)
+    assert {type(one) for sample in samples for one in sample.sensed} == {JointSample}
     assert parse_scenario(mute.toml(), "y.toml") == mute
-
-
-def test_sensors_do_not_change_the_motion(scenario, run):
-    mute = dataclasses.replace(
-        scenario, sensing=dataclasses.replace(scenario.sensing, enabled=False)
-    )
-    with Twin(mute) as twin:
-        last = list(twin.samples())[-1]
-    np.testing.assert_array_equal(last.step.body.position, run[0][-1][0].step.body.position)
+    last = samples[-1].step.body.position
+    np.testing.assert_array_equal(last, run[0][-1][0].step.body.position)
 
 
 def test_a_robot_without_sensors_has_none(make_scenario):
-    with Twin(make_scenario(duration_s=0.05, world=None)) as twin:
-        for sample in twin.samples():
-            assert all(isinstance(one, JointSample) for one in sample.sensed)
+    for sample in simulate(make_scenario(duration_s=0.05)):
+        assert all(isinstance(one, JointSample) for one in sample.sensed)
     nothing = Readings.nothing(make_scenario().robot)
     assert nothing.ranges == {}
 
 
 def test_seeds_change_the_noise_and_only_that(scenario):
     def told(seed):
-        with Twin(scenario.changed(seed=seed, duration_s=0.1)) as twin:
-            samples = list(twin.samples())
+        samples = simulate(scenario.changed(seed=seed, duration_s=0.1))
         values = [one.vector for s in samples for one in s.sensed if isinstance(one, VectorSample)]
         return np.nan_to_num(values), samples[-1].step.body.angle
 
@@ -253,37 +216,15 @@ north = 0.3
 
 
 def test_every_key_is_read_and_written_back():
-    text = SCENARIO.split("[sensing", maxsplit=1)[0]
-    scenario = parse_scenario(text + SENSING, "x.toml")
-    assert dataclasses.asdict(scenario.sensing) == {
-        "servo": {
-            "slot_s": 3e-4,
-            "resolution": 1e-3,
-            "dead_band": 2e-3,
-            "command_resolution": 5e-3,
-        },
-        "ir": {"hold_s": 0.04, "noise_v": 0.01, "adc_bits": 10, "adc_v": 5.0, "peak": 0.1},
-        "sonar": {"rate_hz": 10, "noise": 0.01, "resolution": 0.02, "rays": 7},
-        "accelerometer": {"rate_hz": 50, "noise": 0.1, "resolution": 0.05},
-        "compass": {
-            "rate_hz": 8,
-            "noise": 1e-7,
-            "resolution": 2e-7,
-            "horizontal_field": 2.1e-5,
-            "inclination": 1.1,
-            "north": 0.3,
-        },
-        "enabled": True,
-    }
+    scenario = parse_scenario(SNAKE25 + SENSING, "x.toml")
+    assert dataclasses.asdict(scenario.sensing) == tomllib.loads(SENSING)["sensing"]
     assert parse_scenario(scenario.toml(), "y.toml") == scenario
 
 
 def test_faults_are_listed_at_once():
-    text = SCENARIO.split("[sensing", maxsplit=1)[0]
-    with pytest.raises(ScenarioError) as caught:
-        parse_scenario(
-            text
-            + """
+    found = faults_of(
+        SNAKE25
+        + """
             [sensing]
             enabled = "yes"
             gyro = 1
@@ -297,10 +238,9 @@ def test_faults_are_listed_at_once():
             rays = 0.5
             [sensing.compass]
             inclination = 65
-            """,
-            "x.toml",
-        )
-    assert {fault.key for fault in caught.value.faults} == {
+            """
+    )
+    assert set(found) == {
         "sensing.enabled",
         "sensing.gyro",
         "sensing.servo.slot_s",  # 25 turns of 0.4 ms are a whole control period
@@ -314,9 +254,7 @@ def test_faults_are_listed_at_once():
 
 def test_a_twin_between_walls_sees_them():
     flat = load_scenario("flat").changed(duration_s=0.1)
-    sensing = dataclasses.replace(
-        flat.sensing, ir=dataclasses.replace(flat.sensing.ir, noise_v=0.0)
-    )
+    sensing = dataclasses.replace(flat.sensing, ir=InfraredModel(noise_v=0.0))
     walls = (
         Wall((-3.0, 0.5), (3.0, 0.5)),
         Wall((-3.0, -0.7), (3.0, -0.7)),

@@ -7,22 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from support.twin_runs import SNAKE25, faults_of
 from undulog.capture import Session, load_robot
-from undulog.capture.common.errors import ScenarioError, UsageError
+from undulog.capture.common.errors import UsageError
 from undulog.sim import load_scenario, parse_scenario
 from undulog.sim.scenario.bus_faults import BusFault, FaultKind, parse_faults
 from undulog.sim.twin.recording import record
 
 ROBOT = load_robot("snake25")
-BASE = """
-description = "a test"
-robot = "snake25"
-duration_s = 0.1
-[gait.horizontal]
-amplitude = 0.1
-frequency_hz = 1.0
-lag = 0.5
-"""
+BASE = SNAKE25.replace("2.0", "0.1")
 
 
 @pytest.mark.parametrize(
@@ -33,10 +26,7 @@ lag = 0.5
         ("lost:0.5@2", BusFault(FaultKind.LOST, "", 0.5, 2.0)),
         ("stuck:joint01@5", BusFault(FaultKind.STUCK, "joint01", 0.0, 5.0)),
         ("frozen:joint25@5+2.5", BusFault(FaultKind.FROZEN, "joint25", 0.0, 5.0, 2.5)),
-        (
-            "over-current:joint07:1.5@5",
-            BusFault(FaultKind.OVER_CURRENT, "joint07", 1.5, 5.0),
-        ),
+        ("over-current:joint07:1.5@5", BusFault(FaultKind.OVER_CURRENT, "joint07", 1.5, 5.0)),
         ("bus-off@5+2", BusFault(FaultKind.BUS_OFF, "", 0.0, 5.0, 2.0)),
         ("noise:1e-3", BusFault(FaultKind.NOISE, "", 0.001)),
         ("delay:0.02", BusFault(FaultKind.DELAY, "", 0.02)),
@@ -127,9 +117,7 @@ kind = "noise"
 value = 0.1
 until_s = 3
 """
-    with pytest.raises(ScenarioError) as caught:
-        parse_scenario(BASE + text, "x.toml")
-    told = {fault.key: str(fault) for fault in caught.value.faults}
+    told = faults_of(BASE + text)
     assert set(told) == {
         "faults[0].joint",
         "faults[0].value",

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from support.processes import wait_for
+from support.twin_runs import sensed, simulate
 from undulog.capture import load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.bus.encoding import BusEncoder
@@ -25,7 +26,6 @@ from undulog.sim.serve.pacing import PATIENCE_NS, Pacer
 from undulog.sim.serve.reply_frames import FaultLine, ReplyEncoder
 from undulog.sim.serve.robot import PERIOD_NS, VirtualRobot
 from undulog.sim.serve.socketcand_server import SocketcandServer, VirtualBus
-from undulog.sim.twin.twin import Twin
 
 JOINTS = 4
 STEP = math.radians(0.01)
@@ -154,22 +154,13 @@ class Controller:
 
     names = ()
 
-    def __init__(self):
-        self.tick = 0
-        self.told = []
-
     def step(self, time_s, readings):
-        command = answer(readings.angle, self.tick)
-        self.tick += 1
-        self.told.append(command)
+        command = answer(readings.angle, round(time_s * CONTROL_RATE_HZ))
         return GaitTick(command, np.empty(0), "test", ())
 
 
 def test_a_loop_closed_over_the_bus_in_lockstep_is_the_loop_in_process(scenario, robot, running):
-    with Twin(scenario, Controller()) as twin:
-        truth = [sample.position for s in twin.samples() for sample in s.sensed] + [
-            sample.position for sample in twin.flush()
-        ]
+    truth = [sample.position for sample in sensed(scenario, Controller())]
     live = running(scenario, lockstep=True)
     unknown = np.full(JOINTS, np.nan)
     found = []
@@ -189,8 +180,7 @@ def test_a_loop_closed_over_the_bus_in_lockstep_is_the_loop_in_process(scenario,
 
 
 def test_commands_in_steps_are_the_same_in_process(scenario):
-    with Twin(scenario) as twin:
-        commands = np.array([sample.gait.command for sample in twin.samples()])
+    commands = np.array([sample.gait.command for sample in simulate(scenario)])
     np.testing.assert_allclose(np.rint(commands / STEP) * STEP, commands, rtol=0, atol=1e-15)
     assert len(np.unique(commands[:, 0])) > 20
 

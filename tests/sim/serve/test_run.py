@@ -94,19 +94,8 @@ def recorder(source, output):
 
 
 def driven(scenario, port, control, *words):
-    done = undulog(
-        "drive",
-        scenario,
-        "--on",
-        f"can:socketcand:can0?port={port}",
-        "--arm",
-        "--recorder",
-        control,
-        "--json",
-        *words,
-        "-o",
-        control.with_suffix(".drive.mcap"),
-    )
+    on = ("--on", f"can:socketcand:can0?port={port}", "--arm", "--recorder", control, "--json")
+    done = undulog("drive", scenario, *on, *words, "-o", control.with_suffix(".drive.mcap"))
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -125,10 +114,8 @@ class Run:
 def heedless(scenario, port, control):
     """A controller in lockstep that looks at nothing, and so goes on whatever is wrong."""
     del control
-    robot, gait = (
-        load_robot("snake25"),
-        find_motion(str(scenario)).make(load_robot("snake25"), None),
-    )
+    robot = load_robot("snake25")
+    gait = find_motion(str(scenario)).make(robot, None)
     encoder, blind = CommandEncoder(robot), Readings.nothing(robot)
     address = parse_address(f"can:socketcand:can0?host=127.0.0.1&port={port}")
     link = find_virtual_robot(address, Tally(time.time_ns))

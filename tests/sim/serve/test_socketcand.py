@@ -29,8 +29,10 @@ from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.contract import SourceContext, records
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcand import SocketcandText
+from undulog.sim.drive.links import find_virtual_robot
 from undulog.sim.serve.socketcand_protocol import ClientText, frame_text, sent_frame
 from undulog.sim.serve.socketcand_server import (
+    HOLD_S,
     MOST_CLIENTS,
     MOST_SENT,
     SocketcandServer,
@@ -208,20 +210,10 @@ def test_what_python_can_sends_is_read(identifier, extended, data):
     assert records([record])["dir"].tolist() == [DIR_TX]
 
 
-@pytest.mark.parametrize(
-    "rest",
-    [
-        "",
-        "123",
-        "123 1",
-        "123 9 1 2 3 4 5 6 7 8 9",
-        "800 0",
-        "20000000 0",
-        "1 1 100",
-        "x 0",
-        "1 0 1",
-    ],
-)
+BROKEN = ["", "123", "123 1", "123 9 1 2 3 4 5 6 7 8 9", "800 0", "20000000 0", "1 1 100", "x 0"]
+
+
+@pytest.mark.parametrize("rest", [*BROKEN, "1 0 1"])
 def test_broken_frames_are_no_frames(rest):
     assert sent_frame("send", rest) is None
 
@@ -317,14 +309,11 @@ def test_answers_are_those_of_the_protocol(serving):
             assert heard(sock, b">") == answer
         sock.sendall(b"< send 123 1 A >")  # without the raw mode one can send, too
         wait_for(lambda: len(serving.pulled), "the frame")
-    with hand(serving) as sock:
-        sock.sendall(b"< send 123 1 A >")
-        assert heard(sock, b">") == b"< error could not open bus >"
-        assert sock.recv(10) == b""
-    with hand(serving) as sock:
-        sock.sendall(b"< open can7 >")
-        assert heard(sock, b">") == b"< error could not open bus >"
-        assert sock.recv(10) == b""
+    for said in (b"< send 123 1 A >", b"< open can7 >"):
+        with hand(serving) as sock:
+            sock.sendall(said)
+            assert heard(sock, b">") == b"< error could not open bus >"
+            assert sock.recv(10) == b""
     wait_for(lambda: any("there is only can0" in text for _, text in serving.said), "why")
 
 
@@ -370,6 +359,29 @@ def test_who_sends_more_than_the_robot_takes_has_to_wait_and_loses_nothing(servi
     assert same(serving.frames(), many)
 
 
+def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(serving):
+    own = traffic(40, 8)
+    with serving.lock:
+        serving.pulling = False
+        serving.server.identity = "virtual-robot snake25 paced"
+        serving.server.mark(0)
+    address = parse_address(f"can:socketcand:can0?port={serving.port}")
+    link = find_virtual_robot(address, Tally(lambda: 0))
+    time.sleep(2 * HOLD_S)
+    with serving.lock:  # the robot does not listen
+        # It sent more than the controller has read, so that the end resets the connection; and it
+        # sends again before it listens.
+        serving.server.broadcast(own)
+        link.send(own)
+        link.close()
+        for _ in range(3):
+            serving.server.broadcast(own)
+        assert serving.server.waiting == 0
+    wait_for(lambda: not serving.server.clients)
+    assert same(records(one.record for one in iter(serving.server.take, None)), own)
+    link.close()  # again, and nothing happens
+
+
 def test_no_more_clients_than_there_is_room_for(serving):
     with ExitStack() as clients:
         for _ in range(MOST_CLIENTS):
@@ -398,15 +410,13 @@ def test_silent_clients_lock_nobody_out(serving, said):
 
 
 def test_only_loopback_is_served():
-    for host in ("0.0.0.0", "192.0.2.1"):
-        with pytest.raises(UsageError, match="is not this computer's loopback"):
-            SocketcandServer(host, 0, "can0", lambda *_: None)
-    with pytest.raises(UsageError, match="no address to serve at"):
-        SocketcandServer("no.such.host.invalid", 0, "can0", lambda *_: None)
-
-
-def test_a_port_that_is_taken_is_named():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(UsageError, match=f"can't serve at 127.0.0.1:{port}: Address already"):
-            SocketcandServer("127.0.0.1", port, "can0", lambda *_: None)
+        for host, at, said in (
+            ("0.0.0.0", 0, "is not this computer's loopback"),
+            ("192.0.2.1", 0, "is not this computer's loopback"),
+            ("no.such.host.invalid", 0, "no address to serve at"),
+            ("127.0.0.1", port, f"can't serve at 127.0.0.1:{port}: Address already"),
+        ):
+            with pytest.raises(UsageError, match=said):
+                SocketcandServer(host, at, "can0", lambda *_: None)

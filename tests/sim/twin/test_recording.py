@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 
+import undulog as front
 from support.processes import UNDULOG, start, undulog, wait_for
 from undulog.capture import Session
 from undulog.capture.common.errors import OutputExistsError
@@ -68,7 +69,7 @@ def run(scenario):
     return samples, [(at, told) for at, told in heard if isinstance(told, JointSample)]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def truth(run):
     return run[0]
 
@@ -310,25 +311,15 @@ def test_a_stop_request_ends_between_two_samples(tmp_path, scenario):
     assert (found.sample_count, found.duration_s, found.complete) == (8, 0.07, False)
 
 
+PEG = '[[world.obstacles]]\nshape = "cylinder"\nposition = [0.0, 0.08]\nradius = 0.05\n'
 BAD = {
     "ground": ("[world.ground]\nstiffness = 1e7", "world.ground.stiffness is too stiff for steps"),
     "obstacle": (
-        """[[world.obstacles]]
-shape = "cylinder"
-position = [0.0, 0.08]
-radius = 0.05
-[world.obstacle_contact]
-stiffness = 1e8""",
+        f"{PEG}[world.obstacle_contact]\nstiffness = 1e8",
         "world.obstacle_contact.stiffness is too stiff for steps",
     ),
-    "gear": (
-        "[servo_of.joint03]\ngear_stiffness = 1e6",
-        "servo.gear_stiffness is too stiff for steps",
-    ),
-    "rotor": (
-        "[servo_of.joint03]\nrotor_inertia = 1e-8",
-        "servo.rotor_inertia is too stiff for steps",
-    ),
+    "gear": ("[servo_of.joint03]\ngear_stiffness = 1e6", "servo.gear_stiffness is too stiff"),
+    "rotor": ("[servo_of.joint03]\nrotor_inertia = 1e-8", "servo.rotor_inertia is too stiff"),
     "heavy": ("[link_of.link03]\nmass_factor = 1e4", "link03 is too heavy for world.ground"),
     "step": ("", "servo.gear_stiffness is too stiff for steps of 5 ms"),
 }
@@ -336,8 +327,6 @@ stiffness = 1e8""",
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_failed_run_keeps_what_came_before_and_why(tmp_path, capsys, name):
-    import undulog as front
-
     text, cause = BAD[name]
     (tmp_path / "bad.toml").write_text(
         'description = "bad"\nrobot = "snake13"\nduration_s = 2.0\n'
@@ -385,8 +374,6 @@ def test_nothing_is_overwritten_unasked(tmp_path, scenario):
 
 
 def test_the_command_line_reports(tmp_path, capsys):
-    import undulog as front
-
     path = tmp_path / "a.mcap"
     words = ["sim", "run", "flat", "-o", str(path), "--duration", "0.2"]
     assert front.run([*words, "--json"]) == 0
@@ -407,8 +394,6 @@ def test_the_command_line_reports(tmp_path, capsys):
 
 
 def test_the_command_line_lists_the_scenarios(capsys):
-    import undulog as front
-
     assert front.run(["sim", "list"]) == 0
     text = capsys.readouterr().out
     assert front.run(["sim", "list", "--json"]) == 0

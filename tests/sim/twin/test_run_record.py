@@ -6,23 +6,17 @@ import json
 import pytest
 
 import undulog
+from support.twin_runs import SNAKE13
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.robot.run import RUN_RECORD
 from undulog.sim import parse_scenario
 from undulog.sim.twin.recording import record
 
-SCENARIO = """
+SCENARIO = f"""
 name = "changed"
-description = "Other servos, a heavier link, an obstacle."
-robot = "snake13"
-duration_s = 7.0
 settle_s = 2.0
-[gait]
-ramp_s = 1.0
-[gait.horizontal]
-amplitude = 0.3
-frequency_hz = 1.0
-lag = 0.8
+gait.ramp_s = 1.0
+{SNAKE13.replace("2.0", "7.0").replace("hz = 0.5", "hz = 1.0")}
 [world]
 heading = 0.4
 [world.ground]

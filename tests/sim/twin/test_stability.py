@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from support.twin_runs import simulate
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.model import Plane
 from undulog.sim import (
@@ -18,7 +19,6 @@ from undulog.sim import (
 )
 from undulog.sim.scenario.obstacles import Cylinder, ObstacleMaterial
 from undulog.sim.twin.stability import likely_cause, stability, warnings
-from undulog.sim.twin.twin import Twin
 
 IN_SPACE = World(gravity=(0.0, 0.0, 0.0), ground=None)
 
@@ -26,8 +26,7 @@ IN_SPACE = World(gravity=(0.0, 0.0, 0.0), ground=None)
 def restless(scenario):
     """Fastest joint or link in the last tenth of a run; infinite where the run fails."""
     try:
-        with Twin(scenario) as twin:
-            last = list(twin.samples())[-round(10 * scenario.duration_s) :]
+        last = simulate(scenario)[-round(10 * scenario.duration_s) :]
     except SimulationError:
         return np.inf
     bodies = [sample.step.body for sample in last]

@@ -5,66 +5,17 @@ import math
 import numpy as np
 import pytest
 
+from support.twin_runs import energies, simulate
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.model import Plane
-from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, Wave, World
-from undulog.sim.physics.ledger import TERMS
+from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, World
 from undulog.sim.sensing.contract import JointSample
 from undulog.sim.twin.twin import Twin
-
-G = 9.81
-
-
-def run(scenario):
-    with Twin(scenario) as twin:
-        return list(twin.samples())
 
 
 def centre_of_mass(samples):
     # All links weigh the same here.
     return np.array([sample.step.body.position.mean(axis=1) for sample in samples])
-
-
-def test_a_straight_robot_rests_m_g_over_k_deep(make_scenario):
-    last = run(make_scenario(amplitude=0.0, duration_s=1.0))[-1].step
-    np.testing.assert_allclose(last.contact.depth, 0.1 * G / 2000.0, rtol=1e-6)
-
-
-def test_a_dropped_robot_settles_at_the_same_depth(make_scenario, make_robot):
-    # Dropped by starting it with upward speed: it lands, bounces and comes to rest.
-    world = World(velocity=(0.0, 0.0, 0.3))
-    last = run(make_scenario(make_robot(6), amplitude=0.0, duration_s=2.0, world=world))[-1].step
-    np.testing.assert_allclose(last.contact.depth, 0.1 * G / 2000.0, rtol=1e-6)
-
-
-@pytest.mark.parametrize("heading", [0.0, 2.0])
-def test_a_sliding_robot_stops_after_v2_over_2_mu_g(make_scenario, make_robot, heading):
-    v, eps, mu = 1.0, 0.01, 0.05
-    velocity = (v * math.cos(heading), v * math.sin(heading), 0.0)
-    world = World(velocity=velocity, heading=heading)
-    seconds = v / (mu * G) + 0.5
-    track = centre_of_mass(
-        run(make_scenario(make_robot(3), amplitude=0.0, duration_s=seconds, world=world))
-    )
-    way = np.linalg.norm(track[-1] - track[0])
-    assert way == pytest.approx(v**2 / (2 * mu * G), rel=1e-3)
-    # The smoothing lengthens it to the integral of sqrt(v^2 + eps^2) dv / (mu g).
-    smoothed = (v * math.hypot(v, eps) + eps**2 * math.asinh(v / eps)) / (2 * mu * G)
-    assert way == pytest.approx(smoothed, rel=1e-3)
-
-
-@pytest.mark.parametrize("steepness", [0.8, 1.2])
-def test_on_an_incline_it_slips_where_the_slope_exceeds_mu(make_scenario, make_robot, steepness):
-    slope = math.atan(steepness * 0.05)
-    world = World(gravity=(G * math.sin(slope), 0.0, -G * math.cos(slope)))
-    samples = run(make_scenario(make_robot(3), amplitude=0.0, duration_s=2.0, world=world))
-    speed = samples[-1].step.body.velocity[0, 0]
-    if steepness < 1:
-        # It creeps where smoothed friction balances the slope: s = v / sqrt(v^2 + eps^2).
-        assert speed == pytest.approx(0.01 * steepness / math.sqrt(1 - steepness**2), rel=1e-3)
-    else:
-        free = G * (math.sin(slope) - 0.05 * math.cos(slope)) * 2.0
-        assert free < speed < free + 0.05
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +30,7 @@ def two_cycles(make_scenario, make_robot):
             duration_s=3.0,
             world=World(heading=heading),
         )
-        track = centre_of_mass(run(scenario))
+        track = centre_of_mass(simulate(scenario))
         return (track[300] - track[100]) / 2.0
 
     return {degrees: speed(math.radians(degrees)) for degrees in (0, 30, 45, 90)}
@@ -109,8 +60,8 @@ SIDEWINDING = {
 )
 def test_power_closes_over_five_cycles(make_scenario, make_robot, planes, backlash):
     robot = make_robot(13, stall_torque=0.5, backlash=backlash)
-    samples = run(make_scenario(robot, gait=Serpentine(planes, 1.0), duration_s=8.0))
-    flow = dict(zip(TERMS, samples[800].energy - samples[300].energy, strict=True))
+    samples = simulate(make_scenario(robot, gait=Serpentine(planes, 1.0), duration_s=8.0))
+    flow = energies(samples[800], samples[300])
     assert flow["mechanical_abs"] > 0.1
     assert abs(flow["mechanical_residual"]) < 1e-3 * flow["mechanical_abs"]
     assert abs(flow["electrical_residual"]) < 1e-3 * flow["mechanical_abs"]
@@ -139,38 +90,19 @@ def test_the_ledger_agrees_with_the_logged_torques(make_scenario, make_robot):
     assert len(joints) == len(samples) == 401
     power = [(one.effort * one.velocity).sum() for one in joints]
     electrical = [(one.voltage * one.current).sum() for one in joints]
-    energy = dict(zip(TERMS, samples[-1].energy, strict=True))
+    energy = energies(samples[-1])
     assert np.trapezoid(power, dx=0.01) == pytest.approx(energy["mechanical_net"], rel=0.02)
     assert np.trapezoid(electrical, dx=0.01) == pytest.approx(energy["electrical_net"], rel=0.02)
 
 
 def test_without_ground_nothing_is_lost_to_it(make_scenario, make_robot):
     world = World(gravity=(0.0, 0.0, 0.0), ground=None)
-    samples = run(make_scenario(make_robot(7), frequency_hz=1.0, duration_s=2.0, world=world))
-    energy = dict(zip(TERMS, samples[-1].energy, strict=True))
+    samples = simulate(make_scenario(make_robot(7), frequency_hz=1.0, duration_s=2.0, world=world))
+    energy = energies(samples[-1])
     assert energy["friction_tangential"] == energy["friction_normal"] == 0.0
     drift = centre_of_mass(samples)[-1] - centre_of_mass(samples)[0]
     assert np.linalg.norm(drift) < 0.01 * 0.06  # a hundredth of a link, the integrator's
     assert abs(energy["mechanical_residual"]) < 1e-2 * energy["mechanical_abs"]
-
-
-def test_runs_of_the_same_scenario_are_identical(make_scenario, make_robot):
-    scenario = make_scenario(make_robot(9), ramp_s=0.2, duration_s=0.5)
-    first, second = run(scenario), run(scenario)
-    assert all(np.array_equal(a.energy, b.energy) for a, b in zip(first, second, strict=True))
-    assert len(first) == 51
-    assert first[-1].time_s == 0.5
-
-
-def test_a_failure_names_time_link_and_cause(make_scenario, make_robot):
-    world = World(ground=Ground(stiffness=1e7))
-    scenario = make_scenario(make_robot(5), ramp_s=0.0, duration_s=2.0, world=world)
-    with pytest.raises(SimulationError) as caught:
-        run(scenario)
-    message = str(caught.value)
-    assert "the twin failed at 0." in message
-    assert "link0" in message
-    assert "likely cause: world.ground.stiffness is too stiff for steps of 1 ms" in message
 
 
 def test_a_failure_without_a_stiff_part_says_so(make_scenario, make_robot):
@@ -178,52 +110,20 @@ def test_a_failure_without_a_stiff_part_says_so(make_scenario, make_robot):
     with pytest.raises(
         SimulationError, match=r"at 0\.000 s: link01 moves at 11 m/s.*look at the gait"
     ):
-        run(make_scenario(make_robot(3), amplitude=0.0, world=world))
-
-
-def _lags(scenario, response):
-    """Lag [degrees] of each yaw joint at the gait's frequency, over the settled part."""
-    samples = run(scenario)
-    start = round(scenario.settle_s * 100)
-    yaw = scenario.robot.joint_indices(Plane.HORIZONTAL)
-    commands = np.array([s.gait.command[yaw] for s in samples[start:-1]])
-    angles = np.array([s.step.body.angle[yaw] for s in samples[start:-1]])
-    found = [response(c, q, 0.5) for c, q in zip(commands.T, angles.T, strict=True)]
-    return -np.degrees(np.angle(found))
-
-
-@pytest.fixture(scope="module")
-def weak(make_scenario, make_robot):
-    def build(wave=Wave.HEAD_TO_TAIL, law=FrictionLaw.ELLIPSE):
-        planes = {Plane.HORIZONTAL: PlaneGait(0.4, 0.5, math.pi / 3, wave)}
-        return make_scenario(
-            make_robot(stall_torque=0.25),
-            gait=Serpentine(planes, 2.0),
-            duration_s=16.0,
-            settle_s=8.0,
-            world=World(ground=Ground(law=law)),
-        )
-
-    return build
+        simulate(make_scenario(make_robot(3), amplitude=0.0, world=world))
 
 
 @pytest.mark.slow
-def test_identical_weak_modules_lag_more_in_the_middle(weak, response):
-    # Meister, Stepanenko & Kernbach 2011: the response depends on the place in the body.
-    lag = _lags(weak(), response)
-    ends, middle = lag[[0, -1]].mean(), lag[4:9].mean()
-    assert 5.0 < middle - ends < 10.0
-    assert (ends, middle) == pytest.approx((7.41, 14.50), abs=0.02)
-
-    # Identical modules with free ends: run the wave the other way and the profile mirrors.
-    reverse = _lags(weak(Wave.TAIL_TO_HEAD), response)
-    np.testing.assert_allclose(reverse[::-1], lag, atol=0.03)
-
-
-@pytest.mark.slow
-def test_lags_agree_with_an_independent_program(weak, response):
+def test_lags_agree_with_an_independent_program(make_scenario, make_robot, response):
     # An earlier program of the same equations, with PyBullet and with MuJoCo as its engine:
     # 7.46 degrees at the ends and 13.66 in the middle, with the friction law "transeth".
-    lag = _lags(weak(law=FrictionLaw.TRANSETH), response)
+    robot = make_robot(stall_torque=0.25)
+    world = World(ground=Ground(law=FrictionLaw.TRANSETH))
+    samples = simulate(make_scenario(robot, duration_s=16.0, world=world))[800:-1]
+    yaw = robot.joint_indices(Plane.HORIZONTAL)
+    commands = np.array([sample.gait.command[yaw] for sample in samples])
+    angles = np.array([sample.step.body.angle[yaw] for sample in samples])
+    found = [response(c, q, 0.5) for c, q in zip(commands.T, angles.T, strict=True)]
+    lag = -np.degrees(np.angle(found))
     assert lag[[0, -1]].mean() == pytest.approx(7.46, abs=0.01)
     assert lag[4:9].mean() == pytest.approx(13.66, abs=0.01)

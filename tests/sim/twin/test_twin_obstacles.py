@@ -7,25 +7,16 @@ import math
 import numpy as np
 import pytest
 
+import undulog as front
+from support.twin_runs import energies, simulate
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Serpentine, World
-from undulog.sim.physics.ledger import TERMS
 from undulog.sim.scenario.obstacles import Cylinder, ObstacleMaterial, Wall
 from undulog.sim.scenario.scenario import EngineKind
-from undulog.sim.twin.twin import Twin
 
 MASS, V = 0.3, 0.4  # of three links; the speed at which they come
 WALL = Wall((0.1, -1.0), (0.1, 1.0))  # its face 0.9 - 0.03 - 0.025 m before the head's front
 GAP = 0.1 - 0.01 - 0.03 - 0.025
-
-
-def run(scenario):
-    with Twin(scenario) as twin:
-        return list(twin.samples())
-
-
-def energies(sample):
-    return dict(zip(TERMS, sample.energy, strict=True))
 
 
 @pytest.fixture
@@ -40,7 +31,9 @@ def thrown(make_scenario, make_robot):
             obstacles=(WALL,),
             obstacle_contact=ObstacleMaterial(**material),
         )
-        return run(make_scenario(make_robot(3), amplitude=0.0, duration_s=seconds, world=world))
+        return simulate(
+            make_scenario(make_robot(3), amplitude=0.0, duration_s=seconds, world=world)
+        )
 
     return throw
 
@@ -95,7 +88,7 @@ def forest(make_scenario, make_robot):
 
 
 def test_power_closes_among_obstacles(forest):
-    last = run(forest())[-1]
+    last = simulate(forest())[-1]
     energy = energies(last)
     assert (last.contact_s > 0.0).sum() >= 8
     assert last.contact_s.max() <= 4.0 + 1e-9
@@ -107,14 +100,16 @@ def test_power_closes_among_obstacles(forest):
     obstacles = ("obstacle_friction", "obstacle_damping")
     stored = ("kinetic", "potential", "contact_spring", "obstacle_spring")
     spent = sum(energy[term] for term in (*ground, *obstacles, *stored))
-    before = energies(run(dataclasses.replace(forest(), duration_s=0.01))[0])
+    before = energies(simulate(dataclasses.replace(forest(), duration_s=0.01))[0])
     spent -= sum(before[term] for term in stored)
     assert energy["mechanical_net"] == pytest.approx(spent + energy["mechanical_residual"])
 
 
 def test_both_engines_meet_the_same_obstacles(forest):
     scenario = dataclasses.replace(forest(), duration_s=1.5)
-    ours, theirs = (run(dataclasses.replace(scenario, engine=engine))[-1] for engine in EngineKind)
+    ours, theirs = (
+        simulate(dataclasses.replace(scenario, engine=engine))[-1] for engine in EngineKind
+    )
     assert ours.contact_s.any()
     np.testing.assert_array_equal(ours.contact_s, theirs.contact_s)
     assert ours.step.body.position == pytest.approx(theirs.step.body.position, abs=1e-9)
@@ -124,14 +119,12 @@ def test_both_engines_meet_the_same_obstacles(forest):
 def test_obstacles_out_of_reach_change_nothing(make_scenario, make_robot):
     scenario = make_scenario(make_robot(9), ramp_s=0.2, duration_s=0.3)
     far = dataclasses.replace(scenario, world=World(obstacles=(Cylinder((5.0, 0.0), 0.1),)))
-    for one, other in zip(run(scenario), run(far), strict=True):
+    for one, other in zip(simulate(scenario), simulate(far), strict=True):
         np.testing.assert_array_equal(one.step.body.position, other.step.body.position)
         np.testing.assert_array_equal(one.energy, other.energy)
 
 
 def test_the_command_line_tells_the_time_in_contact(tmp_path, capsys):
-    import undulog as front
-
     text = """
 description = "Past a peg."
 robot = "snake13"
