@@ -73,8 +73,7 @@ def changes(a: Sequence[Mapping[str, str]], b: Sequence[Mapping[str, str]]) -> t
         for name in names
         if (sides := (_recorded_value(a, name), _recorded_value(b, name)))[0] != sides[1]
     ]
-    found.sort(key=lambda one: _ORDER.index(one.name.partition(":")[0]))
-    return tuple(found)
+    return tuple(sorted(found, key=lambda one: _ORDER.index(one.name.partition(":")[0])))
 
 
 def _recorded_value(side: Sequence[Mapping[str, str]], name: str) -> str | None:
@@ -149,13 +148,12 @@ def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False)
             f"no joint has gain and lag in all sessions: {a[0].label} drives "
             f"{_some(a[0].names)}, {b[0].label} {_some(b[0].names)}"
         )
-    left_out: dict[str, str] = {}
-    for name in joints:
-        if name not in names:
-            lacking = [
-                r.label for r, known in zip(runs, answered, strict=True) if name not in known
-            ]
-            left_out[name] = f"no gain and lag in {', '.join(lacking)}"
+    left_out = {
+        name: "no gain and lag in "
+        + ", ".join(r.label for r, known in zip(runs, answered, strict=True) if name not in known)
+        for name in joints
+        if name not in names
+    }
     faults = [fault for run in runs[1:] if (fault := gait_fault(run, runs[0], names)) is not None]
     if faults and not any_gait:
         raise DataError(

@@ -15,7 +15,7 @@ from undulog.capture.common.console import Warn, plain
 from undulog.capture.common.errors import UsageError
 
 from ..estimators.intervals import CONFIDENCE, around, t_factor
-from ..results.answer import Answer, NotFollowing, StandOut
+from ..results.answer import NotFollowing, StandOut
 from ..results.comparison import BrokenJoint, Comparison, Waveform
 from ..results.estimate import Estimate, Provenance
 from ..segments.answer import deviation_in_words, fault_in_words
@@ -43,15 +43,12 @@ def broken_joints(
                 text = f"in {side} {fault_in_words(fault)}"
                 found.append(BrokenJoint(fault.joint, side, fault.kinds, text))
         known = {each.name for each in found}
-        for each in _first([each for answer in answers for each in _off(answer)]):
+        stand_out = [each for answer in answers for each in answer.stand_out]
+        for each in _first([each for each in stand_out if each.quantity == "offset"]):
             if each.joint not in known | elsewhere and _moved(each.joint, own, other):
                 text = f"in {side} {plain(each.joint)} has {deviation_in_words(each)}"
                 found.append(BrokenJoint(each.joint, side, (), text))
     return tuple(sorted(found, key=lambda each: not each.kinds))
-
-
-def _off(answer: Answer) -> list[StandOut]:
-    return [each for each in answer.stand_out if each.quantity == "offset"]
 
 
 def _moved(joint: str, own: Sequence[ComparedSession], other: Sequence[ComparedSession]) -> bool:

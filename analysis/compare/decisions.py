@@ -199,10 +199,9 @@ def _equivalence(
     results: list[Equivalence] = []
     for kind in dict.fromkeys(kinds.tolist()):
         one = kinds == kind
-        largest = float(np.max(np.abs(found.value[one])))
-        within = float(margin[one][0])
-        p = equivalence_p(found.value[one], found.error[one], found.dof[one], within)
-        results.append(Equivalence(kind, within, UNITS[kind], largest, p))
+        value, within = found.value[one], float(margin[one][0])
+        p = equivalence_p(value, found.error[one], found.dof[one], within)
+        results.append(Equivalence(kind, within, UNITS[kind], float(np.abs(value).max()), p))
     return tuple(results)
 
 

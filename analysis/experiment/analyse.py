@@ -18,17 +18,17 @@ from undulog.capture.robot.model import Robot
 
 from ..estimators.intervals import CONFIDENCE, EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
 from ..oscillators.predictions import body_oscillators
+from ..response.fitting import GaitFit
 from ..response.response import gain_estimate, lag_estimate
 from ..results.analysis import Analysis
 from ..results.coupling import LocalCoupling
 from ..results.estimate import Provenance
 from ..results.experiment import Experiment, Headings, PooledJoint, PooledRuns, Reversal, Run
-from ..session.analyse import FittedSession, examine_session
+from ..session.analyse import examine_session
 from ..session.runs import (
     SAME_COMMAND,
     SAME_FREQUENCY,
     GaitRun,
-    Posture,
     Role,
     coupling_of_one_gait,
     gait_run,
@@ -70,26 +70,28 @@ def analyse_experiment(
         UsageError: If there is no session, or the options leave nothing of one.
     """
     options = options or Options()
-    examined: list[FittedSession] = []
+    analyses: list[Analysis] = []
+    gaits: list[GaitFit | None] = []
     robots: list[Robot | None] = []
     commanded: list[CommandTones | None] = []
-    postures: list[Posture] = []
+    runs: list[GaitRun] = []
     for session in sessions:
-        examined.append(examine_session(session, options))
-        postures.append(posture(session, examined[-1].analysis.gait.windows))
-        robots.append(session.robot)
-        commanded.append(command_tones(session, options, examined[-1]))
-    if not examined:
+        fitted = examine_session(session, options)
+        analysis, robot = fitted.analysis, session.robot
+        lay = posture(session, analysis.gait.windows)
+        label = Path(analysis.session.path).name
+        runs.append(gait_run(label, robot, analysis, fitted.gait, lay))
+        analyses.append(analysis)
+        gaits.append(fitted.gait)
+        robots.append(robot)
+        commanded.append(command_tones(session, options, fitted))
+    if not runs:
         raise UsageError("an experiment needs at least one session")
     warnings: list[str] = []
-    runs = [
-        gait_run(Path(one.analysis.session.path).name, robot, one.analysis, one.gait, lay)
-        for one, robot, lay in zip(examined, robots, postures, strict=True)
-    ]
-    kicks = find_kicks(runs, [one.gait for one in examined])
+    kicks = find_kicks(runs, gaits)
     sweep = find_sweep(commanded) if kicks is None else None
     if sweep is not None:
-        return _of_sweep(sweep, commanded, examined, runs, options)
+        return _of_sweep(sweep, commanded, analyses, runs, options)
     parts = [None if kicks is None else kicks.role(k) for k in range(len(runs))]
     rest = [k for k, part in enumerate(parts) if part in (None, "base")]
     own_roles, own_why = sort_runs([runs[k] for k in rest])
@@ -109,15 +111,14 @@ def analyse_experiment(
     forward, reverse = (y[[way is one for way in ways]] for one in (Role.FORWARD, Role.REVERSE))
     pooled = (
         pool_runs(chosen[0].names, [run.response for run in chosen])
-        if one_direction(ways)
+        if len(set(ways)) == 1
         else None
     )
     robot = robots[next(iter(roles))] if roles else None
     joints = None
     if pooled is not None:
-        own = [examined[k].analysis for k in roles]
+        own = [analyses[k] for k in roles]
         joints = own[0].answer if len(own) == 1 else pooled_answer(robot, pooled, own)
-    analyses = [one.analysis for one in examined]
     reversal = None
     if not only_kicks and _both_ways(chosen, ways, names, robot, warnings.append):
         reversal = _reversal(names, (forward, reverse), chosen, ways)
@@ -134,8 +135,8 @@ def analyse_experiment(
         answer=answer if joints is not None else broken_first(analyses, answer),
         sessions=tuple(analyses),
         runs=tuple(
-            _run(one.analysis, run, told.get(k), why.get(k))
-            for k, (one, run) in enumerate(zip(examined, runs, strict=True))
+            _run(one, run, told.get(k), why.get(k))
+            for k, (one, run) in enumerate(zip(analyses, runs, strict=True))
         ),
         heterogeneity=experiment_indices(forward, reverse, reversal),
         reversal=reversal,
@@ -150,12 +151,11 @@ def analyse_experiment(
 def _of_sweep(
     sweep: Sweep,
     commanded: Sequence[CommandTones | None],
-    examined: Sequence[FittedSession],
+    analyses: Sequence[Analysis],
     runs: Sequence[GaitRun],
     options: Options,
 ) -> Experiment:
-    """The experiment of a lag sweep or a multisine: its gaits are no repeats of each other."""
-    analyses = [one.analysis for one in examined]
+    """Return the experiment of a lag sweep or a multisine: its gaits are not repeats."""
     warnings = [
         f"{run.label} is no run of the sweep; it is left out"
         for k, run in enumerate(runs)
@@ -177,11 +177,6 @@ def _of_sweep(
         warnings=tuple(warnings),
         provenance=_provenance(analyses, options),
     )
-
-
-def one_direction(ways: Sequence[Role]) -> bool:
-    """Whether all runs are of one direction."""
-    return len(set(ways)) == 1
 
 
 def _reversal(

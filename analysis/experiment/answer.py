@@ -99,7 +99,14 @@ def _rows_that_fail(coupling: LocalCoupling) -> str:
 def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
     """What stands below the answer."""
     yield from kick_checks(coupling)
-    yield from held_out_detail(coupling)
+    for one in coupling.held_out:
+        yield (
+            f"Held out, {one.session}: deviations up to {one.size:.3f}, error "
+            f"{100 * one.error:.2f} % (noise {100 * one.noise:.2f} %), 'each joint keeps its "
+            f"response' {100 * one.error_kept:.2f} %."
+        )
+    if coupling.valid_to is not None:
+        yield f"Valid for deviations up to {coupling.valid_to:.3f} rad, as far as was tried."
     size = coupling.kick_size
     if size is not None:
         yield (
@@ -128,18 +135,6 @@ def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
             f"small: X = H^-1 (condition number {coupling.condition_number:.3g}) has asymmetry "
             f"{formats.percent(lti.asymmetry)}; off-diagonal energy {bands}."
         )
-
-
-def held_out_detail(coupling: LocalCoupling) -> Iterable[str]:
-    """How well runs that were not used are predicted."""
-    for one in coupling.held_out:
-        yield (
-            f"Held out, {one.session}: deviations up to {one.size:.3f}, error "
-            f"{100 * one.error:.2f} % (noise {100 * one.noise:.2f} %), 'each joint keeps its "
-            f"response' {100 * one.error_kept:.2f} %."
-        )
-    if coupling.valid_to is not None:
-        yield f"Valid for deviations up to {coupling.valid_to:.3f} rad, as far as was tried."
 
 
 def _scatter(scatter: RunScatter) -> str:
@@ -256,9 +251,6 @@ def _tone(tone: ToneCoupling) -> str:
     return f"{text}."
 
 
-OR_TILT = "or the floor is tilted"
-
-
 def experiment_answer(
     reversal: Reversal | None,
     roles: Mapping[int, Role],
@@ -345,7 +337,7 @@ def _different(reversal: Reversal) -> str:
         )
     first = reversal.pairs[0]
     either = f"{first.name} weaker or {first.mirror} stronger"
-    either += "" if reversal.tilt.excluded else f", {OR_TILT}"
+    either += "" if reversal.tilt.excluded else ", or the floor is tilted"
     others = len(reversal.pairs) - 1
     also = f"; {others} more pair{'s differ' if others > 1 else ' differs'}, by less"
     lead = "the modules differ: " if reversal.tilt.excluded else ""

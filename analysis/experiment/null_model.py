@@ -246,9 +246,8 @@ def _one_by_one(
     for j in named:
         base = system.beside(tuple(k for k in named if k != j))
         own = _alone(_System(system.shared, system.modules[..., [j], :], system.rest), base)
-        for all_of, one in zip((gain, deviation, error), own, strict=True):
-            axis = gain.ndim - 1
-            np.moveaxis(all_of, axis, 0)[j] = np.moveaxis(one, axis, 0)[0]
+        gain[..., j] = own[0][..., 0]
+        deviation[..., j, :], error[..., j, :] = own[1][..., 0, :], own[2][..., 0, :]
     return gain, deviation, error
 
 
@@ -317,20 +316,16 @@ def _answered(
 ) -> tuple[Response, np.ndarray[tuple[int], np.dtype[np.int64]]]:
     """The response of the joints that answer, and their places in the model."""
     path, gait = measured.analysis.session.path, measured.gait
-    fault = _other_robot(measured.analysis, model) or _other_gait(gait, model)
+    robot = measured.analysis.session.robot
+    fault = _other_gait(gait, model)
+    if robot != model.robot:
+        fault = f"it is of {robot or 'no known robot'}, the model of {model.robot}"
     if fault is not None or gait is None or gait.response is None:
         raise UsageError(f"{path} can't be held to {file}: {fault or 'it has no gain and lag'}")
     sound = {one.name for one in measured.analysis.joints if one.lag_rad.value is not None}
     chosen = [k for k, name in enumerate(gait.answered) if name in sound]
     joints = np.array([model.joints.index(gait.answered[k]) for k in chosen], dtype=np.int64)
     return gait.response.select(chosen), joints
-
-
-def _other_robot(analysis: Analysis, model: NullModel) -> str | None:
-    robot = analysis.session.robot
-    if robot == model.robot:
-        return None
-    return f"it is of {robot or 'no known robot'}, the model of {model.robot}"
 
 
 def _other_gait(gait: GaitFit | None, model: NullModel) -> str | None:

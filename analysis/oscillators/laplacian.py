@@ -34,7 +34,9 @@ from scipy.optimize import linear_sum_assignment
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
 from ..estimators.intervals import CONFIDENCE, Noisy, noise_draws
+from ..results.coupling import rows_of
 from ..results.estimate import Estimate
+from ..results.oscillators import Levels
 
 STRONG = 0.1
 """A rate of I - P above this counts as strong: the body brings such a pattern back in 10/eps."""
@@ -149,21 +151,18 @@ def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
     draws = [spectrum(one) for one in drawn]
     dealt = np.array([_dealt(here.rates, one.rates) for one in draws])
     strong = np.array([one.strong for one in draws], dtype=np.float64)
-    tails = _quantiles(strong)
+    tail = (1.0 - CONFIDENCE) / 2
+    low, high = np.quantile(strong, (tail, 1.0 - tail)).tolist()
+    fastest = growth(P)
+    growing = _mirrored(np.array(fastest), np.array([growth(one) for one in drawn]))
     real = _mirrored(here.rates.real, dealt.real)
     return SpectrumIntervals(
         real=real,
         imag=_mirrored(here.rates.imag, dealt.imag),
         # Of the slowest mode itself: the lowest of several close ones is biased in every draw.
         gap=Estimate(here.gap, (float(real[0, 0]), float(real[0, 1]))),
-        strong=Estimate(
-            float(here.strong),
-            (min(float(here.strong), tails[0]), max(float(here.strong), tails[1])),
-        ),
-        growth=_estimate(
-            growth(P),
-            np.array([growth(one) for one in drawn]),
-        ),
+        strong=Estimate(float(here.strong), (min(here.strong, low), max(here.strong, high))),
+        growth=Estimate(fastest, (float(growing[0]), float(growing[1]))),
     )
 
 
@@ -173,11 +172,6 @@ def _dealt(rates: ComplexArray, others: ComplexArray) -> ComplexArray:
     return others[order]
 
 
-def _quantiles(draws: FloatArray) -> tuple[float, float]:
-    tail = (1.0 - CONFIDENCE) / 2
-    return float(np.quantile(draws, tail)), float(np.quantile(draws, 1.0 - tail))
-
-
 def _mirrored(value: FloatArray, draws: FloatArray) -> FloatArray:
     """Basic bootstrap intervals, shape (..., 2)."""
     tail = (1.0 - CONFIDENCE) / 2
@@ -185,33 +179,11 @@ def _mirrored(value: FloatArray, draws: FloatArray) -> FloatArray:
     return np.stack([2.0 * value - low, 2.0 * value - high], axis=-1)
 
 
-def _estimate(value: float, draws: FloatArray) -> Estimate:
-    low, high = _quantiles(draws)
-    return Estimate(value, (2.0 * value - high, 2.0 * value - low))
-
-
 POINTS = 41
 """Of the grid, each way."""
 
 MARGIN = 0.1
 """Of the grid around the eigenvalues."""
-
-
-@dataclass(frozen=True)
-class Pseudospectrum:
-    """Levels on a grid of the complex plane.
-
-    Attributes:
-        real: Of z [eps], shape (r,).
-        imag: Of z [eps], shape (c,).
-        level: Smallest singular value of z I - A, shape (r, c).
-        noise: The spectral norm that the error of A stays below, 95 %.
-    """
-
-    real: FloatArray
-    imag: FloatArray
-    level: FloatArray
-    noise: float
 
 
 def smallest_singular(P: FloatArray, real: FloatArray, imag: FloatArray) -> FloatArray:
@@ -230,23 +202,17 @@ def smallest_singular(P: FloatArray, real: FloatArray, imag: FloatArray) -> Floa
     return values[..., -1].astype(np.float64)
 
 
-def pseudospectrum(P: Noisy, seed: int = 21) -> Pseudospectrum:
-    """The levels around all eigenvalues.
-
-    Args:
-        seed: Of the draws that tell the noise's norm.
-
-    Returns:
-        Levels and the noise's own.
-    """
+def pseudospectrum(P: Noisy, seed: int = 21) -> Levels:
+    """Return the levels around all eigenvalues, and the level of the noise of P."""
     here = of_deviations(P.value)
     error = of_deviations(P.value + noise_draws(P, seed)) - here
     noise = np.linalg.norm(error, ord=2, axis=(1, 2))
     reach = float(np.quantile(noise, CONFIDENCE))
-    values: ComplexArray = np.linalg.eigvals(here).astype(np.complex128)
+    values = np.linalg.eigvals(here)
     margin = MARGIN + reach
     left, right = float(values.real.min()), float(values.real.max())
     real = np.linspace(left - margin, right + margin, POINTS)
     top = float(np.abs(values.imag).max()) + margin
     imag = np.linspace(-top, top, POINTS)
-    return Pseudospectrum(real, imag, smallest_singular(P.value, real, imag), reach)
+    level = smallest_singular(P.value, real, imag)
+    return Levels(tuple(real.tolist()), tuple(imag.tolist()), rows_of(level), reach)

@@ -34,7 +34,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm, toeplitz
+from scipy.linalg import toeplitz
 from scipy.optimize import brentq
 from scipy.special import stdtridf, stdtrit
 
@@ -48,7 +48,6 @@ from ..results.oscillators import (
     ENTRAINMENT_LABEL,
     BodyOscillators,
     Comparator,
-    Levels,
     Mode,
     RelativeCoupling,
 )
@@ -56,7 +55,7 @@ from .laplacian import STRONG, Spectrum, SpectrumIntervals, intervals, pseudospe
 
 
 def felt_response(ratio: ComplexArray, omega: float, age_s: float) -> ComplexArray:
-    """The response as the generator hears of it.
+    """Return the response as the generator receives it.
 
     Args:
         ratio: H = a/c as measured, shape (m,).
@@ -69,79 +68,40 @@ def felt_response(ratio: ComplexArray, omega: float, age_s: float) -> ComplexArr
     return (ratio * np.exp(-1j * omega * age_s)).astype(np.complex128)
 
 
-def steady_bias(felt: ComplexArray) -> FloatArray:
-    """b_i = g_i sin Delta_i, which takes the steady part of the feedback away.
-
-    Args:
-        felt: g exp(j Delta), shape (m,).
-
-    Returns:
-        Shape (m,).
-    """
-    return felt.imag.copy()
-
-
 def relaxation(P: FloatArray, R: FloatArray, felt: ComplexArray) -> FloatArray:
-    """J / eps of d phi' = J d phi.
+    """Return J / eps of d phi' = J d phi.
 
     Args:
-        P: d psi / d psi_c of the open loop, shape (m, m).
-        R: d ln|a| / d psi_c of the open loop, shape (m, m).
-        felt: g exp(j Delta) of the open loop, shape (m,).
+        P: d psi / d psi_c of the open loop, shape (..., m, m).
+        R: d ln|a| / d psi_c of the open loop, shape (..., m, m).
+        felt: g exp(j Delta) of the open loop, shape (..., m).
 
     Returns:
-        Shape (m, m); P - I where there is no lag and a gain of 1.
+        Shape (..., m, m); P - I where there is no lag and a gain of 1.
     """
-    return felt.real[:, None] * (P - np.eye(len(P))) + felt.imag[:, None] * R
-
-
-def relax(J: FloatArray, kick: FloatArray, times_s: FloatArray) -> FloatArray:
-    """Deviations after a kick, d phi(t) = exp(J t) d phi(0).
-
-    Args:
-        J: Rates [1/s], shape (m, m).
-        kick: d phi(0) [rad], shape (m,).
-        times_s: After the kick [s], shape (k,).
-
-    Returns:
-        Shape (k, m).
-    """
-    return np.array([expm(J * float(t)) @ kick for t in times_s])
+    off = P - np.eye(P.shape[-1])
+    return felt.real[..., None] * off + felt.imag[..., None] * R
 
 
 MOST_CONDITION = 1e6
 """Condition number of P beyond which it isn't inverted."""
 
 
-@dataclass(frozen=True)
-class Entrainment:
-    """Gamma^-1 L.
-
-    Attributes:
-        relative: P^-1 - I: minus the coupling K_ij / Gamma_i off the diagonal; None where P is
-            singular; shape (m, m).
-        half: Half widths of the 95 % intervals, one by one, shape (m, m).
-        condition_number: Of P: what its inversion may multiply relative errors by.
-    """
-
-    relative: FloatArray | None
-    half: FloatArray | None
-    condition_number: float
-
-
-def entrainment(P: Noisy) -> Entrainment:
-    """Read P as an entrained chain.
+def entrainment(P: Noisy) -> RelativeCoupling:
+    """Read P as the matrix of an entrained chain.
 
     Args:
         P: d psi / d psi_c with standard errors.
 
     Returns:
-        The reading. Intervals are to first order in P's errors E, d(P^-1) = -P^-1 E P^-1, with the
-        degrees of freedom of a sum of variances (Welch, Biometrika 34, 1947).
+        Gamma^-1 L = P^-1 - I. Intervals are to first order in P's errors E,
+        d(P^-1) = -P^-1 E P^-1, with the degrees of freedom of a sum of variances (Welch,
+        Biometrika 34, 1947).
     """
     condition = float(np.linalg.cond(P.value))
+    finite = condition if np.isfinite(condition) else None
     if not condition < MOST_CONDITION:
-        return Entrainment(None, None, condition)
+        return RelativeCoupling(ENTRAINMENT_LABEL, None, None, finite)
     inverse = np.linalg.inv(P.value)
     squared, error = np.square(inverse), np.square(P.error)
     variance = squared @ error @ squared
@@ -150,7 +110,8 @@ def entrainment(P: Noisy) -> Entrainment:
         np.square(variance), scatter, out=np.full(variance.shape, P.dof.min()), where=scatter > 0
     )
     half = np.asarray(stdtrit(dof, 0.5 + CONFIDENCE / 2) * np.sqrt(variance), dtype=np.float64)
-    return Entrainment(inverse - np.eye(len(P.value)), half, condition)
+    relative = inverse - np.eye(len(P.value))
+    return RelativeCoupling(ENTRAINMENT_LABEL, rows_of(relative), rows_of(half), finite)
 
 
 MOST_EXPLICIT = 1e6
@@ -239,10 +200,12 @@ def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
     Returns:
         Modes, comparator, and what explicit coupling must add.
     """
-    P = measured(coupling.P, phase_correlation(coupling))
+    m, correlation = len(coupling.joints), None
+    if coupling.scatter is not None:
+        correlation = np.array(coupling.scatter.correlation)[:m, :m]
+    P = measured(coupling.P, correlation)
     found, said = spectrum(P.value), intervals(P)
     like = spectrum(homogeneous(P.value))
-    levels = pseudospectrum(P)
     explicit = _explicit(P)
     return BodyOscillators(
         answer=_answer(found, said, like, explicit),
@@ -254,22 +217,9 @@ def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
         modes=_modes(found, said),
         comparator=Comparator(like.gap, like.strong, tuple(like.rates.real.tolist())),
         explicit_coupling=explicit,
-        pseudospectrum=Levels(
-            tuple(levels.real.tolist()),
-            tuple(levels.imag.tolist()),
-            rows_of(levels.level),
-            levels.noise,
-        ),
-        entrainment=_relative(P),
+        pseudospectrum=pseudospectrum(P),
+        entrainment=entrainment(P),
     )
-
-
-def phase_correlation(coupling: LocalCoupling) -> FloatArray | None:
-    """Correlation of the joints' phases in a run's errors, shape (m, m); None if unknown."""
-    if coupling.scatter is None:
-        return None
-    m = len(coupling.joints)
-    return np.array(coupling.scatter.correlation)[:m, :m]
 
 
 def measured(matrix: Matrix, correlation: FloatArray | None = None) -> MeasuredP:
@@ -314,17 +264,6 @@ def _explicit(P: MeasuredP) -> Estimate:
     tail = (1.0 - CONFIDENCE) / 2
     low, high = np.quantile(np.array(draws, dtype=np.float64), (tail, 1.0 - tail))
     return Estimate(value, (min(value, float(low)), max(value, float(high))))
-
-
-def _relative(P: MeasuredP) -> RelativeCoupling:
-    reading = entrainment(P)
-    condition = reading.condition_number
-    return RelativeCoupling(
-        ENTRAINMENT_LABEL,
-        None if reading.relative is None else rows_of(reading.relative),
-        None if reading.half is None else rows_of(reading.half),
-        condition if np.isfinite(condition) else None,
-    )
 
 
 def _answer(found: Spectrum, said: SpectrumIntervals, like: Spectrum, explicit: Estimate) -> str:

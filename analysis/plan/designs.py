@@ -159,12 +159,15 @@ def lag_sweep(m: int, amplitude: float, repeats: int = 1, seed: int = 1) -> tupl
         m runs a repeat.
     """
     random = np.random.default_rng(seed)
-    runs: list[PlannedRun] = []
-    for _ in range(repeats):
-        for k in random.permutation(m).tolist():
-            facts = {"kind": "lag", "lag_rad": f"{2 * np.pi * k / m:.6f}"}
-            runs.append(PlannedRun(f"lag{k:02d}", amplitude * _dft(m)[k], facts))
-    return tuple(runs)
+    order = [k for _ in range(repeats) for k in random.permutation(m).tolist()]
+    return tuple(
+        PlannedRun(
+            f"lag{k:02d}",
+            amplitude * _dft(m)[k],
+            {"kind": "lag", "lag_rad": f"{2 * np.pi * k / m:.6f}"},
+        )
+        for k in order
+    )
 
 
 def multisine(

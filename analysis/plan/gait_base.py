@@ -25,7 +25,7 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Joint, Plane, Robot
 
-from ..results.answer import percent
+from ..results.answer import Remarks, percent
 from ..session.analyse import examine_session
 from ..signals.columns import COMMAND_TOPIC, RESPONSE_TOPIC, read_columns
 
@@ -169,11 +169,7 @@ def base_gait(session: SessionView) -> BaseGait:
             f"{session.path}: the command of {worst} is no sine (a harmonic has {share} of its "
             f"amplitude, more than {100 * PURE:g} %); name a session of a steady sine gait"
         )
-
-    def silent(_: str) -> None:
-        """The first reading has told what is missing."""
-
-    commands = read_columns(session, COMMAND_TOPIC, RESPONSE_TOPIC, silent).command
+    commands = read_columns(session, COMMAND_TOPIC, RESPONSE_TOPIC, Remarks()).command
     names = tuple(commands)
     # Of a joint that is held, every sample is its place.
     offset = np.array([float(commands[name].values[-1]) for name in names])

@@ -346,7 +346,7 @@ class Index:
     label: str
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Analysis(PresentedResult):
     """All numbers of one session.
 
@@ -365,20 +365,20 @@ class Analysis(PresentedResult):
         notes: One sentence each: what was not recorded, does not apply or was assumed.
     """
 
+    answer: Answer = field(default_factory=Answer)
     session: SessionFacts
     gait: GaitFacts
     joints: tuple[JointResult, ...]
     body: BodyResult | None
     heterogeneity: dict[str, Index]
     coupling: Coupling
-    warnings: tuple[str, ...]
-    provenance: Provenance
-    artefacts: tuple[Artefact, ...] = ()
-    oscillators: tuple[ChainCoupling, ...] = ()
     over_time: ResponseOverTime | None = None
     energy: EnergyResult | None = None
-    answer: Answer = field(default_factory=Answer)
+    oscillators: tuple[ChainCoupling, ...] = ()
+    artefacts: tuple[Artefact, ...] = ()
+    warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    provenance: Provenance
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain JSON values.
@@ -391,9 +391,7 @@ class Analysis(PresentedResult):
             dataclasses.asdict(group) | _flat("frequency_hz", group.frequency_hz)
             for group in self.gait.groups
         ]
-        return {
-            "answer": dataclasses.asdict(self.answer),
-            "session": dataclasses.asdict(self.session),
+        return dataclasses.asdict(self) | {
             "gait": gait,
             "joints": [
                 dataclasses.asdict(joint)
@@ -402,17 +400,10 @@ class Analysis(PresentedResult):
                 for joint in self.joints
             ],
             "body": None if self.body is None else _body_dict(self.body),
-            "heterogeneity": {
-                name: dataclasses.asdict(index) for name, index in self.heterogeneity.items()
-            },
-            "coupling": dataclasses.asdict(self.coupling),
-            "over_time": None if self.over_time is None else dataclasses.asdict(self.over_time),
             "energy": None if self.energy is None else _energy_dict(self.energy),
-            "oscillators": [dataclasses.asdict(one) for one in self.oscillators],
             "artefacts": [dataclasses.asdict(one) | {"about": one.about} for one in self.artefacts],
             "warnings": list(self.warnings),
             "notes": list(self.notes),
-            "provenance": dataclasses.asdict(self.provenance),
         }
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 from . import formats
 from .analysis import Analysis
@@ -88,10 +86,6 @@ class ModelledAnalysis(Analysis):
     """The numbers of one session, and what a null model makes of them."""
 
     null_model: NullModelResult = field(kw_only=True)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The session's object with the key ``null_model``."""
-        return super().to_dict() | {"null_model": dataclasses.asdict(self.null_model)}
 
 
 def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_p: float) -> str:

@@ -14,54 +14,29 @@ class PictureProtocol(Protocol):
     """A figure, as :class:`.analysis.Picture`."""
 
     @property
-    def svg(self) -> str:
-        """The ``<svg>`` element."""
-        ...
-
+    def svg(self) -> str: ...  # noqa: D102
     @property
-    def caption(self) -> str:
-        """One or two sentences, plain text."""
-        ...
-
-    def to_svg(self) -> str:
-        """Return the figure as the text of a file."""
-        ...
-
-    def save(self, path: Path | str, *, force: bool = False) -> Path:
-        """Write the figure to a file."""
-        ...
+    def caption(self) -> str: ...  # noqa: D102
+    def to_svg(self) -> str: ...  # noqa: D102
+    def save(self, path: Path | str, *, force: bool = False) -> Path: ...  # noqa: D102
 
 
 class Presentation(Protocol):
     """The implementation of the methods of :class:`PresentedResult`, which is above all results."""
 
-    def text(self, result: PresentedResult) -> str:
-        """Return the text of a result."""
-        ...
-
-    def headline(self, result: PresentedResult) -> str:
-        """Return the answer in one line."""
-        ...
-
-    def html(self, result: PresentedResult) -> str:
-        """Return what a notebook shows."""
-        ...
-
-    def frames(self, result: PresentedResult) -> dict[str, pd.DataFrame]:
-        """Return the tables."""
-        ...
-
-    def picture(self, result: PresentedResult, what: str | None) -> PictureProtocol:
-        """Draw a picture."""
-        ...
-
-    def save(self, result: PresentedResult, path: Path, *, force: bool) -> Path:
-        """Write the JSON file."""
-        ...
-
-    def save_tables(self, result: PresentedResult, folder: Path, *, force: bool) -> list[Path]:
-        """Write the Parquet files."""
-        ...
+    def text(self, result: PresentedResult) -> str: ...  # noqa: D102
+    def headline(self, result: PresentedResult) -> str: ...  # noqa: D102
+    def html(self, result: PresentedResult) -> str: ...  # noqa: D102
+    def frames(self, result: PresentedResult) -> dict[str, pd.DataFrame]: ...  # noqa: D102
+    def picture(  # noqa: D102
+        self, result: PresentedResult, what: str | None
+    ) -> PictureProtocol: ...
+    def save(  # noqa: D102
+        self, result: PresentedResult, path: Path, *, force: bool
+    ) -> Path: ...
+    def save_tables(  # noqa: D102
+        self, result: PresentedResult, folder: Path, *, force: bool
+    ) -> list[Path]: ...
 
 
 _make: list[Callable[[], Presentation]] = []

@@ -40,10 +40,11 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 from undulog.capture.common.errors import UsageError
 
-from ...estimators.intervals import CONFIDENCE, noise_draws, norm_ratio, welch_satterthwaite
+from ...estimators.intervals import CONFIDENCE, Noisy, noise_draws, norm_ratio, welch_satterthwaite
+from ...results.coupling import LTI_LABEL, Lti, rows_of
 from ...results.estimate import Estimate
 from .runs import Kick, Kind
-from .scatter import RunErrors, run_errors
+from .scatter import RunErrors, run_errors, sides
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,17 @@ class ResponseMatrices:
     phase_variance: FloatArray
     dof: FloatArray
     errors: RunErrors | None = None
+
+    def select(self, chosen: Sequence[int]) -> ResponseMatrices:
+        """Return some of the runs."""
+        index = list(chosen)
+        return ResponseMatrices(
+            self.log[index],
+            self.log_gain_variance[index],
+            self.phase_variance[index],
+            self.dof[index],
+            self.errors,
+        )
 
 
 @dataclass(frozen=True)
@@ -146,17 +158,14 @@ def central_differences(
     noise = np.stack([answers.phase_variance, answers.log_gain_variance])
     errors = answers.errors
     between = np.zeros((2, m)) if errors is None else errors.between.reshape(2, m)
+    both_ways = sides(kicks, kind)
     for j in range(m):
-        sides = [
-            [k for k, one in enumerate(kicks) if _is(one, j, kind) and (one.size > 0) is up]
-            for up in (True, False)
-        ]
-        if not all(sides):
+        if j not in both_ways:
             raise UsageError(
                 f"joint {j + 1} of {m}: its command's {kind.value} is not kicked both up and down; "
                 "record both, a difference to one side keeps the curvature"
             )
-        up, down = sides
+        up, down = both_ways[j]
         span = np.mean([kicks[k].size for k in up]) - np.mean([kicks[k].size for k in down])
         value[:, :, j] = (parts[:, up].mean(axis=1) - parts[:, down].mean(axis=1)) / span
         weight = np.array([1 / len(up)] * len(up) + [1 / len(down)] * len(down)) / span
@@ -230,7 +239,7 @@ def nonlinearity(
 
 
 def stacked(
-    blocks: Sequence[Sequence[MeasuredDerivatives]], correlation: FloatArray | None
+    blocks: Sequence[Sequence[Noisy]], correlation: FloatArray | None
 ) -> MeasuredDerivatives:
     """One matrix of several, for errors that they have in common.
 
@@ -246,31 +255,13 @@ def stacked(
     return MeasuredDerivatives(value, error, dof, correlation)
 
 
-def _is(kick: Kick, joint: int, kind: Kind) -> bool:
-    return kick.joint == joint and kick.kind is kind
-
-
 BANDS = (1, 2, 3)
+
+UNKNOWN_SHAPE = (Estimate(), Estimate(), Estimate(), Estimate())
+"""Asymmetry and bands of a matrix that can't be inverted."""
 
 SINGULAR = 1e10
 """Condition number beyond which H isn't inverted."""
-
-
-@dataclass(frozen=True)
-class LtiReading:
-    """H and what its inverse says.
-
-    Attributes:
-        H: Response per command, shape (m, m).
-        condition_number: Of H, 2-norm: what its inversion may multiply relative errors by.
-        asymmetry: ||X - X'|| / ||X|| off the diagonal; 0 = reciprocal.
-        band_energy: Share of X's off-diagonal energy within ``|i - j|`` <= each of ``BANDS``.
-    """
-
-    H: ComplexArray
-    condition_number: float
-    asymmetry: Estimate
-    band_energy: tuple[Estimate, ...]
 
 
 def lti_reading(
@@ -281,8 +272,8 @@ def lti_reading(
     seed: int = 11,
     *,
     correlation: FloatArray | None = None,
-) -> LtiReading:
-    """Read P and R as a linear time-invariant system.
+) -> Lti:
+    """Read P and R as those of a linear time-invariant system.
 
     Args:
         P: d psi / d psi_c.
@@ -297,17 +288,21 @@ def lti_reading(
     scale = response[:, None] / command[None, :]
     H = (scale * (P.value - 1j * R.value)).astype(np.complex128)
     condition = float(np.linalg.cond(H))
-    if not condition < SINGULAR:
-        return LtiReading(H, condition, Estimate(), tuple(Estimate() for _ in BANDS))
-    X: ComplexArray = np.linalg.inv(H).astype(np.complex128)
-    draws = noise_draws(stacked(((P,), (R,)), correlation), seed)
-    noise = scale * (draws[:, : len(H)] - 1j * draws[:, len(H) :])
-    error: ComplexArray = np.linalg.inv(H + noise).astype(np.complex128) - X
-    return LtiReading(H, condition, *reciprocity(X, error))
+    shape = UNKNOWN_SHAPE
+    if condition < SINGULAR:
+        X: ComplexArray = np.linalg.inv(H).astype(np.complex128)
+        draws = noise_draws(stacked(((P,), (R,)), correlation), seed)
+        noise = scale * (draws[:, : len(H)] - 1j * draws[:, len(H) :])
+        error: ComplexArray = np.linalg.inv(H + noise).astype(np.complex128) - X
+        shape = reciprocity(X, error)
+    finite = condition if np.isfinite(condition) else None
+    return Lti(LTI_LABEL, rows_of(H.real), rows_of(H.imag), finite, *shape)
 
 
-def reciprocity(X: ComplexArray, error: ComplexArray) -> tuple[Estimate, tuple[Estimate, ...]]:
-    """Asymmetry and reach of a matrix off its diagonal.
+def reciprocity(
+    X: ComplexArray, error: ComplexArray
+) -> tuple[Estimate, Estimate, Estimate, Estimate]:
+    """Return asymmetry and reach of a matrix off its diagonal.
 
     Args:
         X: An impedance, or what stands for one, shape (m, m).
@@ -322,11 +317,11 @@ def reciprocity(X: ComplexArray, error: ComplexArray) -> tuple[Estimate, tuple[E
     off: ComplexArray = X * outside
     off_error: ComplexArray = error * outside
     asymmetry = norm_ratio(off - off.T, off_error - off_error.swapaxes(1, 2), off, off_error)
-    bands = (
-        norm_ratio(off * (distance <= b), off_error * (distance <= b), off, off_error)
+    within_1, within_2, within_3 = (
+        squared(norm_ratio(off * (distance <= b), off_error * (distance <= b), off, off_error))
         for b in BANDS
     )
-    return asymmetry, tuple(squared(one) for one in bands)
+    return asymmetry, within_1, within_2, within_3
 
 
 def squared(share: Estimate) -> Estimate:
@@ -391,12 +386,7 @@ def local_matrices(
     """
     kicked = [k for k, one in enumerate(kicks) if one is not None]
     each = [one for one in kicks if one is not None]
-    of_kicks = ResponseMatrices(
-        answers.log[kicked],
-        answers.log_gain_variance[kicked],
-        answers.phase_variance[kicked],
-        answers.dof[kicked],
-    )
+    of_kicks = answers.select(kicked)
 
     def differences(
         errors: RunErrors | None, kind: Kind

@@ -119,25 +119,18 @@ def _generators(
     """J / eps, shape (m, m), and with errors that it may have, shape (DRAWS, m, m)."""
     m = len(coupling.joints)
     correlation = None if coupling.scatter is None else np.array(coupling.scatter.correlation)
-    blocks = [
-        [MeasuredDerivatives(one.value, one.error, one.dof)]
-        for one in (measured(coupling.P), measured(coupling.R))
-    ]
-    P, R = blocks[0][0].value, blocks[1][0].value
-    noise = noise_draws(stacked(blocks, correlation), SEED)
+    P, R = measured(coupling.P), measured(coupling.R)
+    noise = noise_draws(stacked(((P,), (R,)), correlation), SEED)
     felt = _felt(base, age_s)
     gain, lag = np.array(base.gain), np.array(base.lag_error)
     error = np.concatenate([lag, np.array(base.gain_error) / gain])[:, None]
     dof = np.full_like(error, coupling.scatter.dof if coupling.scatter is not None else np.inf)
     dof = np.minimum(dof, 1e6)
-    own = noise_draws(MeasuredDerivatives(np.zeros_like(error), error, dof, correlation), SEED + 1)[
-        ..., 0
-    ]
-    drawn = [
-        relaxation(P + one[:m], R + one[m:], (felt * np.exp(of[m:] + 1j * of[:m])))
-        for one, of in zip(noise, own, strict=True)
-    ]
-    return relaxation(P, R, felt), np.array(drawn)
+    of_base = MeasuredDerivatives(np.zeros_like(error), error, dof, correlation)
+    own = noise_draws(of_base, SEED + 1)[..., 0]
+    turned = felt * np.exp(own[:, m:] + 1j * own[:, :m])
+    drawn = relaxation(P.value + noise[:, :m], R.value + noise[:, m:], turned)
+    return relaxation(P.value, R.value, felt), drawn
 
 
 def _relaxed(J: FloatArray, drawn: FloatArray, kick: FloatArray, until_s: float) -> Relaxation:

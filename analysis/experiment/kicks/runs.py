@@ -228,12 +228,9 @@ class KickExperiment:
         """What a run of all runs is here: ``base``, ``kick``, ``held-out`` or None."""
         if k not in self.index:
             return None
-        own = self.index.index(k)
-        if own in self.runs.kicks:
-            return "kick"
-        if own in self.runs.patterns:
-            return "held-out"
-        return "base" if own in self.runs.base else None
+        own, runs = self.index.index(k), self.runs
+        parts = {"kick": runs.kicks, "held-out": runs.patterns, "base": runs.base}
+        return next((name for name, members in parts.items() if own in members), None)
 
 
 def find_kicks(runs: Sequence[GaitRun], gaits: Sequence[GaitFit | None]) -> KickExperiment | None:

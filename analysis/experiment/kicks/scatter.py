@@ -101,19 +101,17 @@ def run_errors(
     left_out = sum(bool(sides(kicks, kind)) for kind in Kind) if pairs else 0
     level = values - np.hstack([foreseen.imag, foreseen.real])
     draws = even @ (_without_own(kicks, level) if pairs else level)
-    if not rows:
-        share = np.mean(np.square(even) @ variance, axis=0)
-        return RunErrors(draws, share, len(draws) - left_out)
-    weights = _row_weights(kicks)
-    left = weights @ values - np.repeat((1.0, 0.0), log.shape[1])
-    # Kicks that are repeated unequally make the sum depend on the pairs.
-    along = even @ weights
-    alone = weights - along @ even
-    length = float(np.linalg.norm(alone))
-    own = (left - along @ draws) / length
-    whole = np.vstack([even, alone / length])
-    share = np.mean(np.square(whole) @ variance, axis=0)
-    return RunErrors(np.vstack([draws, own]), share, len(whole) - left_out)
+    if rows:
+        weights = _row_weights(kicks)
+        left = weights @ values - np.repeat((1.0, 0.0), log.shape[1])
+        # Kicks that are repeated unequally make the sum depend on the pairs.
+        along = even @ weights
+        alone = weights - along @ even
+        length = float(np.linalg.norm(alone))
+        draws = np.vstack([draws, (left - along @ draws) / length])
+        even = np.vstack([even, alone / length])
+    share = np.mean(np.square(even) @ variance, axis=0)
+    return RunErrors(draws, share, len(draws) - left_out)
 
 
 def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray:
@@ -125,14 +123,16 @@ def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray
     found = values.copy()
     for kind in Kind:
         pairs = sides(kicks, kind)
+        if len(pairs) < 2:
+            continue
         middle = np.array(
-            [(values[up].mean(axis=0) + values[down].mean(axis=0)) / 2 for up, down in pairs]
+            [
+                (values[up].mean(axis=0) + values[down].mean(axis=0)) / 2
+                for up, down in pairs.values()
+            ]
         )
-        for k, (up, down) in enumerate(pairs):
-            kick = kicks[up[0]]
-            if kick is None or len(pairs) < 2:
-                continue
-            own = [kick.joint, m + kick.joint]
+        for k, (joint, (up, down)) in enumerate(pairs.items()):
+            own = [joint, m + joint]
             others = np.delete(middle[:, own], k, axis=0).mean(axis=0)
             found[np.ix_(up + down, own)] += others - middle[k, own]
     return found
@@ -140,7 +140,7 @@ def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray
 
 def _row_weights(kicks: Sequence[Kick | None]) -> FloatArray:
     weights = np.zeros(len(kicks))
-    for up, down in sides(kicks, Kind.PHASE):
+    for up, down in sides(kicks, Kind.PHASE).values():
         span = _mean_size(kicks, up) - _mean_size(kicks, down)
         weights[up] += 1 / (len(up) * span)
         weights[down] -= 1 / (len(down) * span)
@@ -176,14 +176,10 @@ def _repeats(kicks: Sequence[Kick | None], values: FloatArray) -> list[FloatArra
         seen.add(numbers)
         key = None if one is None else (one.joint, one.kind, one.size > 0)
         groups.setdefault(key, []).append(k)
-    found: list[FloatArray] = []
+    rows = np.eye(len(kicks))
     for group in groups.values():
-        for k in group[1:]:
-            row = np.zeros(len(kicks))
-            row[group] = -1 / len(group)
-            row[k] += 1.0
-            found.append(row)
-    return found
+        rows[np.ix_(group, group)] -= 1 / len(group)
+    return [rows[k] for group in groups.values() for k in group[1:]]
 
 
 def _pairs(kicks: Sequence[Kick | None]) -> list[FloatArray]:
@@ -191,7 +187,7 @@ def _pairs(kicks: Sequence[Kick | None]) -> list[FloatArray]:
     found: list[FloatArray] = []
     for kind in Kind:
         pairs: list[FloatArray] = []
-        for up, down in sides(kicks, kind):
+        for up, down in sides(kicks, kind).values():
             row = np.zeros(len(kicks))
             row[up] = 0.5 / len(up)
             row[down] = 0.5 / len(down)
@@ -201,30 +197,21 @@ def _pairs(kicks: Sequence[Kick | None]) -> list[FloatArray]:
     return found
 
 
-def sides(kicks: Sequence[Kick | None], kind: Kind) -> list[tuple[list[int], list[int]]]:
-    """Runs up and runs down of each joint that is kicked both ways.
+def sides(kicks: Sequence[Kick | None], kind: Kind) -> dict[int, tuple[list[int], list[int]]]:
+    """Return the runs that kick a joint up and those that kick it down.
 
     Args:
         kicks: Of r runs, None of one of the base gait.
 
     Returns:
-        Indices of runs, a pair for each joint.
+        Indices of runs for each joint that is kicked both ways.
     """
-    joints = sorted({one.joint for one in kicks if one is not None and one.kind is kind})
-    found: list[tuple[list[int], list[int]]] = []
-    for joint in joints:
-        up, down = (
-            [
-                k
-                for k, one in enumerate(kicks)
-                if one is not None
-                and (one.joint, one.kind, one.size > 0) == (joint, kind, positive)
-            ]
-            for positive in (True, False)
-        )
-        if up and down:
-            found.append((up, down))
-    return found
+    runs: dict[int, tuple[list[int], list[int]]] = {}
+    for k, one in enumerate(kicks):
+        if one is not None and one.kind is kind:
+            up, down = runs.setdefault(one.joint, ([], []))
+            (up if one.size > 0 else down).append(k)
+    return {joint: runs[joint] for joint in sorted(runs) if all(runs[joint])}
 
 
 def _mean_size(kicks: Sequence[Kick | None], chosen: Sequence[int]) -> float:

@@ -23,12 +23,12 @@ from undulog.capture.robot.run import Run
 from ...estimators.cycle_sums import DRIFT_PER_CYCLE, SIGNIFICANT
 from ...estimators.series import Series, clean
 from ...response.rhythm import DRIVEN_SHARE, NYQUIST_SHARE
+from ...results.answer import Remarks
 from ...session.analyse import FittedSession
 from ...session.runs import SAME_FREQUENCY
 from ...signals.columns import read_columns
 from ...signals.stretch import Options, choose_stretch
-from .chain import Phasors
-from .tones import Beside, ToneFit, common_step, find_tones, fit_tones
+from .tones import Beside, Phasors, ToneFit, common_step, find_tones, fit_tones
 
 MOST_CONDITION = 10.0
 """Commands with a larger condition number make no sweep; a DFT matrix has 1."""
@@ -78,30 +78,19 @@ class Sweep:
     lacking: int = 0
 
 
-@dataclass(frozen=True)
-class Signals:
-    """Signals of a session's stretch, by joint name, in seconds from its middle."""
-
-    command: dict[str, Series]
-    position: dict[str, Series]
-    effort: dict[str, Series]
+Signals = tuple[dict[str, Series], dict[str, Series], dict[str, Series]]
+"""Commands, positions and efforts by joint name, in seconds from the window's middle."""
 
 
 def read_signals(session: SessionView, options: Options) -> Signals:
-    """Read what a sweep is computed from.
+    """Read the signals of the analysed window.
 
     Args:
-        session: An open session, examined before: what it lacks has been told.
-
-    Returns:
-        The signals of the analysed stretch.
+        session: An open session, examined before: its warnings are collected already.
     """
-
-    def silent(_: str) -> None:
-        """The first reading has told what is missing."""
-
-    columns = read_columns(session, options.command_topic, options.response_topic, silent)
-    stretch = choose_stretch(session, columns, options, silent)
+    unused = Remarks()
+    columns = read_columns(session, options.command_topic, options.response_topic, unused)
+    stretch = choose_stretch(session, columns, options, unused)
     origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
     half_s = stretch.duration_s / 2
     command, position, effort = (
@@ -114,7 +103,7 @@ def read_signals(session: SessionView, options: Options) -> Signals:
         }
         for signals in (columns.command, columns.position, columns.effort)
     )
-    return Signals(command, position, effort)
+    return command, position, effort
 
 
 def command_tones(
@@ -132,7 +121,7 @@ def command_tones(
         if left < _PURE:
             omega = np.array([gait.fit.omega])
             return CommandTones(gait.driven, robot, omega, gait.fit.fundamental[:m, None])
-    commands = [one for one in read_signals(session, options).command.values() if one.count > 64]
+    commands = [one for one in read_signals(session, options)[0].values() if one.count > 64]
     found = find_tones(commands)
     if found is None:
         return None
@@ -266,7 +255,7 @@ def sweep_data(
             robot = robot or session.robot_as_run
             twins.append(session.run)
             signals = read_signals(session, options)
-        lost = [name for name in sweep.names if name not in signals.position]
+        lost = [name for name in sweep.names if name not in signals[1]]
         if lost:
             raise DataError(f"{paths[k]}: no responses of {', '.join(lost)}")
         runs.append(_fit(sweep, tones.omega, signals, len(sweep.index)))
@@ -275,14 +264,15 @@ def sweep_data(
     whole = all(run.torque is not None for run in runs)
     torques = [run.torque for run in runs if run.torque is not None]
     responses = [run.response for run in runs]
-    lines = runs[0].beside
+    lines, count = runs[0].beside, runs[0].omega.size
+    free = range(count, count + lines.size)
     return SweepData(
         omega=np.mean([run.omega[tones_at] for run in runs], axis=0),
         command=np.stack([run.command[:, tones_at] for run in runs], axis=-1).swapaxes(0, 1),
-        response=_by_tone(responses, tones_at),
-        torque=_by_tone(torques, tones_at) if whole else None,
-        beside=_beside(lines, responses) if lines.size else None,
-        torque_beside=_beside(lines, torques) if lines.size and whole else None,
+        response=_phasors(responses, tones_at),
+        torque=_phasors(torques, tones_at) if whole else None,
+        beside=Beside(lines, _phasors(responses, free)) if lines.size else None,
+        torque_beside=Beside(lines, _phasors(torques, free)) if lines.size and whole else None,
         period_s=float(np.median([run.period_s for run in runs])),
         contact=True if any(touched) else None if None in touched else False,
         drift=max(run.drift for run in runs),
@@ -292,11 +282,10 @@ def sweep_data(
 
 
 def _fit(sweep: Sweep, omega: FloatArray, signals: Signals, runs: int) -> _Run:
-    command, position = (
-        [kind[name] for name in sweep.names] for kind in (signals.command, signals.position)
-    )
+    commands, positions, efforts = signals
+    command, position = ([kind[name] for name in sweep.names] for kind in (commands, positions))
     lines = _beside_lines(sweep, omega, position)
-    effort = [signals.effort[name] for name in sweep.names if name in signals.effort]
+    effort = [efforts[name] for name in sweep.names if name in efforts]
     responses = fit_tones(position, omega, lines)
     return _Run(
         omega=omega,
@@ -330,29 +319,14 @@ def _beside_lines(sweep: Sweep, omega: FloatArray, series: Sequence[Series]) -> 
     return lines[lines < highest]
 
 
-def _by_tone(fits: Sequence[ToneFit], tones: Sequence[int]) -> tuple[Phasors, ...]:
+def _phasors(fits: Sequence[ToneFit], lines: Sequence[int]) -> tuple[Phasors, ...]:
     return tuple(
         Phasors(
             np.stack([one.amplitude[:, k] for one in fits], axis=1),
             np.stack([one.variance[:, k] for one in fits], axis=1),
             np.stack([one.dof[:, k] for one in fits], axis=1),
         )
-        for k in tones
-    )
-
-
-def _beside(omega: FloatArray, fits: Sequence[ToneFit]) -> Beside:
-    least = np.stack([one.dof.min(axis=1) for one in fits], axis=1)
-    return Beside(
-        omega,
-        tuple(
-            Phasors(
-                np.stack([one.beside[:, k] for one in fits], axis=1),
-                np.stack([one.beside_variance[:, k] for one in fits], axis=1),
-                least,
-            )
-            for k in range(omega.size)
-        ),
+        for k in lines
     )
 
 
@@ -368,13 +342,15 @@ def _drift(series: Sequence[Series], omega: FloatArray, fit: ToneFit, runs: int)
         for start, stop in ((-np.inf, middle), (middle, np.inf))
     ]
     lines = omega[0] * np.array([2.0, 3.0]) if omega.size == 1 else np.zeros(0)
-    first, second = (fit_tones(half, omega, lines).amplitude for half in halves)
+    tones = omega.size
+    first, second = (fit_tones(half, omega, lines).amplitude[:, :tones] for half in halves)
     change: ComplexArray = second - first
     span = middle - float(series[0].t_s[0])
     cycles = omega * span / (2 * np.pi)
-    size: FloatArray = np.linalg.norm(change, axis=0) / np.linalg.norm(fit.amplitude, axis=0)
+    size: FloatArray = np.linalg.norm(change, axis=0)
+    size = size / np.linalg.norm(fit.amplitude[:, :tones], axis=0)
     # Two halves, each with twice the variance of the whole, in two parts.
-    scatter: FloatArray = np.sum(8 * fit.variance, axis=0)
+    scatter: FloatArray = np.sum(8 * fit.variance[:, :tones], axis=0)
     ratio = np.sum(np.abs(change) ** 2, axis=0) / scatter
     worst = 0.0
     for tone, per_cycle in enumerate((size / cycles).tolist()):

@@ -8,7 +8,7 @@ import pytest
 
 import undulog
 from support.analysed import experiment
-from undulog.analysis.experiment.sweep.chain import servo_side
+from undulog.analysis.experiment.sweep.coupling import servo_side
 from undulog.analysis.plan.designs import tones
 from undulog.analysis.present.text_experiment import render_experiment
 from undulog.analysis.results.coupling import LinearCoupling, Route
