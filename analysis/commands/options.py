@@ -28,7 +28,7 @@ def chosen(
     response_topic: str,
     reference_topic: str | None = None,
 ) -> Options:
-    """What the user chose of each session.
+    """Check and collect the options of the analysis of each session.
 
     Args:
         start: From the session's start [s], or None.
@@ -53,7 +53,7 @@ def chosen(
 
 
 def opened(files: Iterable[Path], bar: Progress, done: int = 0) -> Iterator[SessionView]:
-    """Sessions, one open at a time.
+    """Open sessions, one at a time.
 
     Args:
         files: Sessions (MCAP).
@@ -61,7 +61,7 @@ def opened(files: Iterable[Path], bar: Progress, done: int = 0) -> Iterator[Sess
         done: How many were done before.
 
     Yields:
-        Each of them, open until the next is asked for.
+        Each of them, open until the next one is taken.
     """
     from undulog.capture import Session
 

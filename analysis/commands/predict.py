@@ -85,7 +85,7 @@ def predict(
 
 
 def _kicks(words: Sequence[str]) -> dict[str, float]:
-    """Joints and angles of ``JOINT=RAD``."""
+    """Parse joints and angles of ``JOINT=RAD``."""
     found: dict[str, float] = {}
     for word in words:
         name, equals, angle = word.rpartition("=")

@@ -32,7 +32,7 @@ _ORDER = ("robot", *_FILES, "session")
 
 
 def facts_of(session: SessionView) -> dict[str, str]:
-    """What a session says of how it was made.
+    """Read the facts that a session records of itself.
 
     Returns:
         Dotted names to text: of the attached robot, scenario and plan (e.g.
@@ -50,14 +50,14 @@ def facts_of(session: SessionView) -> dict[str, str]:
             continue
         kept = {key: value for key, value in table.items() if key not in _TEXTS}
         facts |= {f"{file}: {key}": text for key, text in _flat(kept).items()}
-    told = session.metadata.get("undulog", {})
+    recorded = session.metadata.get("undulog", {})
     return facts | {
-        f"session: {key}": value for key, value in told.items() if key not in _OF_THE_RUN
+        f"session: {key}": value for key, value in recorded.items() if key not in _OF_THE_RUN
     }
 
 
 def changes(a: Sequence[Mapping[str, str]], b: Sequence[Mapping[str, str]]) -> tuple[Change, ...]:
-    """Facts whose values on side B are not those on side A.
+    """List the facts that differ between the sides.
 
     Args:
         a: Facts of each session of side A.
@@ -82,7 +82,7 @@ def _recorded_value(side: Sequence[Mapping[str, str]], name: str) -> str | None:
 
 
 def _flat(value: Any, before: str = "") -> dict[str, str]:
-    """A TOML table by dotted names; entries of a list go by their own name, or their place."""
+    """Flatten a TOML table to dotted names; entries of a list go by their name or index."""
     parts: dict[str, Any] = {}
     if isinstance(value, dict):
         table = cast("dict[str, Any]", value)
@@ -164,7 +164,7 @@ def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False)
 
 
 def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None:
-    """What makes a run's gait another one than the model's.
+    """Return the difference of a run's gait from the model's.
 
     Args:
         model: The run that it is held against.
@@ -199,7 +199,7 @@ def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None
 
 
 def _refuse_copies(runs: Sequence[GaitRun], side: str) -> None:
-    """Two copies of one run would look like two runs without any scatter."""
+    """Raise an error for copies: two copies of one run would show no scatter."""
     seen: dict[bytes, str] = {}
     for run in runs:
         numbers = run.ratio.tobytes()

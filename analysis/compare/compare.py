@@ -52,7 +52,7 @@ def broken_joints(
 
 
 def _moved(joint: str, own: Sequence[ComparedSession], other: Sequence[ComparedSession]) -> bool:
-    """Whether a joint's mean differs between the sides, too: both may share a zero."""
+    """Return whether a joint's mean differs between the sides, too: both may share a zero."""
     here, there = (
         [one.offsets[joint] for one in side if joint in one.offsets] for side in (own, other)
     )
@@ -65,7 +65,7 @@ _Entry = TypeVar("_Entry", NotFollowing, StandOut)
 
 
 def _first(several: Sequence[_Entry]) -> list[_Entry]:
-    """The first entry of each joint."""
+    """Return the first entry of each joint."""
     found: dict[str, _Entry] = {}
     for each in several:
         found.setdefault(each.joint, each)
@@ -118,11 +118,11 @@ def compare_sessions(
         for side in (a, b)
     ]
     every = sum(map(len, sides))
-    said = [
+    noted = [
         f"{sentence} ({'all sessions' if len(names) == every else ', '.join(names)})"
         for sentence, names in warnings.items()
     ]
-    return compare_fitted(sides[0], sides[1], choices, said)
+    return compare_fitted(sides[0], sides[1], choices, noted)
 
 
 def compare_fitted(
@@ -134,7 +134,7 @@ def compare_fitted(
     """Compare what was taken from the sessions.
 
     Args:
-        warnings: What was said so far.
+        warnings: Warnings of the sessions.
 
     Raises:
         DataError: If sessions have no gait, no joint in common or another gait.
@@ -142,7 +142,7 @@ def compare_fitted(
     """
     if not a or not b:
         raise UsageError("a comparison needs at least one session a side")
-    said = list(warnings)
+    every_warning = list(warnings)
     design = _design(a, b, choices)
     aligned = align([one.run for one in a], [one.run for one in b], any_gait=choices.any_gait)
     keys = family(a, b, aligned.names)
@@ -156,7 +156,7 @@ def compare_fitted(
         first, second, found = differ(stacks[0][0], stacks[1][0], paired_runs=design == "pairs")
     decided = decide(keys, first, second, found, choices.margins)
     partial = _partial(aligned)
-    _warn(a, b, design, said.append)
+    _warn(a, b, design, every_warning.append)
     broken = broken_joints(a, b)
     verdict, sentence = answer_of(decided, partial is not None, broken)
     return Comparison(
@@ -173,7 +173,7 @@ def compare_fitted(
         equivalence=decided.equivalence,
         phase_rad=tuple(phases_rad().tolist()),
         waveforms=_waveforms(a, b, aligned.names, design),
-        warnings=tuple(said),
+        warnings=tuple(every_warning),
         provenance=_provenance(a, b, choices),
     )
 
@@ -250,7 +250,7 @@ def _waveforms(
 
 
 def _by_first(one: ComparedSession, name: str, names: Sequence[str]) -> Quantities:
-    """A mean cycle by the phase of the first joint in common that has the same frequency."""
+    """Turn a mean cycle to the phase of the first common joint of the same frequency."""
     run = one.run
     group = run.group[run.names.index(name)]
     members = [k for k, own in enumerate(run.group) if own == group]

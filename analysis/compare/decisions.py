@@ -66,7 +66,7 @@ class Decided:
 def family(
     a: Sequence[ComparedSession], b: Sequence[ComparedSession], joints: Sequence[str]
 ) -> list[Key]:
-    """What every session of both sides knows.
+    """List the quantities that every session of both sides has.
 
     Args:
         joints: Joints in common, head to tail.
@@ -83,7 +83,7 @@ def family(
 def differ(
     a: FloatArray, b: FloatArray, *, paired_runs: bool
 ) -> tuple[Quantities, Quantities, Differences]:
-    """Both sides and their difference, from runs.
+    """Return both sides and their difference, from runs.
 
     Args:
         a: Values of side A, shape (r1, k).
@@ -103,7 +103,7 @@ def differ(
 def estimates_of(
     side: Sequence[ComparedSession], keys: Sequence[Key], lags_about: FloatArray
 ) -> FloatArray:
-    """Estimates of a side as arrays.
+    """Return estimates of a side as arrays.
 
     Args:
         keys: What to take, k.
@@ -176,7 +176,7 @@ def _margins(kinds: np.ndarray, a: FloatArray, margins: Margins) -> FloatArray:
 
 
 def _named(decisions: Sequence[Difference]) -> tuple[NamedJoint, ...]:
-    """A weak module changes what its neighbours do, but less: the largest comes first."""
+    """List the joints that differ, the largest first: a weak module changes its neighbours less."""
     parts: dict[str, list[Difference]] = {}
     for one in decisions:
         if one.quantity in ("gain", "lag"):
@@ -223,7 +223,7 @@ _RESPONSE = ("gain", "lag")
 def answer_of(
     decided: Decided, partial: bool, broken: Sequence[BrokenJoint] = ()
 ) -> tuple[str, str]:
-    """Verdict and answer.
+    """Return verdict and answer.
 
     Args:
         partial: Whether something could not be compared.
@@ -257,7 +257,7 @@ def answer_of(
 
 
 def _beyond_doubt(decided: Decided) -> list[Difference]:
-    """Differences that are significant and whose interval leaves out zero."""
+    """Return differences that are significant and whose interval leaves out zero."""
     return [
         one
         for one in decided.differences
@@ -266,7 +266,7 @@ def _beyond_doubt(decided: Decided) -> list[Difference]:
 
 
 def _without(decided: Decided, broken: Sequence[BrokenJoint]) -> Decided:
-    """The decisions without the broken joints."""
+    """Return the decisions without the broken joints."""
     names = {each.name for each in broken}
     return dataclasses.replace(
         decided,
@@ -276,7 +276,7 @@ def _without(decided: Decided, broken: Sequence[BrokenJoint]) -> Decided:
 
 
 def difference_text(one: Difference) -> str:
-    """A difference with its interval.
+    """Format a difference with its interval.
 
     Returns:
         For example ``gain −8.1 % [−8.6, −7.6]``.
@@ -285,7 +285,7 @@ def difference_text(one: Difference) -> str:
 
 
 def in_people_units(one: Difference) -> tuple[Estimate, str]:
-    """A difference in the unit people read.
+    """Convert a difference to percent or degrees.
 
     Returns:
         Percent for gains, degrees for lags, and for the others percent of side A.
@@ -300,7 +300,7 @@ def in_people_units(one: Difference) -> tuple[Estimate, str]:
 
 
 def signed(quantity: Estimate, unit: str) -> str:
-    """A difference that always has a sign.
+    """Format a difference with its sign.
 
     Args:
         quantity: In ``unit``.
@@ -313,7 +313,7 @@ def signed(quantity: Estimate, unit: str) -> str:
 
 
 def _largest(decided: Decided) -> str:
-    """The joint that differs most, with all that is beyond doubt of it; else energy or body.
+    """Describe the joint that differs most; else energy or body.
 
     A joint is named if it differs by a margin or more: of many joints one differs by less in five
     comparisons of a hundred that differ in nothing.
@@ -339,7 +339,7 @@ def _largest(decided: Decided) -> str:
 
 
 def _not_shown(decided: Decided) -> str:
-    """How large a difference might be hidden, from the intervals that hold together."""
+    """Describe how large a hidden difference might be, from the simultaneous intervals."""
     worst: dict[str, float] = {"gain": 0.0, "lag": 0.0}
     for one in decided.differences:
         ends = one.difference.ci95

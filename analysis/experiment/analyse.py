@@ -55,7 +55,7 @@ _LOW_FLOOR = 0.01
 def analyse_experiment(
     sessions: Iterable[SessionView], options: Options | None = None
 ) -> Experiment:
-    """Compute what several sessions tell together.
+    """Analyse several sessions as one experiment.
 
     Args:
         sessions: Open sessions, each used once and in turn, so they may be opened one by one.
@@ -97,12 +97,12 @@ def analyse_experiment(
     own_roles, own_why = sort_runs([runs[k] for k in rest])
     roles = {rest[k]: role for k, role in own_roles.items()}
     why = {rest[k]: reason for k, reason in own_why.items()}
-    # Kicks around one gait are asked about its coupling; the reversal only if it is there, too.
+    # Kicks around one gait identify its coupling; the reversal is tested if both ways are there.
     only_kicks = kicks is not None and len(set(roles.values())) < 2
     if only_kicks:
         why = {k: reason for k, reason in why.items() if parts[k] is None}
-    told = {k: part for k, part in enumerate(parts) if part is not None}
-    told |= {} if only_kicks else {k: role.value for k, role in roles.items()}
+    parts_of = {k: part for k, part in enumerate(parts) if part is not None}
+    parts_of |= {} if only_kicks else {k: role.value for k, role in roles.items()}
     for k, reason in why.items():
         warnings.append(f"{runs[k].label} {reason}; it is left out of the reversal test")
     chosen = [runs[k] for k in roles]
@@ -135,7 +135,7 @@ def analyse_experiment(
         answer=answer if joints is not None else broken_first(analyses, answer),
         sessions=tuple(analyses),
         runs=tuple(
-            _run(one, run, told.get(k), why.get(k))
+            _run(one, run, parts_of.get(k), why.get(k))
             for k, (one, run) in enumerate(zip(analyses, runs, strict=True))
         ),
         heterogeneity=experiment_indices(forward, reverse, reversal),
@@ -185,7 +185,7 @@ def _reversal(
     runs: Sequence[GaitRun],
     ways: Sequence[Role],
 ) -> Reversal:
-    """The reversal test, with what the runs' headings and recorded gravity say of a tilt."""
+    """Test the runs by reversal, with their headings and recorded gravity."""
     heading = np.array([run.posture.heading_rad for run in runs])
     lean = np.array([run.posture.lean_rad for run in runs])
     forward = np.array([way is Role.FORWARD for way in ways])
@@ -211,7 +211,7 @@ def _both_ways(
     robot: Robot | None,
     warn: Warn,
 ) -> bool:
-    """Whether the reversal test can be made; warns why not, and of what it takes on trust."""
+    """Return whether the reversal test can be made; warn why not, and of its assumptions."""
     counts = {role: sum(way is role for way in ways) for role in Role}
     if not any(counts.values()):
         warn("no run with a travelling wave: the reversal test can't be made")

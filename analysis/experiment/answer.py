@@ -36,18 +36,18 @@ def kick_answer(coupling: Coupling) -> str:
     """
     if not isinstance(coupling, LocalCoupling):
         return f"coupling not identifiable from these kicks: {coupling.why}"
-    told = "; ".join(part for part in (_largest(coupling), _linear(coupling)) if part)
+    answer = "; ".join(part for part in (_largest(coupling), _linear(coupling)) if part)
     if not coupling.checks_pass:
-        # The first thing said: nothing below holds as it would for a settled gait.
-        told = f"doubtful, since {_rows_that_fail(coupling)} as shifting time demands; {told}"
+        # First of all: nothing below holds as it would for a settled gait.
+        answer = f"doubtful, since {_rows_that_fail(coupling)} as shifting time demands; {answer}"
     size = coupling.kick_size
     if size is not None and size.why is not None:
-        told = f"{told}; {size.why}"
-    return f"coupling around this gait: {told}"
+        answer = f"{answer}; {size.why}"
+    return f"coupling around this gait: {answer}"
 
 
 def _largest(coupling: LocalCoupling) -> str:
-    """The largest element of P off the diagonal that is shown to be one.
+    """Describe the largest element of P off the diagonal that is significant.
 
     The largest of many is large by chance, too: its interval is that which holds for all elements
     off the diagonal together.
@@ -97,7 +97,7 @@ def _rows_that_fail(coupling: LocalCoupling) -> str:
 
 
 def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
-    """What stands below the answer."""
+    """Yield the sentences that follow the answer."""
     yield from kick_checks(coupling)
     for one in coupling.held_out:
         yield (
@@ -116,11 +116,11 @@ def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
 
 
 def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
-    """What was checked, and what the kicks say of a linear chain."""
-    said = "pass" if coupling.checks_pass else "FAIL"
+    """Yield the results of the checks, and of the reading as a linear chain."""
+    verdict = "pass" if coupling.checks_pass else "FAIL"
     yield (
         f"Time shift: rows of P sum to 1 within {_worst(coupling.phase_rows)}, rows of R to 0 "
-        f"within {_worst(coupling.gain_rows)}: {said}."
+        f"within {_worst(coupling.gain_rows)}: {verdict}."
     )
     if coupling.scatter is not None:
         yield _scatter(coupling.scatter)
@@ -138,7 +138,7 @@ def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
 
 
 def _scatter(scatter: RunScatter) -> str:
-    """How much runs differ, in degrees and percent."""
+    """Describe how much runs differ, in degrees and percent."""
     phase, gain = (np.array(one) for one in (scatter.phase_rad, scatter.log_gain))
     noise = np.degrees(np.median(scatter.phase_noise_rad))
     widened = "" if scatter.widened <= 1 else f"; errors widened by up to {scatter.widened:.2g}"
@@ -151,14 +151,14 @@ def _scatter(scatter: RunScatter) -> str:
 
 
 def _worst(rows: tuple[RowCheck, ...]) -> str:
-    """The largest deviation of a row's sum, with its standard error."""
+    """Return the largest deviation of a row's sum, with its standard error."""
     worst = max(rows, key=lambda row: abs((row.total.value or 0.0) - row.expected))
     off = abs((worst.total.value or 0.0) - worst.expected)
     digits = 1 - math.floor(math.log10(max(off, worst.standard_error, 1e-6)))
     return f"{off:.{digits}f} ({worst.name}, standard error {worst.standard_error:.{digits}f})"
 
 
-_TOLD = {
+_ROUTES = {
     Route.TORQUE: "Z from torques",
     Route.SERVO: "Z from H and the servo's parameters",
     Route.ROW_SCALED: "H^-1, which is Z up to a factor for each row",
@@ -175,25 +175,25 @@ def sweep_answer(coupling: Coupling) -> str:
         return f"coupling not identifiable from these runs: {coupling.why}"
     first = coupling.tones[0]
     where = {True: " in contact", False: " without contact", None: ""}[coupling.contact]
-    told = f"coupling{where} at {first.frequency_hz:.4g} Hz"
+    answer = f"coupling{where} at {first.frequency_hz:.4g} Hz"
     if first.asymmetry.value is None:
-        return f"{told}: H can't be inverted"
+        return f"{answer}: H can't be inverted"
     return (
-        f"{told}: {formats.percent(first.within_1)} of it is between neighbours, "
+        f"{answer}: {formats.percent(first.within_1)} of it is between neighbours, "
         f"{formats.percent(first.within_2)} within two joints; "
-        f"asymmetry {formats.percent(first.asymmetry)} ({_TOLD[first.route]})"
+        f"asymmetry {formats.percent(first.asymmetry)} ({_ROUTES[first.route]})"
     )
 
 
 def sweep_detail(coupling: LinearCoupling) -> Iterable[str]:
-    """What stands below the answer."""
+    """Yield the sentences that follow the answer."""
     for tone in coupling.tones:
         yield _tone(tone)
     yield from sweep_checks(coupling)
 
 
 def sweep_checks(coupling: LinearCoupling) -> Iterable[str]:
-    """What was checked of all tones together."""
+    """Yield the results of the checks of all tones."""
     yield f"{coupling.route_why[0].upper()}{coupling.route_why[1:]}."
     settled = (
         "settled"
@@ -209,7 +209,7 @@ def sweep_checks(coupling: LinearCoupling) -> Iterable[str]:
 
 
 def sweep_method(coupling: LinearCoupling) -> str:
-    """How the numbers were made.
+    """Describe the method.
 
     Returns:
         A sentence in lower case, with its full stop.
@@ -223,7 +223,7 @@ def sweep_method(coupling: LinearCoupling) -> str:
 
 
 def _little(share: float) -> str:
-    """A share that may be next to nothing."""
+    """Format a share that may be close to zero."""
     return "less than 0.001 %" if share < 1e-5 else f"{100 * share:.2g} %"
 
 
@@ -304,7 +304,7 @@ def _sessions(names: Sequence[str], count: int) -> str:
 
 
 def pair_order(pair: OrderedPair) -> str:
-    """Which joint of a pair answers less.
+    """Describe which joint of a pair responds less.
 
     Returns:
         A clause; joints as they are named.
@@ -313,7 +313,7 @@ def pair_order(pair: OrderedPair) -> str:
 
 
 def blind_spots(reversal: Reversal) -> str:
-    """What a reversal of these joints can't see."""
+    """Describe the differences that a reversal of these joints can't detect."""
     middle = "" if reversal.middle is None else f" or of the middle joint, {reversal.middle}"
     return f"blind to what is alike at both joints of a pair{middle}"
 
@@ -364,6 +364,6 @@ def _bounded(reversal: Reversal) -> str:
 
 
 def _at_most(bound: float) -> str:
-    """A bound with two digits, rounded up."""
+    """Format a bound with two digits, rounded up."""
     digits = formats.decimals_for_values([bound], 2)
     return formats.number(math.ceil(bound * 10**digits) / 10**digits, digits)

@@ -59,7 +59,7 @@ DRAWS = 1999
 
 @dataclass(frozen=True)
 class NullTest:
-    """What the model says of one session; m modules, K shared parameters, q kinds of deviation.
+    """Test of one session against the model; m modules, K shared parameters, q kinds of deviation.
 
     Attributes:
         x: ln(theta / theta_0), shape (K,).
@@ -103,7 +103,7 @@ class _System:
     rest: FloatArray
 
     def beside(self, named: tuple[int, ...]) -> FloatArray:
-        """Columns of x and of the named modules, shape (..., n, K + q len(named))."""
+        """Return columns of x and of the named modules, shape (..., n, K + q len(named))."""
         own = self.modules[..., list(named), :]
         return np.concatenate([self.shared, own.reshape(*own.shape[:-2], -1)], axis=-1)
 
@@ -188,12 +188,12 @@ def _linear(
 
 
 def _root(model: NullModel) -> FloatArray:
-    """L with L' L = P^-1, shape (K, K)."""
+    """Return L with L' L = P^-1, shape (K, K)."""
     return np.linalg.cholesky(np.linalg.inv(model.covariance)).T.astype(np.float64)
 
 
 def _residual(y: ComplexArray, joints: IntArray, model: NullModel, x: FloatArray) -> FloatArray:
-    """What is left, r = y - f(x), lags within half a turn, shape (2 r,)."""
+    """Return the residual r = y - f(x), lags within half a turn, shape (2 r,)."""
     off = y - model.at(x)[0][joints]
     return parts(off.real + 1j * np.angle(np.exp(1j * off.imag)))
 
@@ -224,7 +224,7 @@ def _fitted(
 
 
 def _draws(system: _System, dof: FloatArray, random: np.random.Generator) -> _System:
-    """Noise of the fitted H1, whitened by a covariance that is itself estimated."""
+    """Draw noise of the fitted H1, whitened by a covariance that is itself estimated."""
     count = dof.size
     half = count // 2
     # Gain and lag of a joint share their noise estimate.
@@ -241,7 +241,7 @@ def _draws(system: _System, dof: FloatArray, random: np.random.Generator) -> _Sy
 def _one_by_one(
     system: _System, named: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Lambda (..., m), deviation and its error (..., m, q) of each module beside the named ones."""
+    """Return Lambda (..., m), deviations and errors (..., m, q) of each module by itself."""
     gain, deviation, error = _alone(system, system.beside(named))
     for j in named:
         base = system.beside(tuple(k for k in named if k != j))
@@ -252,7 +252,7 @@ def _one_by_one(
 
 
 def _alone(system: _System, base: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Each module's columns added to a base by itself (Frisch & Waugh, Econometrica 1, 1933)."""
+    """Add each module's columns to a base by itself (Frisch & Waugh, Econometrica 1, 1933)."""
     q, _ = np.linalg.qr(base)
     shape = system.modules.shape
     columns = system.modules.reshape(*shape[:-2], -1)
@@ -267,21 +267,21 @@ def _alone(system: _System, base: FloatArray) -> tuple[FloatArray, FloatArray, F
 
 
 def _left(system: _System, named: tuple[int, ...]) -> FloatArray:
-    """Q with the named modules free, shape (...)."""
+    """Return Q with the named modules free, shape (...)."""
     q, _ = np.linalg.qr(system.beside(named))
     inside = (np.swapaxes(q, -1, -2) @ system.rest[..., None])[..., 0]
     return np.sum(system.rest**2, axis=-1) - np.sum(inside**2, axis=-1)
 
 
 def _share(drawn: FloatArray, seen: FloatArray) -> FloatArray:
-    """Share of the draws and of what was seen that reach it: never 0."""
+    """Return the share of the draws that reach the observed value, itself included: never 0."""
     return (1 + np.sum(drawn >= seen, axis=0)) / (len(drawn) + 1)
 
 
 def analyse_with_null(
     session: SessionView, file: Path, options: Options | None = None
 ) -> ModelledAnalysis:
-    """Everything that one session can tell, and its test against a null model.
+    """Analyse one session, and test it against a null model.
 
     Raises:
         InputFileError: If the file isn't there or can't be read.
@@ -314,7 +314,7 @@ def analyse_with_null(
 def _answered(
     measured: SessionMeasurement, model: NullModel, file: Path
 ) -> tuple[Response, np.ndarray[tuple[int], np.dtype[np.int64]]]:
-    """The response of the joints that answer, and their places in the model."""
+    """Return the response of the joints that have one, and their indices in the model."""
     path, gait = measured.analysis.session.path, measured.gait
     robot = measured.analysis.session.robot
     fault = _other_gait(gait, model)
@@ -329,7 +329,7 @@ def _answered(
 
 
 def _other_gait(gait: GaitFit | None, model: NullModel) -> str | None:
-    """Why the commands are another gait's; None if they are the model's."""
+    """Return why the commands are another gait's; None if they are the model's."""
     if gait is None or not gait.driven:
         return "it has no gait with commands"
     if gait.others:

@@ -50,7 +50,7 @@ _LABELS = {
 def experiment_indices(
     forward: ComplexArray, reverse: ComplexArray, reversal: Reversal | None
 ) -> dict[str, Index]:
-    """H0, H1 and H2 as indices.
+    """Return H0, H1 and H2 as indices.
 
     Args:
         forward: y of the runs one way, shape (r1, m).
@@ -82,7 +82,7 @@ def experiment_indices(
 
 
 def _common_response(ways: list[ComplexArray]) -> Index:
-    """F of H0 over the means of each way's runs; gain and lag of each way about their own mean."""
+    """Return F of H0 over the means of each way's runs, each way about its own mean."""
     known = [one for one in ways if len(one) >= MIN_RUNS and one.shape[1] > 1]
     ratio = p = None
     if known:
@@ -175,7 +175,7 @@ def pool_runs(names: Sequence[str], runs: Sequence[Response]) -> PooledResponse:
 
 
 def _log_response(ratio: ComplexArray) -> ComplexArray:
-    """Ln H of each run, the phases of a joint within pi of their mean, shape (r, m)."""
+    """Return ln H of each run, the phases of a joint within pi of their mean, shape (r, m)."""
     turn: FloatArray = np.angle((ratio / np.abs(ratio)).sum(axis=0))
     phase = turn + np.angle(ratio * np.exp(-1j * turn))
     return (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
@@ -222,7 +222,7 @@ def pooled_answer(
 
 
 def _scatter(values: FloatArray, variance: FloatArray) -> Scatter:
-    """Scatter of the mean of values (r runs, m joints): r - 1 columns, and what noise adds (m,)."""
+    """Return the scatter of the mean of values (r, m): r - 1 columns, and added noise (m,)."""
     runs = len(values)
     centred = values - values.mean(axis=0)
     # Helmert's contrasts between the runs are orthonormal, so the columns are independent.

@@ -1,19 +1,20 @@
 """Modes of I - P, the signed Laplacian of what the body couples.
 
-With P = d psi / d psi_c of open-loop kicks (:mod:`..kicks.local`) and generators that feel their
-own servos, eps P_ij is the embodied coupling, and deviations of the phases relax as
+With P = d psi / d psi_c of open-loop kicks (:mod:`.analysis.experiment.kicks.local`) and generators
+with feedback from their own servos, eps P_ij is the embodied coupling, and deviations of the phases
+relax as
 
     d phi' = -eps (I - P) d phi,
 
-for small lags (:mod:`.embodied` has the whole of it). Rows of P sum to 1, by time shift, so all
-phases together are a mode of rate 0, whatever noise says: it is left out exactly, by looking at
+for small lags (:mod:`.predictions` has the complete equation). Rows of P sum to 1, by time shift,
+so all phases together are a mode of rate 0, whatever the noise: it is left out exactly, by looking at
 deviations from the mean only, B'(I - P) B with columns of B orthonormal and orthogonal to 1.
 Entries of P may be negative: other rates may be near zero, or below it, and then the body leaves
 that pattern alone, or drives it.
 
 P is not normal. Its eigenvalues may move by far more than its entries, so each has an interval and
 its condition number |x| |y| / |y'x| (Golub & Van Loan, Matrix Computations, 2013, 7.2.2), and the
-pseudospectrum is told (Trefethen & Embree, Spectra and Pseudospectra, 2005).
+pseudospectrum is computed (Trefethen & Embree, Spectra and Pseudospectra, 2005).
 
 How far the eigenvalues of I - P may move if P is off by so much.
 
@@ -86,7 +87,7 @@ class SpectrumIntervals:
 
 
 def spectrum(P: FloatArray) -> Spectrum:
-    """Modes of I - P.
+    """Return modes of I - P.
 
     Args:
         P: d psi / d psi_c, rows sum to 1, shape (m, m).
@@ -100,7 +101,7 @@ def spectrum(P: FloatArray) -> Spectrum:
 
 
 def of_deviations(P: FloatArray) -> FloatArray:
-    """I - P as it acts on deviations from the mean phase.
+    """Return I - P as it acts on deviations from the mean phase.
 
     Args:
         P: d psi / d psi_c, rows sum to 1, shape (..., m, m).
@@ -113,13 +114,13 @@ def of_deviations(P: FloatArray) -> FloatArray:
 
 
 def _basis(m: int) -> FloatArray:
-    """Orthonormal columns, all orthogonal to 1, shape (m, m - 1)."""
+    """Return orthonormal columns, all orthogonal to 1, shape (m, m - 1)."""
     whole = np.linalg.qr(np.column_stack([np.ones(m), np.eye(m)[:, 1:]]))[0]
     return whole[:, 1:].astype(np.float64)
 
 
 def growth(P: FloatArray) -> float:
-    """Numerical abscissa of P - I: the fastest growth of |d phi| at its very start [eps].
+    """Return the numerical abscissa of P - I: the fastest initial growth of |d phi| [eps].
 
     Args:
         P: d psi / d psi_c, shape (m, m).
@@ -132,12 +133,12 @@ def growth(P: FloatArray) -> float:
 
 
 def intervals(P: Noisy, seed: int = 21) -> SpectrumIntervals:
-    """What the noise of P leaves open, by drawing its errors anew."""
+    """Return intervals of the modes from the errors of P."""
     return intervals_of(P.value, P.value + noise_draws(P, seed))
 
 
 def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
-    """What noise leaves open of the modes of I - P.
+    """Return intervals of the modes of I - P from draws of P.
 
     Each draw's eigenvalues are dealt to those of P so that they move least. Noise pushes
     eigenvalues apart and lowers the lowest, in P as in the draws made of it: an interval is the
@@ -167,13 +168,13 @@ def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
 
 
 def _dealt(rates: ComplexArray, others: ComplexArray) -> ComplexArray:
-    """Another draw's rates in the order of these."""
+    """Return another draw's rates in the order of these."""
     _, order = linear_sum_assignment(np.abs(rates[:, None] - others[None, :]))
     return others[order]
 
 
 def _mirrored(value: FloatArray, draws: FloatArray) -> FloatArray:
-    """Basic bootstrap intervals, shape (..., 2)."""
+    """Return basic bootstrap intervals, shape (..., 2)."""
     tail = (1.0 - CONFIDENCE) / 2
     low, high = np.quantile(draws, (1.0 - tail, tail), axis=0)
     return np.stack([2.0 * value - low, 2.0 * value - high], axis=-1)
@@ -187,7 +188,7 @@ MARGIN = 0.1
 
 
 def smallest_singular(P: FloatArray, real: FloatArray, imag: FloatArray) -> FloatArray:
-    """sigma_min(z I - A) on a grid.
+    """Return sigma_min(z I - A) on a grid.
 
     Args:
         P: d psi / d psi_c, shape (m, m).

@@ -4,7 +4,7 @@ A chain whose every joint is coupled to the others alike, by their distance only
 constant along its diagonals. The nearest such matrix to P (its diagonals' means), with rows scaled
 to sum to 1 and I - P scaled to the same norm, is compared with P.
 
-What generators that feel their own servos will do, predicted from open-loop kicks.
+Generators with feedback from their own servos, predicted from open-loop kicks.
 
     phi_i' = omega + eps (2 (q_i/A) cos phi_i - b_i) + explicit coupling
 
@@ -25,8 +25,8 @@ slopes in the settled pattern, so
 
     P = (Gamma + L)^-1 Gamma,      P^-1 - I = Gamma^-1 L.
 
-Settled phases tell coupling relative to the entrainment only: times of any size give the same P.
-Absolute rates need the way back from kicks (:mod:`.chain`).
+Settled phases determine coupling relative to the entrainment only: time constants of any size give
+the same P. Absolute rates need the transients after kicks (:mod:`.chain`).
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ MOST_EXPLICIT = 1e6
 
 
 def homogeneous(P: FloatArray) -> FloatArray:
-    """The homogeneous comparator of a chain.
+    """Return the homogeneous comparator of a chain.
 
     Args:
         P: d psi / d psi_c, rows sum to 1, shape (m, m).
@@ -137,7 +137,7 @@ def homogeneous(P: FloatArray) -> FloatArray:
 
 
 def path_laplacian(m: int) -> FloatArray:
-    """Laplacian of a chain coupled to its next neighbours both ways, with open ends.
+    """Return the laplacian of a chain coupled to its next neighbours both ways, with open ends.
 
     Returns:
         Shape (m, m); its eigenvalues are 4 sin^2(k pi / 2m), k = 0 .. m - 1.
@@ -148,7 +148,7 @@ def path_laplacian(m: int) -> FloatArray:
 
 
 def explicit_coupling(P: FloatArray, rate: float = STRONG) -> float | None:
-    """What coupling between next neighbours must add to that through the body.
+    """Find the coupling between next neighbours that the body's coupling needs in addition.
 
     Args:
         P: d psi / d psi_c, shape (m, m).
@@ -192,7 +192,7 @@ class MeasuredP:
 
 
 def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
-    """What oscillators that feel their servos would do.
+    """Predict oscillators with feedback from their servos.
 
     Args:
         coupling: From kicks around one gait.
@@ -204,17 +204,17 @@ def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
     if coupling.scatter is not None:
         correlation = np.array(coupling.scatter.correlation)[:m, :m]
     P = measured(coupling.P, correlation)
-    found, said = spectrum(P.value), intervals(P)
+    found, ends = spectrum(P.value), intervals(P)
     like = spectrum(homogeneous(P.value))
     explicit = _explicit(P)
     return BodyOscillators(
-        answer=_answer(found, said, like, explicit),
+        answer=_answer(found, ends, like, explicit),
         joints=coupling.joints,
-        slowest=said.gap,
-        strong=said.strong,
+        slowest=ends.gap,
+        strong=ends.strong,
         strong_above=STRONG,
-        growth=said.growth,
-        modes=_modes(found, said),
+        growth=ends.growth,
+        modes=_modes(found, ends),
         comparator=Comparator(like.gap, like.strong, tuple(like.rates.real.tolist())),
         explicit_coupling=explicit,
         pseudospectrum=pseudospectrum(P),
@@ -223,13 +223,13 @@ def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
 
 
 def measured(matrix: Matrix, correlation: FloatArray | None = None) -> MeasuredP:
-    """A matrix of a result with its errors.
+    """Convert a matrix of a result with its errors.
 
     Args:
         correlation: Of a column's errors, shape (m, m), or None.
 
     Returns:
-        Value, errors, and the degrees of freedom that the intervals' factor says.
+        Value, errors, and the degrees of freedom that the intervals' factor implies.
     """
     value, error, half = (
         np.array(one) for one in (matrix.value, matrix.standard_error, matrix.ci95_half)
@@ -241,11 +241,11 @@ def measured(matrix: Matrix, correlation: FloatArray | None = None) -> MeasuredP
     return MeasuredP(value, error, np.minimum(usable, _MOST_DOF), correlation)
 
 
-def _modes(found: Spectrum, said: SpectrumIntervals) -> tuple[Mode, ...]:
+def _modes(found: Spectrum, ends: SpectrumIntervals) -> tuple[Mode, ...]:
     return tuple(
         Mode(
-            real=Estimate(float(rate.real), _pair(said.real[k])),
-            imag=Estimate(float(rate.imag), _pair(said.imag[k])),
+            real=Estimate(float(rate.real), _pair(ends.real[k])),
+            imag=Estimate(float(rate.imag), _pair(ends.imag[k])),
             sensitivity=float(found.sensitivity[k]),
             pattern_abs=tuple(np.abs(found.patterns[:, k]).tolist()),
             pattern_rad=tuple(np.angle(found.patterns[:, k]).tolist()),
@@ -266,26 +266,26 @@ def _explicit(P: MeasuredP) -> Estimate:
     return Estimate(value, (min(value, float(low)), max(value, float(high))))
 
 
-def _answer(found: Spectrum, said: SpectrumIntervals, like: Spectrum, explicit: Estimate) -> str:
+def _answer(found: Spectrum, ends: SpectrumIntervals, like: Spectrum, explicit: Estimate) -> str:
     count = len(found.rates)
-    told = (
-        f"through the body alone the slowest of {count} patterns {_pace(said.gap)} and "
+    answer = (
+        f"through the body alone the slowest of {count} patterns {_pace(ends.gap)} and "
         f"{found.strong} relax at more than {STRONG:g} eps (a homogeneous chain as "
         f"strong: {formats.number(like.gap, 3)} eps, {like.strong})"
     )
     if explicit.value is None:
-        return f"{told}; no coupling of next neighbours lifts all of them to {STRONG:g} eps"
+        return f"{answer}; no coupling of next neighbours lifts all of them to {STRONG:g} eps"
     if explicit.value == 0.0:
-        return f"{told}; that is enough without explicit coupling"
+        return f"{answer}; that is enough without explicit coupling"
     return (
-        f"{told}; explicit coupling must supply the gap: "
+        f"{answer}; explicit coupling must supply the gap: "
         f"{formats.estimate(explicit, ' eps', most=3)} between next neighbours lifts all to "
         f"{STRONG:g} eps"
     )
 
 
 def _pace(gap: Estimate) -> str:
-    """What a pattern does: a negative rate of relaxing is one of growth."""
+    """Describe how a pattern relaxes or grows."""
     if gap.value is None or gap.value >= 0.0:
         return f"relaxes at {formats.estimate(gap, ' eps', most=4)}"
     ends = None if gap.ci95 is None else (-gap.ci95[1], -gap.ci95[0])

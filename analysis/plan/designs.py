@@ -3,9 +3,9 @@
 Runs that make the coupling of a chain without contact identifiable: lag sweep and multisine.
 
 Without contact, at small amplitude, a = H c at every frequency. From r runs, Y = H C; H = Y C^-1 is
-best told when C is a DFT matrix, C_jk = A exp(j 2 pi j k / m): its condition number is 1. A lag
-sweep is just that: m gaits of the lags 2 pi k / m. In a multisine every frequency has such a matrix
-of its own, all in the same m runs (Dobrowiecki, Schoukens & Guillaume, "Optimized excitation
+best estimated when C is a DFT matrix, C_jk = A exp(j 2 pi j k / m): its condition number is 1. A
+lag sweep is just that: m gaits of the lags 2 pi k / m. In a multisine every frequency has such a
+matrix of its own, all in the same m runs (Dobrowiecki, Schoukens & Guillaume, "Optimized excitation
 signals for MIMO frequency response function measurements", IEEE Trans. Instrum. Meas. 55, 2006).
 """
 
@@ -68,7 +68,7 @@ class PlannedRun:
     more: tuple[Tone, ...] = ()
 
     def tones(self, omega: float) -> tuple[Tone, ...]:
-        """All that is commanded.
+        """Return frequencies of which none is another plus a whole number of the gait's.
 
         Args:
             omega: The gait's angular frequency [rad/s].
@@ -88,7 +88,7 @@ def phase_kicks(
     kick: float = KICK,
     base_runs: int = BASE_RUNS,
 ) -> tuple[PlannedRun, ...]:
-    """Runs of the gait as it is, each joint kicked four ways, and held-out patterns.
+    """Plan runs of the gait, four kicks of each joint, and held-out patterns.
 
     Args:
         names: Of the m driven joints.
@@ -123,7 +123,7 @@ def phase_kicks(
 
 
 def reversal(amplitude: ComplexArray, each: int = 6) -> tuple[PlannedRun, ...]:
-    """Runs of a wave and of its reverse, the robot turned by half a turn in half of each.
+    """Plan runs of a wave and of its reverse, the robot turned by half a turn in half of each.
 
     A tilted floor then cancels between runs that are each other's mirror image: the wave at one
     heading and its reverse at the other.
@@ -148,7 +148,7 @@ def reversal(amplitude: ComplexArray, each: int = 6) -> tuple[PlannedRun, ...]:
 
 
 def lag_sweep(m: int, amplitude: float, repeats: int = 1, seed: int = 1) -> tuple[PlannedRun, ...]:
-    """As many gaits as there are joints, of the lags 2 pi k / m.
+    """Plan as many gaits as there are joints, of the lags 2 pi k / m.
 
     Args:
         amplitude: Of every command [rad].
@@ -173,7 +173,7 @@ def lag_sweep(m: int, amplitude: float, repeats: int = 1, seed: int = 1) -> tupl
 def multisine(
     m: int, amplitude: float, omega: FloatArray, repeats: int = 1, seed: int = 1
 ) -> tuple[PlannedRun, ...]:
-    """All joints at all tones in each of m runs, with the phases of a DFT matrix over the runs.
+    """Plan m runs of all joints at all tones, with the phases of a DFT matrix over the runs.
 
     Args:
         amplitude: Of the first tone of every command [rad]; the others fall as 1 / omega^2, so
@@ -200,7 +200,7 @@ def multisine(
 
 
 def tones(omega: float, count: int) -> FloatArray:
-    """Frequencies such that none is another plus a whole number of the gait's.
+    """Return frequencies of which none is another plus a whole number of the gait's.
 
     In units of the gait's frequency over 2 L - 1, tone i is the line i (2 L - 1) + i: remainders
     0 .. L - 1 are all different, of either sign. So the sidebands that a nonlinearity makes of one
@@ -219,7 +219,7 @@ def tones(omega: float, count: int) -> FloatArray:
 
 
 def period_s(omega: float, count: int) -> float:
-    """The time after which a multisine repeats [s].
+    """Return the time after which a multisine repeats [s].
 
     Args:
         omega: Of the gait [rad/s].
@@ -231,7 +231,7 @@ def period_s(omega: float, count: int) -> float:
 
 
 def _dft(m: int) -> ComplexArray:
-    """exp(j 2 pi j k / m), row k = run, column j = joint; shape (m, m)."""
+    """Return exp(j 2 pi j k / m), row k = run, column j = joint; shape (m, m)."""
     place = np.arange(m)
     return np.exp(2j * np.pi / m * place[:, None] * place[None, :]).astype(np.complex128)
 
@@ -296,9 +296,9 @@ def write_plan(
                 force=True,
             ) as writer,
         ):
-            told = {"plan": plan, "plan_id": plan_id, "run": str(k), "like": like.session_id}
-            told |= {"settle_s": f"{settle_s:g}", "measure_s": f"{measure_s:g}"}
-            writer.note("undulog.plan", told | dict(facts or {}) | run.facts)
+            record = {"plan": plan, "plan_id": plan_id, "run": str(k), "like": like.session_id}
+            record |= {"settle_s": f"{settle_s:g}", "measure_s": f"{measure_s:g}"}
+            writer.note("undulog.plan", record | dict(facts or {}) | run.facts)
             if "scenario.toml" in like.attachments:
                 writer.attach(
                     "scenario.toml", "application/toml", like.attachments["scenario.toml"]
@@ -315,7 +315,7 @@ def _file_stem(label: str) -> str:
 
 
 def commands(base: BaseGait, run: PlannedRun, t_s: FloatArray, ramp_s: float) -> FloatArray:
-    """Commands of all joints.
+    """Return the commands of all joints.
 
     Args:
         t_s: Times [s], shape (k,).

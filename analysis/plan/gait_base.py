@@ -49,7 +49,7 @@ class Mode:
 
 
 def slowest_mode(robot: Robot, driven: Sequence[str]) -> Mode:
-    """The mode that takes longest to die away, of the planes that are driven.
+    """Find the mode of the driven planes that decays slowest.
 
     Args:
         driven: Names of the driven joints, at least one.
@@ -67,7 +67,7 @@ def slowest_mode(robot: Robot, driven: Sequence[str]) -> Mode:
 
 
 def transverse_mass(robot: Robot, plane: Plane) -> FloatArray:
-    """Mass matrix of the free straight chain bending in one plane.
+    """Return the mass matrix of the free straight chain bending in one plane.
 
     Args:
         plane: The plane; joints of the other one are rigid.
@@ -94,7 +94,7 @@ def transverse_mass(robot: Robot, plane: Plane) -> FloatArray:
 
 
 def _poles(robot: Robot, plane: Plane) -> ComplexArray:
-    """Eigenvalues of (q, q', th, om), of the joints of one plane."""
+    """Return eigenvalues of (q, q', th, om), of the joints of one plane."""
     joints: list[Joint] = [joint for joint in robot.joints if joint.plane is plane]
     servos = [joint.servo for joint in joints]
     winding = np.array([one.torque_constant / one.resistance_ohm for one in servos])

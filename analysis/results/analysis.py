@@ -1,4 +1,4 @@
-"""What an analysis says: frozen values at the border between estimators and readers of results.
+"""Results of an analysis: frozen values at the border between estimators and readers of results.
 
 ``Analysis.to_dict`` is the object that ``undulog analyse --json`` prints and that a result file
 holds. A value that could not be computed is None (null), and ``Analysis.warnings`` or
@@ -133,8 +133,8 @@ class JointOverTime:
         stop_s: Its end [s].
         run: Which of :attr:`ResponseOverTime.runs_s` it belongs to.
         frequency_hz: Of the phase in that cycle.
-        gain: Amplitude of the response over that of the command; None where the cycle tells
-            nothing.
+        gain: Amplitude of the response over that of the command; None where the cycle has
+            none.
         gain_ci95: Interval of each, or None.
         lag_rad: Lag of the response in (-pi, pi], positive = late [rad], or None.
         lag_ci95: Interval of each, or None.
@@ -352,7 +352,7 @@ class Analysis(PresentedResult):
 
     Attributes:
         joints: In chain order, head to tail.
-        body: Head, middle and tail; None with a note where it can't be told.
+        body: Head, middle and tail; None with a note where it is unknown.
         coupling: Identifiable or not.
         warnings: One sentence each, worst first: what is missing or doubtful, and changes what a
             reader does.
@@ -381,7 +381,7 @@ class Analysis(PresentedResult):
     provenance: Provenance
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain JSON values.
+        """Return the result as plain JSON values.
 
         An estimate becomes two keys, e.g. ``gain`` and ``gain_ci95``; ``lag_rad`` has its
         interval in ``lag_ci95``.

@@ -1,4 +1,4 @@
-"""What a session says when it is held to a model of identical modules."""
+"""Test of a session against a model of identical modules."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class ModelledAnalysis(Analysis):
 
 
 def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_p: float) -> str:
-    """The answer in one sentence.
+    """Return the answer in one sentence.
 
     Args:
         named: Those that deviate, the clearest first.
@@ -121,7 +121,7 @@ def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_
 
 
 def null_model_text(result: NullModelResult) -> list[str]:
-    """Lines for a terminal.
+    """Return lines for a terminal.
 
     Returns:
         The answer first, the parameters last.

@@ -63,21 +63,21 @@ class PresentedResult:
     """
 
     def __str__(self) -> str:
-        """The result as text, the answer first."""
+        """Return the result as text, the answer first."""
         return _presentation().text(self).rstrip("\n")
 
     def __repr__(self) -> str:
-        """The answer in one line."""
+        """Return the answer in one line."""
         from undulog.capture.common.console import plain
 
         return f"<{type(self).__name__}: {plain(_presentation().headline(self))}>"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: the answer, and the first table."""
+        """Return the answer and the first table for a notebook."""
         return _presentation().html(self)
 
     def frames(self) -> dict[str, pd.DataFrame]:
-        """The numbers as tables.
+        """Return the numbers as tables.
 
         Returns:
             Name to table, the most telling first. Columns end in their unit (``lag_rad``), the ends
@@ -87,7 +87,7 @@ class PresentedResult:
         return _presentation().frames(self)
 
     def plot(self, what: str | None = None) -> PictureProtocol:
-        """The result as a picture, as the report draws it; needs the extra ``report``.
+        """Draw the result as in the report; needs the extra ``report``.
 
         Args:
             what: Which picture, where there are several; the first by default.
@@ -132,7 +132,7 @@ class PresentedResult:
         return _presentation().save_tables(self, Path(folder), force=force)
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain JSON values.
+        """Return the result as plain JSON values.
 
         Returns:
             A dictionary that ``json.dumps(..., allow_nan=False)`` takes.

@@ -96,7 +96,7 @@ def kick_size(
 
 
 def _larger(size: float, factor: float) -> str:
-    """What to record so that intervals are narrower by a factor."""
+    """Describe the kicks that make intervals narrower by a factor."""
     if size * factor <= MOST_KICK:
         return f"kicks of {math.ceil(100 * size * factor) / 100:.2g} rad"
     largest = max(size, 0.1)
@@ -112,7 +112,7 @@ def _rounded_down(size: float) -> float:
 def _curvature(
     kicks: Sequence[Kick | None], answers: ResponseMatrices, matrices: LocalMatrices
 ) -> float:
-    """Second order over first order of the kicks of phase, Frobenius norms over all joints."""
+    """Return second over first order of the phase kicks, Frobenius norms over all joints."""
     errors = matrices.steady_errors
     variance = float(np.maximum(errors.variance, errors.within).sum())
     base = [k for k, one in enumerate(kicks) if one is None]
@@ -165,7 +165,7 @@ def predict(
 
 
 def valid_to(predictions: Sequence[HeldOut]) -> float | None:
-    """Largest deviation up to which every held-out run is predicted at least ``BETTER`` better.
+    """Return the largest deviation up to which all held-out runs are predicted well.
 
     Returns:
         The size of the last good run before the first bad one; None where the smallest is bad, or
@@ -274,7 +274,7 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
 
 
 def _has_amplitude(experiment: KickExperiment, warn: Warn) -> bool:
-    """Whether S and G can be told; warns where amplitudes were not kicked both ways."""
+    """Return whether S and G can be estimated; warn of amplitudes not kicked both ways."""
     lacking = missing_kicks(list(experiment.runs.kicks.values()), Kind.AMPLITUDE, experiment.names)
     if lacking:
         warn(
@@ -317,7 +317,7 @@ def _held_out(
 
 
 def _rows(names: Sequence[str], sums: RowSums, expected: float) -> tuple[RowCheck, ...]:
-    """Sums with their intervals, one by one."""
+    """Return sums with their intervals, one by one."""
     half = sums.error * stdtrit(sums.dof, 0.5 + CONFIDENCE / 2)
     return tuple(
         RowCheck(

@@ -19,7 +19,7 @@ The coupling of a chain, read from kicks as if it were linear and time-invariant
 Then a = H c with H_ij = (a_i / c_j)(P_ij - j R_ij), and X = H^-1 is, up to the servos on its
 diagonal and a scaling of its rows, the impedance that couples the joints. Asymmetry of P is not
 directed coupling: a reciprocal H (H = H') has an asymmetric P, too. Hence asymmetry and reach are
-told of X. Where the nonlinearity index isn't small, this is a reading and not a measurement.
+computed of X. Where the nonlinearity index isn't small, this is a reading and not a measurement.
 
 P, R, G and S with errors that hold whether or not runs differ by more than their own noise.
 
@@ -123,7 +123,7 @@ class RowSums:
 def response_matrices(
     deviation: ComplexArray, ratio: ComplexArray, base: ComplexArray
 ) -> ComplexArray:
-    """Change of the responses against the base, whenever each run started.
+    """Return the change of the responses against the base, whenever each run started.
 
     ln a = ln c + ln H, and both of a run's phases are counted from the same instant.
 
@@ -141,7 +141,7 @@ def response_matrices(
 def central_differences(
     kicks: Sequence[Kick], answers: ResponseMatrices, kind: Kind
 ) -> tuple[MeasuredDerivatives, MeasuredDerivatives]:
-    """Derivatives of phase and of log amplitude with respect to one kind of kick.
+    """Return derivatives of phase and of log amplitude with respect to one kind of kick.
 
     Args:
         kicks: Of r runs.
@@ -185,7 +185,7 @@ def central_differences(
 
 
 def row_sums(matrix: MeasuredDerivatives) -> RowSums:
-    """Sums over the columns: 1 for P, 0 for R, by time shift.
+    """Return sums over the columns: 1 for P, 0 for R, by time shift.
 
     Args:
         matrix: P or R.
@@ -209,7 +209,7 @@ def nonlinearity(
     *,
     correlation: FloatArray | None = None,
 ) -> Estimate:
-    """Defect from what a linear time-invariant system shows.
+    """Return the departure from a linear time-invariant system.
 
     Args:
         P: d psi / d psi_c.
@@ -241,7 +241,7 @@ def nonlinearity(
 def stacked(
     blocks: Sequence[Sequence[Noisy]], correlation: FloatArray | None
 ) -> MeasuredDerivatives:
-    """One matrix of several, for errors that they have in common.
+    """Return one matrix of several, for errors that they have in common.
 
     Args:
         blocks: Rows of matrices; those of one row answer the same way, those of one column are of
@@ -325,7 +325,7 @@ def reciprocity(
 
 
 def squared(share: Estimate) -> Estimate:
-    """Energy from a ratio of norms.
+    """Return the energy from a ratio of norms.
 
     Args:
         share: Of a norm in the whole's.
@@ -414,13 +414,13 @@ def local_matrices(
 
 
 def _agree(sums: RowSums, expected: float) -> BoolArray:
-    """Whether each sum is as expected, all 2 m of P and R together at 95 %."""
+    """Return whether each sum is as expected, all 2 m of P and R together at 95 %."""
     quantile = stdtrit(sums.dof, 1 - (1 - CONFIDENCE) / (4 * len(sums.value)))
     return np.abs(sums.value - expected) <= ROW_TOLERANCE + sums.error * quantile
 
 
 def _widening(sums: RowSums, expected: float, agree: BoolArray) -> FloatArray:
-    """Factor on each row's errors; 1 where all sums agree."""
+    """Return the factor on each row's errors; 1 where all sums agree."""
     if agree.all():
         return np.ones(len(agree))
     off = np.abs(sums.value - expected) / np.maximum(sums.error, np.finfo(float).tiny)
@@ -430,7 +430,7 @@ def _widening(sums: RowSums, expected: float, agree: BoolArray) -> FloatArray:
 def _widen(
     pair: tuple[MeasuredDerivatives, MeasuredDerivatives], factor: FloatArray
 ) -> tuple[MeasuredDerivatives, MeasuredDerivatives]:
-    """Errors times each row's factor, which so many sums tell."""
+    """Multiply the errors by each row's factor, which as many sums determine."""
     m = len(factor[0])
 
     def wider(one: MeasuredDerivatives, by: FloatArray) -> MeasuredDerivatives:

@@ -1,8 +1,8 @@
 """How much runs differ from each other beyond what the noise within each of them explains.
 
-A fit knows the noise within its run. A servo that warms up, a cable, a foot of sand or a clock that
-is read late moves gain and lag of a whole run, and no residual shows it. It is estimated from
-combinations of runs whose mean is known whatever the coupling is, y = psi or ln|a| of one joint:
+A fit estimates the noise within its run. A servo that warms up, a cable, sand or a late clock moves
+gain and lag of a whole run, and no residual shows it. It is estimated from combinations of runs
+whose mean is known whatever the coupling is, y = psi or ln|a| of one joint:
 
 * runs of the same commands, against their mean;
 * the mean of a kick up and of the same kick down, against the mean of all those pairs: the coupling
@@ -42,7 +42,7 @@ class RunErrors:
     Attributes:
         draws: Draws of a run's errors, shape (k, 2 m).
         within: Variance expected of them from the noise within runs alone, shape (2 m,).
-        dof: Degrees of freedom of each column: k less what its joint's own kicks would have told.
+        dof: Degrees of freedom of each column: k less those of its joint's own kicks.
     """
 
     draws: FloatArray
@@ -115,7 +115,7 @@ def run_errors(
 
 
 def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray:
-    """Values in which a joint's own kicks, up and down together, are at the mean of the others'.
+    """Set a joint's own kicks, up and down together, to the mean of the others'.
 
     So they add nothing to the squares about that mean, and its joint has a degree of freedom less.
     """
@@ -152,7 +152,7 @@ def _foreseen(
     m: int,
     derivatives: tuple[ComplexArray, ComplexArray | None],
 ) -> ComplexArray:
-    """What a linear chain with these derivatives answers, shape (r, m)."""
+    """Return the response of a linear chain with these derivatives, shape (r, m)."""
     found = np.zeros((len(kicks), m), dtype=np.complex128)
     of_phase, of_amplitude = derivatives
     for k, kick in enumerate(kicks):
@@ -166,7 +166,7 @@ def _foreseen(
 
 
 def _repeats(kicks: Sequence[Kick | None], values: FloatArray) -> list[FloatArray]:
-    """Each run against the mean of all runs of its commands; a copied file isn't a repeat."""
+    """Compare each run with the mean of all runs of its commands; copied files don't count."""
     groups: dict[tuple[int, Kind, bool] | None, list[int]] = {}
     seen: set[bytes] = set()
     for k, one in enumerate(kicks):
@@ -183,7 +183,7 @@ def _repeats(kicks: Sequence[Kick | None], values: FloatArray) -> list[FloatArra
 
 
 def _pairs(kicks: Sequence[Kick | None]) -> list[FloatArray]:
-    """Kicks up and down together, against the mean of all of them, for each kind."""
+    """Compare kicks up and down together with the mean of all of them, for each kind."""
     found: list[FloatArray] = []
     for kind in Kind:
         pairs: list[FloatArray] = []
@@ -220,7 +220,7 @@ def _mean_size(kicks: Sequence[Kick | None], chosen: Sequence[int]) -> float:
 
 
 def _orthonormal(rows: Sequence[FloatArray], count: int) -> FloatArray:
-    """An orthonormal basis of what the rows span, shape (k, count)."""
+    """Return an orthonormal basis of what the rows span, shape (k, count)."""
     if not rows:
         return np.zeros((0, count))
     _, sizes, basis = np.linalg.svd(np.array(rows), full_matrices=False)

@@ -240,7 +240,7 @@ class Strata:
         return precision / precision.sum()
 
     def labellings(self, seed: int = 1) -> BoolArray:
-        """Ways to choose which runs of each stratum are called '+'.
+        """Return ways to choose which runs of each stratum are called '+'.
 
         Returns:
             True for '+', shape (k, r1 + r2), the observed labelling first. All of them, but where
@@ -303,7 +303,7 @@ class Strata:
         return difference / np.sqrt(np.maximum(variance, np.finfo(np.float64).eps))
 
     def difference(self, runs: ComplexArray) -> ComplexArray:
-        """Weighted mean of the strata's differences of '+' and '-'.
+        """Return the weighted mean of the strata's differences of '+' and '-'.
 
         Args:
             runs: Those of the one way first, shape (r, c).
@@ -321,7 +321,7 @@ class Strata:
         return mean
 
     def residuals(self, runs: FloatArray) -> FloatArray:
-        """Runs less the mean of their way in their stratum.
+        """Subtract the mean of each run's way in its stratum.
 
         Args:
             runs: Those of the one way first, shape (r, c).
@@ -336,7 +336,7 @@ class Strata:
         return out
 
     def variances(self, runs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What either way adds to the variance of the difference, from the scatter within strata.
+        """Return the variance that each way adds to the difference, from the scatter in strata.
 
         Args:
             runs: Those of the one way first, shape (r, c).
@@ -354,7 +354,7 @@ class Strata:
 
 
 def parts(y: ComplexArray) -> FloatArray:
-    """Log gain and minus lag side by side.
+    """Join log gain and minus lag.
 
     Args:
         y: Complex, shape (..., m).
@@ -366,7 +366,7 @@ def parts(y: ComplexArray) -> FloatArray:
 
 
 def family_wise_p(scores: FloatArray) -> FloatArray:
-    """Single-step max-T p-values.
+    """Return single-step max-T p-values.
 
     Args:
         scores: abs(t) of k labellings and c quantities, the observed labelling first, shape

@@ -95,7 +95,7 @@ def tilt_check(
 
 
 def floor_lean(lean_rad: FloatArray, heading_rad: FloatArray) -> Estimate:
-    """Fall of the floor along the body by recorded gravity.
+    """Return the fall of the floor along the body by recorded gravity.
 
     Args:
         lean_rad: Of each run [rad], NaN where none is recorded, shape (r,).
@@ -154,7 +154,7 @@ def common_ratio(forward: ComplexArray, reverse: ComplexArray) -> Estimate:
 
 
 def heading_strata(forward: FloatArray, reverse: FloatArray) -> tuple[IntArray, IntArray] | None:
-    """Strata of runs that are mirror images of each other, from the robot's headings.
+    """Find strata of runs that are mirror images of each other, by the robot's headings.
 
     Args:
         forward: Heading of each run one way [rad], NaN where it is unknown, shape (r1,).
@@ -184,7 +184,7 @@ def heading_strata(forward: FloatArray, reverse: FloatArray) -> tuple[IntArray, 
 
 
 def _middle_share(test: MirrorTest) -> float:
-    """Upper bound of the middle joint's size over the lower bound of the largest contrast's."""
+    """Return the middle joint's upper bound over the largest contrast's lower bound."""
     k = len(test.difference) // 2
     contrast = np.abs(np.stack([test.contrast.real, test.contrast.imag]))
     least = float((contrast - test.critical * test.contrast_error).max())
@@ -252,7 +252,7 @@ def variance_shares(forward: ComplexArray, reverse: ComplexArray) -> Shares:
 
 
 def _variances(means: ComplexArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """V_module and V_boundary of both ways' profiles, the reverse mirrored, shape (2, ..., m)."""
+    """Return V_module and V_boundary of both ways' profiles (2, ..., m), the reverse mirrored."""
     joint: IntArray = np.arange(means.shape[-1], dtype=np.int64)
     paired: BoolArray = joint != joint[::-1]
     half: FloatArray = np.abs((means[0] - means[1]) / 2)[..., paired] ** 2
@@ -263,7 +263,7 @@ def _variances(means: ComplexArray, noise: FloatArray) -> tuple[FloatArray, Floa
 
 
 def _noise(runs: ComplexArray) -> FloatArray:
-    """Variance of the mean of r runs, gain and lag together, shape (m,)."""
+    """Return the variance of the mean of r runs, gain and lag together, shape (m,)."""
     return np.var(runs, axis=0, ddof=1) / len(runs)
 
 
@@ -393,7 +393,7 @@ def _joints(names: Sequence[str], test: MirrorTest) -> tuple[MirrorJoint, ...]:
 
 
 def _estimates(value: complex, half: FloatArray) -> tuple[Estimate, Estimate]:
-    """Log gain and lag, positive when late, with their half widths."""
+    """Return log gain and lag, positive when late, with their half widths."""
     gain, lag = float(value.real), -float(value.imag)
     return (
         Estimate(gain, around(gain, float(half[0]))),

@@ -91,7 +91,7 @@ class ServoSide:
 
 
 def transfer(command: ComplexArray, response: Phasors, seed: int = 21) -> MeasuredMatrix:
-    """H = Y C^+, the commands taken as exact.
+    """Estimate H = Y C^+, the commands taken as exact.
 
     Args:
         command: C, of full rank, shape (m, r), r >= m.
@@ -113,7 +113,7 @@ def transfer(command: ComplexArray, response: Phasors, seed: int = 21) -> Measur
 
 
 def impedance(response: Phasors, torque: Phasors, seed: int = 22) -> MeasuredMatrix:
-    """Z = T Y^+.
+    """Estimate Z = T Y^+.
 
     Args:
         response: Y, of full rank.
@@ -141,7 +141,7 @@ def impedance(response: Phasors, torque: Phasors, seed: int = 22) -> MeasuredMat
 
 
 def inverse(H: MeasuredMatrix) -> ComplexArray:
-    """Errors that H^-1 may have.
+    """Draw errors of H^-1.
 
     Returns:
         Shape (DRAWS, m, m).
@@ -151,7 +151,7 @@ def inverse(H: MeasuredMatrix) -> ComplexArray:
 
 
 def impedance_behind_servos(H: MeasuredMatrix, servos: ServoSide) -> MeasuredMatrix:
-    """Z = D_r H^-1 - D_q.
+    """Estimate Z = D_r H^-1 - D_q.
 
     Args:
         H: Of the commands as the servos hold them; regular.
@@ -174,7 +174,7 @@ def impedance_behind_servos(H: MeasuredMatrix, servos: ServoSide) -> MeasuredMat
 
 
 def servo_side(servos: Sequence[Servo], omega: float) -> ServoSide:
-    """What linear servos do at one frequency.
+    """Return D_r and D_q of linear servos at one frequency.
 
     Args:
         servos: Of m joints; their Coulomb friction and play are not in it.
@@ -193,7 +193,7 @@ def servo_side(servos: Sequence[Servo], omega: float) -> ServoSide:
 
 
 def _dof(variance: FloatArray, dof: FloatArray, power: FloatArray) -> FloatArray:
-    """Degrees of freedom of sum_k variance_ik power_kj, shape (m, m)."""
+    """Return the degrees of freedom of sum_k variance_ik power_kj, shape (m, m)."""
     parts = variance.T[:, :, None] * power[:, None, :]
     return welch_satterthwaite(parts, np.broadcast_to(dof.T[:, :, None], parts.shape))
 
@@ -313,7 +313,7 @@ def _tone(data: SweepData, k: int, hold_s: float, servos: Sequence[Servo] | None
 
 
 def _distortion(data: SweepData, k: int) -> float | None:
-    """Of the torques where they are recorded: Z shows it more than H does."""
+    """Return the distortion, of torques where they are recorded: Z shows it more than H."""
     omega = float(data.omega[k])
     if data.torque is not None and data.torque_beside is not None:
         return distortion(omega, data.torque[k], data.torque_beside)
@@ -321,7 +321,7 @@ def _distortion(data: SweepData, k: int) -> float | None:
 
 
 def _servos(data: SweepData, names: Sequence[str]) -> tuple[list[Servo] | None, str]:
-    """The driven joints' servos, if they are known and linear; and why not."""
+    """Return the driven joints' servos if they are known and linear, or why not."""
     if data.robot is None:
         return None, "the sessions carry no robot description"
     robot = data.robot

@@ -1,4 +1,4 @@
-"""Which sessions are runs of one lag sweep or multisine: told from their commands alone.
+"""Find sessions that are runs of one lag sweep or multisine, from their commands.
 
 They drive the same joints at the same frequencies, and at a frequency their commands, one column a
 run, make a matrix C of full rank and small condition number: that is what H = Y C^-1 needs, and
@@ -109,7 +109,7 @@ def read_signals(session: SessionView, options: Options) -> Signals:
 def command_tones(
     session: SessionView, options: Options, examined: FittedSession
 ) -> CommandTones | None:
-    """What a session commands, as tones.
+    """Find the tones of a session's commands.
 
     Returns:
         The gait's frequency alone, or the tones of a multisine; None of anything else.
@@ -133,7 +133,7 @@ def command_tones(
 
 
 def find_sweep(sessions: Sequence[CommandTones | None]) -> Sweep | None:
-    """The largest sweep among sessions.
+    """Find the largest sweep among sessions.
 
     Args:
         sessions: What each commands.
@@ -185,7 +185,7 @@ def _sweep(index: Sequence[int], runs: Sequence[CommandTones]) -> Sweep | None:
 
 
 _PERIODS = 1.5
-"""Periods of a multisine in a record from which lines beside its tones are told apart."""
+"""Periods of a multisine in a record from which lines beside its tones are resolved."""
 
 _MOST_LINES = 60
 
@@ -299,7 +299,7 @@ def _fit(sweep: Sweep, omega: FloatArray, signals: Signals, runs: int) -> _Run:
 
 
 def _beside_lines(sweep: Sweep, omega: FloatArray, series: Sequence[Series]) -> FloatArray:
-    """Frequencies at which a nonlinear robot answers though nothing is commanded."""
+    """Return frequencies at which only a nonlinear robot responds."""
     highest = NYQUIST_SHARE * 2 * np.pi / max(one.period_s for one in series)
     if omega.size == 1:
         lines: FloatArray = omega[0] * np.array([2.0, 3.0])
@@ -331,7 +331,7 @@ def _phasors(fits: Sequence[ToneFit], lines: Sequence[int]) -> tuple[Phasors, ..
 
 
 def _drift(series: Sequence[Series], omega: FloatArray, fit: ToneFit, runs: int) -> float:
-    """Largest change of a tone's responses from one half of a run to the other, per cycle.
+    """Return the largest change of a tone's responses between the halves of a run, per cycle.
 
     It counts where it is above ``DRIFT_PER_CYCLE`` and an F test of all joints' changes against
     the noise rejects that they are noise, the chance of a false alarm shared among the runs.

@@ -53,7 +53,7 @@ class Phasors:
     dof: FloatArray
 
     def draws(self, seed: int) -> ComplexArray:
-        """Errors that they may have.
+        """Draw errors.
 
         Returns:
             Student draws, shape (DRAWS, m, r).
@@ -88,7 +88,7 @@ def sideband_energy(tones: tuple[Phasors, ...], beside: Beside) -> Estimate:
 
 
 def distortion(omega: float, tone: Phasors, beside: Beside) -> float:
-    """How much of a tone a nonlinearity may have made.
+    """Return how much of a tone a nonlinearity may have made.
 
     Args:
         omega: Of the tone [rad/s].
@@ -130,7 +130,7 @@ _STEPS = 4
 
 
 def find_tones(commands: Sequence[Series]) -> FloatArray | None:
-    """The frequencies of a multisine.
+    """Find the frequencies of a multisine.
 
     Args:
         commands: By joint; those that never move are ignored.
@@ -167,7 +167,7 @@ def find_tones(commands: Sequence[Series]) -> FloatArray | None:
 
 
 def common_step(omega: FloatArray, most: int = 24) -> float | None:
-    """The largest frequency of which all tones are multiples.
+    """Find the largest frequency of which all tones are multiples.
 
     Args:
         omega: Rising [rad/s].
@@ -193,7 +193,7 @@ def _span(scouts: Sequence[Series]) -> float:
 
 
 def _peak(scouts: Sequence[Series], residual: Sequence[FloatArray]) -> float | None:
-    """The highest line of what is left [rad/s]; on an even grid, as a starting point."""
+    """Return the highest line of the residual [rad/s]; on an even grid, as a starting point."""
     period = max(one.period_s for one in scouts)
     start = max(float(one.t_s[0]) for one in scouts)
     stop = min(float(one.t_s[-1]) for one in scouts)
@@ -273,7 +273,7 @@ def fit_tones(series: Sequence[Series], omega: FloatArray, beside: FloatArray) -
         beside: Of the further lines, none of them a tone [rad/s], shape (S,).
 
     Raises:
-        DataError: If a channel has too few samples, or too short a record to tell the lines apart.
+        DataError: If a channel has too few samples, or too short a record to resolve the lines.
     """
     lines = np.concatenate([omega, beside])
     tones = omega.size
@@ -313,7 +313,7 @@ def fit_tones(series: Sequence[Series], omega: FloatArray, beside: FloatArray) -
 
 
 def _rows(t_s: FloatArray, omega: FloatArray) -> FloatArray:
-    """1, then cos and -sin of each line; shape (1 + 2 L, n)."""
+    """Return 1, then cos and -sin of each line; shape (1 + 2 L, n)."""
     phase: FloatArray = omega[:, None] * t_s[None, :]
     rows = np.ones((1 + 2 * omega.size, t_s.size))
     rows[1::2], rows[2::2] = np.cos(phase), -np.sin(phase)
@@ -323,7 +323,7 @@ def _rows(t_s: FloatArray, omega: FloatArray) -> FloatArray:
 def _level(
     t_s: FloatArray, residual: FloatArray, omega: float, rows: FloatArray, inverse: FloatArray
 ) -> tuple[FloatArray, int]:
-    """Variance per sample of white noise with the residual's power beside a tone, and its bins."""
+    """Return the noise variance per sample beside a tone, and the number of bins."""
     span = float(t_s[-1] - t_s[0]) * t_s.size / max(t_s.size - 1, 1)
     power: list[FloatArray] = []
     for side in (1, -1):
