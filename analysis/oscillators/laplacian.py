@@ -7,8 +7,8 @@ relax as
     d phi' = -eps (I - P) d phi,
 
 for small lags (:mod:`.predictions` has the complete equation). Rows of P sum to 1, by time shift,
-so all phases together are a mode of rate 0, whatever the noise: it is left out exactly, by looking at
-deviations from the mean only, B'(I - P) B with columns of B orthonormal and orthogonal to 1.
+so all phases together are a mode of rate 0, whatever the noise: it is left out exactly, by looking
+at deviations from the mean only, B'(I - P) B with columns of B orthonormal and orthogonal to 1.
 Entries of P may be negative: other rates may be near zero, or below it, and then the body leaves
 that pattern alone, or drives it.
 
