@@ -151,9 +151,9 @@ def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
     here = spectrum(P)
     draws = [spectrum(one) for one in drawn]
     dealt = np.array([_dealt(here.rates, one.rates) for one in draws])
-    strong = np.array([one.strong for one in draws], dtype=np.float64)
+    strong, counts = float(here.strong), [float(one.strong) for one in draws]
     tail = (1.0 - CONFIDENCE) / 2
-    low, high = np.quantile(strong, (tail, 1.0 - tail)).tolist()
+    low, high = np.quantile(counts, (tail, 1.0 - tail)).tolist()
     fastest = growth(P)
     growing = _mirrored(np.array(fastest), np.array([growth(one) for one in drawn]))
     real = _mirrored(here.rates.real, dealt.real)
@@ -162,7 +162,7 @@ def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
         imag=_mirrored(here.rates.imag, dealt.imag),
         # Of the slowest mode itself: the lowest of several close ones is biased in every draw.
         gap=Estimate(here.gap, (float(real[0, 0]), float(real[0, 1]))),
-        strong=Estimate(float(here.strong), (min(here.strong, low), max(here.strong, high))),
+        strong=Estimate(strong, (min(strong, low), max(strong, high))),
         growth=Estimate(fastest, (float(growing[0]), float(growing[1]))),
     )
 
