@@ -246,7 +246,8 @@ def answer_of(
     )
     whole = " (partial comparison)" if partial else ""
     joints = len({one.place for one in decided.differences if one.place != BODY})
-    alike = f"gain and lag of {_all(joints)} are equivalent within {margins}"
+    which = "the joint" if joints == 1 else f"all {joints} joints"
+    alike = f"gain and lag of {which} are equivalent within {margins}"
     if not beyond_doubt:
         if same:
             return "same", f"no difference found; {alike}{whole}"
@@ -349,10 +350,6 @@ def _not_shown(decided: Decided) -> str:
         f"up to {_short(100 * worst['gain'])} % in gain and {_short(math.degrees(worst['lag']))}° "
         "in lag could hide in the noise; record more"
     )
-
-
-def _all(joints: int) -> str:
-    return "the joint" if joints == 1 else f"all {joints} joints"
 
 
 def _short(value: float) -> str:

@@ -200,10 +200,6 @@ def _pooled(pooled: PooledResponse) -> PooledRuns:
     return PooledRuns(pooled.runs, tuple(joints))
 
 
-def _runs(count: int) -> str:
-    return f"{count} independent run{'' if count == 1 else 's'}"
-
-
 def _both_ways(
     runs: Sequence[GaitRun],
     ways: Sequence[Role],
@@ -216,9 +212,11 @@ def _both_ways(
     if not any(counts.values()):
         warn("no run with a travelling wave: the reversal test can't be made")
         return False
+    forward = counts[Role.FORWARD]
     if min(counts.values()) < MIN_RUNS:
         warn(
-            f"boundary or module: not separable from {_runs(counts[Role.FORWARD])} with "
+            f"boundary or module: not separable from {forward} independent "
+            f"run{'' if forward == 1 else 's'} with "
             f"the wave from head to tail and {counts[Role.REVERSE]} from tail to head; record at "
             "least 6 of each"
         )

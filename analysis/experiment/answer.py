@@ -200,11 +200,10 @@ def sweep_checks(coupling: LinearCoupling) -> Iterable[str]:
         if coupling.drift_per_cycle == 0
         else f"NOT settled, drift {100 * coupling.drift_per_cycle:.2g} % per cycle"
     )
-    beside = (
-        "energy beside the tones unknown"
-        if coupling.sideband_energy.value is None
-        else f"energy beside the tones {_little(coupling.sideband_energy.value)} of theirs"
-    )
+    energy, beside = coupling.sideband_energy.value, "energy beside the tones unknown"
+    if energy is not None:
+        share = "less than 0.001 %" if energy < 1e-5 else f"{100 * energy:.2g} %"
+        beside = f"energy beside the tones {share} of theirs"
     yield f"Checks: {settled}; {beside}. Valid {coupling.validity}."
 
 
@@ -220,11 +219,6 @@ def sweep_method(coupling: LinearCoupling) -> str:
         "intervals one by one at 95 % from the noise beside each tone (Student's t), those of "
         "indices at least 95 %; all matrices with --json."
     )
-
-
-def _little(share: float) -> str:
-    """Format a share that may be close to zero."""
-    return "less than 0.001 %" if share < 1e-5 else f"{100 * share:.2g} %"
 
 
 def _tone(tone: ToneCoupling) -> str:

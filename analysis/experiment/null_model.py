@@ -108,7 +108,7 @@ class _System:
         return np.concatenate([self.shared, own.reshape(*own.shape[:-2], -1)], axis=-1)
 
 
-def null_test(response: Response, joints: IntArray, model: NullModel, seed: int = 1) -> NullTest:
+def null_test(response: Response, joints: IntArray, model: NullModel) -> NullTest:
     """Test identical modules against the model, and name those that deviate.
 
     Args:
@@ -126,13 +126,12 @@ def null_test(response: Response, joints: IntArray, model: NullModel, seed: int 
     most = min(variance.size // kinds.shape[-1] - 1, len(kinds))
     named: tuple[int, ...] = ()
     p = np.ones(len(kinds))
-    whole = noise_whole = None
+    whole: tuple[FloatArray, FloatArray] | None = None
     while True:
         x, system = _linear(np.log(response.ratio), variance, joints, model, named)
-        drawn = _draws(system, np.tile(response.dof, 2), np.random.default_rng(seed))
-        left, noise_left = (_left(one, named) for one in (system, drawn))
-        if whole is None or noise_whole is None:
-            whole, noise_whole = left, noise_left
+        drawn = _draws(system, np.tile(response.dof, 2), np.random.default_rng(1))
+        left, noise_left = _left(system, named), _left(drawn, named)
+        whole = whole or (left, noise_left)
         gain, deviation, error = _one_by_one(system, named)
         noise_gain, noise_deviation, noise_error = _one_by_one(drawn, named)
         others = [j for j in range(len(kinds)) if j not in named]
@@ -148,8 +147,8 @@ def null_test(response: Response, joints: IntArray, model: NullModel, seed: int 
     return NullTest(
         x=frozen(x),
         x_error=frozen(np.sqrt(np.diag(information)[: x.size])),
-        fit=float(whole),
-        fit_p=float(_share(noise_whole, whole)),
+        fit=float(whole[0]),
+        fit_p=float(_share(whole[1], whole[0])),
         gain=frozen(gain),
         p=frozen(p),
         deviation=frozen(deviation),
@@ -306,8 +305,8 @@ def analyse_with_null(
     silent = len(model.joints) - len(joints)
     if silent:
         warnings.append(f"{silent} joints without gain and lag are not held to the null model")
-    known = {one.name: getattr(analysis, one.name) for one in dataclasses.fields(Analysis)}
-    known |= {"warnings": tuple(warnings), "provenance": _provenance(analysis, file)}
+    known = vars(analysis) | {"warnings": tuple(warnings)}
+    known["provenance"] = _provenance(analysis, file)
     return ModelledAnalysis(**known, null_model=result)
 
 

@@ -14,8 +14,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import helmert
 
-from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray, frozen
+from undulog.capture.common.arrays import ComplexArray, FloatArray, frozen
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Robot
 
@@ -226,10 +227,6 @@ def _scatter(values: FloatArray, variance: FloatArray) -> Scatter:
     runs = len(values)
     centred = values - values.mean(axis=0)
     # Helmert's contrasts between the runs are orthonormal, so the columns are independent.
-    size: IntArray = np.arange(1, runs, dtype=np.int64)
-    lower = np.tril(np.ones((runs - 1, runs)))
-    lower[np.arange(runs - 1), size] = -size
-    basis = lower / np.sqrt(size * (size + 1.0))[:, None]
-    columns = (basis @ centred).T / runs**0.5
+    columns = (helmert(runs) @ centred).T / runs**0.5
     raised: FloatArray = np.maximum(variance - np.mean(columns**2, axis=1), 0.0)
     return Scatter(columns, raised, np.zeros_like(raised))

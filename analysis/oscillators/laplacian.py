@@ -132,11 +132,6 @@ def growth(P: FloatArray) -> float:
     return -float(np.linalg.eigvalsh((rates + rates.T) / 2)[0])
 
 
-def intervals(P: Noisy, seed: int = 21) -> SpectrumIntervals:
-    """Return intervals of the modes from the errors of P."""
-    return intervals_of(P.value, P.value + noise_draws(P, seed))
-
-
 def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
     """Return intervals of the modes of I - P from draws of P.
 
@@ -203,10 +198,10 @@ def smallest_singular(P: FloatArray, real: FloatArray, imag: FloatArray) -> Floa
     return values[..., -1].astype(np.float64)
 
 
-def pseudospectrum(P: Noisy, seed: int = 21) -> Levels:
+def pseudospectrum(P: Noisy) -> Levels:
     """Return the levels around all eigenvalues, and the level of the noise of P."""
     here = of_deviations(P.value)
-    error = of_deviations(P.value + noise_draws(P, seed)) - here
+    error = of_deviations(P.value + noise_draws(P, 21)) - here
     noise = np.linalg.norm(error, ord=2, axis=(1, 2))
     reach = float(np.quantile(noise, CONFIDENCE))
     values = np.linalg.eigvals(here)

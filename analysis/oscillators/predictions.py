@@ -51,7 +51,7 @@ from ..results.oscillators import (
     Mode,
     RelativeCoupling,
 )
-from .laplacian import STRONG, Spectrum, SpectrumIntervals, intervals, pseudospectrum, spectrum
+from .laplacian import STRONG, Spectrum, SpectrumIntervals, intervals_of, pseudospectrum, spectrum
 
 
 def felt_response(ratio: ComplexArray, omega: float, age_s: float) -> ComplexArray:
@@ -204,7 +204,7 @@ def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
     if coupling.scatter is not None:
         correlation = np.array(coupling.scatter.correlation)[:m, :m]
     P = measured(coupling.P, correlation)
-    found, ends = spectrum(P.value), intervals(P)
+    found, ends = spectrum(P.value), intervals_of(P.value, P.value + noise_draws(P, 21))
     like = spectrum(homogeneous(P.value))
     explicit = _explicit(P)
     return BodyOscillators(

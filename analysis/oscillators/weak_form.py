@@ -52,7 +52,6 @@ class PhaseLog:
 
     Attributes:
         names: Of its n joints, head to tail.
-        t_ns: Times [Unix ns], shape (k,).
         phases: Without wrap-around [rad], shape (k, n).
         period_s: From sample to sample [s].
         whole: Whether each step is one period long, at the plane's usual rate, shape (k - 1,).
@@ -61,7 +60,6 @@ class PhaseLog:
 
     plane: str
     names: tuple[str, ...]
-    t_ns: IntArray
     phases: FloatArray
     period_s: float
     whole: BoolArray
@@ -121,7 +119,7 @@ def _log(
     inputs = None
     if angles is not None and set(names) <= set(angles.names):
         inputs = _inputs(gait, plane, names, angles, (t_ns, phases, known, period_s))
-    return PhaseLog(plane, names, t_ns, phases, period_s, whole, inputs)
+    return PhaseLog(plane, names, phases, period_s, whole, inputs)
 
 
 def _steady(gait: JointSignals, plane: str, known: BoolArray) -> BoolArray:

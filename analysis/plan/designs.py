@@ -17,6 +17,7 @@ import time
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +29,6 @@ from undulog.capture.common.files import part_file
 
 from ..session.runs import HEADING
 from .gait_base import BaseGait
-
-KICK = 0.05
-"""Of phase [rad] and of log amplitude."""
-
-BASE_RUNS = 6
-"""Of the gait as it is: how much they differ is how much runs scatter."""
 
 HELD_OUT = (0.05, 0.1, 0.15)
 """Largest random phase of each held-out pattern [rad]."""
@@ -82,11 +77,10 @@ class PlannedRun:
 def phase_kicks(
     names: tuple[str, ...],
     amplitude: ComplexArray,
-    repeats: int = 1,
-    seed: int = 1,
+    repeats: int,
     *,
-    kick: float = KICK,
-    base_runs: int = BASE_RUNS,
+    kick: float,
+    base_runs: int,
 ) -> tuple[PlannedRun, ...]:
     """Plan runs of the gait, four kicks of each joint, and held-out patterns.
 
@@ -94,7 +88,6 @@ def phase_kicks(
         names: Of the m driven joints.
         amplitude: Of the gait, shape (m,).
         repeats: How often all of it is run.
-        seed: Of the held-out patterns and of the order.
         kick: Of phase [rad] and of log amplitude.
         base_runs: Runs without a kick in all, at least one a repeat.
 
@@ -102,19 +95,17 @@ def phase_kicks(
         4 m + 3 runs and those without a kick a repeat, in random order, so that warming up looks
         like no kick but like scatter.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     runs: list[PlannedRun] = []
+    kinds = ("phase", kick * 1j), ("amplitude", kick)
+    signs = (1, "up"), (-1, "down")
     for _ in range(repeats):
         once = [PlannedRun("base", amplitude, {"kind": "base"})] * math.ceil(base_runs / repeats)
-        for joint, name in enumerate(names):
-            for kind, step in (("phase", kick * 1j), ("amplitude", kick)):
-                for sign, word in ((1, "up"), (-1, "down")):
-                    off = np.zeros(len(names), dtype=np.complex128)
-                    off[joint] = sign * step
-                    facts = {"kind": kind, "joint": name, "sign": f"{sign:+d}"}
-                    label = f"{name}-{kind}-{word}"
-                    runs_amplitude = (amplitude * np.exp(off)).astype(np.complex128)
-                    once.append(PlannedRun(label, runs_amplitude, facts))
+        for (joint, name), (kind, step), (sign, word) in product(enumerate(names), kinds, signs):
+            kicked = amplitude.copy()
+            kicked[joint] *= np.exp(sign * step)
+            facts = {"kind": kind, "joint": name, "sign": f"{sign:+d}"}
+            once.append(PlannedRun(f"{name}-{kind}-{word}", kicked, facts))
         for size in HELD_OUT:
             turned = amplitude * np.exp(1j * random.uniform(-size, size, len(names)))
             once.append(PlannedRun("held-out", turned.astype(np.complex128), {"kind": "held-out"}))
@@ -147,18 +138,17 @@ def reversal(amplitude: ComplexArray, each: int = 6) -> tuple[PlannedRun, ...]:
     return tuple(runs)
 
 
-def lag_sweep(m: int, amplitude: float, repeats: int = 1, seed: int = 1) -> tuple[PlannedRun, ...]:
+def lag_sweep(m: int, amplitude: float, repeats: int) -> tuple[PlannedRun, ...]:
     """Plan as many gaits as there are joints, of the lags 2 pi k / m.
 
     Args:
         amplitude: Of every command [rad].
         repeats: How often all of it is run.
-        seed: Of the order, random so that warming up looks like no lag.
 
     Returns:
-        m runs a repeat.
+        m runs a repeat, in random order so that warming up looks like no lag.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     order = [k for _ in range(repeats) for k in random.permutation(m).tolist()]
     return tuple(
         PlannedRun(
@@ -170,9 +160,7 @@ def lag_sweep(m: int, amplitude: float, repeats: int = 1, seed: int = 1) -> tupl
     )
 
 
-def multisine(
-    m: int, amplitude: float, omega: FloatArray, repeats: int = 1, seed: int = 1
-) -> tuple[PlannedRun, ...]:
+def multisine(m: int, amplitude: float, omega: FloatArray, repeats: int) -> tuple[PlannedRun, ...]:
     """Plan m runs of all joints at all tones, with the phases of a DFT matrix over the runs.
 
     Args:
@@ -181,12 +169,11 @@ def multisine(
             linear range.
         omega: Angular frequencies of the tones, the gait's first [rad/s], shape (L,).
         repeats: How often all of it is run.
-        seed: Of the tones' own phases and of the order.
 
     Returns:
-        m runs a repeat.
+        m runs a repeat, in random order.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     phase = np.exp(1j * random.uniform(-np.pi, np.pi, omega.size))
     strength = phase * (omega[0] / omega) ** 2
     runs: list[PlannedRun] = []

@@ -40,7 +40,6 @@ from .local import (
     local_matrices,
     lti_reading,
     nonlinearity,
-    response_matrices,
 )
 from .runs import MOST_KICK, Kick, KickExperiment, Kind, missing_kicks
 from .scatter import RunErrors, sides
@@ -213,7 +212,8 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
     others = np.log(experiment.ratio[list(experiment.runs.base)] / first)
     base = (first * np.exp(others.mean(axis=0))).astype(np.complex128)
     deviation = experiment.runs.deviation
-    change = response_matrices(deviation, experiment.ratio, base)
+    # ln a = ln c + ln H, and both of a run's phases are counted from the same instant.
+    change = deviation + np.log(experiment.ratio / base)
     each = [kicks.get(k) for k in used]
     answers = ResponseMatrices(
         change, experiment.log_gain_variance, experiment.lag_variance, experiment.dof

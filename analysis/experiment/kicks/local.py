@@ -52,7 +52,7 @@ class ResponseMatrices:
     """What r runs answered.
 
     Attributes:
-        log: Change of ln|a| + j psi against the base, shape (r, m).
+        log: Change of ln|a| + j psi against the base, whenever each run started, shape (r, m).
         log_gain_variance: Of its real part, from the noise within each run, shape (r, m).
         phase_variance: Of its imaginary part [rad^2], shape (r, m).
         dof: Degrees of freedom of both, shape (r, m).
@@ -118,24 +118,6 @@ class RowSums:
     value: FloatArray
     error: FloatArray
     dof: FloatArray
-
-
-def response_matrices(
-    deviation: ComplexArray, ratio: ComplexArray, base: ComplexArray
-) -> ComplexArray:
-    """Return the change of the responses against the base, whenever each run started.
-
-    ln a = ln c + ln H, and both of a run's phases are counted from the same instant.
-
-    Args:
-        deviation: Of the commands, d ln|c| + j d psi_c, shape (..., m).
-        ratio: H = a/c of the same runs, shape (..., m).
-        base: H of the base gait, shape (m,).
-
-    Returns:
-        d ln|a| + j d psi, shape (..., m).
-    """
-    return deviation + np.log(ratio / base)
 
 
 def central_differences(
@@ -205,7 +187,6 @@ def nonlinearity(
     R: MeasuredDerivatives,
     G: MeasuredDerivatives,
     S: MeasuredDerivatives,
-    seed: int = 1,
     *,
     correlation: FloatArray | None = None,
 ) -> Estimate:
@@ -224,7 +205,7 @@ def nonlinearity(
         :func:`.analysis.estimators.intervals.norm_ratio`.
     """
     m = len(P.value)
-    noise = noise_draws(stacked(((P, S), (R, G)), correlation), seed)
+    noise = noise_draws(stacked(((P, S), (R, G)), correlation), 1)
     of_p, of_s, of_r, of_g = (
         noise[:, rows, columns]
         for rows in (slice(m), slice(m, None))
@@ -269,7 +250,6 @@ def lti_reading(
     R: MeasuredDerivatives,
     response: ComplexArray,
     command: ComplexArray,
-    seed: int = 11,
     *,
     correlation: FloatArray | None = None,
 ) -> Lti:
@@ -291,7 +271,7 @@ def lti_reading(
     shape = UNKNOWN_SHAPE
     if condition < SINGULAR:
         X: ComplexArray = np.linalg.inv(H).astype(np.complex128)
-        draws = noise_draws(stacked(((P,), (R,)), correlation), seed)
+        draws = noise_draws(stacked(((P,), (R,)), correlation), 11)
         noise = scale * (draws[:, : len(H)] - 1j * draws[:, len(H) :])
         error: ComplexArray = np.linalg.inv(H + noise).astype(np.complex128) - X
         shape = reciprocity(X, error)

@@ -203,20 +203,14 @@ class Shares:
         noise_variance: What noise adds to V_total.
         module_share: V_module / (V_module + V_boundary) with interval; empty where noise explains
             all of the spread.
+        boundary_share: The rest, with interval.
     """
 
     module_variance: Estimate
     boundary_variance: Estimate
     noise_variance: float
     module_share: Estimate
-
-    @property
-    def boundary_share(self) -> Estimate:
-        """The rest, with interval."""
-        value, ci95 = self.module_share.value, self.module_share.ci95
-        if value is None or ci95 is None:
-            return Estimate()
-        return Estimate(1 - value, (1 - ci95[1], 1 - ci95[0]))
+    boundary_share: Estimate
 
 
 def variance_shares(forward: ComplexArray, reverse: ComplexArray) -> Shares:
@@ -238,16 +232,19 @@ def variance_shares(forward: ComplexArray, reverse: ComplexArray) -> Shares:
     drawn = np.stack([_resampled(one, random) for one in (forward, mirrored)])
     modules, boundaries = _variances(drawn, 2 * noise)
     whole, wholes = module + boundary, modules + boundaries
-    share = Estimate()
+    share = rest = Estimate()
     if whole > 0:
-        some = wholes > 0
-        parts = np.divide(modules, wholes, out=np.zeros_like(modules), where=some)[some]
-        share = Estimate(float(module / whole), _percentiles(parts))
+        value, some = float(module / whole), wholes > 0
+        share = Estimate(value)
+        if some.any():
+            low, high = _percentiles(modules[some] / wholes[some])
+            share, rest = Estimate(value, (low, high)), Estimate(1 - value, (1 - high, 1 - low))
     return Shares(
         module_variance=Estimate(float(module), _percentiles(modules)),
         boundary_variance=Estimate(float(boundary), _percentiles(boundaries)),
         noise_variance=float(noise.mean()),
         module_share=share,
+        boundary_share=rest,
     )
 
 
@@ -278,9 +275,7 @@ def _resampled(runs: ComplexArray, random: np.random.Generator) -> ComplexArray:
     return mean + (r / (r - 1)) ** 0.5 * (weights @ (runs - mean))
 
 
-def _percentiles(values: FloatArray) -> Interval | None:
-    if not values.size:
-        return None
+def _percentiles(values: FloatArray) -> Interval:
     tail = 50 * (1 - CONFIDENCE)
     low, high = np.percentile(values, [tail, 100 - tail])
     return float(low), float(high)

@@ -77,20 +77,7 @@ class MeasuredMatrix:
         return self.error * stdtrit(self.dof, 0.5 + CONFIDENCE / 2)
 
 
-@dataclass(frozen=True)
-class ServoSide:
-    """What m linear servos do: T = D_r C - D_q Y.
-
-    Attributes:
-        D_r: Torque per command [N m/rad], shape (m,).
-        D_q: Torque against the joint's angle [N m/rad], shape (m,).
-    """
-
-    D_r: ComplexArray
-    D_q: ComplexArray
-
-
-def transfer(command: ComplexArray, response: Phasors, seed: int = 21) -> MeasuredMatrix:
+def transfer(command: ComplexArray, response: Phasors) -> MeasuredMatrix:
     """Estimate H = Y C^+, the commands taken as exact.
 
     Args:
@@ -108,11 +95,11 @@ def transfer(command: ComplexArray, response: Phasors, seed: int = 21) -> Measur
         np.sqrt(response.variance @ power),
         _dof(response.variance, response.dof, power),
         float(np.linalg.cond(command)),
-        response.draws(seed) @ weights,
+        response.draws(21) @ weights,
     )
 
 
-def impedance(response: Phasors, torque: Phasors, seed: int = 22) -> MeasuredMatrix:
+def impedance(response: Phasors, torque: Phasors) -> MeasuredMatrix:
     """Estimate Z = T Y^+.
 
     Args:
@@ -136,7 +123,7 @@ def impedance(response: Phasors, torque: Phasors, seed: int = 22) -> MeasuredMat
         np.sqrt(variance @ power),
         _dof(variance, dof, power),
         float(np.linalg.cond(response.value)),
-        (torque.draws(seed) - Z @ response.draws(seed + 1)) @ weights,
+        (torque.draws(22) - Z @ response.draws(23)) @ weights,
     )
 
 
@@ -150,11 +137,15 @@ def inverse(H: MeasuredMatrix) -> ComplexArray:
     return (np.linalg.inv(H.value + H.draws) - X).astype(np.complex128)
 
 
-def impedance_behind_servos(H: MeasuredMatrix, servos: ServoSide) -> MeasuredMatrix:
+def impedance_behind_servos(
+    H: MeasuredMatrix, D_r: ComplexArray, D_q: ComplexArray
+) -> MeasuredMatrix:
     """Estimate Z = D_r H^-1 - D_q.
 
     Args:
         H: Of the commands as the servos hold them; regular.
+        D_r: Torque of the servos per command [N m/rad], shape (m,).
+        D_q: Torque against the joint's angle [N m/rad], shape (m,).
 
     Returns:
         Z [N m/rad]; to first order var X_ij = sum_kl abs(X_ik)^2 var H_kl abs(X_lj)^2, columns of H
@@ -162,18 +153,18 @@ def impedance_behind_servos(H: MeasuredMatrix, servos: ServoSide) -> MeasuredMat
     """
     X: ComplexArray = np.linalg.inv(H.value).astype(np.complex128)
     size = np.abs(X) ** 2
-    scale = np.abs(servos.D_r)[:, None]
+    scale = np.abs(D_r)[:, None]
     error = scale * np.sqrt(size @ H.error**2 @ size)
     return MeasuredMatrix(
-        (servos.D_r[:, None] * X - np.diag(servos.D_q)).astype(np.complex128),
+        (D_r[:, None] * X - np.diag(D_q)).astype(np.complex128),
         error,
         np.full_like(error, float(H.dof.min())),
         float(np.linalg.cond(H.value)),
-        servos.D_r[:, None] * inverse(H),
+        D_r[:, None] * inverse(H),
     )
 
 
-def servo_side(servos: Sequence[Servo], omega: float) -> ServoSide:
+def servo_side(servos: Sequence[Servo], omega: float) -> tuple[ComplexArray, ComplexArray]:
     """Return D_r and D_q of linear servos at one frequency.
 
     Args:
@@ -189,7 +180,7 @@ def servo_side(servos: Sequence[Servo], omega: float) -> ServoSide:
         G = one.gear_stiffness + 1j * omega * one.gear_damping
         sides.append((G * kappa / (M + G), G * (kappa + M) / (M + G)))
     table = np.array(sides, dtype=np.complex128).reshape(-1, 2)
-    return ServoSide(table[:, 0], table[:, 1])
+    return table[:, 0], table[:, 1]
 
 
 def _dof(variance: FloatArray, dof: FloatArray, power: FloatArray) -> FloatArray:
@@ -283,7 +274,7 @@ def _tone(data: SweepData, k: int, hold_s: float, servos: Sequence[Servo] | None
     condition = float(np.linalg.cond(H.value))
     regular = condition < SINGULAR
     side = None if servos is None else servo_side(servos, omega)
-    by_servo = impedance_behind_servos(H, side) if regular and side is not None else None
+    by_servo = impedance_behind_servos(H, *side) if regular and side is not None else None
     by_torque = None if data.torque is None else impedance(data.response[k], data.torque[k])
     Z = by_torque or by_servo
     shape = UNKNOWN_SHAPE

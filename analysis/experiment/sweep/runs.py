@@ -221,17 +221,6 @@ class SweepData:
     run: Run | None
 
 
-@dataclass(frozen=True)
-class _Run:
-    omega: FloatArray
-    command: ComplexArray
-    response: ToneFit
-    torque: ToneFit | None
-    beside: FloatArray
-    period_s: float
-    drift: float
-
-
 def sweep_data(
     sweep: Sweep, commanded: Sequence[CommandTones | None], paths: Sequence[Path], options: Options
 ) -> SweepData:
@@ -245,56 +234,52 @@ def sweep_data(
     Raises:
         DataError: If a driven joint's response is missing in a run, or too short.
     """
-    runs: list[_Run] = []
     twins: list[Run | None] = []
     robot: Robot | None = None
+    omega: list[FloatArray] = []
+    commands: list[ComplexArray] = []
+    responses: list[ToneFit] = []
+    torques: list[ToneFit] = []
+    periods_s: list[float] = []
+    drifts: list[float] = []
+    lines: FloatArray = np.zeros(0)
     for k in sweep.index:
         tones = commanded[k]
         assert tones is not None  # noqa: S101 - a sweep is made of sessions with tones
         with Session.open(paths[k]) as session:
             robot = robot or session.robot_as_run
             twins.append(session.run)
-            signals = read_signals(session, options)
-        lost = [name for name in sweep.names if name not in signals[1]]
+            command, position, effort = read_signals(session, options)
+        lost = [name for name in sweep.names if name not in position]
         if lost:
             raise DataError(f"{paths[k]}: no responses of {', '.join(lost)}")
-        runs.append(_fit(sweep, tones.omega, signals, len(sweep.index)))
+        asked, moved = ([kind[name] for name in sweep.names] for kind in (command, position))
+        own = _beside_lines(sweep, tones.omega, moved)
+        lines = own if not omega else lines
+        omega.append(tones.omega)
+        commands.append(fit_tones(asked, tones.omega, np.zeros(0)).amplitude)
+        responses.append(fit_tones(moved, tones.omega, own))
+        if all(name in effort for name in sweep.names):
+            turning = [effort[name] for name in sweep.names]
+            torques.append(fit_tones(turning, tones.omega, own))
+        periods_s.append(max(one.period_s for one in asked))
+        drifts.append(_drift(moved, tones.omega, responses[-1], len(sweep.index)))
     touched = [None if one is None else one.contact for one in twins]
-    tones_at = list(sweep.tones)
-    whole = all(run.torque is not None for run in runs)
-    torques = [run.torque for run in runs if run.torque is not None]
-    responses = [run.response for run in runs]
-    lines, count = runs[0].beside, runs[0].omega.size
-    free = range(count, count + lines.size)
+    at = list(sweep.tones)
+    whole = len(torques) == len(responses)
+    free = range(omega[0].size, omega[0].size + lines.size)
     return SweepData(
-        omega=np.mean([run.omega[tones_at] for run in runs], axis=0),
-        command=np.stack([run.command[:, tones_at] for run in runs], axis=-1).swapaxes(0, 1),
-        response=_phasors(responses, tones_at),
-        torque=_phasors(torques, tones_at) if whole else None,
+        omega=np.mean([one[at] for one in omega], axis=0),
+        command=np.stack([one[:, at] for one in commands], axis=-1).swapaxes(0, 1),
+        response=_phasors(responses, at),
+        torque=_phasors(torques, at) if whole else None,
         beside=Beside(lines, _phasors(responses, free)) if lines.size else None,
         torque_beside=Beside(lines, _phasors(torques, free)) if lines.size and whole else None,
-        period_s=float(np.median([run.period_s for run in runs])),
+        period_s=float(np.median(periods_s)),
         contact=True if any(touched) else None if None in touched else False,
-        drift=max(run.drift for run in runs),
+        drift=max(drifts),
         robot=robot,
         run=twins[0],
-    )
-
-
-def _fit(sweep: Sweep, omega: FloatArray, signals: Signals, runs: int) -> _Run:
-    commands, positions, efforts = signals
-    command, position = ([kind[name] for name in sweep.names] for kind in (commands, positions))
-    lines = _beside_lines(sweep, omega, position)
-    effort = [efforts[name] for name in sweep.names if name in efforts]
-    responses = fit_tones(position, omega, lines)
-    return _Run(
-        omega=omega,
-        command=fit_tones(command, omega, np.zeros(0)).amplitude,
-        response=responses,
-        torque=fit_tones(effort, omega, lines) if len(effort) == len(sweep.names) else None,
-        beside=lines,
-        period_s=max(one.period_s for one in command),
-        drift=_drift(position, omega, responses, runs),
     )
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from itertools import product
 
 import kick_tables
 import numpy as np
@@ -25,33 +26,22 @@ def write_run(path, off, seed):
     return linear_chain.write_run(path, command, H @ command, seed, SIGMA)
 
 
-def deviations(*, amplitude=True, patterns=True):
-    found = {"run00": np.zeros(M, dtype=complex)}
-    for step in (0.05j, 0.05) if amplitude else (0.05j,):
-        for joint in range(M):
-            for sign in (1, -1):
-                off = np.zeros(M, dtype=complex)
-                off[joint] = sign * step
-                found[f"run{len(found):02d}"] = off
-    if patterns:
-        rng = np.random.default_rng(4)
-        for _ in range(2):
-            found[f"run{len(found):02d}"] = 1j * rng.uniform(-0.15, 0.15, M)
-    return found
+def deviations():
+    """The gait, each joint kicked four ways, and two patterns of all joints."""
+    kicks = [sign * step * unit for step in (0.05j, 0.05) for unit in np.eye(M) for sign in (1, -1)]
+    patterns = 1j * np.random.default_rng(4).uniform(-0.15, 0.15, (2, M))
+    return [np.zeros(M), *kicks, *patterns]
 
 
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory):
     folder = tmp_path_factory.mktemp("kicks")
-    return {
-        name: write_run(folder / f"{name}.mcap", off, seed)
-        for seed, (name, off) in enumerate(deviations().items())
-    }
+    return [write_run(folder / f"run{k:02d}.mcap", off, k) for k, off in enumerate(deviations())]
 
 
 @pytest.fixture(scope="module")
 def result(sessions):
-    return experiment(sessions.values())
+    return experiment(sessions)
 
 
 def test_the_matrices_are_those_planted(result):
@@ -148,27 +138,24 @@ def test_roles_warnings_and_text(result, sessions):
 
 
 def test_the_json_object(sessions, capsys):
-    assert undulog.run(["analyse", *map(str, sessions.values()), "--json"]) == 0
+    assert undulog.run(["analyse", *map(str, sessions), "--json"]) == 0
     coupling = json.loads(capsys.readouterr().out)["coupling"]
     assert coupling["identifiable"] is True
     assert coupling["record"] is None
     assert coupling["matrix"] == coupling["P"]["value"]
     assert coupling["condition_number"] == coupling["lti"]["condition_number"]
-    for name in "PRGS":
-        for field in ("value", "standard_error", "ci95_half"):
-            assert np.shape(coupling[name][field]) == (M, M)
+    for name, field in product("PRGS", ("value", "standard_error", "ci95_half")):
+        assert np.shape(coupling[name][field]) == (M, M)
 
 
 def test_the_order_of_the_files_does_not_matter(result, sessions):
-    paths = list(sessions.values())
-    again = experiment(paths[::-1]).coupling
+    again = experiment(sessions[::-1]).coupling
     np.testing.assert_allclose(again.P.value, result.coupling.P.value, atol=1e-9)
     assert again.checks_pass
 
 
 def test_phase_kicks_alone_give_p_and_r(sessions):
-    paths = list(sessions.values())[: 1 + 2 * M]
-    result = experiment(paths)
+    result = experiment(sessions[: 1 + 2 * M])
     coupling = result.coupling
     assert coupling.identifiable
     assert (coupling.G, coupling.S, coupling.nonlinearity.value) == (None, None, None)
@@ -178,8 +165,7 @@ def test_phase_kicks_alone_give_p_and_r(sessions):
 
 
 def test_one_sided_kicks_are_not_identifiable(sessions):
-    paths = list(sessions.values())
-    result = experiment([*paths[:4], *paths[5 : 1 + 2 * M]])
+    result = experiment([*sessions[:4], *sessions[5 : 1 + 2 * M]])
     coupling = result.coupling
     assert not coupling.identifiable
     assert coupling.matrix is None
@@ -190,7 +176,7 @@ def test_one_sided_kicks_are_not_identifiable(sessions):
 
 
 def test_runs_of_one_gait_stay_not_identifiable(sessions):
-    coupling = experiment(list(sessions.values())[:1]).coupling
+    coupling = experiment(sessions[:1]).coupling
     assert not coupling.identifiable
     assert not isinstance(coupling, LocalCoupling)
     assert "one gait gives 5 complex numbers for 25 unknown couplings" in coupling.why

@@ -11,7 +11,6 @@ from undulog.analysis.experiment.kicks.local import (
     central_differences,
     lti_reading,
     nonlinearity,
-    response_matrices,
     row_sums,
 )
 from undulog.analysis.experiment.kicks.runs import (
@@ -66,7 +65,7 @@ def run_all(system, command, kicks, turns=None):
         commands = commands * np.exp(1j * turns)[:, None]
         deviation = np.stack([deviation_of(one, command) for one in commands])
     ratio = np.stack([system(one) / one for one in commands])
-    return response_matrices(deviation, ratio, system(command) / command)
+    return deviation + np.log(ratio / (system(command) / command))
 
 
 def noisy(rng, log, sigma):

@@ -39,9 +39,9 @@ def impedance(omega):
 
 
 def response(omega):
-    side = servo_side([SERVO] * M, omega)
+    D_r, D_q = servo_side([SERVO] * M, omega)
     late = np.exp(-1j * omega * HOLD_S)
-    return np.linalg.solve(impedance(omega) + np.diag(side.D_q), np.diag(side.D_r)) * late
+    return np.linalg.solve(impedance(omega) + np.diag(D_q), np.diag(D_r)) * late
 
 
 def robot_of(tmp, text):
@@ -167,9 +167,8 @@ def test_the_text_and_the_object(result, lag_sweep, capsys):
 
 def test_without_torques_a_known_servo_is_taken_off(folder):
     (folder / "servo").mkdir()
-    robot = robot_of(folder, KNOWN)
-    coupling = experiment(sweep(folder / "servo", robot=robot, effort=False)).coupling
-    (tone,) = coupling.tones
+    paths = sweep(folder / "servo", robot=robot_of(folder, KNOWN), effort=False)
+    (tone,) = experiment(paths).coupling.tones
     assert tone.route is Route.SERVO
     close(tone.Z, impedance(2 * np.pi * F0))
     assert tone.servo_difference is None
