@@ -25,7 +25,7 @@ _OF_THE_RUN = frozenset(
 """Facts that name a run rather than describe how it was made."""
 
 _TEXTS = frozenset({"name", "description", "seed", "epoch_s", "robot"})
-"""Keys of an attached file that say nothing of what it does."""
+"""Keys of an attached file without an effect."""
 
 _FILES = ("robot.toml", "scenario.toml", "plan.toml", "calibration.toml")
 _ORDER = ("robot", *_FILES, "session")
@@ -106,7 +106,7 @@ def _text(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Alignment:
-    """What the sessions of both sides have in common.
+    """Common joints and gait of the sessions of both sides.
 
     Attributes:
         names: Joints that can be compared, head to tail.
@@ -120,7 +120,7 @@ class Alignment:
 
 
 def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False) -> Alignment:
-    """Find what can be compared.
+    """Find the joints that can be compared.
 
     Args:
         a: Runs of one side, at least one.

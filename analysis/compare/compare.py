@@ -1,4 +1,4 @@
-"""Two sessions in, or two groups of them: what differs, and what is the same."""
+"""Compare two sessions, or two groups of them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ..segments.examine import OFFSET_RAD
 from ..signals.stretch import Options
 from .alignment import Alignment, align, changes
 from .decisions import Margins, answer_of, decide, differ, estimates_of, family
-from .side import ComparedSession, Quantities, independent, phases_rad, see, turned
+from .side import ComparedSession, Quantities, phases_rad, see, turned
 
 
 def broken_joints(
@@ -74,13 +74,13 @@ def _first(several: Sequence[_Entry]) -> list[_Entry]:
 
 @dataclass(frozen=True)
 class Choices:
-    """What the user may choose in a comparison.
+    """Options of a comparison.
 
     Attributes:
         paired: Run i of B belongs to run i of A, e.g. recorded one after the other.
         any_gait: Compare although the gaits differ.
         margins: Differences that count as the same.
-        session: What is analysed of each session.
+        session: Options of the analysis of each session.
     """
 
     paired: bool = False
@@ -131,7 +131,7 @@ def compare_fitted(
     choices: Choices,
     warnings: Sequence[str] = (),
 ) -> Comparison:
-    """Compare what was taken from the sessions.
+    """Compare sessions that are measured.
 
     Args:
         warnings: Warnings of the sessions.
@@ -148,12 +148,8 @@ def compare_fitted(
     keys = family(a, b, aligned.names)
     # Lags near pi must not part company: all are taken within pi of the first session's.
     about = np.array([a[0].estimates[key][0] for key in keys])
-    stacks = [estimates_of(side, keys, about) for side in (a, b)]
-    if design == "sessions":
-        first, second = (Quantities(*stack[:, 0]) for stack in stacks)
-        found = independent(first, second)
-    else:
-        first, second, found = differ(stacks[0][0], stacks[1][0], paired_runs=design == "pairs")
+    estimates = [estimates_of(side, keys, about) for side in (a, b)]
+    first, second, found = differ(*estimates, design)
     decided = decide(keys, first, second, found, choices.margins)
     partial = _partial(aligned)
     _warn(a, b, design, every_warning.append)
@@ -223,12 +219,7 @@ def _waveforms(
         if not all(name in one.cycles for one in (*a, *b)):
             continue
         sides = [[_by_first(one, name, names) for one in side] for side in (a, b)]
-        if design == "sessions":
-            first, second = sides[0][0], sides[1][0]
-            difference = independent(first, second)
-        else:
-            stacks = [np.stack([one.value for one in side]) for side in sides]
-            first, second, difference = differ(*stacks, paired_runs=design == "pairs")
+        first, second, difference = differ(*sides, design)
         half = difference.error * [t_factor(dof) for dof in difference.dof.tolist()]
         worst = int(np.argmax(np.abs(difference.value)))
         found.append(

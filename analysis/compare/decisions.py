@@ -51,7 +51,7 @@ class Margins:
 
 @dataclass(frozen=True)
 class Decided:
-    """What was decided.
+    """Decisions on a family of differences.
 
     Attributes:
         differences: Beyond doubt first, by size, then the others by p.
@@ -81,14 +81,14 @@ def family(
 
 
 def differ(
-    a: FloatArray, b: FloatArray, *, paired_runs: bool
+    a: Sequence[Quantities], b: Sequence[Quantities], design: str
 ) -> tuple[Quantities, Quantities, Differences]:
-    """Return both sides and their difference, from runs.
+    """Return both sides and their difference.
 
     Args:
-        a: Values of side A, shape (r1, k).
-        b: Of side B, shape (r2, k).
-        paired_runs: Whether run i of B belongs to run i of A.
+        a: k quantities of each session of side A.
+        b: Of each session of side B.
+        design: ``sessions``, ``groups`` or ``pairs``; see :class:`Comparison`.
 
     Returns:
         Side A, side B, B minus A.
@@ -96,27 +96,27 @@ def differ(
     Raises:
         UsageError: If there are too few runs.
     """
-    first, second = from_runs(a), from_runs(b)
-    return first, second, paired(a, b) if paired_runs else independent(first, second)
+    if design == "sessions":
+        return a[0], b[0], independent(a[0], b[0])
+    runs = [np.stack([one.value for one in side]) for side in (a, b)]
+    first, second = (from_runs(one) for one in runs)
+    return first, second, paired(*runs) if design == "pairs" else independent(first, second)
 
 
 def estimates_of(
     side: Sequence[ComparedSession], keys: Sequence[Key], lags_about: FloatArray
-) -> FloatArray:
-    """Return estimates of a side as arrays.
+) -> list[Quantities]:
+    """Return the estimates of each session of a side.
 
     Args:
-        keys: What to take, k.
+        keys: Quantities to take, k.
         lags_about: Lags are taken within pi of these, shape (k,).
-
-    Returns:
-        Values, variances and degrees of freedom, shape (3, sessions, k).
     """
     stack = np.array([[one.estimates[key] for key in keys] for one in side]).transpose(2, 0, 1)
     lag = np.array([quantity == "lag" for quantity, _ in keys])
     about = lags_about[lag]
     stack[0][:, lag] = about + np.angle(np.exp(1j * (stack[0][:, lag] - about)))
-    return stack
+    return [Quantities(*stack[:, k]) for k in range(len(side))]
 
 
 def decide(
@@ -215,7 +215,7 @@ WORDS = {
     "speed": "speed",
     "cost_of_transport": "cost of transport",
 }
-"""What people call the quantities."""
+"""Names of the quantities in text."""
 
 _RESPONSE = ("gain", "lag")
 

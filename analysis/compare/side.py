@@ -1,4 +1,4 @@
-"""What a comparison takes from one session: estimates with variances, and mean cycles.
+"""Estimates with variances, and mean cycles, of one session of a comparison.
 
 The mean cycle of a joint by gait phase, the phase that the commands define.
 
@@ -244,10 +244,10 @@ class ComparedSession:
 
 
 def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
-    """Take from a session what a comparison needs.
+    """Measure the quantities of a session that are compared.
 
     Args:
-        warn: Told what the session lacks.
+        warn: Receives a sentence for each missing quantity.
 
     Raises:
         MissingChannelError: If the session has neither commands nor responses.

@@ -88,8 +88,7 @@ def _rows_that_fail(coupling: LocalCoupling) -> str:
     parts = (("P", 1, coupling.phase_rows), ("R", 0, coupling.gain_rows))
     off = {
         f"rows of {symbol} don't sum to {total}": max(
-            abs((row.total.value or 0.0) - row.expected) / max(row.standard_error, 1e-12)
-            for row in rows
+            _off(row) / max(row.standard_error, 1e-12) for row in rows
         )
         for symbol, total, rows in parts
     }
@@ -150,10 +149,14 @@ def _scatter(scatter: RunScatter) -> str:
     )
 
 
+def _off(row: RowCheck) -> float:
+    return abs((row.total.value or 0.0) - row.expected)
+
+
 def _worst(rows: tuple[RowCheck, ...]) -> str:
     """Return the largest deviation of a row's sum, with its standard error."""
-    worst = max(rows, key=lambda row: abs((row.total.value or 0.0) - row.expected))
-    off = abs((worst.total.value or 0.0) - worst.expected)
+    worst = max(rows, key=_off)
+    off = _off(worst)
     digits = 1 - math.floor(math.log10(max(off, worst.standard_error, 1e-6)))
     return f"{off:.{digits}f} ({worst.name}, standard error {worst.standard_error:.{digits}f})"
 

@@ -102,8 +102,9 @@ def phase_kicks(
     for _ in range(repeats):
         once = [PlannedRun("base", amplitude, {"kind": "base"})] * math.ceil(base_runs / repeats)
         for (joint, name), (kind, step), (sign, word) in product(enumerate(names), kinds, signs):
-            kicked = amplitude.copy()
-            kicked[joint] *= np.exp(sign * step)
+            off = np.zeros(len(names), dtype=np.complex128)
+            off[joint] = sign * step
+            kicked = (amplitude * np.exp(off)).astype(np.complex128)
             facts = {"kind": kind, "joint": name, "sign": f"{sign:+d}"}
             once.append(PlannedRun(f"{name}-{kind}-{word}", kicked, facts))
         for size in HELD_OUT:

@@ -131,9 +131,6 @@ class Artefact:
 def flags_by_joint(artefacts: Iterable[Artefact]) -> dict[str, list[str]]:
     """Return flags of each joint.
 
-    Args:
-        artefacts: E.g. those of a window.
-
     Returns:
         Joint name to flags, each once.
     """

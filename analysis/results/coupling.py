@@ -34,11 +34,7 @@ Rows = tuple[tuple[float, ...], ...]
 
 
 def rows_of(values: FloatArray) -> Rows:
-    """Convert a matrix to plain numbers.
-
-    Args:
-        values: Shape (m, n).
-    """
+    """Convert a matrix of shape (m, n) to plain numbers."""
     return tuple(tuple(float(x) for x in row) for row in values)
 
 

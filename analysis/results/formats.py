@@ -52,10 +52,6 @@ def number(value: float | None, decimals: int) -> str:
 def interval(ci95: Interval | None, decimals: int) -> str:
     """Format a 95 % interval in square brackets, or an empty string.
 
-    Args:
-        ci95: Low and high end, or None.
-        decimals: Digits after the point.
-
     Returns:
         For example ``[5.9, 6.5]``.
     """
@@ -239,9 +235,6 @@ def p_value(p: float | None) -> str:
 def p_value_text(p: float | None) -> str:
     """Format a p-value with its name.
 
-    Args:
-        p: 0 to 1, or None.
-
     Returns:
         For example ``p = 0.013`` or ``p < 0.001``.
     """
@@ -278,11 +271,7 @@ def short(text: str, most: int = 40) -> str:
 
 
 def filename(path: str) -> str:
-    """Return the last part of a path of any system.
-
-    Args:
-        path: As the user named it.
-    """
+    """Return the last part of a path of any system."""
     return plain(path.replace("\\", "/").rstrip("/").rpartition("/")[2] or path)
 
 

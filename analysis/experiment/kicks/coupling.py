@@ -179,10 +179,10 @@ def valid_to(predictions: Sequence[HeldOut]) -> float | None:
 
 
 def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
-    """Estimate the local matrices, check them, and say how far they hold.
+    """Estimate the local matrices, check them, and find how far they hold.
 
     Args:
-        warn: Takes one sentence for each thing that is missing or doubtful.
+        warn: Receives a sentence for each missing or doubtful value.
 
     Returns:
         A :class:`LocalCoupling`; or not identifiable, with the reason and what to record.

@@ -23,7 +23,7 @@ computed of X. Where the nonlinearity index isn't small, this is a reading and n
 
 P, R, G and S with errors that hold whether or not runs differ by more than their own noise.
 
-Rows of P must sum to 1 and rows of R to 0. That is checked against errors which know nothing of
+Rows of P must sum to 1 and rows of R to 0. That is checked against errors estimated without
 those sums; where it fails in spite of the scatter between runs, something else is wrong in every
 run (most often they had not settled), and the errors are widened until the sums agree (the scale
 factor of the Particle Data Group, Review of Particle Physics, Introduction, section 5.2.2).
@@ -49,7 +49,7 @@ from .scatter import RunErrors, run_errors, sides
 
 @dataclass(frozen=True)
 class ResponseMatrices:
-    """What r runs answered.
+    """Responses of r runs.
 
     Attributes:
         log: Change of ln|a| + j psi against the base, whenever each run started, shape (r, m).
@@ -328,7 +328,7 @@ ROW_TOLERANCE = 1e-2
 
 @dataclass(frozen=True)
 class LocalMatrices:
-    """What kicks around one gait say.
+    """Matrices of kicks around one gait.
 
     Attributes:
         P: d psi / d psi_c.
@@ -336,7 +336,7 @@ class LocalMatrices:
         G: d ln|a| / d ln|c|, or None.
         S: d psi / d ln|c|, or None.
         steady_errors: The same from combinations of runs that no second order of a kick enters.
-        phase_rows: Sums of rows of P, with errors that know nothing of these sums.
+        phase_rows: Sums of rows of P, with errors estimated without these sums.
         gain_rows: Of R.
         agree: Whether each sum of P, then of R, is 1 or 0 within its error, all together at 95 %,
             shape (2, m).

@@ -206,13 +206,12 @@ def sweep_coupling(
     options: Options,
     warn: Warn,
 ) -> Coupling:
-    """Estimate H and Z, and say by which route and how far they hold.
+    """Estimate H and Z, with the route of Z and their validity.
 
     Args:
-        sweep: Which of the sessions are its runs.
-        commanded: What each session commands.
+        commanded: Tones of each session.
         paths: The files of all sessions.
-        warn: Takes one sentence for each thing that is missing or doubtful.
+        warn: Receives a sentence for each missing or doubtful value.
 
     Returns:
         A :class:`LinearCoupling`; or not identifiable, with the reason and what to record.

@@ -44,7 +44,7 @@ _ORTHOGONAL = 0.1
 
 @dataclass(frozen=True)
 class CommandTones:
-    """What one session commands.
+    """Commands of one session.
 
     Attributes:
         names: Driven joints, head to tail, m.
@@ -133,14 +133,7 @@ def command_tones(
 
 
 def find_sweep(sessions: Sequence[CommandTones | None]) -> Sweep | None:
-    """Find the largest sweep among sessions.
-
-    Args:
-        sessions: What each commands.
-
-    Returns:
-        The sweep, or None.
-    """
+    """Find the largest sweep among the tones of sessions."""
     best: Sweep | None = None
     for model in sessions:
         # Of two joints, a wave and its reverse are a lag sweep, too: they stay a reversal.
@@ -227,8 +220,7 @@ def sweep_data(
     """Read the runs of a sweep and fit them.
 
     Args:
-        sweep: Which of the sessions they are.
-        commanded: What each session commands.
+        commanded: Tones of each session.
         paths: The files of all sessions.
 
     Raises:
@@ -253,17 +245,19 @@ def sweep_data(
         lost = [name for name in sweep.names if name not in position]
         if lost:
             raise DataError(f"{paths[k]}: no responses of {', '.join(lost)}")
-        asked, moved = ([kind[name] for name in sweep.names] for kind in (command, position))
-        own = _beside_lines(sweep, tones.omega, moved)
+        commanded_series, series = (
+            [kind[name] for name in sweep.names] for kind in (command, position)
+        )
+        own = _beside_lines(sweep, tones.omega, series)
         lines = own if not omega else lines
         omega.append(tones.omega)
-        commands.append(fit_tones(asked, tones.omega, np.zeros(0)).amplitude)
-        responses.append(fit_tones(moved, tones.omega, own))
+        commands.append(fit_tones(commanded_series, tones.omega, np.zeros(0)).amplitude)
+        responses.append(fit_tones(series, tones.omega, own))
         if all(name in effort for name in sweep.names):
-            turning = [effort[name] for name in sweep.names]
-            torques.append(fit_tones(turning, tones.omega, own))
-        periods_s.append(max(one.period_s for one in asked))
-        drifts.append(_drift(moved, tones.omega, responses[-1], len(sweep.index)))
+            efforts = [effort[name] for name in sweep.names]
+            torques.append(fit_tones(efforts, tones.omega, own))
+        periods_s.append(max(one.period_s for one in commanded_series))
+        drifts.append(_drift(series, tones.omega, responses[-1], len(sweep.index)))
     touched = [None if one is None else one.contact for one in twins]
     at = list(sweep.tones)
     whole = len(torques) == len(responses)
