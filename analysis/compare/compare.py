@@ -149,7 +149,7 @@ def compare_fitted(
     # Lags near pi must not part company: all are taken within pi of the first session's.
     about = np.array([a[0].estimates[key][0] for key in keys])
     estimates = [estimates_of(side, keys, about) for side in (a, b)]
-    first, second, found = differ(*estimates, design)
+    first, second, found = differ(estimates[0], estimates[1], design)
     decided = decide(keys, first, second, found, choices.margins)
     partial = _partial(aligned)
     _warn(a, b, design, every_warning.append)
@@ -219,7 +219,7 @@ def _waveforms(
         if not all(name in one.cycles for one in (*a, *b)):
             continue
         sides = [[_by_first(one, name, names) for one in side] for side in (a, b)]
-        first, second, difference = differ(*sides, design)
+        first, second, difference = differ(sides[0], sides[1], design)
         half = difference.error * [t_factor(dof) for dof in difference.dof.tolist()]
         worst = int(np.argmax(np.abs(difference.value)))
         found.append(

@@ -26,7 +26,7 @@ import hashlib
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -305,7 +305,7 @@ def analyse_with_null(
     silent = len(model.joints) - len(joints)
     if silent:
         warnings.append(f"{silent} joints without gain and lag are not held to the null model")
-    known = vars(analysis) | {"warnings": tuple(warnings)}
+    known: dict[str, Any] = {**vars(analysis), "warnings": tuple(warnings)}
     known["provenance"] = _provenance(analysis, file)
     return ModelledAnalysis(**known, null_model=result)
 
