@@ -74,45 +74,28 @@ def test_the_weak_servo_is_named(answered):
     assert result.reversal.boundary_share.value > result.reversal.module_share.value
 
 
-def planned(folder, plan, scenario):
-    """Sessions of commands of a plan around a recorded gait."""
-    (folder / "chain.toml").write_text(ROBOT)
-    like = folder / "like.mcap"
-    (folder / "like.toml").write_text(scenario)
-    assert undulog.run(["sim", "run", str(folder / "like.toml"), "-o", str(like)]) == 0
-    words = ["--like", str(like), "-o", str(folder / plan), "--settle", "4", "--measure", "4"]
-    assert undulog.run(["plan", plan, *words]) == 0
-    return sorted((folder / plan).glob("*.mcap"))
-
-
-def driven(folder, commands, scenario):
-    """Each of the sessions driven on a twin of its own."""
-    world = folder / "world.toml"
-    world.write_text(scenario)
-    folder = folder / "driven"
-    folder.mkdir(exist_ok=True)
-    paths = [str(folder / file.name) for file in commands]
-    for file, path in zip(commands, paths, strict=True):
-        on = ["--on", f"twin:{world}", "-o", path, "--force"]
-        assert undulog.run(["drive", str(file), *on]) == 0
-    return paths
-
-
-def analysed(capsys, *words):
-    capsys.readouterr()
-    assert undulog.run(["analyse", *words, "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
 def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, capsys):
     """From a recorded gait to the pair, by the commands, on a floor that falls by 1 degree."""
-    commands = planned(tmp_path, "reversal", wave())
+    (tmp_path / "chain.toml").write_text(ROBOT)
+    like, folder = tmp_path / "like.mcap", tmp_path / "plan"
+    (tmp_path / "like.toml").write_text(wave())
+    assert undulog.run(["sim", "run", str(tmp_path / "like.toml"), "-o", str(like)]) == 0
+    words = ["--like", str(like), "-o", str(folder), "--settle", "4", "--measure", "4"]
+    assert undulog.run(["plan", "reversal", *words]) == 0
     answers = {}
     for name, more in (("sound", {}), ("weak", WEAK)):
-        paths = driven(tmp_path, commands, wave(world={"slope": math.radians(1.0)}, **more))
-        answers[name, "balanced"] = analysed(capsys, *paths)
-        at_one_heading = [path for path in paths if path.endswith("-0.mcap")]
-        answers[name, "one heading"] = analysed(capsys, *at_one_heading)
+        world = tmp_path / f"{name}.toml"
+        world.write_text(wave(world={"slope": math.radians(1.0)}, **more))
+        driven = []
+        for commands in sorted(folder.glob("*.mcap")):
+            driven.append(str(tmp_path / f"{name}-{commands.name}"))
+            on = ["--on", f"twin:{world}", "-o", driven[-1]]
+            assert undulog.run(["drive", str(commands), *on]) == 0
+        at_one_heading = [path for path in driven if path.endswith("-0.mcap")]
+        for plan, paths in (("balanced", driven), ("one heading", at_one_heading)):
+            capsys.readouterr()
+            assert undulog.run(["analyse", *paths, "--json"]) == 0
+            answers[name, plan] = json.loads(capsys.readouterr().out)
     sound, weak = (answers[name, "balanced"] for name in ("sound", "weak"))
     for one in (sound, weak):
         reversal = one["reversal"]
@@ -137,9 +120,21 @@ def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, capsys):
 
 def test_kicks_in_contact_predict_what_was_held_out(tmp_path, capsys):
     """From a recorded gait to its coupling, by the commands: plan, drive, analyse."""
-    scenario = wave(noise=0.0005)
-    paths = driven(tmp_path, planned(tmp_path, "phase-kicks", scenario), scenario)
-    coupling = analysed(capsys, *paths, "--start", "4")["coupling"]
+    (tmp_path / "chain.toml").write_text(ROBOT)
+    scenario = tmp_path / "wave.toml"
+    scenario.write_text(wave(noise=0.0005))
+    like, folder = tmp_path / "like.mcap", tmp_path / "kicks"
+    assert undulog.run(["sim", "run", str(scenario), "-o", str(like)]) == 0
+    words = ["--like", str(like), "-o", str(folder), "--settle", "4", "--measure", "4"]
+    assert undulog.run(["plan", "phase-kicks", *words]) == 0
+    driven = []
+    for k, commands in enumerate(sorted(folder.glob("*.mcap"))):
+        driven.append(str(tmp_path / f"{k:02d}.mcap"))
+        on = ["--on", f"twin:{scenario}", "-o", driven[-1]]
+        assert undulog.run(["drive", str(commands), *on]) == 0
+    capsys.readouterr()
+    assert undulog.run(["analyse", *driven, "--start", "4", "--json"]) == 0
+    coupling = json.loads(capsys.readouterr().out)["coupling"]
     assert (coupling["base_runs"], coupling["kicked_runs"]) == (6, 16)
     # Time shift, whatever the ground does.
     for rows in ("phase_rows", "gain_rows"):
