@@ -19,7 +19,6 @@ from undulog.analysis import analyse_session
 from undulog.analysis.experiment.reversal.mirror import (
     Strata,
     family_wise_p,
-    label_scores,
     mirror_test,
     parts,
 )
@@ -70,23 +69,24 @@ def false_positives(joints, *, runs=6, sets=5000, seed=1, **noise):
     random = np.random.default_rng(seed)
     forward = boundary_pattern(joints)
     one = np.zeros(runs, dtype=np.int64)
-    labels = Strata.of(one, one).labellings()
+    design = Strata.of(one, one)
+    labels = design.labellings()
     claimed = 0
     for _ in range(sets // 100):
         one = sensed(random, forward, sets=100, runs=runs, **noise)
         other = sensed(random, forward[::-1], sets=100, runs=runs, **noise)
-        claimed += np.count_nonzero(_p(one, other, labels) < LEVEL)
+        claimed += np.count_nonzero(_p(one, other, design, labels) < LEVEL)
     return claimed / sets
 
 
-def _p(forward, reverse, labels):
+def _p(forward, reverse, design, labels):
     """Return the family-wise p of each of many experiments, shape (sets,)."""
     both = np.concatenate([forward, reverse[..., ::-1]], axis=1)
     half = both.shape[-1] // 2
     odd, even = (both - both[..., ::-1]) / 2, (both + both[..., ::-1]) / 2
     columns = odd[..., :half], even[..., : both.shape[-1] - half]
     runs = np.concatenate([parts(one) for one in columns], axis=-1)
-    return family_wise_p(np.abs(label_scores(runs, labels))).min(axis=-1)
+    return family_wise_p(np.abs(design.scores(runs, labels))).min(axis=-1)
 
 
 def twin_profile(scenario, weakened, folder, kernels):

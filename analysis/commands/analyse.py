@@ -97,16 +97,7 @@ def _one(file: Path, options: Options, null: Path | None) -> Analysis:
 
 
 def experiment_of(files: Sequence[Path], options: Options, verb: str) -> Experiment:
-    """Analyse sessions as one experiment, opening one at a time, behind a progress bar.
-
-    Args:
-        files: Sessions (MCAP).
-        options: What the user chose.
-        verb: Of the progress bar.
-
-    Returns:
-        The experiment.
-    """
+    """Analyse sessions as one experiment, one open at a time, with a progress bar."""
     from ..experiment.analyse import analyse_experiment
 
     with progress(verb, total=len(files)) as bar:

@@ -92,7 +92,7 @@ def compare(
 
 
 def _write(result: Comparison, output: Path) -> None:
-    """The page or the numbers; the file was refused before the work began, if it was there."""
+    """Write the page or the numbers; the file was checked before."""
     if output.suffix.lower() not in PAGES:
         result.save(output, force=True)
         return

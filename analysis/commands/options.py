@@ -28,20 +28,15 @@ def chosen(
     response_topic: str,
     reference_topic: str | None = None,
 ) -> Options:
-    """What the user chose of each session.
+    """Check and collect the options of the analysis of each session.
 
     Args:
-        start: From the session's start [s], or None.
-        stop: From the session's start [s], or None.
-        command_topic: Of the commands.
-        response_topic: Of the responses.
-        reference_topic: Of a second sensor, or None.
-
-    Returns:
-        The options.
+        start: From the session's start [s].
+        stop: From the session's start [s].
+        reference_topic: Of a second sensor.
 
     Raises:
-        UsageError: If they leave nothing.
+        UsageError: If the window is empty.
     """
     if start is not None and not start >= 0:
         raise UsageError(f"--start {start:g} is before the session's start, which is 0")
@@ -53,15 +48,10 @@ def chosen(
 
 
 def opened(files: Iterable[Path], bar: Progress, done: int = 0) -> Iterator[SessionView]:
-    """Sessions, one open at a time.
+    """Open sessions, each until the next one is taken, and show the progress.
 
     Args:
-        files: Sessions (MCAP).
-        bar: Receives each name, and how many are done.
-        done: How many were done before.
-
-    Yields:
-        Each of them, open until the next is asked for.
+        done: Sessions of the progress bar that are done before.
     """
     from undulog.capture import Session
 
@@ -75,8 +65,8 @@ def show(render: Callable[[int, bool], str], output: Path | None) -> None:
     """Print a result as text; into a file or a pipe nothing is wrapped: one sentence, one line.
 
     Args:
-        render: Gives the text for a width in columns, with or without bold and dim type.
-        output: Where the result was written, or None.
+        render: Returns the text for a width in columns, with or without bold and dim type.
+        output: The file that was written.
     """
     terminal = sys.stdout.isatty()
     width = shutil.get_terminal_size().columns if terminal else UNLIMITED

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,8 +15,6 @@ from undulog.capture.common.console import echo, emit_json
 from undulog.capture.common.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from undulog.capture import SessionView
 
     from ..plan.designs import PlannedRun
@@ -57,21 +56,17 @@ def phase_kicks(
     """
     if base_runs < 1 or not LEAST <= kick <= MOST:
         raise UsageError(f"--base-runs is at least 1, --kick {LEAST:g} to {MOST:g}")
+    _check_numbers(runs, settle, measure)
 
-    def design(base: BaseGait) -> tuple[PlannedRun, ...]:
+    def design(base: BaseGait, session: SessionView) -> _Planned:
         from ..plan.designs import phase_kicks as kicks
 
-        if len(base.driven) < 3:
-            raise UsageError(f"{like}: it drives {len(base.driven)} joints; kicks need at least 3")
-        return kicks(
-            tuple(base.names[k] for k in base.driven),
-            base.amplitude,
-            runs,
-            kick=kick,
-            base_runs=base_runs,
-        )
+        _check_joints(base, session, "kicks need")
+        names = tuple(base.names[k] for k in base.driven)
+        planned = kicks(names, base.amplitude, runs, kick=kick, base_runs=base_runs)
+        return _Planned(planned, settle, measure)
 
-    _plan("phase-kicks", like, output, design, (runs, settle, measure), as_json=json)
+    _plan("phase-kicks", like, output, design, as_json=json)
 
 
 def reversal(
@@ -99,32 +94,50 @@ def reversal(
         measure: Length of what is measured [s].
         json: Print one JSON object.
     """
+    _check_numbers(runs, settle, measure)
 
-    def design(base: BaseGait) -> tuple[PlannedRun, ...]:
+    def design(base: BaseGait, _: SessionView) -> _Planned:
         from ..plan.designs import reversal as both_ways
 
-        return both_ways(base.amplitude, runs)
-
-    _plan("reversal", like, output, design, (runs, settle, measure), as_json=json)
-    if not json:
-        echo(
+        note = (
             "Before each file whose name ends in -180, put the robot down turned by 180 degrees; "
             "before the others, as in the first"
         )
+        return _Planned(both_ways(base.amplitude, runs), settle, measure, notes=(note,))
+
+    _plan("reversal", like, output, design, as_json=json)
+
+
+@dataclass(frozen=True)
+class _Planned:
+    """Runs with their times, facts for their metadata, and notes for the user."""
+
+    runs: tuple[PlannedRun, ...]
+    settle_s: float
+    measure_s: float
+    facts: dict[str, str] = field(default_factory=dict[str, str])
+    notes: tuple[str, ...] = ()
+
+
+def _check_numbers(runs: int, settle_s: float, measure_s: float) -> None:
+    if runs < 1 or settle_s < 0 or measure_s <= 0:
+        raise UsageError("--runs is at least 1, --settle at least 0, --measure more than 0")
+
+
+def _check_joints(base: BaseGait, session: SessionView, need: str) -> None:
+    if len(base.driven) < 3:
+        raise UsageError(f"{session.path}: it drives {len(base.driven)} joints; {need} at least 3")
 
 
 def _plan(
     plan: str,
     like: Path,
     folder: Path,
-    design: Callable[[BaseGait], tuple[PlannedRun, ...]],
-    numbers: tuple[int, float, float],
+    design: Callable[[BaseGait, SessionView], _Planned],
     *,
     as_json: bool,
 ) -> None:
-    runs, settle_s, measure_s = numbers
-    if runs < 1 or settle_s < 0 or measure_s <= 0:
-        raise UsageError("--runs is at least 1, --settle at least 0, --measure more than 0")
+    """Write the sessions of a plan and print what to do with them."""
     from undulog.capture import Session
 
     from ..plan.designs import write_plan
@@ -132,36 +145,32 @@ def _plan(
 
     with Session.open(like) as session:
         base = base_gait(session)
+        planned = design(base, session)
+        settle_s, measure_s = planned.settle_s, planned.measure_s
         files = write_plan(
-            plan, base, design(base), session, folder, settle_s=settle_s, measure_s=measure_s
+            plan,
+            base,
+            planned.runs,
+            session,
+            folder,
+            settle_s=settle_s,
+            measure_s=measure_s,
+            facts=planned.facts,
         )
-    announce(plan, folder, files, (settle_s, measure_s), as_json=as_json)
-
-
-def announce(
-    plan: str, folder: Path, files: Sequence[Path], times_s: tuple[float, float], *, as_json: bool
-) -> None:
-    """Print what was written, and what to do with it.
-
-    Args:
-        plan: Name of the design.
-        folder: Where the files are.
-        files: One a run.
-        times_s: Of a run's settling, and of what is measured after it [s].
-        as_json: Print one JSON object.
-    """
-    settle_s, measure_s = times_s
     if as_json:
         emit_json({"plan": plan, "files": [str(file) for file in files], "settle_s": settle_s})
         return
+    length_s = settle_s + measure_s
     echo(
-        f"{folder}: {plan}, {len(files)} runs of {settle_s + measure_s:g} s, "
-        f"{len(files) * (settle_s + measure_s) / 60:.1f} min in all"
+        f"{folder}: {plan}, {len(files)} runs of {length_s:g} s, "
+        f"{len(files) * length_s / 60:.1f} min in all"
     )
     echo(
         "Drive each, in this order, with undulog drive FILE --on ...; then undulog analyse "
         f"--start {settle_s:g} of all recordings"
     )
+    for note in planned.notes:
+        echo(note)
 
 
 _AMPLITUDE = 0.02
@@ -196,14 +205,15 @@ def lag_sweep(
         measure: Length of what is measured [s].
         json: Print one JSON object.
     """
+    _check_tones(amplitude, runs)
 
-    def design(base: BaseGait) -> tuple[PlannedRun, ...]:
+    def design(base: BaseGait, session: SessionView) -> _Planned:
         from ..plan.designs import lag_sweep as sweep
 
-        return sweep(len(base.driven), amplitude, runs)
+        planned = sweep(len(base.driven), amplitude, runs)
+        return _without_contact(base, session, planned, (amplitude, settle, measure))
 
-    numbers = amplitude, runs, settle
-    _plan_tones("lag-sweep", like, output, design, lambda _: measure, numbers=numbers, as_json=json)
+    _plan("lag-sweep", like, output, design, as_json=json)
 
 
 def multisine(
@@ -239,78 +249,53 @@ def multisine(
     """
     if tones < 2:
         raise UsageError("--tones is at least 2; for one frequency there is plan lag-sweep")
+    _check_tones(amplitude, runs)
 
-    def design(base: BaseGait) -> tuple[PlannedRun, ...]:
-        from ..plan.designs import multisine as sines
-        from ..plan.designs import tones as choose
+    def design(base: BaseGait, session: SessionView) -> _Planned:
+        from ..plan import designs
 
-        return sines(len(base.driven), amplitude, choose(base.omega, tones), runs)
+        omega = designs.tones(base.omega, tones)
+        planned = designs.multisine(len(base.driven), amplitude, omega, runs)
+        period = designs.period_s(base.omega, tones)
+        whole_s = math.ceil(measure / period - 1e-6) * period
+        return _without_contact(base, session, planned, (amplitude, settle, whole_s))
 
-    def whole_periods(base: BaseGait) -> float:
-        from ..plan.designs import period_s
-
-        period = period_s(base.omega, tones)
-        return math.ceil(measure / period - 1e-6) * period
-
-    numbers = amplitude, runs, settle
-    _plan_tones("multisine", like, output, design, whole_periods, numbers=numbers, as_json=json)
+    _plan("multisine", like, output, design, as_json=json)
 
 
-def _plan_tones(
-    plan: str,
-    like: Path,
-    folder: Path,
-    design: Callable[[BaseGait], tuple[PlannedRun, ...]],
-    measure_s_of: Callable[[BaseGait], float],
-    *,
-    numbers: tuple[float, int, float | None],
-    as_json: bool,
-) -> None:
-    amplitude, runs, settle_s = numbers
+def _check_tones(amplitude: float, runs: int) -> None:
     if amplitude <= 0 or runs < 1:
         raise UsageError("--amplitude is more than 0, --runs at least 1")
-    from undulog.capture import Session
 
-    from ..plan.designs import write_plan
-    from ..plan.gait_base import base_gait
 
-    with Session.open(like) as session:
-        base = base_gait(session)
-        if len(base.driven) < 3:
-            raise UsageError(
-                f"{like}: it drives {len(base.driven)} joints; a sweep needs at least 3"
-            )
-        planned = design(base)
-        check_servos(base, planned, session)
-        needed_s, facts = settling(base, session)
-        settle_s = needed_s if settle_s is None else settle_s
-        measure_s = measure_s_of(base)
-        if settle_s < 0 or measure_s <= 0:
-            raise UsageError("--settle is at least 0, --measure more than 0")
-        files = write_plan(
-            plan,
-            base,
-            planned,
-            session,
-            folder,
-            settle_s=settle_s,
-            measure_s=measure_s,
-            facts={"amplitude_rad": f"{amplitude:g}", **facts},
-        )
-    announce(plan, folder, files, (settle_s, measure_s), as_json=as_json)
-    if as_json:
-        return
+def _without_contact(
+    base: BaseGait,
+    session: SessionView,
+    runs: tuple[PlannedRun, ...],
+    numbers: tuple[float, float | None, float],
+) -> _Planned:
+    """Check the runs of a chain without contact, and find how long it takes to settle."""
+    amplitude, settle_s, measure_s = numbers
+    _check_joints(base, session, "a sweep needs")
+    check_servos(base, runs, session)
+    needed_s, facts = settling(base, session)
+    settle_s = needed_s if settle_s is None else settle_s
+    if settle_s < 0 or measure_s <= 0:
+        raise UsageError("--settle is at least 0, --measure more than 0")
+    notes: list[str] = []
     if facts:
-        echo(
+        notes.append(
             f"The slowest body mode without contact has {facts['mode_hz']} Hz and dies away with "
             f"{facts['mode_tau_s']} s"
         )
     if settle_s < needed_s:
-        echo(f"Warning: it needs {needed_s:g} s to settle; {settle_s:g} s is less")
+        notes.append(f"Warning: it needs {needed_s:g} s to settle; {settle_s:g} s is less")
+    facts = {"amplitude_rad": f"{amplitude:g}", **facts}
+    return _Planned(runs, settle_s, measure_s, facts, tuple(notes))
 
 
 def settling(base: BaseGait, session: SessionView) -> tuple[float, dict[str, str]]:
-    """How long a chain without contact takes to settle.
+    """Return how long a chain without contact takes to settle.
 
     Args:
         base: The gait.

@@ -15,7 +15,7 @@ from undulog.capture.common.files import check_output
 from .options import chosen, show
 
 if TYPE_CHECKING:
-    from ..results.coupling import LocalCoupling
+    from ..results.coupling import Coupling, LocalCoupling
 
 
 def predict(
@@ -85,7 +85,7 @@ def predict(
 
 
 def _kicks(words: Sequence[str]) -> dict[str, float]:
-    """Joints and angles of ``JOINT=RAD``."""
+    """Parse joints and angles of ``JOINT=RAD``."""
     found: dict[str, float] = {}
     for word in words:
         name, equals, angle = word.rpartition("=")
@@ -104,19 +104,20 @@ def _of_result(file: Path) -> LocalCoupling:
     from ..results.experiment import Experiment
 
     result = load(file)
-    if isinstance(result, Experiment):
-        return _local(result.coupling)
-    if isinstance(result, Coupling):
-        return _local(result)
-    raise DataError(f"{file}: holds no coupling from kicks; give the result of all their sessions")
+    coupling = result.coupling if isinstance(result, Experiment) else result
+    if not isinstance(coupling, Coupling):
+        raise DataError(
+            f"{file}: holds no coupling from kicks; give the result of all their sessions"
+        )
+    return _local(coupling)
 
 
-def _local(coupling: object) -> LocalCoupling:
-    from ..results.coupling import Coupling, LocalCoupling
+def _local(coupling: Coupling) -> LocalCoupling:
+    from ..results.coupling import LocalCoupling
 
     if isinstance(coupling, LocalCoupling):
         return coupling
-    if isinstance(coupling, Coupling) and not coupling.identifiable:
+    if not coupling.identifiable:
         record = f"; record {coupling.record}" if coupling.record else ""
         raise DataError(f"no coupling to predict from: {coupling.why}{record}")
     raise DataError("no coupling to predict from: these are no kicks around one gait")

@@ -53,19 +53,19 @@ def report(
     options = chosen(start, stop, command_topic, response_topic)
     why = "the report is an HTML page; end its name in .html"
     check_output(output, PAGES, why, force=force)
-    page, told, warnings = _one(files[0], options) if len(files) == 1 else _several(files, options)
+    page, facts, warnings = _one(files[0], options) if len(files) == 1 else _several(files, options)
     write_text(output, page)
     size = output.stat().st_size
     if json:
-        emit_json({"page": str(output), "bytes": size, **told})
+        emit_json({"page": str(output), "bytes": size, **facts})
         return
-    echo(told["answer"])
+    echo(facts["answer"])
     said = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
     echo(f"{output}: {size / 1e3:.0f} kB{said}")
 
 
 def _one(file: Path, options: Options) -> tuple[str, dict[str, Any], int]:
-    """The page on one session, its answer, and how many warnings are in it."""
+    """Return the page on one session, its answer, and the number of warnings."""
     from undulog.capture import Session
 
     from ..present.page.page import render
@@ -79,29 +79,29 @@ def _one(file: Path, options: Options) -> tuple[str, dict[str, Any], int]:
             analysis = measured.analysis
             bar.update(1, note="page")
             page = render(analysis, session, cycle_maps(measured))
-    told = _summary(analysis)
-    return page, {"answer": told["sentence"], "answers": [told]}, len(analysis.warnings)
+    summary = _summary(analysis)
+    return page, {"answer": summary["sentence"], "answers": [summary]}, len(analysis.warnings)
 
 
 def _several(files: Sequence[Path], options: Options) -> tuple[str, dict[str, Any], int]:
-    """The page on an experiment, its answer and each session's, and how many warnings are in it."""
+    """Return the page on an experiment, all answers, and the number of warnings."""
     from ..present.page.page import render
     from .analyse import experiment_of
 
     experiment = experiment_of(files, options, "report")
     page = render(experiment)
-    told = {
+    facts = {
         "answer": f"{len(files)} sessions: {experiment.answer}.",
         "answers": [_summary(one) for one in experiment.sessions],
     }
-    return page, told, len(experiment.warnings)
+    return page, facts, len(experiment.warnings)
 
 
 def _summary(analysis: Analysis) -> dict[str, Any]:
-    told = analysis.answer
+    answer = analysis.answer
     return {
         "session": analysis.session.id,
         "path": analysis.session.path,
-        "verdict": told.verdict,
-        "sentence": told.sentence,
+        "verdict": answer.verdict,
+        "sentence": answer.sentence,
     }

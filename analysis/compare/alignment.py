@@ -25,14 +25,14 @@ _OF_THE_RUN = frozenset(
 """Facts that name a run rather than describe how it was made."""
 
 _TEXTS = frozenset({"name", "description", "seed", "epoch_s", "robot"})
-"""Keys of an attached file that say nothing of what it does."""
+"""Keys of an attached file without an effect."""
 
 _FILES = ("robot.toml", "scenario.toml", "plan.toml", "calibration.toml")
 _ORDER = ("robot", *_FILES, "session")
 
 
 def facts_of(session: SessionView) -> dict[str, str]:
-    """What a session says of how it was made.
+    """Read the facts that a session records of itself.
 
     Returns:
         Dotted names to text: of the attached robot, scenario and plan (e.g.
@@ -50,14 +50,14 @@ def facts_of(session: SessionView) -> dict[str, str]:
             continue
         kept = {key: value for key, value in table.items() if key not in _TEXTS}
         facts |= {f"{file}: {key}": text for key, text in _flat(kept).items()}
-    told = session.metadata.get("undulog", {})
+    recorded = session.metadata.get("undulog", {})
     return facts | {
-        f"session: {key}": value for key, value in told.items() if key not in _OF_THE_RUN
+        f"session: {key}": value for key, value in recorded.items() if key not in _OF_THE_RUN
     }
 
 
 def changes(a: Sequence[Mapping[str, str]], b: Sequence[Mapping[str, str]]) -> tuple[Change, ...]:
-    """Facts whose values on side B are not those on side A.
+    """List the facts that differ between the sides.
 
     Args:
         a: Facts of each session of side A.
@@ -73,8 +73,7 @@ def changes(a: Sequence[Mapping[str, str]], b: Sequence[Mapping[str, str]]) -> t
         for name in names
         if (sides := (_recorded_value(a, name), _recorded_value(b, name)))[0] != sides[1]
     ]
-    found.sort(key=lambda one: _ORDER.index(one.name.partition(":")[0]))
-    return tuple(found)
+    return tuple(sorted(found, key=lambda one: _ORDER.index(one.name.partition(":")[0])))
 
 
 def _recorded_value(side: Sequence[Mapping[str, str]], name: str) -> str | None:
@@ -83,7 +82,7 @@ def _recorded_value(side: Sequence[Mapping[str, str]], name: str) -> str | None:
 
 
 def _flat(value: Any, before: str = "") -> dict[str, str]:
-    """A TOML table by dotted names; entries of a list go by their own name, or their place."""
+    """Flatten a TOML table to dotted names; entries of a list go by their name or index."""
     parts: dict[str, Any] = {}
     if isinstance(value, dict):
         table = cast("dict[str, Any]", value)
@@ -107,7 +106,7 @@ def _text(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Alignment:
-    """What the sessions of both sides have in common.
+    """Common joints and gait of the sessions of both sides.
 
     Attributes:
         names: Joints that can be compared, head to tail.
@@ -121,7 +120,7 @@ class Alignment:
 
 
 def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False) -> Alignment:
-    """Find what can be compared.
+    """Find the joints that can be compared.
 
     Args:
         a: Runs of one side, at least one.
@@ -149,13 +148,12 @@ def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False)
             f"no joint has gain and lag in all sessions: {a[0].label} drives "
             f"{_some(a[0].names)}, {b[0].label} {_some(b[0].names)}"
         )
-    left_out: dict[str, str] = {}
-    for name in joints:
-        if name not in names:
-            lacking = [
-                r.label for r, known in zip(runs, answered, strict=True) if name not in known
-            ]
-            left_out[name] = f"no gain and lag in {', '.join(lacking)}"
+    left_out = {
+        name: "no gain and lag in "
+        + ", ".join(r.label for r, known in zip(runs, answered, strict=True) if name not in known)
+        for name in joints
+        if name not in names
+    }
     faults = [fault for run in runs[1:] if (fault := gait_fault(run, runs[0], names)) is not None]
     if faults and not any_gait:
         raise DataError(
@@ -166,7 +164,7 @@ def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False)
 
 
 def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None:
-    """What makes a run's gait another one than the model's.
+    """Return the difference of a run's gait from the model's.
 
     Args:
         model: The run that it is held against.
@@ -201,7 +199,7 @@ def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None
 
 
 def _refuse_copies(runs: Sequence[GaitRun], side: str) -> None:
-    """Two copies of one run would look like two runs without any scatter."""
+    """Raise an error for copies: two copies of one run would show no scatter."""
     seen: dict[bytes, str] = {}
     for run in runs:
         numbers = run.ratio.tobytes()

@@ -1,4 +1,4 @@
-"""Two sessions in, or two groups of them: what differs, and what is the same."""
+"""Compare two sessions, or two groups of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from undulog.capture.common.console import Warn, plain
 from undulog.capture.common.errors import UsageError
 
 from ..estimators.intervals import CONFIDENCE, around, t_factor
-from ..results.answer import Answer, NotFollowing, StandOut
+from ..results.answer import NotFollowing, StandOut
 from ..results.comparison import BrokenJoint, Comparison, Waveform
 from ..results.estimate import Estimate, Provenance
 from ..segments.answer import deviation_in_words, fault_in_words
@@ -23,7 +23,7 @@ from ..segments.examine import OFFSET_RAD
 from ..signals.stretch import Options
 from .alignment import Alignment, align, changes
 from .decisions import Margins, answer_of, decide, differ, estimates_of, family
-from .side import ComparedSession, Quantities, independent, phases_rad, see, turned
+from .side import ComparedSession, Quantities, phases_rad, see, turned
 
 
 def broken_joints(
@@ -43,19 +43,16 @@ def broken_joints(
                 text = f"in {side} {fault_in_words(fault)}"
                 found.append(BrokenJoint(fault.joint, side, fault.kinds, text))
         known = {each.name for each in found}
-        for each in _first([each for answer in answers for each in _off(answer)]):
+        stand_out = [each for answer in answers for each in answer.stand_out]
+        for each in _first([each for each in stand_out if each.quantity == "offset"]):
             if each.joint not in known | elsewhere and _moved(each.joint, own, other):
                 text = f"in {side} {plain(each.joint)} has {deviation_in_words(each)}"
                 found.append(BrokenJoint(each.joint, side, (), text))
     return tuple(sorted(found, key=lambda each: not each.kinds))
 
 
-def _off(answer: Answer) -> list[StandOut]:
-    return [each for each in answer.stand_out if each.quantity == "offset"]
-
-
 def _moved(joint: str, own: Sequence[ComparedSession], other: Sequence[ComparedSession]) -> bool:
-    """Whether a joint's mean differs between the sides, too: both may share a zero."""
+    """Return whether a joint's mean differs between the sides, too: both may share a zero."""
     here, there = (
         [one.offsets[joint] for one in side if joint in one.offsets] for side in (own, other)
     )
@@ -68,7 +65,7 @@ _Entry = TypeVar("_Entry", NotFollowing, StandOut)
 
 
 def _first(several: Sequence[_Entry]) -> list[_Entry]:
-    """The first entry of each joint."""
+    """Return the first entry of each joint."""
     found: dict[str, _Entry] = {}
     for each in several:
         found.setdefault(each.joint, each)
@@ -77,13 +74,13 @@ def _first(several: Sequence[_Entry]) -> list[_Entry]:
 
 @dataclass(frozen=True)
 class Choices:
-    """What the user may choose in a comparison.
+    """Options of a comparison.
 
     Attributes:
         paired: Run i of B belongs to run i of A, e.g. recorded one after the other.
         any_gait: Compare although the gaits differ.
         margins: Differences that count as the same.
-        session: What is analysed of each session.
+        session: Options of the analysis of each session.
     """
 
     paired: bool = False
@@ -121,11 +118,11 @@ def compare_sessions(
         for side in (a, b)
     ]
     every = sum(map(len, sides))
-    said = [
+    noted = [
         f"{sentence} ({'all sessions' if len(names) == every else ', '.join(names)})"
         for sentence, names in warnings.items()
     ]
-    return compare_fitted(sides[0], sides[1], choices, said)
+    return compare_fitted(sides[0], sides[1], choices, noted)
 
 
 def compare_fitted(
@@ -134,10 +131,10 @@ def compare_fitted(
     choices: Choices,
     warnings: Sequence[str] = (),
 ) -> Comparison:
-    """Compare what was taken from the sessions.
+    """Compare sessions that are measured.
 
     Args:
-        warnings: What was said so far.
+        warnings: Warnings of the sessions.
 
     Raises:
         DataError: If sessions have no gait, no joint in common or another gait.
@@ -145,21 +142,17 @@ def compare_fitted(
     """
     if not a or not b:
         raise UsageError("a comparison needs at least one session a side")
-    said = list(warnings)
+    every_warning = list(warnings)
     design = _design(a, b, choices)
     aligned = align([one.run for one in a], [one.run for one in b], any_gait=choices.any_gait)
     keys = family(a, b, aligned.names)
     # Lags near pi must not part company: all are taken within pi of the first session's.
     about = np.array([a[0].estimates[key][0] for key in keys])
-    stacks = [estimates_of(side, keys, about) for side in (a, b)]
-    if design == "sessions":
-        first, second = (Quantities(*stack[:, 0]) for stack in stacks)
-        found = independent(first, second)
-    else:
-        first, second, found = differ(stacks[0][0], stacks[1][0], paired_runs=design == "pairs")
+    estimates = [estimates_of(side, keys, about) for side in (a, b)]
+    first, second, found = differ(estimates[0], estimates[1], design)
     decided = decide(keys, first, second, found, choices.margins)
     partial = _partial(aligned)
-    _warn(a, b, design, said.append)
+    _warn(a, b, design, every_warning.append)
     broken = broken_joints(a, b)
     verdict, sentence = answer_of(decided, partial is not None, broken)
     return Comparison(
@@ -176,7 +169,7 @@ def compare_fitted(
         equivalence=decided.equivalence,
         phase_rad=tuple(phases_rad().tolist()),
         waveforms=_waveforms(a, b, aligned.names, design),
-        warnings=tuple(said),
+        warnings=tuple(every_warning),
         provenance=_provenance(a, b, choices),
     )
 
@@ -226,12 +219,7 @@ def _waveforms(
         if not all(name in one.cycles for one in (*a, *b)):
             continue
         sides = [[_by_first(one, name, names) for one in side] for side in (a, b)]
-        if design == "sessions":
-            first, second = sides[0][0], sides[1][0]
-            difference = independent(first, second)
-        else:
-            stacks = [np.stack([one.value for one in side]) for side in sides]
-            first, second, difference = differ(*stacks, paired_runs=design == "pairs")
+        first, second, difference = differ(sides[0], sides[1], design)
         half = difference.error * [t_factor(dof) for dof in difference.dof.tolist()]
         worst = int(np.argmax(np.abs(difference.value)))
         found.append(
@@ -253,7 +241,7 @@ def _waveforms(
 
 
 def _by_first(one: ComparedSession, name: str, names: Sequence[str]) -> Quantities:
-    """A mean cycle by the phase of the first joint in common that has the same frequency."""
+    """Turn a mean cycle to the phase of the first common joint of the same frequency."""
     run = one.run
     group = run.group[run.names.index(name)]
     members = [k for k, own in enumerate(run.group) if own == group]

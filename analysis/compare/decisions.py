@@ -51,7 +51,7 @@ class Margins:
 
 @dataclass(frozen=True)
 class Decided:
-    """What was decided.
+    """Decisions on a family of differences.
 
     Attributes:
         differences: Beyond doubt first, by size, then the others by p.
@@ -66,7 +66,7 @@ class Decided:
 def family(
     a: Sequence[ComparedSession], b: Sequence[ComparedSession], joints: Sequence[str]
 ) -> list[Key]:
-    """What every session of both sides knows.
+    """List the quantities that every session of both sides has.
 
     Args:
         joints: Joints in common, head to tail.
@@ -81,14 +81,14 @@ def family(
 
 
 def differ(
-    a: FloatArray, b: FloatArray, *, paired_runs: bool
+    a: Sequence[Quantities], b: Sequence[Quantities], design: str
 ) -> tuple[Quantities, Quantities, Differences]:
-    """Both sides and their difference, from runs.
+    """Return both sides and their difference.
 
     Args:
-        a: Values of side A, shape (r1, k).
-        b: Of side B, shape (r2, k).
-        paired_runs: Whether run i of B belongs to run i of A.
+        a: k quantities of each session of side A.
+        b: Of each session of side B.
+        design: ``sessions``, ``groups`` or ``pairs``; see :class:`Comparison`.
 
     Returns:
         Side A, side B, B minus A.
@@ -96,27 +96,27 @@ def differ(
     Raises:
         UsageError: If there are too few runs.
     """
-    first, second = from_runs(a), from_runs(b)
-    return first, second, paired(a, b) if paired_runs else independent(first, second)
+    if design == "sessions":
+        return a[0], b[0], independent(a[0], b[0])
+    runs = [np.stack([one.value for one in side]) for side in (a, b)]
+    first, second = (from_runs(one) for one in runs)
+    return first, second, paired(*runs) if design == "pairs" else independent(first, second)
 
 
 def estimates_of(
     side: Sequence[ComparedSession], keys: Sequence[Key], lags_about: FloatArray
-) -> FloatArray:
-    """Estimates of a side as arrays.
+) -> list[Quantities]:
+    """Return the estimates of each session of a side.
 
     Args:
-        keys: What to take, k.
+        keys: Quantities to take, k.
         lags_about: Lags are taken within pi of these, shape (k,).
-
-    Returns:
-        Values, variances and degrees of freedom, shape (3, sessions, k).
     """
     stack = np.array([[one.estimates[key] for key in keys] for one in side]).transpose(2, 0, 1)
     lag = np.array([quantity == "lag" for quantity, _ in keys])
     about = lags_about[lag]
     stack[0][:, lag] = about + np.angle(np.exp(1j * (stack[0][:, lag] - about)))
-    return stack
+    return [Quantities(*stack[:, k]) for k in range(len(side))]
 
 
 def decide(
@@ -176,7 +176,7 @@ def _margins(kinds: np.ndarray, a: FloatArray, margins: Margins) -> FloatArray:
 
 
 def _named(decisions: Sequence[Difference]) -> tuple[NamedJoint, ...]:
-    """A weak module changes what its neighbours do, but less: the largest comes first."""
+    """List the joints that differ, the largest first: a weak module changes its neighbours less."""
     parts: dict[str, list[Difference]] = {}
     for one in decisions:
         if one.quantity in ("gain", "lag"):
@@ -199,10 +199,9 @@ def _equivalence(
     results: list[Equivalence] = []
     for kind in dict.fromkeys(kinds.tolist()):
         one = kinds == kind
-        largest = float(np.max(np.abs(found.value[one])))
-        within = float(margin[one][0])
-        p = equivalence_p(found.value[one], found.error[one], found.dof[one], within)
-        results.append(Equivalence(kind, within, UNITS[kind], largest, p))
+        value, within = found.value[one], float(margin[one][0])
+        p = equivalence_p(value, found.error[one], found.dof[one], within)
+        results.append(Equivalence(kind, within, UNITS[kind], float(np.abs(value).max()), p))
     return tuple(results)
 
 
@@ -216,7 +215,7 @@ WORDS = {
     "speed": "speed",
     "cost_of_transport": "cost of transport",
 }
-"""What people call the quantities."""
+"""Names of the quantities in text."""
 
 _RESPONSE = ("gain", "lag")
 
@@ -224,7 +223,7 @@ _RESPONSE = ("gain", "lag")
 def answer_of(
     decided: Decided, partial: bool, broken: Sequence[BrokenJoint] = ()
 ) -> tuple[str, str]:
-    """Verdict and answer.
+    """Return verdict and answer.
 
     Args:
         partial: Whether something could not be compared.
@@ -247,7 +246,8 @@ def answer_of(
     )
     whole = " (partial comparison)" if partial else ""
     joints = len({one.place for one in decided.differences if one.place != BODY})
-    alike = f"gain and lag of {_all(joints)} are equivalent within {margins}"
+    which = "the joint" if joints == 1 else f"all {joints} joints"
+    alike = f"gain and lag of {which} are equivalent within {margins}"
     if not beyond_doubt:
         if same:
             return "same", f"no difference found; {alike}{whole}"
@@ -258,7 +258,7 @@ def answer_of(
 
 
 def _beyond_doubt(decided: Decided) -> list[Difference]:
-    """Differences that are significant and whose interval leaves out zero."""
+    """Return differences that are significant and whose interval leaves out zero."""
     return [
         one
         for one in decided.differences
@@ -267,7 +267,7 @@ def _beyond_doubt(decided: Decided) -> list[Difference]:
 
 
 def _without(decided: Decided, broken: Sequence[BrokenJoint]) -> Decided:
-    """The decisions without the broken joints."""
+    """Return the decisions without the broken joints."""
     names = {each.name for each in broken}
     return dataclasses.replace(
         decided,
@@ -277,7 +277,7 @@ def _without(decided: Decided, broken: Sequence[BrokenJoint]) -> Decided:
 
 
 def difference_text(one: Difference) -> str:
-    """A difference with its interval.
+    """Format a difference with its interval.
 
     Returns:
         For example ``gain −8.1 % [−8.6, −7.6]``.
@@ -286,7 +286,7 @@ def difference_text(one: Difference) -> str:
 
 
 def in_people_units(one: Difference) -> tuple[Estimate, str]:
-    """A difference in the unit people read.
+    """Convert a difference to percent or degrees.
 
     Returns:
         Percent for gains, degrees for lags, and for the others percent of side A.
@@ -301,7 +301,7 @@ def in_people_units(one: Difference) -> tuple[Estimate, str]:
 
 
 def signed(quantity: Estimate, unit: str) -> str:
-    """A difference that always has a sign.
+    """Format a difference with its sign.
 
     Args:
         quantity: In ``unit``.
@@ -314,7 +314,7 @@ def signed(quantity: Estimate, unit: str) -> str:
 
 
 def _largest(decided: Decided) -> str:
-    """The joint that differs most, with all that is beyond doubt of it; else energy or body.
+    """Describe the joint that differs most; else energy or body.
 
     A joint is named if it differs by a margin or more: of many joints one differs by less in five
     comparisons of a hundred that differ in nothing.
@@ -340,7 +340,7 @@ def _largest(decided: Decided) -> str:
 
 
 def _not_shown(decided: Decided) -> str:
-    """How large a difference might be hidden, from the intervals that hold together."""
+    """Describe how large a hidden difference might be, from the simultaneous intervals."""
     worst: dict[str, float] = {"gain": 0.0, "lag": 0.0}
     for one in decided.differences:
         ends = one.difference.ci95
@@ -350,10 +350,6 @@ def _not_shown(decided: Decided) -> str:
         f"up to {_short(100 * worst['gain'])} % in gain and {_short(math.degrees(worst['lag']))}° "
         "in lag could hide in the noise; record more"
     )
-
-
-def _all(joints: int) -> str:
-    return "the joint" if joints == 1 else f"all {joints} joints"
 
 
 def _short(value: float) -> str:

@@ -1,4 +1,4 @@
-"""What a comparison takes from one session: estimates with variances, and mean cycles.
+"""Estimates with variances, and mean cycles, of one session of a comparison.
 
 The mean cycle of a joint by gait phase, the phase that the commands define.
 
@@ -91,7 +91,7 @@ class Differences:
 
 
 def from_runs(runs: FloatArray) -> Quantities:
-    """A side's means over its runs.
+    """Return a side's means over its runs.
 
     Args:
         runs: Shape (r, k), r at least 2.
@@ -117,7 +117,7 @@ def from_runs(runs: FloatArray) -> Quantities:
 
 
 def independent(a: Quantities, b: Quantities) -> Differences:
-    """B minus A of sides that have nothing to do with each other (Welch).
+    """Return B minus A of independent sides (Welch).
 
     Args:
         a: One side, k quantities.
@@ -131,7 +131,7 @@ def independent(a: Quantities, b: Quantities) -> Differences:
 
 
 def paired(a: FloatArray, b: FloatArray) -> Differences:
-    """Mean of B minus A, run by run.
+    """Return the mean of B minus A, run by run.
 
     Args:
         a: Shape (r, k).
@@ -150,7 +150,7 @@ def paired(a: FloatArray, b: FloatArray) -> Differences:
 
 
 def holm(p: FloatArray) -> FloatArray:
-    """Step-down p-values that hold for the whole family, whatever its dependence (Holm 1979).
+    """Return step-down p-values that hold for the whole family (Holm 1979).
 
     Args:
         p: Of each by itself, shape (k,).
@@ -166,11 +166,11 @@ def holm(p: FloatArray) -> FloatArray:
 
 
 PHASES = 72
-"""Phases at which a mean cycle is told, every 5 degrees."""
+"""Phases of a mean cycle, every 5 degrees."""
 
 
 def phases_rad() -> FloatArray:
-    """The phases of a mean cycle.
+    """Return the phases of a mean cycle.
 
     Returns:
         From 0 up to 2 pi, not included [rad], shape (``PHASES``,).
@@ -181,7 +181,7 @@ def phases_rad() -> FloatArray:
 def cycles_by_phase(
     one: Series, fit: HarmonicFit, channel: int, *, zero_rad: float, start_s: float, stop_s: float
 ) -> FloatArray:
-    """A response cut into its whole cycles.
+    """Cut a response into its whole cycles.
 
     What the harmonic fit leaves is interpolated linearly between samples, and the fit added again:
     so nothing of the gait itself is lost between samples.
@@ -209,7 +209,7 @@ def cycles_by_phase(
 
 
 def _whole(one: Series, start_s: float, stop_s: float) -> bool:
-    """Whether samples reach through a cycle without a gap."""
+    """Return whether samples cover a cycle without a gap."""
     longest = GAP_FACTOR * one.period_s
     inside = one.between(start_s, stop_s).t_s
     edges = np.concatenate([[start_s], inside, [stop_s]])
@@ -228,7 +228,7 @@ class ComparedSession:
     """One session.
 
     Attributes:
-        facts: What it says of how it was made.
+        facts: Recorded facts, by their dotted names.
         estimates: ln gain [1] and lag [rad] of the joints, E_abs per cycle [J]; speed [m/s] and
             cost of transport of the body.
         cycles: Mean cycle of each joint by the phase of the first command of its group [rad].
@@ -244,10 +244,10 @@ class ComparedSession:
 
 
 def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
-    """Take from a session what a comparison needs.
+    """Measure the quantities of a session that are compared.
 
     Args:
-        warn: Told what the session lacks.
+        warn: Receives a sentence for each missing quantity.
 
     Raises:
         MissingChannelError: If the session has neither commands nor responses.
@@ -279,7 +279,7 @@ def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
 
 
 def turned(cycle: Quantities, by_rad: float) -> Quantities:
-    """A mean cycle by another joint's phase.
+    """Turn a mean cycle to another joint's phase.
 
     Args:
         cycle: At evenly spaced phases, shape (p,).
@@ -327,7 +327,7 @@ def _energies(measured: SessionMeasurement) -> dict[Key, Known]:
 
 
 def _total_energy(measured: SessionMeasurement) -> FloatArray | None:
-    """E_abs of all joints together in each cycle [J]; None where one is not known."""
+    """Return E_abs of all joints together in each cycle [J]; None where one is not known."""
     powers = [energies.mechanical for energies in measured.energies.values()]
     known = [power.abs_j for power in powers if power is not None]
     return np.sum(known, axis=0) if known and len(known) == len(powers) else None

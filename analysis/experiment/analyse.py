@@ -18,17 +18,17 @@ from undulog.capture.robot.model import Robot
 
 from ..estimators.intervals import CONFIDENCE, EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
 from ..oscillators.predictions import body_oscillators
+from ..response.fitting import GaitFit
 from ..response.response import gain_estimate, lag_estimate
 from ..results.analysis import Analysis
 from ..results.coupling import LocalCoupling
 from ..results.estimate import Provenance
 from ..results.experiment import Experiment, Headings, PooledJoint, PooledRuns, Reversal, Run
-from ..session.analyse import FittedSession, examine_session
+from ..session.analyse import examine_session
 from ..session.runs import (
     SAME_COMMAND,
     SAME_FREQUENCY,
     GaitRun,
-    Posture,
     Role,
     coupling_of_one_gait,
     gait_run,
@@ -55,7 +55,7 @@ _LOW_FLOOR = 0.01
 def analyse_experiment(
     sessions: Iterable[SessionView], options: Options | None = None
 ) -> Experiment:
-    """Compute what several sessions tell together.
+    """Analyse several sessions as one experiment.
 
     Args:
         sessions: Open sessions, each used once and in turn, so they may be opened one by one.
@@ -70,37 +70,39 @@ def analyse_experiment(
         UsageError: If there is no session, or the options leave nothing of one.
     """
     options = options or Options()
-    examined: list[FittedSession] = []
+    analyses: list[Analysis] = []
+    gaits: list[GaitFit | None] = []
     robots: list[Robot | None] = []
     commanded: list[CommandTones | None] = []
-    postures: list[Posture] = []
+    runs: list[GaitRun] = []
     for session in sessions:
-        examined.append(examine_session(session, options))
-        postures.append(posture(session, examined[-1].analysis.gait.windows))
-        robots.append(session.robot)
-        commanded.append(command_tones(session, options, examined[-1]))
-    if not examined:
+        fitted = examine_session(session, options)
+        analysis, robot = fitted.analysis, session.robot
+        lay = posture(session, analysis.gait.windows)
+        label = Path(analysis.session.path).name
+        runs.append(gait_run(label, robot, analysis, fitted.gait, lay))
+        analyses.append(analysis)
+        gaits.append(fitted.gait)
+        robots.append(robot)
+        commanded.append(command_tones(session, options, fitted))
+    if not runs:
         raise UsageError("an experiment needs at least one session")
     warnings: list[str] = []
-    runs = [
-        gait_run(Path(one.analysis.session.path).name, robot, one.analysis, one.gait, lay)
-        for one, robot, lay in zip(examined, robots, postures, strict=True)
-    ]
-    kicks = find_kicks(runs, [one.gait for one in examined])
+    kicks = find_kicks(runs, gaits)
     sweep = find_sweep(commanded) if kicks is None else None
     if sweep is not None:
-        return _of_sweep(sweep, commanded, examined, runs, options)
+        return _of_sweep(sweep, commanded, analyses, runs, options)
     parts = [None if kicks is None else kicks.role(k) for k in range(len(runs))]
     rest = [k for k, part in enumerate(parts) if part in (None, "base")]
     own_roles, own_why = sort_runs([runs[k] for k in rest])
     roles = {rest[k]: role for k, role in own_roles.items()}
     why = {rest[k]: reason for k, reason in own_why.items()}
-    # Kicks around one gait are asked about its coupling; the reversal only if it is there, too.
+    # Kicks around one gait identify its coupling; the reversal is tested if both ways are there.
     only_kicks = kicks is not None and len(set(roles.values())) < 2
     if only_kicks:
         why = {k: reason for k, reason in why.items() if parts[k] is None}
-    told = {k: part for k, part in enumerate(parts) if part is not None}
-    told |= {} if only_kicks else {k: role.value for k, role in roles.items()}
+    parts_of = {k: part for k, part in enumerate(parts) if part is not None}
+    parts_of |= {} if only_kicks else {k: role.value for k, role in roles.items()}
     for k, reason in why.items():
         warnings.append(f"{runs[k].label} {reason}; it is left out of the reversal test")
     chosen = [runs[k] for k in roles]
@@ -109,15 +111,14 @@ def analyse_experiment(
     forward, reverse = (y[[way is one for way in ways]] for one in (Role.FORWARD, Role.REVERSE))
     pooled = (
         pool_runs(chosen[0].names, [run.response for run in chosen])
-        if one_direction(ways)
+        if len(set(ways)) == 1
         else None
     )
     robot = robots[next(iter(roles))] if roles else None
     joints = None
     if pooled is not None:
-        own = [examined[k].analysis for k in roles]
+        own = [analyses[k] for k in roles]
         joints = own[0].answer if len(own) == 1 else pooled_answer(robot, pooled, own)
-    analyses = [one.analysis for one in examined]
     reversal = None
     if not only_kicks and _both_ways(chosen, ways, names, robot, warnings.append):
         reversal = _reversal(names, (forward, reverse), chosen, ways)
@@ -134,8 +135,8 @@ def analyse_experiment(
         answer=answer if joints is not None else broken_first(analyses, answer),
         sessions=tuple(analyses),
         runs=tuple(
-            _run(one.analysis, run, told.get(k), why.get(k))
-            for k, (one, run) in enumerate(zip(examined, runs, strict=True))
+            _run(one, run, parts_of.get(k), why.get(k))
+            for k, (one, run) in enumerate(zip(analyses, runs, strict=True))
         ),
         heterogeneity=experiment_indices(forward, reverse, reversal),
         reversal=reversal,
@@ -150,12 +151,11 @@ def analyse_experiment(
 def _of_sweep(
     sweep: Sweep,
     commanded: Sequence[CommandTones | None],
-    examined: Sequence[FittedSession],
+    analyses: Sequence[Analysis],
     runs: Sequence[GaitRun],
     options: Options,
 ) -> Experiment:
-    """The experiment of a lag sweep or a multisine: its gaits are no repeats of each other."""
-    analyses = [one.analysis for one in examined]
+    """Return the experiment of a lag sweep or a multisine: its gaits are not repeats."""
     warnings = [
         f"{run.label} is no run of the sweep; it is left out"
         for k, run in enumerate(runs)
@@ -179,18 +179,13 @@ def _of_sweep(
     )
 
 
-def one_direction(ways: Sequence[Role]) -> bool:
-    """Whether all runs are of one direction."""
-    return len(set(ways)) == 1
-
-
 def _reversal(
     names: Sequence[str],
     y: tuple[ComplexArray, ComplexArray],
     runs: Sequence[GaitRun],
     ways: Sequence[Role],
 ) -> Reversal:
-    """The reversal test, with what the runs' headings and recorded gravity say of a tilt."""
+    """Test the runs by reversal, with their headings and recorded gravity."""
     heading = np.array([run.posture.heading_rad for run in runs])
     lean = np.array([run.posture.lean_rad for run in runs])
     forward = np.array([way is Role.FORWARD for way in ways])
@@ -205,10 +200,6 @@ def _pooled(pooled: PooledResponse) -> PooledRuns:
     return PooledRuns(pooled.runs, tuple(joints))
 
 
-def _runs(count: int) -> str:
-    return f"{count} independent run{'' if count == 1 else 's'}"
-
-
 def _both_ways(
     runs: Sequence[GaitRun],
     ways: Sequence[Role],
@@ -216,14 +207,16 @@ def _both_ways(
     robot: Robot | None,
     warn: Warn,
 ) -> bool:
-    """Whether the reversal test can be made; warns why not, and of what it takes on trust."""
+    """Return whether the reversal test can be made; warn why not, and of its assumptions."""
     counts = {role: sum(way is role for way in ways) for role in Role}
     if not any(counts.values()):
         warn("no run with a travelling wave: the reversal test can't be made")
         return False
+    forward = counts[Role.FORWARD]
     if min(counts.values()) < MIN_RUNS:
         warn(
-            f"boundary or module: not separable from {_runs(counts[Role.FORWARD])} with "
+            f"boundary or module: not separable from {forward} independent "
+            f"run{'' if forward == 1 else 's'} with "
             f"the wave from head to tail and {counts[Role.REVERSE]} from tail to head; record at "
             "least 6 of each"
         )

@@ -36,18 +36,18 @@ def kick_answer(coupling: Coupling) -> str:
     """
     if not isinstance(coupling, LocalCoupling):
         return f"coupling not identifiable from these kicks: {coupling.why}"
-    told = "; ".join(part for part in (_largest(coupling), _linear(coupling)) if part)
+    answer = "; ".join(part for part in (_largest(coupling), _linear(coupling)) if part)
     if not coupling.checks_pass:
-        # The first thing said: nothing below holds as it would for a settled gait.
-        told = f"doubtful, since {_rows_that_fail(coupling)} as shifting time demands; {told}"
+        # First of all: nothing below holds as it would for a settled gait.
+        answer = f"doubtful, since {_rows_that_fail(coupling)} as shifting time demands; {answer}"
     size = coupling.kick_size
     if size is not None and size.why is not None:
-        told = f"{told}; {size.why}"
-    return f"coupling around this gait: {told}"
+        answer = f"{answer}; {size.why}"
+    return f"coupling around this gait: {answer}"
 
 
 def _largest(coupling: LocalCoupling) -> str:
-    """The largest element of P off the diagonal that is shown to be one.
+    """Describe the largest element of P off the diagonal that is significant.
 
     The largest of many is large by chance, too: its interval is that which holds for all elements
     off the diagonal together.
@@ -88,8 +88,7 @@ def _rows_that_fail(coupling: LocalCoupling) -> str:
     parts = (("P", 1, coupling.phase_rows), ("R", 0, coupling.gain_rows))
     off = {
         f"rows of {symbol} don't sum to {total}": max(
-            abs((row.total.value or 0.0) - row.expected) / max(row.standard_error, 1e-12)
-            for row in rows
+            _off(row) / max(row.standard_error, 1e-12) for row in rows
         )
         for symbol, total, rows in parts
     }
@@ -97,9 +96,16 @@ def _rows_that_fail(coupling: LocalCoupling) -> str:
 
 
 def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
-    """What stands below the answer."""
+    """Yield the sentences that follow the answer."""
     yield from kick_checks(coupling)
-    yield from held_out_detail(coupling)
+    for one in coupling.held_out:
+        yield (
+            f"Held out, {one.session}: deviations up to {one.size:.3f}, error "
+            f"{100 * one.error:.2f} % (noise {100 * one.noise:.2f} %), 'each joint keeps its "
+            f"response' {100 * one.error_kept:.2f} %."
+        )
+    if coupling.valid_to is not None:
+        yield f"Valid for deviations up to {coupling.valid_to:.3f} rad, as far as was tried."
     size = coupling.kick_size
     if size is not None:
         yield (
@@ -109,11 +115,11 @@ def kick_detail(coupling: LocalCoupling) -> Iterable[str]:
 
 
 def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
-    """What was checked, and what the kicks say of a linear chain."""
-    said = "pass" if coupling.checks_pass else "FAIL"
+    """Yield the results of the checks, and of the reading as a linear chain."""
+    verdict = "pass" if coupling.checks_pass else "FAIL"
     yield (
         f"Time shift: rows of P sum to 1 within {_worst(coupling.phase_rows)}, rows of R to 0 "
-        f"within {_worst(coupling.gain_rows)}: {said}."
+        f"within {_worst(coupling.gain_rows)}: {verdict}."
     )
     if coupling.scatter is not None:
         yield _scatter(coupling.scatter)
@@ -130,20 +136,8 @@ def kick_checks(coupling: LocalCoupling) -> Iterable[str]:
         )
 
 
-def held_out_detail(coupling: LocalCoupling) -> Iterable[str]:
-    """How well runs that were not used are predicted."""
-    for one in coupling.held_out:
-        yield (
-            f"Held out, {one.session}: deviations up to {one.size:.3f}, error "
-            f"{100 * one.error:.2f} % (noise {100 * one.noise:.2f} %), 'each joint keeps its "
-            f"response' {100 * one.error_kept:.2f} %."
-        )
-    if coupling.valid_to is not None:
-        yield f"Valid for deviations up to {coupling.valid_to:.3f} rad, as far as was tried."
-
-
 def _scatter(scatter: RunScatter) -> str:
-    """How much runs differ, in degrees and percent."""
+    """Describe how much runs differ, in degrees and percent."""
     phase, gain = (np.array(one) for one in (scatter.phase_rad, scatter.log_gain))
     noise = np.degrees(np.median(scatter.phase_noise_rad))
     widened = "" if scatter.widened <= 1 else f"; errors widened by up to {scatter.widened:.2g}"
@@ -155,15 +149,19 @@ def _scatter(scatter: RunScatter) -> str:
     )
 
 
+def _off(row: RowCheck) -> float:
+    return abs((row.total.value or 0.0) - row.expected)
+
+
 def _worst(rows: tuple[RowCheck, ...]) -> str:
-    """The largest deviation of a row's sum, with its standard error."""
-    worst = max(rows, key=lambda row: abs((row.total.value or 0.0) - row.expected))
-    off = abs((worst.total.value or 0.0) - worst.expected)
+    """Return the largest deviation of a row's sum, with its standard error."""
+    worst = max(rows, key=_off)
+    off = _off(worst)
     digits = 1 - math.floor(math.log10(max(off, worst.standard_error, 1e-6)))
     return f"{off:.{digits}f} ({worst.name}, standard error {worst.standard_error:.{digits}f})"
 
 
-_TOLD = {
+_ROUTES = {
     Route.TORQUE: "Z from torques",
     Route.SERVO: "Z from H and the servo's parameters",
     Route.ROW_SCALED: "H^-1, which is Z up to a factor for each row",
@@ -180,41 +178,40 @@ def sweep_answer(coupling: Coupling) -> str:
         return f"coupling not identifiable from these runs: {coupling.why}"
     first = coupling.tones[0]
     where = {True: " in contact", False: " without contact", None: ""}[coupling.contact]
-    told = f"coupling{where} at {first.frequency_hz:.4g} Hz"
+    answer = f"coupling{where} at {first.frequency_hz:.4g} Hz"
     if first.asymmetry.value is None:
-        return f"{told}: H can't be inverted"
+        return f"{answer}: H can't be inverted"
     return (
-        f"{told}: {formats.percent(first.within_1)} of it is between neighbours, "
+        f"{answer}: {formats.percent(first.within_1)} of it is between neighbours, "
         f"{formats.percent(first.within_2)} within two joints; "
-        f"asymmetry {formats.percent(first.asymmetry)} ({_TOLD[first.route]})"
+        f"asymmetry {formats.percent(first.asymmetry)} ({_ROUTES[first.route]})"
     )
 
 
 def sweep_detail(coupling: LinearCoupling) -> Iterable[str]:
-    """What stands below the answer."""
+    """Yield the sentences that follow the answer."""
     for tone in coupling.tones:
         yield _tone(tone)
     yield from sweep_checks(coupling)
 
 
 def sweep_checks(coupling: LinearCoupling) -> Iterable[str]:
-    """What was checked of all tones together."""
+    """Yield the results of the checks of all tones."""
     yield f"{coupling.route_why[0].upper()}{coupling.route_why[1:]}."
     settled = (
         "settled"
         if coupling.drift_per_cycle == 0
         else f"NOT settled, drift {100 * coupling.drift_per_cycle:.2g} % per cycle"
     )
-    beside = (
-        "energy beside the tones unknown"
-        if coupling.sideband_energy.value is None
-        else f"energy beside the tones {_little(coupling.sideband_energy.value)} of theirs"
-    )
+    energy, beside = coupling.sideband_energy.value, "energy beside the tones unknown"
+    if energy is not None:
+        share = "less than 0.001 %" if energy < 1e-5 else f"{100 * energy:.2g} %"
+        beside = f"energy beside the tones {share} of theirs"
     yield f"Checks: {settled}; {beside}. Valid {coupling.validity}."
 
 
 def sweep_method(coupling: LinearCoupling) -> str:
-    """How the numbers were made.
+    """Describe the method.
 
     Returns:
         A sentence in lower case, with its full stop.
@@ -225,11 +222,6 @@ def sweep_method(coupling: LinearCoupling) -> str:
         "intervals one by one at 95 % from the noise beside each tone (Student's t), those of "
         "indices at least 95 %; all matrices with --json."
     )
-
-
-def _little(share: float) -> str:
-    """A share that may be next to nothing."""
-    return "less than 0.001 %" if share < 1e-5 else f"{100 * share:.2g} %"
 
 
 def _tone(tone: ToneCoupling) -> str:
@@ -254,9 +246,6 @@ def _tone(tone: ToneCoupling) -> str:
     if tone.distortion is not None:
         text += f"; distortion {100 * tone.distortion:.2g} %"
     return f"{text}."
-
-
-OR_TILT = "or the floor is tilted"
 
 
 def experiment_answer(
@@ -312,7 +301,7 @@ def _sessions(names: Sequence[str], count: int) -> str:
 
 
 def pair_order(pair: OrderedPair) -> str:
-    """Which joint of a pair answers less.
+    """Describe which joint of a pair responds less.
 
     Returns:
         A clause; joints as they are named.
@@ -321,7 +310,7 @@ def pair_order(pair: OrderedPair) -> str:
 
 
 def blind_spots(reversal: Reversal) -> str:
-    """What a reversal of these joints can't see."""
+    """Describe the differences that a reversal of these joints can't detect."""
     middle = "" if reversal.middle is None else f" or of the middle joint, {reversal.middle}"
     return f"blind to what is alike at both joints of a pair{middle}"
 
@@ -345,7 +334,7 @@ def _different(reversal: Reversal) -> str:
         )
     first = reversal.pairs[0]
     either = f"{first.name} weaker or {first.mirror} stronger"
-    either += "" if reversal.tilt.excluded else f", {OR_TILT}"
+    either += "" if reversal.tilt.excluded else ", or the floor is tilted"
     others = len(reversal.pairs) - 1
     also = f"; {others} more pair{'s differ' if others > 1 else ' differs'}, by less"
     lead = "the modules differ: " if reversal.tilt.excluded else ""
@@ -372,6 +361,6 @@ def _bounded(reversal: Reversal) -> str:
 
 
 def _at_most(bound: float) -> str:
-    """A bound with two digits, rounded up."""
+    """Format a bound with two digits, rounded up."""
     digits = formats.decimals_for_values([bound], 2)
     return formats.number(math.ceil(bound * 10**digits) / 10**digits, digits)

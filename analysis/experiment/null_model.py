@@ -26,7 +26,7 @@ import hashlib
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -59,7 +59,7 @@ DRAWS = 1999
 
 @dataclass(frozen=True)
 class NullTest:
-    """What the model says of one session; m modules, K shared parameters, q kinds of deviation.
+    """Test of one session against the model; m modules, K shared parameters, q kinds of deviation.
 
     Attributes:
         x: ln(theta / theta_0), shape (K,).
@@ -103,12 +103,12 @@ class _System:
     rest: FloatArray
 
     def beside(self, named: tuple[int, ...]) -> FloatArray:
-        """Columns of x and of the named modules, shape (..., n, K + q len(named))."""
+        """Return columns of x and of the named modules, shape (..., n, K + q len(named))."""
         own = self.modules[..., list(named), :]
         return np.concatenate([self.shared, own.reshape(*own.shape[:-2], -1)], axis=-1)
 
 
-def null_test(response: Response, joints: IntArray, model: NullModel, seed: int = 1) -> NullTest:
+def null_test(response: Response, joints: IntArray, model: NullModel) -> NullTest:
     """Test identical modules against the model, and name those that deviate.
 
     Args:
@@ -126,13 +126,12 @@ def null_test(response: Response, joints: IntArray, model: NullModel, seed: int 
     most = min(variance.size // kinds.shape[-1] - 1, len(kinds))
     named: tuple[int, ...] = ()
     p = np.ones(len(kinds))
-    whole = noise_whole = None
+    whole: tuple[FloatArray, FloatArray] | None = None
     while True:
         x, system = _linear(np.log(response.ratio), variance, joints, model, named)
-        drawn = _draws(system, np.tile(response.dof, 2), np.random.default_rng(seed))
-        left, noise_left = (_left(one, named) for one in (system, drawn))
-        if whole is None or noise_whole is None:
-            whole, noise_whole = left, noise_left
+        drawn = _draws(system, np.tile(response.dof, 2), np.random.default_rng(1))
+        left, noise_left = _left(system, named), _left(drawn, named)
+        whole = whole or (left, noise_left)
         gain, deviation, error = _one_by_one(system, named)
         noise_gain, noise_deviation, noise_error = _one_by_one(drawn, named)
         others = [j for j in range(len(kinds)) if j not in named]
@@ -148,8 +147,8 @@ def null_test(response: Response, joints: IntArray, model: NullModel, seed: int 
     return NullTest(
         x=frozen(x),
         x_error=frozen(np.sqrt(np.diag(information)[: x.size])),
-        fit=float(whole),
-        fit_p=float(_share(noise_whole, whole)),
+        fit=float(whole[0]),
+        fit_p=float(_share(whole[1], whole[0])),
         gain=frozen(gain),
         p=frozen(p),
         deviation=frozen(deviation),
@@ -188,12 +187,12 @@ def _linear(
 
 
 def _root(model: NullModel) -> FloatArray:
-    """L with L' L = P^-1, shape (K, K)."""
+    """Return L with L' L = P^-1, shape (K, K)."""
     return np.linalg.cholesky(np.linalg.inv(model.covariance)).T.astype(np.float64)
 
 
 def _residual(y: ComplexArray, joints: IntArray, model: NullModel, x: FloatArray) -> FloatArray:
-    """What is left, r = y - f(x), lags within half a turn, shape (2 r,)."""
+    """Return the residual r = y - f(x), lags within half a turn, shape (2 r,)."""
     off = y - model.at(x)[0][joints]
     return parts(off.real + 1j * np.angle(np.exp(1j * off.imag)))
 
@@ -224,7 +223,7 @@ def _fitted(
 
 
 def _draws(system: _System, dof: FloatArray, random: np.random.Generator) -> _System:
-    """Noise of the fitted H1, whitened by a covariance that is itself estimated."""
+    """Draw noise of the fitted H1, whitened by a covariance that is itself estimated."""
     count = dof.size
     half = count // 2
     # Gain and lag of a joint share their noise estimate.
@@ -241,19 +240,18 @@ def _draws(system: _System, dof: FloatArray, random: np.random.Generator) -> _Sy
 def _one_by_one(
     system: _System, named: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Lambda (..., m), deviation and its error (..., m, q) of each module beside the named ones."""
+    """Return Lambda (..., m), deviations and errors (..., m, q) of each module by itself."""
     gain, deviation, error = _alone(system, system.beside(named))
     for j in named:
         base = system.beside(tuple(k for k in named if k != j))
         own = _alone(_System(system.shared, system.modules[..., [j], :], system.rest), base)
-        for all_of, one in zip((gain, deviation, error), own, strict=True):
-            axis = gain.ndim - 1
-            np.moveaxis(all_of, axis, 0)[j] = np.moveaxis(one, axis, 0)[0]
+        gain[..., j] = own[0][..., 0]
+        deviation[..., j, :], error[..., j, :] = own[1][..., 0, :], own[2][..., 0, :]
     return gain, deviation, error
 
 
 def _alone(system: _System, base: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Each module's columns added to a base by itself (Frisch & Waugh, Econometrica 1, 1933)."""
+    """Add each module's columns to a base by itself (Frisch & Waugh, Econometrica 1, 1933)."""
     q, _ = np.linalg.qr(base)
     shape = system.modules.shape
     columns = system.modules.reshape(*shape[:-2], -1)
@@ -268,21 +266,21 @@ def _alone(system: _System, base: FloatArray) -> tuple[FloatArray, FloatArray, F
 
 
 def _left(system: _System, named: tuple[int, ...]) -> FloatArray:
-    """Q with the named modules free, shape (...)."""
+    """Return Q with the named modules free, shape (...)."""
     q, _ = np.linalg.qr(system.beside(named))
     inside = (np.swapaxes(q, -1, -2) @ system.rest[..., None])[..., 0]
     return np.sum(system.rest**2, axis=-1) - np.sum(inside**2, axis=-1)
 
 
 def _share(drawn: FloatArray, seen: FloatArray) -> FloatArray:
-    """Share of the draws and of what was seen that reach it: never 0."""
+    """Return the share of the draws that reach the observed value, itself included: never 0."""
     return (1 + np.sum(drawn >= seen, axis=0)) / (len(drawn) + 1)
 
 
 def analyse_with_null(
     session: SessionView, file: Path, options: Options | None = None
 ) -> ModelledAnalysis:
-    """Everything that one session can tell, and its test against a null model.
+    """Analyse one session, and test it against a null model.
 
     Raises:
         InputFileError: If the file isn't there or can't be read.
@@ -307,17 +305,20 @@ def analyse_with_null(
     silent = len(model.joints) - len(joints)
     if silent:
         warnings.append(f"{silent} joints without gain and lag are not held to the null model")
-    known = {one.name: getattr(analysis, one.name) for one in dataclasses.fields(Analysis)}
-    known |= {"warnings": tuple(warnings), "provenance": _provenance(analysis, file)}
+    known: dict[str, Any] = {**vars(analysis), "warnings": tuple(warnings)}
+    known["provenance"] = _provenance(analysis, file)
     return ModelledAnalysis(**known, null_model=result)
 
 
 def _answered(
     measured: SessionMeasurement, model: NullModel, file: Path
 ) -> tuple[Response, np.ndarray[tuple[int], np.dtype[np.int64]]]:
-    """The response of the joints that answer, and their places in the model."""
+    """Return the response of the joints that have one, and their indices in the model."""
     path, gait = measured.analysis.session.path, measured.gait
-    fault = _other_robot(measured.analysis, model) or _other_gait(gait, model)
+    robot = measured.analysis.session.robot
+    fault = _other_gait(gait, model)
+    if robot != model.robot:
+        fault = f"it is of {robot or 'no known robot'}, the model of {model.robot}"
     if fault is not None or gait is None or gait.response is None:
         raise UsageError(f"{path} can't be held to {file}: {fault or 'it has no gain and lag'}")
     sound = {one.name for one in measured.analysis.joints if one.lag_rad.value is not None}
@@ -326,15 +327,8 @@ def _answered(
     return gait.response.select(chosen), joints
 
 
-def _other_robot(analysis: Analysis, model: NullModel) -> str | None:
-    robot = analysis.session.robot
-    if robot == model.robot:
-        return None
-    return f"it is of {robot or 'no known robot'}, the model of {model.robot}"
-
-
 def _other_gait(gait: GaitFit | None, model: NullModel) -> str | None:
-    """Why the commands are another gait's; None if they are the model's."""
+    """Return why the commands are another gait's; None if they are the model's."""
     if gait is None or not gait.driven:
         return "it has no gait with commands"
     if gait.others:

@@ -11,11 +11,12 @@ covers at least 95 %.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import helmert
 
-from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray, frozen
+from undulog.capture.common.arrays import ComplexArray, FloatArray, frozen
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Robot
 
@@ -31,11 +32,26 @@ from ..session.heterogeneity import spread
 from ..signals.columns import by_plane
 from .reversal.mirror import MIN_RUNS, parts
 
+_LABELS = {
+    "mirror_response": ("1", "T of H1: identical modules, by reversal"),
+    "module_share": ("1", "share of the spread due to the modules"),
+    "boundary_share": ("1", "share of the spread that identical modules show, too"),
+    "equivalence_mirror_gain": (
+        "1",
+        "largest difference of ln gain from the mirror; H1: all in 2 %",
+    ),
+    "equivalence_mirror_lag": (
+        "rad",
+        "largest difference of lag from the mirror; H1: all in 1 degree",
+    ),
+}
+"""Unit and label of each index of a reversal."""
+
 
 def experiment_indices(
     forward: ComplexArray, reverse: ComplexArray, reversal: Reversal | None
 ) -> dict[str, Index]:
-    """H0, H1 and H2 as indices.
+    """Return H0, H1 and H2 as indices.
 
     Args:
         forward: y of the runs one way, shape (r1, m).
@@ -48,55 +64,37 @@ def experiment_indices(
         ``boundary_share`` (H2), ``equivalence_mirror_gain`` and ``equivalence_mirror_lag``. None
         where they can't be computed.
     """
-    indices = {
-        "common_response": _common_response([forward, reverse]),
-        "mirror_response": Index(None, None, None, "1", "T of H1: identical modules, by reversal"),
-        "module_share": Index(None, None, None, "1", "share of the spread due to the modules"),
-        "boundary_share": Index(
-            None, None, None, "1", "share of the spread that identical modules show, too"
-        ),
-        "equivalence_mirror_gain": Index(
-            None, None, None, "1", "largest difference of ln gain from the mirror; H1: all in 2 %"
-        ),
-        "equivalence_mirror_lag": Index(
-            None,
-            None,
-            None,
-            "rad",
-            "largest difference of lag from the mirror; H1: all in 1 degree",
-        ),
-    }
-    if reversal is None:
-        return indices
-    module, boundary = reversal.module_share, reversal.boundary_share
-    gains = [one.log_gain_difference.value or 0.0 for one in reversal.joints]
-    lags = [one.lag_difference_rad.value or 0.0 for one in reversal.joints]
-    found: dict[str, tuple[float | None, Interval | None, float | None]] = {
-        "mirror_response": (reversal.statistic, None, reversal.p),
-        "module_share": (module.value, module.ci95, reversal.p),
-        "boundary_share": (boundary.value, boundary.ci95, None),
-        "equivalence_mirror_gain": (max(map(abs, gains)), None, reversal.equivalence_gain_p),
-        "equivalence_mirror_lag": (max(map(abs, lags)), None, reversal.equivalence_lag_p),
-    }
-    return indices | {
-        name: replace(indices[name], value=value, ci95=ci95, p=p)
-        for name, (value, ci95, p) in found.items()
+    found: dict[str, tuple[float | None, Interval | None, float | None]] = {}
+    if reversal is not None:
+        module, boundary = reversal.module_share, reversal.boundary_share
+        gain = max(abs(one.log_gain_difference.value or 0.0) for one in reversal.joints)
+        lag = max(abs(one.lag_difference_rad.value or 0.0) for one in reversal.joints)
+        found = {
+            "mirror_response": (reversal.statistic, None, reversal.p),
+            "module_share": (module.value, module.ci95, reversal.p),
+            "boundary_share": (boundary.value, boundary.ci95, None),
+            "equivalence_mirror_gain": (gain, None, reversal.equivalence_gain_p),
+            "equivalence_mirror_lag": (lag, None, reversal.equivalence_lag_p),
+        }
+    return {"common_response": _common_response([forward, reverse])} | {
+        name: Index(*found.get(name, (None, None, None)), unit, label)
+        for name, (unit, label) in _LABELS.items()
     }
 
 
 def _common_response(ways: list[ComplexArray]) -> Index:
-    """F of H0 over the means of each way's runs; gain and lag of each way about their own mean."""
+    """Return F of H0 over the means of each way's runs, each way about its own mean."""
     known = [one for one in ways if len(one) >= MIN_RUNS and one.shape[1] > 1]
+    ratio = p = None
+    if known:
+        values = np.concatenate([parts(one.mean(axis=0)) for one in known])
+        variance = np.concatenate([parts(one).var(axis=0, ddof=1) / len(one) for one in known])
+        dof = np.full(known[0].shape[1], min(len(one) for one in known) - 1.0)
+        found = spread(values, variance, dof, blocks=2 * len(known))
+        if found.expected != 0:
+            ratio, p = found.ratio, found.p
     label = "F of H0: all joints have the same gain and delay, noise from run to run"
-    if not known:
-        return Index(None, None, None, "1", label)
-    values = np.concatenate([parts(one.mean(axis=0)) for one in known])
-    variance = np.concatenate([parts(one).var(axis=0, ddof=1) / len(one) for one in known])
-    dof = np.full(known[0].shape[1], min(len(one) for one in known) - 1.0)
-    found = spread(values, variance, dof, blocks=2 * len(known))
-    if found.expected == 0:
-        return Index(None, None, None, "1", label)
-    return Index(found.ratio, None, found.p, "1", label)
+    return Index(ratio, None, p, "1", label)
 
 
 @dataclass(frozen=True)
@@ -153,8 +151,7 @@ def pool_runs(names: Sequence[str], runs: Sequence[Response]) -> PooledResponse:
         ]
     )
     if count > 1:
-        parts = np.concatenate([each.real, each.imag], axis=1)
-        centred = parts - parts.mean(axis=0)
+        centred = parts(each) - parts(each).mean(axis=0)
         scatter = centred.T @ centred / (count - 1)
         dof = np.full(m, count - 1.0)
     else:
@@ -179,7 +176,7 @@ def pool_runs(names: Sequence[str], runs: Sequence[Response]) -> PooledResponse:
 
 
 def _log_response(ratio: ComplexArray) -> ComplexArray:
-    """Ln H of each run, the phases of a joint within pi of their mean, shape (r, m)."""
+    """Return ln H of each run, the phases of a joint within pi of their mean, shape (r, m)."""
     turn: FloatArray = np.angle((ratio / np.abs(ratio)).sum(axis=0))
     phase = turn + np.angle(ratio * np.exp(-1j * turn))
     return (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
@@ -226,14 +223,10 @@ def pooled_answer(
 
 
 def _scatter(values: FloatArray, variance: FloatArray) -> Scatter:
-    """Scatter of the mean of values (r runs, m joints): r - 1 columns, and what noise adds (m,)."""
+    """Return the scatter of the mean of values (r, m): r - 1 columns, and added noise (m,)."""
     runs = len(values)
     centred = values - values.mean(axis=0)
     # Helmert's contrasts between the runs are orthonormal, so the columns are independent.
-    size: IntArray = np.arange(1, runs, dtype=np.int64)
-    lower = np.tril(np.ones((runs - 1, runs)))
-    lower[np.arange(runs - 1), size] = -size
-    basis = lower / np.sqrt(size * (size + 1.0))[:, None]
-    columns = (basis @ centred).T / runs**0.5
+    columns = (helmert(runs) @ centred).T / runs**0.5
     raised: FloatArray = np.maximum(variance - np.mean(columns**2, axis=1), 0.0)
     return Scatter(columns, raised, np.zeros_like(raised))

@@ -1,7 +1,7 @@
-"""Coupled oscillators: what couples them, and what couples them through the body.
+"""Coupled oscillators: their own couplings, and those through the body.
 
-The chain of oscillators that Eq. 1 of Meister, Stepanenko & Kernbach 2011 speaks of is told from
-its own kicked phases (:mod:`.weak_form`). What the body would add is told from open-loop kicks: the
-matrix P read as entrainment (:mod:`.entrainment`) and as a signed Laplacian (:mod:`.laplacian`),
-which predicts how oscillators with feedback relax (:mod:`.embodied`).
+The chain of oscillators of Eq. 1 of Meister, Stepanenko & Kernbach 2011 is estimated from its own
+kicked phases (:mod:`.weak_form`, :mod:`.chain`). The coupling through the body is estimated from
+open-loop kicks: the matrix P read as entrainment and as a signed Laplacian (:mod:`.laplacian`),
+which predicts how oscillators with feedback relax (:mod:`.predictions`).
 """

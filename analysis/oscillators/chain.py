@@ -27,7 +27,7 @@ _SIGMA_OF_MAD = 1.4826
 
 
 def kicked_steps(phases: FloatArray) -> BoolArray:
-    """Which steps from sample to sample hold a kick.
+    """Find the steps from sample to sample that hold a kick.
 
     Args:
         phases: Of n oscillators, without wrap-around [rad], shape (k, n).
@@ -74,7 +74,7 @@ MOST_CONDITION = 500.0
 
 MOST_NOISE = 0.5
 """Standard errors beyond this share of the couplings, both root mean square, are refused: noise
-alone moves locked phases too, but so little that it tells its own size only."""
+alone moves locked phases too, but so little that only its size can be estimated."""
 
 RECORD = (
     "the chain kicked as it runs: each phase turned at once by random amounts up to 1 rad, every "
@@ -92,7 +92,7 @@ def chain_coupling(
     inputs: FloatArray | None = None,
     reach: int = 1,
 ) -> ChainCoupling:
-    """Tell the couplings of a chain from its phases.
+    """Estimate the couplings of a chain from its phases.
 
     Args:
         plane: Of the chain's joints.
@@ -104,7 +104,7 @@ def chain_coupling(
         reach: Couplings are looked for up to abs(i - j) = reach; Eq. 1 has 1.
 
     Returns:
-        The couplings, or why they can't be told and what to record.
+        The couplings, or why they can't be estimated and what to record.
     """
     n = len(names)
     steps = np.ones(len(phases) - 1, dtype=np.bool_) if whole is None else whole
@@ -119,8 +119,8 @@ def chain_coupling(
     windows = sum((len(piece.phases) - 1) // length for piece in pieces)
     unknowns = 1 + 2 * min(2 * reach, n - 1) + (inputs is not None)
     if windows <= 2 * unknowns:
-        told = f"{duration_s:.3g} s of phases are too short for {unknowns} unknowns an oscillator"
-        return refused(told, None)
+        why = f"{duration_s:.3g} s of phases are too short for {unknowns} unknowns an oscillator"
+        return refused(why, None)
     fits = [
         fit_oscillator(pieces, period_s, i, [j for j in range(n) if j != i and abs(i - j) <= reach])
         for i in range(n)
@@ -160,14 +160,14 @@ def chain_coupling(
 
 
 def _noise_share(fits: Sequence[OscillatorFit]) -> float:
-    """Root mean square of the standard errors over that of the couplings."""
+    """Return the root mean square of the standard errors over that of the couplings."""
     squared = sum(float(np.square([fit.in_phase, fit.quadrature]).sum()) for fit in fits)
     errors = sum(float(np.sum(np.trace(fit.covariance, axis1=1, axis2=2))) for fit in fits)
     return (errors / squared) ** 0.5
 
 
 def _link(source: str, target: str, fit: OscillatorFit, k: int) -> Link:
-    """K and psi from (K cos psi, K sin psi), to first order in their errors."""
+    """Return K and psi from (K cos psi, K sin psi), to first order in their errors."""
     pair: FloatArray = np.array([fit.in_phase[k], fit.quadrature[k]])
     size = float(np.hypot(pair[0], pair[1]))
     covariance: FloatArray = fit.covariance[k]
@@ -175,7 +175,7 @@ def _link(source: str, target: str, fit: OscillatorFit, k: int) -> Link:
     factor = t_factor(fit.dof)
     half = factor * float(along @ covariance @ along) ** 0.5
     turn = factor * float(across @ covariance @ across) ** 0.5 / size
-    # Can the pair be told from none? A length is never below zero.
+    # Does the pair differ from zero? A length is never below zero.
     whitened = np.linalg.solve(np.linalg.cholesky(covariance), pair)
     F = float(np.square(whitened).sum()) / 2
     shown = bool(fdtrc(2, fit.dof, F) < 1 - CONFIDENCE)
@@ -204,7 +204,7 @@ _NS = 1e9
 def session_couplings(
     session: SessionView, start_s: float | None = None, stop_s: float | None = None
 ) -> tuple[ChainCoupling, ...]:
-    """Tell the couplings of each plane's oscillators.
+    """Estimate the couplings of each plane's oscillators.
 
     Args:
         start_s: From when on, from the session's start [s]; all of it if None.

@@ -1,19 +1,20 @@
 """Modes of I - P, the signed Laplacian of what the body couples.
 
-With P = d psi / d psi_c of open-loop kicks (:mod:`..kicks.local`) and generators that feel their
-own servos, eps P_ij is the embodied coupling, and deviations of the phases relax as
+With P = d psi / d psi_c of open-loop kicks (:mod:`.analysis.experiment.kicks.local`) and generators
+with feedback from their own servos, eps P_ij is the embodied coupling, and deviations of the phases
+relax as
 
     d phi' = -eps (I - P) d phi,
 
-for small lags (:mod:`.embodied` has the whole of it). Rows of P sum to 1, by time shift, so all
-phases together are a mode of rate 0, whatever noise says: it is left out exactly, by looking at
-deviations from the mean only, B'(I - P) B with columns of B orthonormal and orthogonal to 1.
+for small lags (:mod:`.predictions` has the complete equation). Rows of P sum to 1, by time shift,
+so all phases together are a mode of rate 0, whatever the noise: it is left out exactly, by looking
+at deviations from the mean only, B'(I - P) B with columns of B orthonormal and orthogonal to 1.
 Entries of P may be negative: other rates may be near zero, or below it, and then the body leaves
 that pattern alone, or drives it.
 
 P is not normal. Its eigenvalues may move by far more than its entries, so each has an interval and
 its condition number |x| |y| / |y'x| (Golub & Van Loan, Matrix Computations, 2013, 7.2.2), and the
-pseudospectrum is told (Trefethen & Embree, Spectra and Pseudospectra, 2005).
+pseudospectrum is computed (Trefethen & Embree, Spectra and Pseudospectra, 2005).
 
 How far the eigenvalues of I - P may move if P is off by so much.
 
@@ -34,7 +35,9 @@ from scipy.optimize import linear_sum_assignment
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
 from ..estimators.intervals import CONFIDENCE, Noisy, noise_draws
+from ..results.coupling import rows_of
 from ..results.estimate import Estimate
+from ..results.oscillators import Levels
 
 STRONG = 0.1
 """A rate of I - P above this counts as strong: the body brings such a pattern back in 10/eps."""
@@ -84,7 +87,7 @@ class SpectrumIntervals:
 
 
 def spectrum(P: FloatArray) -> Spectrum:
-    """Modes of I - P.
+    """Return modes of I - P.
 
     Args:
         P: d psi / d psi_c, rows sum to 1, shape (m, m).
@@ -98,7 +101,7 @@ def spectrum(P: FloatArray) -> Spectrum:
 
 
 def of_deviations(P: FloatArray) -> FloatArray:
-    """I - P as it acts on deviations from the mean phase.
+    """Return I - P as it acts on deviations from the mean phase.
 
     Args:
         P: d psi / d psi_c, rows sum to 1, shape (..., m, m).
@@ -111,13 +114,13 @@ def of_deviations(P: FloatArray) -> FloatArray:
 
 
 def _basis(m: int) -> FloatArray:
-    """Orthonormal columns, all orthogonal to 1, shape (m, m - 1)."""
+    """Return orthonormal columns, all orthogonal to 1, shape (m, m - 1)."""
     whole = np.linalg.qr(np.column_stack([np.ones(m), np.eye(m)[:, 1:]]))[0]
     return whole[:, 1:].astype(np.float64)
 
 
 def growth(P: FloatArray) -> float:
-    """Numerical abscissa of P - I: the fastest growth of |d phi| at its very start [eps].
+    """Return the numerical abscissa of P - I: the fastest initial growth of |d phi| [eps].
 
     Args:
         P: d psi / d psi_c, shape (m, m).
@@ -129,13 +132,8 @@ def growth(P: FloatArray) -> float:
     return -float(np.linalg.eigvalsh((rates + rates.T) / 2)[0])
 
 
-def intervals(P: Noisy, seed: int = 21) -> SpectrumIntervals:
-    """What the noise of P leaves open, by drawing its errors anew."""
-    return intervals_of(P.value, P.value + noise_draws(P, seed))
-
-
 def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
-    """What noise leaves open of the modes of I - P.
+    """Return intervals of the modes of I - P from draws of P.
 
     Each draw's eigenvalues are dealt to those of P so that they move least. Noise pushes
     eigenvalues apart and lowers the lowest, in P as in the draws made of it: an interval is the
@@ -148,46 +146,33 @@ def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:
     here = spectrum(P)
     draws = [spectrum(one) for one in drawn]
     dealt = np.array([_dealt(here.rates, one.rates) for one in draws])
-    strong = np.array([one.strong for one in draws], dtype=np.float64)
-    tails = _quantiles(strong)
+    strong, counts = float(here.strong), [float(one.strong) for one in draws]
+    tail = (1.0 - CONFIDENCE) / 2
+    low, high = np.quantile(counts, (tail, 1.0 - tail)).tolist()
+    fastest = growth(P)
+    growing = _mirrored(np.array(fastest), np.array([growth(one) for one in drawn]))
     real = _mirrored(here.rates.real, dealt.real)
     return SpectrumIntervals(
         real=real,
         imag=_mirrored(here.rates.imag, dealt.imag),
         # Of the slowest mode itself: the lowest of several close ones is biased in every draw.
         gap=Estimate(here.gap, (float(real[0, 0]), float(real[0, 1]))),
-        strong=Estimate(
-            float(here.strong),
-            (min(float(here.strong), tails[0]), max(float(here.strong), tails[1])),
-        ),
-        growth=_estimate(
-            growth(P),
-            np.array([growth(one) for one in drawn]),
-        ),
+        strong=Estimate(strong, (min(strong, low), max(strong, high))),
+        growth=Estimate(fastest, (float(growing[0]), float(growing[1]))),
     )
 
 
 def _dealt(rates: ComplexArray, others: ComplexArray) -> ComplexArray:
-    """Another draw's rates in the order of these."""
+    """Return another draw's rates in the order of these."""
     _, order = linear_sum_assignment(np.abs(rates[:, None] - others[None, :]))
     return others[order]
 
 
-def _quantiles(draws: FloatArray) -> tuple[float, float]:
-    tail = (1.0 - CONFIDENCE) / 2
-    return float(np.quantile(draws, tail)), float(np.quantile(draws, 1.0 - tail))
-
-
 def _mirrored(value: FloatArray, draws: FloatArray) -> FloatArray:
-    """Basic bootstrap intervals, shape (..., 2)."""
+    """Return basic bootstrap intervals, shape (..., 2)."""
     tail = (1.0 - CONFIDENCE) / 2
     low, high = np.quantile(draws, (1.0 - tail, tail), axis=0)
     return np.stack([2.0 * value - low, 2.0 * value - high], axis=-1)
-
-
-def _estimate(value: float, draws: FloatArray) -> Estimate:
-    low, high = _quantiles(draws)
-    return Estimate(value, (2.0 * value - high, 2.0 * value - low))
 
 
 POINTS = 41
@@ -197,25 +182,8 @@ MARGIN = 0.1
 """Of the grid around the eigenvalues."""
 
 
-@dataclass(frozen=True)
-class Pseudospectrum:
-    """Levels on a grid of the complex plane.
-
-    Attributes:
-        real: Of z [eps], shape (r,).
-        imag: Of z [eps], shape (c,).
-        level: Smallest singular value of z I - A, shape (r, c).
-        noise: The spectral norm that the error of A stays below, 95 %.
-    """
-
-    real: FloatArray
-    imag: FloatArray
-    level: FloatArray
-    noise: float
-
-
 def smallest_singular(P: FloatArray, real: FloatArray, imag: FloatArray) -> FloatArray:
-    """sigma_min(z I - A) on a grid.
+    """Return sigma_min(z I - A) on a grid.
 
     Args:
         P: d psi / d psi_c, shape (m, m).
@@ -230,23 +198,17 @@ def smallest_singular(P: FloatArray, real: FloatArray, imag: FloatArray) -> Floa
     return values[..., -1].astype(np.float64)
 
 
-def pseudospectrum(P: Noisy, seed: int = 21) -> Pseudospectrum:
-    """The levels around all eigenvalues.
-
-    Args:
-        seed: Of the draws that tell the noise's norm.
-
-    Returns:
-        Levels and the noise's own.
-    """
+def pseudospectrum(P: Noisy) -> Levels:
+    """Return the levels around all eigenvalues, and the level of the noise of P."""
     here = of_deviations(P.value)
-    error = of_deviations(P.value + noise_draws(P, seed)) - here
+    error = of_deviations(P.value + noise_draws(P, 21)) - here
     noise = np.linalg.norm(error, ord=2, axis=(1, 2))
     reach = float(np.quantile(noise, CONFIDENCE))
-    values: ComplexArray = np.linalg.eigvals(here).astype(np.complex128)
+    values = np.linalg.eigvals(here)
     margin = MARGIN + reach
     left, right = float(values.real.min()), float(values.real.max())
     real = np.linspace(left - margin, right + margin, POINTS)
     top = float(np.abs(values.imag).max()) + margin
     imag = np.linspace(-top, top, POINTS)
-    return Pseudospectrum(real, imag, smallest_singular(P.value, real, imag), reach)
+    level = smallest_singular(P.value, real, imag)
+    return Levels(tuple(real.tolist()), tuple(imag.tolist()), rows_of(level), reach)

@@ -4,7 +4,7 @@ A chain whose every joint is coupled to the others alike, by their distance only
 constant along its diagonals. The nearest such matrix to P (its diagonals' means), with rows scaled
 to sum to 1 and I - P scaled to the same norm, is compared with P.
 
-What generators that feel their own servos will do, predicted from open-loop kicks.
+Generators with feedback from their own servos, predicted from open-loop kicks.
 
     phi_i' = omega + eps (2 (q_i/A) cos phi_i - b_i) + explicit coupling
 
@@ -25,8 +25,8 @@ slopes in the settled pattern, so
 
     P = (Gamma + L)^-1 Gamma,      P^-1 - I = Gamma^-1 L.
 
-Settled phases tell coupling relative to the entrainment only: times of any size give the same P.
-Absolute rates need the way back from kicks (:mod:`.chain`).
+Settled phases determine coupling relative to the entrainment only: time constants of any size give
+the same P. Absolute rates need the transients after kicks (:mod:`.chain`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm, toeplitz
+from scipy.linalg import toeplitz
 from scipy.optimize import brentq
 from scipy.special import stdtridf, stdtrit
 
@@ -48,15 +48,14 @@ from ..results.oscillators import (
     ENTRAINMENT_LABEL,
     BodyOscillators,
     Comparator,
-    Levels,
     Mode,
     RelativeCoupling,
 )
-from .laplacian import STRONG, Spectrum, SpectrumIntervals, intervals, pseudospectrum, spectrum
+from .laplacian import STRONG, Spectrum, SpectrumIntervals, intervals_of, pseudospectrum, spectrum
 
 
 def felt_response(ratio: ComplexArray, omega: float, age_s: float) -> ComplexArray:
-    """The response as the generator hears of it.
+    """Return the response as the generator receives it.
 
     Args:
         ratio: H = a/c as measured, shape (m,).
@@ -69,79 +68,40 @@ def felt_response(ratio: ComplexArray, omega: float, age_s: float) -> ComplexArr
     return (ratio * np.exp(-1j * omega * age_s)).astype(np.complex128)
 
 
-def steady_bias(felt: ComplexArray) -> FloatArray:
-    """b_i = g_i sin Delta_i, which takes the steady part of the feedback away.
-
-    Args:
-        felt: g exp(j Delta), shape (m,).
-
-    Returns:
-        Shape (m,).
-    """
-    return felt.imag.copy()
-
-
 def relaxation(P: FloatArray, R: FloatArray, felt: ComplexArray) -> FloatArray:
-    """J / eps of d phi' = J d phi.
+    """Return J / eps of d phi' = J d phi.
 
     Args:
-        P: d psi / d psi_c of the open loop, shape (m, m).
-        R: d ln|a| / d psi_c of the open loop, shape (m, m).
-        felt: g exp(j Delta) of the open loop, shape (m,).
+        P: d psi / d psi_c of the open loop, shape (..., m, m).
+        R: d ln|a| / d psi_c of the open loop, shape (..., m, m).
+        felt: g exp(j Delta) of the open loop, shape (..., m).
 
     Returns:
-        Shape (m, m); P - I where there is no lag and a gain of 1.
+        Shape (..., m, m); P - I where there is no lag and a gain of 1.
     """
-    return felt.real[:, None] * (P - np.eye(len(P))) + felt.imag[:, None] * R
-
-
-def relax(J: FloatArray, kick: FloatArray, times_s: FloatArray) -> FloatArray:
-    """Deviations after a kick, d phi(t) = exp(J t) d phi(0).
-
-    Args:
-        J: Rates [1/s], shape (m, m).
-        kick: d phi(0) [rad], shape (m,).
-        times_s: After the kick [s], shape (k,).
-
-    Returns:
-        Shape (k, m).
-    """
-    return np.array([expm(J * float(t)) @ kick for t in times_s])
+    off = P - np.eye(P.shape[-1])
+    return felt.real[..., None] * off + felt.imag[..., None] * R
 
 
 MOST_CONDITION = 1e6
 """Condition number of P beyond which it isn't inverted."""
 
 
-@dataclass(frozen=True)
-class Entrainment:
-    """Gamma^-1 L.
-
-    Attributes:
-        relative: P^-1 - I: minus the coupling K_ij / Gamma_i off the diagonal; None where P is
-            singular; shape (m, m).
-        half: Half widths of the 95 % intervals, one by one, shape (m, m).
-        condition_number: Of P: what its inversion may multiply relative errors by.
-    """
-
-    relative: FloatArray | None
-    half: FloatArray | None
-    condition_number: float
-
-
-def entrainment(P: Noisy) -> Entrainment:
-    """Read P as an entrained chain.
+def entrainment(P: Noisy) -> RelativeCoupling:
+    """Read P as the matrix of an entrained chain.
 
     Args:
         P: d psi / d psi_c with standard errors.
 
     Returns:
-        The reading. Intervals are to first order in P's errors E, d(P^-1) = -P^-1 E P^-1, with the
-        degrees of freedom of a sum of variances (Welch, Biometrika 34, 1947).
+        Gamma^-1 L = P^-1 - I. Intervals are to first order in P's errors E,
+        d(P^-1) = -P^-1 E P^-1, with the degrees of freedom of a sum of variances (Welch,
+        Biometrika 34, 1947).
     """
     condition = float(np.linalg.cond(P.value))
+    finite = condition if np.isfinite(condition) else None
     if not condition < MOST_CONDITION:
-        return Entrainment(None, None, condition)
+        return RelativeCoupling(ENTRAINMENT_LABEL, None, None, finite)
     inverse = np.linalg.inv(P.value)
     squared, error = np.square(inverse), np.square(P.error)
     variance = squared @ error @ squared
@@ -150,7 +110,8 @@ def entrainment(P: Noisy) -> Entrainment:
         np.square(variance), scatter, out=np.full(variance.shape, P.dof.min()), where=scatter > 0
     )
     half = np.asarray(stdtrit(dof, 0.5 + CONFIDENCE / 2) * np.sqrt(variance), dtype=np.float64)
-    return Entrainment(inverse - np.eye(len(P.value)), half, condition)
+    relative = inverse - np.eye(len(P.value))
+    return RelativeCoupling(ENTRAINMENT_LABEL, rows_of(relative), rows_of(half), finite)
 
 
 MOST_EXPLICIT = 1e6
@@ -158,7 +119,7 @@ MOST_EXPLICIT = 1e6
 
 
 def homogeneous(P: FloatArray) -> FloatArray:
-    """The homogeneous comparator of a chain.
+    """Return the homogeneous comparator of a chain.
 
     Args:
         P: d psi / d psi_c, rows sum to 1, shape (m, m).
@@ -176,7 +137,7 @@ def homogeneous(P: FloatArray) -> FloatArray:
 
 
 def path_laplacian(m: int) -> FloatArray:
-    """Laplacian of a chain coupled to its next neighbours both ways, with open ends.
+    """Return the laplacian of a chain coupled to its next neighbours both ways, with open ends.
 
     Returns:
         Shape (m, m); its eigenvalues are 4 sin^2(k pi / 2m), k = 0 .. m - 1.
@@ -187,7 +148,7 @@ def path_laplacian(m: int) -> FloatArray:
 
 
 def explicit_coupling(P: FloatArray, rate: float = STRONG) -> float | None:
-    """What coupling between next neighbours must add to that through the body.
+    """Find the coupling between next neighbours that the body's coupling needs in addition.
 
     Args:
         P: d psi / d psi_c, shape (m, m).
@@ -231,7 +192,7 @@ class MeasuredP:
 
 
 def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
-    """What oscillators that feel their servos would do.
+    """Predict oscillators with feedback from their servos.
 
     Args:
         coupling: From kicks around one gait.
@@ -239,47 +200,36 @@ def body_oscillators(coupling: LocalCoupling) -> BodyOscillators:
     Returns:
         Modes, comparator, and what explicit coupling must add.
     """
-    P = measured(coupling.P, phase_correlation(coupling))
-    found, said = spectrum(P.value), intervals(P)
+    m, correlation = len(coupling.joints), None
+    if coupling.scatter is not None:
+        correlation = np.array(coupling.scatter.correlation)[:m, :m]
+    P = measured(coupling.P, correlation)
+    found, ends = spectrum(P.value), intervals_of(P.value, P.value + noise_draws(P, 21))
     like = spectrum(homogeneous(P.value))
-    levels = pseudospectrum(P)
     explicit = _explicit(P)
     return BodyOscillators(
-        answer=_answer(found, said, like, explicit),
+        answer=_answer(found, ends, like, explicit),
         joints=coupling.joints,
-        slowest=said.gap,
-        strong=said.strong,
+        slowest=ends.gap,
+        strong=ends.strong,
         strong_above=STRONG,
-        growth=said.growth,
-        modes=_modes(found, said),
+        growth=ends.growth,
+        modes=_modes(found, ends),
         comparator=Comparator(like.gap, like.strong, tuple(like.rates.real.tolist())),
         explicit_coupling=explicit,
-        pseudospectrum=Levels(
-            tuple(levels.real.tolist()),
-            tuple(levels.imag.tolist()),
-            rows_of(levels.level),
-            levels.noise,
-        ),
-        entrainment=_relative(P),
+        pseudospectrum=pseudospectrum(P),
+        entrainment=entrainment(P),
     )
 
 
-def phase_correlation(coupling: LocalCoupling) -> FloatArray | None:
-    """Correlation of the joints' phases in a run's errors, shape (m, m); None if unknown."""
-    if coupling.scatter is None:
-        return None
-    m = len(coupling.joints)
-    return np.array(coupling.scatter.correlation)[:m, :m]
-
-
 def measured(matrix: Matrix, correlation: FloatArray | None = None) -> MeasuredP:
-    """A matrix of a result with its errors.
+    """Convert a matrix of a result with its errors.
 
     Args:
         correlation: Of a column's errors, shape (m, m), or None.
 
     Returns:
-        Value, errors, and the degrees of freedom that the intervals' factor says.
+        Value, errors, and the degrees of freedom that the intervals' factor implies.
     """
     value, error, half = (
         np.array(one) for one in (matrix.value, matrix.standard_error, matrix.ci95_half)
@@ -291,11 +241,11 @@ def measured(matrix: Matrix, correlation: FloatArray | None = None) -> MeasuredP
     return MeasuredP(value, error, np.minimum(usable, _MOST_DOF), correlation)
 
 
-def _modes(found: Spectrum, said: SpectrumIntervals) -> tuple[Mode, ...]:
+def _modes(found: Spectrum, ends: SpectrumIntervals) -> tuple[Mode, ...]:
     return tuple(
         Mode(
-            real=Estimate(float(rate.real), _pair(said.real[k])),
-            imag=Estimate(float(rate.imag), _pair(said.imag[k])),
+            real=Estimate(float(rate.real), _pair(ends.real[k])),
+            imag=Estimate(float(rate.imag), _pair(ends.imag[k])),
             sensitivity=float(found.sensitivity[k]),
             pattern_abs=tuple(np.abs(found.patterns[:, k]).tolist()),
             pattern_rad=tuple(np.angle(found.patterns[:, k]).tolist()),
@@ -316,37 +266,26 @@ def _explicit(P: MeasuredP) -> Estimate:
     return Estimate(value, (min(value, float(low)), max(value, float(high))))
 
 
-def _relative(P: MeasuredP) -> RelativeCoupling:
-    reading = entrainment(P)
-    condition = reading.condition_number
-    return RelativeCoupling(
-        ENTRAINMENT_LABEL,
-        None if reading.relative is None else rows_of(reading.relative),
-        None if reading.half is None else rows_of(reading.half),
-        condition if np.isfinite(condition) else None,
-    )
-
-
-def _answer(found: Spectrum, said: SpectrumIntervals, like: Spectrum, explicit: Estimate) -> str:
+def _answer(found: Spectrum, ends: SpectrumIntervals, like: Spectrum, explicit: Estimate) -> str:
     count = len(found.rates)
-    told = (
-        f"through the body alone the slowest of {count} patterns {_pace(said.gap)} and "
+    answer = (
+        f"through the body alone the slowest of {count} patterns {_pace(ends.gap)} and "
         f"{found.strong} relax at more than {STRONG:g} eps (a homogeneous chain as "
         f"strong: {formats.number(like.gap, 3)} eps, {like.strong})"
     )
     if explicit.value is None:
-        return f"{told}; no coupling of next neighbours lifts all of them to {STRONG:g} eps"
+        return f"{answer}; no coupling of next neighbours lifts all of them to {STRONG:g} eps"
     if explicit.value == 0.0:
-        return f"{told}; that is enough without explicit coupling"
+        return f"{answer}; that is enough without explicit coupling"
     return (
-        f"{told}; explicit coupling must supply the gap: "
+        f"{answer}; explicit coupling must supply the gap: "
         f"{formats.estimate(explicit, ' eps', most=3)} between next neighbours lifts all to "
         f"{STRONG:g} eps"
     )
 
 
 def _pace(gap: Estimate) -> str:
-    """What a pattern does: a negative rate of relaxing is one of growth."""
+    """Describe how a pattern relaxes or grows."""
     if gap.value is None or gap.value >= 0.0:
         return f"relaxes at {formats.estimate(gap, ' eps', most=4)}"
     ends = None if gap.ci95 is None else (-gap.ci95[1], -gap.ci95[0])

@@ -14,10 +14,10 @@ Econometric Analysis of Cross Section and Panel Data, 2010, ch. 5): b = (Z'X)^-1
 Of locked phases every regressor is constant, and X is singular: its condition number says how far
 the data are from telling anything.
 
-The oscillators' phases that a session logged, plane by plane, and what their servos told them.
+The oscillators' phases that a session logged, plane by plane, and the feedback from their servos.
 
-A generator of oscillators tells every joint's own phase on ``/gait``. If it feels its servos, the
-angles enter as u_i = 2 (q_i - Y_i) / A cos phi_i (:mod:`.embodied`); each is taken a sample's
+A generator of oscillators logs every joint's own phase on ``/gait``. With feedback, the
+angles enter as u_i = 2 (q_i - Y_i) / A cos phi_i (:mod:`.predictions`); each is taken a sample's
 period old, as the generator has it.
 """
 
@@ -52,7 +52,6 @@ class PhaseLog:
 
     Attributes:
         names: Of its n joints, head to tail.
-        t_ns: Times [Unix ns], shape (k,).
         phases: Without wrap-around [rad], shape (k, n).
         period_s: From sample to sample [s].
         whole: Whether each step is one period long, at the plane's usual rate, shape (k - 1,).
@@ -61,7 +60,6 @@ class PhaseLog:
 
     plane: str
     names: tuple[str, ...]
-    t_ns: IntArray
     phases: FloatArray
     period_s: float
     whole: BoolArray
@@ -82,16 +80,16 @@ def read_phases(
     """
     if GAIT_TOPIC not in session.channels:
         return ()
-    told = session.joints(GAIT_TOPIC)
+    gait = session.joints(GAIT_TOPIC)
     planes: dict[str, list[str]] = {}
     for joint, plane in planes_of(session.robot).items():
-        if f"{joint}.phase" in told.names:
+        if f"{joint}.phase" in gait.names:
             planes.setdefault(plane, []).append(joint)
     if not any(len(joints) > 1 for joints in planes.values()):
         return ()
     angles = _angles(session)
     logs = (
-        _log(told, plane, tuple(joints), angles, (start_ns, stop_ns))
+        _log(gait, plane, tuple(joints), angles, (start_ns, stop_ns))
         for plane, joints in planes.items()
         if len(joints) > 1
     )
@@ -99,14 +97,14 @@ def read_phases(
 
 
 def _log(
-    told: JointSignals,
+    gait: JointSignals,
     plane: str,
     names: tuple[str, ...],
     angles: JointSignals | None,
     span: tuple[int | None, int | None],
 ) -> PhaseLog | None:
-    t_ns = told.signal(f"{names[0]}.phase").t_ns
-    columns = np.stack([told.signal(f"{name}.phase").values for name in names], axis=1)
+    t_ns = gait.signal(f"{names[0]}.phase").t_ns
+    columns = np.stack([gait.signal(f"{name}.phase").values for name in names], axis=1)
     known = np.isfinite(columns).all(axis=1)
     known &= t_ns >= (t_ns[0] if span[0] is None else span[0])
     known &= t_ns < (t_ns[-1] + 1 if span[1] is None else span[1])
@@ -117,16 +115,16 @@ def _log(
     steps = np.diff(t_ns).astype(np.float64) / _NS
     period_s = float(np.median(steps))
     whole: BoolArray = np.abs(steps - period_s) < _JITTER * period_s
-    whole &= _steady(told, plane, known)
+    whole &= _steady(gait, plane, known)
     inputs = None
     if angles is not None and set(names) <= set(angles.names):
-        inputs = _inputs(told, plane, names, angles, (t_ns, phases, known, period_s))
-    return PhaseLog(plane, names, t_ns, phases, period_s, whole, inputs)
+        inputs = _inputs(gait, plane, names, angles, (t_ns, phases, known, period_s))
+    return PhaseLog(plane, names, phases, period_s, whole, inputs)
 
 
-def _steady(told: JointSignals, plane: str, known: BoolArray) -> BoolArray:
-    """Steps over which the plane's rate is the usual one."""
-    rate = _value(told, f"{plane}.omega", known)
+def _steady(gait: JointSignals, plane: str, known: BoolArray) -> BoolArray:
+    """Return the steps over which the plane's rate is the usual one."""
+    rate = _value(gait, f"{plane}.omega", known)
     if rate is None:
         return np.ones(np.count_nonzero(known) - 1, dtype=np.bool_)
     usual = float(np.median(rate))
@@ -135,37 +133,37 @@ def _steady(told: JointSignals, plane: str, known: BoolArray) -> BoolArray:
 
 
 def _inputs(
-    told: JointSignals,
+    gait: JointSignals,
     plane: str,
     names: tuple[str, ...],
     angles: JointSignals,
     at: tuple[IntArray, FloatArray, BoolArray, float],
 ) -> FloatArray | None:
-    """Of all joints, 2 (q - Y) / A cos phi; None where something of it is missing."""
+    """Return 2 (q - Y) / A cos phi of all joints; None where a value is missing."""
     t_ns, phases, known, period_s = at
-    amplitude = _value(told, f"{plane}.A", known)
+    amplitude = _value(gait, f"{plane}.A", known)
     size = 0.0 if amplitude is None else float(np.median(amplitude))
     if size <= 0.0:
         return None
     then_ns = t_ns - round(period_s * _NS)
     felt = np.zeros_like(phases)
     for i, name in enumerate(names):
-        offset = _value(told, f"{name}.offset", known)
+        offset = _value(gait, f"{name}.offset", known)
         if offset is None:
             return None
         felt[:, i] = _held(angles.signal(name), then_ns) - offset
-    # A joint that hasn't told its angle yet isn't fed back.
+    # A joint without an angle so far has no feedback.
     return 2.0 * np.nan_to_num(felt) / size * np.cos(phases)
 
 
-def _value(told: JointSignals, name: str, known: BoolArray) -> FloatArray | None:
-    if name not in told.names:
+def _value(gait: JointSignals, name: str, known: BoolArray) -> FloatArray | None:
+    if name not in gait.names:
         return None
-    return told.signal(name).values[known]
+    return gait.signal(name).values[known]
 
 
 def _held(signal: Signal, t_ns: IntArray) -> FloatArray:
-    """The newest value at each time; NaN before the first."""
+    """Return the newest value at each time; NaN before the first."""
     values = np.concatenate([[np.nan], signal.values])
     return values[np.searchsorted(signal.t_ns, t_ns, side="right")]
 
@@ -232,7 +230,7 @@ class OscillatorFit:
 
 
 def window_length(period_s: float) -> int:
-    """Sampling periods in a test function.
+    """Return sampling periods in a test function.
 
     Args:
         period_s: Of the samples [s].
@@ -300,14 +298,14 @@ def fit_oscillator(
 
 
 def _mirrored(covariance: FloatArray) -> FloatArray:
-    """Covariance of (a, -b) from that of (a, b)."""
+    """Return the covariance of (a, -b) from that of (a, b)."""
     return covariance * np.array([[1.0, -1.0], [-1.0, 1.0]])
 
 
 def _equations(
     piece: Piece, period_s: float, target: int, sources: Sequence[int], test: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Regressors, instruments and left sides of a piece's windows, as mean rates."""
+    """Return Regressors, instruments and left sides of a piece's windows, as mean rates."""
     length = test.size
     count = (len(piece.phases) - 1) // length
     phases = piece.phases[: count * length + 1]
@@ -331,6 +329,6 @@ def _equations(
 
 
 def _period_means(x: FloatArray) -> FloatArray:
-    """Mean of smooth columns over each sampling period, to fourth order (Euler-Maclaurin)."""
+    """Average smooth columns over each sampling period, to fourth order (Euler-Maclaurin)."""
     slope = np.gradient(x, axis=0, edge_order=2)
     return (x[1:] + x[:-1]) / 2 - np.diff(slope, axis=0) / 12

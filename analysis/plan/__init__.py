@@ -1,1 +1,1 @@
-"""Plans: sessions of commands to drive, so that an experiment can be told from what comes back."""
+"""Plans: sessions of commands to drive, whose recordings are one experiment."""

@@ -3,9 +3,9 @@
 Runs that make the coupling of a chain without contact identifiable: lag sweep and multisine.
 
 Without contact, at small amplitude, a = H c at every frequency. From r runs, Y = H C; H = Y C^-1 is
-best told when C is a DFT matrix, C_jk = A exp(j 2 pi j k / m): its condition number is 1. A lag
-sweep is just that: m gaits of the lags 2 pi k / m. In a multisine every frequency has such a matrix
-of its own, all in the same m runs (Dobrowiecki, Schoukens & Guillaume, "Optimized excitation
+best estimated when C is a DFT matrix, C_jk = A exp(j 2 pi j k / m): its condition number is 1. A
+lag sweep is just that: m gaits of the lags 2 pi k / m. In a multisine every frequency has such a
+matrix of its own, all in the same m runs (Dobrowiecki, Schoukens & Guillaume, "Optimized excitation
 signals for MIMO frequency response function measurements", IEEE Trans. Instrum. Meas. 55, 2006).
 """
 
@@ -17,6 +17,7 @@ import time
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +29,6 @@ from undulog.capture.common.files import part_file
 
 from ..session.runs import HEADING
 from .gait_base import BaseGait
-
-KICK = 0.05
-"""Of phase [rad] and of log amplitude."""
-
-BASE_RUNS = 6
-"""Of the gait as it is: how much they differ is how much runs scatter."""
 
 HELD_OUT = (0.05, 0.1, 0.15)
 """Largest random phase of each held-out pattern [rad]."""
@@ -68,7 +63,7 @@ class PlannedRun:
     more: tuple[Tone, ...] = ()
 
     def tones(self, omega: float) -> tuple[Tone, ...]:
-        """All that is commanded.
+        """Return frequencies of which none is another plus a whole number of the gait's.
 
         Args:
             omega: The gait's angular frequency [rad/s].
@@ -82,19 +77,17 @@ class PlannedRun:
 def phase_kicks(
     names: tuple[str, ...],
     amplitude: ComplexArray,
-    repeats: int = 1,
-    seed: int = 1,
+    repeats: int,
     *,
-    kick: float = KICK,
-    base_runs: int = BASE_RUNS,
+    kick: float,
+    base_runs: int,
 ) -> tuple[PlannedRun, ...]:
-    """Runs of the gait as it is, each joint kicked four ways, and held-out patterns.
+    """Plan runs of the gait, four kicks of each joint, and held-out patterns.
 
     Args:
         names: Of the m driven joints.
         amplitude: Of the gait, shape (m,).
         repeats: How often all of it is run.
-        seed: Of the held-out patterns and of the order.
         kick: Of phase [rad] and of log amplitude.
         base_runs: Runs without a kick in all, at least one a repeat.
 
@@ -102,19 +95,18 @@ def phase_kicks(
         4 m + 3 runs and those without a kick a repeat, in random order, so that warming up looks
         like no kick but like scatter.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     runs: list[PlannedRun] = []
+    kinds = ("phase", kick * 1j), ("amplitude", kick)
+    signs = (1, "up"), (-1, "down")
     for _ in range(repeats):
         once = [PlannedRun("base", amplitude, {"kind": "base"})] * math.ceil(base_runs / repeats)
-        for joint, name in enumerate(names):
-            for kind, step in (("phase", kick * 1j), ("amplitude", kick)):
-                for sign, word in ((1, "up"), (-1, "down")):
-                    off = np.zeros(len(names), dtype=np.complex128)
-                    off[joint] = sign * step
-                    facts = {"kind": kind, "joint": name, "sign": f"{sign:+d}"}
-                    label = f"{name}-{kind}-{word}"
-                    runs_amplitude = (amplitude * np.exp(off)).astype(np.complex128)
-                    once.append(PlannedRun(label, runs_amplitude, facts))
+        for (joint, name), (kind, step), (sign, word) in product(enumerate(names), kinds, signs):
+            off = np.zeros(len(names), dtype=np.complex128)
+            off[joint] = sign * step
+            kicked = (amplitude * np.exp(off)).astype(np.complex128)
+            facts = {"kind": kind, "joint": name, "sign": f"{sign:+d}"}
+            once.append(PlannedRun(f"{name}-{kind}-{word}", kicked, facts))
         for size in HELD_OUT:
             turned = amplitude * np.exp(1j * random.uniform(-size, size, len(names)))
             once.append(PlannedRun("held-out", turned.astype(np.complex128), {"kind": "held-out"}))
@@ -123,7 +115,7 @@ def phase_kicks(
 
 
 def reversal(amplitude: ComplexArray, each: int = 6) -> tuple[PlannedRun, ...]:
-    """Runs of a wave and of its reverse, the robot turned by half a turn in half of each.
+    """Plan runs of a wave and of its reverse, the robot turned by half a turn in half of each.
 
     A tilted floor then cancels between runs that are each other's mirror image: the wave at one
     heading and its reverse at the other.
@@ -147,30 +139,30 @@ def reversal(amplitude: ComplexArray, each: int = 6) -> tuple[PlannedRun, ...]:
     return tuple(runs)
 
 
-def lag_sweep(m: int, amplitude: float, repeats: int = 1, seed: int = 1) -> tuple[PlannedRun, ...]:
-    """As many gaits as there are joints, of the lags 2 pi k / m.
+def lag_sweep(m: int, amplitude: float, repeats: int) -> tuple[PlannedRun, ...]:
+    """Plan as many gaits as there are joints, of the lags 2 pi k / m.
 
     Args:
         amplitude: Of every command [rad].
         repeats: How often all of it is run.
-        seed: Of the order, random so that warming up looks like no lag.
 
     Returns:
-        m runs a repeat.
+        m runs a repeat, in random order so that warming up looks like no lag.
     """
-    random = np.random.default_rng(seed)
-    runs: list[PlannedRun] = []
-    for _ in range(repeats):
-        for k in random.permutation(m).tolist():
-            facts = {"kind": "lag", "lag_rad": f"{2 * np.pi * k / m:.6f}"}
-            runs.append(PlannedRun(f"lag{k:02d}", amplitude * _dft(m)[k], facts))
-    return tuple(runs)
+    random = np.random.default_rng(1)
+    order = [k for _ in range(repeats) for k in random.permutation(m).tolist()]
+    return tuple(
+        PlannedRun(
+            f"lag{k:02d}",
+            amplitude * _dft(m)[k],
+            {"kind": "lag", "lag_rad": f"{2 * np.pi * k / m:.6f}"},
+        )
+        for k in order
+    )
 
 
-def multisine(
-    m: int, amplitude: float, omega: FloatArray, repeats: int = 1, seed: int = 1
-) -> tuple[PlannedRun, ...]:
-    """All joints at all tones in each of m runs, with the phases of a DFT matrix over the runs.
+def multisine(m: int, amplitude: float, omega: FloatArray, repeats: int) -> tuple[PlannedRun, ...]:
+    """Plan m runs of all joints at all tones, with the phases of a DFT matrix over the runs.
 
     Args:
         amplitude: Of the first tone of every command [rad]; the others fall as 1 / omega^2, so
@@ -178,12 +170,11 @@ def multisine(
             linear range.
         omega: Angular frequencies of the tones, the gait's first [rad/s], shape (L,).
         repeats: How often all of it is run.
-        seed: Of the tones' own phases and of the order.
 
     Returns:
-        m runs a repeat.
+        m runs a repeat, in random order.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     phase = np.exp(1j * random.uniform(-np.pi, np.pi, omega.size))
     strength = phase * (omega[0] / omega) ** 2
     runs: list[PlannedRun] = []
@@ -197,7 +188,7 @@ def multisine(
 
 
 def tones(omega: float, count: int) -> FloatArray:
-    """Frequencies such that none is another plus a whole number of the gait's.
+    """Return frequencies of which none is another plus a whole number of the gait's.
 
     In units of the gait's frequency over 2 L - 1, tone i is the line i (2 L - 1) + i: remainders
     0 .. L - 1 are all different, of either sign. So the sidebands that a nonlinearity makes of one
@@ -216,7 +207,7 @@ def tones(omega: float, count: int) -> FloatArray:
 
 
 def period_s(omega: float, count: int) -> float:
-    """The time after which a multisine repeats [s].
+    """Return the time after which a multisine repeats [s].
 
     Args:
         omega: Of the gait [rad/s].
@@ -228,7 +219,7 @@ def period_s(omega: float, count: int) -> float:
 
 
 def _dft(m: int) -> ComplexArray:
-    """exp(j 2 pi j k / m), row k = run, column j = joint; shape (m, m)."""
+    """Return exp(j 2 pi j k / m), row k = run, column j = joint; shape (m, m)."""
     place = np.arange(m)
     return np.exp(2j * np.pi / m * place[:, None] * place[None, :]).astype(np.complex128)
 
@@ -293,9 +284,9 @@ def write_plan(
                 force=True,
             ) as writer,
         ):
-            told = {"plan": plan, "plan_id": plan_id, "run": str(k), "like": like.session_id}
-            told |= {"settle_s": f"{settle_s:g}", "measure_s": f"{measure_s:g}"}
-            writer.note("undulog.plan", told | dict(facts or {}) | run.facts)
+            record = {"plan": plan, "plan_id": plan_id, "run": str(k), "like": like.session_id}
+            record |= {"settle_s": f"{settle_s:g}", "measure_s": f"{measure_s:g}"}
+            writer.note("undulog.plan", record | dict(facts or {}) | run.facts)
             if "scenario.toml" in like.attachments:
                 writer.attach(
                     "scenario.toml", "application/toml", like.attachments["scenario.toml"]
@@ -312,7 +303,7 @@ def _file_stem(label: str) -> str:
 
 
 def commands(base: BaseGait, run: PlannedRun, t_s: FloatArray, ramp_s: float) -> FloatArray:
-    """Commands of all joints.
+    """Return the commands of all joints.
 
     Args:
         t_s: Times [s], shape (k,).

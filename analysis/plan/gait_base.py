@@ -25,7 +25,7 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Joint, Plane, Robot
 
-from ..results.answer import percent
+from ..results.answer import Remarks, percent
 from ..session.analyse import examine_session
 from ..signals.columns import COMMAND_TOPIC, RESPONSE_TOPIC, read_columns
 
@@ -49,7 +49,7 @@ class Mode:
 
 
 def slowest_mode(robot: Robot, driven: Sequence[str]) -> Mode:
-    """The mode that takes longest to die away, of the planes that are driven.
+    """Find the mode of the driven planes that decays slowest.
 
     Args:
         driven: Names of the driven joints, at least one.
@@ -67,7 +67,7 @@ def slowest_mode(robot: Robot, driven: Sequence[str]) -> Mode:
 
 
 def transverse_mass(robot: Robot, plane: Plane) -> FloatArray:
-    """Mass matrix of the free straight chain bending in one plane.
+    """Return the mass matrix of the free straight chain bending in one plane.
 
     Args:
         plane: The plane; joints of the other one are rigid.
@@ -94,7 +94,7 @@ def transverse_mass(robot: Robot, plane: Plane) -> FloatArray:
 
 
 def _poles(robot: Robot, plane: Plane) -> ComplexArray:
-    """Eigenvalues of (q, q', th, om), of the joints of one plane."""
+    """Return eigenvalues of (q, q', th, om), of the joints of one plane."""
     joints: list[Joint] = [joint for joint in robot.joints if joint.plane is plane]
     servos = [joint.servo for joint in joints]
     winding = np.array([one.torque_constant / one.resistance_ohm for one in servos])
@@ -169,11 +169,7 @@ def base_gait(session: SessionView) -> BaseGait:
             f"{session.path}: the command of {worst} is no sine (a harmonic has {share} of its "
             f"amplitude, more than {100 * PURE:g} %); name a session of a steady sine gait"
         )
-
-    def silent(_: str) -> None:
-        """The first reading has told what is missing."""
-
-    commands = read_columns(session, COMMAND_TOPIC, RESPONSE_TOPIC, silent).command
+    commands = read_columns(session, COMMAND_TOPIC, RESPONSE_TOPIC, Remarks()).command
     names = tuple(commands)
     # Of a joint that is held, every sample is its place.
     offset = np.array([float(commands[name].values[-1]) for name in names])

@@ -1,1 +1,1 @@
-"""What an analysis says: frozen values at the border between estimators and readers of results."""
+"""Results: frozen values at the border between estimators and readers of results."""

@@ -1,4 +1,4 @@
-"""What an analysis says: frozen values at the border between estimators and readers of results.
+"""Results of an analysis: frozen values at the border between estimators and readers of results.
 
 ``Analysis.to_dict`` is the object that ``undulog analyse --json`` prints and that a result file
 holds. A value that could not be computed is None (null), and ``Analysis.warnings`` or
@@ -133,8 +133,8 @@ class JointOverTime:
         stop_s: Its end [s].
         run: Which of :attr:`ResponseOverTime.runs_s` it belongs to.
         frequency_hz: Of the phase in that cycle.
-        gain: Amplitude of the response over that of the command; None where the cycle tells
-            nothing.
+        gain: Amplitude of the response over that of the command; None where the cycle has
+            none.
         gain_ci95: Interval of each, or None.
         lag_rad: Lag of the response in (-pi, pi], positive = late [rad], or None.
         lag_ci95: Interval of each, or None.
@@ -346,13 +346,13 @@ class Index:
     label: str
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Analysis(PresentedResult):
     """All numbers of one session.
 
     Attributes:
         joints: In chain order, head to tail.
-        body: Head, middle and tail; None with a note where it can't be told.
+        body: Head, middle and tail; None with a note where it is unknown.
         coupling: Identifiable or not.
         warnings: One sentence each, worst first: what is missing or doubtful, and changes what a
             reader does.
@@ -365,23 +365,23 @@ class Analysis(PresentedResult):
         notes: One sentence each: what was not recorded, does not apply or was assumed.
     """
 
+    answer: Answer = field(default_factory=Answer)
     session: SessionFacts
     gait: GaitFacts
     joints: tuple[JointResult, ...]
     body: BodyResult | None
     heterogeneity: dict[str, Index]
     coupling: Coupling
-    warnings: tuple[str, ...]
-    provenance: Provenance
-    artefacts: tuple[Artefact, ...] = ()
-    oscillators: tuple[ChainCoupling, ...] = ()
     over_time: ResponseOverTime | None = None
     energy: EnergyResult | None = None
-    answer: Answer = field(default_factory=Answer)
+    oscillators: tuple[ChainCoupling, ...] = ()
+    artefacts: tuple[Artefact, ...] = ()
+    warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    provenance: Provenance
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain JSON values.
+        """Return the result as plain JSON values.
 
         An estimate becomes two keys, e.g. ``gain`` and ``gain_ci95``; ``lag_rad`` has its
         interval in ``lag_ci95``.
@@ -391,9 +391,7 @@ class Analysis(PresentedResult):
             dataclasses.asdict(group) | _flat("frequency_hz", group.frequency_hz)
             for group in self.gait.groups
         ]
-        return {
-            "answer": dataclasses.asdict(self.answer),
-            "session": dataclasses.asdict(self.session),
+        return dataclasses.asdict(self) | {
             "gait": gait,
             "joints": [
                 dataclasses.asdict(joint)
@@ -402,17 +400,10 @@ class Analysis(PresentedResult):
                 for joint in self.joints
             ],
             "body": None if self.body is None else _body_dict(self.body),
-            "heterogeneity": {
-                name: dataclasses.asdict(index) for name, index in self.heterogeneity.items()
-            },
-            "coupling": dataclasses.asdict(self.coupling),
-            "over_time": None if self.over_time is None else dataclasses.asdict(self.over_time),
             "energy": None if self.energy is None else _energy_dict(self.energy),
-            "oscillators": [dataclasses.asdict(one) for one in self.oscillators],
             "artefacts": [dataclasses.asdict(one) | {"about": one.about} for one in self.artefacts],
             "warnings": list(self.warnings),
             "notes": list(self.notes),
-            "provenance": dataclasses.asdict(self.provenance),
         }
 
 

@@ -76,7 +76,7 @@ KINDS = {
 FALSIFYING = frozenset(
     name for name, (about, _) in KINDS.items() if about.startswith("sensor") and name != "stale"
 )
-"""After these a position says nothing about its joint; a stale one is late by half a hold."""
+"""These make a position unusable; a stale one is late by half a hold."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Artefact:
         return KINDS[self.flag][0]
 
     def falsifies(self, *quantities: str) -> bool:
-        """Whether one of some quantities is not what the joint did.
+        """Return whether an artefact makes one of some quantities unusable.
 
         Args:
             quantities: E.g. ``position``.
@@ -116,7 +116,7 @@ class Artefact:
         return self.quantity in quantities and self.flag in FALSIFYING
 
     def within(self, start_s: float, stop_s: float) -> bool:
-        """Whether it holds at any time of a window.
+        """Return whether it holds at any time of a window.
 
         Args:
             start_s: From the session's start [s].
@@ -129,10 +129,7 @@ class Artefact:
 
 
 def flags_by_joint(artefacts: Iterable[Artefact]) -> dict[str, list[str]]:
-    """Flags of each joint.
-
-    Args:
-        artefacts: E.g. those of a window.
+    """Return flags of each joint.
 
     Returns:
         Joint name to flags, each once.
@@ -146,7 +143,7 @@ def flags_by_joint(artefacts: Iterable[Artefact]) -> dict[str, list[str]]:
 
 
 def overlapping(spans: Sequence[Span], start_s: float, stop_s: float) -> bool:
-    """Whether any of some stretches meets a window.
+    """Return whether an interval overlaps a window.
 
     Args:
         start_s: Start of the window [s].

@@ -1,4 +1,4 @@
-"""What a comparison says: frozen values.
+"""Result of a comparison: frozen values.
 
 ``Comparison.to_dict`` is the object that ``undulog compare A B --json`` prints. Differences are B
 minus A. What could not be computed is None (null), and ``warnings`` says why.

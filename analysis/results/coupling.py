@@ -1,4 +1,4 @@
-"""What kicks around one gait say of the coupling: frozen values, part of an experiment."""
+"""Couplings of the joints: frozen values, part of an experiment."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .shown import PresentedResult
 
 @dataclass(frozen=True, repr=False)
 class Coupling(PresentedResult):
-    """Whether the coupling can be told from this session.
+    """Whether the coupling is identifiable, and the coupling.
 
     Attributes:
         identifiable: False for one gait alone (m numbers for m^2 unknowns).
@@ -34,11 +34,7 @@ Rows = tuple[tuple[float, ...], ...]
 
 
 def rows_of(values: FloatArray) -> Rows:
-    """A matrix as plain numbers.
-
-    Args:
-        values: Shape (m, n).
-    """
+    """Convert a matrix of shape (m, n) to plain numbers."""
     return tuple(tuple(float(x) for x in row) for row in values)
 
 
@@ -233,7 +229,7 @@ class LocalCoupling(Coupling):
 
 
 class Route(StrEnum):
-    """How the impedance was told.
+    """How the impedance was estimated.
 
     ``torque``: Z = T Y^-1 from measured torques, without a model of the servo.
     ``servo``: Z = D_r H^-1 - D_q with the servo's parameters.
@@ -271,7 +267,7 @@ class ToneCoupling:
         command_condition: Condition number of the commands C; 1 = every run counts fully.
         H: Response per command as the servo holds it [rad/rad].
         condition_number: Of H, or None where it is singular.
-        route: How Z was told.
+        route: How Z was estimated.
         Z: Torque on a joint per angle of a joint [N m/rad]; None where it is known up to a
             scaling of rows only.
         inverted_condition: Condition number of what was inverted for Z (the responses Y by the
@@ -314,7 +310,7 @@ class LinearCoupling(Coupling):
         joints: Names, head to tail, m.
         contact: Whether the robot touched anything; None where its sessions don't say.
         hold_s: Delay of the held commands that is taken out of H [s].
-        route_why: Why Z was told the way it was.
+        route_why: Why Z was estimated in this way.
         tones: One for each frequency, rising.
         sideband_energy: Energy of the responses where nothing was commanded, over that at the
             tones; 0 = linear.

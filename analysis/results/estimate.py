@@ -9,7 +9,7 @@ Interval = tuple[float, float]
 
 
 def leaves_out_zero(ci95: Interval | None) -> bool:
-    """Whether a value differs from zero beyond doubt.
+    """Return whether a value differs from zero beyond doubt.
 
     Args:
         ci95: Its 95 % interval, or None.

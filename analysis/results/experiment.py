@@ -196,7 +196,7 @@ class PooledRuns:
     joints: tuple[PooledJoint, ...]
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Experiment(PresentedResult):
     """All numbers of several sessions.
 
@@ -220,31 +220,17 @@ class Experiment(PresentedResult):
     runs: tuple[Run, ...]
     heterogeneity: dict[str, Index]
     reversal: Reversal | None
+    pooled: PooledRuns | None = None
     coupling: Coupling
+    oscillators: BodyOscillators | None = None
     warnings: tuple[str, ...]
     provenance: Provenance
-    oscillators: BodyOscillators | None = None
-    pooled: PooledRuns | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain JSON values.
+        """Return the result as plain JSON values.
 
         An estimate becomes an object of ``value`` and ``ci95``; each session is the object that
         it gives by itself.
         """
-        return {
-            "answer": self.answer,
-            "sessions": [session.to_dict() for session in self.sessions],
-            "runs": [dataclasses.asdict(run) for run in self.runs],
-            "heterogeneity": {
-                name: dataclasses.asdict(index) for name, index in self.heterogeneity.items()
-            },
-            "reversal": None if self.reversal is None else dataclasses.asdict(self.reversal),
-            "pooled": None if self.pooled is None else dataclasses.asdict(self.pooled),
-            "coupling": dataclasses.asdict(self.coupling),
-            "oscillators": None
-            if self.oscillators is None
-            else dataclasses.asdict(self.oscillators),
-            "warnings": list(self.warnings),
-            "provenance": dataclasses.asdict(self.provenance),
-        }
+        own = dataclasses.asdict(dataclasses.replace(self, sessions=()))
+        return own | {"sessions": [session.to_dict() for session in self.sessions]}

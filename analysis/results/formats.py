@@ -32,7 +32,7 @@ _LONG = 1e9
 
 
 def number(value: float | None, decimals: int) -> str:
-    """A number with fixed decimals, or an en dash.
+    """Format a number with fixed decimals, or an en dash.
 
     Args:
         value: Any unit; None or not finite prints as an en dash.
@@ -50,11 +50,7 @@ def number(value: float | None, decimals: int) -> str:
 
 
 def interval(ci95: Interval | None, decimals: int) -> str:
-    """A 95 % interval in square brackets, or an empty string.
-
-    Args:
-        ci95: Low and high end, or None.
-        decimals: Digits after the point.
+    """Format a 95 % interval in square brackets, or an empty string.
 
     Returns:
         For example ``[5.9, 6.5]``.
@@ -66,7 +62,7 @@ def interval(ci95: Interval | None, decimals: int) -> str:
 
 
 def estimate(quantity: Estimate, unit: str = "", *, most: int = 3) -> str:
-    """A value with its unit and its interval, for a sentence.
+    """Format a value with its unit and its interval, for a sentence.
 
     Args:
         quantity: The estimate, already in ``unit``.
@@ -87,7 +83,7 @@ def estimate(quantity: Estimate, unit: str = "", *, most: int = 3) -> str:
 
 
 def gait_frequency(gait: GaitFacts) -> str:
-    """The gait's frequency, or the frequency of each group of joints.
+    """Format the gait's frequency, or the frequency of each group of joints.
 
     Returns:
         For example ``0.97 Hz [0.969, 0.971]`` or ``1.432 Hz (8 joints) and 0.954 Hz (8 joints)``,
@@ -104,7 +100,7 @@ def gait_frequency(gait: GaitFacts) -> str:
 
 
 def _beside_zero(ci95: Interval, digits: int) -> int:
-    """Digits that show that an interval excludes zero; those given where it doesn't."""
+    """Return digits that show that an interval excludes zero, at least the given ones."""
     low, high = ci95
     end = min(abs(low), abs(high))
     if not (low * high > 0 and math.isfinite(end)):
@@ -114,7 +110,7 @@ def _beside_zero(ci95: Interval, digits: int) -> int:
 
 
 def decimals_for(quantities: Iterable[Estimate], least: int = 1, most: int = 5) -> int:
-    """Decimals that show one or two digits of the typical half width of the intervals.
+    """Return decimals that show one or two digits of the typical half width of the intervals.
 
     Args:
         quantities: Estimates of one table column, in the unit they are printed in.
@@ -135,7 +131,7 @@ def decimals_for(quantities: Iterable[Estimate], least: int = 1, most: int = 5) 
 
 
 def _decimals_of(half_width: float) -> int:
-    """Particle Data Group: 0.0354 shows 0.035, 0.0355 shows 0.04."""
+    """Return decimals by the Particle Data Group: 0.0354 shows 0.035, 0.0355 shows 0.04."""
     if not math.isfinite(half_width):
         return 0
     power = math.floor(math.log10(half_width))
@@ -143,7 +139,7 @@ def _decimals_of(half_width: float) -> int:
 
 
 def decimals_for_values(values: Iterable[float | None], digits: int = 3) -> int:
-    """Decimals that show so many significant digits of the largest value.
+    """Return decimals that show so many significant digits of the largest value.
 
     Args:
         values: One table column; None is skipped.
@@ -160,12 +156,12 @@ def decimals_for_values(values: Iterable[float | None], digits: int = 3) -> int:
 
 
 def degrees(quantity: Estimate) -> Estimate:
-    """The same estimate in degrees."""
+    """Convert an estimate to degrees."""
     return scaled(quantity, 180.0 / math.pi)
 
 
 def scaled(quantity: Estimate, factor: float) -> Estimate:
-    """The same estimate in another unit.
+    """Convert an estimate to another unit.
 
     Args:
         factor: New units in one old unit, positive.
@@ -181,7 +177,7 @@ def scaled(quantity: Estimate, factor: float) -> Estimate:
 
 
 def percent(share: Estimate) -> str:
-    """A share with its interval.
+    """Format a share with its interval.
 
     Args:
         share: 0 to 1.
@@ -208,7 +204,7 @@ def coverage(share: float) -> str:
 
 
 def relative(log_gain: Estimate) -> Estimate:
-    """A ratio of gains, less one, in percent."""
+    """Convert a difference of ln gain to percent."""
     value, ci95 = log_gain.value, log_gain.ci95
     return Estimate(
         None if value is None else 100 * math.expm1(value),
@@ -237,10 +233,7 @@ def p_value(p: float | None) -> str:
 
 
 def p_value_text(p: float | None) -> str:
-    """A p-value with its name.
-
-    Args:
-        p: 0 to 1, or None.
+    """Format a p-value with its name.
 
     Returns:
         For example ``p = 0.013`` or ``p < 0.001``.
@@ -250,7 +243,7 @@ def p_value_text(p: float | None) -> str:
 
 
 def utc(time_ns: int) -> str:
-    """A Unix time as date and time of day in UTC.
+    """Format a Unix time as date and time of day in UTC.
 
     Args:
         time_ns: Unix time [ns].
@@ -266,7 +259,7 @@ def utc(time_ns: int) -> str:
 
 
 def short(text: str, most: int = 40) -> str:
-    """Text that has to fit into a figure.
+    """Shorten text to fit into a figure.
 
     Args:
         most: Characters kept at most; the middle gives way, since names differ at their ends.
@@ -278,16 +271,12 @@ def short(text: str, most: int = 40) -> str:
 
 
 def filename(path: str) -> str:
-    """Last part of a path of any system.
-
-    Args:
-        path: As the user named it.
-    """
+    """Return the last part of a path of any system."""
     return plain(path.replace("\\", "/").rstrip("/").rpartition("/")[2] or path)
 
 
 def sentence(text: str) -> str:
-    """Text with a capital at its beginning and one stop at its end.
+    """Format text with a capital at its beginning and one stop at its end.
 
     Args:
         text: From a log or a result; a name at its beginning keeps its own letters.
@@ -296,7 +285,7 @@ def sentence(text: str) -> str:
 
 
 def capital(text: str) -> str:
-    """Text with a capital at its beginning; a name keeps its own letters."""
+    """Capitalise text; a name keeps its own letters."""
     first = text.partition(" ")[0]
     if first.endswith(":") or any(c in "._/\\" or c.isdigit() for c in first):
         return text

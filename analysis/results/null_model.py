@@ -1,11 +1,9 @@
-"""What a session says when it is held to a model of identical modules."""
+"""Test of a session against a model of identical modules."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 from . import formats
 from .analysis import Analysis
@@ -89,13 +87,9 @@ class ModelledAnalysis(Analysis):
 
     null_model: NullModelResult = field(kw_only=True)
 
-    def to_dict(self) -> dict[str, Any]:
-        """The session's object with the key ``null_model``."""
-        return super().to_dict() | {"null_model": dataclasses.asdict(self.null_model)}
-
 
 def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_p: float) -> str:
-    """The answer in one sentence.
+    """Return the answer in one sentence.
 
     Args:
         named: Those that deviate, the clearest first.
@@ -127,7 +121,7 @@ def null_answer(modules: list[ModuleDeviation], named: list[str], p: float, fit_
 
 
 def null_model_text(result: NullModelResult) -> list[str]:
-    """Lines for a terminal.
+    """Return lines for a terminal.
 
     Returns:
         The answer first, the parameters last.

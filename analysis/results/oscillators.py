@@ -1,4 +1,4 @@
-"""What is said of oscillators: frozen values, parts of an analysis and of an experiment."""
+"""Results on oscillators: frozen values, parts of an analysis and of an experiment."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ class Rate:
 
 @dataclass(frozen=True)
 class ChainCoupling:
-    """The couplings of one chain of oscillators, or why they can't be told.
+    """The couplings of one chain of oscillators, or why they are not identifiable.
 
     Attributes:
-        identifiable: Whether the phases tell the couplings.
+        identifiable: Whether the phases determine the couplings.
         why: Why not, or how.
         record: What to record so that they do; None if they do.
         condition_number: Of the regression of the worst oscillator; None where it is infinite.
@@ -142,7 +142,7 @@ class RelativeCoupling:
 
 @dataclass(frozen=True)
 class BodyOscillators:
-    """How oscillators that feel their own servos would synchronise through the body.
+    """How oscillators with feedback from their servos would synchronise through the body.
 
     Attributes:
         joints: Names, head to tail, m.
@@ -206,7 +206,7 @@ class Relaxation:
 
 @dataclass(frozen=True)
 class ClosedLoop:
-    """How oscillators that feel their servos relax: d phi' = J d phi, predicted from kicks.
+    """Relaxation of oscillators with feedback, d phi' = J d phi, predicted from kicks.
 
     Attributes:
         joints: Names, head to tail, m.

@@ -14,54 +14,29 @@ class PictureProtocol(Protocol):
     """A figure, as :class:`.analysis.Picture`."""
 
     @property
-    def svg(self) -> str:
-        """The ``<svg>`` element."""
-        ...
-
+    def svg(self) -> str: ...  # noqa: D102
     @property
-    def caption(self) -> str:
-        """One or two sentences, plain text."""
-        ...
-
-    def to_svg(self) -> str:
-        """Return the figure as the text of a file."""
-        ...
-
-    def save(self, path: Path | str, *, force: bool = False) -> Path:
-        """Write the figure to a file."""
-        ...
+    def caption(self) -> str: ...  # noqa: D102
+    def to_svg(self) -> str: ...  # noqa: D102
+    def save(self, path: Path | str, *, force: bool = False) -> Path: ...  # noqa: D102
 
 
 class Presentation(Protocol):
     """The implementation of the methods of :class:`PresentedResult`, which is above all results."""
 
-    def text(self, result: PresentedResult) -> str:
-        """Return the text of a result."""
-        ...
-
-    def headline(self, result: PresentedResult) -> str:
-        """Return the answer in one line."""
-        ...
-
-    def html(self, result: PresentedResult) -> str:
-        """Return what a notebook shows."""
-        ...
-
-    def frames(self, result: PresentedResult) -> dict[str, pd.DataFrame]:
-        """Return the tables."""
-        ...
-
-    def picture(self, result: PresentedResult, what: str | None) -> PictureProtocol:
-        """Draw a picture."""
-        ...
-
-    def save(self, result: PresentedResult, path: Path, *, force: bool) -> Path:
-        """Write the JSON file."""
-        ...
-
-    def save_tables(self, result: PresentedResult, folder: Path, *, force: bool) -> list[Path]:
-        """Write the Parquet files."""
-        ...
+    def text(self, result: PresentedResult) -> str: ...  # noqa: D102
+    def headline(self, result: PresentedResult) -> str: ...  # noqa: D102
+    def html(self, result: PresentedResult) -> str: ...  # noqa: D102
+    def frames(self, result: PresentedResult) -> dict[str, pd.DataFrame]: ...  # noqa: D102
+    def picture(  # noqa: D102
+        self, result: PresentedResult, what: str | None
+    ) -> PictureProtocol: ...
+    def save(  # noqa: D102
+        self, result: PresentedResult, path: Path, *, force: bool
+    ) -> Path: ...
+    def save_tables(  # noqa: D102
+        self, result: PresentedResult, folder: Path, *, force: bool
+    ) -> list[Path]: ...
 
 
 _make: list[Callable[[], Presentation]] = []
@@ -88,21 +63,21 @@ class PresentedResult:
     """
 
     def __str__(self) -> str:
-        """The result as text, the answer first."""
+        """Return the result as text, the answer first."""
         return _presentation().text(self).rstrip("\n")
 
     def __repr__(self) -> str:
-        """The answer in one line."""
+        """Return the answer in one line."""
         from undulog.capture.common.console import plain
 
         return f"<{type(self).__name__}: {plain(_presentation().headline(self))}>"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: the answer, and the first table."""
+        """Return the answer and the first table for a notebook."""
         return _presentation().html(self)
 
     def frames(self) -> dict[str, pd.DataFrame]:
-        """The numbers as tables.
+        """Return the numbers as tables.
 
         Returns:
             Name to table, the most telling first. Columns end in their unit (``lag_rad``), the ends
@@ -112,7 +87,7 @@ class PresentedResult:
         return _presentation().frames(self)
 
     def plot(self, what: str | None = None) -> PictureProtocol:
-        """The result as a picture, as the report draws it; needs the extra ``report``.
+        """Draw the result as in the report; needs the extra ``report``.
 
         Args:
             what: Which picture, where there are several; the first by default.
@@ -157,7 +132,7 @@ class PresentedResult:
         return _presentation().save_tables(self, Path(folder), force=force)
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain JSON values.
+        """Return the result as plain JSON values.
 
         Returns:
             A dictionary that ``json.dumps(..., allow_nan=False)`` takes.

@@ -9,10 +9,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import expm
 
 from support import twin_chains
 from support.analysed import experiment as together
-from undulog.analysis.oscillators.predictions import felt_response, relax, relaxation, steady_bias
+from undulog.analysis.oscillators.predictions import felt_response, relaxation
 from undulog.analysis.oscillators.weak_form import read_phases
 from undulog.analysis.results.experiment import Experiment
 from undulog.capture import Session
@@ -110,11 +111,11 @@ def closed_loop(folder, experiment: Experiment):
     yaw = [one for one in experiment.sessions[0].joints if one.gain.value is not None]
     ratio = np.array([one.gain.value * np.exp(-1j * one.lag_rad.value) for one in yaw])
     felt = felt_response(ratio, OMEGA, AGE_S)
-    bias = steady_bias(felt)
-    kicked = _phases(folder, "kicked", bias, kick_every_s=KICK_AT_S, kick_size=LARGEST)
-    off = kicked - _phases(folder, "free", bias)
+    kicked = _phases(folder, "kicked", felt.imag, kick_every_s=KICK_AT_S, kick_size=LARGEST)
+    off = kicked - _phases(folder, "free", felt.imag)
     t_s = np.arange(len(off)) * 0.1
-    return Relaxation(t_s, off, relax(EPS * relaxation(P, R, felt), off[0], t_s))
+    J = EPS * relaxation(P, R, felt)
+    return Relaxation(t_s, off, np.array([expm(J * t) @ off[0] for t in t_s]))
 
 
 def _deviations(m, held_out):

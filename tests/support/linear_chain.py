@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from undulog.capture import SessionWriter
+from support.joint_runs import EPOCH_NS, turns, write_joints
 
-EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("j1", "j2", "j3", "j4", "j5")
 M = len(NAMES)
 PLACE = np.arange(M)
@@ -19,16 +18,14 @@ MODULE[1] = 0.97 * np.exp(-0.02j)
 def write_run(path, command, answer, seed, sigma):
     """Write six cycles at 50 Hz."""
     noise = np.random.default_rng(seed).normal(0.0, sigma, (300, M))
-    epoch_ns = EPOCH_NS + seed * 10_000_000_000
-    with SessionWriter(path, session_id=path.stem, epoch_ns=epoch_ns) as writer:
-        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
-        states = writer.joint_state("/joint_states", NAMES, unit="rad")
-        for k in range(300):
-            turn = np.exp(2j * np.pi * k / 50)
-            t_ns = epoch_ns + k * 20_000_000
-            commands.write(t_ns, np.real(command * turn))
-            states.write(t_ns, np.real(answer * turn) + noise[k])
-    return path
+    turn = turns(1.0, 300)
+    return write_joints(
+        path,
+        NAMES,
+        np.real(command * turn),
+        [np.real(answer * turn) + noise],
+        epoch_ns=EPOCH_NS + seed * 10_000_000_000,
+    )
 
 
 def both_ways(folder):
@@ -66,3 +63,15 @@ def swept(folder):
     return [
         write_run(folder / f"run{k}.mcap", dft[:, k], CHAIN @ dft[:, k], k, 1e-5) for k in PLACE
     ]
+
+
+def asymmetry(X):
+    """||X - X'|| / ||X|| off the diagonal."""
+    off = X - np.diag(np.diag(X))
+    return np.linalg.norm(off - off.T) / np.linalg.norm(off)
+
+
+def within(X, width):
+    """Share of the energy off the diagonal within a band."""
+    off = X - np.diag(np.diag(X))
+    return (np.linalg.norm(np.triu(np.tril(off, width), -width)) / np.linalg.norm(off)) ** 2

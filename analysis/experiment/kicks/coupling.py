@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import stdtrit
@@ -22,13 +21,11 @@ from undulog.capture.common.console import Warn
 
 from ...estimators.intervals import CONFIDENCE
 from ...results.coupling import (
-    LTI_LABEL,
     BaseResponse,
     Coupling,
     HeldOut,
     KickSize,
     LocalCoupling,
-    Lti,
     Matrix,
     RowCheck,
     RunScatter,
@@ -37,14 +34,12 @@ from ...results.coupling import (
 from ...results.estimate import Estimate
 from .local import (
     LocalMatrices,
-    LtiReading,
     MeasuredDerivatives,
     ResponseMatrices,
     RowSums,
     local_matrices,
     lti_reading,
     nonlinearity,
-    response_matrices,
 )
 from .runs import MOST_KICK, Kick, KickExperiment, Kind, missing_kicks
 from .scatter import RunErrors, sides
@@ -100,7 +95,7 @@ def kick_size(
 
 
 def _larger(size: float, factor: float) -> str:
-    """What to record so that intervals are narrower by a factor."""
+    """Describe the kicks that make intervals narrower by a factor."""
     if size * factor <= MOST_KICK:
         return f"kicks of {math.ceil(100 * size * factor) / 100:.2g} rad"
     largest = max(size, 0.1)
@@ -116,13 +111,13 @@ def _rounded_down(size: float) -> float:
 def _curvature(
     kicks: Sequence[Kick | None], answers: ResponseMatrices, matrices: LocalMatrices
 ) -> float:
-    """Second order over first order of the kicks of phase, Frobenius norms over all joints."""
+    """Return second over first order of the phase kicks, Frobenius norms over all joints."""
     errors = matrices.steady_errors
     variance = float(np.maximum(errors.variance, errors.within).sum())
     base = [k for k, one in enumerate(kicks) if one is None]
     middle = answers.log[base].mean(axis=0)
     even = odd = noise = 0.0
-    for up, down in sides(kicks, Kind.PHASE):
+    for up, down in sides(kicks, Kind.PHASE).values():
         high, low = answers.log[up].mean(axis=0), answers.log[down].mean(axis=0)
         even += float(np.sum(np.abs((high + low) / 2 - middle) ** 2))
         odd += float(np.sum(np.abs(high - low) ** 2)) / 4
@@ -134,30 +129,15 @@ BETTER = 2.0
 """P holds where it predicts so many times better than 'each joint keeps its H_i'."""
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """One held-out run.
-
-    Attributes:
-        size: Largest deviation of a command from the base, in phase [rad] or log amplitude.
-        error: ||a - predicted|| / ||a|| of the matrices.
-        error_kept: The same of 'each joint keeps its H_i'.
-        noise: What the run's own noise alone makes of either.
-    """
-
-    size: float
-    error: float
-    error_kept: float
-    noise: float
-
-
 def predict(
     deviation: ComplexArray,
     answered: ComplexArray,
     variance: FloatArray,
     response: ComplexArray,
     matrices: tuple[FloatArray, FloatArray, FloatArray | None, FloatArray | None],
-) -> Prediction:
+    *,
+    session: str = "",
+) -> HeldOut:
     """Predict a run from its commands, and compare.
 
     Args:
@@ -166,9 +146,6 @@ def predict(
         variance: Of ln|a| plus that of psi, shape (m,).
         response: Complex amplitudes of the base's responses, shape (m,).
         matrices: P, R, G, S; without G and S changes of amplitude are taken as G = P, S = -R.
-
-    Returns:
-        The prediction's error.
     """
     P, R, gain, cross = matrices
     G, S = P if gain is None else gain, -R if cross is None else cross
@@ -176,7 +153,8 @@ def predict(
     log_amplitude = R @ deviation.imag + G @ deviation.real
     measured = response * np.exp(answered)
     whole = float(np.linalg.norm(measured))
-    return Prediction(
+    return HeldOut(
+        session=session,
         size=float(max(np.abs(deviation.real).max(), np.abs(deviation.imag).max())),
         error=float(np.linalg.norm(response * np.exp(log_amplitude + 1j * phase) - measured))
         / whole,
@@ -185,8 +163,8 @@ def predict(
     )
 
 
-def valid_to(predictions: Sequence[Prediction]) -> float | None:
-    """Largest deviation up to which every held-out run is predicted at least ``BETTER`` better.
+def valid_to(predictions: Sequence[HeldOut]) -> float | None:
+    """Return the largest deviation up to which all held-out runs are predicted well.
 
     Returns:
         The size of the last good run before the first bad one; None where the smallest is bad, or
@@ -201,10 +179,10 @@ def valid_to(predictions: Sequence[Prediction]) -> float | None:
 
 
 def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
-    """Estimate the local matrices, check them, and say how far they hold.
+    """Estimate the local matrices, check them, and find how far they hold.
 
     Args:
-        warn: Takes one sentence for each thing that is missing or doubtful.
+        warn: Receives a sentence for each missing or doubtful value.
 
     Returns:
         A :class:`LocalCoupling`; or not identifiable, with the reason and what to record.
@@ -234,14 +212,12 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
     others = np.log(experiment.ratio[list(experiment.runs.base)] / first)
     base = (first * np.exp(others.mean(axis=0))).astype(np.complex128)
     deviation = experiment.runs.deviation
-    change = response_matrices(deviation, experiment.ratio, base)
+    # ln a = ln c + ln H, and both of a run's phases are counted from the same instant.
+    change = deviation + np.log(experiment.ratio / base)
     each = [kicks.get(k) for k in used]
     answers = ResponseMatrices(
-        change[used],
-        experiment.log_gain_variance[used],
-        experiment.lag_variance[used],
-        experiment.dof[used],
-    )
+        change, experiment.log_gain_variance, experiment.lag_variance, experiment.dof
+    ).select(used)
     found = local_matrices(each, answers, amplitude=_has_amplitude(experiment, warn))
     P, R, G, S = found.P, found.R, found.G, found.S
     correlation = found.errors.correlation
@@ -250,7 +226,7 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
         P, R, base * experiment.command, experiment.command, correlation=correlation
     )
     held = _held_out(experiment, change, base, found)
-    reached = valid_to([one for _, one in held])
+    reached = valid_to(held)
     passed = bool(found.agree.all())
     if not passed:
         warn(
@@ -274,7 +250,7 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
         identifiable=True,
         why=f"central differences of {len(kicks)} kicks around one gait",
         matrix=rows_of(P.value),
-        condition_number=_finite(reading.condition_number),
+        condition_number=reading.condition_number,
         joints=experiment.names,
         base_runs=len(experiment.runs.base),
         kicked_runs=len(kicks),
@@ -288,11 +264,8 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
         nonlinearity=Estimate()
         if G is None or S is None
         else nonlinearity(P, R, G, S, correlation=correlation),
-        lti=_lti(reading),
-        held_out=tuple(
-            HeldOut(experiment.labels[k], one.size, one.error, one.error_kept, one.noise)
-            for k, one in held
-        ),
+        lti=reading,
+        held_out=held,
         valid_to=reached,
         base=_base_response(experiment, base, found.errors),
         scatter=_scatter(found),
@@ -301,7 +274,7 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
 
 
 def _has_amplitude(experiment: KickExperiment, warn: Warn) -> bool:
-    """Whether S and G can be told; warns where amplitudes were not kicked both ways."""
+    """Return whether S and G can be estimated; warn of amplitudes not kicked both ways."""
     lacking = missing_kicks(list(experiment.runs.kicks.values()), Kind.AMPLITUDE, experiment.names)
     if lacking:
         warn(
@@ -316,35 +289,35 @@ def _held_out(
     change: ComplexArray,
     base: ComplexArray,
     found: LocalMatrices,
-) -> list[tuple[int, Prediction]]:
-    """The held-out runs, by their place in the experiment."""
-    P, R, G, S = found.P, found.R, found.G, found.S
+) -> tuple[HeldOut, ...]:
+    """Predict the held-out runs."""
+    G, S = found.G, found.S
     matrices = (
-        P.value,
-        R.value,
+        found.P.value,
+        found.R.value,
         None if G is None else G.value,
         None if S is None else S.value,
     )
     between = found.errors.between.reshape(2, -1).sum(axis=0)
     variance = experiment.log_gain_variance + experiment.lag_variance + between
-    return [
-        (
-            k,
-            predict(
-                experiment.runs.deviation[k],
-                change[k],
-                variance[k],
-                base * experiment.command,
-                matrices,
-            ),
+    response = base * experiment.command
+    deviation = experiment.runs.deviation
+    return tuple(
+        predict(
+            deviation[k],
+            change[k],
+            variance[k],
+            response,
+            matrices,
+            session=experiment.labels[k],
         )
         for k in experiment.runs.patterns
         if np.isfinite(change[k]).all()
-    ]
+    )
 
 
 def _rows(names: Sequence[str], sums: RowSums, expected: float) -> tuple[RowCheck, ...]:
-    """Sums with their intervals, one by one."""
+    """Return sums with their intervals, one by one."""
     half = sums.error * stdtrit(sums.dof, 0.5 + CONFIDENCE / 2)
     return tuple(
         RowCheck(
@@ -385,17 +358,6 @@ def _scatter(found: LocalMatrices) -> RunScatter:
     )
 
 
-def _lti(reading: LtiReading) -> Lti:
-    return Lti(
-        LTI_LABEL,
-        rows_of(reading.H.real),
-        rows_of(reading.H.imag),
-        _finite(reading.condition_number),
-        reading.asymmetry,
-        *reading.band_energy,
-    )
-
-
 def _matrix(matrix: MeasuredDerivatives) -> Matrix:
     return Matrix(
         rows_of(matrix.value),
@@ -403,7 +365,3 @@ def _matrix(matrix: MeasuredDerivatives) -> Matrix:
         rows_of(matrix.half),
         rows_of(matrix.half_together),
     )
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None

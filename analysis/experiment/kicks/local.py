@@ -19,11 +19,11 @@ The coupling of a chain, read from kicks as if it were linear and time-invariant
 Then a = H c with H_ij = (a_i / c_j)(P_ij - j R_ij), and X = H^-1 is, up to the servos on its
 diagonal and a scaling of its rows, the impedance that couples the joints. Asymmetry of P is not
 directed coupling: a reciprocal H (H = H') has an asymmetric P, too. Hence asymmetry and reach are
-told of X. Where the nonlinearity index isn't small, this is a reading and not a measurement.
+computed of X. Where the nonlinearity index isn't small, this is a reading and not a measurement.
 
 P, R, G and S with errors that hold whether or not runs differ by more than their own noise.
 
-Rows of P must sum to 1 and rows of R to 0. That is checked against errors which know nothing of
+Rows of P must sum to 1 and rows of R to 0. That is checked against errors estimated without
 those sums; where it fails in spite of the scatter between runs, something else is wrong in every
 run (most often they had not settled), and the errors are widened until the sums agree (the scale
 factor of the Particle Data Group, Review of Particle Physics, Introduction, section 5.2.2).
@@ -40,18 +40,19 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 from undulog.capture.common.errors import UsageError
 
-from ...estimators.intervals import CONFIDENCE, noise_draws, norm_ratio, welch_satterthwaite
+from ...estimators.intervals import CONFIDENCE, Noisy, noise_draws, norm_ratio, welch_satterthwaite
+from ...results.coupling import LTI_LABEL, Lti, rows_of
 from ...results.estimate import Estimate
 from .runs import Kick, Kind
-from .scatter import RunErrors, run_errors
+from .scatter import RunErrors, run_errors, sides
 
 
 @dataclass(frozen=True)
 class ResponseMatrices:
-    """What r runs answered.
+    """Responses of r runs.
 
     Attributes:
-        log: Change of ln|a| + j psi against the base, shape (r, m).
+        log: Change of ln|a| + j psi against the base, whenever each run started, shape (r, m).
         log_gain_variance: Of its real part, from the noise within each run, shape (r, m).
         phase_variance: Of its imaginary part [rad^2], shape (r, m).
         dof: Degrees of freedom of both, shape (r, m).
@@ -63,6 +64,17 @@ class ResponseMatrices:
     phase_variance: FloatArray
     dof: FloatArray
     errors: RunErrors | None = None
+
+    def select(self, chosen: Sequence[int]) -> ResponseMatrices:
+        """Return some of the runs."""
+        index = list(chosen)
+        return ResponseMatrices(
+            self.log[index],
+            self.log_gain_variance[index],
+            self.phase_variance[index],
+            self.dof[index],
+            self.errors,
+        )
 
 
 @dataclass(frozen=True)
@@ -108,28 +120,10 @@ class RowSums:
     dof: FloatArray
 
 
-def response_matrices(
-    deviation: ComplexArray, ratio: ComplexArray, base: ComplexArray
-) -> ComplexArray:
-    """Change of the responses against the base, whenever each run started.
-
-    ln a = ln c + ln H, and both of a run's phases are counted from the same instant.
-
-    Args:
-        deviation: Of the commands, d ln|c| + j d psi_c, shape (..., m).
-        ratio: H = a/c of the same runs, shape (..., m).
-        base: H of the base gait, shape (m,).
-
-    Returns:
-        d ln|a| + j d psi, shape (..., m).
-    """
-    return deviation + np.log(ratio / base)
-
-
 def central_differences(
     kicks: Sequence[Kick], answers: ResponseMatrices, kind: Kind
 ) -> tuple[MeasuredDerivatives, MeasuredDerivatives]:
-    """Derivatives of phase and of log amplitude with respect to one kind of kick.
+    """Return derivatives of phase and of log amplitude with respect to one kind of kick.
 
     Args:
         kicks: Of r runs.
@@ -146,17 +140,14 @@ def central_differences(
     noise = np.stack([answers.phase_variance, answers.log_gain_variance])
     errors = answers.errors
     between = np.zeros((2, m)) if errors is None else errors.between.reshape(2, m)
+    both_ways = sides(kicks, kind)
     for j in range(m):
-        sides = [
-            [k for k, one in enumerate(kicks) if _is(one, j, kind) and (one.size > 0) is up]
-            for up in (True, False)
-        ]
-        if not all(sides):
+        if j not in both_ways:
             raise UsageError(
                 f"joint {j + 1} of {m}: its command's {kind.value} is not kicked both up and down; "
                 "record both, a difference to one side keeps the curvature"
             )
-        up, down = sides
+        up, down = both_ways[j]
         span = np.mean([kicks[k].size for k in up]) - np.mean([kicks[k].size for k in down])
         value[:, :, j] = (parts[:, up].mean(axis=1) - parts[:, down].mean(axis=1)) / span
         weight = np.array([1 / len(up)] * len(up) + [1 / len(down)] * len(down)) / span
@@ -176,7 +167,7 @@ def central_differences(
 
 
 def row_sums(matrix: MeasuredDerivatives) -> RowSums:
-    """Sums over the columns: 1 for P, 0 for R, by time shift.
+    """Return sums over the columns: 1 for P, 0 for R, by time shift.
 
     Args:
         matrix: P or R.
@@ -196,11 +187,10 @@ def nonlinearity(
     R: MeasuredDerivatives,
     G: MeasuredDerivatives,
     S: MeasuredDerivatives,
-    seed: int = 1,
     *,
     correlation: FloatArray | None = None,
 ) -> Estimate:
-    """Defect from what a linear time-invariant system shows.
+    """Return the departure from a linear time-invariant system.
 
     Args:
         P: d psi / d psi_c.
@@ -215,7 +205,7 @@ def nonlinearity(
         :func:`.analysis.estimators.intervals.norm_ratio`.
     """
     m = len(P.value)
-    noise = noise_draws(stacked(((P, S), (R, G)), correlation), seed)
+    noise = noise_draws(stacked(((P, S), (R, G)), correlation), 1)
     of_p, of_s, of_r, of_g = (
         noise[:, rows, columns]
         for rows in (slice(m), slice(m, None))
@@ -230,9 +220,9 @@ def nonlinearity(
 
 
 def stacked(
-    blocks: Sequence[Sequence[MeasuredDerivatives]], correlation: FloatArray | None
+    blocks: Sequence[Sequence[Noisy]], correlation: FloatArray | None
 ) -> MeasuredDerivatives:
-    """One matrix of several, for errors that they have in common.
+    """Return one matrix of several, for errors that they have in common.
 
     Args:
         blocks: Rows of matrices; those of one row answer the same way, those of one column are of
@@ -246,31 +236,13 @@ def stacked(
     return MeasuredDerivatives(value, error, dof, correlation)
 
 
-def _is(kick: Kick, joint: int, kind: Kind) -> bool:
-    return kick.joint == joint and kick.kind is kind
-
-
 BANDS = (1, 2, 3)
+
+UNKNOWN_SHAPE = (Estimate(), Estimate(), Estimate(), Estimate())
+"""Asymmetry and bands of a matrix that can't be inverted."""
 
 SINGULAR = 1e10
 """Condition number beyond which H isn't inverted."""
-
-
-@dataclass(frozen=True)
-class LtiReading:
-    """H and what its inverse says.
-
-    Attributes:
-        H: Response per command, shape (m, m).
-        condition_number: Of H, 2-norm: what its inversion may multiply relative errors by.
-        asymmetry: ||X - X'|| / ||X|| off the diagonal; 0 = reciprocal.
-        band_energy: Share of X's off-diagonal energy within ``|i - j|`` <= each of ``BANDS``.
-    """
-
-    H: ComplexArray
-    condition_number: float
-    asymmetry: Estimate
-    band_energy: tuple[Estimate, ...]
 
 
 def lti_reading(
@@ -278,11 +250,10 @@ def lti_reading(
     R: MeasuredDerivatives,
     response: ComplexArray,
     command: ComplexArray,
-    seed: int = 11,
     *,
     correlation: FloatArray | None = None,
-) -> LtiReading:
-    """Read P and R as a linear time-invariant system.
+) -> Lti:
+    """Read P and R as those of a linear time-invariant system.
 
     Args:
         P: d psi / d psi_c.
@@ -297,17 +268,21 @@ def lti_reading(
     scale = response[:, None] / command[None, :]
     H = (scale * (P.value - 1j * R.value)).astype(np.complex128)
     condition = float(np.linalg.cond(H))
-    if not condition < SINGULAR:
-        return LtiReading(H, condition, Estimate(), tuple(Estimate() for _ in BANDS))
-    X: ComplexArray = np.linalg.inv(H).astype(np.complex128)
-    draws = noise_draws(stacked(((P,), (R,)), correlation), seed)
-    noise = scale * (draws[:, : len(H)] - 1j * draws[:, len(H) :])
-    error: ComplexArray = np.linalg.inv(H + noise).astype(np.complex128) - X
-    return LtiReading(H, condition, *reciprocity(X, error))
+    shape = UNKNOWN_SHAPE
+    if condition < SINGULAR:
+        X: ComplexArray = np.linalg.inv(H).astype(np.complex128)
+        draws = noise_draws(stacked(((P,), (R,)), correlation), 11)
+        noise = scale * (draws[:, : len(H)] - 1j * draws[:, len(H) :])
+        error: ComplexArray = np.linalg.inv(H + noise).astype(np.complex128) - X
+        shape = reciprocity(X, error)
+    finite = condition if np.isfinite(condition) else None
+    return Lti(LTI_LABEL, rows_of(H.real), rows_of(H.imag), finite, *shape)
 
 
-def reciprocity(X: ComplexArray, error: ComplexArray) -> tuple[Estimate, tuple[Estimate, ...]]:
-    """Asymmetry and reach of a matrix off its diagonal.
+def reciprocity(
+    X: ComplexArray, error: ComplexArray
+) -> tuple[Estimate, Estimate, Estimate, Estimate]:
+    """Return asymmetry and reach of a matrix off its diagonal.
 
     Args:
         X: An impedance, or what stands for one, shape (m, m).
@@ -322,15 +297,15 @@ def reciprocity(X: ComplexArray, error: ComplexArray) -> tuple[Estimate, tuple[E
     off: ComplexArray = X * outside
     off_error: ComplexArray = error * outside
     asymmetry = norm_ratio(off - off.T, off_error - off_error.swapaxes(1, 2), off, off_error)
-    bands = (
-        norm_ratio(off * (distance <= b), off_error * (distance <= b), off, off_error)
+    within_1, within_2, within_3 = (
+        squared(norm_ratio(off * (distance <= b), off_error * (distance <= b), off, off_error))
         for b in BANDS
     )
-    return asymmetry, tuple(squared(one) for one in bands)
+    return asymmetry, within_1, within_2, within_3
 
 
 def squared(share: Estimate) -> Estimate:
-    """Energy from a ratio of norms.
+    """Return the energy from a ratio of norms.
 
     Args:
         share: Of a norm in the whole's.
@@ -353,7 +328,7 @@ ROW_TOLERANCE = 1e-2
 
 @dataclass(frozen=True)
 class LocalMatrices:
-    """What kicks around one gait say.
+    """Matrices of kicks around one gait.
 
     Attributes:
         P: d psi / d psi_c.
@@ -361,7 +336,7 @@ class LocalMatrices:
         G: d ln|a| / d ln|c|, or None.
         S: d psi / d ln|c|, or None.
         steady_errors: The same from combinations of runs that no second order of a kick enters.
-        phase_rows: Sums of rows of P, with errors that know nothing of these sums.
+        phase_rows: Sums of rows of P, with errors estimated without these sums.
         gain_rows: Of R.
         agree: Whether each sum of P, then of R, is 1 or 0 within its error, all together at 95 %,
             shape (2, m).
@@ -391,12 +366,7 @@ def local_matrices(
     """
     kicked = [k for k, one in enumerate(kicks) if one is not None]
     each = [one for one in kicks if one is not None]
-    of_kicks = ResponseMatrices(
-        answers.log[kicked],
-        answers.log_gain_variance[kicked],
-        answers.phase_variance[kicked],
-        answers.dof[kicked],
-    )
+    of_kicks = answers.select(kicked)
 
     def differences(
         errors: RunErrors | None, kind: Kind
@@ -424,13 +394,13 @@ def local_matrices(
 
 
 def _agree(sums: RowSums, expected: float) -> BoolArray:
-    """Whether each sum is as expected, all 2 m of P and R together at 95 %."""
+    """Return whether each sum is as expected, all 2 m of P and R together at 95 %."""
     quantile = stdtrit(sums.dof, 1 - (1 - CONFIDENCE) / (4 * len(sums.value)))
     return np.abs(sums.value - expected) <= ROW_TOLERANCE + sums.error * quantile
 
 
 def _widening(sums: RowSums, expected: float, agree: BoolArray) -> FloatArray:
-    """Factor on each row's errors; 1 where all sums agree."""
+    """Return the factor on each row's errors; 1 where all sums agree."""
     if agree.all():
         return np.ones(len(agree))
     off = np.abs(sums.value - expected) / np.maximum(sums.error, np.finfo(float).tiny)
@@ -440,7 +410,7 @@ def _widening(sums: RowSums, expected: float, agree: BoolArray) -> FloatArray:
 def _widen(
     pair: tuple[MeasuredDerivatives, MeasuredDerivatives], factor: FloatArray
 ) -> tuple[MeasuredDerivatives, MeasuredDerivatives]:
-    """Errors times each row's factor, which so many sums tell."""
+    """Multiply the errors by each row's factor, which as many sums determine."""
     m = len(factor[0])
 
     def wider(one: MeasuredDerivatives, by: FloatArray) -> MeasuredDerivatives:

@@ -1,8 +1,8 @@
-"""The closed loop foretold: how generators that feel their servos relax on a body that was kicked.
+"""Predict the closed loop: how generators with feedback relax on a body that was kicked.
 
-:mod:`.embodied` has the equations. What is known of P, R and of the response to the gait has
-errors, those of one run shared by all joints; they are drawn anew, and so the modes' rates and what
-is left of a kick have intervals.
+:mod:`.analysis.oscillators.predictions` has the equations. P, R and the response to the gait have
+errors, those of one run shared by all joints; draws of them give intervals of the modes' rates and
+of the rest of a kick.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ...results.oscillators import ClosedLoop, LoopMode, Relaxation
 from .local import MeasuredDerivatives, stacked
 
 POINTS = 50
-"""Times at which what is left of a kick is told."""
+"""Times at which the rest of a kick is predicted."""
 
 SLOW = 0.1
 """Rates above this share of the gait's angular frequency leave the average over a cycle."""
@@ -42,7 +42,7 @@ def closed_loop(
     kick: Mapping[str, float] | None = None,
     until_s: float | None = None,
 ) -> ClosedLoop:
-    """Predict how phase oscillators that feel their servos relax, with nothing fitted.
+    """Predict how phase oscillators with feedback from their servos relax, with nothing fitted.
 
     Args:
         coupling: From kicks of the open loop around one gait.
@@ -71,15 +71,15 @@ def closed_loop(
         )
     here, drawn = _generators(coupling, base, age_s)
     m = len(here)
-    found, said = spectrum(np.eye(m) + here), intervals_of(np.eye(m) + here, np.eye(m) + drawn)
+    modes_here, ends = spectrum(np.eye(m) + here), intervals_of(np.eye(m) + here, np.eye(m) + drawn)
     modes = tuple(
         LoopMode(
-            rate=_scaled(float(rate.real), said.real[k], eps),
-            turning=_scaled(float(rate.imag), said.imag[k], eps),
-            pattern_abs=tuple(np.abs(found.patterns[:, k]).tolist()),
-            pattern_rad=tuple(np.angle(found.patterns[:, k]).tolist()),
+            rate=_scaled(float(rate.real), ends.real[k], eps),
+            turning=_scaled(float(rate.imag), ends.imag[k], eps),
+            pattern_abs=tuple(np.abs(modes_here.patterns[:, k]).tolist()),
+            pattern_rad=tuple(np.angle(modes_here.patterns[:, k]).tolist()),
         )
-        for k, rate in enumerate(found.rates.tolist())
+        for k, rate in enumerate(modes_here.rates.tolist())
     )
     omega = 2 * math.pi * base.frequency_hz
     spread = here - here.mean(axis=0)
@@ -87,7 +87,7 @@ def closed_loop(
     relaxed = None
     if kick:
         turned = np.array([kick.get(name, 0.0) for name in coupling.joints])
-        slowest = eps * max(abs(found.gap), 1e-9)
+        slowest = eps * max(abs(modes_here.gap), 1e-9)
         end = min(3 / slowest, 100 / base.frequency_hz) if until_s is None else until_s
         relaxed = _relaxed(eps * here, eps * drawn, turned, end)
     limits = tuple(_limits(coupling, fastest, omega, kick or {}))
@@ -116,32 +116,25 @@ def _felt(base: BaseResponse, age_s: float) -> ComplexArray:
 def _generators(
     coupling: LocalCoupling, base: BaseResponse, age_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """J / eps, shape (m, m), and with errors that it may have, shape (DRAWS, m, m)."""
+    """Return J / eps, shape (m, m), and draws of it with errors, shape (DRAWS, m, m)."""
     m = len(coupling.joints)
     correlation = None if coupling.scatter is None else np.array(coupling.scatter.correlation)
-    blocks = [
-        [MeasuredDerivatives(one.value, one.error, one.dof)]
-        for one in (measured(coupling.P), measured(coupling.R))
-    ]
-    P, R = blocks[0][0].value, blocks[1][0].value
-    noise = noise_draws(stacked(blocks, correlation), SEED)
+    P, R = measured(coupling.P), measured(coupling.R)
+    noise = noise_draws(stacked(((P,), (R,)), correlation), SEED)
     felt = _felt(base, age_s)
     gain, lag = np.array(base.gain), np.array(base.lag_error)
     error = np.concatenate([lag, np.array(base.gain_error) / gain])[:, None]
     dof = np.full_like(error, coupling.scatter.dof if coupling.scatter is not None else np.inf)
     dof = np.minimum(dof, 1e6)
-    own = noise_draws(MeasuredDerivatives(np.zeros_like(error), error, dof, correlation), SEED + 1)[
-        ..., 0
-    ]
-    drawn = [
-        relaxation(P + one[:m], R + one[m:], (felt * np.exp(of[m:] + 1j * of[:m])))
-        for one, of in zip(noise, own, strict=True)
-    ]
-    return relaxation(P, R, felt), np.array(drawn)
+    of_base = MeasuredDerivatives(np.zeros_like(error), error, dof, correlation)
+    own = noise_draws(of_base, SEED + 1)[..., 0]
+    turned = felt * np.exp(own[:, m:] + 1j * own[:, :m])
+    drawn = relaxation(P.value + noise[:, :m], R.value + noise[:, m:], turned)
+    return relaxation(P.value, R.value, felt), drawn
 
 
 def _relaxed(J: FloatArray, drawn: FloatArray, kick: FloatArray, until_s: float) -> Relaxation:
-    """D phi(t) = exp(J t) d phi(0), and 95 % intervals from the draws."""
+    """Return d phi(t) = exp(J t) d phi(0), and 95 % intervals from the draws."""
     times = np.linspace(0.0, until_s, POINTS + 1)
     step = float(times[1])
 
@@ -168,7 +161,7 @@ def _relaxed(J: FloatArray, drawn: FloatArray, kick: FloatArray, until_s: float)
 def _limits(
     coupling: LocalCoupling, fastest: float, omega: float, kick: Mapping[str, float]
 ) -> list[str]:
-    """What the prediction holds for, worst first."""
+    """List the limits of the prediction, worst first."""
     found: list[str] = []
     if not coupling.checks_pass:
         found.append("P's rows don't sum to 1 within their errors: the prediction is doubtful")

@@ -1,4 +1,4 @@
-"""Which runs are local kicks around one gait: told from the phasors of the commands alone.
+"""Find runs that are local kicks around one gait, from the phasors of their commands.
 
 With c the complex amplitudes of a run's commands and b those of the base gait, the run deviates by
 delta_j = ln(c_j / b_j) - j theta, where theta is what all joints share: the run started at another
@@ -73,7 +73,7 @@ class KickedRuns:
 
 
 def deviation_of(command: ComplexArray, base: ComplexArray, same: float = SAME) -> ComplexArray:
-    """How a run's commands deviate from the base gait, whenever it started.
+    """Return the deviation of a run's commands from the base gait, whenever it started.
 
     Args:
         command: Complex amplitudes, shape (m,), m > 2.
@@ -93,7 +93,7 @@ def deviation_of(command: ComplexArray, base: ComplexArray, same: float = SAME) 
 
 
 def kick_of(deviation: ComplexArray, same: float = SAME, most: float = MOST_KICK) -> Kick | None:
-    """The kick that a deviation is.
+    """Return the kick that makes a deviation.
 
     Args:
         deviation: From :func:`deviation_of`, shape (m,).
@@ -157,7 +157,7 @@ def sort_kicks_within(command: ComplexArray, same: float, most: float) -> Kicked
 
 
 def missing_kicks(kicks: Sequence[Kick], kind: Kind, names: Sequence[str]) -> tuple[str, ...]:
-    """What central differences of one kind lack.
+    """List the kicks that are missing for central differences.
 
     Args:
         names: Of the m joints.
@@ -225,15 +225,12 @@ class KickExperiment:
     frequency_hz: float
 
     def role(self, k: int) -> str | None:
-        """What a run of all runs is here: ``base``, ``kick``, ``held-out`` or None."""
+        """Return a run's role: ``base``, ``kick``, ``held-out`` or None."""
         if k not in self.index:
             return None
-        own = self.index.index(k)
-        if own in self.runs.kicks:
-            return "kick"
-        if own in self.runs.patterns:
-            return "held-out"
-        return "base" if own in self.runs.base else None
+        own, runs = self.index.index(k), self.runs
+        parts = {"kick": runs.kicks, "held-out": runs.patterns, "base": runs.base}
+        return next((name for name, members in parts.items() if own in members), None)
 
 
 def find_kicks(runs: Sequence[GaitRun], gaits: Sequence[GaitFit | None]) -> KickExperiment | None:

@@ -1,8 +1,8 @@
 """How much runs differ from each other beyond what the noise within each of them explains.
 
-A fit knows the noise within its run. A servo that warms up, a cable, a foot of sand or a clock that
-is read late moves gain and lag of a whole run, and no residual shows it. It is estimated from
-combinations of runs whose mean is known whatever the coupling is, y = psi or ln|a| of one joint:
+A fit estimates the noise within its run. A servo that warms up, a cable, sand or a late clock moves
+gain and lag of a whole run, and no residual shows it. It is estimated from combinations of runs
+whose mean is known whatever the coupling is, y = psi or ln|a| of one joint:
 
 * runs of the same commands, against their mean;
 * the mean of a kick up and of the same kick down, against the mean of all those pairs: the coupling
@@ -42,7 +42,7 @@ class RunErrors:
     Attributes:
         draws: Draws of a run's errors, shape (k, 2 m).
         within: Variance expected of them from the noise within runs alone, shape (2 m,).
-        dof: Degrees of freedom of each column: k less what its joint's own kicks would have told.
+        dof: Degrees of freedom of each column: k less those of its joint's own kicks.
     """
 
     draws: FloatArray
@@ -101,23 +101,21 @@ def run_errors(
     left_out = sum(bool(sides(kicks, kind)) for kind in Kind) if pairs else 0
     level = values - np.hstack([foreseen.imag, foreseen.real])
     draws = even @ (_without_own(kicks, level) if pairs else level)
-    if not rows:
-        share = np.mean(np.square(even) @ variance, axis=0)
-        return RunErrors(draws, share, len(draws) - left_out)
-    weights = _row_weights(kicks)
-    left = weights @ values - np.repeat((1.0, 0.0), log.shape[1])
-    # Kicks that are repeated unequally make the sum depend on the pairs.
-    along = even @ weights
-    alone = weights - along @ even
-    length = float(np.linalg.norm(alone))
-    own = (left - along @ draws) / length
-    whole = np.vstack([even, alone / length])
-    share = np.mean(np.square(whole) @ variance, axis=0)
-    return RunErrors(np.vstack([draws, own]), share, len(whole) - left_out)
+    if rows:
+        weights = _row_weights(kicks)
+        left = weights @ values - np.repeat((1.0, 0.0), log.shape[1])
+        # Kicks that are repeated unequally make the sum depend on the pairs.
+        along = even @ weights
+        alone = weights - along @ even
+        length = float(np.linalg.norm(alone))
+        draws = np.vstack([draws, (left - along @ draws) / length])
+        even = np.vstack([even, alone / length])
+    share = np.mean(np.square(even) @ variance, axis=0)
+    return RunErrors(draws, share, len(draws) - left_out)
 
 
 def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray:
-    """Values in which a joint's own kicks, up and down together, are at the mean of the others'.
+    """Set a joint's own kicks, up and down together, to the mean of the others'.
 
     So they add nothing to the squares about that mean, and its joint has a degree of freedom less.
     """
@@ -125,14 +123,16 @@ def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray
     found = values.copy()
     for kind in Kind:
         pairs = sides(kicks, kind)
+        if len(pairs) < 2:
+            continue
         middle = np.array(
-            [(values[up].mean(axis=0) + values[down].mean(axis=0)) / 2 for up, down in pairs]
+            [
+                (values[up].mean(axis=0) + values[down].mean(axis=0)) / 2
+                for up, down in pairs.values()
+            ]
         )
-        for k, (up, down) in enumerate(pairs):
-            kick = kicks[up[0]]
-            if kick is None or len(pairs) < 2:
-                continue
-            own = [kick.joint, m + kick.joint]
+        for k, (joint, (up, down)) in enumerate(pairs.items()):
+            own = [joint, m + joint]
             others = np.delete(middle[:, own], k, axis=0).mean(axis=0)
             found[np.ix_(up + down, own)] += others - middle[k, own]
     return found
@@ -140,7 +140,7 @@ def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray
 
 def _row_weights(kicks: Sequence[Kick | None]) -> FloatArray:
     weights = np.zeros(len(kicks))
-    for up, down in sides(kicks, Kind.PHASE):
+    for up, down in sides(kicks, Kind.PHASE).values():
         span = _mean_size(kicks, up) - _mean_size(kicks, down)
         weights[up] += 1 / (len(up) * span)
         weights[down] -= 1 / (len(down) * span)
@@ -152,7 +152,7 @@ def _foreseen(
     m: int,
     derivatives: tuple[ComplexArray, ComplexArray | None],
 ) -> ComplexArray:
-    """What a linear chain with these derivatives answers, shape (r, m)."""
+    """Return the response of a linear chain with these derivatives, shape (r, m)."""
     found = np.zeros((len(kicks), m), dtype=np.complex128)
     of_phase, of_amplitude = derivatives
     for k, kick in enumerate(kicks):
@@ -166,7 +166,7 @@ def _foreseen(
 
 
 def _repeats(kicks: Sequence[Kick | None], values: FloatArray) -> list[FloatArray]:
-    """Each run against the mean of all runs of its commands; a copied file isn't a repeat."""
+    """Compare each run with the mean of all runs of its commands; copied files don't count."""
     groups: dict[tuple[int, Kind, bool] | None, list[int]] = {}
     seen: set[bytes] = set()
     for k, one in enumerate(kicks):
@@ -176,22 +176,18 @@ def _repeats(kicks: Sequence[Kick | None], values: FloatArray) -> list[FloatArra
         seen.add(numbers)
         key = None if one is None else (one.joint, one.kind, one.size > 0)
         groups.setdefault(key, []).append(k)
-    found: list[FloatArray] = []
+    rows = np.eye(len(kicks))
     for group in groups.values():
-        for k in group[1:]:
-            row = np.zeros(len(kicks))
-            row[group] = -1 / len(group)
-            row[k] += 1.0
-            found.append(row)
-    return found
+        rows[np.ix_(group, group)] -= 1 / len(group)
+    return [rows[k] for group in groups.values() for k in group[1:]]
 
 
 def _pairs(kicks: Sequence[Kick | None]) -> list[FloatArray]:
-    """Kicks up and down together, against the mean of all of them, for each kind."""
+    """Compare kicks up and down together with the mean of all of them, for each kind."""
     found: list[FloatArray] = []
     for kind in Kind:
         pairs: list[FloatArray] = []
-        for up, down in sides(kicks, kind):
+        for up, down in sides(kicks, kind).values():
             row = np.zeros(len(kicks))
             row[up] = 0.5 / len(up)
             row[down] = 0.5 / len(down)
@@ -201,30 +197,21 @@ def _pairs(kicks: Sequence[Kick | None]) -> list[FloatArray]:
     return found
 
 
-def sides(kicks: Sequence[Kick | None], kind: Kind) -> list[tuple[list[int], list[int]]]:
-    """Runs up and runs down of each joint that is kicked both ways.
+def sides(kicks: Sequence[Kick | None], kind: Kind) -> dict[int, tuple[list[int], list[int]]]:
+    """Return the runs that kick a joint up and those that kick it down.
 
     Args:
         kicks: Of r runs, None of one of the base gait.
 
     Returns:
-        Indices of runs, a pair for each joint.
+        Indices of runs for each joint that is kicked both ways.
     """
-    joints = sorted({one.joint for one in kicks if one is not None and one.kind is kind})
-    found: list[tuple[list[int], list[int]]] = []
-    for joint in joints:
-        up, down = (
-            [
-                k
-                for k, one in enumerate(kicks)
-                if one is not None
-                and (one.joint, one.kind, one.size > 0) == (joint, kind, positive)
-            ]
-            for positive in (True, False)
-        )
-        if up and down:
-            found.append((up, down))
-    return found
+    runs: dict[int, tuple[list[int], list[int]]] = {}
+    for k, one in enumerate(kicks):
+        if one is not None and one.kind is kind:
+            up, down = runs.setdefault(one.joint, ([], []))
+            (up if one.size > 0 else down).append(k)
+    return {joint: runs[joint] for joint in sorted(runs) if all(runs[joint])}
 
 
 def _mean_size(kicks: Sequence[Kick | None], chosen: Sequence[int]) -> float:
@@ -233,7 +220,7 @@ def _mean_size(kicks: Sequence[Kick | None], chosen: Sequence[int]) -> float:
 
 
 def _orthonormal(rows: Sequence[FloatArray], count: int) -> FloatArray:
-    """An orthonormal basis of what the rows span, shape (k, count)."""
+    """Return an orthonormal basis of what the rows span, shape (k, count)."""
     if not rows:
         return np.zeros((0, count))
     _, sizes, basis = np.linalg.svd(np.array(rows), full_matrices=False)

@@ -72,9 +72,7 @@ class MirrorTest:
         contrast_error: Standard errors of its parts, shape (2, m).
         contrast_p: p of each contrast after single-step max-T: family-wise over contrasts and
             common parts of all pairs, gain and lag, shape (2, m); 1 of the middle joint.
-        common: (d_i + d_{m+1-i}) / 2: what both joints of a pair do otherwise the other way, (m,).
-        common_error: Standard errors of its parts, shape (2, m).
-        common_p: p of each common part, of the same family, shape (2, m).
+        common_p: p of each common part (d_i + d_{m+1-i}) / 2, of the same family, shape (2, m).
         strata: How many sets of runs that are mirror images of each other were compared.
         labellings: How many labellings there are.
         tried: How many were tried; all or a random subset.
@@ -90,8 +88,6 @@ class MirrorTest:
     contrast: ComplexArray
     contrast_error: FloatArray
     contrast_p: FloatArray
-    common: ComplexArray
-    common_error: FloatArray
     common_p: FloatArray
     strata: int
     labellings: int
@@ -102,11 +98,6 @@ class MirrorTest:
     def p(self) -> float:
         """p-value of H1, identical modules."""
         return float(self.joint_p.min())
-
-    @property
-    def exact(self) -> bool:
-        """Whether all labellings were tried."""
-        return self.tried == self.labellings
 
     @property
     def joint_p(self) -> FloatArray:
@@ -160,9 +151,9 @@ def mirror_test(
     odd, even = (both - both[:, ::-1]) / 2, (both + both[:, ::-1]) / 2
     columns = np.concatenate([parts(odd[:, :half]), parts(even[:, : m - half])], axis=1)
     labels = design.labellings(seed)
-    scores = np.abs(label_scores(columns, labels, design.index))
+    scores = np.abs(design.scores(columns, labels))
     p = family_wise_p(scores)
-    noise_only = np.abs(label_scores(design.residuals(parts(both)), labels, design.index))
+    noise_only = np.abs(design.scores(design.residuals(parts(both)), labels))
     shares, dof = design.variances(parts(both))
     p_contrast, p_common = np.ones((2, m)), np.ones((2, m))
     p_contrast[:, :half] = p[: 2 * half].reshape(2, half)
@@ -176,14 +167,12 @@ def mirror_test(
         difference=frozen(difference),
         error=frozen(np.sqrt(shares.sum(axis=0)).reshape(2, m)),
         dof=frozen(welch_satterthwaite(shares, dof).reshape(2, m)),
-        score=frozen(label_scores(parts(both), labels[:1], design.index)[0].reshape(2, m)),
+        score=frozen(design.scores(parts(both), labels[:1])[0].reshape(2, m)),
         critical=float(np.quantile(noise_only.max(axis=-1), CONFIDENCE, method="higher")),
         statistic=float(scores[0].max()),
         contrast=frozen((difference - difference[::-1]) / 2),
         contrast_error=frozen(np.sqrt(design.variances(parts(odd))[0].sum(axis=0)).reshape(2, m)),
         contrast_p=frozen(p_contrast),
-        common=frozen((difference + difference[::-1]) / 2),
-        common_error=frozen(np.sqrt(design.variances(parts(even))[0].sum(axis=0)).reshape(2, m)),
         common_p=frozen(p_common),
         strata=design.strata,
         labellings=total,
@@ -251,7 +240,7 @@ class Strata:
         return precision / precision.sum()
 
     def labellings(self, seed: int = 1) -> BoolArray:
-        """Ways to choose which runs of each stratum are called '+'.
+        """Return ways to choose which runs of each stratum are called '+'.
 
         Returns:
             True for '+', shape (k, r1 + r2), the observed labelling first. All of them, but where
@@ -280,8 +269,41 @@ class Strata:
             labels = (labels[:, None] | part[None]).reshape(-1, len(self.index))
         return labels  # combinations come in order, so the first is the observed one
 
+    def scores(self, runs: FloatArray, labels: BoolArray) -> FloatArray:
+        """Return the studentised difference of the runs called '+' and the others.
+
+        Args:
+            runs: Those of the one way first, sets of them in the leading axes, shape (..., r, c).
+            labels: True for '+', with the same numbers in each stratum, shape (k, r).
+
+        Returns:
+            Difference over its standard error, shape (..., k, c). Of one stratum
+            (mean '+' - mean others) / sqrt(s1^2 / r1 + s2^2 / r2). 0 where all runs of each
+            stratum agree to the bit; finite where they agree but for their label.
+        """
+        own = [np.flatnonzero(self.index == s) for s in range(self.strata)]
+        # The first of all subtracted first, so that runs that agree give exact zeros.
+        centred = [runs[..., rows, :] - runs[..., rows[:1], :] for rows in own]
+        centred = [one - one.mean(axis=-2, keepdims=True) for one in centred]
+        size = np.sqrt(sum(np.sum(one**2, axis=-2, keepdims=True) for one in centred))
+        counts = np.stack([self.plus, self.minus])
+        difference = within1 = within2 = np.zeros(1)
+        for s, (rows, one) in enumerate(zip(own, centred, strict=True)):
+            r1, r2 = counts[:, s].tolist()
+            z = np.divide(one, size, out=np.zeros_like(one), where=size > 0)
+            # All sums from those of '+' alone: z sums to 0 in a stratum.
+            plus = labels[:, rows].astype(np.float64)
+            first, squares = plus @ z, plus @ z**2
+            within1 = within1 + squares - first**2 / r1
+            within2 = within2 + np.sum(z**2, axis=-2, keepdims=True) - squares - first**2 / r2
+            difference = difference + self.weights[s] * first * (1 / r1 + 1 / r2)
+        spread1, spread2 = np.sum(self.weights**2 / counts, axis=1)
+        dof1, dof2 = np.sum(counts - 1.0, axis=1)
+        variance = within1 / dof1 * spread1 + within2 / dof2 * spread2
+        return difference / np.sqrt(np.maximum(variance, np.finfo(np.float64).eps))
+
     def difference(self, runs: ComplexArray) -> ComplexArray:
-        """Weighted mean of the strata's differences of '+' and '-'.
+        """Return the weighted mean of the strata's differences of '+' and '-'.
 
         Args:
             runs: Those of the one way first, shape (r, c).
@@ -299,7 +321,7 @@ class Strata:
         return mean
 
     def residuals(self, runs: FloatArray) -> FloatArray:
-        """Runs less the mean of their way in their stratum.
+        """Subtract the mean of each run's way in its stratum.
 
         Args:
             runs: Those of the one way first, shape (r, c).
@@ -314,7 +336,7 @@ class Strata:
         return out
 
     def variances(self, runs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What either way adds to the variance of the difference, from the scatter within strata.
+        """Return the variance that each way adds to the difference, from the scatter in strata.
 
         Args:
             runs: Those of the one way first, shape (r, c).
@@ -332,7 +354,7 @@ class Strata:
 
 
 def parts(y: ComplexArray) -> FloatArray:
-    """Log gain and minus lag side by side.
+    """Join log gain and minus lag.
 
     Args:
         y: Complex, shape (..., m).
@@ -343,46 +365,8 @@ def parts(y: ComplexArray) -> FloatArray:
     return np.concatenate([y.real, y.imag], axis=-1)
 
 
-def label_scores(runs: FloatArray, labels: BoolArray, strata: IntArray | None = None) -> FloatArray:
-    """Studentised difference of the means of the runs called '+' and the others.
-
-    Args:
-        runs: Shape (..., r, c): r runs of c quantities, sets of them in the leading axes.
-        labels: True for '+', shape (k, r), with the same numbers in each stratum.
-        strata: Stratum of each run, from 0, shape (r,); all are in one where it is None.
-
-    Returns:
-        Difference over its standard error, shape (..., k, c); see :class:`Strata`. Of one stratum
-        (mean '+' - mean others) / sqrt(s1^2 / r1 + s2^2 / r2). 0 where all runs of each stratum
-        agree to the bit; finite where they agree but for their label.
-    """
-    index = np.zeros(runs.shape[-2], dtype=np.int64) if strata is None else strata
-    own = [np.flatnonzero(index == s) for s in range(int(index.max()) + 1)]
-    # The first of all subtracted first, so that runs that agree give exact zeros.
-    centred = [runs[..., rows, :] - runs[..., rows[:1], :] for rows in own]
-    centred = [one - one.mean(axis=-2, keepdims=True) for one in centred]
-    size = np.sqrt(sum(np.sum(one**2, axis=-2, keepdims=True) for one in centred))
-    design = [(float(labels[0, rows].sum()), float((~labels[0, rows]).sum())) for rows in own]
-    precision = np.array([r1 * r2 / (r1 + r2) for r1, r2 in design])
-    weights = precision / precision.sum()
-    difference = within1 = within2 = np.zeros(1)
-    spread1 = spread2 = dof1 = dof2 = 0.0
-    for rows, one, (r1, r2), weight in zip(own, centred, design, weights.tolist(), strict=True):
-        z = np.divide(one, size, out=np.zeros_like(one), where=size > 0)
-        # All sums from those of '+' alone: z sums to 0 in a stratum.
-        plus = labels[:, rows].astype(np.float64)
-        first, squares = plus @ z, plus @ z**2
-        within1 = within1 + squares - first**2 / r1
-        within2 = within2 + np.sum(z**2, axis=-2, keepdims=True) - squares - first**2 / r2
-        difference = difference + weight * first * (1 / r1 + 1 / r2)
-        spread1, spread2 = spread1 + weight**2 / r1, spread2 + weight**2 / r2
-        dof1, dof2 = dof1 + r1 - 1, dof2 + r2 - 1
-    variance = within1 / dof1 * spread1 + within2 / dof2 * spread2
-    return difference / np.sqrt(np.maximum(variance, np.finfo(np.float64).eps))
-
-
 def family_wise_p(scores: FloatArray) -> FloatArray:
-    """Single-step max-T p-values.
+    """Return single-step max-T p-values.
 
     Args:
         scores: abs(t) of k labellings and c quantities, the observed labelling first, shape

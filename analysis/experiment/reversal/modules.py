@@ -65,53 +65,37 @@ LEAST_LEANS = 3
 RESAMPLES = 2_000
 
 
-@dataclass(frozen=True)
-class TiltCheck:
-    """What speaks for and against a tilted floor in runs that do not cancel it.
-
-    Attributes:
-        ratio: Root mean square of the common part over that of the contrast, over the body, with
-            interval; empty where noise explains all of the contrast.
-        middle: Largest size that the middle joint's d_i can have (95 %) over the smallest that the
-            largest contrast can have; None for an even number of joints.
-        excluded: Whether both exclude a tilt as the cause.
-    """
-
-    ratio: Estimate
-    middle: float | None
-    excluded: bool
-
-
 def tilt_check(
     forward: ComplexArray,
     reverse: ComplexArray,
     test: MirrorTest,
     gravity_rad: Estimate | None = None,
-    *,
-    seed: int = 1,
-) -> TiltCheck:
-    """Check whether the differences of a reversal exclude a tilted floor as their cause.
+    headings: Headings = Headings.UNKNOWN,
+) -> FloorTilt:
+    """Check whether a tilted floor can make the differences of a reversal.
 
     Args:
         forward: y of the runs one way, shape (r1, m).
         reverse: y of the runs the other way, shape (r2, m), joints from head to tail too.
         gravity_rad: Lean of recorded gravity along the body with its interval, None or empty where
             none is recorded.
+        headings: Balanced ones exclude a tilt by design.
     """
-    ratio = common_ratio(forward, reverse, seed)
+    ratio = common_ratio(forward, reverse)
     excluded = ratio.ci95 is not None and ratio.ci95[1] < MODULE_RATIO
     middle = None
-    m = len(test.difference)
-    if m % 2:
+    if len(test.difference) % 2:
         middle = _middle_share(test)
         excluded &= middle < 1.0
-    lean = None if gravity_rad is None else gravity_rad.ci95
+    gravity_rad = gravity_rad or Estimate()
+    lean = gravity_rad.ci95
     excluded &= lean is None or (lean[0] < LEVEL_RAD and lean[1] > -LEVEL_RAD)
-    return TiltCheck(ratio, middle, excluded)
+    excluded |= headings is Headings.BALANCED
+    return FloorTilt(headings, test.strata, ratio, middle, gravity_rad, excluded)
 
 
 def floor_lean(lean_rad: FloatArray, heading_rad: FloatArray) -> Estimate:
-    """Fall of the floor along the body by recorded gravity.
+    """Return the fall of the floor along the body by recorded gravity.
 
     Args:
         lean_rad: Of each run [rad], NaN where none is recorded, shape (r,).
@@ -139,32 +123,26 @@ def floor_lean(lean_rad: FloatArray, heading_rad: FloatArray) -> Estimate:
     return Estimate(float(value[0]), around(float(value[0]), t_factor(dof) * error))
 
 
-def common_ratio(forward: ComplexArray, reverse: ComplexArray, seed: int = 1) -> Estimate:
-    """Root mean square of the common part of d over that of the contrast, noise subtracted.
+def common_ratio(forward: ComplexArray, reverse: ComplexArray) -> Estimate:
+    """Return the RMS of the common part of d over that of the contrast, noise subtracted.
 
     Args:
         forward: y of the runs one way, shape (r1, m).
         reverse: y of the runs the other way, shape (r2, m).
-        seed: Of the bootstrap over runs, each way resampled for itself.
 
     Returns:
-        The ratio with its percentile interval; empty where the contrast is no more than noise.
+        The ratio with its percentile interval from a bootstrap over runs, each way resampled for
+        itself; empty where the contrast is no more than noise.
     """
-    random = np.random.default_rng(seed)
-    mirrored = reverse[:, ::-1]
-    noise = np.zeros((2,))
+    random = np.random.default_rng(1)
+    noise = np.zeros(2)
     means: list[ComplexArray] = []
     drawn: list[ComplexArray] = []
-    for runs in (forward, mirrored):
-        r = len(runs)
+    for runs in (forward, reverse[:, ::-1]):
         parity = np.stack([runs + runs[:, ::-1], runs - runs[:, ::-1]]) / 2
-        noise += parity.var(axis=1, ddof=1).sum(axis=-1) / r
+        noise += parity.var(axis=1, ddof=1).sum(axis=-1) / len(runs)
         means.append(parity.mean(axis=1))
-        weights = random.multinomial(r, np.full(r, 1 / r), size=RESAMPLES) / r
-        # A resample of r runs scatters by (r - 1)/r too little.
-        wider = (r / (r - 1)) ** 0.5
-        centred = parity - parity.mean(axis=1, keepdims=True)
-        drawn.append(parity.mean(axis=1)[:, None] + wider * (weights @ centred))
+        drawn.append(_resampled(parity, random))
     power = np.sum(np.abs(means[0] - means[1]) ** 2, axis=-1) - noise
     if power[1] <= 0:
         return Estimate()
@@ -172,18 +150,15 @@ def common_ratio(forward: ComplexArray, reverse: ComplexArray, seed: int = 1) ->
     powers = np.sum(np.abs(drawn[0] - drawn[1]) ** 2, axis=-1) - 2 * noise[:, None]
     ratios = np.sqrt(np.maximum(powers[0], 0.0) / np.maximum(powers[1], np.finfo(np.float64).tiny))
     value = float(np.sqrt(max(power[0], 0.0) / power[1]))
-    return Estimate(value, _tilt_percentiles(ratios))
+    return Estimate(value, _percentiles(ratios))
 
 
-def heading_strata(
-    forward: FloatArray, reverse: FloatArray, tolerance_rad: float
-) -> tuple[IntArray, IntArray] | None:
-    """Strata of runs that are mirror images of each other, from the robot's headings.
+def heading_strata(forward: FloatArray, reverse: FloatArray) -> tuple[IntArray, IntArray] | None:
+    """Find strata of runs that are mirror images of each other, by the robot's headings.
 
     Args:
         forward: Heading of each run one way [rad], NaN where it is unknown, shape (r1,).
         reverse: The same the other way, shape (r2,).
-        tolerance_rad: Headings that differ by no more are the same [rad].
 
     Returns:
         Stratum of each run of either way, or None where a heading is unknown or a stratum lacks
@@ -196,13 +171,10 @@ def heading_strata(
     leaders: list[float] = []
     index = np.zeros(len(keys), dtype=np.int64)
     for k, key in enumerate(keys.tolist()):
-        near = [
-            s for s, leader in enumerate(leaders) if abs(_turned(key - leader)) <= tolerance_rad
-        ]
-        if near:
-            index[k] = near[0]
-        else:
-            index[k] = len(leaders)
+        apart = np.abs(np.angle(np.exp(1j * (key - np.array(leaders)))))
+        near = np.flatnonzero(apart <= SAME_HEADING_RAD)
+        index[k] = near[0] if near.size else len(leaders)
+        if not near.size:
             leaders.append(key)
     plus = np.bincount(index[: len(forward)], minlength=len(leaders))
     minus = np.bincount(index[len(forward) :], minlength=len(leaders))
@@ -212,24 +184,13 @@ def heading_strata(
 
 
 def _middle_share(test: MirrorTest) -> float:
-    """Upper bound of the middle joint's size over the lower bound of the largest contrast's."""
+    """Return the middle joint's upper bound over the largest contrast's lower bound."""
     k = len(test.difference) // 2
     contrast = np.abs(np.stack([test.contrast.real, test.contrast.imag]))
     least = float((contrast - test.critical * test.contrast_error).max())
     middle = np.abs([test.difference[k].real, test.difference[k].imag])
     most = float((middle + test.critical * test.error[:, k]).max())
     return most / least if least > 0 else float("inf")
-
-
-def _turned(angle: float) -> float:
-    """An angle in (-pi, pi]."""
-    return float(np.angle(np.exp(1j * angle)))
-
-
-def _tilt_percentiles(values: FloatArray) -> Interval:
-    tail = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile(values, [tail, 100 - tail])
-    return float(low), float(high)
 
 
 @dataclass(frozen=True)
@@ -242,23 +203,17 @@ class Shares:
         noise_variance: What noise adds to V_total.
         module_share: V_module / (V_module + V_boundary) with interval; empty where noise explains
             all of the spread.
+        boundary_share: The rest, with interval.
     """
 
     module_variance: Estimate
     boundary_variance: Estimate
     noise_variance: float
     module_share: Estimate
-
-    @property
-    def boundary_share(self) -> Estimate:
-        """The rest, with interval."""
-        value, ci95 = self.module_share.value, self.module_share.ci95
-        if value is None or ci95 is None:
-            return Estimate()
-        return Estimate(1 - value, (1 - ci95[1], 1 - ci95[0]))
+    boundary_share: Estimate
 
 
-def variance_shares(forward: ComplexArray, reverse: ComplexArray, seed: int = 1) -> Shares:
+def variance_shares(forward: ComplexArray, reverse: ComplexArray) -> Shares:
     """Split the spread over the joints.
 
     Args:
@@ -266,33 +221,35 @@ def variance_shares(forward: ComplexArray, reverse: ComplexArray, seed: int = 1)
         reverse: y of the runs the other way, shape (r2, m), r2 >= 2.
 
     Returns:
-        The shares. Intervals by bootstrap over runs, each way resampled for itself. A resample
-        of r runs scatters by (r - 1)/r too little, which is made good, and adds the noise once
-        more, which is subtracted once more.
+        The shares. Intervals by bootstrap over runs, each way resampled for itself; a resample
+        adds the noise once more, which is subtracted once more.
     """
     mirrored = reverse[:, ::-1]
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     noise = np.stack([_noise(forward), _noise(mirrored)])
     means = np.stack([forward.mean(axis=0), mirrored.mean(axis=0)])
     module, boundary = _variances(means, noise)
     drawn = np.stack([_resampled(one, random) for one in (forward, mirrored)])
     modules, boundaries = _variances(drawn, 2 * noise)
     whole, wholes = module + boundary, modules + boundaries
-    share = Estimate()
+    share = rest = Estimate()
     if whole > 0:
-        some = wholes > 0
-        parts = np.divide(modules, wholes, out=np.zeros_like(modules), where=some)[some]
-        share = Estimate(float(module / whole), _percentiles(parts))
+        value, some = float(module / whole), wholes > 0
+        share = Estimate(value)
+        if some.any():
+            low, high = _percentiles(modules[some] / wholes[some])
+            share, rest = Estimate(value, (low, high)), Estimate(1 - value, (1 - high, 1 - low))
     return Shares(
         module_variance=Estimate(float(module), _percentiles(modules)),
         boundary_variance=Estimate(float(boundary), _percentiles(boundaries)),
         noise_variance=float(noise.mean()),
         module_share=share,
+        boundary_share=rest,
     )
 
 
 def _variances(means: ComplexArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """V_module and V_boundary of both ways' profiles, the reverse mirrored, shape (2, ..., m)."""
+    """Return V_module and V_boundary of both ways' profiles (2, ..., m), the reverse mirrored."""
     joint: IntArray = np.arange(means.shape[-1], dtype=np.int64)
     paired: BoolArray = joint != joint[::-1]
     half: FloatArray = np.abs((means[0] - means[1]) / 2)[..., paired] ** 2
@@ -303,21 +260,22 @@ def _variances(means: ComplexArray, noise: FloatArray) -> tuple[FloatArray, Floa
 
 
 def _noise(runs: ComplexArray) -> FloatArray:
-    """Variance of the mean of r runs, gain and lag together, shape (m,)."""
+    """Return the variance of the mean of r runs, gain and lag together, shape (m,)."""
     return np.var(runs, axis=0, ddof=1) / len(runs)
 
 
 def _resampled(runs: ComplexArray, random: np.random.Generator) -> ComplexArray:
-    """Means of resampled runs, shape (RESAMPLES, m)."""
-    r = len(runs)
+    """Return means of resampled runs, (..., r, m) -> (..., RESAMPLES, m).
+
+    A resample of r runs scatters by (r - 1)/r too little, which is corrected.
+    """
+    r = runs.shape[-2]
     weights = random.multinomial(r, np.full(r, 1 / r), size=RESAMPLES) / r
-    mean = runs.mean(axis=0)
+    mean = runs.mean(axis=-2, keepdims=True)
     return mean + (r / (r - 1)) ** 0.5 * (weights @ (runs - mean))
 
 
-def _percentiles(values: FloatArray) -> Interval | None:
-    if not values.size:
-        return None
+def _percentiles(values: FloatArray) -> Interval:
     tail = 50 * (1 - CONFIDENCE)
     low, high = np.percentile(values, [tail, 100 - tail])
     return float(low), float(high)
@@ -353,17 +311,15 @@ def reversal_of(
         UsageError: If a way has fewer than two runs.
     """
     known = headings or (np.full(len(forward), np.nan), np.full(len(reverse), np.nan))
-    strata = heading_strata(*known, SAME_HEADING_RAD)
+    strata = heading_strata(*known)
     test = mirror_test(forward, reverse, strata)
     shares = variance_shares(forward, reverse)
     half = test.critical * test.error
     bounds = (np.abs([test.difference.real, test.difference.imag]) + half).max(axis=1)
+    every = all(np.isfinite(one).all() for one in known)
+    kind = Headings.UNBALANCED if every else Headings.UNKNOWN
     if strata is not None:
         kind = Headings.BALANCED
-    else:
-        every = all(np.isfinite(one).all() for one in known)
-        kind = Headings.UNBALANCED if every else Headings.UNKNOWN
-    check = tilt_check(forward, reverse, test, gravity_rad)
     return Reversal(
         forward_runs=len(forward),
         reverse_runs=len(reverse),
@@ -387,14 +343,7 @@ def reversal_of(
         noise_variance=shares.noise_variance,
         module_share=shares.module_share,
         boundary_share=shares.boundary_share,
-        tilt=FloorTilt(
-            headings=kind,
-            strata=test.strata,
-            ratio=check.ratio,
-            middle=check.middle,
-            gravity_rad=gravity_rad or Estimate(),
-            excluded=kind is Headings.BALANCED or check.excluded,
-        ),
+        tilt=tilt_check(forward, reverse, test, gravity_rad, kind),
         middle=names[len(names) // 2] if len(names) % 2 else None,
     )
 
@@ -431,15 +380,15 @@ def ordered_pairs(names: Sequence[str], test: MirrorTest) -> tuple[OrderedPair, 
 
 def _joints(names: Sequence[str], test: MirrorTest) -> tuple[MirrorJoint, ...]:
     own = test.joint_p
-    result: list[MirrorJoint] = []
-    for i, name in enumerate(names):
-        gain, lag = _estimates(test.difference[i], test.critical * test.error[:, i])
-        result.append(MirrorJoint(name, names[-1 - i], gain, lag, float(own[i])))
-    return tuple(result)
+    half = test.critical * test.error
+    return tuple(
+        MirrorJoint(name, names[-1 - i], *_estimates(test.difference[i], half[:, i]), float(own[i]))
+        for i, name in enumerate(names)
+    )
 
 
 def _estimates(value: complex, half: FloatArray) -> tuple[Estimate, Estimate]:
-    """Log gain and lag, positive when late, with their half widths."""
+    """Return log gain and lag, positive when late, with their half widths."""
     gain, lag = float(value.real), -float(value.imag)
     return (
         Estimate(gain, around(gain, float(half[0]))),

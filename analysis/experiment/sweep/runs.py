@@ -1,4 +1,4 @@
-"""Which sessions are runs of one lag sweep or multisine: told from their commands alone.
+"""Find sessions that are runs of one lag sweep or multisine, from their commands.
 
 They drive the same joints at the same frequencies, and at a frequency their commands, one column a
 run, make a matrix C of full rank and small condition number: that is what H = Y C^-1 needs, and
@@ -23,12 +23,12 @@ from undulog.capture.robot.run import Run
 from ...estimators.cycle_sums import DRIFT_PER_CYCLE, SIGNIFICANT
 from ...estimators.series import Series, clean
 from ...response.rhythm import DRIVEN_SHARE, NYQUIST_SHARE
+from ...results.answer import Remarks
 from ...session.analyse import FittedSession
 from ...session.runs import SAME_FREQUENCY
 from ...signals.columns import read_columns
 from ...signals.stretch import Options, choose_stretch
-from .chain import Phasors
-from .tones import Beside, ToneFit, common_step, find_tones, fit_tones
+from .tones import Beside, Phasors, ToneFit, common_step, find_tones, fit_tones
 
 MOST_CONDITION = 10.0
 """Commands with a larger condition number make no sweep; a DFT matrix has 1."""
@@ -44,7 +44,7 @@ _ORTHOGONAL = 0.1
 
 @dataclass(frozen=True)
 class CommandTones:
-    """What one session commands.
+    """Commands of one session.
 
     Attributes:
         names: Driven joints, head to tail, m.
@@ -78,30 +78,19 @@ class Sweep:
     lacking: int = 0
 
 
-@dataclass(frozen=True)
-class Signals:
-    """Signals of a session's stretch, by joint name, in seconds from its middle."""
-
-    command: dict[str, Series]
-    position: dict[str, Series]
-    effort: dict[str, Series]
+Signals = tuple[dict[str, Series], dict[str, Series], dict[str, Series]]
+"""Commands, positions and efforts by joint name, in seconds from the window's middle."""
 
 
 def read_signals(session: SessionView, options: Options) -> Signals:
-    """Read what a sweep is computed from.
+    """Read the signals of the analysed window.
 
     Args:
-        session: An open session, examined before: what it lacks has been told.
-
-    Returns:
-        The signals of the analysed stretch.
+        session: An open session, examined before: its warnings are collected already.
     """
-
-    def silent(_: str) -> None:
-        """The first reading has told what is missing."""
-
-    columns = read_columns(session, options.command_topic, options.response_topic, silent)
-    stretch = choose_stretch(session, columns, options, silent)
+    unused = Remarks()
+    columns = read_columns(session, options.command_topic, options.response_topic, unused)
+    stretch = choose_stretch(session, columns, options, unused)
     origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
     half_s = stretch.duration_s / 2
     command, position, effort = (
@@ -114,13 +103,13 @@ def read_signals(session: SessionView, options: Options) -> Signals:
         }
         for signals in (columns.command, columns.position, columns.effort)
     )
-    return Signals(command, position, effort)
+    return command, position, effort
 
 
 def command_tones(
     session: SessionView, options: Options, examined: FittedSession
 ) -> CommandTones | None:
-    """What a session commands, as tones.
+    """Find the tones of a session's commands.
 
     Returns:
         The gait's frequency alone, or the tones of a multisine; None of anything else.
@@ -132,7 +121,7 @@ def command_tones(
         if left < _PURE:
             omega = np.array([gait.fit.omega])
             return CommandTones(gait.driven, robot, omega, gait.fit.fundamental[:m, None])
-    commands = [one for one in read_signals(session, options).command.values() if one.count > 64]
+    commands = [one for one in read_signals(session, options)[0].values() if one.count > 64]
     found = find_tones(commands)
     if found is None:
         return None
@@ -144,14 +133,7 @@ def command_tones(
 
 
 def find_sweep(sessions: Sequence[CommandTones | None]) -> Sweep | None:
-    """The largest sweep among sessions.
-
-    Args:
-        sessions: What each commands.
-
-    Returns:
-        The sweep, or None.
-    """
+    """Find the largest sweep among the tones of sessions."""
     best: Sweep | None = None
     for model in sessions:
         # Of two joints, a wave and its reverse are a lag sweep, too: they stay a reversal.
@@ -196,7 +178,7 @@ def _sweep(index: Sequence[int], runs: Sequence[CommandTones]) -> Sweep | None:
 
 
 _PERIODS = 1.5
-"""Periods of a multisine in a record from which lines beside its tones are told apart."""
+"""Periods of a multisine in a record from which lines beside its tones are resolved."""
 
 _MOST_LINES = 60
 
@@ -232,85 +214,71 @@ class SweepData:
     run: Run | None
 
 
-@dataclass(frozen=True)
-class _Run:
-    omega: FloatArray
-    command: ComplexArray
-    response: ToneFit
-    torque: ToneFit | None
-    beside: FloatArray
-    period_s: float
-    drift: float
-
-
 def sweep_data(
     sweep: Sweep, commanded: Sequence[CommandTones | None], paths: Sequence[Path], options: Options
 ) -> SweepData:
     """Read the runs of a sweep and fit them.
 
     Args:
-        sweep: Which of the sessions they are.
-        commanded: What each session commands.
+        commanded: Tones of each session.
         paths: The files of all sessions.
 
     Raises:
         DataError: If a driven joint's response is missing in a run, or too short.
     """
-    runs: list[_Run] = []
     twins: list[Run | None] = []
     robot: Robot | None = None
+    omega: list[FloatArray] = []
+    commands: list[ComplexArray] = []
+    responses: list[ToneFit] = []
+    torques: list[ToneFit] = []
+    periods_s: list[float] = []
+    drifts: list[float] = []
+    lines: FloatArray = np.zeros(0)
     for k in sweep.index:
         tones = commanded[k]
         assert tones is not None  # noqa: S101 - a sweep is made of sessions with tones
         with Session.open(paths[k]) as session:
             robot = robot or session.robot_as_run
             twins.append(session.run)
-            signals = read_signals(session, options)
-        lost = [name for name in sweep.names if name not in signals.position]
+            command, position, effort = read_signals(session, options)
+        lost = [name for name in sweep.names if name not in position]
         if lost:
             raise DataError(f"{paths[k]}: no responses of {', '.join(lost)}")
-        runs.append(_fit(sweep, tones.omega, signals, len(sweep.index)))
+        commanded_series, series = (
+            [kind[name] for name in sweep.names] for kind in (command, position)
+        )
+        own = _beside_lines(sweep, tones.omega, series)
+        lines = own if not omega else lines
+        omega.append(tones.omega)
+        commands.append(fit_tones(commanded_series, tones.omega, np.zeros(0)).amplitude)
+        responses.append(fit_tones(series, tones.omega, own))
+        if all(name in effort for name in sweep.names):
+            efforts = [effort[name] for name in sweep.names]
+            torques.append(fit_tones(efforts, tones.omega, own))
+        periods_s.append(max(one.period_s for one in commanded_series))
+        drifts.append(_drift(series, tones.omega, responses[-1], len(sweep.index)))
     touched = [None if one is None else one.contact for one in twins]
-    tones_at = list(sweep.tones)
-    whole = all(run.torque is not None for run in runs)
-    torques = [run.torque for run in runs if run.torque is not None]
-    responses = [run.response for run in runs]
-    lines = runs[0].beside
+    at = list(sweep.tones)
+    whole = len(torques) == len(responses)
+    free = range(omega[0].size, omega[0].size + lines.size)
     return SweepData(
-        omega=np.mean([run.omega[tones_at] for run in runs], axis=0),
-        command=np.stack([run.command[:, tones_at] for run in runs], axis=-1).swapaxes(0, 1),
-        response=_by_tone(responses, tones_at),
-        torque=_by_tone(torques, tones_at) if whole else None,
-        beside=_beside(lines, responses) if lines.size else None,
-        torque_beside=_beside(lines, torques) if lines.size and whole else None,
-        period_s=float(np.median([run.period_s for run in runs])),
+        omega=np.mean([one[at] for one in omega], axis=0),
+        command=np.stack([one[:, at] for one in commands], axis=-1).swapaxes(0, 1),
+        response=_phasors(responses, at),
+        torque=_phasors(torques, at) if whole else None,
+        beside=Beside(lines, _phasors(responses, free)) if lines.size else None,
+        torque_beside=Beside(lines, _phasors(torques, free)) if lines.size and whole else None,
+        period_s=float(np.median(periods_s)),
         contact=True if any(touched) else None if None in touched else False,
-        drift=max(run.drift for run in runs),
+        drift=max(drifts),
         robot=robot,
         run=twins[0],
     )
 
 
-def _fit(sweep: Sweep, omega: FloatArray, signals: Signals, runs: int) -> _Run:
-    command, position = (
-        [kind[name] for name in sweep.names] for kind in (signals.command, signals.position)
-    )
-    lines = _beside_lines(sweep, omega, position)
-    effort = [signals.effort[name] for name in sweep.names if name in signals.effort]
-    responses = fit_tones(position, omega, lines)
-    return _Run(
-        omega=omega,
-        command=fit_tones(command, omega, np.zeros(0)).amplitude,
-        response=responses,
-        torque=fit_tones(effort, omega, lines) if len(effort) == len(sweep.names) else None,
-        beside=lines,
-        period_s=max(one.period_s for one in command),
-        drift=_drift(position, omega, responses, runs),
-    )
-
-
 def _beside_lines(sweep: Sweep, omega: FloatArray, series: Sequence[Series]) -> FloatArray:
-    """Frequencies at which a nonlinear robot answers though nothing is commanded."""
+    """Return frequencies at which only a nonlinear robot responds."""
     highest = NYQUIST_SHARE * 2 * np.pi / max(one.period_s for one in series)
     if omega.size == 1:
         lines: FloatArray = omega[0] * np.array([2.0, 3.0])
@@ -330,34 +298,19 @@ def _beside_lines(sweep: Sweep, omega: FloatArray, series: Sequence[Series]) -> 
     return lines[lines < highest]
 
 
-def _by_tone(fits: Sequence[ToneFit], tones: Sequence[int]) -> tuple[Phasors, ...]:
+def _phasors(fits: Sequence[ToneFit], lines: Sequence[int]) -> tuple[Phasors, ...]:
     return tuple(
         Phasors(
             np.stack([one.amplitude[:, k] for one in fits], axis=1),
             np.stack([one.variance[:, k] for one in fits], axis=1),
             np.stack([one.dof[:, k] for one in fits], axis=1),
         )
-        for k in tones
-    )
-
-
-def _beside(omega: FloatArray, fits: Sequence[ToneFit]) -> Beside:
-    least = np.stack([one.dof.min(axis=1) for one in fits], axis=1)
-    return Beside(
-        omega,
-        tuple(
-            Phasors(
-                np.stack([one.beside[:, k] for one in fits], axis=1),
-                np.stack([one.beside_variance[:, k] for one in fits], axis=1),
-                least,
-            )
-            for k in range(omega.size)
-        ),
+        for k in lines
     )
 
 
 def _drift(series: Sequence[Series], omega: FloatArray, fit: ToneFit, runs: int) -> float:
-    """Largest change of a tone's responses from one half of a run to the other, per cycle.
+    """Return the largest change of a tone's responses between the halves of a run, per cycle.
 
     It counts where it is above ``DRIFT_PER_CYCLE`` and an F test of all joints' changes against
     the noise rejects that they are noise, the chance of a false alarm shared among the runs.
@@ -368,13 +321,15 @@ def _drift(series: Sequence[Series], omega: FloatArray, fit: ToneFit, runs: int)
         for start, stop in ((-np.inf, middle), (middle, np.inf))
     ]
     lines = omega[0] * np.array([2.0, 3.0]) if omega.size == 1 else np.zeros(0)
-    first, second = (fit_tones(half, omega, lines).amplitude for half in halves)
+    tones = omega.size
+    first, second = (fit_tones(half, omega, lines).amplitude[:, :tones] for half in halves)
     change: ComplexArray = second - first
     span = middle - float(series[0].t_s[0])
     cycles = omega * span / (2 * np.pi)
-    size: FloatArray = np.linalg.norm(change, axis=0) / np.linalg.norm(fit.amplitude, axis=0)
+    size: FloatArray = np.linalg.norm(change, axis=0)
+    size = size / np.linalg.norm(fit.amplitude[:, :tones], axis=0)
     # Two halves, each with twice the variance of the whole, in two parts.
-    scatter: FloatArray = np.sum(8 * fit.variance, axis=0)
+    scatter: FloatArray = np.sum(8 * fit.variance[:, :tones], axis=0)
     ratio = np.sum(np.abs(change) ** 2, axis=0) / scatter
     worst = 0.0
     for tone, per_cycle in enumerate((size / cycles).tolist()):

@@ -28,15 +28,40 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.errors import DataError
 
 from ...estimators.harmonic import RELATIVE_FLOOR
-from ...estimators.intervals import norm_ratio
+from ...estimators.intervals import DRAWS, norm_ratio
 from ...estimators.series import Series, shared_times
 from ...estimators.spectrum import BINS_PER_SIDE, KEPT_POWER
 from ...response.rhythm import NYQUIST_SHARE
 from ...results.estimate import Estimate
 from ..kicks.local import squared
-from .chain import Phasors
 
 _NEAREST = 6
+
+
+@dataclass(frozen=True)
+class Phasors:
+    """Complex amplitudes of m joints in r runs.
+
+    Attributes:
+        value: Shape (m, r).
+        variance: Of their real and of their imaginary parts, shape (m, r).
+        dof: Degrees of freedom of the variances, shape (m, r).
+    """
+
+    value: ComplexArray
+    variance: FloatArray
+    dof: FloatArray
+
+    def draws(self, seed: int) -> ComplexArray:
+        """Draw errors.
+
+        Returns:
+            Student draws, shape (DRAWS, m, r).
+        """
+        random = np.random.default_rng(seed)
+        dof = np.broadcast_to(self.dof, (DRAWS, *self.dof.shape))
+        real, imag = random.standard_t(dof), random.standard_t(dof)
+        return (np.sqrt(self.variance) * (real + 1j * imag)).astype(np.complex128)
 
 
 @dataclass(frozen=True)
@@ -53,7 +78,7 @@ class Beside:
 
 
 def sideband_energy(tones: tuple[Phasors, ...], beside: Beside) -> Estimate:
-    """Energy at the free lines over that at the tones.
+    """Return the energy at the free lines over that at the tones.
 
     Returns:
         The ratio, noise taken off, with an interval of at least 95 %.
@@ -63,7 +88,7 @@ def sideband_energy(tones: tuple[Phasors, ...], beside: Beside) -> Estimate:
 
 
 def distortion(omega: float, tone: Phasors, beside: Beside) -> float:
-    """How much of a tone a nonlinearity may have made.
+    """Return how much of a tone a nonlinearity may have made.
 
     Args:
         omega: Of the tone [rad/s].
@@ -105,7 +130,7 @@ _STEPS = 4
 
 
 def find_tones(commands: Sequence[Series]) -> FloatArray | None:
-    """The frequencies of a multisine.
+    """Find the frequencies of a multisine.
 
     Args:
         commands: By joint; those that never move are ignored.
@@ -128,11 +153,11 @@ def find_tones(commands: Sequence[Series]) -> FloatArray | None:
             break
         grown: FloatArray = np.concatenate([omega, [peak]])
         for _ in range(_STEPS):
-            grown = grown + _refine(scouts, grown).step
-        found = _refine(scouts, grown)
-        if found.amplitude[:, -1].max() < FAINT * found.amplitude.max():
+            grown = grown + _refine(scouts, grown)[0]
+        _, amplitude, left = _refine(scouts, grown)
+        if amplitude[:, -1].max() < FAINT * amplitude.max():
             break
-        omega, residual = grown, found.residual
+        omega, residual = grown, left
     omega = np.sort(omega)
     explained = 1 - sum(float(np.sum(one**2)) for one in residual) / total
     if omega.size < 2 or explained < EXPLAINED:
@@ -142,7 +167,7 @@ def find_tones(commands: Sequence[Series]) -> FloatArray | None:
 
 
 def common_step(omega: FloatArray, most: int = 24) -> float | None:
-    """The largest frequency of which all tones are multiples.
+    """Find the largest frequency of which all tones are multiples.
 
     Args:
         omega: Rising [rad/s].
@@ -168,7 +193,7 @@ def _span(scouts: Sequence[Series]) -> float:
 
 
 def _peak(scouts: Sequence[Series], residual: Sequence[FloatArray]) -> float | None:
-    """The highest line of what is left [rad/s]; on an even grid, as a starting point."""
+    """Return the highest line of the residual [rad/s]; on an even grid, as a starting point."""
     period = max(one.period_s for one in scouts)
     start = max(float(one.t_s[0]) for one in scouts)
     stop = min(float(one.t_s[-1]) for one in scouts)
@@ -188,17 +213,13 @@ def _peak(scouts: Sequence[Series], residual: Sequence[FloatArray]) -> float | N
     return float(2 * np.pi * frequency[inside][np.argmax(power[inside])])
 
 
-@dataclass(frozen=True)
-class _Refined:
-    """A Gauss-Newton step of all frequencies, with the amplitudes and residual before it."""
+def _refine(
+    scouts: Sequence[Series], omega: FloatArray
+) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
+    """Return a Gauss-Newton step of all frequencies, the amplitudes and residuals before it.
 
-    step: FloatArray
-    amplitude: FloatArray
-    residual: list[FloatArray]
-
-
-def _refine(scouts: Sequence[Series], omega: FloatArray) -> _Refined:
-    """Variable projection: what of the slopes dy/domega the other parameters can't make."""
+    Variable projection: the part of the slopes dy/domega that no other parameter explains.
+    """
     tones = omega.size
     normal, right = np.zeros((tones, tones)), np.zeros(tones)
     sizes: list[FloatArray] = []
@@ -219,7 +240,7 @@ def _refine(scouts: Sequence[Series], omega: FloatArray) -> _Refined:
         left.append(rest)
     limit = np.pi / (2 * _span(scouts))
     step: FloatArray = np.linalg.lstsq(normal, right, rcond=None)[0].astype(np.float64)
-    return _Refined(np.clip(step, -limit, limit), np.stack(sizes), left)
+    return np.clip(step, -limit, limit), np.stack(sizes), left
 
 
 _REACH = 16
@@ -228,21 +249,19 @@ _REACH = 16
 
 @dataclass(frozen=True)
 class ToneFit:
-    """K channels at L tones, with S further lines fitted beside them.
+    """K channels at L tones, then at S further lines that were fitted beside them.
 
     Attributes:
-        amplitude: Complex amplitudes of the tones at t = 0, shape (K, L).
-        variance: Of their real and of their imaginary parts, shape (K, L).
-        dof: Degrees of freedom of the variances, shape (K, L).
-        beside: Complex amplitudes of the further lines, shape (K, S).
-        beside_variance: By the noise of the nearest tone, shape (K, S).
+        amplitude: Complex amplitudes at t = 0, shape (K, L + S).
+        variance: Of their real and of their imaginary parts, of a further line by the noise of
+            the nearest tone, shape (K, L + S).
+        dof: Degrees of freedom of the variances, of further lines the least of the tones', shape
+            (K, L + S).
     """
 
     amplitude: ComplexArray
     variance: FloatArray
     dof: FloatArray
-    beside: ComplexArray
-    beside_variance: FloatArray
 
 
 def fit_tones(series: Sequence[Series], omega: FloatArray, beside: FloatArray) -> ToneFit:
@@ -254,14 +273,14 @@ def fit_tones(series: Sequence[Series], omega: FloatArray, beside: FloatArray) -
         beside: Of the further lines, none of them a tone [rad/s], shape (S,).
 
     Raises:
-        DataError: If a channel has too few samples, or too short a record to tell the lines apart.
+        DataError: If a channel has too few samples, or too short a record to resolve the lines.
     """
     lines = np.concatenate([omega, beside])
     tones = omega.size
     nearest = np.argmin(np.abs(beside[:, None] - omega[None, :]), axis=1)
     amplitude = np.zeros((len(series), lines.size), dtype=np.complex128)
     variance = np.zeros((len(series), lines.size))
-    dof = np.zeros((len(series), tones))
+    dof = np.zeros((len(series), lines.size))
     for members in shared_times(series):
         t_s = series[members[0]].t_s
         if t_s.size <= 2 * lines.size + 2:
@@ -289,13 +308,12 @@ def fit_tones(series: Sequence[Series], omega: FloatArray, beside: FloatArray) -
             noise = np.maximum(level, floor)[:, None] * of_part[None, own]
             variance[np.ix_(members, own)] = noise
             dof[members, tone] = 2.0 * bins
-    return ToneFit(
-        amplitude[:, :tones], variance[:, :tones], dof, amplitude[:, tones:], variance[:, tones:]
-    )
+    dof[:, tones:] = dof[:, :tones].min(axis=1, keepdims=True)
+    return ToneFit(amplitude, variance, dof)
 
 
 def _rows(t_s: FloatArray, omega: FloatArray) -> FloatArray:
-    """1, then cos and -sin of each line; shape (1 + 2 L, n)."""
+    """Return 1, then cos and -sin of each line; shape (1 + 2 L, n)."""
     phase: FloatArray = omega[:, None] * t_s[None, :]
     rows = np.ones((1 + 2 * omega.size, t_s.size))
     rows[1::2], rows[2::2] = np.cos(phase), -np.sin(phase)
@@ -305,7 +323,7 @@ def _rows(t_s: FloatArray, omega: FloatArray) -> FloatArray:
 def _level(
     t_s: FloatArray, residual: FloatArray, omega: float, rows: FloatArray, inverse: FloatArray
 ) -> tuple[FloatArray, int]:
-    """Variance per sample of white noise with the residual's power beside a tone, and its bins."""
+    """Return the noise variance per sample beside a tone, and the number of bins."""
     span = float(t_s[-1] - t_s[0]) * t_s.size / max(t_s.size - 1, 1)
     power: list[FloatArray] = []
     for side in (1, -1):

@@ -6,26 +6,18 @@ import numpy as np
 import pytest
 
 import undulog
-from undulog.capture import SessionWriter
+from support.joint_runs import write_joints
 
-EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = ("j1", "j2", "j3")
 
 
-def written(path, *, states=True, lost=(), samples=300):
-    """A gait of 1 Hz whose responses at some samples are no numbers."""
-    with SessionWriter(path, session_id=path.stem, epoch_ns=EPOCH_NS) as writer:
-        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
-        responses = writer.joint_state("/joint_states", NAMES, unit="rad") if states else None
-        noise = np.random.default_rng(5).normal(0, 1e-3, (samples, 3))
-        for k in range(samples):
-            phase = 2 * np.pi * k / 50 - np.arange(3)
-            t_ns = EPOCH_NS + k * 20_000_000
-            commands.write(t_ns, 0.4 * np.sin(phase))
-            if responses is not None:
-                angle = 0.38 * np.sin(phase - 0.2) + noise[k]
-                responses.write(t_ns, np.full(3, np.nan) if k in lost else angle)
-    return path
+def written(path, *, states=True, lost=()):
+    """A gait of 1 Hz whose responses at some samples are not numbers."""
+    noise = np.random.default_rng(5).normal(0, 1e-3, (300, 3))
+    phase = 2 * np.pi * np.arange(300)[:, None] / 50 - np.arange(3)
+    angle = 0.38 * np.sin(phase - 0.2) + noise
+    angle[list(lost)] = np.nan
+    return write_joints(path, NAMES, 0.4 * np.sin(phase), [angle] if states else [])
 
 
 @pytest.fixture

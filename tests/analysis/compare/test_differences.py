@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from undulog.analysis.compare.decisions import Margins, decide, differ
+from undulog.analysis.compare.decisions import Margins, decide
 from undulog.analysis.compare.side import Quantities, from_runs, holm, independent, paired
 from undulog.capture.common.errors import UsageError
 
@@ -34,7 +34,7 @@ def within(share, expected, trials=SEEDS):
 def test_welch_and_paired_agree_with_scipy():
     rng = np.random.default_rng(0)
     a, b = rng.normal(0, 1, (5, 4)), rng.normal(0.5, 2, (7, 4))
-    _, _, found = differ(a, b, paired_runs=False)
+    found = independent(from_runs(a), from_runs(b))
     np.testing.assert_allclose(found.p, stats.ttest_ind(b, a, equal_var=False).pvalue)
     np.testing.assert_allclose(paired(a, b[:5]).p, stats.ttest_rel(b[:5], a).pvalue)
 
@@ -79,9 +79,11 @@ def test_groups_hold_the_level_whatever_runs_share(runs, is_paired):
         if is_paired:
             shared = 10 * rng.normal(size=(runs[0], k))
             a, b = a + shared, b + shared
-        _, _, found = differ(a, b + 0.7, paired_runs=is_paired)
+        found, null = (
+            paired(a, other) if is_paired else independent(from_runs(a), from_runs(other))
+            for other in (b + 0.7, b)
+        )
         covered.append(simultaneous(found, 0.7))
-        _, _, null = differ(a, b, paired_runs=is_paired)
         false.append(bool(np.any(holm(null.p) < 0.05)))
     assert np.mean(false) < 0.05 + 3 * np.sqrt(0.05 * 0.95 / SEEDS)
     assert np.mean(covered) > 0.95 - 3 * np.sqrt(0.05 * 0.95 / SEEDS)
@@ -125,7 +127,7 @@ def test_what_differs_is_ranked_by_size_in_margins_and_named():
 def test_runs_that_agree_to_the_last_digits_do_not_differ():
     a = np.full((3, 2), 0.1)
     b = a + 1e-16 * np.array([[1.0], [2.0], [0.0]])
-    assert differ(a, b, paired_runs=False)[2].p.min() > 0.5
+    assert independent(from_runs(a), from_runs(b)).p.min() > 0.5
     assert paired(a, b).p.min() > 0.5
 
 

@@ -10,13 +10,13 @@ import pytest
 
 import undulog
 from support.analysed import experiment
+from support.joint_runs import EPOCH_NS, turns, write_joints
 from undulog.analysis.present.text_experiment import render_experiment
 from undulog.analysis.session.runs import mirror_fault
-from undulog.capture import SessionWriter, load_robot
+from undulog.capture import load_robot
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Plane
 
-EPOCH_NS = 1_735_689_600_000_000_000
 ROBOT = load_robot("snake25")
 YAW = ROBOT.joint_indices(Plane.HORIZONTAL)
 M = len(YAW)
@@ -46,20 +46,13 @@ def write_run(
         command[kick[0]] *= kick[1]
     identical = BOUNDARY if ahead < 0 else BOUNDARY[::-1]
     answer = command * np.exp(identical + module)
-    names = ROBOT.joint_names
     epoch_ns = EPOCH_NS + round(start_s * 1e9)
-    with SessionWriter(path, session_id=f"run{seed}", epoch_ns=epoch_ns, robot=robot) as writer:
-        commands = writer.joint_state("/joint_commands", names, unit="rad")
-        states = writer.joint_state("/joint_states", names, unit="rad")
-        for k in range(round(4 / frequency * 50)):
-            turn = np.exp(2j * np.pi * frequency * k / 50)
-            asked, seen = np.zeros(25), rng.normal(0.0, sigma, 25)
-            asked[YAW] = np.real(command * turn)
-            seen[YAW] += np.real(answer * turn)
-            t_ns = epoch_ns + k * 20_000_000
-            commands.write(t_ns, asked)
-            states.write(t_ns, seen)
-    return path
+    turn = turns(frequency, round(4 / frequency * 50))
+    asked, seen = np.zeros((len(turn), 25)), rng.normal(0.0, sigma, (len(turn), 25))
+    asked[:, YAW] = np.real(command * turn)
+    seen[:, YAW] += np.real(answer * turn)
+    how = {"epoch_ns": epoch_ns, "session_id": f"run{seed}", "robot": robot}
+    return write_joints(path, ROBOT.joint_names, asked, [seen], **how)
 
 
 def write_ways(folder, runs=6, **how):

@@ -101,11 +101,15 @@ def test_integrated_oscillators_do_what_is_predicted():
     assert error.max() < 0.03 * np.linalg.norm(off)  # second order in a kick of 0.03 rad
 
 
-def test_intervals_of_rates_hold_under_scatter():
-    H, c, _ = measured()
+def rates_of(H, c):
+    """J of a linear chain, in closed form."""
     L = H * c[None, :] / (H @ c)[:, None]
     felt = (H @ c) / c
-    J = felt.real[:, None] * (L.real - np.eye(5)) - felt.imag[:, None] * L.imag
+    return EPS * (felt.real[:, None] * (L.real - np.eye(5)) - felt.imag[:, None] * L.imag)
+
+
+def test_intervals_of_rates_hold_under_scatter():
+    J = rates_of(*kick_tables.chain(5)) / EPS
     truth = EPS * np.sort(np.linalg.eigvals(of_deviations(np.eye(5) + J)).real)
     random = np.random.default_rng(3)
     inside = []
@@ -118,10 +122,7 @@ def test_intervals_of_rates_hold_under_scatter():
 
 
 def test_what_is_left_of_a_kick_has_an_interval():
-    H, c, _ = measured()
-    L = H * c[None, :] / (H @ c)[:, None]
-    felt = (H @ c) / c
-    J = EPS * (felt.real[:, None] * (L.real - np.eye(5)) - felt.imag[:, None] * L.imag)
+    J = rates_of(*kick_tables.chain(5))
     off = 0.1 * (np.arange(5) == 2)
     random = np.random.default_rng(4)
     inside = []
@@ -137,13 +138,16 @@ def test_what_is_left_of_a_kick_has_an_interval():
 
 def test_the_limits_are_stated():
     coupling = measured()[2]
-    assert "isn't known" in closed_loop(coupling, EPS).limits[0]
     known = dataclasses.replace(coupling, valid_to=0.1)
-    assert "beyond 0.1 rad" in closed_loop(known, EPS, kick={"j1": 0.2}).limits[0]
-    assert "holds for deviations up to 0.1 rad" in closed_loop(known, EPS).limits[0]
-    assert "take a smaller eps" in closed_loop(known, 20.0).limits[0]
     failed = dataclasses.replace(known, checks_pass=False)
-    assert "the prediction is doubtful" in closed_loop(failed, EPS).limits[0]
+    for given, eps, kick, limit in (
+        (coupling, EPS, None, "isn't known"),
+        (known, EPS, {"j1": 0.2}, "beyond 0.1 rad"),
+        (known, EPS, None, "holds for deviations up to 0.1 rad"),
+        (known, 20.0, None, "take a smaller eps"),
+        (failed, EPS, None, "the prediction is doubtful"),
+    ):
+        assert limit in closed_loop(given, eps, kick=kick).limits[0]
 
 
 def test_what_can_not_be_predicted():
@@ -174,10 +178,7 @@ def test_the_verb_takes_sessions_or_their_result(result, tmp_path, capsys):
     assert undulog.run(["predict", *map(str, sessions), "--eps", "0.3", "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
     np.testing.assert_allclose(found["J"], again["J"], atol=1e-12)
-    coupling = CHAIN * WAVE[None, :] / (CHAIN @ WAVE)[:, None]
-    felt = (CHAIN @ WAVE) / WAVE
-    J = felt.real[:, None] * (coupling.real - np.eye(5)) - felt.imag[:, None] * coupling.imag
-    np.testing.assert_allclose(found["J"], 0.3 * J, atol=0.02)
+    np.testing.assert_allclose(found["J"], rates_of(CHAIN, WAVE), atol=0.02)
     output = tmp_path / "predicted.json"
     words = ["predict", str(file), "--eps", "0.3", "--kick", "j2=0.05", "-o", str(output)]
     assert undulog.run(words) == 0

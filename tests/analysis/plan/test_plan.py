@@ -1,5 +1,6 @@
 """Plans: the commands that are written, read back as the experiment they are for."""
 
+import dataclasses
 import json
 import subprocess
 
@@ -7,44 +8,36 @@ import numpy as np
 import pytest
 
 import undulog
+from support.joint_runs import turns, write_joints
 from undulog.analysis.experiment.kicks.runs import Kind, missing_kicks, sort_kicks
-from undulog.analysis.plan.designs import reversal
-from undulog.capture import Session, SessionWriter, load_robot
+from undulog.analysis.plan.designs import reversal, tones
+from undulog.analysis.plan.gait_base import slowest_mode, transverse_mass
+from undulog.capture import Session, load_robot
 from undulog.capture.robot.model import Plane
 
 ROBOT = load_robot("snake25")
 YAW = ROBOT.joint_indices(Plane.HORIZONTAL)[:4]
-EPOCH_NS = 1_735_689_600_000_000_000
 BASE = 0.3 * np.exp(-1j * np.pi / 3 * np.arange(4) + 0.7j)
 
 
 def write_gait(path, amplitude=BASE, overtone=0.0):
-    offset = np.linspace(-0.1, 0.1, 25)
-    names = ROBOT.joint_names
-    with SessionWriter(path, session_id="like", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
-        commands = writer.joint_state("/joint_commands", names, unit="rad")
-        states = writer.joint_state("/joint_states", names, unit="rad")
-        for k in range(300):
-            asked = offset.copy()
-            turn = np.exp(2j * np.pi * 0.8 * k / 50)
-            asked[YAW] += np.real(amplitude * (turn + overtone * turn**2))
-            commands.write(EPOCH_NS + k * 20_000_000, asked)
-            states.write(EPOCH_NS + k * 20_000_000, asked)
-    return path
+    turn = turns(0.8, 300)
+    asked = np.tile(np.linspace(-0.1, 0.1, 25), (300, 1))
+    asked[:, YAW] += np.real(amplitude * (turn + overtone * turn**2))
+    return write_joints(path, ROBOT.joint_names, asked, [asked], robot=ROBOT)
 
 
-def phasors(path, start_s):
-    """Demodulated over whole cycles, by a plain sum."""
+def phasors(path, start_s, seconds=5.0, frequency_hz=0.8):
+    """Demodulated over whole cycles, by a plain sum, shape (tones, joints); mean angles; plan."""
     with Session.open(path) as session:
         signals = session.joints("/joint_commands")
         columns = [signals.signal(name) for name in ROBOT.joint_names]
         plan = dict(session.metadata["undulog.plan"])
-        started = session.start_ns
-    t = (columns[0].t_ns - started) * 1e-9
-    inside = (t >= start_s - 1e-9) & (t < start_s + 5.0 - 1e-9)  # four cycles of 0.8 Hz
+        t = (columns[0].t_ns - session.start_ns) * 1e-9
+    inside = (t >= start_s - 1e-9) & (t < start_s + seconds - 1e-9)
     values = np.stack([one.values for one in columns])[:, inside]
-    turn = np.exp(-2j * np.pi * 0.8 * t[inside])
-    return 2 * (values @ turn) / turn.size, values.mean(axis=1), plan
+    turn = np.exp(-2j * np.pi * np.atleast_1d(frequency_hz)[:, None] * t[inside])
+    return 2 * turn @ values.T / turn.shape[1], values.mean(axis=1), plan
 
 
 @pytest.fixture(scope="module")
@@ -53,16 +46,17 @@ def like(tmp_path_factory):
 
 
 def planned(capsys, *words):
+    capsys.readouterr()
     assert undulog.run(["plan", *map(str, words), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)["files"]
+    return json.loads(capsys.readouterr().out)
 
 
 def test_kicks_read_back_as_kicks(like, tmp_path, capsys):
     words = ("--like", like, "-o", tmp_path / "kicks", "--settle", 3, "--measure", 5)
-    files = planned(capsys, "phase-kicks", *words)
+    files = planned(capsys, "phase-kicks", *words)["files"]
     assert len(files) == 4 * 4 + 6 + 3
     found = [phasors(file, 3.0) for file in files]
-    command = np.stack([one[0][YAW] for one in found])
+    command = np.stack([one[0][0, YAW] for one in found])
     runs = sort_kicks(command)
     assert (len(runs.base), len(runs.kicks), len(runs.patterns)) == (6, 16, 3)
     for kind in Kind:
@@ -82,16 +76,11 @@ def test_kicks_read_back_as_kicks(like, tmp_path, capsys):
 
 def test_names_of_joints_lead_out_of_no_folder(tmp_path, capsys):
     names = ["../up", "/etc/x", "nul\0", "l" * 300]
-    with SessionWriter(tmp_path / "like.mcap", session_id="like", epoch_ns=EPOCH_NS) as writer:
-        commands = writer.joint_state("/joint_commands", names, unit="rad")
-        states = writer.joint_state("/joint_states", names, unit="rad")
-        for k in range(300):
-            asked = np.real(BASE * np.exp(2j * np.pi * 0.8 * k / 50))
-            commands.write(EPOCH_NS + k * 20_000_000, asked)
-            states.write(EPOCH_NS + k * 20_000_000, asked)
+    asked = np.real(BASE * turns(0.8, 300))
+    like = write_joints(tmp_path / "like.mcap", names, asked, [asked])
     folder = tmp_path / "deep" / "kicks"
-    words = ("--like", tmp_path / "like.mcap", "-o", folder, "--settle", 3, "--measure", 5)
-    files = planned(capsys, "phase-kicks", *words)
+    words = ("--like", like, "-o", folder, "--settle", 3, "--measure", 5)
+    files = planned(capsys, "phase-kicks", *words)["files"]
     assert len(set(files)) == len(list(folder.iterdir())) == 4 * 4 + 6 + 3
     kicked = set()
     for file in files:
@@ -102,9 +91,9 @@ def test_names_of_joints_lead_out_of_no_folder(tmp_path, capsys):
 
 def test_a_reversal_alternates(like, tmp_path, capsys):
     words = ("--like", like, "-o", tmp_path / "both", "--runs", 2, "--settle", 2, "--measure", 5)
-    files = planned(capsys, "reversal", *words)
+    files = planned(capsys, "reversal", *words)["files"]
     assert len(files) == 4
-    command = [phasors(file, 2.0)[0][YAW] for file in files]
+    command = [phasors(file, 2.0)[0][0, YAW] for file in files]
     step = np.angle([one[1] / one[0] for one in command])
     np.testing.assert_allclose(step, np.array([-1, 1, -1, 1]) * np.pi / 3, atol=1e-5)
     plans = [phasors(file, 2.0)[2] for file in files]
@@ -162,3 +151,92 @@ def test_a_full_disk_ends_a_plan(like, disk_of, capsys):
     assert undulog.run(["plan", "phase-kicks", "--like", str(like), "-o", str(disk)]) == 1
     assert "No space left" in capsys.readouterr().err
     assert not list(disk.glob("*.part"))
+
+
+def test_a_lag_sweep_is_a_dft(like, tmp_path, capsys):
+    told = planned(capsys, "lag-sweep", "--like", like, "-o", tmp_path / "s", "--amplitude", 0.03)
+    assert len(told["files"]) == 4
+    found = [phasors(file, told["settle_s"], 10.0, 0.8) for file in told["files"]]
+    C = np.stack([one[0][0, YAW] for one in found], axis=1)
+    np.testing.assert_allclose(np.abs(C), 0.03, rtol=1e-6)
+    assert np.linalg.cond(C) == pytest.approx(1.0, abs=1e-6)
+    for one, _, plan in found:
+        step = one[0, YAW][1:] / one[0, YAW][:-1]
+        np.testing.assert_allclose(step, np.exp(1j * float(plan["lag_rad"])), atol=1e-5)
+    assert sorted(plan["run"] for _, _, plan in found) == ["0", "1", "2", "3"]
+
+
+def test_settling_is_told_by_the_slowest_body_mode(like, tmp_path, capsys):
+    told = planned(capsys, "lag-sweep", "--like", like, "-o", tmp_path / "s")
+    plan = phasors(told["files"][0], 0.0)[2]
+    tau_s = float(plan["mode_tau_s"])
+    assert tau_s == pytest.approx(1.845, rel=1e-3)
+    assert told["settle_s"] == float(plan["settle_s"]) >= 5 * tau_s
+    assert (plan["measure_s"], plan["amplitude_rad"]) == ("10", "0.02")
+
+
+def test_every_tone_of_a_multisine_is_a_dft(like, tmp_path, capsys):
+    told = planned(capsys, "multisine", "--like", like, "-o", tmp_path / "m", "--measure", 12)
+    omega = tones(2 * np.pi * 0.8, 3)
+    found = [phasors(file, told["settle_s"], 12.5, omega / (2 * np.pi)) for file in told["files"]]
+    assert omega[0] == 2 * np.pi * 0.8
+    assert found[0][2]["measure_s"] == "12.5"  # two whole periods
+    for tone in range(3):
+        C = np.stack([one[0][tone, YAW] for one in found], axis=1)
+        np.testing.assert_allclose(np.abs(C), 0.02 * (omega[0] / omega[tone]) ** 2, rtol=1e-6)
+        assert np.linalg.cond(C) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 8])
+def test_no_tone_is_another_plus_gait_frequencies(count):
+    gait = 2 * np.pi * 0.7
+    chosen = tones(gait, count)
+    for i, one in enumerate(chosen):
+        for sign in (1, -1):
+            apart = (chosen - sign * one) / gait
+            off = np.abs(apart - np.round(apart))
+            off[i] = 1.0
+            assert off.min() > 0.5 / (2 * count - 1)
+
+
+def weak(stall_torque):
+    return dataclasses.replace(
+        ROBOT,
+        joints=tuple(
+            dataclasses.replace(
+                joint, servo=dataclasses.replace(joint.servo, stall_torque=stall_torque)
+            )
+            for joint in ROBOT.joints
+        ),
+    )
+
+
+def test_the_weak_chain_rings_for_seconds():
+    mode = slowest_mode(weak(0.25), ["joint01"])
+    # Measured on a prototype that shares nothing with this code: 0.551 Hz, 3.8 %, 7.5 s.
+    assert mode.frequency_hz == pytest.approx(0.551, abs=2e-3)
+    assert mode.damping == pytest.approx(0.038, abs=1e-3)
+    assert mode.time_constant_s == pytest.approx(7.5, abs=0.05)
+
+
+def test_two_rods_have_their_textbook_inertia():
+    """Two free uniform rods on one hinge: bending by q takes m l^2/24 q''^2/2 (thin rods)."""
+    link = dataclasses.replace(
+        ROBOT.links[0], length=0.3, mass=0.2, inertia=(0.0, 0.0, 0.2 * 0.3**2 / 12)
+    )
+    robot = dataclasses.replace(ROBOT, links=(link, link), joints=ROBOT.joints[:1])
+    inertia = transverse_mass(robot, Plane.HORIZONTAL)
+    # Mirror symmetry: each rod turns by q/2, its centre moves q l/8 against the hinge's q l/8.
+    np.testing.assert_allclose(inertia, [[0.2 * 0.3**2 / 24]], rtol=1e-12)
+
+
+def test_sweeps_that_are_refused(like, tmp_path, capsys):
+    words = ["plan", "lag-sweep", "--like", str(like), "-o", str(tmp_path / "x")]
+    assert undulog.run([*words, "--amplitude", "0.2"]) == 2
+    assert "would saturate" in capsys.readouterr().err
+    assert undulog.run([*words, "--amplitude", "0.6"]) == 2
+    assert undulog.run([*words, "--amplitude", "0"]) == 2
+    assert undulog.run(["plan", "multisine", *words[2:], "--tones", "1"]) == 2
+    assert not (tmp_path / "x").exists()
+    assert undulog.run([*words, "--settle", "2"]) == 0
+    assert "Warning: it needs 12 s to settle; 2 s is less" in capsys.readouterr().out

@@ -39,10 +39,18 @@ def test_decimals_follow_the_particle_data_group(half, decimals):
     assert formats.decimals_for([quantity], least=0) == decimals
 
 
-def test_an_estimate_prints_value_unit_and_interval():
-    assert formats.estimate(Estimate(6.2, (5.9, 6.5)), "°") == "6.20° [5.90, 6.50]"
-    assert formats.estimate(Estimate(6.2), "°", most=1) == "6.2°"
-    assert formats.estimate(Estimate(), "°") == "–"
+@pytest.mark.parametrize(
+    ("quantity", "unit", "most", "text"),
+    [
+        (Estimate(6.2, (5.9, 6.5)), "°", 3, "6.20° [5.90, 6.50]"),
+        (Estimate(6.2), "°", 1, "6.2°"),
+        (Estimate(), "°", 3, "–"),
+        (Estimate(1.0, (-0.01, 2.0)), "", 1, "1.0 [0.0, 2.0]"),  # it holds zero
+        (Estimate(1.0, (0.01, 2.0)), "", 1, "1.00 [0.01, 2.00]"),
+    ],
+)
+def test_an_estimate_prints_value_unit_and_interval(quantity, unit, most, text):
+    assert formats.estimate(quantity, unit, most=most) == text
 
 
 @given(st.floats(0.001, 1.0))
@@ -56,11 +64,6 @@ def test_an_interval_that_excludes_zero_is_printed_so(end, ratio, negative):
     text = formats.estimate(Estimate((low + high) / 2, (low, high)), most=1)
     ends = text.replace(formats.MINUS, "-").partition("[")[2].rstrip("]").split(", ")
     assert all(float(one) != 0 for one in ends)
-
-
-def test_an_interval_that_holds_zero_keeps_its_digits():
-    assert formats.estimate(Estimate(1.0, (-0.01, 2.0)), most=1) == "1.0 [0.0, 2.0]"
-    assert formats.estimate(Estimate(1.0, (0.01, 2.0)), most=1) == "1.00 [0.01, 2.00]"
 
 
 @pytest.mark.parametrize(

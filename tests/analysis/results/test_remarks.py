@@ -6,28 +6,22 @@ import numpy as np
 import pytest
 
 import undulog
+from support.joint_runs import write_joints
 from undulog.analysis import analyse_session
 from undulog.analysis.results.answer import Lacking, Note, Remarks
-from undulog.capture import Session, SessionWriter
+from undulog.capture import Session
 
 NAMES = tuple(f"j{k}" for k in range(8))
-EPOCH_NS = 1_700_000_000_000_000_000
 
 
-def write(path, *, moving=True, extra=()):
-    """20 s of eight joints that follow 0.5 Hz: positions only, and topics of ``extra``."""
+def write(path, *, moving=True):
+    """20 s of eight joints that follow 0.5 Hz: positions only."""
     noise = np.random.default_rng(1).normal(0, 1e-3, (2000, len(NAMES)))
-    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
-        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
-        states = writer.joint_state("/joint_states", NAMES, unit="rad")
-        more = [writer.joint_state(topic, NAMES, unit=unit) for topic, unit in extra]
-        for k in range(2000):
-            t_ns, phase = EPOCH_NS + k * 10_000_000, np.pi * 0.01 * k - np.arange(len(NAMES))
-            commands.write(t_ns, 0.4 * np.sin(phase) if moving else np.zeros(len(NAMES)))
-            states.write(t_ns, 0.38 * np.sin(phase - 0.1) + noise[k])
-            for channel in more:
-                channel.write(t_ns, np.full(len(NAMES), 1.0) + 0.1 * np.sin(phase))
-    return path
+    phase = np.pi * 0.01 * np.arange(2000)[:, None] - np.arange(len(NAMES))
+    commands = 0.4 * np.sin(phase) * moving
+    return write_joints(
+        path, NAMES, commands, [0.38 * np.sin(phase - 0.1) + noise], rate_hz=100, session_id="s"
+    )
 
 
 def test_worst_first_and_each_once():

@@ -89,7 +89,16 @@ def experiment(analysis):
         Run("reverse", "reverse.mcap", "tail-to-head", "reverse"),
         Run("made-for-tests", "made.mcap", "head-to-tail", "forward"),
     )
-    return Experiment("joint03 is weak", (one, analysis), runs, {}, reversal, NO_COUPLING, (), MADE)
+    return Experiment(
+        answer="joint03 is weak",
+        sessions=(one, analysis),
+        runs=runs,
+        heterogeneity={},
+        reversal=reversal,
+        coupling=NO_COUPLING,
+        warnings=(),
+        provenance=MADE,
+    )
 
 
 def test_the_numbers_shown_are_the_saved_ones(session, analysis, tmp_path):

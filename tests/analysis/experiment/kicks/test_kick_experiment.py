@@ -2,71 +2,46 @@
 
 import json
 import math
+from itertools import product
 
+import kick_tables
 import numpy as np
 import pytest
 
 import undulog
+from support import linear_chain
 from support.analysed import experiment
+from support.linear_chain import M, asymmetry, within
 from undulog.analysis.present.text_experiment import render_experiment
 from undulog.analysis.results.coupling import LocalCoupling
-from undulog.capture import SessionWriter
 
-EPOCH_NS = 1_735_689_600_000_000_000
-NAMES = ("j1", "j2", "j3", "j4", "j5")
-M = len(NAMES)
-BASE = 0.4 * np.exp(-1j * np.pi / 3 * np.arange(M))
-PLACE = np.arange(M)
-H = np.diag(np.full(M, 0.9 * np.exp(-0.3j))) + 0.12 * np.exp(
-    -np.abs(PLACE[:, None] - PLACE[None, :]) + 0.5j * PLACE[None, :]
-)
+H, BASE = kick_tables.chain(M)
 TRUTH = H * BASE[None, :] / (H @ BASE)[:, None]
 SIGMA = 0.002
 
 
 def write_run(path, off, seed):
     """Six cycles at 50 Hz, started at any time, without physics."""
-    rng = np.random.default_rng(seed)
-    command = BASE * np.exp(off + 1j * rng.uniform(-np.pi, np.pi))
-    answer = H @ command
-    with SessionWriter(path, session_id=path.stem, epoch_ns=EPOCH_NS) as writer:
-        commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
-        states = writer.joint_state("/joint_states", NAMES, unit="rad")
-        for k in range(300):
-            turn = np.exp(2j * np.pi * k / 50)
-            t_ns = EPOCH_NS + k * 20_000_000
-            commands.write(t_ns, np.real(command * turn))
-            states.write(t_ns, np.real(answer * turn) + rng.normal(0.0, SIGMA, M))
-    return path
+    command = BASE * np.exp(off + 1j * np.random.default_rng(seed).uniform(-np.pi, np.pi))
+    return linear_chain.write_run(path, command, H @ command, seed, SIGMA)
 
 
-def deviations(*, amplitude=True, patterns=True):
-    found = {"run00": np.zeros(M, dtype=complex)}
-    for step in (0.05j, 0.05) if amplitude else (0.05j,):
-        for joint in range(M):
-            for sign in (1, -1):
-                off = np.zeros(M, dtype=complex)
-                off[joint] = sign * step
-                found[f"run{len(found):02d}"] = off
-    if patterns:
-        rng = np.random.default_rng(4)
-        for _ in range(2):
-            found[f"run{len(found):02d}"] = 1j * rng.uniform(-0.15, 0.15, M)
-    return found
+def deviations():
+    """The gait, each joint kicked four ways, and two patterns of all joints."""
+    kicks = [sign * step * unit for step in (0.05j, 0.05) for unit in np.eye(M) for sign in (1, -1)]
+    patterns = 1j * np.random.default_rng(4).uniform(-0.15, 0.15, (2, M))
+    return [np.zeros(M), *kicks, *patterns]
 
 
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory):
     folder = tmp_path_factory.mktemp("kicks")
-    return {
-        name: write_run(folder / f"{name}.mcap", off, seed)
-        for seed, (name, off) in enumerate(deviations().items())
-    }
+    return [write_run(folder / f"run{k:02d}.mcap", off, k) for k, off in enumerate(deviations())]
 
 
 @pytest.fixture(scope="module")
 def result(sessions):
-    return experiment(sessions.values())
+    return experiment(sessions)
 
 
 def test_the_matrices_are_those_planted(result):
@@ -104,12 +79,10 @@ def test_a_linear_chain_is_told_as_linear(result):
     np.testing.assert_allclose(np.array(coupling.lti.real), H.real, atol=error)
     np.testing.assert_allclose(np.array(coupling.lti.imag), H.imag, atol=error)
     X = np.linalg.inv(H)
-    off = X - np.diag(np.diag(X))
     low, high = coupling.lti.asymmetry.ci95
-    assert low <= np.linalg.norm(off - off.T) / np.linalg.norm(off) <= high
-    near = np.triu(np.tril(off, 1), -1)
+    assert low <= asymmetry(X) <= high
     low, high = coupling.lti.within_1.ci95
-    assert low <= (np.linalg.norm(near) / np.linalg.norm(off)) ** 2 <= high
+    assert low <= within(X, 1) <= high
 
 
 def parts(value):
@@ -165,27 +138,24 @@ def test_roles_warnings_and_text(result, sessions):
 
 
 def test_the_json_object(sessions, capsys):
-    assert undulog.run(["analyse", *map(str, sessions.values()), "--json"]) == 0
+    assert undulog.run(["analyse", *map(str, sessions), "--json"]) == 0
     coupling = json.loads(capsys.readouterr().out)["coupling"]
     assert coupling["identifiable"] is True
     assert coupling["record"] is None
     assert coupling["matrix"] == coupling["P"]["value"]
     assert coupling["condition_number"] == coupling["lti"]["condition_number"]
-    for name in "PRGS":
-        for field in ("value", "standard_error", "ci95_half"):
-            assert np.shape(coupling[name][field]) == (M, M)
+    for name, field in product("PRGS", ("value", "standard_error", "ci95_half")):
+        assert np.shape(coupling[name][field]) == (M, M)
 
 
 def test_the_order_of_the_files_does_not_matter(result, sessions):
-    paths = list(sessions.values())
-    again = experiment(paths[::-1]).coupling
+    again = experiment(sessions[::-1]).coupling
     np.testing.assert_allclose(again.P.value, result.coupling.P.value, atol=1e-9)
     assert again.checks_pass
 
 
 def test_phase_kicks_alone_give_p_and_r(sessions):
-    paths = list(sessions.values())[: 1 + 2 * M]
-    result = experiment(paths)
+    result = experiment(sessions[: 1 + 2 * M])
     coupling = result.coupling
     assert coupling.identifiable
     assert (coupling.G, coupling.S, coupling.nonlinearity.value) == (None, None, None)
@@ -195,8 +165,7 @@ def test_phase_kicks_alone_give_p_and_r(sessions):
 
 
 def test_one_sided_kicks_are_not_identifiable(sessions):
-    paths = list(sessions.values())
-    result = experiment([*paths[:4], *paths[5 : 1 + 2 * M]])
+    result = experiment([*sessions[:4], *sessions[5 : 1 + 2 * M]])
     coupling = result.coupling
     assert not coupling.identifiable
     assert coupling.matrix is None
@@ -207,7 +176,7 @@ def test_one_sided_kicks_are_not_identifiable(sessions):
 
 
 def test_runs_of_one_gait_stay_not_identifiable(sessions):
-    coupling = experiment(list(sessions.values())[:1]).coupling
+    coupling = experiment(sessions[:1]).coupling
     assert not coupling.identifiable
     assert not isinstance(coupling, LocalCoupling)
     assert "one gait gives 5 complex numbers for 25 unknown couplings" in coupling.why

@@ -94,7 +94,7 @@ def test_turned_runs_cancel_a_tilt_that_one_heading_leaves():
     rng = np.random.default_rng(3)
     one = mirror_test(*runs(rng, tilt=1.0, scatter=1e-6))
     np.testing.assert_allclose(one.difference, 2 * FALL, atol=1e-5)
-    strata = heading_strata(*TURNED, 0.2)
+    strata = heading_strata(*TURNED)
     both = mirror_test(*runs(rng, tilt=1.0, turned=True, scatter=1e-6), strata)
     assert np.abs(both.difference).max() < 1e-5
     # The scatter is that within the strata: a tilt a thousand times as large isn't in it.
@@ -105,7 +105,7 @@ def test_a_tilt_names_no_module_in_either_plan():
     """Identical modules on a floor whose effect is ten times a run's scatter, 300 experiments."""
     rng = np.random.default_rng(4)
     stated = named = single = 0
-    strata = heading_strata(*TURNED, 0.2)
+    strata = heading_strata(*TURNED)
     for _ in range(300):
         named += bool(ordered_pairs(NAMES, mirror_test(*runs(rng, tilt=1.0, turned=True), strata)))
     assert named / 300 < 0.065
@@ -168,15 +168,15 @@ def test_the_ratio_of_common_to_contrast():
 
 def test_strata_from_headings():
     forward = np.array([0.0, 0.05, np.pi, -np.pi])
-    index = heading_strata(forward, np.array([np.pi, -3.1, 0.0, 2 * np.pi]), 0.2)
+    index = heading_strata(forward, np.array([np.pi, -3.1, 0.0, 2 * np.pi]))
     assert [part.tolist() for part in index] == [[0, 0, 1, 1], [0, 0, 1, 1]]
     # Turned along with its wave, every run is in one stratum.
-    index = heading_strata(np.zeros(2), np.full(2, np.pi), 0.2)
+    index = heading_strata(np.zeros(2), np.full(2, np.pi))
     assert [part.tolist() for part in index] == [[0, 0], [0, 0]]
     # One heading alone, an unknown one, or too few of a mirror image leave no strata.
-    assert heading_strata(np.zeros(3), np.zeros(3), 0.2) is None
-    assert heading_strata(forward, np.array([np.pi, -3.1, 0.0, np.nan]), 0.2) is None
-    assert heading_strata(forward, np.array([np.pi, np.pi, np.pi, 0.0]), 0.2) is None
+    assert heading_strata(np.zeros(3), np.zeros(3)) is None
+    assert heading_strata(forward, np.array([np.pi, -3.1, 0.0, np.nan])) is None
+    assert heading_strata(forward, np.array([np.pi, np.pi, np.pi, 0.0])) is None
 
 
 def test_recorded_gravity_takes_the_sensors_offset_out_where_headings_differ():

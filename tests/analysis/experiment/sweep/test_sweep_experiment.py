@@ -8,14 +8,15 @@ import pytest
 
 import undulog
 from support.analysed import experiment
-from undulog.analysis.experiment.sweep.chain import servo_side
+from support.joint_runs import write_joints
+from support.linear_chain import within
+from undulog.analysis.experiment.sweep.coupling import servo_side
 from undulog.analysis.plan.designs import tones
 from undulog.analysis.present.text_experiment import render_experiment
 from undulog.analysis.results.coupling import LinearCoupling, Route
-from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture import Session, load_robot
 from undulog.capture.robot.model import Plane
 
-EPOCH_NS = 1_735_689_600_000_000_000
 ROBOT = load_robot("snake25")
 YAW = ROBOT.joint_indices(Plane.HORIZONTAL)[:4]
 NAMES = tuple(ROBOT.joint_names[k] for k in YAW)
@@ -38,9 +39,9 @@ def impedance(omega):
 
 
 def response(omega):
-    side = servo_side([SERVO] * M, omega)
+    D_r, D_q = servo_side([SERVO] * M, omega)
     late = np.exp(-1j * omega * HOLD_S)
-    return np.linalg.solve(impedance(omega) + np.diag(side.D_q), np.diag(side.D_r)) * late
+    return np.linalg.solve(impedance(omega) + np.diag(D_q), np.diag(D_r)) * late
 
 
 def robot_of(tmp, text):
@@ -55,29 +56,22 @@ def write_run(
 ):
     """One run: steady sines at each tone, no physics; scenario None = a real robot."""
     rng = np.random.default_rng(seed)
+    t = np.arange(RATE * SECONDS)[:, None] / RATE
     shift = rng.uniform(-np.pi, np.pi)
-    with SessionWriter(path, session_id=path.stem, epoch_ns=EPOCH_NS, robot=robot) as writer:
-        if scenario is not None:
-            writer.attach("scenario.toml", "application/toml", scenario.encode())
-        said = writer.joint_state("/joint_commands", NAMES, unit="rad")
-        seen = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True, effort=effort)
-        for k in range(RATE * SECONDS):
-            t = k / RATE
-            turn = [np.exp(1j * omega * (t + shift)) for omega in omegas]
-            asked = sum(np.real(c * x) for c, x in zip(commands, turn, strict=True))
-            moved = [
-                response(w) @ c * x * (1 + drift * t)
-                for w, c, x in zip(omegas, commands, turn, strict=True)
-            ]
-            torque = sum(np.real(impedance(w) @ q) for w, q in zip(omegas, moved, strict=True))
-            values = np.real(sum(moved)) + rng.normal(0, SIGMA, M)
-            values += bend * np.real(sum(moved)) ** 3
-            speed = np.real(sum(1j * w * q for w, q in zip(omegas, moved, strict=True)))
-            t_ns = EPOCH_NS + round(t * 1e9)
-            said.write(t_ns, asked)
-            efforts = (torque + rng.normal(0, SIGMA_TORQUE, M),) if effort else ()
-            seen.write(t_ns, values, speed, *efforts)
-    return path
+    turn = [np.exp(1j * omega * (t + shift)) for omega in omegas]
+    moved = [
+        response(w) @ c * x * (1 + drift * t)
+        for w, c, x in zip(omegas, commands, turn, strict=True)
+    ]
+    angle = np.real(sum(moved))
+    speed = np.real(sum(1j * w * q for w, q in zip(omegas, moved, strict=True)))
+    torque = sum(np.real(q @ impedance(w).T) for w, q in zip(omegas, moved, strict=True))
+    noise = rng.normal(size=(len(t), 2 if effort else 1, M))
+    seen = [angle + SIGMA * noise[:, 0] + bend * angle**3, speed]
+    if effort:
+        seen.append(torque + SIGMA_TORQUE * noise[:, 1])
+    asked = sum(np.real(c * x) for c, x in zip(commands, turn, strict=True))
+    return write_joints(path, NAMES, asked, seen, rate_hz=RATE, robot=robot, scenario=scenario)
 
 
 def dft():
@@ -137,10 +131,8 @@ def test_h_and_z_are_those_planted(result):
     assert tone.servo_difference < 0.2
     low, high = tone.asymmetry.ci95
     assert low == 0.0 < high
-    off = BODY - np.diag(np.diag(BODY))
-    near = np.triu(np.tril(off, 1), -1)
     low, high = tone.within_1.ci95
-    assert low <= (np.linalg.norm(near) / np.linalg.norm(off)) ** 2 <= high
+    assert low <= within(BODY, 1) <= high
     assert coupling.drift_per_cycle == 0.0
     assert tone.distortion < 0.01
     assert coupling.sideband_energy.ci95[0] == 0.0
@@ -175,9 +167,8 @@ def test_the_text_and_the_object(result, lag_sweep, capsys):
 
 def test_without_torques_a_known_servo_is_taken_off(folder):
     (folder / "servo").mkdir()
-    robot = robot_of(folder, KNOWN)
-    coupling = experiment(sweep(folder / "servo", robot=robot, effort=False)).coupling
-    (tone,) = coupling.tones
+    paths = sweep(folder / "servo", robot=robot_of(folder, KNOWN), effort=False)
+    (tone,) = experiment(paths).coupling.tones
     assert tone.route is Route.SERVO
     close(tone.Z, impedance(2 * np.pi * F0))
     assert tone.servo_difference is None
