@@ -14,9 +14,10 @@ from undulog.capture.common.console import UNLIMITED, plain
 
 from ..results import formats
 from ..results.analysis import Analysis, EnergyResult
+from ..results.coupling import Coupling
 from ..results.estimate import Estimate
 from ..results.null_model import ModelledAnalysis, null_model_text
-from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, Link, LoopMode
+from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, LoopMode
 from . import tables
 from .tables import TERMINAL, Cell, Column, Ends, PValue, Quantity, Table
 
@@ -129,7 +130,8 @@ def chain_detail(chain: ChainCoupling) -> Iterable[str]:
         f"the strongest is {strongest.source} on {strongest.target}, "
         f"K = {formats.estimate(strongest.K, ' 1/s')}."
     )
-    yield f"K [1/s]: {'; '.join(_link(link) for link in chain.links)}."
+    couplings = [f"{one.source} on {one.target} {formats.estimate(one.K)}" for one in chain.links]
+    yield f"K [1/s]: {'; '.join(couplings)}."
     fed = [one for one in chain.oscillators if one.feedback.value is not None]
     if fed:
         told = ", ".join(f"{one.name} {formats.estimate(one.feedback)}" for one in fed)
@@ -153,8 +155,10 @@ def body_detail(body: BodyOscillators) -> Iterable[str]:
     )
 
 
-def _link(link: Link) -> str:
-    return f"{link.source} on {link.target} {formats.estimate(link.K)}"
+def unidentified(coupling: Coupling) -> str:
+    """Return why a coupling isn't identifiable, and what to record."""
+    record = f" To identify it, record {coupling.record}." if coupling.record else ""
+    return f"Coupling: not identifiable: {coupling.why}.{record}"
 
 
 class Sheet:
@@ -257,10 +261,8 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     sheet.print()
     for line in more_lines(analysis):
         sheet.print(line)
-    coupling = analysis.coupling
-    if not coupling.identifiable:
-        record = f" To identify it, record {coupling.record}." if coupling.record else ""
-        sheet.print(f"Coupling: not identifiable: {coupling.why}.{record}")
+    if not analysis.coupling.identifiable:
+        sheet.print(unidentified(analysis.coupling))
     for chain in analysis.oscillators:
         for line in chain_detail(chain):
             sheet.print(line)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Literal
 
 from undulog.capture.common.console import UNLIMITED, plain
 
@@ -17,7 +18,7 @@ from ..results.coupling import LinearCoupling, LocalCoupling
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, FloorTilt, Headings, Reversal
 from .tables import difference_table, mirror_table, run_table, waveform_table
-from .text import Sheet, body_detail
+from .text import Sheet, body_detail, unidentified
 
 MOST_CHANGES = 12
 """Lines of what was changed; the rest is in the JSON."""
@@ -156,15 +157,13 @@ def render_experiment(
     sheet.print()
     sheet.table(run_table(experiment))
     sheet.print()
-    own = [f"{warning} ({names})" for warning, names in by_warning(experiment)]
+    own = [f"{warning} ({names})" for warning, names in by_sentence(experiment, "warnings")]
     for warning in (*experiment.warnings, *own):
         sheet.print(f"Warning: {warning}")
-    coupling = experiment.coupling
-    if not coupling.identifiable:
-        record = f" To identify it, record {coupling.record}." if coupling.record else ""
-        sheet.print(f"Coupling: not identifiable: {coupling.why}.{record}")
+    if not experiment.coupling.identifiable:
+        sheet.print(unidentified(experiment.coupling))
     sheet.print(f"Method: {method(experiment)}", "dim")
-    for note, names in by_note(experiment):
+    for note, names in by_sentence(experiment, "notes"):
         sheet.print(f"Note: {note} ({names})", "dim")
     return sheet.text()
 
@@ -220,33 +219,22 @@ def _lag(lag_rad: Estimate) -> str:
     return formats.estimate(formats.degrees(lag_rad), "°", most=2)
 
 
-def by_warning(experiment: Experiment) -> list[tuple[str, str]]:
-    """Return the sessions' own warnings, each once, without what the experiment itself answers.
-
-    Returns:
-        Warning, and the names of the files that have it, or ``all sessions``.
-    """
-    return _by_sentence(experiment, [one.warnings for one in experiment.sessions])
-
-
-def by_note(experiment: Experiment) -> list[tuple[str, str]]:
-    """Return the sessions' own notes, each once, without what the experiment itself answers.
-
-    Returns:
-        Note, and the names of the files that have it, or ``all sessions``.
-    """
-    return _by_sentence(experiment, [one.notes for one in experiment.sessions])
-
-
-def _by_sentence(
-    experiment: Experiment, sentences: Sequence[Sequence[str]]
+def by_sentence(
+    experiment: Experiment, kind: Literal["warnings", "notes"]
 ) -> list[tuple[str, str]]:
+    """Return the sessions' own warnings or notes, each once.
+
+    Sentences on what the experiment itself answers are left out.
+
+    Returns:
+        Sentence, and the names of its files, or ``all sessions``.
+    """
     expected = ["boundary or module:"]
     if isinstance(experiment.coupling, LinearCoupling) and experiment.coupling.plan == "multisine":
         expected += _MANY_TONES
     files: dict[str, list[str]] = {}
-    for session, own in zip(experiment.sessions, sentences, strict=True):
-        for sentence in own:
+    for session in experiment.sessions:
+        for sentence in getattr(session, kind):
             if not sentence.startswith(tuple(expected)):
                 files.setdefault(sentence, []).append(Path(session.session.path).name)
     everyone = len(experiment.sessions)
