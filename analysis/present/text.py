@@ -1,4 +1,4 @@
-"""The result as text for a terminal: the answer first, then the joints, the method last."""
+"""Write results as text for a terminal: the answer first, the method last."""
 
 from __future__ import annotations
 
@@ -33,11 +33,7 @@ _SPANS = 3
 
 
 def more_lines(analysis: Analysis) -> Iterator[str]:
-    """Lines to print after the tables.
-
-    Yields:
-        Plain text without a line break.
-    """
+    """Yield the lines of text after the tables."""
     if analysis.energy is not None:
         yield from _energy(analysis.energy)
     yield from _over_time(analysis)
@@ -53,7 +49,7 @@ def more_lines(analysis: Analysis) -> Iterator[str]:
 
 
 def _dead_bands(analysis: Analysis) -> Iterator[str]:
-    """A line for each joint with stick or play: how far its command travels in vain."""
+    """Yield a line for each joint with stick or play: its dead band at both reversals."""
     for joint in analysis.joints:
         band = joint.dead_band
         if band is None:
@@ -92,7 +88,7 @@ def _energy(energy: EnergyResult) -> Iterator[str]:
 
 
 def _over_time(analysis: Analysis) -> Iterator[str]:
-    """The range of gain and lag over cycles, where there is no one gait to tell them for."""
+    """Yield the range of gain and lag over cycles if there is no single gait."""
     if analysis.over_time is None or analysis.gait.frequency_hz.value is not None:
         return
     known = [
@@ -112,11 +108,7 @@ def _over_time(analysis: Analysis) -> Iterator[str]:
 
 
 def chain_detail(chain: ChainCoupling) -> Iterable[str]:
-    """A chain of oscillators, told from its phases.
-
-    Yields:
-        Sentences; the first is the answer.
-    """
+    """Yield sentences on a chain of oscillators, the answer first."""
     where = f"Oscillators, {chain.plane}:"
     if not chain.identifiable:
         record = f" To decide it, record {chain.record}." if chain.record else ""
@@ -140,11 +132,7 @@ def chain_detail(chain: ChainCoupling) -> Iterable[str]:
 
 
 def body_detail(body: BodyOscillators) -> Iterable[str]:
-    """What oscillators that feel their servos would do on this body.
-
-    Yields:
-        Sentences; the first is the answer.
-    """
+    """Yield sentences on oscillators with feedback from their servos, the answer first."""
     yield f"Oscillators that feel their servos: {body.answer}."
     worst = max(mode.sensitivity for mode in body.modes)
     noise = body.pseudospectrum.noise
@@ -165,11 +153,7 @@ class Sheet:
     """The text of a result for a terminal: sentences, wrapped, and tables."""
 
     def __init__(self, width: int, *, color: bool) -> None:
-        """Begin.
-
-        Args:
-            color: Whether to use bold and dim type.
-        """
+        """Make an empty sheet; with ``color`` it has bold and dim type."""
         from rich.console import Console
 
         self._text = StringIO()
@@ -184,15 +168,11 @@ class Sheet:
         )
 
     def print(self, line: str = "", style: str = "") -> None:
-        """Add a sentence.
-
-        Args:
-            line: Any text; what would end a line or control a terminal is escaped.
-        """
+        """Add a sentence; line ends and control characters are escaped."""
         self._console.print(plain(line), style=style)
 
     def table(self, table: tables.AnyTable) -> None:
-        """Add a table, without what it can spare where the terminal is too narrow for all of it."""
+        """Add a table; columns that can be spared are left out on a narrow terminal."""
         columns = [column for column in table.columns if column.text is not None]
         cells = zip(*(column.cells(table.rows, TERMINAL) for column in columns), strict=True)
         styles = ["bold" if table.bold(row) else "" for row in table.rows]
@@ -212,11 +192,7 @@ class Sheet:
             self.print(f"Without {names}: the terminal is too narrow; --json has all.", "dim")
 
     def text(self) -> str:
-        """Return all of it.
-
-        Returns:
-            Several lines, the last one ended.
-        """
+        """Return all lines, the last one ended."""
         return "\n".join(line.rstrip() for line in self._text.getvalue().splitlines()) + "\n"
 
 
@@ -236,14 +212,11 @@ def _shown(cell: Cell) -> str:
 
 
 def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -> str:
-    """Set a result as text.
+    """Return a session's result as text.
 
     Args:
-        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
+        width: Columns of the terminal: sentences wrap, tables leave out spare columns.
         color: Whether to use bold and dim type.
-
-    Returns:
-        Several lines, the last one ended.
     """
     sheet = Sheet(width, color=color)
     name, answer = Path(analysis.session.path).name, analysis.answer
@@ -303,14 +276,7 @@ _PART = 0.5
 
 
 def render_loop(loop: ClosedLoop, *, width: int = UNLIMITED, color: bool = False) -> str:
-    """Set a prediction as text.
-
-    Args:
-        color: Whether to use bold and dim type.
-
-    Returns:
-        Several lines, the last one ended.
-    """
+    """Return a prediction as text; see :func:`render`."""
     sheet = Sheet(width, color=color)
     sheet.print(formats.sentence(loop.answer), "bold")
     for line in loop.limits:
@@ -352,7 +318,7 @@ def _time(rate: float) -> str:
 
 
 def _mostly(mode: LoopMode, joints: tuple[str, ...]) -> str:
-    """Joints with most of a pattern, and their signs against the largest."""
+    """Return the joints with most of a pattern, with their signs relative to the largest."""
     share = np.array(mode.pattern_abs)
     turn = np.array(mode.pattern_rad) - mode.pattern_rad[int(np.argmax(share))]
     return " ".join(

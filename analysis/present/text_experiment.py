@@ -1,4 +1,4 @@
-"""An experiment as text for a terminal: the answer first, then mirror pairs and runs."""
+"""Write experiments and comparisons as text for a terminal, the answer first."""
 
 from __future__ import annotations
 
@@ -33,15 +33,7 @@ _DESIGNS = {
 def render_comparison(
     comparison: Comparison, *, width: int = UNLIMITED, color: bool = False
 ) -> str:
-    """Set a comparison as text.
-
-    Args:
-        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
-        color: Whether to use bold and dim type.
-
-    Returns:
-        Several lines, the last one ended.
-    """
+    """Return a comparison as text; see :func:`.text.render`."""
     sheet = Sheet(width, color=color)
     sheet.print(f"{comparison.answer}.", "bold")
     for side, sessions in (("A", comparison.a), ("B", comparison.b)):
@@ -79,13 +71,10 @@ def _changed(changed: tuple[Change, ...]) -> list[str]:
 
 
 def margin_text(one: Equivalence, value: float | None = None) -> str:
-    """A margin, or a difference that is held to it, in the unit people read.
+    """Return a difference in readable units, e.g. ``2 %``, ``0.35°`` or ``0.01 J``.
 
     Args:
         value: In the test's unit; its margin if None.
-
-    Returns:
-        For example ``2 %``, ``0.35°`` or ``0.01 J``.
     """
     factor, unit = {"rad": (math.degrees(1), "°"), "1": (1.0, "")}.get(
         one.unit, (1.0, f" {one.unit}")
@@ -106,11 +95,7 @@ def _equivalence(comparison: Comparison) -> str:
 
 
 def comparison_method(comparison: Comparison) -> str:
-    """How a comparison was made.
-
-    Returns:
-        One sentence, beginning in lower case.
-    """
+    """Return the method of a comparison as one sentence, beginning in lower case."""
     return (
         f"aligned by gait phase; {_DESIGNS[comparison.design]}; decisions over all "
         f"{len(comparison.differences)} quantities after Holm at "
@@ -121,21 +106,13 @@ def comparison_method(comparison: Comparison) -> str:
 
 
 _MANY_TONES = ("no gait:", "no body motion", "no joint's gain and lag are known")
-"""How warnings begin that every run of a multisine has: it is no gait, and isn't meant to be."""
+"""Beginnings of warnings that every run of a multisine has, since it is no gait."""
 
 
 def render_experiment(
     experiment: Experiment, *, width: int = UNLIMITED, color: bool = False
 ) -> str:
-    """Set an experiment as text.
-
-    Args:
-        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
-        color: Whether to use bold and dim type.
-
-    Returns:
-        Several lines, the last one ended.
-    """
+    """Return an experiment as text; see :func:`.text.render`."""
     sheet = Sheet(width, color=color)
     count = len(experiment.sessions)
     sheet.print(f"{count} session{'s' if count > 1 else ''}: {experiment.answer}.", "bold")
@@ -169,7 +146,7 @@ def render_experiment(
 
 
 def reversal_detail(reversal: Reversal) -> Iterable[str]:
-    """What stands below the answer."""
+    """Yield sentences on the pairs, the tilt of the floor and the shares of the spread."""
     for pair in reversal.pairs:
         yield (
             f"{pair.name} against its mirror {pair.mirror}, over both directions: "
@@ -196,7 +173,7 @@ def reversal_detail(reversal: Reversal) -> Iterable[str]:
 
 
 def _tilt(tilt: FloorTilt, middle: str | None) -> str:
-    """What speaks for and against a tilted floor."""
+    """Return the evidence for and against a tilted floor."""
     lean = ""
     if tilt.gravity_rad.value is not None:
         fall = formats.estimate(formats.degrees(tilt.gravity_rad), "°", most=2)
@@ -245,11 +222,7 @@ def by_sentence(
 
 
 def method(experiment: Experiment) -> str:
-    """How the numbers of an experiment were made.
-
-    Returns:
-        One sentence, beginning in lower case.
-    """
+    """Return the method of an experiment as one sentence, beginning in lower case."""
     coupling = experiment.coupling
     if isinstance(coupling, LocalCoupling):
         return _kick_method(coupling)

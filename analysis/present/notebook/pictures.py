@@ -43,11 +43,11 @@ class Picture:
     caption: str
 
     def __repr__(self) -> str:
-        """The caption."""
+        """Return the caption."""
         return f"<Picture: {plain(self.caption)}>"
 
     def _repr_html_(self) -> str:
-        """The figure on paper, whatever the notebook's theme, and its caption."""
+        """Return the figure on paper, whatever the notebook's theme, and its caption."""
         colors = "".join(f"--{name}:{value};" for name, value in paper_colors().items())
         rules = f"<style>{figure_rules()}</style>"
         style = f"{colors}background:var(--paper);color:var(--ink);max-width:60rem;padding:.5rem"

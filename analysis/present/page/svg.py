@@ -161,7 +161,7 @@ def inline_svg(
 
 
 def _drawn(figure: Figure) -> ET.Element:
-    """The figure as matplotlib writes it, parsed."""
+    """Return the figure as matplotlib writes it, parsed."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         # Text is set in the reader's fonts, so a glyph that our layout font lacks is no loss.
