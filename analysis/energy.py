@@ -1,4 +1,4 @@
-"""Energy of each joint, four ways, on the samples' own times.
+"""Energies of each joint on the samples' own times, and their comparison with the twin's ledger.
 
 E_net is the integral of torque times velocity, E_plus that of its positive part (a joint that
 can't take energy back), E_abs that of its absolute value; E_el is the integral of motor voltage
@@ -7,10 +7,8 @@ each sampling interval (:class:`.PowerTopic`), their means are added up;
 else sampled factors are multiplied, and what the two do within an interval is lost. Gaps are not
 bridged: no time inside them counts.
 
-Energies against the twin's own ledger, where a session has one.
-
-The twin books energy at its physics rate. An analysis that has to multiply samples misses what
-happens between them; where the two differ by much, there is a warning.
+The twin books energy in a ledger at its physics rate. Products of samples miss what happens
+between them; a large difference gives a warning.
 """
 
 from __future__ import annotations
@@ -123,7 +121,7 @@ def add_up(net: Series, plus: Series, start_s: float, stop_s: float, cycles: int
 
 
 def power_of(first: Signal, second: Signal, origin_ns: int) -> Series:
-    """Product of two signals as a power on the first one's times.
+    """Return the product of two signals as a power on the first one's times.
 
     Args:
         first: E.g. torque, or current.
@@ -153,20 +151,35 @@ def _interpolate(t_ns: IntArray, signal: Signal) -> FloatArray:
     return values
 
 
+TERMS = {
+    "net": ("mechanical", "net_j", "mechanical_net"),
+    "plus": ("mechanical", "plus_j", "mechanical_plus"),
+    "abs": ("mechanical", "abs_j", "mechanical_abs"),
+    "el": ("electrical", "net_j", "electrical_net"),
+    "el_clipped": ("electrical", "plus_j", "electrical_plus"),
+}
+"""Energy to its kind, its attribute of :class:`Energy`, and its term in the ledger."""
+
+
 @dataclass(frozen=True)
 class Energies:
     """Energies of one joint.
 
     Attributes:
-        mechanical: By torque and velocity; None where they were not recorded.
+        mechanical: By torque and velocity; None if they were not recorded.
         electrical: By voltage and current; None likewise.
-        sampled: Which of the two are products of samples: what the factors do within a sampling
-            interval is not in them.
+        sampled: Kinds that are products of samples, without changes within a sampling interval.
     """
 
     mechanical: Energy | None
     electrical: Energy | None
     sampled: frozenset[str] = frozenset()
+
+    def per_cycle(self, name: str) -> FloatArray | None:
+        """Return one of :data:`TERMS` in each cycle [J], shape (c,), or None."""
+        kind, attribute, _ = TERMS[name]
+        energy: Energy | None = getattr(self, kind)
+        return None if energy is None else getattr(energy, attribute)
 
 
 STEADY_SHARE = 0.2
@@ -184,29 +197,18 @@ def energy_result(
     closure: Closure | None,
     warn: Warn,
 ) -> EnergyResult:
-    """Set the energies out in cycles.
-
-    Args:
-        closure: Against the ledger, or None.
-        warn: Told where E_el is made of the supply's voltage.
-    """
+    """Return the energies cycle by cycle; warn if E_el comes from the supply's voltage."""
     shift_s = (span.origin_ns - session.start_ns) * 1e-9
     edges = np.linspace(span.start_s, span.stop_s, max(span.cycles, 1) + 1) + shift_s
-    joints: list[JointCycles] = []
-    for name, one in energies.items():
-        mechanical, electrical = one.mechanical, one.electrical
-        joints.append(
-            JointCycles(
-                name,
-                net_j=_each(mechanical, "net_j"),
-                plus_j=_each(mechanical, "plus_j"),
-                abs_j=_each(mechanical, "abs_j"),
-                el_j=_each(electrical, "net_j"),
-                el_clipped_j=_each(electrical, "plus_j"),
-                coverage=_each(mechanical, "covered"),
-                el_coverage=_each(electrical, "covered"),
-            )
+    joints = [
+        JointCycles(
+            name,
+            **{f"{term}_j": _each(one.per_cycle(term)) for term in TERMS},
+            coverage=_each(None if one.mechanical is None else one.mechanical.covered),
+            el_coverage=_each(None if one.electrical is None else one.electrical.covered),
         )
+        for name, one in energies.items()
+    ]
     source = electrical_source(session, columns)
     if source == "supply":
         topic = columns.topics["voltage"]
@@ -260,20 +262,11 @@ def _all_steady(voltages: Iterable[FloatArray]) -> bool:
     return True
 
 
-def _each(one: Energy | None, name: str) -> Each:
-    return None if one is None else tuple(getattr(one, name).tolist())
+def _each(values: FloatArray | None) -> Each:
+    return None if values is None else tuple(values.tolist())
 
 
 LEDGER_TOPIC = "/energy_ledger"
-TERMS = {
-    "net": ("mechanical", "mechanical_net"),
-    "plus": ("mechanical", "mechanical_plus"),
-    "abs": ("mechanical", "mechanical_abs"),
-    "el": ("electrical", "electrical_net"),
-    "el_clipped": ("electrical", "electrical_plus"),
-}
-"""Energy to what it is of, and to its term in the ledger."""
-
 TOLERANCE = 0.05
 """Difference, as a share of the absolute energy, that is worth a warning."""
 
@@ -298,7 +291,7 @@ def check_ledger(
         return None
     found = whole_robot(energies)
     off: dict[str, float] = {}
-    for name, (kind, term) in TERMS.items():
+    for name, (kind, _, term) in TERMS.items():
         if name in found and term in booked:
             off[name] = found[name] - booked[term]
             scale = max(found["abs" if kind == "mechanical" else "el_abs"], abs(booked[term]))
@@ -346,7 +339,7 @@ def booked_energies(session: SessionView, span: Span) -> dict[str, float] | None
 
 
 def whole_robot(energies: Iterable[Energies]) -> Mapping[str, float]:
-    """Energies of all joints together.
+    """Return the energies of all joints together.
 
     Returns:
         Sums [J], by the names in :data:`TERMS`, with ``el_abs`` besides; those that no joint has
@@ -403,32 +396,13 @@ def transport(
         warn(Note(f"cost of transport is not applicable: {why}"))
         return Transport(distance, mass, *[nothing] * 5, why=why)
     weighed = steps.mass_kg * GRAVITY * steps.forward_m
-    kinds = {
-        "mechanical": [one.mechanical for one in energies.values()],
-        "electrical": [one.electrical for one in energies.values()],
-    }
-    cost: dict[str, Estimate] = {}
-    lacking: list[str] = []
-    for kind, found in kinds.items():
-        sums = _sums(found)
-        if sums is None:
-            lacking.append(f"no {kind} energy of some joints")
-            sums = {}
-        for name in ("net", "plus", "abs"):
-            value = _ratio(sums[name], weighed) if name in sums else nothing
-            cost[f"{kind} {name}"] = value
+    sums = {name: _sum([one.per_cycle(name) for one in energies.values()]) for name in TERMS}
+    kinds = dict.fromkeys(TERMS[name][0] for name, total in sums.items() if total is None)
+    lacking = [f"no {kind} energy of some joints" for kind in kinds]
     if lacking:
         warn(Note(f"cost of transport is partly null: {' and '.join(lacking)}"))
-    return Transport(
-        distance,
-        mass,
-        cost["mechanical net"],
-        cost["mechanical plus"],
-        cost["mechanical abs"],
-        cost["electrical net"],
-        cost["electrical plus"],
-        "; ".join(lacking),
-    )
+    costs = [nothing if total is None else _ratio(total, weighed) for total in sums.values()]
+    return Transport(distance, mass, *costs, why="; ".join(lacking))
 
 
 def _distance(way: FloatArray) -> Estimate:
@@ -448,20 +422,14 @@ def _goes_nowhere(way: FloatArray, distance: Estimate, robot: Robot) -> list[str
     return [f"{moved}, which does not differ significantly from 0"]
 
 
-def _sums(found: Sequence[Energy | None]) -> dict[str, FloatArray] | None:
-    """Energies of all joints together in each cycle; None if one is unknown."""
+def _sum(found: Sequence[FloatArray | None]) -> FloatArray | None:
+    """Return the energy of all joints together in each cycle; None if one is unknown."""
     known = [one for one in found if one is not None]
-    if not known or len(known) < len(found):
-        return None
-    return {
-        "net": np.sum([one.net_j for one in known], axis=0),
-        "plus": np.sum([one.plus_j for one in known], axis=0),
-        "abs": np.sum([one.abs_j for one in known], axis=0),
-    }
+    return np.sum(known, axis=0) if known and len(known) == len(found) else None
 
 
 def _ratio(above: FloatArray, below: FloatArray) -> Estimate:
-    """Ratio of two sums over cycles, with the interval of a ratio estimator.
+    """Return the ratio of two sums over cycles, with the interval of a ratio estimator.
 
     With r the ratio, var r = n / (n - 1) sum (a - r b)^2 / (sum b)^2 (Cochran, Sampling Techniques,
     1977, section 6.3).

@@ -11,10 +11,11 @@ import numpy as np
 from scipy.signal import lfilter
 
 from undulog.analysis.estimators.harmonic import fit_at
-from undulog.analysis.estimators.intervals import contrast_variance, lag_contrast_variance, t_factor
+from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import Noise, residual_spectrum
 from undulog.analysis.response.response import respond
+from undulog.analysis.segments.profile import scatter_of
 
 JOINTS, RATE, OMEGA = 9, 100.0, 2 * np.pi * 0.97
 AMPLITUDE, GAIN, LAG = 0.5, 0.9, 0.3
@@ -124,10 +125,10 @@ def judged(shared, correlation, *, runs=300, **more):
             (weights**2 @ one, np.full(len(weights), found.dof[0] * JOINTS))
             for one in (found.log_gain_variance, found.lag_variance)
         ]
-        judge = (
-            contrast_variance(found.errors, weights),
-            lag_contrast_variance(found.errors, weights),
-        )
+        judge = [
+            (one.variance(weights), np.full(len(weights), one.columns.shape[1]))
+            for one in scatter_of(found.errors)
+        ]
         inside.append([_holds(values, judge), _holds(values, apart)])
     return np.mean(inside, axis=0)
 

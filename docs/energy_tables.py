@@ -58,7 +58,7 @@ def figures(path):
         columns = read_columns(session, "/joint_commands", RESPONSE_TOPIC, _ignore)
         without = dataclasses.replace(columns, powers={one: {} for one in columns.powers})
         products = joint_energies(session, without, (), measured.span, _ignore)
-    booked = {name: ledger[term] for name, (_, term) in TERMS.items()}
+    booked = {name: ledger[term] for name, (*_, term) in TERMS.items()}
     scale = booked | {"net": max(abs(booked["net"]), NET_FLOOR * booked["abs"])}
 
     def errors(energies):

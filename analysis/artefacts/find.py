@@ -21,7 +21,6 @@ from undulog.capture.common.process import in_threads
 from undulog.capture.log.read.signals import LARGEST, Signal
 
 from ..estimators.series import Series, clean_together
-from ..response.rhythm import DRIVEN_SHARE
 from ..results.artefact import FALSIFYING, Artefact, Span
 from ..signals.columns import QUANTITIES, Columns
 from .holds import clipped, frozen, stale
@@ -121,7 +120,7 @@ def _alone(step: FloatArray, dt: FloatArray, most_rate: float) -> BoolArray:
 
 
 def _beside(step: FloatArray, at: IntArray) -> FloatArray:
-    """Mean of the steps just before and after each."""
+    """Return the mean of the steps just before and after each."""
     before, after = np.maximum(at - 1, 0), np.minimum(at + 1, step.size - 1)
     return (step[before] + step[after]) / 2
 
@@ -151,12 +150,7 @@ def find_artefacts(session: SessionView, columns: Columns) -> tuple[Artefact, ..
         What was found, in chain order.
     """
     limits = limits_of(session)
-    swing = {
-        name: float(np.nanmax(one.values) - np.nanmin(one.values))
-        for name, one in columns.command.items()
-        if np.isfinite(one.values).any()
-    }
-    lively = DRIVEN_SHARE * max(swing.values(), default=0.0)
+    commanded = columns.commanded()
     origin_ns = session.start_ns
 
     def of_joint(name: str) -> list[Artefact]:
@@ -166,8 +160,7 @@ def find_artefacts(session: SessionView, columns: Columns) -> tuple[Artefact, ..
             if name in (signals := columns.of(key)) and signals[name].t_ns.size
         }
         series = {key: one for key, one in clean_together(raw, origin_ns).items() if one.count}
-        driven = swing.get(name, 0.0) > lively
-        joint = _Joint(name, raw, series, limits.get(name), driven)
+        joint = _Joint(name, raw, series, limits.get(name), name in commanded)
         return [
             Artefact(name, columns.topics.get(quantity, ""), quantity, flag, spans, note)
             for quantity, flag, spans, note in _of_joint(joint, origin_ns)
@@ -273,11 +266,11 @@ def _of_scale(
 
 
 def _stalled(joint: _Joint) -> tuple[Span, ...]:
-    limits, position = joint.limits, joint.series["position"]
-    known = limits is not None and limits.known
+    position = joint.series["position"]
+    limits = joint.limits if joint.limits is not None and joint.limits.known else None
     for quantity, most in (
-        ("effort", limits.torque if limits is not None and known else None),
-        ("current", limits.current if limits is not None and known else None),
+        ("effort", limits and limits.torque),
+        ("current", limits and limits.current),
     ):
         if quantity in joint.series:
             asked = joint.series.get("command", position)
@@ -310,15 +303,10 @@ def _at_limits(joint: _Joint) -> _Found:
 
 def _of_record(quantity: str, joint: _Joint, origin_ns: int) -> _Found:
     raw, one = joint.raw[quantity], joint.series[quantity]
+    seconds = (raw.t_ns - origin_ns).astype(np.float64) * 1e-9
     if one.dropped_nan:
-        yield (
-            quantity,
-            "nan",
-            spans_of(_seconds(raw, origin_ns), ~(np.abs(raw.values) <= LARGEST)),
-            "",
-        )
+        yield quantity, "nan", spans_of(seconds, ~(np.abs(raw.values) <= LARGEST)), ""
     if one.dropped_duplicates:
-        seconds = _seconds(raw, origin_ns)
         again = np.concatenate((np.diff(raw.t_ns) == 0, [False]))
         yield quantity, "duplicate_stamps", tuple((t, t) for t in np.unique(seconds[again])), ""
     if one.count < 2:
@@ -328,18 +316,14 @@ def _of_record(quantity: str, joint: _Joint, origin_ns: int) -> _Found:
         yield quantity, "gaps", tuple(zip(begin.tolist(), end.tolist(), strict=True)), ""
 
 
-def _seconds(raw: Signal, origin_ns: int) -> FloatArray:
-    return (raw.t_ns - origin_ns).astype(np.float64) * 1e-9
-
-
 def _apart(spans: Sequence[Span], others: Sequence[Span]) -> tuple[Span, ...]:
-    """The stretches that meet none of some others."""
+    """Return the stretches that meet none of some others."""
     return tuple(
         s for s in spans if not any(s[0] < stop and s[1] > start for start, stop in others)
     )
 
 
 def _cycle_s(motion: Series) -> float:
-    """Median length of the cycles of a motion [s]; 0 where it has none."""
+    """Return the median length of the cycles of a motion [s]; 0 where it has none."""
     edges = turns(motion)
     return float(np.median(np.diff(edges))) if edges.size > 1 else 0.0

@@ -14,7 +14,7 @@ from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 from ..estimators.series import Series
 from ..results.artefact import Span
-from .scales import runs, spans_of, turns
+from .scales import resolution_of, runs, spans_of, turns
 
 FROZEN_TRAVEL = 0.29
 """Travel of the command during a hold, as a share of its range: what it has in a quarter of a
@@ -64,7 +64,7 @@ _TOPS = 2
 
 
 def frozen(position: Series, motion: Series, way: Series | None = None) -> tuple[Span, ...]:
-    """Stretches in which a position stays exactly the same while the joint must move.
+    """Return the stretches in which a position stays exactly the same while the joint must move.
 
     Args:
         motion: What says that it moves: its command, or its velocity integrated over time.
@@ -85,7 +85,7 @@ def frozen(position: Series, motion: Series, way: Series | None = None) -> tuple
     begin, end = (np.interp(position.t_s[k], motion.t_s, travelled) for k in (first, stop - 1))
     seen = float(np.ptp(position.values))
     scale = seen / asked if seen > 0 else 1.0
-    travel, least = end - begin, RESOLVED * _resolution(position.values)
+    travel, least = end - begin, RESOLVED * resolution_of(position.values)
     marked = (travel >= FROZEN_TRAVEL * asked) & (scale * np.minimum(travel, asked) > least)
     if np.any(marked):
         marked &= ~_at_reversals(position, motion, first, travel, asked)
@@ -97,7 +97,7 @@ def frozen(position: Series, motion: Series, way: Series | None = None) -> tuple
 
 
 def stale(position: Series) -> tuple[Span, ...]:
-    """Stretches in which samples repeat old values at new times.
+    """Return the stretches in which samples repeat old values at new times.
 
     Looked at where the motion is fast: where the change over four samples is more than half of
     the usual most (95 %), and more than eight times the smallest step that the sensor ever shows.
@@ -114,7 +114,9 @@ def stale(position: Series) -> tuple[Span, ...]:
     if not np.any(_around(repeats) > STALE_SHARE * _FEW):
         return ()
     travel = np.abs(value[4:] - value[:-4])
-    fast = (travel > 0.5 * np.percentile(travel, 95)) & (travel > 2 * RESOLVED * _resolution(value))
+    fast = (travel > 0.5 * np.percentile(travel, 95)) & (
+        travel > 2 * RESOLVED * resolution_of(value)
+    )
     of, among = (_around(one) for one in (fast & repeats, fast))
     told = np.flatnonzero(among >= _FEW)
     if told.size == 0:
@@ -198,7 +200,7 @@ def clipped(
         entered = sign * (level - value[i - _ENTRY]) / (t_s[i] - t_s[i - _ENTRY])
         left = sign * (level - value[j + _ENTRY - 1]) / (t_s[j + _ENTRY - 1] - t_s[j - 1])
         height = np.minimum(entered, left) * (t_s[j - 1] - t_s[i]) / 4
-        lost = (height > CLIPPED_SHARE * span) & (height > 2 * RESOLVED * _resolution(value))
+        lost = (height > CLIPPED_SHARE * span) & (height > 2 * RESOLVED * resolution_of(value))
         if command is not None and np.any(lost):
             lost &= _centred(series, command, i, j, sign)
         if np.count_nonzero(lost) >= _TOPS:
@@ -209,7 +211,7 @@ def clipped(
 def _centred(
     series: Series, command: Series, first: IntArray, stop: IntArray, sign: float
 ) -> BoolArray:
-    """Whether flat tops have their command's extremum in their middle, shape (k,).
+    """Return whether flat tops have their command's extremum in their middle, shape (k,).
 
     The joint's delay is that of its swings through the middle, over their medians.
     """
@@ -246,13 +248,6 @@ def _around(marked: BoolArray) -> IntArray:
     before: IntArray = np.concatenate((np.zeros(half + 1, dtype=np.int64), so_far))
     after: IntArray = np.concatenate((so_far, np.full(half, so_far[-1])))
     return after[half:] - before[: marked.size]
-
-
-def _resolution(value: FloatArray) -> float:
-    """The smallest step that a sensor shows; 0 where it shows none."""
-    step = np.abs(np.diff(value))
-    moved = step[step > 0]
-    return float(moved.min()) if moved.size else 0.0
 
 
 def _stands(way: Series, span: Span, least: float) -> bool:

@@ -67,7 +67,7 @@ class Limits:
 
 
 def limits_of(session: SessionView) -> dict[str, Limits]:
-    """Limits of the session's joints.
+    """Return the limits of the session's joints.
 
     Args:
         session: An open session; a twin may have run other servos than the robot's own.
@@ -97,7 +97,7 @@ def _limits(joint: Joint, known: bool) -> Limits:
 
 
 def saturated(one: Series, lower: float, upper: float, slack: float) -> tuple[Span, ...]:
-    """Stretches in which a channel is at a limit.
+    """Return the stretches in which a channel is at a limit.
 
     Args:
         slack: This close to a limit is at it.
@@ -114,7 +114,7 @@ def saturated(one: Series, lower: float, upper: float, slack: float) -> tuple[Sp
 def stalled(
     effort: Series, position: Series, most: float | None, asked: Series
 ) -> tuple[Span, ...]:
-    """Stretches in which a joint pushes with all it has, and stands still.
+    """Return the stretches in which a joint pushes with all it has, and stands still.
 
     Without a known stall torque, a joint has stalled where its effort stays constant at its
     largest value for far longer than a sine at its turning point stands still.
@@ -155,7 +155,7 @@ def stalled(
 
 
 def _constant(effort: Series, span: Span) -> bool:
-    """Whether an effort keeps one value over a span."""
+    """Return whether an effort keeps one value over a span."""
     i, j = np.searchsorted(effort.t_s, span)
     inside = effort.values[i : j + 1]
     return bool(np.std(inside) < CONSTANT * abs(float(np.mean(inside))))

@@ -31,8 +31,15 @@ def runs(marked: BoolArray) -> tuple[IntArray, IntArray]:
     return np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
 
 
+def resolution_of(values: FloatArray) -> float:
+    """Return the smallest step along the last axis that a sensor shows; 0 if it shows none."""
+    step = np.abs(np.diff(values))
+    moved = step[step > 0]
+    return float(moved.min()) if moved.size else 0.0
+
+
 def spans_of(t_s: FloatArray, marked: BoolArray, *, join: int = 1) -> tuple[Span, ...]:
-    """Stretches over which samples are marked.
+    """Return the stretches over which samples are marked.
 
     Args:
         t_s: Times, strictly increasing [s], shape (n,).
@@ -123,7 +130,7 @@ class Compared:
     error: FloatArray
 
     def spans(self, marked: BoolArray) -> tuple[Span, ...]:
-        """The marked cycles as stretches.
+        """Return the marked cycles as stretches.
 
         Args:
             marked: Shape (c,).
@@ -140,7 +147,7 @@ class Compared:
 
 
 def turns(one: Series) -> FloatArray:
-    """Times at which a signal swings up through its middle.
+    """Return the times at which a signal swings up through its middle.
 
     Returns:
         Between them lies a cycle each [s]; with hysteresis, so that noise makes none.
@@ -244,7 +251,7 @@ def integral(velocity: Series) -> Series:
 
 
 def _hole(one: Series, start_s: FloatArray, stop_s: FloatArray) -> FloatArray:
-    """Time in each cycle that lies in a channel's gaps [s]."""
+    """Return the time in each cycle that lies in a channel's gaps [s]."""
     if not one.gaps.size:
         return np.zeros(start_s.size)
     step = np.zeros(one.count)
@@ -262,7 +269,7 @@ def _correlated(residual: FloatArray) -> float:
 
 
 def _smoothed(ratio: FloatArray) -> FloatArray:
-    """Median of each value and its two neighbours; the ends count twice."""
+    """Return the median of each value and its two neighbours; the ends count twice."""
     padded = np.pad(ratio, 1, mode="edge")
     return np.median(np.stack([padded[:-2], ratio, padded[2:]]), axis=0)
 

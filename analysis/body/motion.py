@@ -50,7 +50,7 @@ class Track:
 
 
 def place_links(count: int) -> tuple[int, int, int]:
-    """Indices of the head, the middle and the tail link.
+    """Return the indices of the head, the middle and the tail link.
 
     Args:
         count: Number of links; of an even number the front one of the two middle links.
@@ -123,18 +123,10 @@ def observed(robot: Robot, plane: Plane, seen: Track, omega: float) -> tuple[Bod
     points: list[BodyPoint] = []
     for k, place in enumerate(PLACES):
         factor = t_factor(float(noise.dof[k]))
-        half = factor * float(along[k]) ** 0.5
-        amplitude = Estimate(
-            float(size[k]), (max(0.0, float(size[k]) - half), float(size[k]) + half)
-        )
-        points.append(
-            BodyPoint(
-                place=place,
-                link=robot.links[links[k]].name,
-                amplitude_m=amplitude,
-                phase_rad=_phase(fit, sideways, k, factor),
-            )
-        )
+        low, high = around(float(size[k]), factor * float(along[k]) ** 0.5)
+        amplitude = Estimate(float(size[k]), (max(0.0, low), high))
+        phase = _phase(fit, sideways, k, factor)
+        points.append(BodyPoint(place, robot.links[links[k]].name, amplitude, phase))
     return tuple(points)
 
 
@@ -147,7 +139,7 @@ def perfect_tracking(
     cycles: int,
     drag_ratio: float = DRAG_RATIO,
 ) -> dict[str, tuple[BodyPoint, ...]]:
-    """The same three points if every joint were exactly on its command.
+    """Return the same three points if every joint were exactly on its command.
 
     Args:
         plane: The driven plane; joints of the other plane are straight.
@@ -185,10 +177,10 @@ def perfect_tracking(
         fit = fit_at(series, omega, HarmonicModel(harmonics=3, trend=TREND))
         result[name] = tuple(
             BodyPoint(
-                place=place,
-                link=robot.links[links[k]].name,
-                amplitude_m=Estimate(float(np.abs(fit.fundamental[k]))),
-                phase_rad=Estimate(_angle(fit.fundamental, k)),
+                place,
+                robot.links[links[k]].name,
+                Estimate(float(np.abs(fit.fundamental[k]))),
+                Estimate(_angle(fit.fundamental, k)),
             )
             for k, place in enumerate(PLACES)
         )
@@ -246,20 +238,16 @@ def body_motion(
         robot, fitted, plane = _fit_for_null(session, responses, gait)
         poses = head_poses(session, robot.links[0].name, span)
         seen = track(robot, *poses, [responses[name] for name in robot.joint_names])
-        commands = _commands(robot, fitted)
-        omega = fitted.fit.omega
-        result = BodyResult(
-            plane=plane.value,
-            observed=observed(robot, plane, seen, omega),
-            null=perfect_tracking(
-                robot,
-                plane,
-                commands,
-                omega=omega,
-                cycles=span.cycles,
-                drag_ratio=drag_ratio(session),
-            ),
+        fit = fitted.fit
+        commands = {
+            robot.joint_names.index(name): (fit.amplitudes[k], float(fit.trend[k, 0]))
+            for k, name in enumerate(fitted.driven)
+        }
+        ratio = drag_ratio(session)
+        null = perfect_tracking(
+            robot, plane, commands, omega=fit.omega, cycles=span.cycles, drag_ratio=ratio
         )
+        result = BodyResult(plane.value, observed(robot, plane, seen, fit.omega), null)
     except (DataError, LogError) as error:
         warn(Note(f"no body motion (head, middle, tail): {error}"))
         return None
@@ -298,7 +286,7 @@ def _fit_for_null(
 def head_poses(
     session: SessionView, head: str, span: Span
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The head's poses within a window.
+    """Return the head's poses within a window.
 
     Args:
         head: Name of the head link.
@@ -337,11 +325,3 @@ def head_poses(
         raise DataError(f"{ODOMETRY_TOPIC} holds orientations that are not unit quaternions")
     t_s = (t_ns - span.origin_ns).astype(np.float64) * 1e-9
     return t_s, pose[:3].T, (pose[3:] / length).T
-
-
-def _commands(robot: Robot, gait: GaitFit) -> dict[int, tuple[ComplexArray, float]]:
-    """Harmonics and mean of each driven joint's command, by joint index."""
-    return {
-        robot.joint_names.index(name): (gait.fit.amplitudes[k], float(gait.fit.trend[k, 0]))
-        for k, name in enumerate(gait.driven)
-    }

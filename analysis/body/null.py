@@ -60,7 +60,7 @@ class Motion:
 
 
 def viscous_chain(robot: Robot, ratio: float = DRAG_RATIO) -> Chain:
-    """The robot's chain under anisotropic viscous drag, without inertia.
+    """Return the robot's chain under anisotropic viscous drag, without inertia.
 
     Args:
         ratio: K = c_n / c_t.
@@ -73,7 +73,7 @@ def viscous_chain(robot: Robot, ratio: float = DRAG_RATIO) -> Chain:
 
 
 def free_chain(robot: Robot, plane: Plane) -> Chain:
-    """The robot's chain that nothing touches, at rest as a whole.
+    """Return the robot's chain that nothing touches, at rest as a whole.
 
     Args:
         plane: The plane of motion; it says which moment of inertia counts.
@@ -157,7 +157,7 @@ def _shape(chain: Chain, angles: FloatArray) -> tuple[ComplexArray, FloatArray]:
 
 
 def _head_velocity(chain: Chain, angles: FloatArray, rates: FloatArray) -> FloatArray:
-    """The head's velocity (forward, left, turning) in its own frame, shape (t, 3)."""
+    """Return the head's velocity (forward, left, turning) in its own frame, shape (t, 3)."""
     centre, turned = _shape(chain, angles)
     spin = np.concatenate([np.zeros((rates.shape[0], 1)), np.cumsum(rates, axis=1)], axis=1)
     # Velocity of the centres that the joint rates alone cause, the head held.
@@ -179,7 +179,7 @@ def _head_velocity(chain: Chain, angles: FloatArray, rates: FloatArray) -> Float
 
 
 def _integral(omegas: FloatArray, time_s: FloatArray) -> ComplexArray:
-    """Integral of exp(j omega t) from 0 to t, shape (times, omegas)."""
+    """Return the integral of exp(j omega t) from 0 to t, shape (times, omegas)."""
     still: BoolArray = np.abs(omegas) * time_s[-1] < 1e-12
     safe = np.where(still, 1.0, omegas)
     turning: ComplexArray = (np.exp(1j * np.outer(time_s, safe)) - 1) / (1j * safe)

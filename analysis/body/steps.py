@@ -85,7 +85,7 @@ def centre_of_mass(
     poses: tuple[FloatArray, FloatArray, FloatArray],
     angles: FloatArray,
 ) -> FloatArray:
-    """The centre of mass from the head's pose and the joint angles.
+    """Return the centre of mass from the head's pose and the joint angles.
 
     Args:
         robot: The robot, m joints.
@@ -117,7 +117,7 @@ def _at(t_s: FloatArray, known_s: FloatArray, columns: FloatArray) -> FloatArray
 
 
 def mean_of_cycles(per_cycle: FloatArray) -> tuple[float, float, float] | None:
-    """Mean over cycles, its variance from their scatter, and its degrees of freedom.
+    """Return the mean over cycles, its variance from their scatter, and its degrees of freedom.
 
     Args:
         per_cycle: Shape (c,).

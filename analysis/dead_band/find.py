@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
-from undulog.capture.log.read.signals import Signal
 
-from ..artefacts.scales import runs
-from ..estimators.series import Series, clean, shared_times
+from ..artefacts.scales import resolution_of, runs
+from ..estimators.series import Series, clean_together, shared_times
 from ..response.fitting import GaitFit
 from ..results.artefact import EITHER, PLAY, STICK, DeadBand, Reversal
 from ..signals.columns import Columns
@@ -27,6 +26,8 @@ _NONE = 0.2
 
 _ALONG = 0.5
 """Share of the command's travel that a second sensor goes along with, before the play."""
+
+_WITNESSES = ("current", "effort", "reference")
 
 _INNER = 0.6
 """Part of a plateau away from arrest and onset."""
@@ -49,23 +50,15 @@ class Witness:
     second: Series | None
 
     @classmethod
-    def of(cls, columns: Columns, name: str, series: Callable[[Signal], Series]) -> Witness:
-        """Look for it.
-
-        Args:
-            columns: The session's columns.
-            series: Takes a signal into the form of the estimators.
-
-        Returns:
-            The motor's current before the effort, which may be the gear's.
-        """
-        effort, quantity = None, ""
-        for key in ("current", "effort"):
-            signal = columns.of(key).get(name)
-            if effort is None and signal is not None and np.isfinite(signal.values).any():
-                effort, quantity = series(signal), key
-        second = columns.reference.get(name)
-        return cls(effort, quantity, None if second is None else series(second))
+    def of(cls, columns: Columns, name: str, origin_ns: int) -> Witness:
+        """Return a joint's motor current, or else its effort, which may be the gear's."""
+        found = clean_together(
+            {key: columns.of(key)[name] for key in _WITNESSES if name in columns.of(key)}, origin_ns
+        )
+        quantity = next(
+            (key for key in ("current", "effort") if key in found and found[key].count), ""
+        )
+        return cls(found.get(quantity), quantity, found.get("reference"))
 
 
 def decide(cycles: Cycles, joint: int, one: Fitted, witness: Witness) -> tuple[str, str]:
@@ -115,7 +108,7 @@ def _slopes(over: FloatArray, values: FloatArray, rests: BoolArray) -> FloatArra
 
 
 def _sure(values: FloatArray) -> bool:
-    """Whether a mean over cycles differs from zero."""
+    """Return whether a mean over cycles differs from zero."""
     if values.size < _FEW:
         return False
     error = float(values.std(ddof=1)) / values.size**0.5
@@ -163,7 +156,7 @@ def rested(command: FloatArray, width: float, top: float, bottom: float) -> Floa
 def fundamental_change(
     t_s: FloatArray, command: FloatArray, followed: FloatArray, omega: float
 ) -> complex:
-    """Ratio of two fundamentals, by least squares.
+    """Return the ratio of two fundamentals, by least squares.
 
     Args:
         t_s: Times [s], shape (n,).
@@ -250,7 +243,7 @@ def _of_group(
 ) -> dict[str, DeadBand]:
     wave, ratio = _fundamentals(cycles, omega)
     amplitude, lag = np.abs(wave), -np.angle(ratio) % (2 * np.pi)
-    resolution = np.array([_resolution(one) for one in cycles.measured])
+    resolution = np.array([resolution_of(one) for one in cycles.measured])
     linear = np.array([_without(cycles, j, float(lag[j]), omega) for j in range(len(names))])
     hinted = (
         (np.abs(ratio) > _FOLLOWS)
@@ -278,8 +271,7 @@ def _of_group(
             continue
         rest_s = _rests(part, k, one, float(resolution[j]))
         if rest_s is not None:
-            witness = Witness.of(columns, names[j], lambda s: _series(s, origin_ns))
-            kind = decide(part, k, one, witness)
+            kind = decide(part, k, one, Witness.of(columns, names[j], origin_ns))
             found[names[j]] = _result(
                 one, part.commands[k], rest_s, omega, kind=kind, count=len(part.t_s)
             )
@@ -287,7 +279,7 @@ def _of_group(
 
 
 def _fundamentals(cycles: Cycles, omega: float) -> tuple[ComplexArray, ComplexArray]:
-    """Amplitudes of the commands, and of the positions over them."""
+    """Return the amplitudes of the commands, and of the positions over them."""
     back = np.exp(1j * omega * cycles.t_s[:, cycles.first :])
     waves: list[complex] = []
     ratios: list[complex] = []
@@ -332,13 +324,6 @@ def _without(cycles: Cycles, joint: int, lag: float, omega: float) -> tuple[floa
     return cost, 2 * abs(float(both[-1])), gain
 
 
-def _resolution(measured: FloatArray) -> float:
-    """The smallest step that a sensor shows; 0 where it shows none."""
-    step = np.abs(np.diff(measured, axis=1))
-    moved = step[step > 0]
-    return float(moved.min()) if moved.size else 0.0
-
-
 def _rests(
     cycles: Cycles, joint: int, one: Fitted, resolution: float
 ) -> tuple[float, float] | None:
@@ -373,10 +358,6 @@ def _rests(
         if float(np.median(crept[side])) > allowed:
             return None
     return float(np.median(found[0])), float(np.median(found[1]))
-
-
-def _series(signal: Signal, origin_ns: int) -> Series:
-    return clean(signal.name, signal.t_ns, signal.values, origin_ns)
 
 
 def _result(

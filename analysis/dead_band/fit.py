@@ -135,7 +135,7 @@ class _Candidates(NamedTuple):
 
 
 def _chosen(cycles: Cycles, joint: int, found: _Candidates, scales: _Scales) -> Fitted:
-    """The simplest model that none explains more than, with its intervals."""
+    """Return the simplest model that none explains more than, with its intervals."""
     index = np.array([joint])
     lefts = [misfit(cycles, index, one.parameters[np.newaxis]) for one in found.fits]
     independent = _independent(lefts[-1].residual[0])
@@ -247,7 +247,7 @@ def _levenberg(
 def _slopes(
     cycles: Cycles, joint: IntArray, values: FloatArray, ties: FloatArray, scales: _Scales
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals, shape (r, k, n), and their derivatives a unit, shape (r, m, k, n)."""
+    """Return the residuals, shape (r, k, n), and their derivatives a unit, shape (r, m, k, n)."""
     rows, n = values.shape
     nudge = scales.nudge[joint, :n]
     sets = np.repeat(values[:, np.newaxis], n + 1, axis=1)
@@ -278,7 +278,7 @@ def _mean(values: FloatArray) -> float:
 
 
 def _repeated(residual: FloatArray) -> float:
-    """Share of the mean cycle's residual that is the same in every cycle, 0 to 1."""
+    """Return the share of the mean cycle's residual that is the same in every cycle, 0 to 1."""
     mean = _mean(residual.mean(axis=0) ** 2)
     chance = _mean(residual.var(axis=0, ddof=1)) / len(residual)
     return max(0.0, 1 - chance / mean) if mean > 0 else 0.0
@@ -345,7 +345,7 @@ def _errors(
 
 
 def _jackknife(normals: FloatArray, pulls: FloatArray) -> FloatArray:
-    """Covariance from leaving out one group at a time, linearised; groups first."""
+    """Return the covariance from leaving out one group at a time, linearised; groups first."""
     total: FloatArray = normals.sum(axis=0)
     groups = len(normals)
     ridge = 1e-9 * np.diag(np.diag(total))

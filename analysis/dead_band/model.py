@@ -42,7 +42,7 @@ _TINY = 1e-300
 def follow(
     command: FloatArray, step_s: FloatArray, parameters: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """The follower z, exact for a command that is linear between samples.
+    """Return the follower z, exact for a command that is linear between samples.
 
     Args:
         command: u, r rows of k stretches of n samples [rad], shape (r, k, n).

@@ -78,7 +78,7 @@ def starts_of(t_s: FloatArray, edges_s: FloatArray) -> IntArray:
 
 
 def cycle_sums(values: FloatArray, starts: IntArray) -> FloatArray:
-    """Sums over the samples of each cycle.
+    """Return the sums over the samples of each cycle.
 
     Args:
         values: Samples in their last axis, shape (..., n).
@@ -123,7 +123,7 @@ class Drift:
 
 
 def worst_drift(series: list[Series], fit: HarmonicFit, channels: list[int]) -> Drift | None:
-    """The joint that drifts most, if they drift beyond doubt.
+    """Return the joint that drifts most, if they drift beyond doubt.
 
     Args:
         series: The responses, in the order of ``channels``.
@@ -158,7 +158,7 @@ def worst_drift(series: list[Series], fit: HarmonicFit, channels: list[int]) -> 
 
 
 def _each_cycle(one: Series, fit: HarmonicFit, channel: int) -> ComplexArray:
-    """Deviation of ln a from the fit in each whole cycle, shape (c,)."""
+    """Return the deviation of ln a from the fit in each whole cycle, shape (c,)."""
     amplitude = complex(fit.amplitudes[channel, 0])
     nothing = np.zeros(0, dtype=np.complex128)
     if amplitude == 0 or one.count < 2:

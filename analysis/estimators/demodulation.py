@@ -61,7 +61,7 @@ class Phase:
     value: FloatArray
 
     def at(self, t_s: FloatArray) -> FloatArray:
-        """The phase at other times.
+        """Return the phase at other times.
 
         Args:
             t_s: Times [s], any shape.
@@ -72,7 +72,7 @@ class Phase:
         return np.interp(t_s, self.t_s, self.value, left=np.nan, right=np.nan)
 
     def edges_s(self) -> FloatArray:
-        """Times of the ends of its whole cycles.
+        """Return the times of the ends of its whole cycles.
 
         Returns:
             Half a cycle from its beginning to half a cycle from its end [s], so that each cycle
@@ -131,7 +131,7 @@ def cycles_of(
     *,
     settled_s: float = -np.inf,
 ) -> Cycles:
-    """Response in each cycle of all runs, with its noise.
+    """Return the response in each cycle of all runs, with its noise.
 
     Args:
         edges: Edges of the cycles of each run [s], shapes (c + 1,).
@@ -189,7 +189,7 @@ def _difference_dof(count: int) -> float:
 
 
 def _amplitudes(one: Series, phase: Phase, edges_s: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Fundamental in each cycle, and its power as a share of all; each (c,)."""
+    """Return the fundamental in each cycle, and its power as a share of all; each (c,)."""
     count = edges_s.size - 1
     amplitude = np.full(count, np.nan, dtype=np.complex128)
     explained = np.zeros(count)
@@ -216,7 +216,7 @@ def _amplitudes(one: Series, phase: Phase, edges_s: FloatArray) -> tuple[Complex
 def _moments(
     phase: FloatArray, values: FloatArray, starts: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sums over each cycle, all that the fit needs."""
+    """Return the sums over each cycle, all that the fit needs."""
     count = starts.size - 1
     sums = np.empty((14, count))
     # So many cycles at a time that their rows stay in the processor's cache.

@@ -331,7 +331,7 @@ class HarmonicFit:
         return np.concatenate([trend, harmonic], axis=1)
 
     def predict(self, channel: int, t_s: FloatArray) -> FloatArray:
-        """The fitted model of one channel.
+        """Return the fitted model of one channel.
 
         Args:
             t_s: Times [s], any shape.

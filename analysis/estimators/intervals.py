@@ -106,49 +106,6 @@ def response_errors(
     return ResponseErrors(parts[0] - parts[1], rounding, turn)
 
 
-def contrast_variance(errors: ResponseErrors, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Variance of weighted sums of the joints' log gains.
-
-    Args:
-        errors: Of m joints.
-        weights: Real, shape (..., m).
-
-    Returns:
-        Variance of sum_i w_i ln|H_i| and its degrees of freedom, each of shape (...). Bins have
-        two degrees of freedom each; rounding is known without error.
-    """
-    return _variance(errors, weights, weights**2 @ errors.rounding[:, 0, 0])
-
-
-def lag_contrast_variance(
-    errors: ResponseErrors, weights: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Variance of weighted sums of the joints' lags.
-
-    But for rounding it is that of the log gains, and what the error of the shared frequency adds
-    where commands and responses were sampled at different times.
-
-    Args:
-        errors: Of m joints.
-        weights: Real, shape (..., m).
-
-    Returns:
-        Variance [rad^2] and its degrees of freedom, each of shape (...).
-    """
-    known = weights**2 @ errors.rounding[:, 1, 1] + (weights @ errors.turn) ** 2
-    return _variance(errors, weights, known)
-
-
-def _variance(
-    errors: ResponseErrors, weights: FloatArray, known: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """The variance in the bins plus a known one, and the degrees of freedom of the sum (Welch)."""
-    found = np.mean(np.abs(weights @ errors.bins) ** 2, axis=-1) / 2
-    total = np.maximum(found + known, 0.0)
-    share = np.divide(found, total, out=np.ones_like(found), where=total > 0)
-    return total, 2.0 * errors.bins.shape[1] / np.clip(share, 1e-6, 1.0) ** 2
-
-
 EQUIVALENT_GAIN = 0.02
 EQUIVALENT_LAG_RAD = np.pi / 180
 """Default margins: 2 % in gain, 1 degree in lag."""
@@ -177,7 +134,7 @@ CONFIDENCE = 0.95
 
 
 def welch_satterthwaite(variances: FloatArray, dof: FloatArray) -> FloatArray:
-    """Degrees of freedom of a sum of estimated variances (Welch, Biometrika 34, 1947).
+    """Return the degrees of freedom of a sum of estimated variances (Welch, Biometrika 34, 1947).
 
     Args:
         variances: Shape (parts, ...).
@@ -204,7 +161,7 @@ def t_factor(dof: float, confidence: float = CONFIDENCE) -> float:
 
 
 def around(value: float, half: float) -> Interval:
-    """The interval of a value with a half width."""
+    """Return the interval of a value with a half width."""
     return value - half, value + half
 
 
@@ -228,7 +185,7 @@ class Noisy(Protocol):
 
 
 def noise_draws(matrix: Noisy, seed: int) -> FloatArray:
-    """Errors that a measured matrix may have.
+    """Return the errors that a measured matrix may have.
 
     Returns:
         Student draws, shape (DRAWS, n, m). Where errors of a column are correlated their variances
@@ -277,7 +234,7 @@ def norm_ratio(
 def _norm(
     value: FloatArray | ComplexArray, noise: FloatArray | ComplexArray
 ) -> tuple[float, float]:
-    """The norm without what noise adds, and the quantile of the noise's own norm."""
+    """Return the norm without what noise adds, and the quantile of the noise's own norm."""
     sizes: FloatArray = np.linalg.norm(noise.reshape(len(noise), -1), axis=1).astype(np.float64)
     squared = float(np.linalg.norm(value)) ** 2 - float(np.mean(sizes**2))
     # Two norms share the 5 %.

@@ -98,7 +98,7 @@ def _common_step(apart: FloatArray, blur: float) -> float:
 
 
 def steady_noise(step: float, residual: float, level: float) -> float | None:
-    """Noise of a channel beside its rounding.
+    """Return the noise of a channel beside its rounding.
 
     Args:
         step: Of its lattice, 0 for none.
@@ -117,7 +117,7 @@ def steady_noise(step: float, residual: float, level: float) -> float | None:
 def rounding_covariance(
     one: Series, fit: HarmonicFit, channel: int, step: float, noise: float
 ) -> FloatArray:
-    """Covariance of the fundamental of a rounded channel.
+    """Return the covariance of the fundamental of a rounded channel.
 
     Draws differ in amplitude, and half of them in phase as well. Near its mean a small wave needs
     that to reach other steps; but a wave whose quarters mirror each other at the samples has only
@@ -160,7 +160,7 @@ def rounding_covariance(
 
 
 def not_negative(symmetric: FloatArray) -> FloatArray:
-    """The part of a symmetric matrix that is not negative.
+    """Return the part of a symmetric matrix that is not negative.
 
     Args:
         symmetric: Shape (n, n).

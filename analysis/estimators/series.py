@@ -51,7 +51,7 @@ class Series:
         return gaps_after(np.diff(self.t_s))
 
     def at(self, t_s: FloatArray) -> FloatArray:
-        """Values at other times, interpolated linearly; the ends are held.
+        """Return the values at other times, interpolated linearly; the ends are held.
 
         Args:
             t_s: Times [s], shape (k,).
@@ -64,7 +64,7 @@ class Series:
         return np.interp(t_s, self.t_s, self.values).astype(np.float64, copy=False)
 
     def between(self, start_s: float, stop_s: float) -> Series:
-        """The samples of a half-open window.
+        """Return the samples of a half-open window.
 
         Args:
             start_s: First time [s].
@@ -167,7 +167,7 @@ def _all_usual(step_s: FloatArray, longest_s: float) -> bool:
 
 
 def sample_weights(t_s: FloatArray, start_s: float, stop_s: float) -> FloatArray:
-    """Time that each sample stands for, so that ``sum(weights * f(t))`` integrates f.
+    """Return the time that each sample stands for, so that ``sum(weights * f(t))`` integrates f.
 
     Each sample stands for half the interval to either neighbour: the trapezoidal rule, with the
     window closed upon itself, so that over whole cycles of a periodic f it converges faster than

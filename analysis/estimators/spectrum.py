@@ -61,7 +61,7 @@ class Noise:
     covariance: FloatArray
 
     def along(self, direction: ComplexArray) -> FloatArray:
-        """Variance of each fundamental along a direction of the complex plane.
+        """Return the variance of each fundamental along a direction of the complex plane.
 
         Args:
             direction: Unit complex numbers, shape (K,).
@@ -121,7 +121,7 @@ class ResidualBins:
 
 
 def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> Noise:
-    """Noise of each channel's fundamental.
+    """Return the noise of each channel's fundamental.
 
     The periodogram is a direct sum over the actual sampling times, so it needs no even grid. Each
     bin is divided by what the fit left of it, e^H (1 - Phi (Phi^T Phi)^-1 Phi^T) e, which makes
@@ -138,7 +138,7 @@ def residual_noise(series: Sequence[Series], fit: HarmonicFit) -> Noise:
 
 
 def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise, ResidualBins]:
-    """Noise of each channel's fundamental, and the bins that it comes from.
+    """Return the noise of each channel's fundamental, and the bins that it comes from.
 
     Bins lie whole multiples of 2 pi / T beside omega. For the bins that all channels share, T is
     the shortest channel's; the noise of a channel that is longer by more than ``SAME_SPAN`` comes
@@ -192,7 +192,7 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
 def _rounded(
     series: Sequence[Series], fit: HarmonicFit, level: FloatArray
 ) -> list[tuple[int, FloatArray]]:
-    """Channels whose rounding no noise makes white, and the covariance that it makes."""
+    """Return the channels whose rounding no noise makes white, and the covariance that it makes."""
     found: list[tuple[int, float, float]] = []
     for k, one in enumerate(series):
         step = lattice_step(one.values)
@@ -227,7 +227,7 @@ def _common_bins(
 
 
 def omega_variance(fit: HarmonicFit, noise: Noise) -> tuple[float, float]:
-    """Variance of the shared frequency, from each channel's own noise.
+    """Return the variance of the shared frequency, from each channel's own noise.
 
     With information i, weight w and noise level s of each channel it is sum(w^2 i s) over
     sum(w i)^2; for white noise, where w s = 1, that is the inverse of the summed Fisher
@@ -305,14 +305,14 @@ class _Demodulated:
 
 
 def _span(one: Series) -> float:
-    """Length of a record, the last sample's own interval included [s]."""
+    """Return the length of a record, the last sample's own interval included [s]."""
     return float(one.t_s[-1] - one.t_s[0]) * one.count / max(one.count - 1, 1)
 
 
 def _demodulated(
     group: Sequence[Series], fit: HarmonicFit, members: Sequence[int], span: float
 ) -> _Demodulated:
-    """Residuals in the bins of a record of this length."""
+    """Return the residuals in the bins of a record of this length."""
     t_s = group[0].t_s
     side = bins_per_side(fit.omega * span / (2 * np.pi))
     transform = np.zeros((len(group), 2 * side), dtype=np.complex128)
@@ -333,7 +333,7 @@ def _demodulated(
 
 
 def _turned_rows(rows: FloatArray, edges: IntArray, model: HarmonicModel) -> ComplexArray:
-    """Sums over blocks of the basis rows times exp(-j omega t), shape (p, blocks).
+    """Return the sums over blocks of the basis rows times exp(-j omega t), shape (p, blocks).
 
     Of a harmonic they are those of its neighbours: cos(h x) exp(-j x) is half the sum of
     exp(j (h - 1) x) and exp(-j (h + 1) x), and -sin(h x) exp(-j x) is j / 2 of their difference.

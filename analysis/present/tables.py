@@ -76,7 +76,7 @@ class Column(Generic[Row]):
     note: str = ""
 
     def cells(self, rows: Sequence[Row], where: int) -> list[Cell]:
-        """The cells of the column.
+        """Return the cells of the column.
 
         Args:
             where: ``TERMINAL`` or ``PAGE``.
@@ -123,12 +123,12 @@ def _p(p: float | None) -> PValue | None:
 
 
 def _typical(most: int) -> Callable[[Sequence[Estimate]], int]:
-    """Digits that the typical interval of the column deserves."""
+    """Return the digits that the typical interval of the column deserves."""
     return partial(formats.decimals_for, most=most)
 
 
 def _significant(digits: int) -> Callable[[Sequence[Estimate]], int]:
-    """Digits that show so many of the column's largest value."""
+    """Return the digits that show so many of the column's largest value."""
     return lambda column: formats.decimals_for_values((one.value for one in column), digits)
 
 
@@ -143,7 +143,7 @@ _ENERGIES: tuple[tuple[str, str, Callable[[JointResult], float | None], int | No
 
 
 def joint_table(analysis: Analysis, joints: Sequence[JointResult]) -> Table[JointResult]:
-    """The response of joints, on a terminal with their energies.
+    """Return the response of joints, on a terminal with their energies.
 
     Args:
         joints: Those to show, in chain order.
@@ -196,7 +196,7 @@ def joint_table(analysis: Analysis, joints: Sequence[JointResult]) -> Table[Join
 
 
 def energy_table(joints: Sequence[JointResult]) -> Table[JointResult]:
-    """The energies of every joint over the analysed windows, all with the same digits."""
+    """Return the energies of every joint over the analysed windows, all with the same digits."""
     every = [Estimate(of(joint)) for _, _, of, _ in _ENERGIES for joint in joints]
     digits = _significant(4)(every)
     columns: list[Column[JointResult]] = [Column(None, "joint", lambda j: j.name, kind="word")]
@@ -289,7 +289,7 @@ def mirror_table(reversal: Reversal) -> Table[MirrorJoint]:
 
 
 def run_table(experiment: Experiment) -> Table[tuple[Run, Analysis]]:
-    """The sessions of an experiment."""
+    """Return the sessions of an experiment."""
 
     def start(session: Analysis) -> str:
         return formats.utc(session.session.start_ns).replace(" UTC", "")
@@ -330,7 +330,7 @@ def _place(place: str) -> str:
 
 
 def _side(one: Difference, value: float) -> str:
-    """The value of a side, with the digits and the unit of both."""
+    """Return the value of a side, with the digits and the unit of both."""
     factor = math.degrees(1) if one.unit == "rad" else 1.0
     unit = {"rad": "°", "1": ""}.get(one.unit, f" {one.unit}")
     digits = formats.decimals_for_values([one.a * factor, one.b * factor], 4)
@@ -343,7 +343,7 @@ def _difference(one: Difference) -> Quantity:
 
 
 def named_table(comparison: Comparison) -> Table[NamedJoint]:
-    """The joints that differ, the largest difference first."""
+    """Return the joints that differ, the largest difference first."""
     known = {(one.place, one.quantity): _difference(one) for one in comparison.differences}
     columns: list[Column[NamedJoint]] = [
         Column(None, "joint", lambda one: one.name, kind="word"),

@@ -1,4 +1,4 @@
-"""The result as text for a terminal: the answer first, then the joints, the method last."""
+"""Write results as text for a terminal: the answer first, the method last."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from undulog.capture.common.console import UNLIMITED, plain
 
 from ..results import formats
 from ..results.analysis import Analysis, EnergyResult
+from ..results.coupling import Coupling
 from ..results.estimate import Estimate
 from ..results.null_model import ModelledAnalysis, null_model_text
-from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, Link, LoopMode
+from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, LoopMode
 from . import tables
 from .tables import TERMINAL, Cell, Column, Ends, PValue, Quantity, Table
 
@@ -32,11 +33,7 @@ _SPANS = 3
 
 
 def more_lines(analysis: Analysis) -> Iterator[str]:
-    """Lines to print after the tables.
-
-    Yields:
-        Plain text without a line break.
-    """
+    """Yield the lines of text after the tables."""
     if analysis.energy is not None:
         yield from _energy(analysis.energy)
     yield from _over_time(analysis)
@@ -52,7 +49,7 @@ def more_lines(analysis: Analysis) -> Iterator[str]:
 
 
 def _dead_bands(analysis: Analysis) -> Iterator[str]:
-    """A line for each joint with stick or play: how far its command travels in vain."""
+    """Yield a line for each joint with stick or play: its dead band at both reversals."""
     for joint in analysis.joints:
         band = joint.dead_band
         if band is None:
@@ -91,7 +88,7 @@ def _energy(energy: EnergyResult) -> Iterator[str]:
 
 
 def _over_time(analysis: Analysis) -> Iterator[str]:
-    """The range of gain and lag over cycles, where there is no one gait to tell them for."""
+    """Yield the range of gain and lag over cycles if there is no single gait."""
     if analysis.over_time is None or analysis.gait.frequency_hz.value is not None:
         return
     known = [
@@ -111,11 +108,7 @@ def _over_time(analysis: Analysis) -> Iterator[str]:
 
 
 def chain_detail(chain: ChainCoupling) -> Iterable[str]:
-    """A chain of oscillators, told from its phases.
-
-    Yields:
-        Sentences; the first is the answer.
-    """
+    """Yield sentences on a chain of oscillators, the answer first."""
     where = f"Oscillators, {chain.plane}:"
     if not chain.identifiable:
         record = f" To decide it, record {chain.record}." if chain.record else ""
@@ -129,7 +122,8 @@ def chain_detail(chain: ChainCoupling) -> Iterable[str]:
         f"the strongest is {strongest.source} on {strongest.target}, "
         f"K = {formats.estimate(strongest.K, ' 1/s')}."
     )
-    yield f"K [1/s]: {'; '.join(_link(link) for link in chain.links)}."
+    couplings = [f"{one.source} on {one.target} {formats.estimate(one.K)}" for one in chain.links]
+    yield f"K [1/s]: {'; '.join(couplings)}."
     fed = [one for one in chain.oscillators if one.feedback.value is not None]
     if fed:
         told = ", ".join(f"{one.name} {formats.estimate(one.feedback)}" for one in fed)
@@ -138,11 +132,7 @@ def chain_detail(chain: ChainCoupling) -> Iterable[str]:
 
 
 def body_detail(body: BodyOscillators) -> Iterable[str]:
-    """What oscillators that feel their servos would do on this body.
-
-    Yields:
-        Sentences; the first is the answer.
-    """
+    """Yield sentences on oscillators with feedback from their servos, the answer first."""
     yield f"Oscillators that feel their servos: {body.answer}."
     worst = max(mode.sensitivity for mode in body.modes)
     noise = body.pseudospectrum.noise
@@ -153,19 +143,17 @@ def body_detail(body: BodyOscillators) -> Iterable[str]:
     )
 
 
-def _link(link: Link) -> str:
-    return f"{link.source} on {link.target} {formats.estimate(link.K)}"
+def unidentified(coupling: Coupling) -> str:
+    """Return why a coupling isn't identifiable, and what to record."""
+    record = f" To identify it, record {coupling.record}." if coupling.record else ""
+    return f"Coupling: not identifiable: {coupling.why}.{record}"
 
 
 class Sheet:
     """The text of a result for a terminal: sentences, wrapped, and tables."""
 
     def __init__(self, width: int, *, color: bool) -> None:
-        """Begin.
-
-        Args:
-            color: Whether to use bold and dim type.
-        """
+        """Make an empty sheet; with ``color`` it has bold and dim type."""
         from rich.console import Console
 
         self._text = StringIO()
@@ -180,15 +168,11 @@ class Sheet:
         )
 
     def print(self, line: str = "", style: str = "") -> None:
-        """Add a sentence.
-
-        Args:
-            line: Any text; what would end a line or control a terminal is escaped.
-        """
+        """Add a sentence; line ends and control characters are escaped."""
         self._console.print(plain(line), style=style)
 
     def table(self, table: tables.AnyTable) -> None:
-        """Add a table, without what it can spare where the terminal is too narrow for all of it."""
+        """Add a table; columns that can be spared are left out on a narrow terminal."""
         columns = [column for column in table.columns if column.text is not None]
         cells = zip(*(column.cells(table.rows, TERMINAL) for column in columns), strict=True)
         styles = ["bold" if table.bold(row) else "" for row in table.rows]
@@ -208,11 +192,7 @@ class Sheet:
             self.print(f"Without {names}: the terminal is too narrow; --json has all.", "dim")
 
     def text(self) -> str:
-        """Return all of it.
-
-        Returns:
-            Several lines, the last one ended.
-        """
+        """Return all lines, the last one ended."""
         return "\n".join(line.rstrip() for line in self._text.getvalue().splitlines()) + "\n"
 
 
@@ -232,14 +212,11 @@ def _shown(cell: Cell) -> str:
 
 
 def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -> str:
-    """Set a result as text.
+    """Return a session's result as text.
 
     Args:
-        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
+        width: Columns of the terminal: sentences wrap, tables leave out spare columns.
         color: Whether to use bold and dim type.
-
-    Returns:
-        Several lines, the last one ended.
     """
     sheet = Sheet(width, color=color)
     name, answer = Path(analysis.session.path).name, analysis.answer
@@ -257,10 +234,8 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     sheet.print()
     for line in more_lines(analysis):
         sheet.print(line)
-    coupling = analysis.coupling
-    if not coupling.identifiable:
-        record = f" To identify it, record {coupling.record}." if coupling.record else ""
-        sheet.print(f"Coupling: not identifiable: {coupling.why}.{record}")
+    if not analysis.coupling.identifiable:
+        sheet.print(unidentified(analysis.coupling))
     for chain in analysis.oscillators:
         for line in chain_detail(chain):
             sheet.print(line)
@@ -301,14 +276,7 @@ _PART = 0.5
 
 
 def render_loop(loop: ClosedLoop, *, width: int = UNLIMITED, color: bool = False) -> str:
-    """Set a prediction as text.
-
-    Args:
-        color: Whether to use bold and dim type.
-
-    Returns:
-        Several lines, the last one ended.
-    """
+    """Return a prediction as text; see :func:`render`."""
     sheet = Sheet(width, color=color)
     sheet.print(formats.sentence(loop.answer), "bold")
     for line in loop.limits:
@@ -350,7 +318,7 @@ def _time(rate: float) -> str:
 
 
 def _mostly(mode: LoopMode, joints: tuple[str, ...]) -> str:
-    """Joints with most of a pattern, and their signs against the largest."""
+    """Return the joints with most of a pattern, with their signs relative to the largest."""
     share = np.array(mode.pattern_abs)
     turn = np.array(mode.pattern_rad) - mode.pattern_rad[int(np.argmax(share))]
     return " ".join(

@@ -1,10 +1,11 @@
-"""An experiment as text for a terminal: the answer first, then mirror pairs and runs."""
+"""Write experiments and comparisons as text for a terminal, the answer first."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Literal
 
 from undulog.capture.common.console import UNLIMITED, plain
 
@@ -17,7 +18,7 @@ from ..results.coupling import LinearCoupling, LocalCoupling
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, FloorTilt, Headings, Reversal
 from .tables import difference_table, mirror_table, run_table, waveform_table
-from .text import Sheet, body_detail
+from .text import Sheet, body_detail, unidentified
 
 MOST_CHANGES = 12
 """Lines of what was changed; the rest is in the JSON."""
@@ -32,15 +33,7 @@ _DESIGNS = {
 def render_comparison(
     comparison: Comparison, *, width: int = UNLIMITED, color: bool = False
 ) -> str:
-    """Set a comparison as text.
-
-    Args:
-        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
-        color: Whether to use bold and dim type.
-
-    Returns:
-        Several lines, the last one ended.
-    """
+    """Return a comparison as text; see :func:`.text.render`."""
     sheet = Sheet(width, color=color)
     sheet.print(f"{comparison.answer}.", "bold")
     for side, sessions in (("A", comparison.a), ("B", comparison.b)):
@@ -78,13 +71,10 @@ def _changed(changed: tuple[Change, ...]) -> list[str]:
 
 
 def margin_text(one: Equivalence, value: float | None = None) -> str:
-    """A margin, or a difference that is held to it, in the unit people read.
+    """Return a difference in readable units, e.g. ``2 %``, ``0.35°`` or ``0.01 J``.
 
     Args:
         value: In the test's unit; its margin if None.
-
-    Returns:
-        For example ``2 %``, ``0.35°`` or ``0.01 J``.
     """
     factor, unit = {"rad": (math.degrees(1), "°"), "1": (1.0, "")}.get(
         one.unit, (1.0, f" {one.unit}")
@@ -105,11 +95,7 @@ def _equivalence(comparison: Comparison) -> str:
 
 
 def comparison_method(comparison: Comparison) -> str:
-    """How a comparison was made.
-
-    Returns:
-        One sentence, beginning in lower case.
-    """
+    """Return the method of a comparison as one sentence, beginning in lower case."""
     return (
         f"aligned by gait phase; {_DESIGNS[comparison.design]}; decisions over all "
         f"{len(comparison.differences)} quantities after Holm at "
@@ -120,21 +106,13 @@ def comparison_method(comparison: Comparison) -> str:
 
 
 _MANY_TONES = ("no gait:", "no body motion", "no joint's gain and lag are known")
-"""How warnings begin that every run of a multisine has: it is no gait, and isn't meant to be."""
+"""Beginnings of warnings that every run of a multisine has, since it is no gait."""
 
 
 def render_experiment(
     experiment: Experiment, *, width: int = UNLIMITED, color: bool = False
 ) -> str:
-    """Set an experiment as text.
-
-    Args:
-        width: Columns of the terminal: sentences wrap there, tables leave out what they can spare.
-        color: Whether to use bold and dim type.
-
-    Returns:
-        Several lines, the last one ended.
-    """
+    """Return an experiment as text; see :func:`.text.render`."""
     sheet = Sheet(width, color=color)
     count = len(experiment.sessions)
     sheet.print(f"{count} session{'s' if count > 1 else ''}: {experiment.answer}.", "bold")
@@ -156,21 +134,19 @@ def render_experiment(
     sheet.print()
     sheet.table(run_table(experiment))
     sheet.print()
-    own = [f"{warning} ({names})" for warning, names in by_warning(experiment)]
+    own = [f"{warning} ({names})" for warning, names in by_sentence(experiment, "warnings")]
     for warning in (*experiment.warnings, *own):
         sheet.print(f"Warning: {warning}")
-    coupling = experiment.coupling
-    if not coupling.identifiable:
-        record = f" To identify it, record {coupling.record}." if coupling.record else ""
-        sheet.print(f"Coupling: not identifiable: {coupling.why}.{record}")
+    if not experiment.coupling.identifiable:
+        sheet.print(unidentified(experiment.coupling))
     sheet.print(f"Method: {method(experiment)}", "dim")
-    for note, names in by_note(experiment):
+    for note, names in by_sentence(experiment, "notes"):
         sheet.print(f"Note: {note} ({names})", "dim")
     return sheet.text()
 
 
 def reversal_detail(reversal: Reversal) -> Iterable[str]:
-    """What stands below the answer."""
+    """Yield sentences on the pairs, the tilt of the floor and the shares of the spread."""
     for pair in reversal.pairs:
         yield (
             f"{pair.name} against its mirror {pair.mirror}, over both directions: "
@@ -197,7 +173,7 @@ def reversal_detail(reversal: Reversal) -> Iterable[str]:
 
 
 def _tilt(tilt: FloorTilt, middle: str | None) -> str:
-    """What speaks for and against a tilted floor."""
+    """Return the evidence for and against a tilted floor."""
     lean = ""
     if tilt.gravity_rad.value is not None:
         fall = formats.estimate(formats.degrees(tilt.gravity_rad), "°", most=2)
@@ -220,33 +196,22 @@ def _lag(lag_rad: Estimate) -> str:
     return formats.estimate(formats.degrees(lag_rad), "°", most=2)
 
 
-def by_warning(experiment: Experiment) -> list[tuple[str, str]]:
-    """Return the sessions' own warnings, each once, without what the experiment itself answers.
-
-    Returns:
-        Warning, and the names of the files that have it, or ``all sessions``.
-    """
-    return _by_sentence(experiment, [one.warnings for one in experiment.sessions])
-
-
-def by_note(experiment: Experiment) -> list[tuple[str, str]]:
-    """Return the sessions' own notes, each once, without what the experiment itself answers.
-
-    Returns:
-        Note, and the names of the files that have it, or ``all sessions``.
-    """
-    return _by_sentence(experiment, [one.notes for one in experiment.sessions])
-
-
-def _by_sentence(
-    experiment: Experiment, sentences: Sequence[Sequence[str]]
+def by_sentence(
+    experiment: Experiment, kind: Literal["warnings", "notes"]
 ) -> list[tuple[str, str]]:
+    """Return the sessions' own warnings or notes, each once.
+
+    Sentences on what the experiment itself answers are left out.
+
+    Returns:
+        Sentence, and the names of its files, or ``all sessions``.
+    """
     expected = ["boundary or module:"]
     if isinstance(experiment.coupling, LinearCoupling) and experiment.coupling.plan == "multisine":
         expected += _MANY_TONES
     files: dict[str, list[str]] = {}
-    for session, own in zip(experiment.sessions, sentences, strict=True):
-        for sentence in own:
+    for session in experiment.sessions:
+        for sentence in getattr(session, kind):
             if not sentence.startswith(tuple(expected)):
                 files.setdefault(sentence, []).append(Path(session.session.path).name)
     everyone = len(experiment.sessions)
@@ -257,11 +222,7 @@ def _by_sentence(
 
 
 def method(experiment: Experiment) -> str:
-    """How the numbers of an experiment were made.
-
-    Returns:
-        One sentence, beginning in lower case.
-    """
+    """Return the method of an experiment as one sentence, beginning in lower case."""
     coupling = experiment.coupling
     if isinstance(coupling, LocalCoupling):
         return _kick_method(coupling)

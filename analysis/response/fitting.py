@@ -83,10 +83,6 @@ class GaitFit:
                 return index
         return None
 
-    def command_of(self, joint: str) -> int:
-        """Index of a driven joint's command in the fit."""
-        return self.driven.index(joint)
-
 
 @dataclass(frozen=True)
 class _Channels:
@@ -112,7 +108,11 @@ def fit_gait(
     """
     known = list((commands or responses).values())
     kind = "commands" if commands else "responses"
-    found = find_groups(known, duration_s) if commands else _common_rhythm(known, duration_s)
+    if commands:
+        found = find_groups(known, duration_s)
+    else:  # through the body each response has the tones of all groups
+        rhythm = find_rhythm(known, duration_s)
+        found = None if rhythm is None else Groups((rhythm,), rhythm.explained)
     if found is None or found.explained < MIN_EXPLAINED:
         warn(Lacking(_no_gait(known, found, kind, duration_s)))
         return None
@@ -132,16 +132,10 @@ def fit_gait(
     return replace(groups[0], others=tuple(groups[1:]))
 
 
-def _common_rhythm(series: Sequence[Series], duration_s: float) -> Groups | None:
-    """One rhythm of all responses: through the body each has the tones of all groups."""
-    rhythm = find_rhythm(series, duration_s)
-    return None if rhythm is None else Groups((rhythm,), rhythm.explained)
-
-
 def _select(
     commands: Mapping[str, Series], responses: Mapping[str, Series], found: Groups, warn: Warn
 ) -> tuple[list[_Channels], dict[str, float]]:
-    """Channels of each group's driven joints, and the amplitudes of all commands."""
+    """Return the channels of each group's driven joints, and the amplitudes of all commands."""
     several = len(found.rhythms) > 1
     least = max(MIN_SAMPLES, 2 * HARMONICS * len(found.rhythms) + 2 if several else 0)
     group_of = {name: k for k, one in enumerate(found.rhythms) for name in one.names}
@@ -221,7 +215,7 @@ def _fit_groups(
 def _group_fit(
     group: _Channels, fit: HarmonicFit, amplitudes: Mapping[str, float], warn: Warn
 ) -> GaitFit:
-    """Response of a group's joints, with its noise."""
+    """Return the response of a group's joints, with its noise."""
     moved, answered, channels = group.driven, group.answered, group.series
     noise, bins = residual_spectrum(channels, fit)
     variance, dof = omega_variance(fit, noise)

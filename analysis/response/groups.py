@@ -139,12 +139,12 @@ def _lively(fit: HarmonicFit) -> BoolArray:
 
 
 def _own(fit: HarmonicFit) -> BoolArray:
-    """Whether the common rhythm is each channel's own and not a subharmonic of it."""
+    """Return whether the common rhythm is each channel's own and not a subharmonic of it."""
     return (fit.explained >= _CLEAR) & (_fundamental_share(fit) >= _OWN_SHARE)
 
 
 def _fundamental_share(fit: HarmonicFit) -> FloatArray:
-    """Share of the fundamental in the power of each channel's harmonics, shape (K,)."""
+    """Return the share of the fundamental in the power of each channel's harmonics, shape (K,)."""
     power = np.abs(fit.amplitudes) ** 2
     total = power.sum(axis=1)
     return np.divide(power[:, 0], total, out=np.zeros_like(total), where=total > 0)
@@ -163,7 +163,7 @@ def _clusters(tones: Sequence[_Tone], apart: float) -> list[list[_Tone]]:
 
 
 def _one_rhythm(cluster: Sequence[_Tone], same: float) -> tuple[Rhythm | None, Unresolved | None]:
-    """The rhythm of a cluster, and whether it holds frequencies that differ."""
+    """Return the rhythm of a cluster, and whether it holds frequencies that differ."""
     parts: list[list[_Tone]] = [[cluster[0]]]
     for before, after in pairwise(cluster):
         doubt = _SIGMAS * float(np.hypot(before.error, after.error))

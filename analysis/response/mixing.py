@@ -72,7 +72,7 @@ class MixedTone:
 def group_model(
     series: Sequence[Series], omegas: Sequence[float], group: int, duration_s: float
 ) -> HarmonicModel:
-    """The basis of a group's channels: own harmonics, and those of the other groups.
+    """Return the basis of a group's channels: own harmonics, and those of the other groups.
 
     Args:
         omegas: Angular frequencies of all groups [rad/s].
@@ -89,7 +89,7 @@ def group_model(
 def further_lines(
     omegas: Sequence[float], group: int, harmonics: int, highest: float, duration_s: float
 ) -> tuple[float, ...]:
-    """Frequencies of the other groups' harmonics, for the model of one group's channels.
+    """Return the frequencies of the other groups' harmonics, for the model of one group's channels.
 
     Args:
         omegas: Angular frequencies of all groups [rad/s].

@@ -55,12 +55,15 @@ class Response:
         lag = -np.angle(self.ratio)
         return np.where(lag <= -np.pi, np.pi, lag)
 
-    def select(self, chosen: Sequence[int]) -> Response:
-        """Some of the joints.
+    @property
+    def lag_near_mean_rad(self) -> FloatArray:
+        """Lags within pi of their circular mean [rad], shape (m,)."""
+        lag = self.lag_rad
+        mean = np.angle(np.mean(np.exp(1j * lag)))
+        return np.asarray(mean + np.angle(np.exp(1j * (lag - mean))), dtype=np.float64)
 
-        Args:
-            chosen: Indices, k of them.
-        """
+    def select(self, chosen: Sequence[int]) -> Response:
+        """Return the response of the joints with these indices."""
         index = np.asarray(chosen, dtype=np.int64)
         return Response(
             self.ratio[index],
@@ -81,7 +84,7 @@ def respond(
     delay_between_s: FloatArray | float = 0.0,
     bins: tuple[ResidualBins, ResidualBins] | None = None,
 ) -> Response:
-    """Response of each joint to its command.
+    """Return the response of each joint to its command.
 
     The error of the shared frequency turns both phases alike, except for the distance between
     the mean sampling times of the two channels.
@@ -130,7 +133,7 @@ def respond(
 
 
 def gain_estimate(response: Response, joint: int) -> Estimate:
-    """Gain with its interval, symmetric in log gain.
+    """Return the gain with its interval, symmetric in log gain.
 
     Returns:
         The estimate; empty where the joint has no response.
@@ -143,7 +146,7 @@ def gain_estimate(response: Response, joint: int) -> Estimate:
 
 
 def lag_estimate(response: Response, joint: int) -> Estimate:
-    """Lag with its interval.
+    """Return the lag with its interval.
 
     Of an amplitude |a| with standard error s across its direction, |a| sin(error) / s is
     Student's t exactly, so the half width is arcsin(t s / |a|).

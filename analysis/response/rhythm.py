@@ -94,7 +94,7 @@ def find_rhythm(series: Sequence[Series], duration_s: float) -> Rhythm | None:
 
 
 def allowed_model(series: Sequence[Series], omega: float, trend: int = 0) -> HarmonicModel:
-    """The basis that the slowest channel's sampling rate allows.
+    """Return the basis that the slowest channel's sampling rate allows.
 
     Args:
         omega: Angular frequency [rad/s].
@@ -125,7 +125,7 @@ def driven(fit: HarmonicFit) -> tuple[BoolArray, BoolArray]:
 
 
 def phase_step(fundamentals: ComplexArray) -> float:
-    """Mean phase step from joint to joint, signed as in Eq. 2.
+    """Return the mean phase step from joint to joint, signed as in Eq. 2.
 
     Args:
         fundamentals: Complex amplitudes of one plane's commands, head to tail, shape (k,), k > 1.
@@ -167,7 +167,7 @@ def _liveliest(series: Sequence[Series]) -> list[Series]:
 
 
 def _refined(scouts: Sequence[Series], series: Sequence[Series], omega: float) -> Rhythm | None:
-    """The rhythm of the scouts near a frequency, and what it explains of all channels."""
+    """Return the rhythm of the scouts near a frequency, and what it explains of all channels."""
     model = allowed_model(series, omega)
     if any(one.count <= model.size + 1 for one in series):
         return None
@@ -180,7 +180,7 @@ def _refined(scouts: Sequence[Series], series: Sequence[Series], omega: float) -
 
 
 def _periodogram_peak(scouts: Sequence[Series], duration_s: float) -> float | None:
-    """Peak of the channels' summed periodogram [rad/s].
+    """Return the peak of the channels' summed periodogram [rad/s].
 
     Only a starting point: the channels are interpolated to an even grid and tapered, and the
     Gauss-Newton fit does the rest on the true times.

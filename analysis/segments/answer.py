@@ -18,7 +18,7 @@ from undulog.capture.following.fault import KINDS as FAULT_KINDS
 from ..results import formats
 from ..results.analysis import GaitFacts, Index, JointResult
 from ..results.answer import Answer, NotFollowing, Shape, StandOut, Verdict
-from ..results.estimate import Estimate
+from ..results.estimate import Estimate, Interval
 from .examine import Findings
 
 NAMED = 4
@@ -81,12 +81,10 @@ def compose(facts: Facts) -> Answer:
         verdict = Verdict.UNLIKE
         detail = _responding(facts, known) + _caveat(facts.joints)
     findings = facts.findings
-    compared = set(findings.compared)
-    everyone = bool(facts.commanded) and set(facts.commanded) <= compared
     alike: bool | None = None
     if first or findings.shape or findings.undecided:
         alike = False
-    if verdict is Verdict.ALIKE and everyone:
+    if verdict is Verdict.ALIKE and facts.commanded and _everyone(facts):
         alike = True
     return Answer(
         verdict=verdict,
@@ -94,16 +92,16 @@ def compose(facts: Facts) -> Answer:
         detail=detail,
         not_following=facts.not_following,
         stand_out=findings.stand_out,
-        undecided=_undecided(findings, facts) or None,
+        undecided=_undecided(facts) or None,
         shape=findings.shape,
         alike=alike,
-        compared=len(compared),
+        compared=len(set(findings.compared)),
         commanded=len(facts.commanded),
     )
 
 
 def find(indices: Mapping[str, Index], stem: str) -> dict[str, Index]:
-    """The indices of one kind that have a value, by plane and group.
+    """Return the indices of one kind that have a value, by plane and group.
 
     Args:
         indices: Name to index; where both planes are driven, names end in the plane, where joints
@@ -143,19 +141,21 @@ def fault_in_words(fault: NotFollowing) -> str:
     """
     if fault.kinds == ("lost_samples",):
         return f"{plain(fault.joint)} {fault.evidence}"
-    when = ""
-    if fault.since_s is not None and fault.until_s is None:
-        when = f" from {fault.since_s:.1f} s on"
-    elif fault.since_s is None and fault.until_s is not None:
-        when = f" until {fault.until_s:.1f} s"
-    elif fault.since_s is not None and fault.until_s is not None:
-        share = max(1.0, 100 * fault.share)
-        when = f" for {share:.0f} % of the time from {fault.since_s:.1f} to {fault.until_s:.1f} s"
+    match fault.since_s, fault.until_s:
+        case None, None:
+            when = ""
+        case since, None:
+            when = f" from {since:.1f} s on"
+        case None, until:
+            when = f" until {until:.1f} s"
+        case since, until:
+            share = max(1.0, 100 * fault.share)
+            when = f" for {share:.0f} % of the time from {since:.1f} to {until:.1f} s"
     return f"{plain(fault.joint)} does not follow its command{when}: {kinds_in_words(fault.kinds)}"
 
 
 def _named(facts: Facts) -> str:
-    """The joints that do not follow, then those that stand out; empty for none."""
+    """Return the joints that do not follow, then those that stand out; empty for none."""
     clauses = [fault_in_words(each) for each in facts.not_following[:NAMED]]
     if len(facts.not_following) > NAMED:
         names = [plain(each.joint) for each in facts.not_following[NAMED:]]
@@ -169,7 +169,7 @@ def _named(facts: Facts) -> str:
     if len(by_joint) > NAMED:
         names = [plain(joint) for joint in list(by_joint)[NAMED:]]
         clauses.append(f"{', '.join(names)} respond differently, too")
-    undecided = _undecided(facts.findings, facts)
+    undecided = _undecided(facts)
     if undecided:
         clauses.append(undecided)
     # A joint's name keeps its letters at the beginning, too: a reader searches for it.
@@ -187,10 +187,10 @@ def _left_out(facts: Facts) -> str:
     return f"Not compared: {listed}."
 
 
-def _undecided(findings: Findings, facts: Facts) -> str:
-    if not findings.undecided:
+def _undecided(facts: Facts) -> str:
+    if not facts.findings.undecided:
         return ""
-    word = _joints_word(facts, *findings.undecided[0])
+    word = _joints_word(facts, *facts.findings.undecided[0])
     return f"the {word} differ, but with fewer than 4 sound ones it can't be decided which one"
 
 
@@ -200,16 +200,20 @@ def deviation_in_words(each: StandOut) -> str:
     Returns:
         For example ``gain 20.1 % [18.9, 21.2] less``.
     """
-    sign = -1.0 if each.deviation < 0 else 1.0
-    low, high = sorted(sign * end for end in each.ci95)
-    size = Estimate(sign * each.deviation, (low, high))
-    if each.quantity == "gain":
-        text = formats.estimate(formats.scaled(size, 100.0), " %", most=2)
-        return f"gain {text} {'less' if sign < 0 else 'more'}"
-    text = formats.estimate(formats.degrees(size), "°", most=2)
+    negative, text = each.deviation < 0, _size_in_words(each.quantity, each.deviation, each.ci95)
     if each.quantity == "offset":
-        return f"its mean {text} {'below' if sign < 0 else 'above'} its command's"
-    return f"lag {text} {'less' if sign < 0 else 'more'}"
+        return f"its mean {text} {'below' if negative else 'above'} its command's"
+    return f"{each.quantity} {text} {'less' if negative else 'more'}"
+
+
+def _size_in_words(quantity: str, value: float, ci95: Interval) -> str:
+    """Return the magnitude of a difference with its interval, in percent or degrees."""
+    sign = -1.0 if value < 0 else 1.0
+    low, high = sorted(sign * end for end in ci95)
+    size = Estimate(sign * value, (low, high))
+    if quantity == "gain":
+        return formats.estimate(formats.scaled(size, 100.0), " %", most=2)
+    return formats.estimate(formats.degrees(size), "°", most=2)
 
 
 def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str]:
@@ -231,11 +235,8 @@ def _single(facts: Facts, joint: JointResult, *, named: bool) -> tuple[Verdict, 
     lag = formats.estimate(formats.degrees(joint.lag_rad), "°", most=2)
     lead = f"{'One other' if named else 'One'} joint was driven: its gain is "
     lead += f"{formats.estimate(joint.gain)}, its lag {lag} behind the command."
-    return (
-        Verdict.SINGLE,
-        lead,
-        "There is no second joint to compare it with." + _caveat(facts.joints),
-    )
+    detail = "There is no second joint to compare it with." + _caveat(facts.joints)
+    return Verdict.SINGLE, lead, detail
 
 
 def _compared(facts: Facts, *, named: bool) -> tuple[Verdict, str]:
@@ -261,7 +262,7 @@ def _everyone(facts: Facts) -> bool:
 
 
 def _shapes(facts: Facts) -> str:
-    """The largest shape of lag and of gain of each plane."""
+    """Return the largest shape of lag and of gain of each plane."""
     clauses: list[str] = []
     chains = dict.fromkeys((each.plane, each.group) for each in facts.findings.shape)
     for plane, group in sorted(chains):
@@ -280,41 +281,26 @@ def _shapes(facts: Facts) -> str:
 
 
 def _shape(shape: Shape, joints: str) -> str:
-    """One shape with its simultaneous interval."""
-    sign = -1.0 if shape.value < 0 else 1.0
-    low, high = sorted(sign * end for end in shape.ci95)
-    size = Estimate(sign * shape.value, (low, high))
-    lag = shape.quantity == "lag"
-    text = (
-        formats.estimate(formats.degrees(size), "°", most=2)
-        if lag
-        else formats.estimate(formats.scaled(size, 100.0), " %", most=2)
-    )
+    """Return a shape with its simultaneous interval as a clause."""
+    negative, lag = shape.value < 0, shape.quantity == "lag"
+    text = _size_in_words(shape.quantity, shape.value, shape.ci95)
+    more = "less" if negative else "more"
     if shape.kind == "ends":
-        late = f"the middle {joints}" if sign < 0 else f"the {joints} at the ends"
-        other = "the ends" if sign < 0 else "the middle"
-        return (
-            f"{late} lag {text} more than {other}"
-            if lag
-            else (
-                f"the gain of {late} is {text} {'more' if sign > 0 else 'less'}"
-                if sign > 0
-                else f"the gain at the ends is {text} less than in the middle"
-            )
-        )
+        if lag and negative:
+            return f"the middle {joints} lag {text} more than the ends"
+        if lag:
+            return f"the {joints} at the ends lag {text} more than the middle"
+        at = f"the gain at the ends is {text} less than in the middle"
+        return at if negative else f"the gain of the {joints} at the ends is {text} more"
     if shape.kind == "trend":
-        grows = "grows" if sign > 0 else "falls"
+        grows = "falls" if negative else "grows"
         return f"the {shape.quantity} of the {joints} {grows} by {text} from head to tail"
     if shape.kind == "mirror":
-        more = "more" if sign > 0 else "less"
-        verb = "lag" if lag else "have"
-        tail = f"{text} {more}" if lag else f"{text} {more} gain"
-        return f"the outer {joints} {verb} {tail} than the inner ones, alike on both sides"
-    # Which one it is most stands in the table: one of many sound joints always is.
-    return (
-        f"each of the {joints} has a {shape.quantity} of its own, up to {text} "
-        f"{'more' if sign > 0 else 'less'} than the others"
-    )
+        what = f"lag {text} {more}" if lag else f"have {text} {more} gain"
+        return f"the outer {joints} {what} than the inner ones, alike on both sides"
+    # The table names the joint with the largest: one of many sound joints always has it.
+    own = f"each of the {joints} has a {shape.quantity} of its own"
+    return f"{own}, up to {text} {more} than the others"
 
 
 def _joints_word(facts: Facts, plane: str, group: int) -> str:
@@ -359,7 +345,7 @@ def _caveat(joints: Sequence[JointResult]) -> str:
 
 
 def _why_not(facts: Facts, lacking: str) -> str:
-    """The warning that says what is lacking, or else speaks of a gait, or the first."""
+    """Return the warning that says what is lacking, or else speaks of a gait, or the first."""
     if not facts.warnings:
         return "The result gives no reason."
     verdict = [one for one in facts.warnings if lacking in one and "held still" not in one]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -110,7 +110,7 @@ def examine(chains: Iterable[Chain]) -> Findings:
             if chain.names[each.joint] in chain.loaded:
                 continue
             excluded[id(chain)].add(each.joint)
-            out.append(_stand_out(chain, quantity, each, critical))
+            out.append(_stand_out(chain, each.joint, quantity, each, critical))
     for chain in some:
         out += _offset(chain, critical)
     for chain, quantity, profile in profiles:
@@ -136,13 +136,10 @@ def examine(chains: Iterable[Chain]) -> Findings:
 
 
 def profile_of(chain: Chain, quantity: str) -> Profile:
-    """The profile of one quantity along a chain.
+    """Return the profile of one quantity along a chain.
 
     Args:
         quantity: ``gain`` (as its logarithm) or ``lag``.
-
-    Returns:
-        The profile; lags lie within pi of their circular mean.
 
     Raises:
         ValueError: If the response carries no errors.
@@ -152,20 +149,15 @@ def profile_of(chain: Chain, quantity: str) -> Profile:
         raise ValueError("the response carries no errors to judge contrasts by")
     gains, lags = chain.errors
     place = np.array([chain.commanded.index(name) for name in chain.names], dtype=np.float64)
+    count = len(chain.commanded)
     if quantity == "gain":
-        values = np.asarray(np.log(response.gain), dtype=np.float64)
-        scatter = gains
-    else:
-        mean = np.angle(np.mean(np.exp(1j * response.lag_rad)))
-        turned = mean + np.angle(np.exp(1j * (response.lag_rad - mean)))
-        values = np.asarray(turned, dtype=np.float64)
-        scatter = lags
-    margin = math.log1p(_MARGINS["gain"]) if quantity == "gain" else _MARGINS["lag"]
-    return Profile(place, len(chain.commanded), values, scatter, margin)
+        margin = math.log1p(_MARGINS["gain"])
+        return Profile(place, count, np.log(response.gain), gains, margin)
+    return Profile(place, count, response.lag_near_mean_rad, lags, _MARGINS["lag"])
 
 
 def _offset(chain: Chain, critical: float) -> list[StandOut]:
-    """Joints whose mean stands off their command's as no other joint's does.
+    """Return the joints whose mean stands off their command's as no other joint's does.
 
     Their errors come from the scatter between cycles, so they are outside the family of gain and
     lag; the margin is many times what noise makes of a mean.
@@ -182,23 +174,14 @@ def _offset(chain: Chain, critical: float) -> list[StandOut]:
     place = np.array([chain.commanded.index(chain.names[k]) for k in index], dtype=np.float64)
     scatter = Scatter(columns, nothing, nothing)
     profile = Profile(place, len(chain.commanded), values, scatter, OFFSET_RAD)
-    found = standing_out(profile, critical)
     return [
-        StandOut(
-            chain.names[index[each.joint]],
-            chain.plane,
-            chain.group,
-            0,
-            "offset",
-            each.value,
-            (each.value - critical * each.error, each.value + critical * each.error),
-        )
-        for each in found
+        _stand_out(chain, index[each.joint], "offset", each, critical)
+        for each in standing_out(profile, critical)
     ]
 
 
 def _alike(chain: Chain, excluded: set[int]) -> bool:
-    """Whether the equivalence tests of gain and lag pass for the rest of a chain."""
+    """Return whether the equivalence tests of gain and lag pass for the rest of a chain."""
     index = [k for k in range(len(chain.names)) if k not in excluded]
     if len(index) < 2:
         return False
@@ -224,10 +207,11 @@ def _interval(value: float, half: float, quantity: str) -> tuple[float, tuple[fl
     return value, (value - half, value + half)
 
 
-def _stand_out(chain: Chain, quantity: str, each: Deviation, critical: float) -> StandOut:
+def _stand_out(
+    chain: Chain, joint: int, quantity: str, each: Deviation, critical: float
+) -> StandOut:
     value, ci95 = _interval(each.value, critical * each.error, quantity)
-    name = chain.names[each.joint]
-    return StandOut(name, chain.plane, chain.group, 0, quantity, value, ci95)
+    return StandOut(chain.names[joint], chain.plane, chain.group, 0, quantity, value, ci95)
 
 
 def _shape(chain: Chain, quantity: str, each: Contrast, critical: float) -> Shape:
@@ -237,20 +221,7 @@ def _shape(chain: Chain, quantity: str, each: Contrast, critical: float) -> Shap
 
 
 def _ranked(out: Sequence[StandOut]) -> tuple[StandOut, ...]:
-    """Joints ranked by their largest deviation; both quantities of a joint have its rank."""
-    ranks: Mapping[str, int] = {
-        name: k for k, name in enumerate(dict.fromkeys(each.joint for each in out), start=1)
-    }
-    ranked = [
-        StandOut(
-            each.joint,
-            each.plane,
-            each.group,
-            ranks[each.joint],
-            each.quantity,
-            each.deviation,
-            each.ci95,
-        )
-        for each in out
-    ]
+    """Rank joints by their largest deviation; both quantities of a joint have its rank."""
+    order = list(dict.fromkeys(each.joint for each in out))
+    ranked = [replace(each, rank=1 + order.index(each.joint)) for each in out]
     return tuple(sorted(ranked, key=lambda each: each.rank))

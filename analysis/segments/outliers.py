@@ -153,7 +153,7 @@ def _trimmed(profile: Profile, critical: float) -> State:
 
 
 def _core(profile: Profile, columns: Sequence[FloatArray]) -> BoolArray:
-    """The half of the joints whose squared residuals from one fit have the least sum."""
+    """Return the half of the joints whose squared residuals from one fit have the least sum."""
     m, p = profile.values.size, 1 + len(columns)
     half = (m + p + 1) // 2
     design = np.stack([np.ones(m), *columns], axis=1)
@@ -174,7 +174,7 @@ def _subsets(joints: int, size: int) -> IntArray:
 
 
 def _squares(design: FloatArray, values: FloatArray, subsets: IntArray) -> FloatArray:
-    """Squared residuals of all joints from the fit to each subset, shape (s, m)."""
+    """Return the squared residuals of all joints from the fit to each subset, shape (s, m)."""
     some: FloatArray = design[subsets]
     inverse = np.linalg.pinv(some, rtol=max(some.shape[1:]) * float(np.finfo(np.float64).eps))
     fit = (inverse @ values[subsets][..., np.newaxis])[..., 0]
@@ -182,7 +182,7 @@ def _squares(design: FloatArray, values: FloatArray, subsets: IntArray) -> Float
 
 
 def _excess(profile: Profile, state: State, critical: float) -> FloatArray:
-    """Deviations of all joints by what noise and scatter of the present rest explain."""
+    """Return the deviations of all joints by what noise and scatter of the present rest explain."""
     rows = deviation_weights(profile, state.active, state.shapes)
     index = np.flatnonzero(state.active)
     spare = index.size - 1 - len(state.shapes)
@@ -220,7 +220,7 @@ def _worst(profile: Profile, state: State, critical: float) -> tuple[int | None,
 def _steepest(
     profile: Profile, state: State, columns: Sequence[FloatArray]
 ) -> tuple[FloatArray | None, float]:
-    """The shape that the present model lacks most, and its studentised coefficient."""
+    """Return the shape that the present model lacks most, and its studentised coefficient."""
     best: FloatArray | None = None
     largest = 0.0
     basis = [np.ones(profile.values.size), *state.shapes]
@@ -248,7 +248,7 @@ def _smooth_columns(profile: Profile) -> list[FloatArray]:
 
 
 def _stands_out(profile: Profile, state: State, one: Deviation, critical: float) -> bool:
-    """Whether a deviation exceeds its interval, the margin and the others' residuals."""
+    """Return whether a deviation exceeds its interval, the margin and the others' residuals."""
     if abs(one.value) <= max(critical * one.error, profile.margin):
         return False
     others = state.active.copy()
@@ -274,7 +274,7 @@ def _stands_out(profile: Profile, state: State, one: Deviation, critical: float)
 
 
 def _scatter(residual: FloatArray, rows: FloatArray, others: IntArray, spare: int) -> float:
-    """Standard deviation of the joints that take part, from studentised residuals.
+    """Return the standard deviation of the joints that take part, from studentised residuals.
 
     The leave-one-out residuals are e / (1 - h) with weights of norm (1 - h)^-1/2.
     """
@@ -290,7 +290,7 @@ def _limit(profile: Profile, spare: int) -> float:
 def _out_of_profile(
     profile: Profile, others: IntArray, one: Deviation, rows: FloatArray, *, smooth: bool
 ) -> bool:
-    """Whether a joint stands out of a rest that has a profile of its own.
+    """Return whether a joint stands out of a rest that has a profile of its own.
 
     It stands out beside its neighbours, too; at an end of a rest that is not smooth, where its
     prediction is an extrapolation, it leaves the others' range; and its mirror joint does not show
@@ -312,7 +312,7 @@ def _out_of_profile(
 
 
 def _at_an_end(profile: Profile, others: IntArray, joint: int) -> bool:
-    """Whether all other joints are on one side of a joint."""
+    """Return whether all other joints are on one side of a joint."""
     place = profile.place
     return bool(place[joint] < place[others].min() or place[joint] > place[others].max())
 

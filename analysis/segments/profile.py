@@ -53,7 +53,7 @@ class Scatter:
     turn: FloatArray
 
     def variance(self, weights: FloatArray) -> FloatArray:
-        """Variance of weighted sums of the joints.
+        """Return the variance of weighted sums of the joints.
 
         Args:
             weights: Shape (c, m).
@@ -121,7 +121,7 @@ def critical_value(members: Sequence[Member], level: float = LEVEL, draws: int =
 
 
 def _largest(member: Member, rng: np.random.Generator, draws: int) -> FloatArray:
-    """Largest studentised contrast of each draw, shape (draws,)."""
+    """Return the largest studentised contrast of each draw, shape (draws,)."""
     scatter, weights = member.scatter, member.weights
     columns = scatter.columns
     joints, count = columns.shape
@@ -140,7 +140,7 @@ def _largest(member: Member, rng: np.random.Generator, draws: int) -> FloatArray
 
 
 def _shrinkage(columns: FloatArray) -> float:
-    """Share of the diagonal in the shrunk covariance, 0 to 1."""
+    """Return the share of the diagonal in the shrunk covariance, 0 to 1."""
     joints, count = columns.shape
     sigma = np.sqrt(np.maximum(np.mean(columns**2, axis=1), _TINY))
     correlation = (columns / sigma[:, None]) @ (columns / sigma[:, None]).T / count
@@ -224,7 +224,7 @@ def family_of(profile: Profile) -> Member:
 
 
 def shape_weights(profile: Profile, active: BoolArray) -> list[tuple[str, FloatArray]]:
-    """Weights of the shapes' contrasts on the joints that take part.
+    """Return the weights of the shapes' contrasts on the joints that take part.
 
     Args:
         active: Joints that take part, shape (m,).
@@ -256,7 +256,7 @@ def shape_weights(profile: Profile, active: BoolArray) -> list[tuple[str, FloatA
 
 
 def contrasts(profile: Profile, active: BoolArray) -> list[Contrast]:
-    """The shape of the joints that take part.
+    """Return the shape of the joints that take part.
 
     Args:
         active: Joints that take part, shape (m,).
@@ -290,7 +290,7 @@ def _design(shapes: Sequence[FloatArray], size: int) -> FloatArray:
 def deviation_weights(
     profile: Profile, active: BoolArray, shapes: Sequence[FloatArray]
 ) -> FloatArray:
-    """Weights of the joints' deviations from the prediction of the others.
+    """Return the weights of the joints' deviations from the prediction of the others.
 
     Args:
         active: Joints that predict, shape (m,).

@@ -16,7 +16,6 @@ from undulog.capture.following.session import motions_of
 from undulog.capture.robot.model import Robot
 
 from ..response.fitting import GaitFit
-from ..response.rhythm import DRIVEN_SHARE
 from ..results.analysis import JointResult
 from ..results.answer import NotFollowing
 from ..results.artefact import Artefact
@@ -56,24 +55,6 @@ _WHOLE = 0.8
 """Share of the window that old values in all of it are seen in: ends and turns show little."""
 
 
-def commanded_joints(columns: Columns) -> tuple[str, ...]:
-    """Joints whose command moves.
-
-    Args:
-        columns: The session's columns.
-
-    Returns:
-        Names, head to tail: those whose command moves more than ``DRIVEN_SHARE`` of the largest.
-    """
-    swing = {
-        name: float(np.nanmax(signal.values) - np.nanmin(signal.values))
-        for name, signal in columns.command.items()
-        if np.isfinite(signal.values).any()
-    }
-    least = DRIVEN_SHARE * max(swing.values(), default=0.0)
-    return tuple(name for name in columns.names if swing.get(name, 0.0) > least)
-
-
 @dataclass(frozen=True)
 class Following:
     """How the joints follow their commands.
@@ -108,7 +89,7 @@ def following(session: SessionView, columns: Columns, window: Stretch) -> Follow
 
 
 def _offsets(motion: JointMotion) -> FloatArray:
-    """Offset of each whole cycle that is judged [rad]."""
+    """Return the offset of each whole cycle that is judged [rad]."""
     response = motion.response
     return response.offset[::BLOCKS][response.valid[::BLOCKS]]
 
@@ -133,7 +114,7 @@ def unrefuted(artefacts: Iterable[Artefact], follows: Following) -> tuple[Artefa
 
 
 def _follows_there(motion: JointMotion | None, spans_s: Iterable[tuple[float, float]]) -> bool:
-    """Whether a joint is driven and follows in every window that overlaps some spans."""
+    """Return whether a joint is driven and follows in every window that overlaps some spans."""
     if motion is None or not motion.command.range > 0 or motion.position.t_s.size < 2:
         return False
     response = motion.response
@@ -184,7 +165,7 @@ def not_following(
 
 
 def stopped(faulty: Iterable[NotFollowing]) -> frozenset[str]:
-    """Joints that are not compared.
+    """Return the joints that are not compared.
 
     Args:
         faulty: Joints that do not follow.
@@ -207,7 +188,7 @@ def _kinds_of(artefact: Artefact, motion: JointMotion | None) -> tuple[str, ...]
 
 
 def _goes_on(second: Samples, command: Samples, spans_s: Iterable[tuple[float, float]]) -> bool:
-    """Whether a second sensor moves with the command where the first one is flat."""
+    """Return whether a second sensor moves with the command where the first one is flat."""
     parts: list[FloatArray] = []
     for span in spans_s:
         i, j = np.searchsorted(second.t_s, span)

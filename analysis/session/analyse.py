@@ -1,4 +1,4 @@
-"""A session in, all its numbers out: pure orchestration of the estimators."""
+"""Analyse one session: the orchestration of all estimators."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 
-import numpy as np
-
 from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
-from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.log.read.signals import Signal
 
@@ -32,15 +30,21 @@ from ..results.artefact import KINDS, Artefact, DeadBand, flags_by_joint
 from ..results.estimate import Estimate, Provenance
 from ..segments.answer import Facts, compose
 from ..segments.session import (
-    commanded_joints,
     compare_joints,
     following,
     not_following,
     stopped,
     unrefuted,
 )
-from ..signals.columns import drag_ratio, read_columns, settle_time_s
-from ..signals.stretch import Options, choose_stretch, recorded, without_breaks
+from ..signals.columns import drag_ratio, read_columns
+from ..signals.stretch import (
+    Options,
+    SharedTimes,
+    choose_stretch,
+    part_of,
+    recorded,
+    without_breaks,
+)
 from ..signals.windows import Span, Stretch, whole_cycles
 from .heterogeneity import heterogeneity_indices
 from .joints import group_facts, joint_energies, joint_results
@@ -50,26 +54,13 @@ from .runs import coupling_of_one_gait
 _NS = 1e9
 
 
-def within(
-    artefacts: Iterable[Artefact], session: SessionView, stretch: Stretch
-) -> tuple[Artefact, ...]:
-    """The artefacts that hold in the analysed stretch."""
-    start_s, stop_s = ((t - session.start_ns) / _NS for t in (stretch.start_ns, stretch.stop_ns))
-    return tuple(one for one in artefacts if one.within(start_s, stop_s))
-
-
-def warn_flags(
+def _warn_flags(
     artefacts: Iterable[Artefact],
     joints: tuple[JointResult, ...],
     gait: GaitFit | None,
     warn: Warn,
 ) -> None:
-    """Name the joints of each artefact, and whether it is the sensor's, the record's or a limit.
-
-    Args:
-        gait: The fitted gait, or None.
-        warn: Takes a sentence for each kind.
-    """
+    """Warn of each kind of artefact with its joints, and of responses lost in noise."""
     joined: dict[tuple[str, str, str], list[Artefact]] = {}
     for one in artefacts:
         joined.setdefault((one.flag, one.quantity, one.topic), []).append(one)
@@ -78,11 +69,10 @@ def warn_flags(
             continue
         about, text = KINDS[flag]
         where = f"{quantity} on {topic}" if topic else quantity
+        nulls = "; gain and lag are null" if same[0].falsifies("position") else ""
         meaning = {
-            "sensor": "an artefact of the sensor, not mechanics"
-            + ("; gain and lag are null" if same[0].falsifies("position") else ""),
-            "sensor or joint": "the sensor or the joint itself, see the answer"
-            + ("; gain and lag are null" if same[0].falsifies("position") else ""),
+            "sensor": f"an artefact of the sensor, not mechanics{nulls}",
+            "sensor or joint": f"the sensor or the joint itself, see the answer{nulls}",
             "record": "an artefact of the record, not mechanics",
             "limit": "a limit of the robot, not a fault of the sensor",
         }[about]
@@ -137,13 +127,10 @@ class SessionMeasurement(FittedSession):
 
 
 def analyse_session(session: SessionView, options: Options | None = None) -> Analysis:
-    """Compute everything that one session can tell.
-
-    Args:
-        options: What the user chose; the defaults choose by themselves.
+    """Analyse one session.
 
     Returns:
-        The result. What can't be computed is None, and a warning says why.
+        The result; values that can't be computed are None, with a warning.
 
     Raises:
         MissingChannelError: If the session has neither commands nor responses.
@@ -156,20 +143,7 @@ def analyse_session(session: SessionView, options: Options | None = None) -> Ana
 def examine_session(
     session: SessionView, options: Options | None = None, *, with_dead_bands: bool = True
 ) -> FittedSession:
-    """Compute what one session tells, and keep the fit.
-
-    Args:
-        options: What the user chose; the defaults choose by themselves.
-        with_dead_bands: See :func:`measure_session`.
-
-    Returns:
-        The result and the fitted gait.
-
-    Raises:
-        MissingChannelError: If the session has neither commands nor responses.
-        DataError: If they hold no samples.
-        UsageError: If the options leave nothing of the session.
-    """
+    """Analyse one session as :func:`measure_session` does, and keep the fit only."""
     measured = measure_session(session, options, with_dead_bands=with_dead_bands)
     return FittedSession(measured.analysis, measured.gait)
 
@@ -177,15 +151,11 @@ def examine_session(
 def measure_session(
     session: SessionView, options: Options | None = None, *, with_dead_bands: bool = True
 ) -> SessionMeasurement:
-    """Compute what one session tells, and keep what it was computed from.
+    """Analyse one session, and keep the intermediate data.
 
     Args:
-        options: What the user chose; the defaults choose by themselves.
         with_dead_bands: Whether to fit them, which takes a third of the time of a short session
             and changes nothing else.
-
-    Returns:
-        The result, the fitted gait, the responses and the energies.
 
     Raises:
         MissingChannelError: If the session has neither commands nor responses.
@@ -194,13 +164,8 @@ def measure_session(
     """
     options = options or Options()
     warn = Remarks()
-    columns = read_columns(
-        session,
-        options.command_topic,
-        options.response_topic,
-        warn,
-        reference_topic=options.reference_topic,
-    )
+    topics = (options.command_topic, options.response_topic)
+    columns = read_columns(session, *topics, warn, reference_topic=options.reference_topic)
     columns, left_out = without_breaks(session, columns, options, warn)
     session.forget()  # what each step has looked at need not stay in memory beside the next one's
     artefacts = find_artefacts(session, columns)
@@ -213,7 +178,8 @@ def measure_session(
     _warn_dropped(commands, responses, warn)
     session.forget()
     follows = following(session, columns, whole)
-    held = unrefuted(within(artefacts, session, stretch), follows)
+    start_s, stop_s = ((t - session.start_ns) / _NS for t in (stretch.start_ns, stretch.stop_ns))
+    held = unrefuted([one for one in artefacts if one.within(start_s, stop_s)], follows)
     session.forget()
     falsified = {one.joint for one in held if one.falsifies("position")}
     sound = {name: one for name, one in responses.items() if name not in falsified}
@@ -239,7 +205,7 @@ def measure_session(
         dead=dead,
         span=span,
     )
-    warn_flags(held, joints, gait, warn)
+    _warn_flags(held, joints, gait, warn)
     cost = transport(session, sound, energies, span, warn)
     session.forget()
     energy = energy_result(
@@ -249,7 +215,7 @@ def measure_session(
     over_time = response_over_time(session, columns, artefacts, warn)
     body = body_motion(session, sound, gait, span, warn)
     heterogeneity = heterogeneity_indices(session.robot, gait, joints, energies, warn)
-    commanded = commanded_joints(columns)
+    commanded = columns.commanded()
     findings = compare_joints(
         session.robot,
         gait,
@@ -291,17 +257,14 @@ def measure_session(
 def _series(
     names: tuple[str, ...], signals: Mapping[str, Signal], stretch: Stretch, origin_ns: int
 ) -> dict[str, Series]:
-    """The signals of a stretch as series, in chain order."""
-    part: dict[str, Signal] = {}
-    times: dict[int, tuple[slice, IntArray]] = {}
-    for one in (signals[name] for name in names if name in signals):
-        if id(one.t_ns) not in times:
-            limits = (stretch.start_ns, stretch.stop_ns)
-            inside = slice(*np.searchsorted(one.t_ns, limits, side="left").tolist())
-            times[id(one.t_ns)] = inside, one.t_ns[inside]
-        inside, t_ns = times[id(one.t_ns)]
-        part[one.name] = Signal(one.name, one.unit, t_ns, one.values[inside])
-    return clean_together(part, origin_ns)
+    """Return the signals of a time window as series, in chain order."""
+    times: SharedTimes = {}
+    parts = {
+        name: part_of(signals[name], stretch.start_ns, stretch.stop_ns, times)
+        for name in names
+        if name in signals
+    }
+    return clean_together(parts, origin_ns)
 
 
 def _warn_dropped(
@@ -369,7 +332,7 @@ def _provenance(session: SessionView, options: Options) -> Provenance:
             "min_cycles": MIN_CYCLES,
             "min_explained": MIN_EXPLAINED,
             "bins_per_side": BINS_PER_SIDE,
-            "settle_s": settle_time_s(session),
+            "settle_s": session.settle_s or 0.0,
             "drag_ratio": drag_ratio(session),
         },
     )

@@ -10,7 +10,6 @@ a better estimate. What stands against it is the command's amplitude over the wh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,7 +75,7 @@ def cycle_maps(measured: SessionMeasurement) -> CycleMaps | None:
     nothing = np.full(span.cycles, np.nan, dtype=np.complex128)
     ratio: list[ComplexArray] = []
     for name in gait.driven:
-        command = gait.fit.fundamental[gait.command_of(name)]
+        command = gait.fit.fundamental[gait.driven.index(name)]
         if name in whole and name in gait.answered and abs(command) > 0:
             amplitude = amplitudes(parts[name], starts[name], gait.fit.omega)
             ratio.append(np.where(whole[name], amplitude / command, nothing))
@@ -90,7 +89,7 @@ def cycle_maps(measured: SessionMeasurement) -> CycleMaps | None:
     period = (span.stop_s - span.start_s) / span.cycles
     edges = np.linspace(span.start_s, span.stop_s, span.cycles + 1)
     shift_s = (span.origin_ns - measured.analysis.session.start_ns) * 1e-9
-    response = _stacked(ratio, span.cycles)
+    response = np.array(ratio, dtype=np.complex128).reshape(-1, span.cycles)
     return CycleMaps(
         start_s=frozen(edges[:-1] + shift_s),
         period_s=period,
@@ -124,13 +123,9 @@ def amplitudes(series: Series, starts: IntArray, omega: float) -> ComplexArray:
 
 
 def _lag(response: ComplexArray) -> FloatArray:
-    """Lag within pi of each joint's mean [rad], shape (m, c)."""
+    """Return the lag within pi of each joint's mean [rad], shape (m, c)."""
     size = np.abs(response)
     unit = np.divide(response, size, out=np.zeros_like(response), where=size > 0)
     mean = np.angle(unit.sum(axis=1, keepdims=True))
     lag: FloatArray = -(mean + np.angle(response * np.exp(-1j * mean)))
     return lag
-
-
-def _stacked(rows: Sequence[ComplexArray], count: int) -> ComplexArray:
-    return np.array(rows, dtype=np.complex128).reshape(-1, count)

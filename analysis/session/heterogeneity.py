@@ -110,22 +110,12 @@ def index(
     ci95: Interval | None = None,
     p: float | None = None,
 ) -> Index:
-    """An index of a known kind.
-
-    Args:
-        name: One of ``KINDS``.
-        value: Its value; None where it can't be computed.
-        ci95: Its 95 % interval.
-        p: p-value of its null.
-
-    Returns:
-        The index with its unit and label.
-    """
+    """Return an index of one of ``KINDS`` with its unit and label."""
     return Index(value, ci95, p, *KINDS[name])
 
 
 def response_indices(response: Response) -> dict[str, Index]:
-    """Indices of gain and lag of one plane's driven joints, head to tail.
+    """Return the indices of gain and lag of one plane's driven joints, head to tail.
 
     Args:
         response: Of k joints in chain order.
@@ -139,7 +129,7 @@ def response_indices(response: Response) -> dict[str, Index]:
     if count < 2:
         return {}
     dof = response.dof
-    gain, lag = response.gain, _unwrapped(response)
+    gain, lag = response.gain, response.lag_near_mean_rad
     relative = gain / gain.mean()
     gain_variance, lag_variance = response.log_gain_variance * relative**2, response.lag_variance
     both = spread(
@@ -150,24 +140,18 @@ def response_indices(response: Response) -> dict[str, Index]:
     )
     gains = spread(relative, gain_variance, dof)
     lags = _circular(lag, spread(lag, lag_variance, dof))
-    result = {
-        "gain_cv": index("gain_cv", gains.deviation, gains.interval, gains.p),
-        "lag_sd": index("lag_sd", lags.deviation, lags.interval, lags.p),
-        "common_response": index("common_response", both.ratio, None, both.p),
-        "equivalence_gain": index(
-            "equivalence_gain", *_equivalence(relative - 1, gain_variance, dof, EQUIVALENT_GAIN)
-        ),
-        "equivalence_lag": index(
-            "equivalence_lag",
-            *_equivalence(lag - lag.mean(), lag_variance, dof, EQUIVALENT_LAG_RAD),
-        ),
+    found: dict[str, tuple[float, Interval | None, float]] = {
+        "gain_cv": (gains.deviation, gains.interval, gains.p),
+        "lag_sd": (lags.deviation, lags.interval, lags.p),
+        "common_response": (both.ratio, None, both.p),
+        "equivalence_gain": _equivalence(relative - 1, gain_variance, dof, EQUIVALENT_GAIN),
+        "equivalence_lag": _equivalence(lag - lag.mean(), lag_variance, dof, EQUIVALENT_LAG_RAD),
     }
     if count >= MIDDLE + ENDS:
         scaled = response.log_gain_variance * gain**2
-        for name, values, variance in (("gain", gain, scaled), ("lag", lag, lag_variance)):
-            key = f"boundary_contrast_{name}"
-            result[key] = index(key, *_contrast(values, variance, dof))
-    return result
+        found["boundary_contrast_gain"] = _contrast(gain, scaled, dof)
+        found["boundary_contrast_lag"] = _contrast(lag, lag_variance, dof)
+    return {name: index(name, *numbers) for name, numbers in found.items()}
 
 
 def energy_indices(per_cycle_j: FloatArray) -> dict[str, Index]:
@@ -229,15 +213,8 @@ def spread(values: FloatArray, variance: FloatArray, dof: FloatArray, blocks: in
     return Spread(squares, expected, box, noise_dof, m)
 
 
-def _unwrapped(response: Response) -> FloatArray:
-    """Lags within pi of their circular mean [rad]."""
-    lag = response.lag_rad
-    mean = np.angle(np.mean(np.exp(1j * lag)))
-    return np.asarray(mean + np.angle(np.exp(1j * (lag - mean))), dtype=np.float64)
-
-
 def _circular(lag: FloatArray, linear: Spread) -> Spread:
-    """The spread with the circular variance -2 ln R (Mardia & Jupp 2000) for its squares."""
+    """Return the spread with the circular variance -2 ln R (Mardia & Jupp 2000) for its squares."""
     length = float(np.abs(np.mean(np.exp(1j * lag))))
     if length < 1e-12:
         return linear
@@ -257,7 +234,7 @@ def _noncentral_root(value: float, dof: float, quantile: float) -> float:
 def _contrast(
     values: FloatArray, variance: FloatArray, dof: FloatArray
 ) -> tuple[float, Interval, float]:
-    """Mean of the first and last joint minus mean of the middle five; interval and p."""
+    """Return the mean of the first and last joint minus mean of the middle five; interval and p."""
     count = values.size
     weight = np.zeros(count)
     weight[[0, -1]] = 1 / ENDS
@@ -289,7 +266,7 @@ def _cv(values: FloatArray) -> float:
 def _jackknifed(
     per_cycle: FloatArray, statistic: Callable[[FloatArray], float]
 ) -> tuple[float, Interval | None]:
-    """Statistic of the joints' totals, leaving out one cycle at a time (Tukey 1958)."""
+    """Return the statistic of the joints' totals, leaving out one cycle at a time (Tukey 1958)."""
     cycles = per_cycle.shape[1]
     total = per_cycle.sum(axis=1)
     value = statistic(total)
@@ -345,34 +322,23 @@ def heterogeneity_indices(
         suffix = f"_{plane}" if len(planes) > 1 else ""
         suffix += f"_group{k}" if several else ""
         result |= {f"{name}{suffix}": one for name, one in found.items()}
-    warn(
-        Note(
-            "boundary or module: not separable from a wave in one direction (module_share is "
-            "null); record the reverse"
-        )
-    )
+    told = "boundary or module: not separable from a wave in one direction (module_share is null)"
+    warn(Note(f"{told}; record the reverse"))
     return result
 
 
 def _of_plane(
     plane: str, names: list[str], sound: list[str], gait: GaitFit, warn: Warn
 ) -> dict[str, Index]:
-    """Indices of gain and lag of one plane; its contrasts need every joint of it."""
+    """Return the indices of gain and lag of one plane; its contrasts need every joint of it."""
     if gait.response is None or len(sound) < 2:
-        warn(
-            Note(
-                f"fewer than two {plane} joints have a response: its heterogeneity indices are null"
-            )
-        )
+        few = f"fewer than two {plane} joints have a response"
+        warn(Note(f"{few}: its heterogeneity indices are null"))
         return {}
     found = response_indices(gait.response.select([gait.answered.index(name) for name in sound]))
     if len(names) < MIDDLE + ENDS:
-        warn(
-            Note(
-                f"{len(names)} driven {plane} joints are too few for a contrast of the ends with "
-                f"the middle {MIDDLE}: the boundary contrasts are null"
-            )
-        )
+        few = f"{len(names)} driven {plane} joints are too few for a contrast of the ends"
+        warn(Note(f"{few} with the middle {MIDDLE}: the boundary contrasts are null"))
     elif len(sound) < len(names):
         warn(
             f"the {plane} indices leave out joints without gain and lag; the boundary contrasts, "

@@ -7,13 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.process import in_threads
 from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.robot.model import Robot
 
-from ..energy import Energies, Energy, add_up, integrate, power_of
+from ..energy import TERMS, Energies, Energy, add_up, integrate, power_of
 from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series, clean, coverage
 from ..response.fitting import GaitFit
@@ -31,15 +30,11 @@ _NS = 1e9
 def group_facts(
     robot: Robot | None, gait: GaitFit, span: Span, stretch: Stretch, start_ns: int
 ) -> tuple[GroupFacts, ...]:
-    """State frequency, whole cycles and wave of each group.
+    """Return frequency, whole cycles and wave of each group, the largest first.
 
     Args:
-        robot: The robot, or None.
         span: The largest group's whole cycles.
         start_ns: Unix time of the session's start [ns].
-
-    Returns:
-        One a group, the largest first.
     """
     ends = [(t - start_ns) / _NS for t in (stretch.start_ns, stretch.stop_ns)]
     shift_s = (span.origin_ns - start_ns) / _NS
@@ -64,7 +59,7 @@ def _wave(robot: Robot | None, gait: GaitFit) -> tuple[str | None, dict[str, flo
     main, largest = None, 0.0
     for plane, names in by_plane(robot, gait.driven).items():
         if len(names) > 1:
-            waves = gait.fit.fundamental[[gait.command_of(name) for name in names]]
+            waves = gait.fit.fundamental[[gait.driven.index(name) for name in names]]
             steps[plane] = phase_step(waves)
             if np.abs(waves).max() > largest:
                 main, largest = plane, float(np.abs(waves).max())
@@ -78,13 +73,7 @@ GAP_SHARE = 0.01
 def joint_energies(
     session: SessionView, columns: Columns, artefacts: Iterable[Artefact], span: Span, warn: Warn
 ) -> dict[str, Energies]:
-    """Energies of all joints.
-
-    Args:
-        columns: The session's columns.
-        artefacts: Of the analysed stretch; what a sensor falsifies has no energy.
-        warn: Told of joints whose power has gaps or is falsified.
-    """
+    """Return the energies of all joints; warn of powers with gaps or falsified by a sensor."""
     wrong = list(artefacts)
     false = {one.joint for one in wrong if one.falsifies("velocity", "effort")}
     false_el = {one.joint for one in wrong if one.falsifies("current", "voltage")}
@@ -130,7 +119,7 @@ def joint_energies(
 def _accumulated(
     columns: Columns, kind: str, name: str, origin_ns: int, window: tuple[float, float, int]
 ) -> Energy | None:
-    """Energy by the powers that the log has themselves, or None."""
+    """Return the energy by the powers that the log has themselves, or None."""
     net, plus = (
         columns.powers[topic].get(name)
         for topic in (
@@ -156,14 +145,10 @@ def joint_results(
     dead: Mapping[str, DeadBand],
     span: Span,
 ) -> tuple[JointResult, ...]:
-    """The joints' lines, head to tail.
+    """Return the results of all joints, head to tail.
 
     Args:
-        robot: The robot, or None.
-        columns: The session's columns.
-        responses: By joint name, on the analysed stretch.
-        gait: The fitted gait, or None.
-        flags: Artefacts of each joint on the analysed stretch, by name.
+        flags: Artefacts of each joint in the analysed window, by name.
         dead: Dead bands, by name.
         span: The window of energies and coverage.
     """
@@ -179,8 +164,7 @@ def joint_results(
         index = None if gait is None else gait.group_of(name)
         group = None if gait is None or index is None else gait.groups[index]
         gain, lag = _estimates(group, name)
-        power = energies[name]
-        mechanical, electrical = power.mechanical, power.electrical
+        per_cycle = {term: energies[name].per_cycle(term) for term in TERMS}
         results.append(
             JointResult(
                 name=name,
@@ -188,11 +172,10 @@ def joint_results(
                 command_amplitude_rad=None if gait is None else gait.command_amplitudes.get(name),
                 gain=gain,
                 lag_rad=lag,
-                energy_net_j=_total(None if mechanical is None else mechanical.net_j),
-                energy_plus_j=_total(None if mechanical is None else mechanical.plus_j),
-                energy_abs_j=_total(None if mechanical is None else mechanical.abs_j),
-                energy_el_j=_total(None if electrical is None else electrical.net_j),
-                energy_el_clipped_j=_total(None if electrical is None else electrical.plus_j),
+                **{
+                    f"energy_{term}_j": None if found is None else float(np.sum(found))
+                    for term, found in per_cycle.items()
+                },
                 coverage=fraction,
                 samples=0 if part is None else part.count,
                 flags=tuple(own),
@@ -211,7 +194,3 @@ def _estimates(gait: GaitFit | None, name: str) -> tuple[Estimate, Estimate]:
     lag = lag_estimate(gait.response, place)
     # A phase that noise leaves open means an amplitude that isn't there.
     return (gain_estimate(gait.response, place) if lag.value is not None else Estimate()), lag
-
-
-def _total(per_cycle: FloatArray | None) -> float | None:
-    return None if per_cycle is None else float(np.sum(per_cycle))

@@ -21,7 +21,7 @@ from ..estimators.series import GAP_FACTOR, Series, clean
 from ..results.analysis import Intervals, JointOverTime, Maybe, ResponseOverTime
 from ..results.answer import Note
 from ..results.artefact import Artefact, Span
-from ..signals.columns import Columns, planes_of, settle_time_s
+from ..signals.columns import Columns, planes_of
 from ..signals.stretch import GAIT_TOPIC
 
 _Value = TypeVar("_Value")
@@ -104,7 +104,7 @@ class LoggedGait:
 def response_over_time(
     session: SessionView, columns: Columns, artefacts: Iterable[Artefact], warn: Warn
 ) -> ResponseOverTime | None:
-    """Gain and lag of every driven joint in every cycle of its logged phase.
+    """Return the gain and lag of every driven joint in every cycle of its logged phase.
 
     Args:
         artefacts: What falsifies positions, and when.
@@ -125,7 +125,7 @@ def response_over_time(
     planes = planes_of(session.robot)
     runs = logged.runs()
     paces = {name: logged.paces(name, runs) for name in logged.phases}
-    settled_s = settle_time_s(session)
+    settled_s = session.settle_s or 0.0
     origin_ns = session.start_ns
 
     def of_joint(name: str) -> JointOverTime | None:
@@ -200,22 +200,15 @@ def _joint(
         given.append(pair[1])
         number += [k] * (main.edges_s.size - 1)
     if not edges:
-        return JointOverTime(command.name, (), (), (), (), (), (), (), ())
+        return JointOverTime(command.name, *[()] * 8)
     found = cycles_of(edges, asked, given, settled_s=settled_s)
     for start, stop in false:
         found.ratio[(found.start_s < stop) & (found.stop_s > start)] = np.nan
-    gain, gain_ci, lag, lag_ci = _estimates(found)
-    return JointOverTime(
-        command.name,
-        tuple(found.start_s.tolist()),
-        tuple(found.stop_s.tolist()),
-        tuple(number),
-        tuple((1 / (found.stop_s - found.start_s)).tolist()),
-        gain,
-        gain_ci,
-        lag,
-        lag_ci,
+    frequency = 1 / (found.stop_s - found.start_s)
+    start, stop, frequency = (
+        tuple(one.tolist()) for one in (found.start_s, found.stop_s, frequency)
     )
+    return JointOverTime(command.name, start, stop, tuple(number), frequency, *_estimates(found))
 
 
 def _rising(t_s: FloatArray, value: FloatArray) -> Phase | None:
@@ -243,7 +236,7 @@ def _estimates(found: Cycles) -> tuple[Maybe, Intervals, Maybe, Intervals]:
 
 
 def _where(told: BoolArray, values: Iterable[_Value]) -> tuple[_Value | None, ...]:
-    """Values, or None where they are not told."""
+    """Return the values, or None where they are not told."""
     return tuple(
         value if known else None for value, known in zip(values, told.tolist(), strict=True)
     )

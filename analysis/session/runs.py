@@ -262,7 +262,7 @@ def gait_run(
 
 
 def _unknown(count: int) -> Response:
-    """The response of joints of which none is known yet."""
+    """Return the response of joints of which none is known yet."""
     gain, lag, dof = (np.full(count, np.nan) for _ in range(3))
     return Response(np.full(count, np.nan, dtype=np.complex128), gain, lag, dof)
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+
+import numpy as np
 
 from undulog.capture import SessionView
 from undulog.capture.common.console import Warn
@@ -13,6 +15,7 @@ from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.read.signals import JointSignals, Signal
 from undulog.capture.robot.model import Robot
 
+from ..response.rhythm import DRIVEN_SHARE
 from ..results.answer import Lacking, Note
 
 DRAG_RATIO = 10.0
@@ -69,16 +72,19 @@ class Columns:
     topics: Mapping[str, str]
 
     def of(self, quantity: str) -> Mapping[str, Signal]:
-        """One quantity by its name.
-
-        Args:
-            quantity: One of ``QUANTITIES``.
-
-        Returns:
-            Signals by joint name.
-        """
+        """Return one of ``QUANTITIES``, signals by joint name."""
         signals: Mapping[str, Signal] = getattr(self, quantity)
         return signals
+
+    def commanded(self) -> tuple[str, ...]:
+        """Return joints whose command moves more than ``DRIVEN_SHARE`` of the largest."""
+        swing = {
+            name: float(np.nanmax(signal.values) - np.nanmin(signal.values))
+            for name, signal in self.command.items()
+            if np.isfinite(signal.values).any()
+        }
+        least = DRIVEN_SHARE * max(swing.values(), default=0.0)
+        return tuple(name for name in self.names if swing.get(name, 0.0) > least)
 
 
 def read_columns(
@@ -89,7 +95,7 @@ def read_columns(
     *,
     reference_topic: str | None = None,
 ) -> Columns:
-    """Read what is there, and say what is not.
+    """Read the joints' signals; warn of those that are missing.
 
     Args:
         command_topic: JointState topic of the commands.
@@ -100,7 +106,6 @@ def read_columns(
     Raises:
         MissingChannelError: If neither topic is there, or one that was chosen is not; the message
             lists those that are.
-            those that are.
         DataError: If a topic is not of JointStates, or there are too many joints.
     """
     wanted = {
@@ -124,7 +129,8 @@ def read_columns(
     for topics in asked:
         if not set(topics) & set(session.channels):
             there = joint_topics or sorted(session.channels)
-            raise MissingChannelError(session.path, _wanted(topics, session.warnings), there)
+            damage = f" ({'; '.join(session.warnings)})" if session.warnings else ""
+            raise MissingChannelError(session.path, " or ".join(topics) + damage, there)
     wanted = {key: one for key, one in wanted.items() if one[0] in session.channels}
     found = _read(session, wanted)
     if response_topic == RESPONSE_TOPIC:
@@ -172,59 +178,24 @@ def read_columns(
     )
 
 
-def settle_time_s(session: SessionView) -> float:
-    """Settling time that the session states [s]; 0 where it states none.
-
-    Returns:
-        From the session's start.
-    """
-    return session.settle_s or 0.0
-
-
 def drag_ratio(session: SessionView) -> float:
-    """Ratio of the drag across a link to that along it, for the viscous null.
-
-    Returns:
-        That of the twin's ground, else the default.
-    """
+    """Return c_n / c_t for the viscous null: of the twin's ground, else the default."""
     stated = None if session.run is None else session.run.drag_ratio
     return DRAG_RATIO if stated is None else stated
 
 
 def planes_of(robot: Robot | None) -> dict[str, str]:
-    """Plane of each joint by name; empty without a robot description.
-
-    Args:
-        robot: The robot, or None.
-
-    Returns:
-        Joint name to ``horizontal`` or ``vertical``.
-    """
-    if robot is None:
-        return {}
-    return {joint.name: joint.plane.value for joint in robot.joints}
+    """Return ``horizontal`` or ``vertical`` by joint name; empty without a robot description."""
+    return {} if robot is None else {joint.name: joint.plane.value for joint in robot.joints}
 
 
 def by_plane(robot: Robot | None, names: Iterable[str]) -> dict[str, list[str]]:
-    """Joint names by plane.
-
-    Args:
-        robot: The robot, or None.
-
-    Returns:
-        Plane to names, in their order; all under ``chain`` without a robot description.
-    """
+    """Return names by plane, in their order; all under ``chain`` without a robot description."""
     planes = planes_of(robot)
     result: dict[str, list[str]] = {}
     for name in names:
         result.setdefault(planes.get(name, "chain"), []).append(name)
     return result
-
-
-def _wanted(topics: Sequence[str], warnings: Sequence[str]) -> str:
-    """What is missing; where the file itself is not whole, that is why."""
-    told = " or ".join(topics)
-    return f"{told} ({'; '.join(warnings)})" if warnings else told
 
 
 def _read(session: SessionView, wanted: Mapping[str, tuple[str, str]]) -> dict[str, JointSignals]:

@@ -1,4 +1,4 @@
-"""Choosing the stretch of a session that is analysed, and saying why."""
+"""Choose the time window of a session that is analysed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from undulog.capture.log.read.signals import Signal
 
 from ..estimators.series import clean
 from ..response.rhythm import MIN_CYCLES
-from .columns import COMMAND_TOPIC, QUANTITIES, RESPONSE_TOPIC, Columns, settle_time_s
+from .columns import COMMAND_TOPIC, QUANTITIES, RESPONSE_TOPIC, Columns
 from .windows import Stretch, covered, long_enough, moving, settled, steady_part, steady_runs
 
 GAIT_TOPIC = "/gait"
@@ -28,7 +28,7 @@ _WORTH_IT = 0.1
 
 @dataclass(frozen=True)
 class Options:
-    """What the user may choose.
+    """The user's options.
 
     Attributes:
         start_s: Start of what is analysed, from the session's start [s]; None: chosen.
@@ -45,7 +45,7 @@ class Options:
     reference_topic: str | None = None
 
     def arguments(self) -> list[str]:
-        """What to give on the command line for these options, defaults left out."""
+        """Return the command-line arguments for these options, without defaults."""
         arguments: list[str] = []
         for field in fields(self):
             value = getattr(self, field.name)
@@ -55,17 +55,30 @@ class Options:
         return arguments
 
 
+SharedTimes = dict[int, tuple[slice, IntArray]]
+
+
+def part_of(one: Signal, start_ns: int, stop_ns: int, times: SharedTimes) -> Signal:
+    """Return the samples of a signal within a half-open window.
+
+    Args:
+        times: Filled with the times of the parts, so that signals which share their times before
+            share them afterwards.
+    """
+    if id(one.t_ns) not in times:
+        inside = slice(*np.searchsorted(one.t_ns, (start_ns, stop_ns)).tolist())
+        times[id(one.t_ns)] = inside, one.t_ns[inside]
+    inside, t_ns = times[id(one.t_ns)]
+    return Signal(one.name, one.unit, t_ns, one.values[inside])
+
+
 def without_breaks(
     session: SessionView, columns: Columns, options: Options, warn: Warn
 ) -> tuple[Columns, str]:
-    """Leave out all but the longest stretch in which samples follow each other.
-
-    Args:
-        options: What the user chose; only samples between his limits count.
-        warn: Takes one sentence where something is left out.
+    """Leave out all but the longest time window without a break, within the options' limits.
 
     Returns:
-        The columns of that stretch, and what is left out; empty where that is nothing.
+        The columns of that window, and a description of what is left out, which may be empty.
 
     Raises:
         DataError: If there are no samples at all, or commands and responses don't overlap.
@@ -80,17 +93,11 @@ def without_breaks(
         return columns, ""
     if found.others:
         warn(str(found))
-    parts: dict[int, tuple[slice, IntArray]] = {}
-
-    def part(one: Signal) -> Signal:
-        if id(one.t_ns) not in parts:  # signals that share their times go on sharing them
-            inside = slice(*np.searchsorted(one.t_ns, (found.start_ns, found.last_ns + 1)).tolist())
-            parts[id(one.t_ns)] = inside, one.t_ns[inside]
-        inside, t_ns = parts[id(one.t_ns)]
-        return Signal(one.name, one.unit, t_ns, one.values[inside])
+    shared: SharedTimes = {}
 
     def parts_of(signals: Mapping[str, Signal]) -> dict[str, Signal]:
-        return {name: part(one) for name, one in signals.items()}
+        limits = found.start_ns, found.last_ns + 1
+        return {name: part_of(one, *limits, shared) for name, one in signals.items()}
 
     kept = replace(
         columns,
@@ -101,27 +108,21 @@ def without_breaks(
 
 
 def choose_stretch(session: SessionView, columns: Columns, options: Options, warn: Warn) -> Stretch:
-    """The stretch to analyse.
-
-    Args:
-        options: What the user chose; a start of his own replaces the settling time.
-        warn: Takes one sentence where the choice needs one.
+    """Choose the time window to analyse; a start in the options replaces the settling time.
 
     Raises:
         DataError: If there are no samples at all.
         UsageError: If the user's limits leave nothing.
     """
-    recorded = _recorded(session, columns)
-    chosen = recorded.intersect(
-        _absolute(session, options.start_s), _absolute(session, options.stop_s)
-    )
+    chosen = recorded(session, columns, options)
     if chosen.duration_s <= 0:
-        first, last = ((t - session.start_ns) / _NS for t in (recorded.start_ns, recorded.stop_ns))
+        every = recorded(session, columns, Options())
+        first, last = ((t - session.start_ns) / _NS for t in (every.start_ns, every.stop_ns))
         raise UsageError(
             f"{session.path}: nothing between --start and --stop; it has joint samples from "
             f"{first:.2f} to {last:.2f} s"
         )
-    settle_s = settle_time_s(session) if options.start_s is None else 0.0
+    settle_s = (session.settle_s or 0.0) if options.start_s is None else 0.0
     runs = _gait_runs(session, chosen, settle_s, warn)
     if not runs and settle_s > 0:
         runs = _gait_runs(session, chosen, 0.0, warn)
@@ -157,21 +158,11 @@ def choose_stretch(session: SessionView, columns: Columns, options: Options, war
 
 
 def recorded(session: SessionView, columns: Columns, options: Options) -> Stretch:
-    """What was recorded of commands and positions, within the user's limits.
-
-    Returns:
-        The window, without regard to settling or steadiness.
+    """Return the overlap of commands and positions, or the window of one, within the limits.
 
     Raises:
-        DataError: If there are no samples at all.
+        DataError: If there are no samples at all, or commands and responses don't overlap.
     """
-    return _recorded(session, columns).intersect(
-        _absolute(session, options.start_s), _absolute(session, options.stop_s)
-    )
-
-
-def _recorded(session: SessionView, columns: Columns) -> Stretch:
-    """Where commands and responses overlap, or where the one that exists lies."""
     kinds = (columns.command, columns.position)
     spans = [covered([signal.t_ns for signal in kind.values()]) for kind in kinds]
     known = [span for span in spans if span is not None]
@@ -182,11 +173,11 @@ def _recorded(session: SessionView, columns: Columns) -> Stretch:
         raise DataError(
             f"{session.path}: commands and responses don't overlap in time; their clocks differ"
         )
-    return both
-
-
-def _absolute(session: SessionView, time_s: float | None) -> int | None:
-    return None if time_s is None else session.start_ns + round(time_s * _NS)
+    limits = (
+        None if time_s is None else session.start_ns + round(time_s * _NS)
+        for time_s in (options.start_s, options.stop_s)
+    )
+    return both.intersect(*limits)
 
 
 def _gait_runs(session: SessionView, chosen: Stretch, settle_s: float, warn: Warn) -> list[Stretch]:

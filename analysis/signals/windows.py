@@ -133,7 +133,7 @@ def amplitude_by_cycle(commands: Sequence[Series], omega: float, edges_s: FloatA
 
 
 def _sums(rows: FloatArray, begin: IntArray, end: IntArray) -> FloatArray:
-    """Sums of the rows (q, n) from begin to end, each of shape (c,); shape (c, q)."""
+    """Return the sums of the rows (q, n) from begin to end, each of shape (c,); shape (c, q)."""
     running = np.zeros((rows.shape[0], rows.shape[1] + 1))
     np.cumsum(rows, axis=1, out=running[:, 1:])
     return (running[:, end] - running[:, begin]).T
@@ -168,7 +168,7 @@ def soft_ends(size: FloatArray) -> tuple[int, int]:
 
 
 def _commonest(size: FloatArray) -> float:
-    """Median of the largest number of values within ``STEADY`` of one of them."""
+    """Return the median of the largest number of values within ``STEADY`` of one of them."""
     ordered = np.sort(size)
     stops = np.searchsorted(ordered, ordered * (1 + 2 * STEADY), side="right")
     k = int(np.argmax(stops - np.arange(ordered.size)))
@@ -241,7 +241,7 @@ class Stretch:
         return (self.stop_ns - self.start_ns) / _NS
 
     def intersect(self, start_ns: int | None, stop_ns: int | None) -> Stretch:
-        """The part of it within limits.
+        """Return the part of it within limits.
 
         Args:
             start_ns: Lower limit [Unix ns], or None.
@@ -280,7 +280,7 @@ def steady_runs(
     *,
     least_s: float = 0.0,
 ) -> list[Stretch]:
-    """Stretches over which the logged gait parameters stay as they are.
+    """Return the stretches over which the logged gait parameters stay as they are.
 
     Args:
         t_ns: Times of the gait samples [Unix ns], shape (n,).
@@ -347,7 +347,7 @@ def moving(commands: Sequence[Series]) -> tuple[float, float] | None:
 
 
 def whole_cycles(start_s: float, stop_s: float, frequency_hz: float) -> tuple[float, float, int]:
-    """The whole cycles at the end of a stretch.
+    """Return the whole cycles at the end of a stretch.
 
     Args:
         start_s: Start of the stretch [s].
@@ -365,7 +365,7 @@ def whole_cycles(start_s: float, stop_s: float, frequency_hz: float) -> tuple[fl
 
 
 def long_enough(duration_s: float, frequency_hz: float) -> bool:
-    """Whether a stretch holds enough cycles for an analysis.
+    """Return whether a stretch holds enough cycles for an analysis.
 
     Args:
         duration_s: Its length [s].

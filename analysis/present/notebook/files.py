@@ -14,13 +14,10 @@ from undulog.capture.common.console import refuse_existing
 from undulog.capture.common.errors import DataError, MissingExtraError
 from undulog.capture.common.files import check_output, part_file, read_input, write_text
 
-from ...results import analysis as result_energy
-from ...results import analysis as result_over_time
-from ...results import coupling as result_sweep
-from ...results import oscillators
+from ...results import analysis, oscillators
 from ...results.analysis import Analysis, interval_key
 from ...results.comparison import Comparison
-from ...results.coupling import Coupling, LocalCoupling
+from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
 from ...results.estimate import Estimate
 from ...results.experiment import Experiment, Reversal
 
@@ -28,7 +25,7 @@ if TYPE_CHECKING:
     from ...results.shown import PresentedResult
 
 
-_NAMES = {**vars(oscillators), **vars(result_energy), **vars(result_over_time)}
+_NAMES = {**vars(oscillators), **vars(analysis)}
 """Types that :mod:`.analysis.results.analysis` names for type checkers only."""
 
 _KINDS: tuple[type[PresentedResult], ...] = (
@@ -37,39 +34,20 @@ _KINDS: tuple[type[PresentedResult], ...] = (
     Comparison,
     Reversal,
     LocalCoupling,
-    result_sweep.LinearCoupling,
+    LinearCoupling,
     Coupling,
 )
 
 
 def save(result: PresentedResult, path: Path, *, force: bool) -> Path:
-    """Write a result as JSON; see :meth:`.analysis.results.shown.PresentedResult.save`.
-
-    Args:
-        path: A name that ends in .json.
-        force: Replace the file if it exists.
-
-    Raises:
-        UsageError: If the name ends in anything else.
-        OutputExistsError: If it is there and ``force`` is not given.
-        LogWriteError: If it can't be written.
-    """
+    """Write a result as JSON; see :meth:`.analysis.results.shown.PresentedResult.save`."""
     check_output(path, (".json",), "the result file is JSON; end its name in .json", force=force)
     write_text(path, json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n")
     return path
 
 
 def save_tables(result: PresentedResult, folder: Path, *, force: bool) -> list[Path]:
-    """Write the tables as Parquet; see :meth:`.analysis.results.shown.PresentedResult.to_parquet`.
-
-    Args:
-        folder: Made if it isn't there.
-
-    Raises:
-        OutputExistsError: If one is there and ``force`` is not given.
-        MissingExtraError: If pyarrow is not installed.
-        LogWriteError: If one can't be written.
-    """
+    """Write the tables as Parquet; see :meth:`.results.shown.PresentedResult.to_parquet`."""
     frames = result.frames()
     folder.mkdir(parents=True, exist_ok=True)
     paths = {folder / f"{name}.parquet": frame for name, frame in frames.items()}
@@ -118,7 +96,7 @@ def _required(kind: type[Any]) -> set[str]:
 
 
 def _build(kind: Any, value: Any) -> Any:  # noqa: PLR0911 - one kind of type a line
-    """A value of an annotated type from plain JSON values."""
+    """Return a value of an annotated type from plain JSON values."""
     origin, arguments = get_origin(kind), get_args(kind)
     if kind is Any:
         return value
@@ -148,7 +126,7 @@ def _plain(kind: type[Any], value: Any) -> Any:
 
 
 def _dataclass(kind: Any, data: dict[str, Any]) -> Any:
-    """Of the kinds that fit, the one that says most."""
+    """Build the matching kind with the most fields."""
     fitting = [one for one in (kind, *kind.__subclasses__()) if _required(one) <= set(data)]
     chosen = max(fitting, key=lambda one: len(dataclasses.fields(one)), default=kind)
     hints = get_type_hints(chosen, localns=_NAMES)

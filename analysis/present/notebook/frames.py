@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from functools import singledispatch
+from itertools import chain
 from typing import Any, cast
 
 import numpy as np
@@ -30,7 +30,7 @@ _UNITS = ("_rad", "_hz", "_m_s", "_m", "_j", "_s", "_deg")
 
 
 def table(kind: type[Any], rows: Iterable[Any], **more: Iterable[Any]) -> pd.DataFrame:
-    """Dataclasses of one kind as a table.
+    """Return dataclasses of one kind as a table.
 
     An :class:`~.analysis.results.estimate.Estimate` named ``lag_rad`` becomes ``lag_rad``,
     ``lag_low_rad`` and ``lag_high_rad``; a field ``ci95`` becomes ``low`` and ``high``; tuples of
@@ -50,7 +50,7 @@ def table(kind: type[Any], rows: Iterable[Any], **more: Iterable[Any]) -> pd.Dat
 
 
 def row_of(one: Any) -> dict[str, Any]:
-    """One dataclass as a row."""
+    """Return a dataclass as a row."""
     row: dict[str, Any] = {}
     for field in fields(one):
         value = getattr(one, field.name)
@@ -61,25 +61,14 @@ def row_of(one: Any) -> dict[str, Any]:
 
 
 def ends(name: str) -> tuple[str, str]:
-    """Columns of the two ends of an interval.
-
-    Args:
-        name: Of the value's column, e.g. ``lag_rad``.
-
-    Returns:
-        For example ``lag_low_rad`` and ``lag_high_rad``.
-    """
+    """Return the columns of an interval's ends, e.g. ``lag_low_rad`` and ``lag_high_rad``."""
     unit = next((unit for unit in _UNITS if name.endswith(unit)), "")
     stem = name.removesuffix(unit)
     return f"{stem}_low{unit}", f"{stem}_high{unit}"
 
 
 def named(kind: type[Any], indices: Mapping[str, Any]) -> pd.DataFrame:
-    """A mapping of dataclasses as a table, the keys first.
-
-    Returns:
-        One row each.
-    """
+    """Return a mapping of dataclasses as a table, the keys first."""
     return table(kind, indices.values(), name=list(indices))
 
 
@@ -116,38 +105,50 @@ def _number(value: float | None) -> float:
 Frames = dict[str, pd.DataFrame]
 
 
-@singledispatch
-def frames_of(result: object) -> Frames:
-    """The tables of a result; see :meth:`.analysis.results.shown.PresentedResult.frames`.
-
-    Args:
-        result: A result of this package.
+def frames_of(result: object) -> Frames:  # noqa: PLR0911 - one kind of result a case
+    """Return the tables of a result; see :meth:`.analysis.results.shown.PresentedResult.frames`.
 
     Raises:
-        TypeError: If it is no result.
+        TypeError: If it is no result of this package.
     """
-    raise TypeError(f"{type(result).__name__} is no result of analysis")
+    match result:
+        case Analysis():
+            return _of_analysis(result)
+        case Experiment():
+            return _of_experiment(result)
+        case Reversal():
+            pairs = table(OrderedPair, result.pairs)
+            return {"mirror": table(MirrorJoint, result.joints), "pairs": pairs}
+        case LocalCoupling():
+            return _of_kicks(result)
+        case LinearCoupling():
+            return _of_sweep(result)
+        case Coupling():
+            if result.matrix is None:
+                return {"coupling": pd.DataFrame([row_of(result)])}
+            names = [str(k + 1) for k in range(len(result.matrix))]
+            return {"coupling": pd.DataFrame(_pairs(names) | _entries("coupling", result.matrix))}
+        case Comparison():
+            return _of_comparison(result)
+        case _:
+            raise TypeError(f"{type(result).__name__} is no result of analysis")
 
 
-@frames_of.register
-def _(result: Analysis) -> Frames:
+def _of_analysis(result: Analysis) -> Frames:
     frames = {
         "joints": table(JointResult, result.joints),
         "heterogeneity": named(Index, result.heterogeneity),
+        "gait": pd.DataFrame([row_of(result.gait)]),
     }
-    frames["gait"] = pd.DataFrame([row_of(result.gait)])
     if result.body is not None:
         models = {"measured": result.body.observed} | result.body.null
-        points = [(model, point) for model, points in models.items() for point in points]
-        frames["body"] = table(
-            BodyPoint, [point for _, point in points], model=[model for model, _ in points]
-        )
+        names = [model for model, points in models.items() for _ in points]
+        frames["body"] = table(BodyPoint, chain.from_iterable(models.values()), model=names)
     frames["artefacts"] = _artefacts(result.artefacts)
     return frames | _oscillators(result.oscillators)
 
 
-@frames_of.register
-def _(result: Experiment) -> Frames:
+def _of_experiment(result: Experiment) -> Frames:
     sessions = result.sessions
     joints = [joint for one in sessions for joint in one.joints]
     whose = [one.session.path for one in sessions for _ in one.joints]
@@ -158,29 +159,16 @@ def _(result: Experiment) -> Frames:
     }
     if result.reversal is not None:
         frames = frames_of(result.reversal) | frames
-    found = [(one.session.path, each) for one in sessions for each in one.artefacts]
-    frames["artefacts"] = _artefacts([each for _, each in found], [path for path, _ in found])
+    artefacts = [each for one in sessions for each in one.artefacts]
+    paths = [one.session.path for one in sessions for _ in one.artefacts]
+    frames["artefacts"] = _artefacts(artefacts, paths)
     if result.oscillators is not None:
         frames["modes"] = table(Mode, result.oscillators.modes)
     return frames | frames_of(result.coupling)
 
 
-@frames_of.register
-def _(result: Reversal) -> Frames:
-    return {"mirror": table(MirrorJoint, result.joints), "pairs": table(OrderedPair, result.pairs)}
-
-
-@frames_of.register
-def _(result: Coupling) -> Frames:
-    if result.matrix is None:
-        return {"coupling": pd.DataFrame([row_of(result)])}
-    names = [str(k + 1) for k in range(len(result.matrix))]
-    return {"coupling": pd.DataFrame(_pairs(names) | _entries("coupling", result.matrix))}
-
-
-@frames_of.register
-def _(result: LocalCoupling) -> Frames:
-    columns: dict[str, Sequence[str] | Sequence[float]] = dict(_pairs(result.joints))
+def _of_kicks(result: LocalCoupling) -> Frames:
+    columns: dict[str, Any] = dict(_pairs(result.joints))
     for symbol in ("P", "R", "G", "S"):
         matrix: Matrix | None = getattr(result, symbol)
         if matrix is not None:
@@ -195,11 +183,10 @@ def _(result: LocalCoupling) -> Frames:
     }
 
 
-@frames_of.register
-def _(result: LinearCoupling) -> Frames:
+def _of_sweep(result: LinearCoupling) -> Frames:
     parts: list[pd.DataFrame] = []
     for tone in result.tones:
-        columns: dict[str, Sequence[str] | Sequence[float]] = dict(_pairs(result.joints))
+        columns: dict[str, Any] = dict(_pairs(result.joints))
         columns["frequency_hz"] = [tone.frequency_hz] * len(columns["joint"])
         for symbol, unit, matrix in (("H", "", tone.H), ("Z", "_n_m_per_rad", tone.Z)):
             if matrix is not None:
@@ -213,18 +200,12 @@ def _(result: LinearCoupling) -> Frames:
     }
 
 
-@frames_of.register
-def _(result: Comparison) -> Frames:
+def _of_comparison(result: Comparison) -> Frames:
+    columns = ("a_rad", "b_rad", "difference_rad", "half_rad")
     waves = [
         pd.DataFrame(
-            {
-                "name": one.name,
-                "phase_rad": result.phase_rad,
-                "a_rad": one.a_rad,
-                "b_rad": one.b_rad,
-                "difference_rad": one.difference_rad,
-                "half_rad": one.half_rad,
-            }
+            {"name": one.name, "phase_rad": result.phase_rad}
+            | {name: getattr(one, name) for name in columns}
         )
         for one in result.waveforms
     ]
@@ -237,31 +218,32 @@ def _(result: Comparison) -> Frames:
     }
 
 
-def _artefacts(artefacts: Sequence[Artefact], whose: Sequence[str] | None = None) -> pd.DataFrame:
-    """One row a stretch; NaN as times of what holds throughout."""
-    nowhere: tuple[Span, ...] = ((float("nan"), float("nan")),)
-    rows = [(k, span) for k, one in enumerate(artefacts) for span in one.spans_s or nowhere]
-    frame = table(
-        Artefact,
-        [artefacts[k] for k, _ in rows],
-        **({} if whose is None else {"session": [whose[k] for k, _ in rows]}),
-    )
-    times = {
-        "start_s": [start for _, (start, _) in rows],
-        "stop_s": [stop for _, (_, stop) in rows],
-    }
-    return frame.assign(**times)
+def _artefacts(artefacts: Sequence[Artefact], paths: Sequence[str] | None = None) -> pd.DataFrame:
+    """Return one row a time window; its times are NaN if the artefact lasts throughout."""
+    throughout: tuple[Span, ...] = ((float("nan"), float("nan")),)
+    rows = [(k, span) for k, one in enumerate(artefacts) for span in one.spans_s or throughout]
+    more = {} if paths is None else {"session": [paths[k] for k, _ in rows]}
+    frame = table(Artefact, [artefacts[k] for k, _ in rows], **more)
+    frame["start_s"] = [start for _, (start, _) in rows]
+    frame["stop_s"] = [stop for _, (_, stop) in rows]
+    return frame
 
 
 def _oscillators(chains: Sequence[ChainCoupling]) -> Frames:
-    """Couplings and rates of all chains; none where no phases were logged."""
+    """Return couplings and rates of all chains; no tables without logged phases."""
     if not chains:
         return {}
-    links = [(chain.plane, link) for chain in chains for link in chain.links]
-    rates = [(chain.plane, rate) for chain in chains for rate in chain.oscillators]
     found = {
-        "oscillators": table(Link, [link for _, link in links], plane=[of for of, _ in links]),
-        "oscillator_rates": table(Rate, [rate for _, rate in rates], plane=[of for of, _ in rates]),
+        "oscillators": table(
+            Link,
+            [link for one in chains for link in one.links],
+            plane=[one.plane for one in chains for _ in one.links],
+        ),
+        "oscillator_rates": table(
+            Rate,
+            [rate for one in chains for rate in one.oscillators],
+            plane=[one.plane for one in chains for _ in one.oscillators],
+        ),
         "chains": table(ChainCoupling, chains),
     }
     return {name: frame.rename(columns=_with_unit) for name, frame in found.items()}
@@ -274,7 +256,7 @@ def _with_unit(column: str) -> str:
 
 
 def _pairs(names: Sequence[str]) -> dict[str, list[str]]:
-    """Who answers whom, row by row of a matrix."""
+    """Return responding and commanded joints, row by row of a matrix."""
     return {
         "joint": [name for name in names for _ in names],
         "commanded": [other for _ in names for other in names],

@@ -1,11 +1,11 @@
-"""Which pictures a result has."""
+"""Pictures of results for notebooks and files."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial, singledispatch
+from functools import cache, partial
 from html import escape
 from importlib.resources import files
 from itertools import count
@@ -23,7 +23,6 @@ from ...results.experiment import Experiment, Reversal
 from ...results.formats import degrees, relative
 
 if TYPE_CHECKING:
-    from ..page.matrix import Entries
     from ..page.svg import Drawing
 
 
@@ -44,11 +43,11 @@ class Picture:
     caption: str
 
     def __repr__(self) -> str:
-        """The caption."""
+        """Return the caption."""
         return f"<Picture: {plain(self.caption)}>"
 
     def _repr_html_(self) -> str:
-        """The figure on paper, whatever the notebook's theme, and its caption."""
+        """Return the figure on paper, whatever the notebook's theme, and its caption."""
         colors = "".join(f"--{name}:{value};" for name, value in paper_colors().items())
         rules = f"<style>{figure_rules()}</style>"
         style = f"{colors}background:var(--paper);color:var(--ink);max-width:60rem;padding:.5rem"
@@ -58,11 +57,7 @@ class Picture:
         )
 
     def to_svg(self) -> str:
-        """The figure as a file of its own.
-
-        Returns:
-            SVG with colours in the place of variables, on paper.
-        """
+        """Return the text of an SVG file, with colours instead of variables, on paper."""
         name = 'xmlns="http://www.w3.org/2000/svg"'
         svg = self.svg.replace("<svg ", f"<svg {name} ", 1)
         inside = svg.index(">") + 1
@@ -90,42 +85,26 @@ class Picture:
         return path
 
 
-def of(drawing: Drawing) -> Picture:
-    """A figure of the report as a picture."""
-    return Picture(drawing.svg, drawing.caption)
-
-
 @cache
 def paper_colors() -> dict[str, str]:
-    """The report's colours on light ground.
-
-    Returns:
-        Name of a variable to colour.
-    """
+    """Return the report's colours on light ground, by name of the variable."""
     light = _ROOT.search(_style())
     return dict(_VARIABLE.findall(light[1])) if light is not None else {}
 
 
 @cache
 def figure_rules() -> str:
-    """The report's rules for what is inside its figures.
-
-    Returns:
-        CSS whose selectors all begin with ``svg.``.
-    """
+    """Return the report's CSS rules for figures, whose selectors all begin with ``svg.``."""
     return "\n".join(line for line in _style().splitlines() if line.startswith("svg."))
 
 
 def _style() -> str:
-    return (
-        files("undulog.analysis.present.page")
-        .joinpath("templates/style.css")
-        .read_text(encoding="utf-8")
-    )
+    folder = files("undulog.analysis.present.page")
+    return folder.joinpath("templates", "style.css").read_text(encoding="utf-8")
 
 
 _number = count(1)
-"""Identifiers of a figure are its own in a notebook: figures are numbered as they are drawn."""
+"""Figures are numbered, so that two of a notebook share no identifiers."""
 
 
 def picture_of(result: object, what: str | None = None) -> Picture:
@@ -139,66 +118,63 @@ def picture_of(result: object, what: str | None = None) -> Picture:
         UsageError: If there is no such picture; the message lists those that are.
         MissingExtraError: If matplotlib is not installed.
     """
-    known = pictures_of(result)
-    name = next(iter(known)) if what is None else what
-    if name not in known:
-        raise UsageError(f"there is no picture {name!r} of it; there are: {', '.join(known)}")
     try:
-        return of(known[name](f"figure{next(_number)}"))
+        known = pictures_of(result)
+        name = next(iter(known)) if what is None else what
+        if name not in known:
+            raise UsageError(f"there is no picture {name!r} of it; there are: {', '.join(known)}")
+        drawing = known[name](f"figure{next(_number)}")
     except ImportError as error:
         raise MissingExtraError("plot()", "report", "matplotlib") from error
+    return Picture(drawing.svg, drawing.caption)
 
 
 Pictures = dict[str, "Callable[[str], Drawing]"]
 
 
-@singledispatch
 def pictures_of(result: object) -> Pictures:
-    """The pictures that a result has.
-
-    Args:
-        result: A result of this package.
+    """Return the pictures of a result.
 
     Returns:
-        Name to what draws it, given a prefix for identifiers; the most telling first.
+        Name to a function that draws it, given a prefix for identifiers; the main one first.
 
     Raises:
         UsageError: If it has none.
     """
-    raise UsageError(f"{result!r}: nothing in it can be drawn")
+    match result:
+        case Analysis():
+            return _of_analysis(result)
+        case Experiment():
+            return _of_experiment(result)
+        case Comparison():
+            return _of_comparison(result)
+        case Reversal():
+            return {"mirror": partial(_mirror_differences, result)}
+        case Coupling() if result.matrix is None:
+            raise UsageError(f"{result!r}: there is no matrix to draw")
+        case Coupling():
+            from ..page.matrix import entries_of, matrix_picture
+
+            return {one.symbol: partial(matrix_picture, one) for one in entries_of(result, ())}
+        case _:
+            raise UsageError(f"{result!r}: nothing in it can be drawn")
 
 
-@pictures_of.register(Analysis)
-def _(result: Analysis) -> Pictures:
-    def draw(prefix: str) -> Drawing:
-        from ..page.segments import segments
+def _of_analysis(result: Analysis) -> Pictures:
+    from ..page.motion import body_motion
+    from ..page.segments import segments
 
-        return segments(result.joints, prefix)
-
-    body = result.body
-    if body is None:
-        return {"segments": draw}
-
-    def move(prefix: str) -> Drawing:
-        from ..page.motion import body_motion
-
-        return body_motion(body, prefix)
-
-    return {"segments": draw, "body": move}
+    body = {} if result.body is None else {"body": partial(body_motion, result.body)}
+    return {"segments": partial(segments, result.joints), **body}
 
 
-@pictures_of.register(Experiment)
-def _(result: Experiment) -> Pictures:
+def _of_experiment(result: Experiment) -> Pictures:
+    from ..page.mirror import mirror_profile, profiles
+
     reversal = result.reversal
     known: Pictures = {}
     if reversal is not None:
-
-        def mirror(prefix: str) -> Drawing:
-            from ..page.mirror import mirror_profile, profiles
-
-            return mirror_profile(profiles(result, reversal), reversal, prefix)
-
-        known["mirror"] = mirror
+        known["mirror"] = partial(mirror_profile, profiles(result, reversal), reversal)
     if result.coupling.matrix is not None:
         known |= pictures_of(result.coupling)
     if not known:
@@ -206,48 +182,22 @@ def _(result: Experiment) -> Pictures:
     return known
 
 
-@pictures_of.register(Coupling)
-def _(result: Coupling) -> Pictures:
-    if result.matrix is None:
-        raise UsageError(f"{result!r}: there is no matrix to draw")
-    from ..page.matrix import entries_of
+def _of_comparison(result: Comparison) -> Pictures:
+    from ..page.comparison_view import differences_of
+    from ..page.motion import waveforms_drawing
 
-    return {one.symbol: partial(_matrix, one) for one in entries_of(result, ())}
-
-
-@pictures_of.register(Reversal)
-def _(result: Reversal) -> Pictures:
-    def draw(prefix: str) -> Drawing:
-        from ..page.comparison_view import Panel, differences_drawing
-
-        gains = [relative(one.log_gain_difference) for one in result.joints]
-        lags = [degrees(one.lag_difference_rad) for one in result.joints]
-        return differences_drawing(
-            [one.name for one in result.joints],
-            [Panel("gain [%]", gains, 2.0), Panel("lag [°]", lags, 1.0)],
-            title="Each joint against its mirror joint with the wave reversed",
-            prefix=prefix,
-        )
-
-    return {"mirror": draw}
+    waves = {"waveforms": partial(waveforms_drawing, result)} if result.waveforms else {}
+    return {"differences": partial(differences_of, result), **waves}
 
 
-@pictures_of.register(Comparison)
-def _(result: Comparison) -> Pictures:
-    def differences(prefix: str) -> Drawing:
-        from ..page.comparison_view import differences_of
+def _mirror_differences(result: Reversal, prefix: str) -> Drawing:
+    from ..page.comparison_view import Panel, differences_drawing
 
-        return differences_of(result, prefix)
-
-    def waveforms(prefix: str) -> Drawing:
-        from ..page.motion import waveforms_drawing
-
-        return waveforms_drawing(result, prefix)
-
-    return {"differences": differences} | ({"waveforms": waveforms} if result.waveforms else {})
-
-
-def _matrix(entries: Entries, prefix: str) -> Drawing:
-    from ..page.matrix import matrix_picture
-
-    return matrix_picture(entries, prefix)
+    gains = [relative(one.log_gain_difference) for one in result.joints]
+    lags = [degrees(one.lag_difference_rad) for one in result.joints]
+    return differences_drawing(
+        [one.name for one in result.joints],
+        [Panel("gain [%]", gains, 2.0), Panel("lag [°]", lags, 1.0)],
+        title="Each joint against its mirror joint with the wave reversed",
+        prefix=prefix,
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import singledispatch
+from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from ...results.analysis import Analysis
 from ...results.comparison import Comparison
 from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
 from ...results.experiment import Experiment, Reversal
-from ..text import render
+from ..text import render, unidentified
 from ..text_experiment import render_comparison, render_experiment, reversal_detail
 
 if TYPE_CHECKING:
@@ -29,15 +29,12 @@ class Presenter:
     """A :class:`.Presentation`; each method imports what it needs when called."""
 
     def text(self, result: PresentedResult) -> str:  # noqa: D102
-
         return text_of(result)
 
     def headline(self, result: PresentedResult) -> str:  # noqa: D102
-
         return headline_of(result)
 
     def html(self, result: PresentedResult) -> str:  # noqa: D102
-
         return html_of(result)
 
     def frames(self, result: PresentedResult) -> dict[str, pd.DataFrame]:  # noqa: D102
@@ -65,132 +62,77 @@ MOST_ROWS = 40
 """Rows of a table that a notebook shows."""
 
 
-@singledispatch
-def headline_of(result: object) -> str:
-    """The answer in one line, the first of :func:`text_of`.
-
-    Args:
-        result: A result of this package.
-
-    Returns:
-        One line, without its end.
+def headline_of(result: object) -> str:  # noqa: PLR0911 - one kind of result a case
+    """Return the answer in one line, the first of :func:`text_of`.
 
     Raises:
-        TypeError: If it is no result.
+        TypeError: If it is no result of this package.
     """
-    raise TypeError(f"{type(result).__name__} is no result of analysis")
+    match result:
+        case Analysis():
+            return f"{Path(result.session.path).name}: {result.answer.sentence}"
+        case Experiment():
+            count = len(result.sessions)
+            return f"{count} session{'s' if count > 1 else ''}: {result.answer}."
+        case Comparison():
+            return f"{result.answer}."
+        case Reversal():
+            return _reversal_headline(result)
+        case LocalCoupling():
+            return kick_answer(result)
+        case LinearCoupling():
+            return sweep_answer(result)
+        case Coupling():
+            return f"Coupling: {result.why}" if result.identifiable else unidentified(result)
+        case _:
+            raise TypeError(f"{type(result).__name__} is no result of analysis")
 
 
-@headline_of.register
-def _(result: Analysis) -> str:
-    return f"{Path(result.session.path).name}: {result.answer.sentence}"
-
-
-@headline_of.register
-def _(result: Experiment) -> str:
-    count = len(result.sessions)
-    return f"{count} session{'s' if count > 1 else ''}: {result.answer}."
-
-
-@headline_of.register
-def _(result: Comparison) -> str:
-    return f"{result.answer}."
-
-
-@headline_of.register
-def _(result: Reversal) -> str:
+def _reversal_headline(result: Reversal) -> str:
     runs = f"{result.forward_runs} + {result.reverse_runs} runs"
     differ = pair_order(result.pairs[0]) if result.pairs else "no pair is ordered"
     floor = "" if result.tilt.excluded or not result.pairs else ", or the floor is tilted"
     return f"Reversal, {runs}: {differ}{floor} ({formats.p_value_text(result.p)})"
 
 
-@headline_of.register
-def _(result: Coupling) -> str:
-    if not result.identifiable:
-        record = f" To identify it, record {result.record}." if result.record else ""
-        return f"Coupling: not identifiable: {result.why}.{record}"
-    return f"Coupling: {result.why}"
-
-
-@headline_of.register
-def _(result: LocalCoupling) -> str:
-    return kick_answer(result)
-
-
-@headline_of.register
-def _(result: LinearCoupling) -> str:
-    return sweep_answer(result)
-
-
-@singledispatch
 def text_of(result: object) -> str:
-    """A result as text, the answer first.
-
-    Args:
-        result: A result of this package.
+    """Return a result as text, the answer first.
 
     Raises:
-        TypeError: If it is no result.
+        TypeError: If it is no result of this package.
     """
-    raise TypeError(f"{type(result).__name__} is no result of analysis")
-
-
-@text_of.register
-def _(result: Analysis) -> str:
-    return render(result)
-
-
-@text_of.register
-def _(result: Experiment) -> str:
-    return render_experiment(result)
-
-
-@text_of.register
-def _(result: Comparison) -> str:
-    return render_comparison(result)
-
-
-@text_of.register
-def _(result: Reversal) -> str:
-    return "\n".join(map(plain, [headline_of(result), *reversal_detail(result)]))
-
-
-@text_of.register
-def _(result: Coupling) -> str:
-    return plain(headline_of(result))
-
-
-@text_of.register
-def _(result: LocalCoupling) -> str:
-    return "\n".join(map(plain, [headline_of(result), *kick_detail(result)]))
-
-
-@text_of.register
-def _(result: LinearCoupling) -> str:
-    return "\n".join(map(plain, [headline_of(result), *sweep_detail(result)]))
+    detail: Iterable[str] = ()
+    match result:
+        case Analysis():
+            return render(result)
+        case Experiment():
+            return render_experiment(result)
+        case Comparison():
+            return render_comparison(result)
+        case Reversal():
+            detail = reversal_detail(result)
+        case LocalCoupling():
+            detail = kick_detail(result)
+        case LinearCoupling():
+            detail = sweep_detail(result)
+        case _:
+            pass
+    return "\n".join(map(plain, [headline_of(result), *detail]))
 
 
 def html_of(result: Any) -> str:
-    """What a notebook shows of a result.
-
-    Args:
-        result: A result of this package.
-
-    Returns:
-        The answer, the first table, and the warnings; names from logs are escaped.
-    """
-    told = escape(plain(headline_of(result)))
+    """Return the answer, the first table, and the warnings, for a notebook; all text escaped."""
+    answer = escape(plain(headline_of(result)))
     name, frame = next(iter(result.frames().items()))
     clean = frame.head(MOST_ROWS).map(_readable)
     shown = clean.to_html(float_format="{:.4g}".format, index=False, na_rep="–")
     left = len(frame) - MOST_ROWS
     more = f", {left} more rows in frames()[{name!r}]" if left > 0 else ""
-    said = ""
+    remarks = ""
     for kind in ("warnings", "notes"):
         items = "".join(f"<li>{escape(plain(text))}</li>" for text in getattr(result, kind, ()))
-        said += f"<details><summary>{kind}</summary><ul>{items}</ul></details>" if items else ""
-    return f"<p><strong>{told}</strong></p><p>{escape(name)}{escape(more)}</p>{shown}{said}"
+        remarks += f"<details><summary>{kind}</summary><ul>{items}</ul></details>" if items else ""
+    return f"<p><strong>{answer}</strong></p><p>{escape(name)}{escape(more)}</p>{shown}{remarks}"
 
 
 def _readable(cell: object) -> object:

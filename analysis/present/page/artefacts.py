@@ -1,4 +1,4 @@
-"""What is wrong with samples, and when: rows with their place in the session."""
+"""Prepare artefacts, and commands and responses of a few joints, for the page."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from ...results import formats
 from ...results.analysis import Analysis, JointResult
 from ...results.artefact import KINDS, Artefact, Span
 from ...results.formats import degrees, estimate, short
-from .svg import REFERENCE, WIDTH_IN, Axes, Drawing, drawing, inline_svg, key, legend, new_figure
+from ...signals.columns import COMMAND_TOPIC, RESPONSE_TOPIC
+from .svg import REFERENCE, WIDTH_IN, Drawing, drawing, inline_svg, key, legend, new_figure
 from .tables import element, is_driven
 
 CYCLES = 2.5
@@ -33,11 +34,10 @@ MOST_POINTS = 600
 
 @dataclass(frozen=True)
 class Trace:
-    """Command and response of one joint over a stretch of the session.
+    """Command and response of one joint over a time window.
 
     Attributes:
-        joint: The joint's result.
-        place: Its index in the chain, from 0 at the head.
+        place: Index of the joint in the chain, from 0 at the head.
         command_t_s: Sampling times of the command from the session's start [s], shape (n,).
         command_rad: [rad], shape (n,).
         response_t_s: Sampling times of the response from the session's start [s], shape (k,).
@@ -53,61 +53,48 @@ class Trace:
 
 
 def chosen_joints(joints: Sequence[JointResult]) -> list[int]:
-    """The joints to show: head, middle and tail end of the plane that is driven most.
+    """Return head, middle and tail end of the plane with most driven joints.
 
     Returns:
-        Up to three indices, ascending; all joints count where none is driven.
+        Up to three indices, ascending; of all joints if none is driven.
     """
-    driven = [i for i, joint in enumerate(joints) if is_driven(joint)]
-    planes = [joints[i].plane for i in driven]
-    if driven:
+    members = [i for i, joint in enumerate(joints) if is_driven(joint)]
+    planes = [joints[i].plane for i in members]
+    if members:
         most = max(dict.fromkeys(planes), key=planes.count)
-        members = [i for i in driven if joints[i].plane == most]
+        members = [i for i in members if joints[i].plane == most]
     else:
         members = list(range(len(joints)))
-    if len(members) <= 3:
-        return members
-    return [members[0], members[len(members) // 2], members[-1]]
+    return sorted({members[k] for k in (0, len(members) // 2, -1)}) if members else []
 
 
 def stretch_s(analysis: Analysis) -> tuple[float, float]:
-    """The stretch to show: the last cycles of the last analysed window.
-
-    Args:
-        analysis: With or without a gait.
-
-    Returns:
-        Start and stop from the session's start [s].
-    """
+    """Return start and stop of the last cycles of the last analysed window [s]."""
     frequency = analysis.gait.frequency_hz.value
     length = CYCLES / frequency if frequency else SECONDS_WITHOUT_GAIT
-    window = analysis.gait.windows[-1] if analysis.gait.windows else None
-    stop = window.stop_s if window is not None else analysis.session.duration_s
-    first = window.start_s if window is not None else 0.0
+    first, stop = 0.0, analysis.session.duration_s
+    for window in analysis.gait.windows[-1:]:
+        first, stop = window.start_s, window.stop_s
     return max(first, stop - length), stop
 
 
 def read_traces(session: SessionView, analysis: Analysis) -> tuple[Trace, ...]:
-    """Read what :func:`command_response` draws.
-
-    Args:
-        analysis: Of that session; its options say which topics were analysed.
+    """Return the samples of a few joints from the analysed topics.
 
     Returns:
-        One trace a chosen joint; empty where a topic or all samples are missing.
+        One trace a chosen joint; empty if a topic or all samples are missing.
     """
     options = analysis.provenance.options
-    commands = str(options.get("command_topic") or "/joint_commands")
-    states = str(options.get("response_topic") or "/joint_states")
-    start_s, stop_s = stretch_s(analysis)
     start_ns = analysis.session.start_ns
-    bounds = {
-        "start_ns": start_ns + round(start_s * 1e9),
-        "stop_ns": start_ns + round(stop_s * 1e9),
-    }
+    start, stop = (start_ns + round(time_s * 1e9) for time_s in stretch_s(analysis))
     try:
-        command = session.joints(commands, "position", **bounds)
-        response = session.joints(states, "position", **bounds)
+        command, response = (
+            session.joints(str(topic), "position", start_ns=start, stop_ns=stop)
+            for topic in (
+                options.get("command_topic") or COMMAND_TOPIC,
+                options.get("response_topic") or RESPONSE_TOPIC,
+            )
+        )
     except (MissingChannelError, DataError):
         return ()
     traces: list[Trace] = []
@@ -129,7 +116,7 @@ def read_traces(session: SessionView, analysis: Analysis) -> tuple[Trace, ...]:
 
 
 def _thinned(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Every k-th finite sample, k the least that keeps within ``MOST_POINTS``."""
+    """Return every k-th finite sample, k the least that keeps within ``MOST_POINTS``."""
     finite = np.isfinite(values)
     t_s, values = t_s[finite], values[finite]
     step = max(1, -(-len(t_s) // MOST_POINTS))
@@ -137,50 +124,33 @@ def _thinned(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def command_response(traces: Sequence[Trace], joint_count: int, prefix: str) -> Drawing:
-    """Command (grey) and response (coloured) of a few joints, one panel each.
+    """Draw command (grey) and response (coloured) of a few joints, one panel each.
 
     Args:
         joint_count: Joints in the chain, for their colours.
         prefix: For identifiers, unique in the page.
-
-    Returns:
-        The figure; angles in degrees.
     """
     colors = joint_hex(joint_count)
     with drawing():
         figure = new_figure(WIDTH_IN, 0.7 + 1.35 * len(traces))
         grid = figure.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)
-        for k, trace in enumerate(traces):
-            axes: Axes = grid[k, 0]
-            axes.plot(
-                trace.command_t_s, np.degrees(trace.command_rad), color=REFERENCE, linewidth=2.4
-            )
-            axes.plot(
-                trace.response_t_s,
-                np.degrees(trace.response_rad),
-                color=colors[trace.place],
-                linewidth=1.6,
-            )
+        for (axes,), trace in zip(grid, traces, strict=True):
+            command, response = np.degrees(trace.command_rad), np.degrees(trace.response_rad)
+            axes.plot(trace.command_t_s, command, color=REFERENCE, linewidth=2.4)
+            axes.plot(trace.response_t_s, response, color=colors[trace.place], linewidth=1.6)
             axes.set_title(_panel_title(trace.joint))
             axes.margins(x=0.01)
         figure.supylabel("joint angle [°]", fontsize=8.0)
         grid[-1, 0].set_xlabel("time from the session's start [s]")
-        handles = [
-            key([], [], color=REFERENCE, linewidth=2.4, label="command"),
-            key([], [], color=colors[traces[len(traces) // 2].place], label="response"),
-        ]
-        legend(figure, handles)
-        svg = inline_svg(
-            figure,
-            prefix=prefix,
-            title="Command and response of " + ", ".join(t.joint.name for t in traces),
-            description="Joint angle over time, command in grey, response in the joint's colour. "
-            + "; ".join(_panel_title(t.joint) for t in traces)
-            + ".",
-        )
-    return Drawing(
-        svg, "The last analysed cycles: command in grey, response in the joint's colour."
-    )
+        command_key = key(color=REFERENCE, linewidth=2.4, label="command")
+        middle = colors[traces[len(traces) // 2].place]
+        legend(figure, command_key, key(color=middle, label="response"))
+        title = "Command and response of " + ", ".join(t.joint.name for t in traces)
+        about = "Joint angle over time, command in grey, response in the joint's colour. "
+        about += "; ".join(_panel_title(t.joint) for t in traces) + "."
+        svg = inline_svg(figure, prefix, title, about)
+    caption = "The last analysed cycles: command in grey, response in the joint's colour."
+    return Drawing(svg, caption)
 
 
 def _panel_title(joint: JointResult) -> str:
@@ -200,17 +170,17 @@ WHAT = {
     "limit": "a limit of the robot",
     "record": "the record, not mechanics",
 }
-"""What an artefact is about, in words."""
+"""Text for each source of artefacts."""
 
 
 @dataclass(frozen=True)
 class ArtefactRow:
-    """One artefact, of one or several joints at once, as the page shows it.
+    """A row of the page's table: one artefact of one or several joints.
 
     Attributes:
-        joints: Joint names, or how many there are.
-        meaning: What the values do, and what else is known.
-        line: A drawing of that along the session.
+        joints: Joint names, or their number.
+        meaning: Behaviour of the values, and the artefact's note.
+        line: Drawing of the time windows along the session.
     """
 
     joints: str
@@ -223,7 +193,7 @@ class ArtefactRow:
 
 
 def artefact_rows(analysis: Analysis) -> tuple[ArtefactRow, ...]:
-    """The artefacts of a session, those that several joints have at the same time as one.
+    """Return the artefacts of a session; those of several joints at the same time are one row.
 
     Returns:
         Rows: sensors first, then limits, then the record; each in chain order.
@@ -240,11 +210,7 @@ def artefact_rows(analysis: Analysis) -> tuple[ArtefactRow, ...]:
 
 
 def flagged_joints(joints: Sequence[JointResult]) -> tuple[tuple[str, str], ...]:
-    """Flags of the analysed cycles.
-
-    Returns:
-        Flag, and the joints that have it.
-    """
+    """Return each flag of the analysed cycles with the names of its joints."""
     found: dict[str, list[str]] = {}
     for joint in joints:
         for flag in joint.flags:
@@ -257,13 +223,10 @@ def _named(names: Sequence[str], count: int) -> str:
 
 
 def times_text(spans: tuple[Span, ...]) -> str:
-    """Stretches in words.
+    """Return time windows as text, e.g. ``2.00 to 3.50 s, 7.10 s and 3 more, 4.20 s in all``.
 
     Args:
-        spans: From the session's start [s]; none where it is not a matter of time.
-
-    Returns:
-        For example ``2.00 to 3.50 s, 7.10 s and 3 more, 4.20 s in all``.
+        spans: From the session's start [s]; none if the artefact lasts throughout.
     """
     if not spans:
         return "throughout"
@@ -296,10 +259,9 @@ def _row(same: Sequence[Artefact], analysis: Analysis) -> ArtefactRow:
 
 
 def _line(one: Artefact, analysis: Analysis) -> Markup:
-    """The session as a line, the analysed stretch raised, the artefact's stretches dark."""
+    """Return the session as a line: analysed window light, the artefact's windows dark."""
     whole = analysis.session.duration_s or 1.0
-    spans = one.spans_s or ((0.0, whole),)
-    analysed = [(w.start_s, w.stop_s) for w in analysis.gait.windows]
+    analysed = tuple((w.start_s, w.stop_s) for w in analysis.gait.windows)
 
     def bars(stretches: tuple[Span, ...], kind: str, least: float) -> Markup:
         path = ""
@@ -310,8 +272,8 @@ def _line(one: Artefact, analysis: Analysis) -> Markup:
 
     return element(
         "svg",
-        bars(tuple(analysed), "analysed", 0.0),
-        bars(spans, "held", 0.8),
+        bars(analysed, "analysed", 0.0),
+        bars(one.spans_s or ((0.0, whole),), "held", 0.8),
         viewBox="0 0 100 10",
         preserveAspectRatio="none",
         class_="spans",

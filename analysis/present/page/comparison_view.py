@@ -1,24 +1,21 @@
-"""What the page shows of a comparison."""
+"""Prepare a comparison for the page."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-
-from markupsafe import Markup
+from typing import Any, NamedTuple
 
 from undulog.capture.common.palette import joint_hex
 
 from ...compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, in_people_units, signed
-from ...results.analysis import SessionFacts
 from ...results.comparison import BODY, Comparison
 from ...results.estimate import Estimate
 from ...results.formats import scaled
 from ..text_experiment import comparison_method, margin_text
 from .motion import waveforms_drawing
 from .svg import (
-    INK,
+    DASHED,
     REFERENCE,
     WIDTH_IN,
     Axes,
@@ -29,20 +26,14 @@ from .svg import (
     key,
     legend,
     new_figure,
+    plot_estimate,
 )
 from .tables import Fact, joint_mark
 from .trials import Trial
 
-_DASHED = (0, (5, 3))
 
-
-@dataclass(frozen=True)
-class Panel:
-    """One quantity.
-
-    Attributes:
-        values: Of the joints, in that unit; those without a value are left out.
-    """
+class Panel(NamedTuple):
+    """One quantity: its label with unit, the joints' values in that unit, and its margin."""
 
     label: str
     values: Sequence[Estimate]
@@ -52,10 +43,9 @@ class Panel:
 def differences_drawing(
     names: Sequence[str], panels: Sequence[Panel], *, title: str, prefix: str
 ) -> Drawing:
-    """Differences of every joint, head to tail, one panel a quantity.
+    """Draw the differences of every joint, head to tail, one panel a quantity.
 
     Args:
-        title: What is subtracted from what.
         prefix: For identifiers, unique in the page.
     """
     colors = joint_hex(len(names))
@@ -68,43 +58,20 @@ def differences_drawing(
         joint_ticks(last, names)
         last.set_xlabel("joint, head on the left")
         figure.align_ylabels()
-        middle = colors[len(colors) // 2]
-        legend(
-            figure,
-            [
-                key([], [], color=middle, marker="o", label="difference, 95 %"),
-                key([], [], color=REFERENCE, linestyle=_DASHED, label="margins"),
-            ],
-        )
-        told = ", ".join(panel.label for panel in panels)
-        svg = inline_svg(
-            figure,
-            prefix=prefix,
-            title=title,
-            description=f"{len(names)} joints; panels: {told}.",
-        )
+        difference = key(color=colors[len(colors) // 2], marker="o", label="difference, 95 %")
+        legend(figure, difference, key(color=REFERENCE, linestyle=DASHED, label="margins"))
+        labels = ", ".join(panel.label for panel in panels)
+        svg = inline_svg(figure, prefix, title, f"{len(names)} joints; panels: {labels}.")
     return Drawing(svg, f"{title}. The intervals hold together at 95 %; dashed: the margins.")
 
 
 def _panel(axes: Axes, panel: Panel, colors: Sequence[str]) -> None:
     axes.axhline(0.0, color=REFERENCE, linewidth=0.8, zorder=1)
     for margin in (-panel.margin, panel.margin):
-        axes.axhline(margin, color=REFERENCE, linestyle=_DASHED, linewidth=0.8, zorder=1)
+        axes.axhline(margin, color=REFERENCE, linestyle=DASHED, linewidth=0.8, zorder=1)
     for place, (value, color) in enumerate(zip(panel.values, colors, strict=True), start=1):
-        if value.value is None:
-            continue
-        if value.ci95 is not None:
-            axes.plot([place, place], value.ci95, color=color, linewidth=1.6, zorder=2)
-        axes.plot(
-            [place],
-            [value.value],
-            "o",
-            markersize=5.2,
-            markerfacecolor=color,
-            markeredgecolor=INK,
-            markeredgewidth=0.5,
-            zorder=3,
-        )
+        if value.value is not None:
+            plot_estimate(axes, place, value, color)
     axes.set_ylabel(panel.label)
     axes.margins(y=0.15)
 
@@ -117,65 +84,37 @@ _VERDICTS = {
 }
 
 
-@dataclass(frozen=True)
-class ComparisonView:
-    """All that the template shows of a comparison.
-
-    Attributes:
-        sides: Letter and session, A first.
-        marks: Of the joints that answer differently.
-        differences: Of every joint, as a picture; None where there are none.
-        waveforms: Mean cycles, or None.
-        trials: What is shown to be the same.
-    """
-
-    comparison: Comparison
-    sentence: str
-    sides: tuple[tuple[str, SessionFacts], ...]
-    facts: tuple[Fact, ...]
-    marks: tuple[Markup, ...]
-    differences: Drawing | None
-    waveforms: Drawing | None
-    trials: tuple[Trial, ...]
-    method: str
-
-
-def comparison_view(comparison: Comparison) -> ComparisonView:
-    """Prepare what the template shows of a comparison."""
+def comparison_view(comparison: Comparison) -> dict[str, Any]:
+    """Return what the template shows of a comparison, by name."""
     sides = (("A", comparison.a), ("B", comparison.b))
-    return ComparisonView(
-        comparison=comparison,
-        sentence=comparison.answer,
-        sides=tuple((letter, one) for letter, sessions in sides for one in sessions),
-        facts=tuple(_facts(comparison)),
-        marks=_marks(comparison),
-        differences=differences_of(comparison, "differences") if joints_of(comparison) else None,
-        waveforms=waveforms_drawing(comparison, "waveforms") if comparison.waveforms else None,
-        trials=_trials(comparison),
-        method=comparison_method(comparison),
-    )
+    names = joints_of(comparison)
+    colors = dict(zip(names, joint_hex(len(names)), strict=True)) if names else {}
+    return {
+        "comparison": comparison,
+        "sentence": comparison.answer,
+        "sides": [(letter, one) for letter, sessions in sides for one in sessions],
+        "facts": _facts(comparison),
+        "marks": [joint_mark(colors[one.name], "horizontal") for one in comparison.named],
+        "differences": differences_of(comparison, "differences") if names else None,
+        "waveforms": waveforms_drawing(comparison, "waveforms") if comparison.waveforms else None,
+        "trials": _trials(comparison),
+        "method": comparison_method(comparison),
+    }
 
 
 def joints_of(comparison: Comparison) -> list[str]:
-    """The joints that are compared.
-
-    Returns:
-        Names, head to tail where mean cycles say so, else by name.
-    """
+    """Return the names of the compared joints, head to tail if known from their mean cycles."""
     return [one.name for one in comparison.waveforms] or sorted(
         {one.place for one in comparison.differences if one.quantity == "gain"}
     )
 
 
 def differences_of(comparison: Comparison, prefix: str) -> Drawing:
-    """Draw the differences of every joint.
+    """Draw the differences of every joint in gain, lag and energy, one panel each.
 
     Args:
         comparison: With at least one joint.
         prefix: For identifiers, unique in the page.
-
-    Returns:
-        Gain, lag and energy, one panel each.
     """
     names = joints_of(comparison)
     known = {(one.quantity, one.place): one.difference for one in comparison.differences}
@@ -192,14 +131,8 @@ def differences_of(comparison: Comparison, prefix: str) -> Drawing:
     return differences_drawing(names, panels, title="B minus A of every joint", prefix=prefix)
 
 
-def _marks(comparison: Comparison) -> tuple[Markup, ...]:
-    names = joints_of(comparison)
-    colors = dict(zip(names, joint_hex(len(names)), strict=True)) if names else {}
-    return tuple(joint_mark(colors[one.name], "horizontal") for one in comparison.named)
-
-
-def _trials(comparison: Comparison) -> tuple[Trial, ...]:
-    return tuple(
+def _trials(comparison: Comparison) -> list[Trial]:
+    return [
         Trial(
             f"Is the {WORDS[one.quantity]} the same on both sides, within {margin_text(one)}?",
             f"largest difference {margin_text(one, one.largest)}",
@@ -207,7 +140,7 @@ def _trials(comparison: Comparison) -> tuple[Trial, ...]:
             "yes, shown to be the same" if one.p < SIGNIFICANT_DIFFERENCE else "not shown",
         )
         for one in comparison.equivalence
-    )
+    ]
 
 
 def _facts(comparison: Comparison) -> list[Fact]:
@@ -222,10 +155,10 @@ def _facts(comparison: Comparison) -> list[Fact]:
         of = [one for one in comparison.differences if one.quantity == quantity]
         if of:
             worst = max(of, key=lambda one: one.size)
-            told = signed(*in_people_units(worst))
-            facts.append(Fact(f"Largest in {quantity}", told, f"B minus A, {worst.place}"))
+            text = signed(*in_people_units(worst))
+            facts.append(Fact(f"Largest in {quantity}", text, f"B minus A, {worst.place}"))
     for one in comparison.differences:
         if one.place == BODY:
-            told = signed(*in_people_units(one))
-            facts.append(Fact(WORDS[one.quantity].capitalize(), told, "B minus A"))
+            text = signed(*in_people_units(one))
+            facts.append(Fact(WORDS[one.quantity].capitalize(), text, "B minus A"))
     return facts

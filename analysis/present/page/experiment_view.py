@@ -1,61 +1,52 @@
-"""What the page shows of several sessions of one experiment."""
+"""Prepare an experiment for the page."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 from ...experiment.answer import kick_checks, sweep_checks
 from ...experiment.sweep.coupling import NONLINEAR
 from ...results import formats
-from ...results.analysis import Analysis, JointResult
 from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
 from ...results.estimate import Estimate
-from ...results.experiment import Experiment, Run
-from ..text_experiment import by_note, by_warning, method, reversal_detail
-from .matrix import Entries, entries_of, matrix_picture
+from ...results.experiment import Experiment, Reversal
+from ..text_experiment import by_sentence, method, reversal_detail
+from .matrix import entries_of, matrix_picture
 from .mirror import mirror_profile, profiles
 from .oscillators import body_facts, entrainment_entries, modes_drawing
-from .svg import Drawing
 from .tables import Fact, digits
 from .trials import Trial, experiment_trials
 
 AGREE = 0.1
-"""Z by torques and Z behind the described servos are called one up to this relative difference."""
+"""Largest relative difference of Z from torques and Z from the described servos that agree."""
 
 
-def sweep_facts(coupling: LinearCoupling) -> list[Fact]:
-    """Key figures at the first tone."""
+def _sweep_facts(coupling: LinearCoupling) -> list[Fact]:
+    """Return the key figures at the first tone."""
     tone = coupling.tones[0]
     tones = ", ".join(f"{one.frequency_hz:.4g}" for one in coupling.tones)
-    at = f"{tone.frequency_hz:.4g} Hz"
+    contact = {True: "in contact", False: "without contact", None: "contact unknown"}
     what = "X" if tone.Z is None else "Z"
-    of = f"of the off-diagonal energy of {what} at {at}"
-    inverted = tone.inverted_condition if tone.Z is not None else tone.condition_number
+    at = f"{what} at {tone.frequency_hz:.4g} Hz"
+    of = f"of the off-diagonal energy of {at}"
+    number = tone.inverted_condition if tone.Z is not None else tone.condition_number
+    condition = "singular" if number is None else f"{number:.3g}"
+    name = "Tone" if len(coupling.tones) == 1 else "Tones"
     return [
-        Fact(
-            "Tone" if len(coupling.tones) == 1 else "Tones",
-            f"{tones} Hz",
-            {True: "in contact", False: "without contact", None: "contact unknown"}[
-                coupling.contact
-            ],
-        ),
-        Fact("Asymmetry", formats.percent(tone.asymmetry), f"of {what} at {at}; 0 is reciprocal"),
+        Fact(name, f"{tones} Hz", contact[coupling.contact]),
+        Fact("Asymmetry", formats.percent(tone.asymmetry), f"of {at}; 0 is reciprocal"),
         Fact("Between neighbours", formats.percent(tone.within_1), of),
         Fact("Within two joints", formats.percent(tone.within_2), of),
         Fact("Within three joints", formats.percent(tone.within_3), of),
-        Fact(
-            "Condition number",
-            "singular" if inverted is None else f"{inverted:.3g}",
-            "of what is inverted; the errors grow by it",
-        ),
+        Fact("Condition number", condition, "of what is inverted; the errors grow by it"),
     ]
 
 
-def sweep_trials(coupling: LinearCoupling) -> list[Trial]:
-    """What must hold for the matrices to mean something."""
+def _sweep_trials(coupling: LinearCoupling) -> list[Trial]:
+    """Return the conditions for the matrices to be meaningful."""
     drift = coupling.drift_per_cycle
     settled = "no drift beyond noise" if drift == 0 else f"drift {digits(100 * drift)} % a cycle"
     trials = [
@@ -65,24 +56,15 @@ def sweep_trials(coupling: LinearCoupling) -> list[Trial]:
     for tone in coupling.tones:
         at = f"at {tone.frequency_hz:.4g} Hz"
         if tone.asymmetry.ci95 is not None:
-            trials.append(
-                Trial(
-                    f"Does every pair of joints act on one another alike, {at}?",
-                    f"asymmetry {formats.percent(tone.asymmetry)}",
-                    None,
-                    "no" if tone.asymmetry.ci95[0] > 0 else "a difference could not be shown",
-                )
-            )
+            question = f"Does every pair of joints act on one another alike, {at}?"
+            verdict = "no" if tone.asymmetry.ci95[0] > 0 else "a difference could not be shown"
+            asymmetry = f"asymmetry {formats.percent(tone.asymmetry)}"
+            trials.append(Trial(question, asymmetry, None, verdict))
         apart = tone.servo_difference
         if apart is not None:
-            trials.append(
-                Trial(
-                    f"Do the described servos fit the torques, {at}?",
-                    f"Z differs by {digits(100 * apart)} %",
-                    None,
-                    f"{'yes' if apart <= AGREE else 'no'}, {100 * AGREE:g} % is taken as one",
-                )
-            )
+            question = f"Do the described servos fit the torques, {at}?"
+            verdict = f"{'yes' if apart <= AGREE else 'no'}, {100 * AGREE:g} % is taken as one"
+            trials.append(Trial(question, f"Z differs by {digits(100 * apart)} %", None, verdict))
     return trials
 
 
@@ -100,160 +82,82 @@ _NUMBERS = re.compile(r"[-+]?\d[\d.e-]*")
 _BOUND = "no joint differs more from its mirror, 95 %"
 
 
-@dataclass(frozen=True)
-class RunsTable:
-    """A quantity of every joint in every run.
-
-    Attributes:
-        title: What it is, with its unit.
-        decimals: Digits after the point.
-        rows: One a run: the values of all joints that any run knows.
-    """
-
-    title: str
-    decimals: int
-    rows: tuple[tuple[float | None, ...], ...]
-
-
-@dataclass(frozen=True)
-class ExperimentView:
-    """All that the template shows of an experiment.
-
-    Attributes:
-        runs: Each session's part, and its numbers.
-        left_out: Sessions that have no part in it.
-        answers: What each session says by itself.
-        mirror: Both directions, or None.
-        entries: Coupling matrices, the main one first.
-        told: What the coupling says besides, in sentences.
-        modes: What oscillators that feel their servos would do, or None.
-        entrainment: The other reading of P, or None.
-        indices: Whether any heterogeneity index has a value.
-        shared: Warnings of single sessions, alike ones once, with the files that have them.
-        notes: Notes of single sessions, likewise.
-        flagged: Flag of a joint, with the files that have it.
-        names: Joints that any run has a gain of.
-        tables: Gain and lag of them in every run.
-    """
-
-    experiment: Experiment
-    runs: tuple[tuple[Run, Analysis], ...]
-    left_out: tuple[Run, ...]
-    sentence: str
-    detail: tuple[str, ...]
-    facts: tuple[Fact, ...]
-    answers: tuple[str, ...]
-    mirror: Drawing | None
-    entries: tuple[Entries, ...]
-    matrices: tuple[Drawing, ...]
-    told: tuple[str, ...]
-    modes: Drawing | None
-    body_facts: tuple[Fact, ...]
-    entrainment: Entries | None
-    trials: tuple[Trial, ...]
-    indices: bool
-    shared: tuple[tuple[str, str], ...]
-    notes: tuple[str, ...]
-    flagged: tuple[tuple[str, str], ...]
-    names: tuple[str, ...]
-    tables: tuple[RunsTable, ...]
-    method: str
-
-
-def experiment_view(experiment: Experiment) -> ExperimentView:
-    """Prepare what the template shows of an experiment."""
+def experiment_view(experiment: Experiment) -> dict[str, Any]:
+    """Return what the template shows of an experiment, by name."""
     reversal, coupling, body = experiment.reversal, experiment.coupling, experiment.oscillators
-    names = _known_joints(experiment)
+    joints = [joint for one in experiment.sessions for joint in one.joints]
+    known = {joint.name for joint in joints if joint.gain.value is not None}
+    names = tuple(name for name in dict.fromkeys(j.name for j in joints) if name in known)
     entries = entries_of(coupling, names)
+    trials = experiment_trials(experiment)
     mirror = None
     if reversal is not None:
         mirror = mirror_profile(profiles(experiment, reversal), reversal, "mirror-figure")
-    return ExperimentView(
-        experiment=experiment,
-        runs=tuple(zip(experiment.runs, experiment.sessions, strict=True)),
-        left_out=tuple(run for run in experiment.runs if run.role is None),
-        sentence=formats.sentence(experiment.answer),
-        detail=tuple(reversal_detail(reversal)) if reversal is not None else (),
-        facts=tuple(_facts(experiment)),
-        answers=tuple(one.answer.sentence for one in experiment.sessions),
-        mirror=mirror,
-        entries=entries,
-        matrices=tuple(
+    if isinstance(coupling, LinearCoupling):
+        trials += _sweep_trials(coupling)
+    return {
+        "experiment": experiment,
+        "runs": list(zip(experiment.runs, experiment.sessions, strict=True)),
+        "left_out": [run for run in experiment.runs if run.role is None],
+        "sentence": formats.sentence(experiment.answer),
+        "detail": [] if reversal is None else list(reversal_detail(reversal)),
+        "facts": _facts(experiment),
+        "answers": [one.answer.sentence for one in experiment.sessions],
+        "mirror": mirror,
+        "entries": entries,
+        "matrices": [
             matrix_picture(one, f"matrix-{k + 1}", small=k > 0) for k, one in enumerate(entries)
-        ),
-        told=_checks(coupling),
-        modes=None if body is None else modes_drawing(body, "modes-figure"),
-        body_facts=() if body is None else tuple(body_facts(body)),
-        entrainment=None if body is None else entrainment_entries(body),
-        trials=experiment_trials(experiment)
-        + (tuple(sweep_trials(coupling)) if isinstance(coupling, LinearCoupling) else ()),
-        indices=any(one.value is not None for one in experiment.heterogeneity.values()),
-        shared=tuple(_alike(by_warning(experiment))),
-        notes=tuple(f"{note} ({files})" for note, files in _alike(by_note(experiment))),
-        flagged=tuple(_flagged(experiment)),
-        names=names,
-        tables=_tables(experiment, names),
-        method=formats.sentence(method(experiment)),
-    )
-
-
-def _checks(coupling: Coupling) -> tuple[str, ...]:
-    if isinstance(coupling, LocalCoupling):
-        return tuple(kick_checks(coupling))
-    return tuple(sweep_checks(coupling)) if isinstance(coupling, LinearCoupling) else ()
-
-
-def _known_joints(experiment: Experiment) -> tuple[str, ...]:
-    """Joints that have a gain in any session, in chain order."""
-    order = dict.fromkeys(joint.name for one in experiment.sessions for joint in one.joints)
-    known = {
-        joint.name
-        for one in experiment.sessions
-        for joint in one.joints
-        if joint.gain.value is not None
+        ],
+        "told": _checks(coupling),
+        "modes": None if body is None else modes_drawing(body, "modes-figure"),
+        "body_facts": [] if body is None else body_facts(body),
+        "entrainment": None if body is None else entrainment_entries(body),
+        "trials": trials,
+        "indices": any(one.value is not None for one in experiment.heterogeneity.values()),
+        "shared": _alike(by_sentence(experiment, "warnings")),
+        "notes": [f"{note} ({files})" for note, files in _alike(by_sentence(experiment, "notes"))],
+        "flagged": _flagged(experiment),
+        "names": names,
+        "tables": _tables(experiment, names),
+        "method": formats.sentence(method(experiment)),
     }
-    return tuple(name for name in order if name in known)
 
 
-def _tables(experiment: Experiment, names: Sequence[str]) -> tuple[RunsTable, ...]:
-    def rows(of: str) -> tuple[tuple[float | None, ...], ...]:
-        result: list[tuple[float | None, ...]] = []
-        for session in experiment.sessions:
-            joints = {joint.name: joint for joint in session.joints}
-            result.append(tuple(_value(joints.get(name), of) for name in names))
-        return tuple(result)
+def _checks(coupling: Coupling) -> list[str]:
+    if isinstance(coupling, LocalCoupling):
+        return list(kick_checks(coupling))
+    return list(sweep_checks(coupling)) if isinstance(coupling, LinearCoupling) else []
 
+
+def _tables(experiment: Experiment, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Return gain and lag of every joint, one row a run."""
     if not names:
-        return ()
-    return (RunsTable("gain [1]", 3, rows("gain")), RunsTable("lag [°]", 2, rows("lag")))
-
-
-def _value(joint: JointResult | None, of: str) -> float | None:
-    if joint is None:
-        return None
-    return joint.gain.value if of == "gain" else formats.degrees(joint.lag_rad).value
-
-
-def _alike(warnings: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Warnings that differ by their numbers alone, once."""
-    found: dict[str, list[tuple[str, str]]] = {}
-    for warning, files in warnings:
-        found.setdefault(_NUMBERS.sub("#", warning), []).append((warning, files))
+        return []
+    runs = [{joint.name: joint for joint in one.joints} for one in experiment.sessions]
+    rows = [[joints.get(name) for name in names] for joints in runs]
+    gains = [[j and j.gain.value for j in row] for row in rows]
+    lags = [[j and formats.degrees(j.lag_rad).value for j in row] for row in rows]
     return [
-        (
-            first,
-            files if not more else f"{files}; alike, with other numbers, {_times(len(more))} more",
-        )
-        for (first, files), *more in found.values()
+        {"title": "gain [1]", "decimals": 3, "rows": gains},
+        {"title": "lag [°]", "decimals": 2, "rows": lags},
     ]
 
 
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"
+def _alike(warnings: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Return one warning of those that differ in their numbers only."""
+    found: dict[str, list[tuple[str, str]]] = {}
+    for warning, files in warnings:
+        found.setdefault(_NUMBERS.sub("#", warning), []).append((warning, files))
+    result: list[tuple[str, str]] = []
+    for (first, files), *more in found.values():
+        times = "once" if len(more) == 1 else f"{len(more)} times"
+        rest = f"; alike, with other numbers, {times} more" if more else ""
+        result.append((first, files + rest))
+    return result
 
 
 def _flagged(experiment: Experiment) -> list[tuple[str, str]]:
-    """Joint and flag, with the files that show it."""
+    """Return joint and flag with the names of the files that have it."""
     seen: dict[str, list[str]] = {}
     for session in experiment.sessions:
         for joint in session.joints:
@@ -274,58 +178,41 @@ def _facts(experiment: Experiment) -> list[Fact]:
     for run in runs:
         word = run.role or "left out"
         roles[word] = roles.get(word, 0) + 1
-    told = ", ".join(f"{count} {word}" for word, count in roles.items())
-    facts = [Fact("Sessions", str(len(runs)), told)]
+    counts = ", ".join(f"{count} {word}" for word, count in roles.items())
+    facts = [Fact("Sessions", str(len(runs)), counts)]
     frequencies = [v for s in experiment.sessions if (v := s.gait.frequency_hz.value) is not None]
     if frequencies and not isinstance(experiment.coupling, LinearCoupling):
         low, high = (formats.number(v, 3) for v in (min(frequencies), max(frequencies)))
         facts.append(Fact("Gait frequency", f"{low} Hz" if low == high else f"{low} to {high} Hz"))
-    reversal, coupling = experiment.reversal, experiment.coupling
-    if reversal is not None:
-        lag_bound = math.degrees(reversal.lag_bound_rad)
-        facts += [
-            Fact("p of identical modules", formats.p_value(reversal.p), _floor(reversal.p_floor)),
-            Fact(
-                "Modules' share",
-                formats.percent(reversal.module_share),
-                "of the spread over the joints",
-            ),
-            Fact(
-                "Boundary's share",
-                formats.percent(reversal.boundary_share),
-                "of the spread, the rest",
-            ),
-            Fact("Gain bound", f"{formats.number(100 * reversal.gain_bound, 2)} %", _BOUND),
-            Fact("Lag bound", f"{formats.number(lag_bound, 2)}°", _BOUND),
-        ]
+    if experiment.reversal is not None:
+        facts += _reversal_facts(experiment.reversal)
+    coupling = experiment.coupling
     if isinstance(coupling, LinearCoupling):
-        facts += sweep_facts(coupling)
+        facts += _sweep_facts(coupling)
     if isinstance(coupling, LocalCoupling):
-        valid = coupling.valid_to
-        facts += [
-            Fact(
-                "Nonlinearity",
-                formats.percent(coupling.nonlinearity),
-                "0 is linear, time-invariant",
-            ),
-            Fact(
-                "Asymmetry of X",
-                formats.percent(coupling.lti.asymmetry),
-                "read as linear; 0 reciprocal",
-            ),
-            Fact(
-                "Within one joint",
-                formats.percent(coupling.lti.within_1),
-                "of X's off-diagonal energy",
-            ),
-            Fact(
-                "Valid to",
-                formats.estimate(Estimate(valid), " rad"),
-                f"{len(coupling.held_out)} held-out runs",
-            ),
-        ]
+        facts += _kick_facts(coupling)
     return facts
 
 
-def _floor(p: float) -> str:
-    return f"the least these runs can give: {formats.number(p, 4)}"
+def _reversal_facts(reversal: Reversal) -> list[Fact]:
+    floor = f"the least these runs can give: {formats.number(reversal.p_floor, 4)}"
+    modules, boundary = map(formats.percent, (reversal.module_share, reversal.boundary_share))
+    lag_bound = math.degrees(reversal.lag_bound_rad)
+    return [
+        Fact("p of identical modules", formats.p_value(reversal.p), floor),
+        Fact("Modules' share", modules, "of the spread over the joints"),
+        Fact("Boundary's share", boundary, "of the spread, the rest"),
+        Fact("Gain bound", f"{formats.number(100 * reversal.gain_bound, 2)} %", _BOUND),
+        Fact("Lag bound", f"{formats.number(lag_bound, 2)}°", _BOUND),
+    ]
+
+
+def _kick_facts(coupling: LocalCoupling) -> list[Fact]:
+    valid = formats.estimate(Estimate(coupling.valid_to), " rad")
+    nonlinearity, lti = coupling.nonlinearity, coupling.lti
+    return [
+        Fact("Nonlinearity", formats.percent(nonlinearity), "0 is linear, time-invariant"),
+        Fact("Asymmetry of X", formats.percent(lti.asymmetry), "read as linear; 0 reciprocal"),
+        Fact("Within one joint", formats.percent(lti.within_1), "of X's off-diagonal energy"),
+        Fact("Valid to", valid, f"{len(coupling.held_out)} held-out runs"),
+    ]

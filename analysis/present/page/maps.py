@@ -1,4 +1,4 @@
-"""Maps of joints against cycles: how gain, lag and power went on.
+"""Draw maps of joints against cycles: gain, lag and power over time.
 
 Colours run in a straight line through OKLab, in equal steps of lightness for equal steps of value,
 and from one hue over the ground to another where the sign matters.
@@ -18,12 +18,11 @@ from undulog.capture.common.arrays import BoolArray, FloatArray
 from ...results.formats import decimals_for_values, number, short
 from ...session.cycles import CycleMaps
 from .svg import Drawing
-from .tables import element
+from .tables import LEVELS, color_bar, element, hue, svg_element
 
 MOST_COLUMNS = 150
-"""Columns of a map; more cycles than these are averaged, and the page says so."""
+"""Columns of a map; more cycles are averaged, with a note."""
 
-LEVELS = 48
 WIDTH = 960.0
 """One unit is a pixel of a wide page."""
 
@@ -32,7 +31,7 @@ _RIGHT = 8.0
 
 @dataclass(frozen=True)
 class Map:
-    """What one map shows.
+    """A map.
 
     Attributes:
         names: Of the rows, head at the top, m.
@@ -40,7 +39,7 @@ class Map:
         holed: Whether any cycle of a column is missing, shape (m, k).
         edges_s: Limits of the columns from the session's start [s], shape (k + 1,).
         signed: Whether colours part at zero.
-        least: Smallest span of the colours: noise isn't magnified.
+        least: Smallest span of the colours, so that noise isn't magnified.
     """
 
     title: str
@@ -53,7 +52,7 @@ class Map:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Values at the ends of the colours."""
+        """The values at the ends of the colours."""
         low, high = float(np.nanmin(self.value)), float(np.nanmax(self.value))
         if self.signed:
             high = max(abs(low), abs(high), self.least / 2)
@@ -63,13 +62,10 @@ class Map:
 
 
 def cycle_drawings(cycles: CycleMaps, prefix: str) -> tuple[Drawing, ...]:
-    """Draw gain, lag and power.
+    """Draw gain, lag and power, as far as any cycle has them.
 
     Args:
         prefix: For identifiers, unique in the page.
-
-    Returns:
-        One drawing each; none of a quantity that no cycle has.
     """
     shown = (
         ("Gain", cycles.driven, cycles.gain, False, 0.02),
@@ -78,16 +74,14 @@ def cycle_drawings(cycles: CycleMaps, prefix: str) -> tuple[Drawing, ...]:
     )
     drawings: list[Drawing] = []
     for title, names, value, signed, least in shown:
-        if not np.isfinite(value).any():
-            continue
-        means, holed, edges_s = _thinned(cycles, value)
-        one = Map(title, names, means, holed, edges_s, signed, least)
-        drawings.append(_draw(one, f"{prefix}-{len(drawings)}", _caption(cycles, one)))
+        if np.isfinite(value).any():
+            one = Map(title, names, *_thinned(cycles, value), signed, least)
+            drawings.append(_draw(one, f"{prefix}-{len(drawings)}", _caption(cycles, one)))
     return tuple(drawings)
 
 
 def _thinned(cycles: CycleMaps, value: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Means over as few cycles as fit into the map's columns."""
+    """Return means over as few cycles as fit into the map's columns."""
     count = cycles.start_s.size
     step = -(-count // MOST_COLUMNS)
     first = np.arange(0, count, step)
@@ -111,34 +105,28 @@ def _draw(shown: Map, prefix: str, caption: str) -> Drawing:
     share = (shown.value - low) / (high - low)
     level = np.where(np.isfinite(share), np.rint(share * LEVELS), -1).astype(np.int64)
     paths = [
-        element(
-            "path",
-            d=_cells(level == n, edges, top, side),
-            class_=_hue(n, signed=shown.signed),
-            style=f"--v:{_strength(n, signed=shown.signed):.0f}%",
-        )
+        element("path", d=_cells(level == n, edges, top, side), **hue(n, signed=shown.signed))
         for n in range(LEVELS + 1)
         if (level == n).any()
     ]
     parts = [element("g", *paths, class_="cells")]
     if shown.holed.any():
         line = element("path", d="M0 0V6", class_="hatch")
-        pattern = element(
-            "pattern",
-            line,
-            id=f"{prefix}-missing",
-            width=6,
-            height=6,
-            patternUnits="userSpaceOnUse",
-            patternTransform="rotate(45)",
-        )
+        pattern = {
+            "id": f"{prefix}-missing",
+            "width": 6,
+            "height": 6,
+            "patternUnits": "userSpaceOnUse",
+            "patternTransform": "rotate(45)",
+        }
         holes = _cells(shown.holed, edges, top, side)
-        parts += [pattern, element("path", d=holes, fill=f"url(#{prefix}-missing)", class_="holed")]
+        parts.append(element("pattern", line, **pattern))
+        parts.append(element("path", d=holes, fill=f"url(#{prefix}-missing)", class_="holed"))
     foot = top + height
-    svg = element(
-        "svg",
-        element("title", f"{shown.title} of every joint in every cycle", id=f"{prefix}-title"),
-        element("desc", _in_words(shown), id=f"{prefix}-desc"),
+    svg = svg_element(
+        prefix,
+        f"{shown.title} of every joint in every cycle",
+        _in_words(shown),
         *parts,
         element("rect", x=left, y=top, width=width, height=height, class_="frame"),
         *_names(shown.names, left, top, side),
@@ -147,8 +135,6 @@ def _draw(shown: Map, prefix: str, caption: str) -> Drawing:
         viewBox=f"0 0 {WIDTH:.0f} {foot + 74:.0f}",
         role="img",
         class_="map",
-        aria_labelledby=f"{prefix}-title",
-        aria_describedby=f"{prefix}-desc",
     )
     return Drawing(str(svg), caption)
 
@@ -165,28 +151,10 @@ def _cells(chosen: BoolArray, edges: FloatArray, top: float, side: float) -> str
     )
 
 
-def _hue(level: int, *, signed: bool) -> str:
-    if not signed:
-        return "q"
-    return "plus" if 2 * level >= LEVELS else "minus"
-
-
-def _strength(level: int, *, signed: bool) -> float:
-    """How much of the hue is in a colour [%]."""
-    share = level / LEVELS
-    return 100 * abs(2 * share - 1) if signed else 100 * share
-
-
 def _names(names: Sequence[str], left: float, top: float, side: float) -> list[Markup]:
     step = 1 if side > 14 else 2
     return [
-        element(
-            "text",
-            short(name, 12),
-            x=left - 6,
-            y=top + side * (i + 0.5),
-            text_anchor="end",
-        )
+        element("text", short(name, 12), x=left - 6, y=top + side * (i + 0.5), text_anchor="end")
         for i, name in enumerate(names)
         if i % step == 0
     ]
@@ -203,10 +171,10 @@ def _times(edges_s: FloatArray, left: float, width: float, foot: float) -> list[
     for tick in ticks:
         x = left + width * (tick - start) / (stop - start)
         parts.append(element("path", d=f"M{x:.1f} {foot:g}v4", class_="tick"))
-        label = number(tick, digits)
-        parts.append(element("text", label, x=x, y=foot + 13, text_anchor="middle"))
-    told = "time from the session's start [s]"
-    parts.append(element("text", told, x=left + width, y=foot + 30, text_anchor="end"))
+        text = number(tick, digits)
+        parts.append(element("text", text, x=x, y=foot + 13, text_anchor="middle"))
+    label = "time from the session's start [s]"
+    parts.append(element("text", label, x=left + width, y=foot + 30, text_anchor="end"))
     return parts
 
 
@@ -214,25 +182,13 @@ def _bar(shown: Map, left: float, top: float) -> list[Markup]:
     low, high = shown.limits
     digits = decimals_for_values([low, high], 3)
     width = 240.0
-    bars = [
-        element(
-            "rect",
-            x=left + width * n / (LEVELS + 1),
-            y=top,
-            width=width / (LEVELS + 1) + 0.4,
-            height=9,
-            class_=_hue(n, signed=shown.signed),
-            style=f"--v:{_strength(n, signed=shown.signed):.0f}%",
-        )
-        for n in range(LEVELS + 1)
-    ]
     ends = ((low, 0.0, "start"), ((low + high) / 2, 0.5, "middle"), (high, 1.0, "end"))
     texts = [
         element("text", number(v, digits), x=left + width * f, y=top + 20, text_anchor=anchor)
         for v, f, anchor in ends
     ]
     title = element("text", shown.title, x=left + width + 14, y=top + 5)
-    return [*bars, *texts, title]
+    return [*color_bar(left, top, width, 9, signed=shown.signed), *texts, title]
 
 
 def _in_words(shown: Map) -> str:
@@ -252,10 +208,8 @@ def _caption(cycles: CycleMaps, shown: Map) -> str:
     name = shown.title.partition(" [")[0].capitalize()
     text = f"{name}: each column is one of {count} cycles."
     if step > 1:
-        text = (
-            f"{name}: {count} cycles are too many to show one by one; each column is the mean of "
-            f"{step}."
-        )
+        text = f"{name}: {count} cycles are too many to show one by one; "
+        text += f"each column is the mean of {step}."
     if shown.signed:
         text += " Negative: driven by the rest of the body."
     if shown.holed.any():

@@ -1,4 +1,4 @@
-"""A matrix of coupling as a picture: who follows whom, with every number in reach.
+"""Draw a coupling matrix whose numbers can all be reached by mouse and keyboard.
 
 Colour goes from one hue over the page's ground to another, in equal steps of lightness for equal
 steps of value (a straight line in OKLab), and a stroke stands in every negative cell, so that the
@@ -8,6 +8,7 @@ sign needs no colour. Rows take the focus: the keyboard reaches every number, an
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -16,10 +17,10 @@ from markupsafe import Markup
 
 from undulog.capture.common.arrays import FloatArray
 
-from ...results.coupling import ComplexMatrix, Coupling, LinearCoupling, LocalCoupling, Matrix
+from ...results.coupling import ComplexMatrix, Coupling, LinearCoupling, LocalCoupling
 from ...results.formats import decimals_for_values, number, short
 from .svg import Drawing
-from .tables import element, joined
+from .tables import color_bar, element, joined, svg_element
 
 
 @dataclass(frozen=True)
@@ -28,13 +29,13 @@ class Entries:
 
     Attributes:
         symbol: E.g. ``P``.
-        meaning: What an entry is, in words.
+        meaning: Of an entry.
         rows: Names of the responding joints, m.
         columns: Names of the commanded joints, k.
-        value: Shape (m, k); NaN where nothing is known.
-        half: Half widths of the 95 % intervals, same shape; None where they are not known.
-        verb: What the one does to the other.
-        ends: Magnitude at the ends of the colours, where it is given by what stands beside it.
+        value: Shape (m, k); NaN if unknown.
+        half: Half widths of the 95 % intervals, same shape, or None.
+        verb: Between the names of row and column.
+        ends: Magnitude at the ends of the colours, if another matrix gives it.
     """
 
     symbol: str
@@ -50,7 +51,7 @@ class Entries:
 
     @property
     def limit(self) -> float:
-        """Magnitude at the ends of the colours: the largest beside the diagonal, else of all."""
+        """The magnitude at the ends of the colours: the largest off the diagonal, else of all."""
         if self.ends is not None:
             return self.ends
         size = np.nan_to_num(np.abs(self.value))
@@ -59,14 +60,7 @@ class Entries:
         return largest or float(size.max()) or 1.0
 
     def entry_text(self, i: int, j: int, decimals: int) -> str:
-        """One entry in words.
-
-        Args:
-            decimals: Digits after the point.
-
-        Returns:
-            For example ``-0.21 ± 0.01``.
-        """
+        """Return an entry as text, e.g. ``-0.21 ± 0.01``."""
         text = number(float(self.value[i, j]), decimals)
         if self.half is None or not np.isfinite(self.value[i, j]):
             return text
@@ -74,18 +68,18 @@ class Entries:
 
     @property
     def cell_decimals(self) -> int:
-        """Digits after the point that show two digits of the entries beside the diagonal."""
+        """The decimals that show two digits of the entries off the diagonal."""
         return max(2, decimals_for_values([self.limit], 2))
 
     @property
     def decimals(self) -> int:
-        """Digits after the point that show two digits of the typical interval, 2 to 6."""
+        """The decimals that show two digits of the typical interval, 2 to 6."""
         if self.half is None or not np.median(self.half) > 0:
             return 3
         return int(np.clip(1 - np.floor(np.log10(np.median(self.half))), 2, 6))
 
     def in_words(self) -> str:
-        """What a reader who can't see the picture should know."""
+        """Return the description for readers who can't see the picture."""
         m, k = self.value.shape
         return (
             f"{m} rows: {self.row}; {k} columns: {self.column}. The colours end at "
@@ -94,90 +88,94 @@ class Entries:
 
 
 def entries_of(coupling: Coupling, names: tuple[str, ...]) -> tuple[Entries, ...]:
-    """The matrices that a coupling holds, the main one first.
+    """Return the matrices of a coupling, the main one first.
 
     Args:
-        coupling: Of a session or an experiment.
-        names: Of the driven joints, where the coupling doesn't name them itself.
+        names: Of the driven joints, if the coupling doesn't name them itself.
 
     Returns:
-        None where it isn't identifiable; P, R, G and S of local kicks; of a sweep Z, where it is
-        known, and H at its first tone, then the first of them at the others; else its one matrix.
+        P, R, G and S of local kicks; of a sweep Z, if known, and H at its first tone, then the
+        first of them at the others; else its one matrix; empty if it isn't identifiable.
     """
     if isinstance(coupling, LocalCoupling):
+        amplitude = "log amplitude"
         known = (
-            ("P", "phase of the response over phase of the command", coupling.P),
-            ("R", "log amplitude of the response over phase of the command", coupling.R),
-            ("G", "log amplitude of the response over log amplitude of the command", coupling.G),
-            ("S", "phase of the response over log amplitude of the command", coupling.S),
+            ("P", "phase", "phase", coupling.P),
+            ("R", amplitude, "phase", coupling.R),
+            ("G", amplitude, amplitude, coupling.G),
+            ("S", "phase", amplitude, coupling.S),
         )
         return tuple(
-            _local(symbol, meaning, matrix, coupling.joints)
-            for symbol, meaning, matrix in known
+            _entries(
+                symbol,
+                f"{what} of the response over {of} of the command",
+                coupling.joints,
+                matrix.value,
+                matrix.ci95_half,
+            )
+            for symbol, what, of, matrix in known
             if matrix is not None
         )
     if isinstance(coupling, LinearCoupling):
         return _sweep(coupling)
     if coupling.matrix is None:
         return ()
-    value = np.array(coupling.matrix, dtype=np.float64)
-    rows = names if len(names) == len(value) else tuple(str(k + 1) for k in range(len(value)))
-    return (Entries("Coupling", "response over command", rows, rows, value),)
+    count = len(coupling.matrix)
+    rows = names if len(names) == count else tuple(str(k + 1) for k in range(count))
+    return (_entries("Coupling", "response over command", rows, coupling.matrix),)
 
 
-def _local(symbol: str, meaning: str, matrix: Matrix, names: tuple[str, ...]) -> Entries:
-    value, half = (np.array(one, dtype=np.float64) for one in (matrix.value, matrix.ci95_half))
-    return Entries(symbol, meaning, names, names, value, half)
+_Rows = Sequence[Sequence[float]]
+
+
+def _entries(
+    symbol: str, meaning: str, names: tuple[str, ...], value: _Rows, half: _Rows | None = None
+) -> Entries:
+    errors = None if half is None else np.array(half, dtype=np.float64)
+    return Entries(symbol, meaning, names, names, np.array(value, dtype=np.float64), errors)
 
 
 def _sweep(coupling: LinearCoupling) -> tuple[Entries, ...]:
-    """What the answer speaks of comes first: Z, or H where Z isn't known."""
-    several = len(coupling.tones) > 1
+    """Return Z, if known, and H at the first tone, then the first of them at the others."""
     found: list[Entries] = []
     for k, tone in enumerate(coupling.tones):
-        at = f"{tone.frequency_hz:.4g} Hz"
-        symbol = f" at {at}" if several and k else ""
+        at = f"at {tone.frequency_hz:.4g} Hz"
+        torque = f"torque over angle {at} [N m/rad]"
+        response = f"response over command {at} [rad/rad]"
+        suffix = f" {at}" if k else ""
         if tone.Z is not None:
-            found += _parts(_torques(f"Z{symbol}", at, coupling.joints, tone.Z), tone.Z)
+            found += _parts(f"Z{suffix}", torque, coupling.joints, tone.Z)
         if tone.Z is None or k == 0:
-            found += _parts(_responses(f"H{symbol}", at, coupling.joints, tone.H), tone.H)
+            found += _parts(f"H{suffix}", response, coupling.joints, tone.H)
     return tuple(found)
 
 
-def _torques(symbol: str, at: str, names: tuple[str, ...], matrix: ComplexMatrix) -> Entries:
-    meaning = f"torque over angle at {at} [N m/rad]"
-    who = ("the joint that feels the torque", "the joint that is moved", "feels")
-    return Entries(symbol, meaning, names, names, *_real(matrix), *who)
-
-
-def _responses(symbol: str, at: str, names: tuple[str, ...], matrix: ComplexMatrix) -> Entries:
-    meaning = f"response over command at {at} [rad/rad]"
-    return Entries(symbol, meaning, names, names, *_real(matrix))
-
-
-def _real(matrix: ComplexMatrix) -> tuple[FloatArray, FloatArray]:
-    return np.array(matrix.real, dtype=np.float64), np.array(matrix.ci95_half, dtype=np.float64)
-
-
-def _parts(real: Entries, matrix: ComplexMatrix) -> tuple[Entries, Entries]:
-    """Real and imaginary part, in the same colours: what is small beside the other looks small."""
-    imag = replace(real, value=np.array(matrix.imag, dtype=np.float64))
-    ends = max(real.limit, imag.limit)
-    return (
-        replace(real, symbol=f"Re {real.symbol}", ends=ends),
-        replace(imag, symbol=f"Im {real.symbol}", ends=ends),
-    )
+def _parts(
+    symbol: str, meaning: str, names: tuple[str, ...], matrix: ComplexMatrix
+) -> Iterable[Entries]:
+    """Return real and imaginary part with the same ends of the colours."""
+    parts = [
+        _entries(f"{name} {symbol}", meaning, names, value, matrix.ci95_half)
+        for name, value in (("Re", matrix.real), ("Im", matrix.imag))
+    ]
+    ends = max(part.limit for part in parts)
+    words = {"row": _FEELS, "column": "the joint that is moved", "verb": "feels"}
+    if symbol.startswith("H"):
+        words = {}
+    return (replace(part, ends=ends, **words) for part in parts)
 
 
 PICTURE = 560.0
 """Side of a picture, one unit is a pixel of a wide page."""
 
 MOST_IN_CELLS = 16
-"""Matrices up to this size carry their numbers in the cells; larger ones show those of a row."""
+"""Matrices up to this size have numbers in all cells; larger ones show those of a row."""
+
+_FEELS = "the joint that feels the torque"
 
 
 class _Box(NamedTuple):
-    """Place of a cell."""
+    """Position of a cell."""
 
     x: float
     y: float
@@ -206,23 +204,19 @@ def matrix_picture(entries: Entries, prefix: str, *, small: bool = False) -> Dra
     width, height = left + k * cell + 2, top + m * cell + 14 + 32 * unit
     bar = _Box(left, top + m * cell + 14, min(240.0 * unit, k * cell))
     title = f"{entries.symbol}: {entries.meaning}"
-    svg = element(
-        "svg",
-        element("title", title, id=f"{prefix}-title"),
-        element("desc", entries.in_words(), id=f"{prefix}-desc"),
+    svg = svg_element(
+        prefix,
+        title,
+        entries.in_words(),
         _column_names(entries, left, top, cell, small=small),
         element("g", *rows, class_=f"cells{' numbers' if numbers else ''}"),
         _color_bar(entries.limit, bar, unit),
         viewBox=f"0 0 {width:.0f} {height:.0f}",
         role="img" if small else "group",
         class_=f"matrix{' small' if small else ''}",
-        aria_labelledby=f"{prefix}-title",
-        aria_describedby=f"{prefix}-desc",
     )
-    return Drawing(
-        str(svg),
-        _caption(entries) if not small else f"{title}; joints numbered as in the large picture.",
-    )
+    caption = f"{title}; joints numbered as in the large picture." if small else _caption(entries)
+    return Drawing(str(svg), caption)
 
 
 def _row(entries: Entries, i: int, first: _Box, *, small: bool) -> Markup:
@@ -236,7 +230,7 @@ def _row(entries: Entries, i: int, first: _Box, *, small: bool) -> Markup:
         x=left - 6,
         y=first.middle[1],
         text_anchor="end",
-        class_="name" if not small or _stands(i, len(entries.rows)) else "no",
+        class_="name" if not small or i % _every(len(entries.rows)) == 0 else "no",
     )
     if small:
         return element("g", label, *parts)
@@ -244,9 +238,8 @@ def _row(entries: Entries, i: int, first: _Box, *, small: bool) -> Markup:
         f"{name} {entries.entry_text(i, j, entries.decimals)}"
         for j, name in enumerate(entries.columns)
     )
-    frame = element(
-        "rect", x=left - 1, y=y - 1, width=k * cell + 2, height=cell + 2, class_="frame"
-    )
+    size = {"width": k * cell + 2, "height": cell + 2}
+    frame = element("rect", x=left - 1, y=y - 1, **size, class_="frame")
     text = f"{entries.rows[i]} {entries.verb}: {words}"
     return element("g", label, *parts, frame, class_="row", tabindex=0, role="img", aria_label=text)
 
@@ -258,17 +251,12 @@ def _cell(entries: Entries, i: int, j: int, box: _Box, *, small: bool) -> Markup
     level = min(1.0, abs(value) / entries.limit)
     sign = "plus" if value >= 0 else "minus"
     edge = 0.5 if box.side > 12 else 0.0
-    parts = [
-        element(
-            "rect",
-            x=box.x + edge,
-            y=box.y + edge,
-            width=box.side - 2 * edge,
-            height=box.side - 2 * edge,
-            class_=f"{sign}{' own' if i == j else ''}",
-            style=f"--v:{100 * level:.0f}%",
-        )
-    ]
+    side = box.side - 2 * edge
+    kind = {
+        "class_": f"{sign}{' own' if i == j else ''}",
+        "style": f"--v:{100 * level:.0f}%",
+    }
+    parts = [element("rect", x=box.x + edge, y=box.y + edge, width=side, height=side, **kind)]
     if value < 0 and level > 0.08:
         x, y = box.middle
         if not small and len(entries.rows) <= MOST_IN_CELLS:
@@ -283,19 +271,15 @@ def _cell(entries: Entries, i: int, j: int, box: _Box, *, small: bool) -> Markup
 
 
 def _numbers(entries: Entries, i: int, j: int, box: _Box) -> list[Markup]:
-    """The value, and its half width, which the row's focus uncovers."""
+    """Return the value, and its half width, which is visible when the row has the focus."""
     size = min(13.0, box.side * 0.33)
     x, y = box.middle
     value = float(entries.value[i, j])
     half = None if entries.half is None else float(entries.half[i, j])
-    unsure = half is not None and abs(value) <= half
     place = {"x": x, "text_anchor": "middle"}
-    kind = "value unsure" if unsure else "value"
-    parts = [
-        element(
-            "text", number(value, entries.cell_decimals), y=y, font_size=size, class_=kind, **place
-        )
-    ]
+    kind = "value unsure" if half is not None and abs(value) <= half else "value"
+    text = number(value, entries.cell_decimals)
+    parts = [element("text", text, y=y, font_size=size, class_=kind, **place)]
     if half is not None and len(entries.rows) <= MOST_IN_CELLS:
         half_text = f"\N{PLUS-MINUS SIGN}{number(half, entries.decimals)}"
         small = {"y": y + size * 0.95, "font_size": size * 0.72}
@@ -303,69 +287,44 @@ def _numbers(entries: Entries, i: int, j: int, box: _Box) -> list[Markup]:
     return parts
 
 
-def _stands(i: int, count: int) -> bool:
-    """Whether the number of a joint has room beside a small picture."""
-    return i % max(1, -(-count // 9)) == 0
+def _every(count: int) -> int:
+    """Return the step of joint numbers that have room beside a small picture."""
+    return max(1, -(-count // 9))
 
 
 def _column_names(entries: Entries, left: float, top: float, cell: float, *, small: bool) -> Markup:
     names = entries.columns
     size = 12.0
     wide = max(len(short(name, 12)) for name in names) * size * 0.62 > cell
-    step = max(1, -(-len(names) // 9)) if small else 1
-    texts = [
-        element(
-            "text",
-            str(j + 1) if small else (short(name, 12) if not wide else _tail(name)),
-            x=left + (j + 0.5) * cell,
-            y=top - (20 if small else 10),
-            text_anchor="middle",
-            class_="name",
-        )
-        for j, name in enumerate(names)
-        if j % step == 0
-    ]
+    step = _every(len(names)) if small else 1
+    y = top - (20 if small else 10)
+    texts: list[Markup] = []
+    for j in range(0, len(names), step):
+        text = str(j + 1) if small else _tail(names[j]) if wide else short(names[j], 12)
+        style = {"text_anchor": "middle", "class_": "name"}
+        texts.append(element("text", text, x=left + (j + 0.5) * cell, y=y, **style))
     return element("g", *texts)
 
 
 def _tail(name: str) -> str:
-    """The number at a name's end, which tells joints apart, or else the end of the name."""
+    """Return the number at a name's end, or else a short form of the name."""
     digits = name[len(name.rstrip("0123456789")) :]
     return digits or short(name, 5)
 
 
 def _color_bar(limit: float, box: _Box, unit: float) -> Markup:
-    steps = 24
     left, top, width = box
-    bars = [
-        element(
-            "rect",
-            x=left + width * n / (2 * steps + 1),
-            y=top,
-            width=width / (2 * steps + 1) + 0.4,
-            height=9 * unit,
-            class_="minus" if n < steps else "plus",
-            style=f"--v:{abs(n - steps) / steps:.0%}",
-        )
-        for n in range(2 * steps + 1)
-    ]
     digits = decimals_for_values([limit], 2)
+    ends = (
+        (number(-limit, digits), left, "start"),
+        ("0", left + width / 2, "middle"),
+        (number(limit, digits), left + width, "end"),
+    )
     ticks = [
-        element(
-            "text",
-            number(value, digits) if value else "0",
-            x=x,
-            y=top + 20 * unit,
-            text_anchor=anchor,
-            class_="name",
-        )
-        for value, x, anchor in (
-            (-limit, left, "start"),
-            (0.0, left + width / 2, "middle"),
-            (limit, left + width, "end"),
-        )
+        element("text", text, x=x, y=top + 20 * unit, text_anchor=anchor, class_="name")
+        for text, x, anchor in ends
     ]
-    return element("g", *bars, *ticks)
+    return element("g", *color_bar(left, top, width, 9 * unit, signed=True), *ticks)
 
 
 def _caption(entries: Entries) -> str:

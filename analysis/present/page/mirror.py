@@ -1,10 +1,9 @@
-"""A wave and its reverse: the profile of one direction over the mirrored other."""
+"""Draw the profile of a wave over the mirrored profile of its reverse."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from ...results.estimate import Estimate, leaves_out_zero
 from ...results.experiment import Experiment, Reversal
 from ...results.formats import degrees, estimate, relative, short
 from .svg import (
+    DASHED,
     INK,
     MUTED,
     REFERENCE,
@@ -27,23 +27,18 @@ from .svg import (
     key,
     legend,
     new_figure,
+    plot_estimate,
 )
 
 _ASIDE = 0.16
-"""Dots of single runs stand this far beside a joint's place."""
-
+"""Distance of the dots of single runs from their joint's position."""
 
 _SOLID: dict[str, Any] = {"markersize": 4.6, "markeredgecolor": INK, "markeredgewidth": 0.5}
-_HOLLOW: dict[str, Any] = {
-    "markersize": 6.6,
-    "markerfacecolor": "none",
-    "markeredgecolor": INK,
-    "markeredgewidth": 1.0,
-}
+_HOLLOW = _SOLID | {"markersize": 6.6, "markerfacecolor": "none", "markeredgewidth": 1.0}
+_MIRRORED: dict[str, Any] = {"color": INK, "linestyle": (0, (2, 2))}
 
 
-@dataclass(frozen=True)
-class Profiles:
+class Profiles(NamedTuple):
     """Gain and lag of the runs of a reversal, all read at the joints of the forward wave.
 
     Attributes:
@@ -60,49 +55,38 @@ class Profiles:
 
 
 def profiles(experiment: Experiment, reversal: Reversal) -> Profiles:
-    """Collect what the runs of a reversal measured.
-
-    Args:
-        reversal: Its reversal test, which says what joints took part.
-    """
+    """Return gain and lag of the joints that take part in a reversal test, run by run."""
     names = [one.name for one in reversal.joints]
 
     def of(role: str) -> tuple[FloatArray, FloatArray]:
-        gain: list[list[float]] = []
-        lag: list[list[float]] = []
-        for run, session in zip(experiment.runs, experiment.sessions, strict=True):
-            if run.role != role:
-                continue
-            joints = {joint.name: joint for joint in session.joints}
-            gain.append([_known(joints[name].gain) for name in names])
-            lag.append([_known(joints[name].lag_rad) for name in names])
-        return np.array(gain), np.array(lag)
+        chosen = [
+            {joint.name: joint for joint in session.joints}
+            for run, session in zip(experiment.runs, experiment.sessions, strict=True)
+            if run.role == role
+        ]
+        gain = [[joints[name].gain.value for name in names] for joints in chosen]
+        lag = [[joints[name].lag_rad.value for name in names] for joints in chosen]
+        return np.array(gain, dtype=np.float64), np.array(lag, dtype=np.float64)
 
     (gain, lag), (back_gain, back_lag) = of("forward"), of("reverse")
     middle = np.angle(np.nanmean(np.exp(1j * lag)))
     lag, back_lag = (middle + np.angle(np.exp(1j * (one - middle))) for one in (lag, back_lag))
-    return Profiles(
-        frozen(gain),
-        frozen(np.degrees(lag)),
-        frozen(back_gain[:, ::-1]),
-        frozen(np.degrees(back_lag)[:, ::-1]),
-    )
+    parts = (gain, np.degrees(lag), back_gain[:, ::-1], np.degrees(back_lag)[:, ::-1])
+    return Profiles(*map(frozen, parts))
 
 
 def mirror_profile(seen: Profiles, reversal: Reversal, prefix: str) -> Drawing:
-    """Profiles of both directions, and their differences with simultaneous intervals.
+    """Draw gain and lag of both directions, each with its differences below.
 
     Args:
         prefix: For identifiers, unique in the page.
-
-    Returns:
-        The figure: gain and lag, each with its difference below.
     """
     joints = reversal.joints
     colors = joint_hex(len(joints))
     tooltips: dict[str, str] = {}
     gains = [relative(one.log_gain_difference) for one in joints]
     lags = [degrees(one.lag_difference_rad) for one in joints]
+    labels = ("gain [1]", "difference [%]", "lag [°]", "difference [°]")
     with drawing():
         figure = new_figure(WIDTH_IN, 6.6)
         rows = figure.subplots(4, 1, sharex=True, height_ratios=[1.35, 1, 1.35, 1])
@@ -110,9 +94,7 @@ def mirror_profile(seen: Profiles, reversal: Reversal, prefix: str) -> Drawing:
         _differences(rows[1], reversal, gains, colors, tooltips, what="gain")
         _profile(rows[2], seen.lag_deg, seen.mirrored_lag_deg, colors)
         _differences(rows[3], reversal, lags, colors, tooltips, what="lag")
-        for axes, label in zip(
-            rows, ("gain [1]", "difference [%]", "lag [°]", "difference [°]"), strict=True
-        ):
+        for axes, label in zip(rows, labels, strict=True):
             axes.set_ylabel(label)
         joint_ticks(rows[3], [one.name for one in joints])
         rows[3].set_xlabel("joint with the wave from head to tail, head on the left")
@@ -120,28 +102,13 @@ def mirror_profile(seen: Profiles, reversal: Reversal, prefix: str) -> Drawing:
         middle = colors[len(colors) // 2]
         legend(
             figure,
-            [
-                key([], [], color=middle, marker="o", label="wave from head to tail", **_SOLID),
-                key(
-                    [],
-                    [],
-                    color=INK,
-                    marker="D",
-                    linestyle=(0, (2, 2)),
-                    label="from tail to head, mirrored",
-                    **_HOLLOW,
-                ),
-                key([], [], color=MUTED, marker=".", linestyle="none", label="one run"),
-                key([], [], color=middle, linewidth=2.2, label="difference, 95 % together"),
-            ],
+            key(color=middle, marker="o", label="wave from head to tail", **_SOLID),
+            key(marker="D", label="from tail to head, mirrored", **_MIRRORED, **_HOLLOW),
+            key(color=MUTED, marker=".", linestyle="none", label="one run"),
+            key(color=middle, linewidth=2.2, label="difference, 95 % together"),
         )
-        svg = inline_svg(
-            figure,
-            prefix=prefix,
-            title="Gain and lag of both directions, and their differences",
-            description=_in_words(reversal),
-            tooltips=tooltips,
-        )
+        title = "Gain and lag of both directions, and their differences"
+        svg = inline_svg(figure, prefix, title, _description(reversal), tooltips)
     caption = (
         "Identical modules mirror: the profile with the wave from tail to head, read from tail to "
         "head, lies on the other one, whatever the free ends do to both. The intervals of the "
@@ -156,7 +123,7 @@ def _profile(axes: Axes, one: FloatArray, other: FloatArray, colors: Sequence[st
     for runs, aside in ((one, -_ASIDE), (other, _ASIDE)):
         for run in runs:
             axes.plot(place + aside, run, ".", color=MUTED, markersize=2.2, zorder=2)
-    axes.plot(place, other.mean(0), color=INK, linestyle=(0, (2, 2)), linewidth=1.0)
+    axes.plot(place, other.mean(0), linewidth=1.0, **_MIRRORED)
     axes.plot(place, one.mean(0), color=MUTED, linewidth=1.0, zorder=1)
     for x, y, color in zip(place, one.mean(0), colors, strict=True):
         axes.plot([x], [y], "o", markerfacecolor=color, **_SOLID, zorder=3)
@@ -174,46 +141,33 @@ def _differences(
     what: str,
 ) -> None:
     named = {pair.name for pair in reversal.pairs}
-    axes.axhline(0.0, color=REFERENCE, linestyle=(0, (5, 3)), zorder=1)
+    axes.axhline(0.0, color=REFERENCE, linestyle=DASHED, zorder=1)
     unit = " %" if what == "gain" else "°"
     for k, (joint, value, color) in enumerate(zip(reversal.joints, values, colors, strict=True)):
         if value.value is None or value.ci95 is None:
             continue
-        away = leaves_out_zero(value.ci95)
-        axes.plot([k + 1] * 2, value.ci95, color=color, linewidth=2.2, zorder=2)
+        size, edge = (5.2, 0.9) if leaves_out_zero(value.ci95) else (3.6, 0.4)
         gid = f"{what}-{k}"
-        axes.plot(
-            [k + 1],
-            [value.value],
-            "o",
-            markersize=5.2 if away else 3.6,
-            markerfacecolor=color,
-            markeredgecolor=INK,
-            markeredgewidth=0.9 if away else 0.4,
-            gid=gid,
-            zorder=3,
-        )
+        style: dict[str, Any] = {"markersize": size, "markeredgewidth": edge, "gid": gid}
+        plot_estimate(axes, k + 1, value, color, bar=2.2, **style)
         tooltips[gid] = f"{joint.name} against {joint.mirror}: {what} {estimate(value, unit)}"
         if joint.name in named:
+            above = value.value > 0
             axes.annotate(
                 short(joint.name, 14),
-                (k + 1, value.ci95[1] if value.value > 0 else value.ci95[0]),
-                xytext=(0, 5 if value.value > 0 else -5),
+                (k + 1, value.ci95[1] if above else value.ci95[0]),
+                xytext=(0, 5 if above else -5),
                 textcoords="offset points",
                 ha="center",
-                va="bottom" if value.value > 0 else "top",
+                va="bottom" if above else "top",
                 fontweight="bold",
             )
     axes.margins(y=0.3)
 
 
-def _in_words(reversal: Reversal) -> str:
+def _description(reversal: Reversal) -> str:
     less = ", ".join(f"{pair.name} less than {pair.mirror}" for pair in reversal.pairs) or "none"
     return (
         f"{len(reversal.joints)} joints, {reversal.forward_runs} and {reversal.reverse_runs} runs. "
         f"Pairs that differ beyond doubt: {less}. The table of mirror pairs holds every number."
     )
-
-
-def _known(quantity: Estimate) -> float:
-    return float("nan") if quantity.value is None else quantity.value

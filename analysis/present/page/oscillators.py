@@ -1,79 +1,60 @@
-"""Coupled oscillators on the page: the couplings of a chain, and what the body couples."""
+"""Prepare coupled oscillators for the page: couplings of a chain, and patterns of the body."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 
 from ...results import formats
-from ...results.estimate import Estimate
 from ...results.oscillators import BodyOscillators, ChainCoupling
 from ..text import chain_detail
 from .matrix import Entries, matrix_picture
-from .svg import INK, REFERENCE, WIDTH_IN, Drawing, drawing, inline_svg, key, legend, new_figure
+from .svg import (
+    DASHED,
+    INK,
+    REFERENCE,
+    WIDTH_IN,
+    Drawing,
+    drawing,
+    inline_svg,
+    key,
+    legend,
+    new_figure,
+    plot_estimate,
+)
 from .tables import Fact
 
-_DASHED = (0, (5, 3))
 
+def chain_view(chain: ChainCoupling, prefix: str) -> dict[str, Any]:
+    """Return what the template shows of one chain of oscillators, by name.
 
-@dataclass(frozen=True)
-class ChainView:
-    """What the page shows of one chain of oscillators.
-
-    Attributes:
-        sentence: The answer, or None where it has none.
-        matrix: The couplings as a picture; None where there are none.
-        decimals: Digits after the point of K, of the rates and of the feedback.
-        lags: Of the links [deg].
-        lag_decimals: Digits after the point of them.
-        fed: Whether any feedback is known.
+    Args:
+        prefix: For identifiers, unique in the page.
     """
-
-    chain: ChainCoupling
-    sentence: str | None
-    method: str
-    matrix: Drawing | None
-    decimals: tuple[int, int, int]
-    lags: tuple[Estimate, ...]
-    lag_decimals: int
-    fed: bool
-
-
-def chain_views(chains: Iterable[ChainCoupling]) -> tuple[ChainView, ...]:
-    """The chains of a session.
-
-    Returns:
-        The same, ready for the page.
-    """
-    return tuple(_chain(one, f"oscillators-{k + 1}") for k, one in enumerate(chains))
-
-
-def _chain(chain: ChainCoupling, prefix: str) -> ChainView:
     lines = list(chain_detail(chain))
-    lags = tuple(formats.degrees(link.lag_rad) for link in chain.links)
+    lags = [formats.degrees(link.lag_rad) for link in chain.links]
     rates = chain.oscillators
-    return ChainView(
-        chain=chain,
-        sentence=lines[0].partition(": ")[2] if chain.identifiable else None,
-        method=lines[-1].removeprefix("Method: ") if chain.identifiable else "",
-        matrix=matrix_picture(_couplings(chain), prefix) if chain.links else None,
-        decimals=(
+    return {
+        "chain": chain,
+        "sentence": lines[0].partition(": ")[2] if chain.identifiable else None,
+        "method": lines[-1].removeprefix("Method: ") if chain.identifiable else "",
+        "matrix": matrix_picture(_couplings(chain), prefix) if chain.links else None,
+        "decimals": (  # of K, of the rates and of the feedback
             formats.decimals_for((link.K for link in chain.links), most=3),
             formats.decimals_for((one.omega for one in rates), most=4),
             formats.decimals_for((one.feedback for one in rates), most=3),
         ),
-        lags=lags,
-        lag_decimals=formats.decimals_for(lags, most=2),
-        fed=any(one.feedback.value is not None for one in rates),
-    )
+        "lags": lags,
+        "lag_decimals": formats.decimals_for(lags, most=2),
+        "fed": any(one.feedback.value is not None for one in rates),
+    }
 
 
 def _couplings(chain: ChainCoupling) -> Entries:
-    """K as a matrix; what was not looked for is not a number."""
+    """Return K as a matrix with NaN for couplings that were not estimated."""
     names = tuple(one.name for one in chain.oscillators)
     place = {name: k for k, name in enumerate(names)}
     value: FloatArray = np.full((len(names), len(names)), np.nan)
@@ -83,46 +64,30 @@ def _couplings(chain: ChainCoupling) -> Entries:
         value[at] = link.K.value or 0.0
         if link.K.ci95 is not None:
             half[at] = (link.K.ci95[1] - link.K.ci95[0]) / 2
-    return Entries(
-        "K",
-        f"coupling of oscillators, {chain.plane} [1/s]; looked for up to {chain.reach} apart",
-        names,
-        names,
-        value,
-        half,
-        row="the oscillator that is turned",
-        column="the oscillator that turns it",
-        verb="is turned by",
-    )
+    meaning = f"coupling of oscillators, {chain.plane} [1/s]; looked for up to {chain.reach} apart"
+    words = ("the oscillator that is turned", "the oscillator that turns it", "is turned by")
+    return Entries("K", meaning, names, names, value, half, *words)
 
 
 def body_facts(body: BodyOscillators) -> list[Fact]:
-    """Key figures of oscillators that feel their servos."""
-    patterns = len(body.modes)
+    """Return the key figures of oscillators with feedback from their servos."""
     bound = f"{body.strong_above:g} eps"
-    explicit = body.explicit_coupling
+    slowest = formats.estimate(body.slowest, " eps", most=4)
+    strong = f"{formats.number(body.strong.value, 0)} of {len(body.modes)}"
+    growth = formats.estimate(body.growth, " eps")
+    explicit = "none is enough"
+    if body.explicit_coupling.value is not None:
+        explicit = formats.estimate(body.explicit_coupling, " eps")
     return [
-        Fact("Slowest pattern", formats.estimate(body.slowest, " eps", most=4), "negative: grows"),
-        Fact(
-            "Strong patterns",
-            f"{formats.number(body.strong.value, 0)} of {patterns}",
-            f"relax faster than {bound}",
-        ),
-        Fact(
-            "Growth for a while",
-            formats.estimate(body.growth, " eps"),
-            "the fastest of a deviation; negative: none",
-        ),
-        Fact(
-            "Explicit coupling",
-            "none is enough" if explicit.value is None else formats.estimate(explicit, " eps"),
-            f"between neighbours, lifts all to {bound}",
-        ),
+        Fact("Slowest pattern", slowest, "negative: grows"),
+        Fact("Strong patterns", strong, f"relax faster than {bound}"),
+        Fact("Growth for a while", growth, "the fastest of a deviation; negative: none"),
+        Fact("Explicit coupling", explicit, f"between neighbours, lifts all to {bound}"),
     ]
 
 
 def modes_drawing(body: BodyOscillators, prefix: str) -> Drawing:
-    """The rates at which patterns of phases relax, beside those of a homogeneous chain.
+    """Draw the rates at which patterns of phases relax, and those of a homogeneous chain.
 
     Args:
         body: With at least one mode.
@@ -130,54 +95,32 @@ def modes_drawing(body: BodyOscillators, prefix: str) -> Drawing:
     """
     count = len(body.modes)
     tooltips: dict[str, str] = {}
+    hollow = {"markerfacecolor": "none", "linestyle": "none"}
     with drawing():
         figure = new_figure(WIDTH_IN, 2.9)
         axes = figure.subplots()
         axes.axhline(0.0, color=REFERENCE, linewidth=0.8, zorder=1)
-        axes.axhline(body.strong_above, color=REFERENCE, linestyle=_DASHED, zorder=1)
-        axes.plot(
-            range(1, len(body.comparator.real) + 1),
-            body.comparator.real,
-            "D",
-            markersize=6.0,
-            markerfacecolor="none",
-            markeredgecolor=REFERENCE,
-            zorder=2,
-        )
+        axes.axhline(body.strong_above, color=REFERENCE, linestyle=DASHED, zorder=1)
+        others = body.comparator.real
+        style = {"markersize": 6.0, "markeredgecolor": REFERENCE, **hollow}
+        axes.plot(range(1, len(others) + 1), others, marker="D", zorder=2, **style)
         for k, mode in enumerate(body.modes, start=1):
-            if mode.real.ci95 is not None:
-                axes.plot([k, k], mode.real.ci95, color=INK, linewidth=1.8, zorder=3)
-            gid = f"mode-{k}"
-            axes.plot([k], [mode.real.value], "o", color=INK, markersize=4.6, gid=gid, zorder=4)
-            tooltips[gid] = f"pattern {k}: {formats.estimate(mode.real, ' eps', most=4)}"
+            style = {"markersize": 4.6, "markeredgewidth": 1.0, "gid": f"mode-{k}"}
+            plot_estimate(axes, k, mode.real, INK, bar=1.8, zorder=3, **style)
+            tooltips[f"mode-{k}"] = f"pattern {k}: {formats.estimate(mode.real, ' eps', most=4)}"
         axes.set_xlim(0.4, count + 0.6)
         axes.set_xticks(range(1, count + 1))
         axes.set_xlabel("pattern of phases, the slowest first")
         axes.set_ylabel("rate of relaxing [eps]")
-        strong = f"{body.strong_above:g} eps: strong"
         legend(
             figure,
-            [
-                key([], [], color=INK, marker="o", markersize=4.6, label="this body, 95 %"),
-                key(
-                    [],
-                    [],
-                    color=REFERENCE,
-                    marker="D",
-                    markerfacecolor="none",
-                    linestyle="none",
-                    label="a homogeneous chain as strong",
-                ),
-                key([], [], color=REFERENCE, linestyle=_DASHED, label=strong),
-            ],
+            key(color=INK, marker="o", markersize=4.6, label="this body, 95 %"),
+            key(color=REFERENCE, marker="D", label="a homogeneous chain as strong", **hollow),
+            key(color=REFERENCE, linestyle=DASHED, label=f"{body.strong_above:g} eps: strong"),
         )
-        svg = inline_svg(
-            figure,
-            prefix=prefix,
-            title="Rates at which patterns of phases relax through the body",
-            description=f"{count} patterns; the table below holds every number.",
-            tooltips=tooltips,
-        )
+        title = "Rates at which patterns of phases relax through the body"
+        description = f"{count} patterns; the table below holds every number."
+        svg = inline_svg(figure, prefix, title, description, tooltips)
     caption = (
         "What oscillators that feel their own servos would do without any other coupling, eps the "
         "strength of that feeling: a pattern above zero relaxes, below zero it grows. All phases "
@@ -187,22 +130,13 @@ def modes_drawing(body: BodyOscillators, prefix: str) -> Drawing:
 
 
 def entrainment_entries(body: BodyOscillators) -> Entries | None:
-    """The other reading of P, as entrainment.
-
-    Returns:
-        P^-1 - I; None where P is singular.
-    """
+    """Return P^-1 - I, the coupling relative to entrainment; None if P is singular."""
     relative = body.entrainment
     if relative.value is None:
         return None
+    value = np.array(relative.value, dtype=np.float64)
     half = None if relative.ci95_half is None else np.array(relative.ci95_half, dtype=np.float64)
-    return Entries(
-        "P\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT ONE} \N{MINUS SIGN} I",
-        "P read as entrainment by the commands: coupling relative to it [1]",
-        body.joints,
-        body.joints,
-        np.array(relative.value, dtype=np.float64),
-        half,
-        row="the joint that follows",
-        column="the joint that it follows",
-    )
+    symbol = "P\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT ONE} \N{MINUS SIGN} I"
+    meaning = "P read as entrainment by the commands: coupling relative to it [1]"
+    words = ("the joint that follows", "the joint that it follows")
+    return Entries(symbol, meaning, body.joints, body.joints, value, half, *words)

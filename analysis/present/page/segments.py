@@ -1,9 +1,10 @@
-"""Gain, lag and energy of every joint, head to tail."""
+"""Draw gain, lag and energy of every joint, head to tail."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ...results.analysis import JointResult
 from ...results.estimate import Estimate
 from ...results.formats import degrees, estimate, number
 from .svg import (
+    DASHED,
     INK,
     MUTED,
     PAPER,
@@ -28,22 +30,23 @@ from .svg import (
     legend,
     marker,
     new_figure,
+    plot_estimate,
 )
 from .tables import is_driven
 
-_MARKER_SIZE = 5.2
-_PLANE_WORDS = {"horizontal": "horizontal", "vertical": "vertical", None: "plane unknown"}
+_SOLID: dict[str, Any] = {"markersize": 5.2, "markeredgecolor": INK, "markeredgewidth": 0.5}
+_HOLLOW: dict[str, Any] = {"markersize": 5.2, "markeredgewidth": 1.2, "markerfacecolor": PAPER}
+_PLANES = ("horizontal", "vertical", None)
 
 
 def segments(joints: Sequence[JointResult], prefix: str) -> Drawing:
-    """Gain, lag and energy of every joint, head to tail, in three panels on one axis.
+    """Draw gain, lag and energy of every joint, head to tail, in three panels on one axis.
+
+    Joints without a command are in the energy panel only, with hollow markers.
 
     Args:
         joints: In chain order, at least one.
         prefix: For identifiers, unique in the page.
-
-    Returns:
-        The figure. Joints without a command show in the energy panel only, hollow.
     """
     colors = joint_hex(len(joints))
     tooltips: dict[str, str] = {}
@@ -60,13 +63,8 @@ def segments(joints: Sequence[JointResult], prefix: str) -> Drawing:
         _segment_axis(energy_axes, len(joints))
         _legend(figure, joints)
         figure.align_ylabels()
-        svg = inline_svg(
-            figure,
-            prefix=prefix,
-            title="Gain, lag and energy of every joint, head to tail",
-            description=_in_words(joints),
-            tooltips=tooltips,
-        )
+        title = "Gain, lag and energy of every joint, head to tail"
+        svg = inline_svg(figure, prefix, title, _in_words(joints), tooltips)
     return Drawing(svg, _segments_caption(joints))
 
 
@@ -79,42 +77,25 @@ def _estimates(
     what: str,
     of: Callable[[JointResult], Estimate],
 ) -> None:
-    """One panel of values with their intervals, and the mean of each plane, dashed."""
-    unit = "°" if what == "lag" else ""
+    """Draw a panel of values with their intervals, and the mean of each plane, dashed."""
+    lag = what == "lag"
     drawn = False
     for i, joint in enumerate(joints):
         quantity = of(joint)
-        if quantity.value is None:
-            continue
-        drawn = True
-        color, place = colors[i], i + 1
-        if quantity.ci95 is not None:
-            axes.plot([place, place], quantity.ci95, color=color, linewidth=1.6, zorder=2)
-        gid = f"{what}-{i}"
-        axes.plot(
-            [place],
-            [quantity.value],
-            marker=marker(joint.plane),
-            markersize=_MARKER_SIZE,
-            markerfacecolor=color,
-            markeredgecolor=INK,
-            markeredgewidth=0.5,
-            linestyle="none",
-            gid=gid,
-            zorder=3,
-        )
-        tooltips[gid] = _tooltip(joint, f"{what} {estimate(quantity, unit)}")
-    _mean_lines(axes, joints, of, _circular_mean_deg if what == "lag" else fmean)
-    if not drawn:
-        _empty(axes, f"no {what}: see the warnings")
-    elif what == "gain":
-        _room(axes, least=0.02)
+        if quantity.value is not None:
+            drawn = True
+            gid = f"{what}-{i}"
+            plot_estimate(axes, i + 1, quantity, colors[i], marker=marker(joint.plane), gid=gid)
+            tooltips[gid] = _tooltip(joint, f"{what} {estimate(quantity, '°' if lag else '')}")
+    _mean_lines(axes, joints, of, _circular_mean_deg if lag else fmean)
+    if drawn:
+        _keep_span(axes, least=1.0 if lag else 0.02)
     else:
-        _room(axes, least=1.0)
+        _empty(axes, f"no {what}: see the warnings")
 
 
 def _circular_mean_deg(values: Sequence[float]) -> float:
-    """Mean direction [°] (Fisher 1993, Statistical Analysis of Circular Data, Eq. 2.9)."""
+    """Return the mean direction [°] (Fisher, Statistical Analysis of Circular Data, Eq. 2.9)."""
     return float(np.degrees(np.angle(np.mean(np.exp(1j * np.radians(values))))))
 
 
@@ -124,55 +105,33 @@ def _mean_lines(
     of: Callable[[JointResult], Estimate],
     average: Callable[[Sequence[float]], float],
 ) -> None:
-    """The mean over the joints of a plane: where all would lie if they moved alike."""
-    for plane in ("horizontal", "vertical", None):
+    """Draw the mean over the joints of each plane: the position of all if they moved alike."""
+    for plane in _PLANES:
         members = [(i + 1, of(j).value) for i, j in enumerate(joints) if j.plane == plane]
         known = [(place, value) for place, value in members if value is not None]
-        if len(known) < 2:
-            continue
-        mean = average([value for _, value in known])
-        ends = [known[0][0] - 0.4, known[-1][0] + 0.4]
-        axes.plot(ends, [mean, mean], color=REFERENCE, linestyle=(0, (5, 3)), zorder=1)
+        if len(known) > 1:
+            mean = average([value for _, value in known])
+            ends = [known[0][0] - 0.4, known[-1][0] + 0.4]
+            axes.plot(ends, [mean, mean], color=REFERENCE, linestyle=DASHED, zorder=1)
 
 
 def _energies(
     axes: Axes, joints: Sequence[JointResult], colors: Sequence[str], tooltips: dict[str, str]
 ) -> None:
-    """Net energy as a marker on a stem, absolute energy as a bar across it."""
-    drawn = False
-    for i, joint in enumerate(joints):
-        color, place = colors[i], i + 1
-        if joint.energy_abs_j is not None:
-            axes.plot(
-                [place - 0.3, place + 0.3],
-                [joint.energy_abs_j] * 2,
-                color=MUTED,
-                linewidth=1.2,
-                solid_capstyle="butt",
-            )
-            drawn = True
-        net = joint.energy_net_j
-        if net is None:
-            continue
-        drawn = True
-        axes.plot([place, place], [0.0, net], color=color, linewidth=1.6, zorder=2)
-        gid = f"energy-{i}"
-        driven = is_driven(joint)
-        axes.plot(
-            [place],
-            [net],
-            marker=marker(joint.plane),
-            markersize=_MARKER_SIZE,
-            markerfacecolor=color if driven else PAPER,
-            markeredgecolor=INK if driven else color,
-            markeredgewidth=0.5 if driven else 1.2,
-            linestyle="none",
-            gid=gid,
-            zorder=3,
-        )
-        values = f"E_net {number(net, 4)} J, E_abs {number(joint.energy_abs_j, 4)} J"
-        tooltips[gid] = _tooltip(joint, values)
-    if drawn:
+    """Draw net energy as a marker on a stem, absolute energy as a bar across it."""
+    for i, (joint, color) in enumerate(zip(joints, colors, strict=True)):
+        place, whole, net = i + 1, joint.energy_abs_j, joint.energy_net_j
+        if whole is not None:
+            bar = {"linewidth": 1.2, "solid_capstyle": "butt"}
+            axes.plot([place - 0.3, place + 0.3], [whole, whole], color=MUTED, **bar)
+        if net is not None:
+            style: dict[str, Any] = {"marker": marker(joint.plane), "gid": f"energy-{i}"}
+            if not is_driven(joint):
+                style |= _HOLLOW | {"markeredgecolor": color}
+            plot_estimate(axes, place, Estimate(net, (0.0, net)), color, **style)
+            values = f"E_net {number(net, 4)} J, E_abs {number(whole, 4)} J"
+            tooltips[f"energy-{i}"] = _tooltip(joint, values)
+    if any(j.energy_abs_j is not None or j.energy_net_j is not None for j in joints):
         axes.axhline(0.0, color=MUTED, linewidth=0.6, zorder=1)
     else:
         _empty(axes, "no energy: see the notes")
@@ -188,8 +147,8 @@ def _empty(axes: Axes, text: str) -> None:
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=MUTED)
 
 
-def _room(axes: Axes, least: float) -> None:
-    """Never magnify noise: the panel spans at least ``least`` of its unit."""
+def _keep_span(axes: Axes, least: float) -> None:
+    """Let the panel span at least ``least`` of its unit, so that noise isn't magnified."""
     low, high = axes.get_ylim()
     if high - low < least:
         middle = 0.5 * (low + high)
@@ -197,17 +156,10 @@ def _room(axes: Axes, least: float) -> None:
 
 
 def _flag_marks(axes: Axes, joints: Sequence[JointResult]) -> None:
+    style = {"ha": "center", "va": "bottom", "fontweight": "bold"}
     for i, joint in enumerate(joints):
         if joint.flags:
-            axes.text(
-                i + 1,
-                1.0,
-                "!",
-                transform=axes.get_xaxis_transform(),
-                ha="center",
-                va="bottom",
-                fontweight="bold",
-            )
+            axes.text(i + 1, 1.0, "!", transform=axes.get_xaxis_transform(), **style)
 
 
 def _segment_axis(axes: Axes, count: int) -> None:
@@ -220,35 +172,22 @@ def _segment_axis(axes: Axes, count: int) -> None:
 def _legend(figure: Figure, joints: Sequence[JointResult]) -> None:
     handles: list[Handle] = []
     middle = joint_hex(3)[1]
-    solid = {"markersize": _MARKER_SIZE, "markeredgecolor": INK, "markeredgewidth": 0.5}
-    for plane, word in _PLANE_WORDS.items():
-        if any(j.plane == plane and is_driven(j) for j in joints):
-            handles.append(
-                key([], [], color=middle, marker=marker(plane), label=f"{word}, 95 %", **solid)
-            )
+    driven = {j.plane for j in joints if is_driven(j)}
     passive = {j.plane for j in joints if not is_driven(j) and j.energy_net_j is not None}
-    hollow = {"markersize": _MARKER_SIZE, "markeredgewidth": 1.2, "markerfacecolor": PAPER}
-    for plane, word in _PLANE_WORDS.items():
-        if plane in passive:
-            handles.append(
-                key(
-                    [],
-                    [],
-                    linestyle="none",
-                    color=middle,
-                    marker=marker(plane),
-                    label=f"{word}, no command",
-                    **hollow,
-                )
-            )
+    for planes, note, style in (
+        (driven, "95 %", _SOLID),
+        (passive, "no command", {**_HOLLOW, "linestyle": "none"}),
+    ):
+        for plane in _PLANES:
+            if plane in planes:
+                label = f"{plane or 'plane unknown'}, {note}"
+                handles.append(key(color=middle, marker=marker(plane), label=label, **style))
     if sum(j.gain.value is not None for j in joints) > 1:
-        handles.append(
-            key([], [], color=REFERENCE, linestyle=(0, (5, 3)), label="mean of the plane")
-        )
+        handles.append(key(color=REFERENCE, linestyle=DASHED, label="mean of the plane"))
     if any(j.energy_abs_j is not None for j in joints):
-        handles.append(key([], [], color=MUTED, linewidth=1.2, label="E_abs (marker: E_net)"))
+        handles.append(key(color=MUTED, linewidth=1.2, label="E_abs (marker: E_net)"))
     if handles:
-        legend(figure, handles)
+        legend(figure, *handles)
 
 
 def _in_words(joints: Sequence[JointResult]) -> str:

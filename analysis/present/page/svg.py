@@ -1,10 +1,8 @@
-"""A matplotlib figure as clean SVG for inside a page.
+"""Matplotlib figures as inline SVG, and the style that all figures of the report share.
 
 Colours that must follow the reader's light or dark scheme are drawn in sentinel colours and
 become CSS variables here. Text stays text, in the page's own font. Nothing in the result depends
 on the time, the machine or other figures on the page: identifiers carry the figure's own prefix.
-
-What all figures of the report share: width, markers, keys.
 
 Every figure is a pure function of results. A joint keeps its colour, horizontal joints are
 circles and vertical ones squares, references and nulls are dashed grey, estimates carry their
@@ -29,6 +27,7 @@ from matplotlib.figure import Figure as _Figure
 
 from undulog.capture.common.console import plain
 
+from ...results.estimate import Estimate
 from ...results.formats import short
 
 Figure: TypeAlias = Any
@@ -109,10 +108,10 @@ _FILL = re.compile(r"(?:^|; ?)fill: ([^;]+)")
 
 @contextmanager
 def drawing() -> Generator[None]:
-    """The look of all figures of the report; they are built, laid out and written inside it.
+    """Set the style of the report's figures, which are built and written inside the block.
 
     Yields:
-        Nothing. The reader's own matplotlib settings are out of force until the block ends.
+        Nothing. The user's own matplotlib settings are restored at the end.
     """
     with _mpl.rc_context():
         _mpl.rcdefaults()
@@ -121,33 +120,20 @@ def drawing() -> Generator[None]:
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure whose panels make room for their labels.
-
-    Args:
-        width_in: [inch].
-        height_in: [inch].
-
-    Returns:
-        A matplotlib figure that no window knows of.
-    """
+    """Return an empty figure [inch] without a window, whose panels make room for their labels."""
     return _Figure(figsize=(width_in, height_in), layout="constrained")
 
 
 def inline_svg(
-    figure: Figure,
-    *,
-    prefix: str,
-    title: str,
-    description: str,
-    tooltips: Mapping[str, str] | None = None,
+    figure: Figure, prefix: str, title: str, description: str, tooltips: Mapping[str, str] = {}
 ) -> str:
-    """Write a figure as an ``<svg>`` element that can stand in any HTML page.
+    """Write a figure as an ``<svg>`` element for any HTML page.
 
     Args:
         figure: Drawn with the sentinel colours of this module.
         prefix: Unique in the page; every identifier begins with it.
         title: Its accessible name (WAI-ARIA ``img``; W3C SVG Accessibility API Mappings).
-        description: What a reader who cannot see it should know.
+        description: Text for readers who cannot see the figure.
         tooltips: Group identifier (``gid`` of an artist) to the text shown when hovered.
 
     Returns:
@@ -158,11 +144,16 @@ def inline_svg(
         for child in list(parent):
             if child.tag in (f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"):
                 parent.remove(child)
-    _add_tooltips(root, tooltips or {})
+    for group in root.iter(f"{{{_SVG}}}g"):
+        if group.get("id", "") in tooltips:
+            group.insert(0, _text_element("title", tooltips[group.get("id", "")]))
     _rename_identifiers(root, prefix)
     for element in root.iter():
         _tidy(element)
-    _name_it(root, prefix, title, description)
+    root.insert(0, _text_element("title", title, f"{prefix}-title"))
+    root.insert(1, _text_element("desc", description, f"{prefix}-desc"))
+    labels = {"aria-labelledby": f"{prefix}-title", "aria-describedby": f"{prefix}-desc"}
+    root.attrib.update({"role": "img", **labels, "class": "figure"})
     # Inline in HTML the default namespace is implied, and the parser wants plain tags.
     for element in root.iter():
         element.tag = element.tag.removeprefix(f"{{{_SVG}}}")
@@ -170,7 +161,7 @@ def inline_svg(
 
 
 def _drawn(figure: Figure) -> ET.Element:
-    """The figure as matplotlib writes it, parsed."""
+    """Return the figure as matplotlib writes it, parsed."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         # Text is set in the reader's fonts, so a glyph that our layout font lacks is no loss.
@@ -181,13 +172,10 @@ def _drawn(figure: Figure) -> ET.Element:
     return ET.fromstring(buffer.getvalue())  # noqa: S314  our own output of a moment ago
 
 
-def _add_tooltips(root: ET.Element, tooltips: Mapping[str, str]) -> None:
-    for group in root.iter(f"{{{_SVG}}}g"):
-        text = tooltips.get(group.get("id", ""))
-        if text is not None:
-            note = ET.Element(f"{{{_SVG}}}title")
-            note.text = plain(text)
-            group.insert(0, note)
+def _text_element(tag: str, text: str, identifier: str | None = None) -> ET.Element:
+    element = ET.Element(f"{{{_SVG}}}{tag}", {} if identifier is None else {"id": identifier})
+    element.text = plain(text)
+    return element
 
 
 def _rename_identifiers(root: ET.Element, prefix: str) -> None:
@@ -247,27 +235,11 @@ def _plain_text_style(text: ET.Element) -> None:
         del text.attrib["transform"]
 
 
-def _name_it(root: ET.Element, prefix: str, title: str, description: str) -> None:
-    name = ET.Element(f"{{{_SVG}}}title", {"id": f"{prefix}-title"})
-    name.text = plain(title)
-    note = ET.Element(f"{{{_SVG}}}desc", {"id": f"{prefix}-desc"})
-    note.text = plain(description)
-    root.insert(0, name)
-    root.insert(1, note)
-    root.set("role", "img")
-    root.set("aria-labelledby", f"{prefix}-title")
-    root.set("aria-describedby", f"{prefix}-desc")
-    root.set("class", "figure")
-
-
 WIDTH_IN = 8.0
 """Width of every figure [inch]; the page scales it."""
 
-MARKERS: dict[str | None, str] = {"horizontal": "o", "vertical": "s", None: "^"}
-"""Marker by plane; a triangle where no robot description says."""
-
-key: Any = lines.Line2D
-"""A line or marker of a legend, drawn nowhere else."""
+DASHED = (0, (5, 3))
+"""Line style of margins, means and nulls."""
 
 
 @dataclass(frozen=True)
@@ -284,23 +256,41 @@ class Drawing:
 
 
 def marker(plane: str | None) -> str:
-    """Matplotlib marker of a joint of this plane.
+    """Return the matplotlib marker of a plane: circle, square, or triangle if it is unknown."""
+    return {"horizontal": "o", "vertical": "s"}.get(plane or "", "^")
+
+
+def key(**style: Any) -> Handle:
+    """Return a line or marker for a legend."""
+    return lines.Line2D([], [], **style)
+
+
+def plot_estimate(
+    axes: Axes,
+    place: float,
+    quantity: Estimate,
+    color: str,
+    *,
+    bar: float = 1.6,
+    zorder: int = 2,
+    **style: Any,
+) -> None:
+    """Plot a value as a marker, and its 95 % interval, if it has one, as a vertical bar.
 
     Args:
-        plane: ``horizontal``, ``vertical`` or None.
-
-    Returns:
-        Circle, square, or triangle for anything else.
+        bar: Width of the bar [points].
+        zorder: Of the bar; the marker lies above it.
+        **style: Of the marker, instead of a circle of that colour.
     """
-    return MARKERS.get(plane, "^")
+    if quantity.ci95 is not None:
+        axes.plot([place, place], quantity.ci95, color=color, linewidth=bar, zorder=zorder)
+    solid = {"marker": "o", "markersize": 5.2, "markerfacecolor": color, "markeredgecolor": INK}
+    style = solid | {"markeredgewidth": 0.5} | style
+    axes.plot([place], [quantity.value], linestyle="none", zorder=zorder + 1, **style)
 
 
-def legend(figure: Figure, handles: Sequence[Handle]) -> None:
-    """One line of keys above all panels, from the left edge.
-
-    Args:
-        figure: Laid out by the constrained engine.
-    """
+def legend(figure: Figure, *handles: Handle) -> None:
+    """Draw one line of keys above all panels of a constrained layout, from the left edge."""
     figure.legend(
         handles=handles,
         loc="outside upper left",
@@ -313,11 +303,7 @@ def legend(figure: Figure, handles: Sequence[Handle]) -> None:
 
 
 def joint_ticks(axes: Axes, names: Sequence[str]) -> None:
-    """Joint names along the axis where they fit, else every second, third ... of them.
-
-    Args:
-        axes: Joints stand at 1, 2, ... from head to tail.
-    """
+    """Label joints 1, 2, ... along the axis; every second, third ... if not all names fit."""
     shown = [short(name, 14) for name in names]
     room = 95  # characters of 8 points that stand beside one another over the width
     step = max(1, -(-sum(len(name) + 2 for name in shown) // room))

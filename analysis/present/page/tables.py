@@ -1,4 +1,4 @@
-"""Key figures, tables and numbers as HTML."""
+"""Write key figures, tables, numbers and parts of drawings as HTML."""
 
 from __future__ import annotations
 
@@ -22,40 +22,80 @@ STILL_RAD = 1e-6
 
 
 def is_driven(joint: JointResult) -> bool:
-    """Whether a joint was given a command that moves.
-
-    Returns:
-        True if it has a gain, or a command with an amplitude (and then its response is missing).
-    """
+    """Return whether a joint has a command that moves, even if its response is missing."""
     amplitude = joint.command_amplitude_rad
     return joint.gain.value is not None or (amplitude is not None and amplitude > STILL_RAD)
 
 
 def element(name: str, *children: object, **attributes: object) -> Markup:
-    """One element.
+    """Return an element.
 
     Args:
         children: Elements, or text, which is escaped.
-        attributes: By name; ``class_`` is ``class``, other underscores are hyphens; what is None
-            is left out, numbers keep two decimals.
+        attributes: By name; ``class_`` is ``class``, other underscores are hyphens; None is left
+            out, numbers keep two decimals.
     """
-    told = "".join(
+    pairs = "".join(
         f' {key.rstrip("_").replace("_", "-")}="{escape(_value(value))}"'
         for key, value in attributes.items()
         if value is not None
     )
-    return Markup(f"<{name}{told}>{joined(children)}</{name}>")  # noqa: S704  escaped here
+    return Markup(f"<{name}{pairs}>{joined(children)}</{name}>")  # noqa: S704  escaped here
 
 
 def joined(children: Iterable[object]) -> Markup:
-    """Elements and text, one behind the other.
-
-    Args:
-        children: Elements, or text, which is escaped.
-    """
+    """Return elements and text, which is escaped, one behind the other."""
     return Markup("").join(
         child if isinstance(child, Markup) else escape(plain(str(child))) for child in children
     )
+
+
+def svg_element(
+    prefix: str, title: str, description: str, *children: Markup, **attributes: object
+) -> Markup:
+    """Return an ``<svg>`` element with an accessible name and description.
+
+    Args:
+        prefix: Of identifiers, unique in the page.
+    """
+    return element(
+        "svg",
+        element("title", title, id=f"{prefix}-title"),
+        element("desc", description, id=f"{prefix}-desc"),
+        *children,
+        **attributes,
+        aria_labelledby=f"{prefix}-title",
+        aria_describedby=f"{prefix}-desc",
+    )
+
+
+LEVELS = 48
+"""Steps of a colour scale."""
+
+
+def hue(level: int, *, signed: bool) -> dict[str, str]:
+    """Return class and style of a colour.
+
+    Args:
+        level: From 0 to ``LEVELS``.
+        signed: Whether the scale has one hue below its middle and another above.
+    """
+    if not signed:
+        return {"class_": "q", "style": f"--v:{100 * level / LEVELS:.0f}%"}
+    kind = "plus" if 2 * level >= LEVELS else "minus"
+    return {"class_": kind, "style": f"--v:{abs(2 * level - LEVELS) / LEVELS:.0%}"}
+
+
+def color_bar(
+    left: float, top: float, width: float, height: float, *, signed: bool
+) -> list[Markup]:
+    """Return the rectangles of a colour scale."""
+    step = width / (LEVELS + 1)
+    sizes = {"y": top, "width": step + 0.4, "height": height}
+    return [
+        element("rect", x=left + width * n / (LEVELS + 1), **sizes, **hue(n, signed=signed))
+        for n in range(LEVELS + 1)
+    ]
 
 
 def _value(value: object) -> str:
@@ -67,63 +107,37 @@ def _value(value: object) -> str:
 NO_BREAK = "\N{NO-BREAK SPACE}"
 
 _UNIT = re.compile(r"(?<=\d) (?=(?:%|Hz|J|s|rad|mm|N m|kB)(?![\w]))")
+_INTERVAL = re.compile(r"\[[^]]*\]")
 _P = re.compile(r"\bp ([<=]) ")
 _INVERSE = "\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT ONE}"
 
 
 def typeset(text: str) -> str:
-    """Plain text for a paragraph.
-
-    Args:
-        text: From a log or a result.
-
-    Returns:
-        The same words; no line ends between a number and its unit, and ``H^-1`` is raised.
-    """
+    """Return text without line breaks between numbers and units, and with ``H^-1`` raised."""
     known = _UNIT.sub(NO_BREAK, plain(text).replace("^-1", _INVERSE))
     return _P.sub(rf"p{NO_BREAK}\1{NO_BREAK}", known)
 
 
 def sentence(text: str) -> str:
-    """A sentence from a log or a result.
-
-    Args:
-        text: With or without a capital and a full stop.
-    """
+    """Return text as a typeset sentence with capital and full stop."""
     return typeset(formats.sentence(text))
 
 
 def softer(text: str) -> Markup:
-    """Set the intervals of a sentence smaller, so that the sentence is read first."""
-    escaped = str(escape(typeset(text)))
-    parts: list[str] = []
-    rest = escaped
-    while (start := rest.find("[")) >= 0 and (stop := rest.find("]", start)) >= 0:
-        parts += [rest[:start], '<span class="ci">', rest[start : stop + 1], "</span>"]
-        rest = rest[stop + 1 :]
-    return Markup("".join([*parts, rest]))  # noqa: S704  escaped above
+    """Set the intervals of a sentence in smaller type."""
+    marked = _INTERVAL.sub(r'<span class="ci">\g<0></span>', str(escape(typeset(text))))
+    return Markup(marked)  # noqa: S704  escaped above
 
 
 def cut(text: str, most: int = 130) -> str:
-    """The beginning of a long sentence.
-
-    Args:
-        most: Characters kept at most.
-
-    Returns:
-        Up to a whole word, with an ellipsis where something is left out.
-    """
+    """Return the beginning of a long sentence, up to a whole word, with an ellipsis."""
     if len(text) <= most:
         return text
     return text[:most].rpartition(" ")[0] + " \N{HORIZONTAL ELLIPSIS}"
 
 
 def digits(value: float) -> str:
-    """A number of any size with two digits.
-
-    Returns:
-        For example ``0.026`` or ``3.4e−9``.
-    """
+    """Return a number of any size with two digits, e.g. ``0.026`` or ``3.4e−9``."""
     return f"{value:.2g}".replace("-", formats.MINUS)
 
 
@@ -135,11 +149,7 @@ _NOT_COMPUTED = Markup(
 
 @dataclass(frozen=True)
 class Fact:
-    """One key figure.
-
-    Attributes:
-        note: Where or when, in small print; may be empty.
-    """
+    """A key figure, with a note in small print, which may be empty."""
 
     name: str
     value: str
@@ -150,13 +160,10 @@ _CLASSES = {"number": ' class="n"', "sentence": ' class="say"', "word": "", "cod
 
 
 def grid(table: Table[Any], marks: Sequence[Markup] = ()) -> Markup:
-    """Head and body of a table.
+    """Return the elements ``thead`` and ``tbody`` of a table.
 
     Args:
-        marks: What stands before the name of each row, if anything does.
-
-    Returns:
-        The elements ``thead`` and ``tbody``.
+        marks: Elements before the name of each row, if any.
     """
     columns = [column for column in table.columns if column.page is not None]
     count = '<th scope="col" class="n i">#</th>' if table.numbered else ""
@@ -184,11 +191,7 @@ def grid(table: Table[Any], marks: Sequence[Markup] = ()) -> Markup:
 
 
 def joint_mark(color: str, plane: str | None, *, driven: bool = True) -> Markup:
-    """The mark of a joint, which stands before its name.
-
-    Args:
-        driven: Whether it was given a command that moves.
-    """
+    """Return the mark of a joint, for the left of its name."""
     kind = plane if plane in ("horizontal", "vertical") else "unknown"
     return Markup('<span class="mark {}{}" style="--c: {}"></span>').format(
         kind, "" if driven else " passive", color
@@ -208,29 +211,14 @@ def _shown(cell: Cell) -> Markup:
 
 
 def number(value: float | None, decimals: int) -> Markup:
-    """A number that keeps its full precision in the page.
-
-    Args:
-        decimals: Digits after the point.
-
-    Returns:
-        The number, or a dash.
-    """
+    """Return a number that keeps its full precision in the page, or a dash."""
     if value is None:
         return _NOT_COMPUTED
     return Markup('<data value="{}">{}</data>').format(value, formats.number(value, decimals))
 
 
 def estimate(quantity: Estimate, decimals: int, unit: str = "") -> Markup:
-    """A number with its interval.
-
-    Args:
-        quantity: In ``unit``.
-        decimals: Digits after the point.
-
-    Returns:
-        The number, or a dash; its interval in smaller type.
-    """
+    """Return a number, or a dash, with its interval in smaller type."""
     shown = number(quantity.value, decimals) + ("" if quantity.value is None else unit)
     if quantity.ci95 is None:
         return shown
@@ -239,73 +227,47 @@ def estimate(quantity: Estimate, decimals: int, unit: str = "") -> Markup:
 
 
 def p_value(p: float | None) -> Markup:
-    """A p-value that keeps its full precision in the page.
-
-    Args:
-        p: 0 to 1, or None.
-
-    Returns:
-        The p-value, or a dash.
-    """
+    """Return a p-value that keeps its full precision in the page, or a dash."""
     if p is None:
         return _NOT_COMPUTED
     return Markup('<data value="{}">{}</data>').format(p, formats.p_value(p))
 
 
 def known(value: object) -> Markup:
-    """A word, or a dash.
-
-    Args:
-        value: Anything that prints; None: not known.
-    """
+    """Return a value as escaped text, or a dash for None."""
     return _NOT_COMPUTED if value is None else escape(plain(str(value)))
 
 
 def key_figures(analysis: Analysis) -> list[Fact]:
-    """The figures that stand at the top of the page; what is unknown is an en dash.
-
-    Returns:
-        Eight facts, seven where there are no joints.
-    """
+    """Return the eight figures at the top of the page; seven without joints."""
     gait, joints = analysis.gait, analysis.joints
     driven = [joint for joint in joints if is_driven(joint)]
-    frequency = formats.gait_frequency(gait)
-    facts = [
-        Fact("Gait frequency", frequency, _analysed(analysis)),
-        Fact("Wave", (gait.wave or formats.MISSING).replace("-", " "), _lag_per_joint(analysis)),
-        Fact(
-            "Joints in the gait",
-            f"{len(driven)} of {len(joints)}" if driven else formats.MISSING,
-        ),
-    ]
+    count = f"{len(driven)} of {len(joints)}" if driven else formats.MISSING
     gains = [(j.gain.value, j.name) for j in joints if j.gain.value is not None]
     lags = [(math.degrees(v), j.name) for j in joints if (v := j.lag_rad.value) is not None]
-    facts.append(_range("Gain", gains, formats.decimals_for((j.gain for j in joints), most=3), ""))
-    facts.append(_range("Lag", lags, 1, "°"))
     energies = [j.energy_abs_j for j in joints if j.energy_abs_j is not None]
-    total = math.fsum(energies)
-    digits = formats.decimals_for_values([total])
-    facts.append(
-        Fact(
-            "Mechanical energy E_abs",
-            f"{formats.number(total, digits)} J" if energies else formats.MISSING,
-            f"{len(energies)} of {len(joints)} joints" if energies else "",
-        )
-    )
+    total, energy_note = formats.MISSING, ""
+    if energies:
+        sum_j = math.fsum(energies)
+        total = f"{formats.number(sum_j, formats.decimals_for_values([sum_j]))} J"
+        energy_note = f"{len(energies)} of {len(joints)} joints"
+    facts = [
+        Fact("Gait frequency", formats.gait_frequency(gait), _analysed(analysis)),
+        Fact("Wave", (gait.wave or formats.MISSING).replace("-", " "), _lag_per_joint(analysis)),
+        Fact("Joints in the gait", count),
+        _range("Gain", gains, formats.decimals_for((j.gain for j in joints), most=3), ""),
+        _range("Lag", lags, 1, "°"),
+        Fact("Mechanical energy E_abs", total, energy_note),
+    ]
     if joints:
         least = min(joints, key=lambda j: j.coverage)
         where = plain(least.name) if least.coverage < 0.9995 else "every joint"
         facts.append(Fact("Lowest coverage", formats.coverage(least.coverage), where))
     points = analysis.body.observed if analysis.body is not None else ()
     sizes = [formats.number(formats.scaled(p.amplitude_m, 1000.0).value, 0) for p in points]
-    facts.append(
-        Fact(
-            "Body amplitude",
-            " / ".join(sizes) + " mm" if sizes else formats.MISSING,
-            plain(" / ".join(p.place for p in points)),
-        )
-    )
-    return facts
+    amplitude = " / ".join(sizes) + " mm" if sizes else formats.MISSING
+    places = plain(" / ".join(p.place for p in points))
+    return [*facts, Fact("Body amplitude", amplitude, places)]
 
 
 def _range(name: str, values: Sequence[tuple[float, str]], decimals: int, unit: str) -> Fact:

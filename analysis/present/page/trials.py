@@ -1,4 +1,4 @@
-"""The tests of a result as questions with their answers in words."""
+"""Present the tests of a result as questions with answers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from undulog.capture.common.console import plain
 from ...experiment.reversal.modules import SIGNIFICANT
 from ...results import formats
 from ...results.analysis import Index
-from ...results.coupling import Coupling, LocalCoupling, RowCheck
+from ...results.coupling import LocalCoupling, RowCheck
 from ...results.estimate import Estimate
 from ...results.experiment import Experiment, Reversal
 from ...segments.answer import find
@@ -23,13 +23,16 @@ LEVEL_NOTE = (
 )
 
 
+_MARGINS = {"gain": "2 %", "lag": "1°"}
+
+
 @dataclass(frozen=True)
 class Trial:
-    """One question put to the data.
+    """A test as a question.
 
     Attributes:
-        statistic: What was computed, with unit and interval.
-        p: Of the null hypothesis; None where the answer rests on an interval or a bound.
+        statistic: With unit and interval.
+        p: Of the null hypothesis; None if the answer rests on an interval or a bound.
     """
 
     question: str
@@ -38,32 +41,23 @@ class Trial:
     verdict: str
 
 
-def session_trials(indices: Mapping[str, Index]) -> tuple[Trial, ...]:
-    """The tests of one session.
-
-    Returns:
-        Trials, plane by plane; empty where nothing was tested.
-    """
-    found: list[Trial] = []
-    for plane, index in find(dict(indices), "common_response").items():
-        found.append(_common(index, _of(plane)))
+def session_trials(indices: Mapping[str, Index]) -> list[Trial]:
+    """Return the tests of one session, plane by plane."""
+    found = [
+        _common(index, _of(plane)) for plane, index in find(indices, "common_response").items()
+    ]
     for quantity in ("gain", "lag"):
-        for plane, index in find(dict(indices), f"boundary_contrast_{quantity}").items():
+        for plane, index in find(indices, f"boundary_contrast_{quantity}").items():
             found.append(_contrast(index, quantity, _of(plane)))
     for quantity in ("gain", "lag"):
-        for plane, index in find(dict(indices), f"equivalence_{quantity}").items():
-            margin = "2 %" if quantity == "gain" else "1°"
-            asked = f"Is every {quantity} within {margin} of the mean of {_of(plane)}?"
-            found.append(_equivalence(index, quantity, asked))
-    return tuple(found)
+        for plane, index in find(indices, f"equivalence_{quantity}").items():
+            question = f"within {_MARGINS[quantity]} of the mean of {_of(plane)}?"
+            found.append(_equivalence(index, quantity, f"Is every {quantity} {question}"))
+    return found
 
 
-def experiment_trials(experiment: Experiment) -> tuple[Trial, ...]:
-    """The tests of several sessions together.
-
-    Returns:
-        Trials; empty where nothing was tested.
-    """
+def experiment_trials(experiment: Experiment) -> list[Trial]:
+    """Return the tests of several sessions together."""
     found: list[Trial] = []
     indices = experiment.heterogeneity
     common = indices.get("common_response")
@@ -71,55 +65,35 @@ def experiment_trials(experiment: Experiment) -> tuple[Trial, ...]:
         found.append(_common(common, "the driven joints"))
     if experiment.reversal is not None:
         found += _reversal(experiment.reversal, indices)
-    found += coupling_trials(experiment.coupling)
-    return tuple(found)
+    if isinstance(experiment.coupling, LocalCoupling):
+        found += _kicks(experiment.coupling)
+    return found
 
 
-def coupling_trials(coupling: Coupling) -> list[Trial]:
-    """The checks of a coupling.
-
-    Args:
-        coupling: Identified or not.
-
-    Returns:
-        Trials; empty where there is nothing to check.
-    """
-    if not isinstance(coupling, LocalCoupling):
-        return []
+def _kicks(coupling: LocalCoupling) -> Iterable[Trial]:
     sums = "as any settled gait's do" if coupling.checks_pass else "not in all rows: settle longer"
-    found = [
-        Trial(
-            f"Do rows of {symbol} sum to {rows[0].expected:g}, as shifting time demands?",
-            f"largest deviation {_worst(rows)}",
-            None,
-            sums,
-        )
-        for symbol, rows in (("P", coupling.phase_rows), ("R", coupling.gain_rows))
-    ]
+    for symbol, rows in (("P", coupling.phase_rows), ("R", coupling.gain_rows)):
+        question = f"Do rows of {symbol} sum to {rows[0].expected:g}, as shifting time demands?"
+        yield Trial(question, f"largest deviation {_worst(rows)}", None, sums)
     index = coupling.nonlinearity
     if index.value is not None and index.ci95 is not None:
         linear = index.ci95[0] <= 0.0
-        found.append(
-            Trial(
-                "Is the chain linear and time-invariant around this gait?",
-                f"nonlinearity {formats.percent(index)}",
-                None,
-                "a deviation could not be shown" if linear else "no: H is descriptive only",
-            )
+        yield Trial(
+            "Is the chain linear and time-invariant around this gait?",
+            f"nonlinearity {formats.percent(index)}",
+            None,
+            "a deviation could not be shown" if linear else "no: H is descriptive only",
         )
     if coupling.held_out:
         good = sum(2 * one.error <= one.error_kept for one in coupling.held_out)
         reach = coupling.valid_to
-        found.append(
-            Trial(
-                "Do the matrices predict gaits that were not used?",
-                f"{good} of {len(coupling.held_out)} at least twice as well as 'each joint keeps "
-                "its response'",
-                None,
-                "not even the smallest" if reach is None else f"yes, up to {reach:.3f} rad",
-            )
+        yield Trial(
+            "Do the matrices predict gaits that were not used?",
+            f"{good} of {len(coupling.held_out)} at least twice as well as 'each joint keeps "
+            "its response'",
+            None,
+            "not even the smallest" if reach is None else f"yes, up to {reach:.3f} rad",
         )
-    return found
 
 
 def _of(end: str) -> str:
@@ -141,20 +115,16 @@ def _common(index: Index, whose: str) -> Trial:
 
 def _contrast(index: Index, quantity: str, whose: str) -> Trial:
     value = Estimate(index.value, index.ci95)
-    told = formats.estimate(formats.degrees(value), "°") if quantity == "lag" else None
+    if quantity == "lag":
+        size = formats.estimate(formats.degrees(value), "°")
+    else:
+        size = formats.estimate(value, most=5)
     low, high = index.ci95 or (-math.inf, math.inf)
-    larger = {"gain": "gain is larger", "lag": "lag is larger"}[quantity]
     verdict = "open: no difference could be shown"
-    if low > 0:
-        verdict = f"yes, {larger} at the ends"
-    elif high < 0:
-        verdict = f"yes, {larger} in the middle"
-    return Trial(
-        f"Does {quantity} differ between ends and middle of {whose}?",
-        f"ends minus middle {told or formats.estimate(value, most=5)}",
-        index.p,
-        verdict,
-    )
+    if low > 0 or high < 0:
+        verdict = f"yes, {quantity} is larger {'at the ends' if low > 0 else 'in the middle'}"
+    question = f"Does {quantity} differ between ends and middle of {whose}?"
+    return Trial(question, f"ends minus middle {size}", index.p, verdict)
 
 
 def _equivalence(index: Index, quantity: str, question: str) -> Trial:
@@ -182,9 +152,8 @@ def _reversal(reversal: Reversal, indices: Mapping[str, Index]) -> Iterable[Tria
     for quantity in ("gain", "lag"):
         index = indices.get(f"equivalence_mirror_{quantity}")
         if index is not None and index.value is not None:
-            margin = "2 %" if quantity == "gain" else "1°"
-            asked = f"Is every joint's {quantity} within {margin} of its mirror's?"
-            yield _equivalence(index, quantity, asked)
+            question = f"Is every joint's {quantity} within {_MARGINS[quantity]} of its mirror's?"
+            yield _equivalence(index, quantity, question)
 
 
 def _worst(rows: tuple[RowCheck, ...]) -> str:

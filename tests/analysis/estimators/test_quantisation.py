@@ -6,14 +6,11 @@ import pytest
 from scipy.special import stdtrit
 
 from undulog.analysis.estimators.harmonic import fit_at
-from undulog.analysis.estimators.intervals import (
-    contrast_variance,
-    lag_contrast_variance,
-    response_errors,
-)
+from undulog.analysis.estimators.intervals import response_errors
 from undulog.analysis.estimators.quantisation import lattice_step
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import ResidualBins, residual_spectrum
+from undulog.analysis.segments.profile import scatter_of
 
 STEP = estimator_tables.STEP
 
@@ -106,10 +103,8 @@ def test_contrasts_of_rounded_joints():
     inside = []
     for run in range(runs):
         own = errors.select(range(run * joints, (run + 1) * joints))
-        for variance, value in (
-            (contrast_variance(own, each), found[run].real),
-            (lag_contrast_variance(own, each), found[run].imag),
-        ):
-            half = stdtrit(variance[1], 0.975) * variance[0] ** 0.5
+        values = (found[run].real, found[run].imag)
+        for scatter, value in zip(scatter_of(own), values, strict=True):
+            half = stdtrit(scatter.columns.shape[1], 0.975) * scatter.variance(each) ** 0.5
             inside.append(np.mean(np.abs(each @ value) <= half))
     assert np.mean(inside) > 0.92

@@ -10,14 +10,14 @@ import pytest
 from undulog.analysis.present.text import render
 
 
-def test_the_answer_stands_first_and_the_method_last(snake):
-    lines = render(snake).splitlines()
+def test_a_pipe_gets_the_answer_first_every_column_and_the_method_last(snake):
+    text = render(snake)
+    lines = text.splitlines()
     assert lines[0] == f"weak.mcap: {snake.answer.sentence}"
     assert lines[-1].startswith("Method: ")
-
-
-def test_every_joint_that_was_driven_has_its_numbers(snake):
-    text = render(snake)
+    heading = next(line for line in lines if line.startswith("joint "))
+    assert all(name in heading for name in ("plane", "command°", "gain", "lag°", "cover"))
+    assert not [line for line in lines if line.startswith("Without ")]
     for joint in snake.joints:
         rows = [line for line in text.splitlines() if line.startswith(f"{joint.name} ")]
         if joint.gain.value is None:
@@ -39,14 +39,6 @@ def test_nothing_is_wider_than_the_terminal(snake, width):
     heading = next(line for line in lines if line.startswith("joint "))
     told = left_out[0].partition(":")[0].removeprefix("Without ") if left_out else ""
     assert not [name for name in told.split(", ") if name and name in heading]
-
-
-def test_a_pipe_gets_every_column_and_one_line_a_sentence(snake):
-    lines = render(snake).splitlines()
-    heading = next(line for line in lines if line.startswith("joint "))
-    for name in ("plane", "command°", "gain", "lag°", "cover"):
-        assert name in heading
-    assert not [line for line in lines if line.startswith("Without ")]
 
 
 def test_nulls_are_dashes_and_every_joint_stays_when_none_was_driven(still):

@@ -25,7 +25,7 @@ def test_the_last_cycles_of_the_last_window(snake, still):
     assert signals.stretch_s(still) == (0.0, 3.0)
 
 
-def test_traces_are_the_samples(snake, recorded):
+def test_traces_are_the_samples(snake, recorded, monkeypatch):
     with Session.open(recorded) as session:
         traces = signals.read_traces(session, snake)
     assert [trace.joint.name for trace in traces] == ["joint01", "joint13", "joint25"]
@@ -36,25 +36,17 @@ def test_traces_are_the_samples(snake, recorded):
     )
     assert np.max(middle.response_rad) == pytest.approx(0.4 * middle.joint.gain.value, rel=1e-3)
     assert head.response_rad.size == head.command_rad.size - 1  # the NaN is not drawn
-
-
-def test_long_stretches_are_thinned(snake, recorded, monkeypatch):
     monkeypatch.setattr(signals, "MOST_POINTS", 100)
     with Session.open(recorded) as session:
         traces = signals.read_traces(session, snake)
     assert traces[1].response_rad.size == 100
 
 
-def test_the_figure_is_on_the_page(snake, recorded):
-    with Session.open(recorded) as session:
-        page = render(snake, session)
-    assert "Command and response of joint01, joint13, joint25" in page
-    assert len(page.encode()) < 300_000
-
-
 def test_a_page_that_grows_too_large_goes_without_signals_and_says_so(snake, recorded, monkeypatch):
     with Session.open(recorded) as session:
         full = render(snake, session)
+        assert "Command and response of joint01, joint13, joint25" in full
+        assert len(full.encode()) < 300_000
         monkeypatch.setattr(
             "undulog.analysis.present.page.page.LARGEST_BYTES", len(full.encode()) - 1
         )
