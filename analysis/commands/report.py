@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 def report(
     *files: Path,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    catalog: str | None = None,
+    find: Annotated[str, Parameter(name="--where")] = "",
     start: float | None = None,
     stop: float | None = None,
     command_topic: str = "/joint_commands",
@@ -32,13 +35,17 @@ def report(
     """Write the offline report: one HTML page that needs no network and no script.
 
     Several sessions are one experiment, as for `undulog analyse`: runs of a gait and of its reverse
-    separate boundary from module, kicks of single joints identify the coupling.
+    separate boundary from module, kicks of single joints identify the coupling. With `--catalog`
+    the page is on all sessions of a folder over time: joints that change, trends, outliers.
 
     Example: `undulog report run.mcap -o run.html`
 
     Args:
         files: Sessions (MCAP); several are runs of one experiment.
         output: The page, a name that ends in .html.
+        catalog: Folder or URL of sessions to compare over time, instead of files; those without
+            results are analysed first.
+        find: Condition on the sessions of the catalogue, as for `undulog catalog`.
         start: Start of what is analysed, from the session's start [s]; chosen if not given.
         stop: Its end [s].
         command_topic: JointState topic of the commands.
@@ -46,14 +53,22 @@ def report(
         force: Replace the page if it exists.
         json: Print one JSON object: the page, the answer, and the answer to each session.
     """
-    if not files:
+    if not files and catalog is None:
         raise UsageError(
             "report needs at least one session, e.g. undulog report run.mcap -o x.html"
         )
+    if files and catalog is not None:
+        raise UsageError("--catalog takes the place of files; name its sessions by --where")
+    if find and catalog is None:
+        raise UsageError("--where is a condition on the sessions of --catalog")
     options = chosen(start, stop, command_topic, response_topic)
     why = "the report is an HTML page; end its name in .html"
     check_output(output, PAGES, why, force=force)
-    page, facts, warnings = _one(files[0], options) if len(files) == 1 else _several(files, options)
+    if catalog is not None:
+        page, facts, warnings = _fleet(catalog, find, output)
+    else:
+        alone = len(files) == 1
+        page, facts, warnings = _one(files[0], options) if alone else _several(files, options)
     write_text(output, page)
     size = output.stat().st_size
     if json:
@@ -81,6 +96,28 @@ def _one(file: Path, options: Options) -> tuple[str, dict[str, Any], int]:
             page = render(analysis, session, cycle_maps(measured))
     summary = _summary(analysis)
     return page, {"answer": summary["sentence"], "answers": [summary]}, len(analysis.warnings)
+
+
+def _fleet(where: str, find: str, output: Path) -> tuple[str, dict[str, Any], int]:
+    """Return the page on the sessions of a catalogue, its result, and the number of warnings."""
+    from ..catalog.catalog import Catalog
+    from ..fleet.fleet import analyse_fleet
+    from ..present.page.page import render_fleet
+
+    found = Catalog(where)
+    with progress("report", total=2) as bar:
+        found.scan()
+        missing = found.find(find).query("status == 'not analysed' and damage.isna()")["path"]
+        faults = found.analyse(
+            missing.to_list(), on_done=lambda k, n: bar.update(k / n, f"{k} of {n} analysed")
+        )
+        bar.update(1, note="page")
+        sessions, joints = found.find(find), found.find(joints=True)
+        fleet = analyse_fleet(sessions, joints)
+        warnings = [*fleet.warnings, *(f"{name}: {why}" for name, why in faults.items())]
+        fleet = replace(fleet, warnings=tuple(warnings))
+        page = render_fleet(fleet, joints, where, output)
+    return page, fleet.to_dict(), len(warnings)
 
 
 def _several(files: Sequence[Path], options: Options) -> tuple[str, dict[str, Any], int]:

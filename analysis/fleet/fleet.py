@@ -34,6 +34,7 @@ QUANTITIES = {"gain": "gain", "lag": "lag [rad]", "energy": "energy [W]"}
 
 _TRENDS = ("lag_sd", "gain_cv", "energy_cv", "cost_of_transport", "distance_m", "frequency_hz")
 _LEAST_JOINTS = 3
+_SAME = 1e-9  # relative: equal but for rounding
 _MOST_OUTLIERS = 50
 _MOST_ROWS = 2000  # of a mixed-effects model
 
@@ -192,9 +193,10 @@ def _answer(histories: list[RobotHistory]) -> str:
     if not changes:
         n_sessions = sum(history.sessions for history in histories)
         return f"No joint changes over {n_sessions} sessions, at a family-wise level of 5 %."
-    history, change = min(changes, key=lambda pair: (pair[1].p, -abs(pair[1].change)))
+    rank = list(QUANTITIES).index
+    history, change = min(changes, key=lambda pair: (pair[1].p, rank(pair[1].quantity)))
     more = len(changes) - 1
-    others = f"; {more} more change{'s' if more == 1 else ''}" if more else ""
+    others = f"; {more} more change{'s' if more > 1 else ''}" if more else ""
     return f"{history.robot}: {sentence(change)}{others}."
 
 
@@ -204,11 +206,11 @@ def sentence(change: JointChange) -> str:
         size = f"{abs(math.degrees(change.change)):.2g}°"
     else:
         size = f"{abs(change.change) * 100:.2g} %"
-    way = "more" if change.change > 0 else "less"
-    begun = "grows to" if change.gradual else "is"
+    way = "rises" if change.change > 0 else "falls"
+    gradually = ", gradually," if change.gradual else ""
     return (
-        f"the {change.quantity} of {change.joint} {begun} {size} {way} than the other joints' from "
-        f"{change.date[:10]} on (95 %: {change.earliest[:10]} to {change.latest[:10]})"
+        f"the {change.quantity} of {change.joint} {way} by {size}{gradually} against the other "
+        f"joints from {change.date[:10]} on (95 %: {change.earliest[:10]} to {change.latest[:10]})"
     )
 
 
@@ -320,7 +322,9 @@ def _trends(sessions: _Frame) -> list[Trend]:
     for name in _TRENDS:
         values = sessions[name].astype(float).to_numpy()
         known = np.isfinite(values)
-        if np.count_nonzero(known) < LEAST_SESSIONS or np.ptp(values[known]) == 0:
+        if np.count_nonzero(known) < LEAST_SESSIONS:
+            continue
+        if np.ptp(values[known]) <= _SAME * np.abs(values[known]).max():
             continue
         tau: Any = stats.kendalltau(days[known], values[known])
         slope: Any = stats.theilslopes(values[known], days[known], alpha=0.95)

@@ -10,8 +10,10 @@ import re
 from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -20,6 +22,7 @@ from undulog.capture.common.console import plain
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.palette import joint_hex
 
+from ...fleet.fleet import Fleet
 from ...results import formats
 from ...results.analysis import Analysis, JointResult
 from ...results.answer import beyond
@@ -31,6 +34,7 @@ from .. import tables
 from .artefacts import artefact_rows, command_response, flagged_joints, read_traces
 from .comparison_view import comparison_view
 from .experiment_view import experiment_view
+from .fleet_view import change_text, fleet_view, spread_text
 from .maps import cycle_drawings
 from .matrix import entries_of, matrix_picture
 from .motion import body_motion
@@ -154,6 +158,19 @@ def _page(
     else:
         template, view = "session.html.j2", _session_view(result, session, cycles)
     return _environment().get_template(template).render(v=view, left_out=left_out)
+
+
+def render_fleet(fleet: Fleet, joints: pd.DataFrame, where: str, page: Path) -> str:
+    """Return the report on many sessions over time.
+
+    Args:
+        joints: Rows of the catalogue's view ``joints`` that it was computed from.
+        where: Folder or URL of the sessions.
+        page: Where the page goes; its links start there.
+    """
+    view = fleet_view(fleet, joints, where, page)
+    template = _environment().get_template("fleet.html.j2")
+    return template.render(v=view, change=change_text, spread=spread_text)
 
 
 def _template_text(name: str) -> str:

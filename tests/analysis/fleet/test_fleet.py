@@ -1,9 +1,13 @@
 """Fleets whose truth is known: a joint that wears from a day on, or none."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
 
+from support.linear_chain import CHAIN, WAVE, M, write_run
+from support.processes import undulog
 from undulog.analysis.fleet.change_points import find_change_points, relative_to_others
 from undulog.analysis.fleet.fleet import analyse_fleet
 
@@ -82,7 +86,7 @@ def test_a_worn_joint_is_named_with_its_date():
     assert (change.joint, change.quantity, change.gradual) == (name, "gain", False)
     assert change.earliest <= begun.isoformat() <= change.latest
     assert change.change == pytest.approx(-0.055, abs=0.01)
-    assert f"the gain of {name} is" in fleet.answer
+    assert f"the gain of {name} falls by" in fleet.answer
     assert begun.date().isoformat() in fleet.answer
 
 
@@ -164,3 +168,28 @@ def test_wear_is_named_with_a_date_whose_interval_holds(kind):
         mine = [change for change in changes if (change.joint, change.quantity) == (name, "gain")]
         good += any(one.earliest <= begun.isoformat() <= one.latest for one in mine)
     assert good >= {"step": 45, "ramp": 38, "saturating": 42}[kind]
+
+
+def test_the_page_of_a_folder_names_the_joint_and_links_outliers(tmp_path):
+    for number in range(12):
+        weak = np.diag(np.where(np.arange(M) == 2, 0.8 if number >= 6 else 1.0, 1.0))
+        answer = weak @ CHAIN @ WAVE
+        if number == 3:
+            answer[1] *= np.exp(-0.3j)
+        write_run(tmp_path / f"run{number:02d}.mcap", WAVE, answer, number, 0.003)
+    (tmp_path / "run03.html").write_text("its page")
+    page = tmp_path / "fleet.html"
+    done = undulog("report", "--catalog", tmp_path, "-o", page, "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert "the gain of j3 falls by" in result["answer"]
+    text = page.read_text()
+    assert result["answer"].split(":")[1].strip()[:20] in text
+    assert '<a href="run03.mcap">' in text
+    assert '<a href="run03.html">page</a>' in text
+    assert "<svg" in text
+    assert "://" not in text.replace("http://www.w3.org", "")
+    refused = undulog(
+        "report", tmp_path / "run00.mcap", "--catalog", tmp_path, "-o", page, "--force"
+    )
+    assert refused.returncode == 2
