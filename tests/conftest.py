@@ -10,7 +10,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
+settings.register_profile("undulog", deadline=None)  # no test is timed
+settings.load_profile("undulog")
 pytest.register_assert_rewrite("support")
 
 # In the background of a script or under nohup these are ignored, and every process that a test

@@ -160,12 +160,15 @@ class Fleet:
         return asdict(self)
 
 
-def analyse_fleet(sessions: pd.DataFrame, joints: pd.DataFrame) -> Fleet:
+def analyse_fleet(
+    sessions: pd.DataFrame, joints: pd.DataFrame, *, components: bool = True
+) -> Fleet:
     """Compare the sessions of each robot over time.
 
     Args:
         sessions: Rows of the view ``catalog``, as :meth:`.Catalog.find` returns them.
         joints: Rows of the view ``joints`` of the same sessions.
+        components: Also fit the mixed-effects models, which take most of the time.
 
     Raises:
         MissingExtraError: If statsmodels is not installed.
@@ -175,7 +178,7 @@ def analyse_fleet(sessions: pd.DataFrame, joints: pd.DataFrame) -> Fleet:
     histories: list[RobotHistory] = []
     left_out: list[str] = []
     for robot, own in analysed.groupby(analysed["robot"].fillna("(no name)"), sort=True):
-        history = _history(str(robot), own.sort_values("start"), joints)
+        history = _history(str(robot), own.sort_values("start"), joints, components=components)
         if history is None:
             left_out.append(f"{robot}: no {LEAST_SESSIONS} analysed sessions with the same joints")
         else:
@@ -214,7 +217,9 @@ def sentence(change: JointChange) -> str:
     )
 
 
-def _history(robot: str, sessions: _Frame, joints: _Frame) -> RobotHistory | None:
+def _history(
+    robot: str, sessions: _Frame, joints: _Frame, *, components: bool
+) -> RobotHistory | None:
     own = joints[joints["path"].isin(sessions["path"])]
     tables = {
         "gain": _table(own, np.log(own["gain"].where(own["gain"] > 0))),
@@ -244,7 +249,9 @@ def _history(robot: str, sessions: _Frame, joints: _Frame) -> RobotHistory | Non
         conditions=len(np.unique(conditions)),
         changes=tuple(changes),
         trends=tuple(_trends(ordered)),
-        components=tuple(_components(name, table, conditions) for name, table in tables.items()),
+        components=tuple(
+            _components(name, table, conditions) for name, table in tables.items() if components
+        ),
         outliers=tuple(_outliers(tables, relative, ordered, changes, conditions)),
         warnings=(f"{dropped} sessions lack the response of a joint",) if dropped else (),
     )

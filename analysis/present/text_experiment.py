@@ -181,8 +181,8 @@ def _tilt(tilt: FloorTilt, middle: str | None) -> str:
     if tilt.headings is Headings.BALANCED:
         return f"A tilted floor cancels: {tilt.strata} sets of mirror-image runs.{lean}"
     checks = f"the common part is {formats.estimate(tilt.ratio, most=2)} of the contrast"
-    if tilt.middle is not None:
-        middle_size = formats.number(tilt.middle, 2) if math.isfinite(tilt.middle) else "any size"
+    if middle is not None:
+        middle_size = "any size" if tilt.middle is None else formats.number(tilt.middle, 2)
         checks += f", the middle joint {middle} at most {middle_size} of the largest contrast"
     verdict = "excluded" if tilt.excluded else "not excluded"
     return f"A tilted floor is {verdict}: {checks} (a tilt makes both large).{lean}"

@@ -107,7 +107,8 @@ class FloorTilt:
         ratio: Root mean square of what both joints of a pair do otherwise the other way, over that
             of their contrast: above 1 for a tilt, below for one module.
         middle: Largest size of the middle joint's difference over the least size of the largest
-            contrast (95 %): below 1 for one module; None for an even number of joints.
+            contrast (95 %): below 1 for one module; None for an even number of joints, or where
+            no contrast differs from zero.
         gravity_rad: Lean along the body by recorded gravity [rad], downhill towards the head
             positive; empty without.
         excluded: Whether headings or checks exclude a tilt as the cause.

@@ -86,7 +86,7 @@ def tilt_check(
     middle = None
     if len(test.difference) % 2:
         middle = _middle_share(test)
-        excluded &= middle < 1.0
+        excluded &= middle is not None and middle < 1.0
     gravity_rad = gravity_rad or Estimate()
     lean = gravity_rad.ci95
     excluded &= lean is None or (lean[0] < LEVEL_RAD and lean[1] > -LEVEL_RAD)
@@ -183,14 +183,14 @@ def heading_strata(forward: FloatArray, reverse: FloatArray) -> tuple[IntArray, 
     return index[: len(forward)], index[len(forward) :]
 
 
-def _middle_share(test: MirrorTest) -> float:
+def _middle_share(test: MirrorTest) -> float | None:
     """Return the middle joint's upper bound over the largest contrast's lower bound."""
     k = len(test.difference) // 2
     contrast = np.abs(np.stack([test.contrast.real, test.contrast.imag]))
     least = float((contrast - test.critical * test.contrast_error).max())
     middle = np.abs([test.difference[k].real, test.difference[k].imag])
     most = float((middle + test.critical * test.error[:, k]).max())
-    return most / least if least > 0 else float("inf")
+    return most / least if least > 0 else None
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """A tilted floor in a reversal: strata of mirror images, the checks without them, headings."""
 
+import dataclasses
+import json
 import math
 from itertools import product
 
@@ -164,6 +166,14 @@ def test_the_ratio_of_common_to_contrast():
     even = np.ones((6, 4), dtype=complex) + rng.normal(0, 0.01, (6, 4))
     tested = mirror_test(even, 1.1 * even[:, ::-1])
     assert tilt_check(even, 1.1 * even[:, ::-1], tested).middle is None
+
+
+def test_without_a_contrast_nothing_is_infinite():
+    reversal = reversal_of(NAMES, *runs(np.random.default_rng(3), scatter=0.02))
+    assert reversal.middle == "d"
+    assert reversal.tilt.middle is None
+    assert not reversal.tilt.excluded
+    json.dumps(dataclasses.asdict(reversal), allow_nan=False)
 
 
 def test_strata_from_headings():
