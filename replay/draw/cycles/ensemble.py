@@ -252,7 +252,8 @@ def _fitted(
 ) -> Pace | None:
     """Return the phase of a fitted rhythm: 0 at the crest of the first joint's command."""
     track = next((one for one in commanded if one.name == places.names[0]), None)
-    if track is None:
+    cycles = (window[1] - window[0]) * frequency_hz
+    if track is None or not cycles <= track.t_ns.size:  # a saved result may say anything
         return None
     omega = 2 * np.pi * frequency_hz
     series = clean(track.name, track.t_ns, track.values, start_ns).between(*window)
@@ -260,7 +261,7 @@ def _fitted(
     if model is None or series.count <= model.size + 1:
         return None
     crest = float(np.angle(fit_at([series], omega, model).fundamental[0]))
-    steps = 2 + int((window[1] - window[0]) * frequency_hz * PHASES)
+    steps = 2 + int(cycles * PHASES)
     at_s = np.linspace(*window, steps)
     ends = omega * window[0] + crest, omega * window[1] + crest
     at_ns = start_ns + np.round(at_s * _NS).astype(np.int64)
