@@ -25,7 +25,9 @@ from numpy.typing import NDArray
 
 from undulog.capture.common.arrays import FloatArray, IntArray
 
-LEVEL = 0.05
+LEVEL = 0.01
+"""Family-wise level at which a joint is named: a wrong name costs somebody a repair."""
+_CONFIDENCE = 0.95
 LEAST_SESSIONS = 8
 """Sessions of a robot from which on change points are looked for."""
 _LEAST_BESIDE = 3  # sessions before and after a change
@@ -204,7 +206,7 @@ def _fit(
     simulated = signal[:, None] + _residuals(drawn, basis)
     left_simulated = _left(simulated, shapes)
     ratio = n * np.log(left_simulated[best] / left_simulated.min(axis=0))
-    accepted = n * np.log(left / left[best]) <= np.quantile(ratio, 1 - LEVEL)
+    accepted = n * np.log(left / left[best]) <= np.quantile(ratio, _CONFIDENCE)
     starts = shapes.starts[accepted]
     unit, raw = shapes.unit[best], shapes.raw[best]
     size = float(unit @ residual) / float(unit @ raw)

@@ -195,7 +195,7 @@ def _answer(histories: list[RobotHistory]) -> str:
         return "No robot has enough analysed sessions to compare them over time."
     if not changes:
         n_sessions = sum(history.sessions for history in histories)
-        return f"No joint changes over {n_sessions} sessions, at a family-wise level of 5 %."
+        return f"No joint changes over {n_sessions} sessions, at a family-wise level of 1 %."
     rank = list(QUANTITIES).index
     history, change = min(changes, key=lambda pair: (pair[1].p, rank(pair[1].quantity)))
     more = len(changes) - 1

@@ -153,12 +153,12 @@ def test_one_joint_does_not_move_the_others():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gaits", [1, 3])
-def test_without_wear_a_joint_is_named_in_five_percent(gaits):
+def test_without_wear_hardly_a_joint_is_named(gaits):
     named = 0
     for seed in range(50):
         sessions, rows, _, _ = frames(seed, gaits=gaits)
         named += bool(analyse_fleet(sessions, rows, components=False).robots[0].changes)
-    assert named <= 6  # binomial, 5 %: 6 or fewer in 97 %
+    assert named <= 2  # binomial, 1 %: 2 or fewer in 99 %
 
 
 @pytest.mark.slow
@@ -170,7 +170,7 @@ def test_wear_is_named_with_a_date_whose_interval_holds(kind):
         changes = analyse_fleet(sessions, rows, components=False).robots[0].changes
         mine = [change for change in changes if (change.joint, change.quantity) == (name, "gain")]
         good += any(one.earliest <= begun.isoformat() <= one.latest for one in mine)
-    assert good >= {"step": 45, "ramp": 38, "saturating": 42}[kind]
+    assert good >= {"step": 45, "ramp": 36, "saturating": 42}[kind]
 
 
 def test_the_page_of_a_folder_names_the_joint_and_links_outliers(tmp_path):
