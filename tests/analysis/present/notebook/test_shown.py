@@ -180,7 +180,16 @@ def test_two_figures_on_one_page_share_no_identifier(snake):
 def test_what_can_not_be_drawn_says_why(results, snake):
     with pytest.raises(UsageError, match="no matrix"):
         snake.coupling.plot()
-    alone = Experiment("one", (snake,), (), {}, None, snake.coupling, (), snake.provenance)
+    alone = Experiment(
+        answer="one",
+        sessions=(snake,),
+        runs=(),
+        heterogeneity={},
+        reversal=None,
+        coupling=snake.coupling,
+        warnings=(),
+        provenance=snake.provenance,
+    )
     with pytest.raises(UsageError, match="plot its sessions one by one"):
         alone.plot()
 
