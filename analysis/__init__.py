@@ -23,9 +23,11 @@ from undulog.capture.common.lazy import attach
 from .results.shown import Presentation, present_with
 
 if TYPE_CHECKING:
+    from .catalog.catalog import Catalog
     from .compare.compare import Choices, compare_sessions
     from .compare.decisions import Margins
     from .experiment.analyse import analyse_experiment
+    from .fleet.fleet import Fleet, analyse_fleet
     from .present.notebook.files import load
     from .present.notebook.pictures import Picture
     from .present.text import render
@@ -50,10 +52,12 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
     __name__,
     {
         "Analysis": "results.analysis",
+        "Catalog": "catalog.catalog",
         "Choices": "compare.compare",
         "Comparison": "results.comparison",
         "Estimate": "results.estimate",
         "Experiment": "results.experiment",
+        "Fleet": "fleet.fleet",
         "Index": "results.analysis",
         "JointResult": "results.analysis",
         "LinearCoupling": "results.coupling",
@@ -63,6 +67,7 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "Picture": "present.notebook.pictures",
         "Reversal": "results.experiment",
         "analyse_experiment": "experiment.analyse",
+        "analyse_fleet": "fleet.fleet",
         "analyse_session": "session.analyse",
         "compare_sessions": "compare.compare",
         "load": "present.notebook.files",

@@ -10,9 +10,9 @@ from support.paths import ROOT
 
 PUBLIC = {
     "analysis": (
-        "Analysis Choices Comparison Estimate Experiment Index JointResult LinearCoupling "
-        "LocalCoupling Margins Options Picture Reversal analyse_experiment analyse_session "
-        "compare_sessions load render"
+        "Analysis Catalog Choices Comparison Estimate Experiment Fleet Index JointResult "
+        "LinearCoupling LocalCoupling Margins Options Picture Reversal analyse_experiment "
+        "analyse_fleet analyse_session compare_sessions load render"
     ),
     "capture": (
         "Channel JointSignals Robot Session SessionView SessionWriter Signal load_robot robot_names"
