@@ -120,3 +120,14 @@ def test_a_full_device_behind_the_output_is_an_error(words):
         silent = subprocess.run(command, cwd=ROOT, stdout=full, stderr=full, check=False)
     assert (done.returncode, silent.returncode) == (1, 1)
     assert done.stderr == "error: the output can't be written: No space left on device\n"
+
+
+def test_reading_a_robot_loads_python_can_only_when_it_is_used() -> None:
+    code = (
+        "import sys; from undulog.capture.common.lazy import defer; defer();"
+        "from undulog.capture import load_robot; load_robot('snake25');"
+        "assert 'cantools' in sys.modules; assert 'can' not in sys.modules;"
+        "import cantools; assert issubclass(cantools.tester.Tester, object)"
+    )
+    done = python(code)
+    assert done.returncode == 0, done.stderr
