@@ -28,7 +28,6 @@ import pyarrow.parquet as pq
 from undulog.capture.common.errors import (
     DataError,
     InputFileError,
-    NotALogError,
     UndulogError,
     UsageError,
 )
@@ -487,7 +486,5 @@ def _analyse(where: str, name: str) -> str | dict[str, Any]:
                 path.write_bytes(store.read(name))
             with Session.open(path) as session:
                 return analyse_session(session).to_dict()
-    except NotALogError as error:
-        return str(error)
     except (UndulogError, OSError) as error:
         return str(error)

@@ -62,6 +62,8 @@ def report(
     if find and catalog is None:
         raise UsageError("--where is a condition on the sessions of --catalog")
     options = chosen(start, stop, command_topic, response_topic)
+    if catalog is not None and options != chosen(None, None, "/joint_commands", "/joint_states"):
+        raise UsageError("--catalog shows results as they are; leave out window and topics")
     why = "the report is an HTML page; end its name in .html"
     check_output(output, PAGES, why, force=force)
     if catalog is not None:

@@ -62,19 +62,18 @@ def fleet_view(fleet: Fleet, joints: pd.DataFrame, where: str, page: Path) -> di
     }
 
 
-def change_text(quantity: str, value: float) -> str:
-    """Return a change or deviation as people read it: degrees for lag, percent for the others."""
-    scaled = math.degrees(value) if quantity == "lag" else 100 * value
-    sign = "+" if value > 0 else ""
-    return f"{sign}{number(scaled, 2)}{'°' if quantity == 'lag' else ' %'}"
-
-
 def spread_text(quantity: str, value: float | None) -> str:
-    """Return a standard deviation as people read it."""
+    """Return a standard deviation as people read it: degrees for lag, percent for the others."""
     if value is None:
         return number(None, 0)
-    scaled = math.degrees(value) if quantity == "lag" else 100 * value
-    return f"{number(scaled, 2)}{'°' if quantity == 'lag' else ' %'}"
+    return (
+        f"{number(math.degrees(value), 2)}°" if quantity == "lag" else f"{number(100 * value, 2)} %"
+    )
+
+
+def change_text(quantity: str, value: float) -> str:
+    """Return a change or deviation as :func:`spread_text` does, with its sign."""
+    return ("+" if value > 0 else "") + spread_text(quantity, value)
 
 
 def _facts(history: RobotHistory) -> list[Fact]:
