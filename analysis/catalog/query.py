@@ -66,13 +66,19 @@ create temp view catalog as
 select sessions.*,
   case when analyses.session_id is null then 'not analysed' else 'analysed' end as status,
   analyses.* exclude (session_id, modified_ns, scanned_ns)
-from sessions left join analyses using (session_id)
+from sessions left join analyses on sessions.session_id = analyses.session_id and {own}
 """
 
 _JOINTS = """
 create temp view joints as
 select sessions.path, sessions.robot, sessions.start, all_joints.* exclude (modified_ns, scanned_ns)
-from all_joints left join sessions using (session_id)
+from all_joints left join sessions on sessions.session_id = all_joints.session_id and {own}
+"""
+
+# A damaged copy has the id of the whole session, but not its results.
+_OWN = """
+(damage is null
+  or sessions.session_id not in (select session_id from sessions where damage is null))
 """
 
 
@@ -115,8 +121,8 @@ def connect(
             _SPLIT_SESSIONS if split else _SESSIONS,
             _AFFECTED,
             _ANALYSES,
-            _CATALOG,
-            _JOINTS,
+            _CATALOG.format(own=_OWN),
+            _JOINTS.format(own=_OWN),
         ):
             database.execute(statement)
         yield database

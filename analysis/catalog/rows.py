@@ -70,7 +70,7 @@ SCHEMAS: Mapping[str, Any] = {
         times="start",
     ),
     "analyses": _schema(
-        texts="source session_id answer sentence detail gait_wave",
+        texts="source session_id answer sentence detail gait_wave changes",
         integers="modified_ns scanned_ns joints joints_compared",
         numbers=" ".join(
             [
@@ -214,6 +214,7 @@ def sweep_rows(row: Mapping[str, Any]) -> tuple[Row, list[Row]] | None:
         "sentence": row.get("sentence"),
         "joints": len(names),
         "warnings": row.get("warnings") or [],
+        "changes": row.get("changes"),
         **{name: row.get(name) for name in _SWEPT},
     }
     columns = [

@@ -6,6 +6,7 @@ ratio; lag enters in rad.
 
 from __future__ import annotations
 
+import json
 import math
 import warnings
 from collections.abc import Mapping
@@ -70,7 +71,7 @@ class Trend:
     """A monotonic trend of a result of sessions.
 
     Attributes:
-        against: ``date`` (per day), or a parameter.
+        against: ``date`` (per day), or a parameter of a sweep.
         slope: Median of the slopes of all pairs (Theil and Sen), with its 95 % interval.
         tau: Kendall's rank correlation.
         p: Of no correlation, corrected by Holm's method over all trends of the robot.
@@ -324,35 +325,47 @@ def _date(start: Any) -> str:
 
 
 def _trends(sessions: _Frame) -> list[Trend]:
-    days = sessions["start"].astype("int64").to_numpy() / 86_400e9
+    """Kendall's tau of each result against the date and each number that a sweep varied."""
     found: list[Trend] = []
-    for name in _TRENDS:
-        values = sessions[name].astype(float).to_numpy()
-        known = np.isfinite(values)
-        if np.count_nonzero(known) < LEAST_SESSIONS:
-            continue
-        if np.ptp(values[known]) <= _SAME * np.abs(values[known]).max():
-            continue
-        tau: Any = stats.kendalltau(days[known], values[known])
-        slope: Any = stats.theilslopes(values[known], days[known], alpha=0.95)
-        ends = (float(slope.low_slope), float(slope.high_slope))
-        count = int(np.count_nonzero(known))
-        found.append(
-            Trend(
-                name,
-                "date",
-                float(slope.slope),
-                ends,
-                float(tau.statistic),
-                float(tau.pvalue),
-                count,
+    for against, x in _covariates(sessions).items():
+        for name in _TRENDS:
+            y = sessions[name].to_numpy(float)
+            known = np.isfinite(x) & np.isfinite(y)
+            count = int(np.count_nonzero(known))
+            if count < LEAST_SESSIONS or any(_is_constant(v[known]) for v in (x, y)):
+                continue
+            tau: Any = stats.kendalltau(x[known], y[known])
+            slope: Any = stats.theilslopes(y[known], x[known], alpha=0.95)
+            found.append(
+                Trend(
+                    name,
+                    against,
+                    float(slope.slope),
+                    (float(slope.low_slope), float(slope.high_slope)),
+                    float(tau.statistic),
+                    float(tau.pvalue),
+                    count,
+                )
             )
-        )
     corrected, trends = 0.0, list[Trend]()
     for rank, trend in enumerate(sorted(found, key=lambda trend: trend.p)):  # Holm (1979)
         corrected = max(corrected, min(1.0, (len(found) - rank) * trend.p))
         trends.append(replace(trend, p=corrected))
     return trends
+
+
+def _covariates(sessions: _Frame) -> dict[str, FloatArray]:
+    """Days since 1970, and the changes of the sweeps that the sessions come from."""
+    changes = pd.DataFrame(
+        [json.loads(text) if isinstance(text, str) else {} for text in sessions["changes"]]
+    )
+    days = sessions["start"].astype("int64").to_numpy() / 86_400e9
+    numbers = changes.select_dtypes("number")
+    return {"date": days} | {str(name): numbers[name].to_numpy(float) for name in numbers}
+
+
+def _is_constant(values: FloatArray) -> bool:
+    return bool(np.ptp(values) <= _SAME * np.abs(values).max())
 
 
 def _components(name: str, table: _Frame, conditions: IntArray) -> Components:

@@ -175,6 +175,20 @@ def test_a_session_that_can_t_be_analysed_has_its_reason(tmp_path):
     assert "/joint_commands" in catalog.analyse()["text.mcap"]
 
 
+def test_a_damaged_copy_has_none_of_the_results_of_the_whole_session(lab):
+    whole = (lab / "day1" / "gait.mcap").read_bytes()
+    (lab / "copy.mcap").write_bytes(whole[: len(whole) // 2])
+    catalog = Catalog(str(lab))
+    catalog.scan()
+    rows = catalog.find("path in ('copy.mcap', 'day1/gait.mcap')")
+    assert rows.session_id.nunique() == 1
+    assert rows.status.to_list() == ["not analysed", "analysed"]
+    assert set(catalog.find(joints=True).path) == {"day1/gait.mcap"}
+    (lab / "day1" / "gait.mcap").unlink()  # alone, it is the session that the result names
+    catalog.scan()
+    assert catalog.find("path = 'copy.mcap'").status.to_list() == ["analysed"]
+
+
 def test_parts_of_a_session_are_one_row(tmp_path):
     sink = recorder.open_sink(tmp_path / "run.mcap")
     for number in range(900):

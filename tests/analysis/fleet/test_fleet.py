@@ -1,6 +1,7 @@
 """Fleets whose truth is known: a joint that wears from a day on, or none."""
 
 import json
+from itertools import combinations
 
 import numpy as np
 import pandas as pd
@@ -60,6 +61,7 @@ def frames(seed, kind="none", *, size=0.05, n=60, joints=13, gaits=1):
             "cost_of_transport": np.nan,
             "distance_m": np.nan,
             "frequency_hz": 0.5,
+            "changes": None,
         }
     )
     rows = pd.DataFrame(
@@ -106,6 +108,25 @@ def test_variance_components_and_trends_are_those_planted():
     low, high = trends["lag_sd"].slope_ci95
     assert trends["lag_sd"].slope == pytest.approx(0.001)
     assert low - 1e-9 <= 0.001 <= high + 1e-9
+
+
+def test_results_of_a_sweep_are_held_against_its_parameters():
+    sessions, rows, _, _ = frames(3)
+    torque = np.random.default_rng(0).permutation(np.geomspace(0.2, 1.0, len(sessions)))
+    swept = sessions.assign(
+        lag_sd=0.02 / torque,
+        changes=[json.dumps({"servo.stall_torque": t, "robot": "snake13"}) for t in torque],
+    )
+    trends = {(t.quantity, t.against): t for t in analyse_fleet(swept, rows).robots[0].trends}
+    trend = trends["lag_sd", "servo.stall_torque"]
+    assert (trend.tau, trend.sessions) == (-1.0, len(sessions))
+    assert trend.p < 1e-6
+    pairs = [
+        (y - x) / (b - a)
+        for (a, x), (b, y) in combinations(zip(torque, 0.02 / torque, strict=True), 2)
+    ]
+    assert trend.slope == pytest.approx(np.median(pairs))
+    assert trends["lag_sd", "date"].p > 0.05
 
 
 def test_an_odd_session_is_an_outlier_and_no_change():
