@@ -24,6 +24,7 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TextIO, cast
 
+import numpy as np
 from can import BLFReader, Message
 from can.io.blf import (
     LOG_CONTAINER,
@@ -191,19 +192,22 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
 
 def _datable(log: FrameLog) -> FrameLog:
     """Leave out, and count, the frames whose time no stamp can hold."""
-    log.blocks = _before_the_latest(log.blocks, log.problems)
+    log.blocks = _stampable(log.blocks, log.problems)
     return log
 
 
-def _before_the_latest(blocks: Iterator[LogBlock], problems: list[str]) -> Iterator[LogBlock]:
-    late = 0
+def _stampable(blocks: Iterator[LogBlock], problems: list[str]) -> Iterator[LogBlock]:
+    early = late = 0
     for block in blocks:
-        kept = block[block.times_ns() < LATEST_NS]
-        late += len(block) - len(kept)
+        t_ns = block.times_ns()
+        kept = block[(t_ns >= 0) & (t_ns < LATEST_NS)]
+        early += np.count_nonzero(t_ns < 0)
+        late += np.count_nonzero(t_ns >= LATEST_NS)
         if len(kept):
             yield kept
-    if late:
-        problems.append(f"{late} frames are stamped after 2038, which no stamp can hold: left out")
+    for count, when in ((early, "before 1970"), (late, "after 2038")):
+        if count:
+            problems.append(f"{count} frames are stamped {when}, which no stamp can hold: left out")
 
 
 def log_suffix(path: Path) -> str:

@@ -9,6 +9,7 @@ import re
 import signal
 import socket
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -115,12 +116,21 @@ def _descriptors(pid: int) -> int:
     return len(os.listdir(f"/proc/{pid}/fd"))  # noqa: PTH208
 
 
+def _targets(pid: int) -> str:
+    found = Counter[str]()
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(OSError):  # closed meanwhile
+            found[str(link.readlink()).split("[")[0]] += 1
+    return ", ".join(f"{count} x {target}" for target, count in found.items())
+
+
 def _check_descriptors(result: Result, pid: int, before: int, of: str = "") -> None:
     """Check that after the clients no more descriptors are open than before."""
     with suppress(TimeoutError):
         _wait(lambda: _descriptors(pid) <= before + MORE)
     if (left := _descriptors(pid)) > before + MORE:
-        result.failures.append(f"descriptors: {before} before, {left} after{of}")
+        text = f"descriptors: {before} before, {left} after{of}: {_targets(pid)}"
+        result.failures.append(text)
 
 
 def _watched(
