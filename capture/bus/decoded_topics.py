@@ -153,15 +153,17 @@ class _OffsetTopic:
 
         Rounds of several topics that come in the same frames share a stamp and its offsets. A
         stamp that stands for other offsets is left to them: this round gets one that is earlier
-        by nanoseconds, and its offsets grow by as much, so that no sample moves.
+        by nanoseconds (later at the begin of 1970, as none is negative), and its offsets grow by as
+        much, so that no sample moves.
         """
         if len(self._joints) == 1:
             return stamp_ns, []
+        step_ns = -1 if stamp_ns > _STAMPS_KEPT else 1
         while (known := self._written.get(stamp_ns)) is not None:
             if known == offset_s.tobytes():
                 return stamp_ns, []
-            stamp_ns -= 1
-            offset_s = offset_s + 1e-9
+            stamp_ns += step_ns
+            offset_s = offset_s - step_ns * 1e-9
         self._written[stamp_ns] = offset_s.tobytes()
         if len(self._written) > _STAMPS_KEPT:
             self._written.popitem(last=False)
