@@ -12,8 +12,8 @@ from ..common.errors import ImportFormatError, UsageError
 from ..common.files import check_output, is_file
 
 if TYPE_CHECKING:
+    from ..exchange.can_import import ImportReport
     from ..exchange.csv_import import ColumnMap
-    from ..exchange.import_output import ImportReport
     from ..robot.model import Robot
 
 

@@ -11,8 +11,8 @@ from ..common.console import echo, emit_json, progress
 from ..log.messages.frames import FD_TOPIC_PREFIX
 
 if TYPE_CHECKING:
+    from ..log.health.bus_tally import SourceHealth
     from ..log.health.session_check import SessionHealth
-    from ..log.health.sources import SourceHealth
     from ..log.health.tallies import BusHealth, SeriesHealth
 
 
@@ -72,7 +72,7 @@ def as_json(health: SessionHealth) -> dict[str, Any]:
         "series": series,
         "joints": [asdict(joint) for joint in health.joints],
         "buses": [asdict(bus) for bus in health.buses],
-        "sources": [asdict(source) for source in health.sources],
+        "sources": [asdict(source) for source in health.bus_tally],
     }
 
 
@@ -85,7 +85,7 @@ def _print(health: SessionHealth) -> None:
     echo(*(f"  note: {sentence}" for sentence in health.notes))
     _print_stored(health)
     _print_series(health)
-    for line in (*map(_bus_line, health.buses), *map(_source_line, health.sources)):
+    for line in (*map(_bus_line, health.buses), *map(_source_line, health.bus_tally)):
         echo("", line)
     _print_sequences(health)
     file = health.file

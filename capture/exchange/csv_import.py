@@ -47,9 +47,9 @@ from ..common.strict_table import NONZERO, Faults, Table, listed, read_toml
 from ..log.write.writer import SessionWriter
 from ..robot.bus_map import JOINT_QUANTITIES, SESSION_UNIT, TIME_UNITS, unit_for, valid_units
 from ..robot.model import Quantity, Robot
+from .can_import import ImportReport, imported_session
 from .can_logs import CSV_HEADER
 from .frame_log import LATEST_NS, RELATIVE_EPOCH_NS
-from .import_output import ImportReport, imported_session
 
 _DELIMITERS = (",", ";", "\t", " ")
 _OPTION_FORM = (

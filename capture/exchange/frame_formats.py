@@ -1,7 +1,7 @@
 """Formats of CAN traces that can be written, by suffix.
 
 A format declares what it keeps of frames (:meth:`FrameFormat.kept`) and writes that, so that what
-is lost can be counted before it is lost. Formats: candump (:mod:`.capture.exchange.candump`),
+is lost can be counted before it is lost. Formats: candump (:mod:`.capture.exchange.frame_log`),
 Vector's ASC and BLF by python-can, and messages of ROS 2 (:mod:`.capture.exchange.frame_formats`).
 
 CAN frames as ROS 2 messages, one a frame, for the tools of ROS.
@@ -40,9 +40,8 @@ from ..log.messages.frames import (
     REMOTE_FLAG,
     FrameArray,
 )
-from .candump import candump_lines
 from .frame_blocks import FrameFacts, is_error, is_remote
-from .frame_log import LogBlock
+from .frame_log import LogBlock, candump_lines
 
 if TYPE_CHECKING:
     from can.io.generic import MessageWriter

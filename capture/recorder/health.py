@@ -19,7 +19,7 @@ from ..common.errors import DataError
 from ..log.health.rules import FROZEN_SECONDS, MAX_AT_LIMIT
 from ..log.health.session_scan import ChannelMeasures, SessionMeasures, SessionScan
 from ..log.health.tallies import BusHealth, JointHealth
-from ..log.mcap.records import BODY_AT, FIXED_SIZE, HEAD
+from ..log.mcap.chunk import BODY_AT, FIXED_SIZE, HEAD
 from ..log.messages.definitions import parse_message_type
 from ..log.messages.frames import FRAME_TOPIC_PREFIX, FRAME_TOPIC_PREFIXES
 from ..log.sinks.mcap_sink import Description

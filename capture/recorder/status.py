@@ -1,7 +1,7 @@
 """A recording's state, its statuses on ``/diagnostics``, and its clock.
 
 ``undulog log check`` reads the counts of the sources from the statuses; the names of their keys are
-those of :class:`.capture.log.health.sources.SourceHealth`.
+those of :class:`.capture.log.health.bus_tally.SourceHealth`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ..log.health.bus_tally import ELAPSED, RECORDER, SOURCE_PREFIX
 from ..log.health.rules import GOOD_LOSS, VERDICTS, has_rhythm
-from ..log.health.sources import ELAPSED, RECORDER, SOURCE_PREFIX
 from ..log.messages.definitions import ERROR, OK, STALE, WARN, DiagnosticStatus
 from ..log.messages.frames import FRAME_TOPIC_PREFIXES
 from .source_clock import ClockEstimate

@@ -209,7 +209,6 @@ class Source(Protocol):
         Raises:
             SourceError: If it can never work: no such device type, a path of another user.
         """
-        ...
 
     def poll(self) -> Polled:
         """Return new frames and events, without waiting."""
@@ -217,7 +216,6 @@ class Source(Protocol):
 
     def stop(self) -> None:
         """End and release everything, also a dead device; safe to call twice."""
-        ...
 
 
 @runtime_checkable
@@ -226,4 +224,3 @@ class EndingSource(Protocol):
 
     def end(self) -> None:
         """Accept no more frames. Those accepted come with the next polls; then it is finished."""
-        ...

@@ -88,7 +88,6 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Release it, also a dead device; safe to call twice."""
-        ...
 
 
 OpenLink = Callable[[Tally], Link]

@@ -16,9 +16,6 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray
 
-TURN = 2.0 * math.pi
-"""One gait period, in phase [rad]."""
-
 
 class PhaseHistory:
     """A vector as a function of the past phase, linear between its samples."""
@@ -111,9 +108,9 @@ class PathHeading:
         if math.isfinite(heading):
             if self._rows:
                 last = self._rows[-1][1]
-                heading = last + math.remainder(heading - last, TURN)
+                heading = last + math.remainder(heading - last, math.tau)
             self._rows.append((phase, heading, offset))
-            old = bisect_left(self._rows, phase - TURN, key=lambda row: row[0])
+            old = bisect_left(self._rows, phase - math.tau, key=lambda row: row[0])
             del self._rows[:old]
         if not self._rows:
             return math.nan

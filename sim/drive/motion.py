@@ -24,7 +24,7 @@ from undulog.capture import Session
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import DataError, JointSetError, PlanError, UsageError
 from undulog.capture.common.files import Shelf
-from undulog.capture.log.read.signals import JointSignals
+from undulog.capture.log.read.sample_times import JointSignals
 from undulog.capture.robot.model import Plane, Robot
 
 from ..control.adaptive import build_gait

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 
 from undulog.capture.common.errors import LogWriteError, UsageError
@@ -20,7 +19,7 @@ from undulog.capture.sources.events import Tally
 from ..gait.contract import CONTROL_RATE_HZ
 from ..gate.confirmation import Confirmation
 from ..gate.gate import Gate
-from ..gate.limits import GateLimits, Spacing, gate_limits
+from ..gate.limits import Spacing, gate_limits
 from ..gate.outcome import DriveEnding, FaultKind, GateFault, Outcome, jitter
 from ..scenario.scenario import LONGEST_S, Scenario
 from ..twin.recording import quick_collections
@@ -28,7 +27,7 @@ from .links import Link, VirtualRobotLink
 from .loop import BusTick, ConsoleWatch, ControlLoop, LockstepPace, LoopTally, WallPace
 from .motion import MotionSource
 from .python_can_bus import open_link
-from .report import UNASKED, BusReport, Feedback, remarks_of
+from .report import UNASKED, BusPlan, BusReport, Feedback
 from .session import BusSession, GaitPublisher, stamped
 
 LISTEN_S = 0.5
@@ -36,26 +35,6 @@ LISTEN_S = 0.5
 report. A robot in lockstep has said its name, and waits for each command."""
 
 _NS = 1_000_000_000
-
-
-@dataclass(frozen=True)
-class BusPlan:
-    """Parameters of a drive over a bus.
-
-    Attributes:
-        limits: Limits of the robot.
-        duration_s: Time of the gait's last tick.
-        recorder: Control socket of the recorder that receives the gait, or None.
-    """
-
-    driven: MotionSource
-    robot: Robot
-    limits: GateLimits
-    address: SourceAddress
-    duration_s: float
-    output: Path
-    recorder: Path | None = None
-    force: bool = False
 
 
 def bus_plan(
@@ -214,7 +193,7 @@ def drive_bus(
         try:
             publish.begin()
             loop.run(stop, each_tick, console)
-            report = _report(gate, loop, spacing, tally.counts)
+            report = _report(plan, gate, loop, spacing, tally.counts)
             publish.end(report)
             session.close()
         except LogWriteError as error:
@@ -268,10 +247,13 @@ def _feedback(gate: Gate, loop: ControlLoop) -> Feedback | None:
     return Feedback(loop.by_replies, interval * period_s, gate.silence.limit, period_s)
 
 
-def _report(gate: Gate, loop: ControlLoop, spacing: Spacing | None, bus: SourceCounts) -> BusReport:
+def _report(
+    plan: BusPlan, gate: Gate, loop: ControlLoop, spacing: Spacing | None, bus: SourceCounts
+) -> BusReport:
     outcome = gate.outcome or Outcome(DriveEnding.STOPPED, "", "")
     began = gate.run_from
     return BusReport(
+        plan=plan,
         outcome=outcome,
         tally=loop.tally,
         lockstep=spacing is None,
@@ -347,7 +329,7 @@ class _Telling:
     def end(self, report: BusReport) -> None:
         for event in self._events.flush():
             self._session.log_event(event.level, event.text)
-        self._session.finish(report.outcome, remarks_of(report))
+        self._session.finish(report.outcome, report.remarks())
         if report.jitter is not None:
             facts = {name: str(value) for name, value in report.jitter.to_dict().items()}
             self._session.writer.note("undulog.gate.jitter", facts)

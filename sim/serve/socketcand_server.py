@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from undulog.capture.common.errors import UsageError
 from undulog.capture.log.messages.frames import FrameArray, empty_frames
 from undulog.capture.sources.contract import records
-from undulog.capture.sources.sender import FrameSender
+from undulog.capture.sources.unix_socket import FrameSender
 
 from .pacing import listen_on_loopback
 from .socketcand_protocol import BusClient, Sent, frame_text, sent_frame

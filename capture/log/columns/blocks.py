@@ -26,8 +26,17 @@ from mcap.opcode import Opcode
 from ...common.arrays import IntArray
 from ...common.errors import LogError
 from ..file.log_file import LogFile, keep_freed, new_pages
-from ..mcap.chunk import LAST_NS, PREFIX_SIZE, Block, Buffer
-from ..mcap.records import BODY_AT, FIXED_SIZE, Places, gather, read_message_heads
+from ..mcap.chunk import (
+    BODY_AT,
+    FIXED_SIZE,
+    LAST_NS,
+    PREFIX_SIZE,
+    Block,
+    Buffer,
+    Places,
+    gather,
+    read_message_heads,
+)
 
 _T = TypeVar("_T")
 

@@ -16,8 +16,7 @@ import numpy as np
 from ...common.arrays import IntArray
 from ...common.errors import DataError
 from ..file.log_file import FilePages, LogFile
-from ..mcap.chunk import PREFIX_SIZE, Buffer
-from ..mcap.records import BODY_AT, FIXED_SIZE, MESSAGE, Places
+from ..mcap.chunk import BODY_AT, FIXED_SIZE, MESSAGE, PREFIX_SIZE, Buffer, Places
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import JOINT_STATE, MessageType
 from .blocks import Records, Window, blocks_in, record_batches

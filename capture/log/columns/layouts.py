@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...common.arrays import IntArray
 from ...common.errors import DataError
 from ..file.log_file import FilePages
-from ..mcap.records import Places
+from ..mcap.chunk import Places
 from ..messages.cdr import Layout, Leaf
 from .buffers import ColumnStore, Times, TimeStore
 

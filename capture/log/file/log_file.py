@@ -23,10 +23,9 @@ from mcap.records import Attachment, Channel, Header, Metadata, Schema
 from numpy.typing import NDArray
 
 from ...common.errors import LogError, NotALogError
-from ..mcap.chunk import LAST_NS, Block
+from ..mcap.chunk import LAST_NS, Block, read_message_heads
 from ..mcap.file import McapFile
-from ..mcap.records import read_message_heads
-from ..wal.tail import MessageKey, WalContents, WalTail, beyond, read_wal
+from ..wal.reader import MessageKey, WalContents, WalTail, beyond, read_wal
 from .parts import PART_RECORD, PartFiles, first_part, open_parts
 
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None

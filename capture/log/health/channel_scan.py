@@ -25,8 +25,7 @@ from ..columns.layouts import (
     time_ns,
     values_of,
 )
-from ..mcap.chunk import LAST_NS, Buffer
-from ..mcap.records import BODY_AT, FIXED_SIZE, gather
+from ..mcap.chunk import BODY_AT, FIXED_SIZE, LAST_NS, Buffer, gather
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import MessageType
 from ..messages.frames import (

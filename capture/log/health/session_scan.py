@@ -18,7 +18,7 @@ from ...robot.model import Robot
 from ..mcap.chunk import Buffer
 from ..messages.definitions import JOINT_STATE, MessageType
 from ..messages.frames import identifier_text
-from .bus_tally import named_identifiers, undecoded
+from .bus_tally import SourceHealth, judge_source, measure_sources, named_identifiers, undecoded
 from .channel_scan import ChannelScan, Limits, Series
 from .freeze import FreezeTally
 from .rules import (
@@ -33,7 +33,6 @@ from .rules import (
     judge_topics,
     verdict_of,
 )
-from .sources import SourceHealth, judge_source, measure_sources
 from .tallies import NS, BusHealth, ChannelHealth, JointHealth, SeriesHealth
 
 _MOST_PAIRS = 4096
@@ -147,7 +146,7 @@ class SessionScan:
         Args:
             data: Bytes that hold their records.
             offsets: Offsets of the records, in the order of the session, shape (n,).
-            heads: The records' heads, of :data:`.capture.log.mcap.records.HEAD`, shape (n,).
+            heads: The records' heads, of :data:`.capture.log.mcap.chunk.HEAD`, shape (n,).
         """
         self._scans[key].add(data, offsets, heads)
 

@@ -38,8 +38,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from .chunk import MAGIC
-from .records import FIXED_SIZE, MESSAGE
+from .chunk import FIXED_SIZE, MAGIC, MESSAGE
 
 CHUNK_SIZE = 1 << 20
 """Bytes of messages after which a chunk is written."""
@@ -64,7 +63,6 @@ class Stream(Protocol):
 
     def flush(self) -> None:
         """Flush buffered bytes."""
-        ...
 
 
 @dataclass(slots=True)

@@ -19,8 +19,7 @@ from ..columns.columns import Messages
 from ..columns.layouts import Group, names_of
 from ..columns.topics import Topics
 from ..messages.definitions import JOINT_STATE, MessageType
-from .sample_times import Series, StampClock, cut, own_times
-from .signals import JointSignals
+from .sample_times import JointSignals, Series, StampClock, cut, own_times
 
 _EARLY_OR_LATE = 0.1
 """A joint that is missing for more than this part of the topic's span causes a warning."""

@@ -21,8 +21,7 @@ from ..columns.topics import Topics
 from ..file.log_file import LogFile
 from ..messages.frames import FrameArray, join_batches
 from .joint_states import JointReader
-from .sample_times import StampClock
-from .signals import JointSignals
+from .sample_times import JointSignals, StampClock
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -24,7 +24,7 @@ from ..columns.blocks import Window
 from ..columns.topics import Channel
 from ..messages.frames import FD_FRAME_DTYPE, FD_FRAME_LAYOUT, FRAME_DTYPE, FRAME_LAYOUT, FrameArray
 from .open_log import OpenLog
-from .signals import JointSignals
+from .sample_times import JointSignals
 
 if TYPE_CHECKING:
     import pandas as pd

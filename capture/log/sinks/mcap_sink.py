@@ -48,7 +48,6 @@ class MessageSink(Protocol):
         Raises:
             LogWriteError: If it can't be stored.
         """
-        ...
 
     def write(
         self,
@@ -68,7 +67,6 @@ class MessageSink(Protocol):
         Raises:
             LogWriteError: If it can't be stored.
         """
-        ...
 
     def close(self, last: tuple[Metadata, ...]) -> None:
         """Finalise; safe to call twice.
@@ -79,7 +77,6 @@ class MessageSink(Protocol):
         Raises:
             LogWriteError: If it can't be finalised.
         """
-        ...
 
 
 PROFILE = "ros2"
