@@ -73,8 +73,7 @@ class _Slot:
     def placed(self, value: float, size: int) -> int:
         if value == math.inf and self.entry.out_of_range is not None:
             return self.code(self.entry.out_of_range, size)
-        physical = self.entry.physical(value)
-        bits = self.entry.bits.raw_bits(physical, self.within)
+        bits = self.entry.bits.raw_bits(self.entry.physical(value), self.within)
         return self.entry.bits.placed(bits, size)
 
     def code(self, raw: int, size: int) -> int:

@@ -134,8 +134,7 @@ def export_log(
             what += f"in the format of {trace.title}"
             warnings = trace.warnings
     if json:
-        facts = {"source": str(session), "output": str(output), **counts, "warnings": warnings}
-        emit_json(facts)
+        emit_json({"source": str(session), "output": str(output), **counts, "warnings": warnings})
         return
     echo(f"{output}: {what}", *(f"  warning: {warning}" for warning in warnings))
 

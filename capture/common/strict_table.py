@@ -193,8 +193,7 @@ class Table:
             found: What stands there; by default the value itself, ``nothing`` when absent.
         """
         where, value = self.look(key)
-        text = found or ("nothing" if value is None else shown(value))
-        self.faults.add(where, text, valid)
+        self.faults.add(where, found or ("nothing" if value is None else shown(value)), valid)
 
     def look(self, key: str) -> tuple[str, object]:
         """Look a key up, first here, then in the defaults.

@@ -271,8 +271,7 @@ def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:
             yield message
             count += 1
     except _READ_ERRORS as error:
-        text = f"can't be read after {count} frames: {error}"
-        raise ImportFormatError(path, text) from error
+        raise ImportFormatError(path, f"can't be read after {count} frames: {error}") from error
 
 
 def _read_part(reader: MessageReader) -> float:

@@ -440,5 +440,4 @@ def _converted(column: Column, values: FloatArray) -> FloatArray:
     if column.wrap:
         known = ~np.isnan(plain)
         plain[known] = np.unwrap(plain[known], period=column.wrap)
-    unit = unit_for(column.unit, column.quantity)
-    return unit.convert(column.scale * plain + column.offset)
+    return unit_for(column.unit, column.quantity).convert(column.scale * plain + column.offset)

@@ -239,8 +239,7 @@ def _described(found: Excursions, span: Span, end: float, period_s: float) -> tu
     if rough > NOISY and residual.size >= 2 * FEW and spread > abs(mean):
         return "noisy", f"residual of {np.degrees(spread):.2g} degrees"
     if swing > 0.5 * found.amplitude and moved < HELD * swing:
-        level = float(np.median(position))
-        return "held", f"position constant at {np.degrees(level):.1f} degrees"
+        return "held", f"position constant at {np.degrees(float(np.median(position))):.1f} degrees"
     against = float(residual @ expected) < 0 and moved > 0.5 * swing and position.size > 2
     if against and np.corrcoef(position, expected)[0, 1] < -0.7:
         return "opposite", "moves against its command"

@@ -89,8 +89,7 @@ def fault_of(
         kinds, decided = _standing(motion, judged, main, usual)
         if main.name == "held" and _again(main, end - begin, end, judged.response.period_s):
             first = ["intermittent"] if set(kinds) - {"frozen_sensor", "stale_sensor"} else []
-            late = ["stale_sensor"] if "frozen_sensor" in kinds else []
-            kinds = [*first, *kinds, *late]
+            kinds = [*first, *kinds, *(["stale_sensor"] if "frozen_sensor" in kinds else [])]
     elif main.name == "opposite":
         kinds, decided = _opposite(motion)
     elif main.name in ("stepped", "drifting"):

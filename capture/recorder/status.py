@@ -325,8 +325,7 @@ def _session(snapshot: RecorderSnapshot) -> DiagnosticStatus:
     message = ": ".join((snapshot.verdict, *snapshot.reasons[:1]))
     values = {"verdict": snapshot.verdict, "reasons": len(snapshot.reasons)}
     values |= {f"reason.{k + 1}": text for k, text in enumerate(snapshot.reasons[:_REASONS])}
-    level = (OK, WARN, ERROR)[VERDICTS.index(snapshot.verdict)]
-    return _status(level, "session", message, values)
+    return _status((OK, WARN, ERROR)[VERDICTS.index(snapshot.verdict)], "session", message, values)
 
 
 def _source(source: SourceSnapshot) -> DiagnosticStatus:

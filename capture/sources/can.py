@@ -186,8 +186,7 @@ def failure(error: Exception) -> OSError:
     if isinstance(error, OSError):
         return error
     code = getattr(error, "error_code", None)
-    text = str(error) or type(error).__name__
-    return OSError(code if isinstance(code, int) else 0, text)
+    return OSError(code if isinstance(code, int) else 0, str(error) or type(error).__name__)
 
 
 def open_bus(text: str, bus: type[can.BusABC], options: Mapping[str, object]) -> can.BusABC:

@@ -125,8 +125,7 @@ class SocketcanLink:
 
     def _count(self, batch: Batch) -> None:
         whole = batch.sizes.count(CAN_MTU) + batch.sizes.count(CANFD_MTU)
-        odd = len(batch.sizes) - whole
-        self._tally.malformed("packet that is no CAN frame", odd)
+        self._tally.malformed("packet that is no CAN frame", len(batch.sizes) - whole)
         if batch.drops is not None and batch.drops != self._drops:
             lost = (batch.drops - self._drops) % 2**32
             self._drops = batch.drops

@@ -108,8 +108,7 @@ def _one_by_one(
 ) -> list[bytes]:
     """Records of all messages; ``stops`` are the ends of the pieces that they came in."""
     messages = list(_MESSAGE.finditer(text))
-    broken = text.count("<") + text.count(">") - 2 * len(messages)
-    tally.malformed("malformed message", broken)
+    tally.malformed("malformed message", text.count("<") + text.count(">") - 2 * len(messages))
     return [
         record
         for message in messages

@@ -191,8 +191,7 @@ class AdaptiveGait:
         """Change the generator by the readings, and step it."""
         if self._wave is None:  # the first tick tells phase and lag; from the next on it reacts
             tick = self._generator.step(time_s, readings)
-            lag = float(tick.values[self._lag_at])
-            self._wave = BodyWave(len(self._horizontal), lag)
+            self._wave = BodyWave(len(self._horizontal), float(tick.values[self._lag_at]))
             return self._reported_tick(tick, time_s)
         elapsed_s, phase = time_s - self._time_s, self._phase
         pose = self._reckoning.step(elapsed_s, phase, self._steering.offset, readings)

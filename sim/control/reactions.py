@@ -277,8 +277,7 @@ class AmplitudeReduction:
         """
         law = self._law
         self._past.add(now.phase, np.array([distances.nearest([name]) for name in self._sides]))
-        nearest = self._past.least()
-        wall = np.where(self._beside, nearest[:, None], np.inf).min(axis=0)
+        wall = np.where(self._beside, self._past.least()[:, None], np.inf).min(axis=0)
         factor = self._filter.step(now.elapsed_s, amplitude(wall, 1.0, law.smallest, law.k))
         self.values = factor[self._joints]
         self.shrinking = bool(self.values.min(initial=1.0) < 0.9)

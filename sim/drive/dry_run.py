@@ -164,8 +164,7 @@ def dry_run(
     missing = missing_limits(robot)
     limits = gate_limits(_unlimited(robot, missing))
     inner = NotedGait(driven.make(robot, planned), robot)
-    place = f"the twin of {robot.name}"
-    gate = Gate(inner, limits, duration_s=planned.duration_s, place=place)
+    gate = Gate(inner, limits, duration_s=planned.duration_s, place=f"the twin of {robot.name}")
     gait = GatedGait(inner, gate, robot, limits)
     longest_ramp_s = Ramp(limits.lower, limits.upper, limits.ramp_rate).duration_s
     longest_s = planned.duration_s + POSE_S + 2.0 * longest_ramp_s
@@ -240,8 +239,7 @@ def _unlimited(robot: Robot, missing: tuple[str, ...]) -> Robot:
 def _approach_s(first: FloatArray, limits: GateLimits) -> float:
     """How long the ramp takes from straight joints to the first pose."""
     rest = np.clip(np.zeros_like(first), limits.lower, limits.upper)
-    target = np.clip(first, limits.lower, limits.upper)
-    return Ramp(rest, target, limits.ramp_rate).duration_s
+    return Ramp(rest, np.clip(first, limits.lower, limits.upper), limits.ramp_rate).duration_s
 
 
 _NOTHING = "-"

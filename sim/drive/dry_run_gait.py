@@ -317,8 +317,7 @@ class GatedGait:
             self._command = step.command
         if step.gait is None or step.wanted is None:
             return GaitTick(self._command.copy(), self._values, str(step.phase), ())
-        changed = ~(np.abs(self._command - step.wanted) <= _CHANGED)
-        self.tally.command(step.wanted, changed)
+        self.tally.command(step.wanted, ~(np.abs(self._command - step.wanted) <= _CHANGED))
         self._values = step.gait.values
         return step.gait._replace(command=self._command.copy())
 

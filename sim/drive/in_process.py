@@ -112,11 +112,10 @@ def drive_twin(
         if gait.at_rest:
             ended.signal = stop.signal if stop is not None else None
 
-    driver = Driver(gait, driven.facts, driven.attachments, driven.records)
     return record(
         scenario,
         path,
-        driver=driver,
+        driver=Driver(gait, driven.facts, driven.attachments, driven.records),
         force=force,
         stop=ended,
         on_sample=after,

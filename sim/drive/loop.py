@@ -316,8 +316,7 @@ class ControlLoop:
         time_s, trouble, before = tick / CONTROL_RATE_HZ, None, self._known.angles.copy()
         for frames in received:
             self._known.add(frames, time_s)
-            found: GateFault | None = self._presence.add(frames)
-            trouble = trouble or found
+            trouble = trouble or self._presence.add(frames)
             self.tally.received += len(frames)
         self.tally.decoded = self._known.tally.decoded
         if self._pace.by_the_clock:

@@ -150,8 +150,7 @@ class CommandReplay:
         cut = np.flatnonzero(command != wanted)
         clamped = tuple(self._joint_names[i] for i in cut)
         values = self._gait.at(t_ns) if self._gait is not None else np.empty(0)
-        mode = self._modes[bisect_right(self._since_ns, t_ns)]
-        return GaitTick(command, values, mode, clamped)
+        return GaitTick(command, values, self._modes[bisect_right(self._since_ns, t_ns)], clamped)
 
 
 # Attachments of recorded commands that say what they were made from: they go on to the run.

@@ -204,12 +204,10 @@ class HopfOscillators:
         coupling, attraction = self._coupling, self._attraction
 
         def rate(time_s: float, z: ComplexArray) -> ComplexArray:
-            turning = 1j * extra(time_s, np.angle(z)) * z
-            return turning + hopf_rates(z, coupling, attraction)
+            return (1j * extra(time_s, np.angle(z)) * z) + hopf_rates(z, coupling, attraction)
 
         before = self._z
-        bound = fastest + coupling.fastest + 2.0 * attraction
-        self._z = integrate(rate, before, span_s, bound)
+        self._z = integrate(rate, before, span_s, fastest + coupling.fastest + 2.0 * attraction)
         self.theta = self.theta + np.angle(self._z * np.conj(before))
 
     def kick(self, turn: FloatArray) -> None:
@@ -426,7 +424,6 @@ class _OscillatorRhythm:
             return detuning + felt * np.cos(phase + omega * time_s + theta) - steady
 
         if self._chain.feedback > 0.0:
-            fastest = abs(omega) + float(np.abs(felt).max())
-            self._oscillators.advance(elapsed_s, sensed, fastest)
+            self._oscillators.advance(elapsed_s, sensed, abs(omega) + float(np.abs(felt).max()))
         else:
             self._oscillators.advance(elapsed_s, constant, 0.0)

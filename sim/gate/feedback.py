@@ -216,8 +216,7 @@ class CurrentLimiter:
             Joint angles [rad], shape (m,); untouched where nothing gives way.
         """
         beyond = np.abs(current) > self._limit  # False for NaN
-        grown = np.minimum(self._share + _MORE, 1.0)
-        self._share = np.where(beyond, self._share * _LESS, grown)
+        self._share = np.where(beyond, self._share * _LESS, np.minimum(self._share + _MORE, 1.0))
         pulls = self.yields & np.isfinite(angle)
         pulled = np.where(pulls, angle, 0.0)
         pulled += self._share * (wanted - pulled)

@@ -214,8 +214,7 @@ class Gate:
             if self.phase is Phase.ENDING or self._progress_s < self._way.duration_s:
                 return self._way.at(self._progress_s), None
             self._run(tick)
-        run_tick = min(tick - (self.run_from or 0), self._last)
-        self.run_s = run_tick / CONTROL_RATE_HZ
+        self.run_s = min(tick - (self.run_from or 0), self._last) / CONTROL_RATE_HZ
         self.run_ticks += 1
         said, self._first = self._first, None
         try:
@@ -354,8 +353,7 @@ class Gate:
         if left_out > 0:
             many = f"{left_out} control ticks were" if left_out > 1 else "a control tick was"
             of_gait = f", {left_out / CONTROL_RATE_HZ:g} s of the gait" * (self.phase is Phase.RUN)
-            text = f"gate: {late_s:.3f} s late, {many} left out{of_gait}"
-            self._remark("warn", text)
+            self._remark("warn", f"gate: {late_s:.3f} s late, {many} left out{of_gait}")
 
     def _become(self, phase: Phase, detail: str = "") -> None:
         self.phase = phase

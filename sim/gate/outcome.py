@@ -117,13 +117,12 @@ def jitter(late_s: list[float]) -> Jitter | None:
         return None
     late = np.array(late_s)
     place = np.searchsorted(np.array(_EDGES_MS) * 1e-3, late, side="left")
-    counts = np.bincount(place, minlength=len(_EDGES_MS) + 1)
     return Jitter(
         ticks=len(late),
         median_s=float(np.median(late)),
         p99_s=float(np.quantile(late, 0.99)),
         worst_s=float(late.max()),
-        counts=tuple(counts.tolist()),
+        counts=tuple(np.bincount(place, minlength=len(_EDGES_MS) + 1).tolist()),
     )
 
 

@@ -280,8 +280,7 @@ class FaultLine:
 
     def _losses(self, fault: BusFault, frames: FrameArray) -> BoolArray:
         struck = self._random.random(len(frames)) < fault.value
-        own = self._replies.identifiers(fault.joint)
-        struck &= np.isin(frames["id_flags"], own)
+        struck &= np.isin(frames["id_flags"], self._replies.identifiers(fault.joint))
         self.lost += int(struck.sum())
         return struck
 

@@ -190,8 +190,7 @@ class VirtualRobot:
         robot = self._robot = scenario.robot
         self._replies = ReplyEncoder(robot)
         self._latch = CommandLatch(robot)
-        ordered = (*scenario.faults, *faults)
-        self._line = FaultLine(ordered, robot, self._replies, scenario.seed)
+        self._line = FaultLine((*scenario.faults, *faults), robot, self._replies, scenario.seed)
         self._tick = 0
         self._silent = False
         self._logged_cuts: set[str] = set()

@@ -382,8 +382,7 @@ class VirtualBus:
         """
         if self._server is None:
             return []
-        taken = iter(self._server.take, None)
-        return list(itertools.islice(taken, most))
+        return list(itertools.islice(iter(self._server.take, None), most))
 
     def relay(self, sent: Sequence[Sent], t_ns: int) -> FrameArray:
         """Send frames of clients to everyone but their senders.

@@ -55,8 +55,7 @@ def urdf(robot: Robot) -> str:
         damping and no friction (the servos bring their own).
     """
     root = ET.Element("robot", name=robot.name)
-    material = ET.SubElement(root, "material", name="body")
-    ET.SubElement(material, "color", rgba="0.55 0.6 0.65 1")
+    ET.SubElement(ET.SubElement(root, "material", name="body"), "color", rgba="0.55 0.6 0.65 1")
     for i, link in enumerate(robot.links):
         _add_link(root, link, 0.0 if i == 0 else -link.length / 2)
     for i, joint in enumerate(robot.joints):
@@ -93,14 +92,12 @@ def _add_link(root: ET.Element, link: Link, centre: float) -> None:
     if link.mesh:
         visual = ET.SubElement(element, "visual")
         ET.SubElement(visual, "origin", xyz=f"{centre!r} 0 0", rpy="0 0 0")
-        scale = " ".join([repr(link.mesh_scale)] * 3)
-        shape = {"filename": link.mesh, "scale": scale}
+        shape = {"filename": link.mesh, "scale": " ".join([repr(link.mesh_scale)] * 3)}
         ET.SubElement(ET.SubElement(visual, "geometry"), "mesh", shape)
         return
     half, radius = link.length / 2, repr(link.radius)
-    tube = {"radius": radius, "length": repr(link.length)}
     for shape, at, size in (
-        ("cylinder", centre, tube),
+        ("cylinder", centre, {"radius": radius, "length": repr(link.length)}),
         ("sphere", centre + half, {"radius": radius}),
         ("sphere", centre - half, {"radius": radius}),
     ):
@@ -258,8 +255,7 @@ class SessionLog:
         )
         if sample.tick % _TF_EVERY == 0:
             centres, turns = body.position.T, body.quaternion.T
-            origins = frame_origins(self._scenario.robot, centres, turns)
-            self._transforms.write(t_ns, origins, turns)
+            self._transforms.write(t_ns, frame_origins(self._scenario.robot, centres, turns), turns)
         if sample.gait.mode != self._last_mode:
             self._last_mode = sample.gait.mode
             self._mode.write(t_ns, sample.gait.mode)

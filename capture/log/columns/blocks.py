@@ -323,8 +323,7 @@ def _records(
         at = starts.offsets
         records = _alike(data, starts) if len(at) else Records(at, at, None, Places(data, at))
         if records is None:
-            ends = np.repeat(starts.ends, starts.counts)
-            if read_message_heads(data, at, ends) is None:
+            if read_message_heads(data, at, np.repeat(starts.ends, starts.counts)) is None:
                 raise LogError(
                     log_file.path, "a message index points to something that is not a message"
                 )

@@ -212,8 +212,7 @@ class _GroupReader:
             else:
                 self._sort_in(length, places, log_ns, np.arange(first, self._count))
             return
-        heads = Places(places.data, places.at - BODY_AT)
-        lengths = heads.field("<i8", _LENGTH_AT) - FIXED_SIZE
+        lengths = Places(places.data, places.at - BODY_AT).field("<i8", _LENGTH_AT) - FIXED_SIZE
         for length in np.unique(lengths).tolist():
             rows = np.flatnonzero(lengths == length)
             self._sort_in(length, places.take(rows), log_ns[rows], first + rows)

@@ -210,8 +210,7 @@ class Stamping:
             stamp: Leaves of the stamps: seconds and nanoseconds.
         """
         seconds, rest = stamp
-        pair = (seconds.dtype, rest.dtype, rest.offset - seconds.offset)
-        if pair != ("<i4", "<u4", 4):
+        if (seconds.dtype, rest.dtype, rest.offset - seconds.offset) != ("<i4", "<u4", 4):
             parts = (places.field(leaf.dtype, leaf.offset) for leaf in stamp)
             return Times.of(log_ns, time_ns(*parts))
         raw = np.ascontiguousarray(places.field("V8", seconds.offset)).view("<i8")

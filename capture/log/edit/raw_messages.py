@@ -125,8 +125,7 @@ class RawLog:
         """
         # With log time, and file and place of its block.
         last: dict[int, tuple[tuple[int, int, int], RawMessage]] = {}
-        backward = sorted(self.file.blocks, key=lambda b: (b.end_ns, b.part, b.start))[::-1]
-        for block in backward:
+        for block in sorted(self.file.blocks, key=lambda b: (b.end_ns, b.part, b.start))[::-1]:
             if block.end_ns and block.start_ns >= before_ns:
                 continue
             open_ids = {k for k in channel_ids if k not in last or last[k][0][0] <= block.end_ns}

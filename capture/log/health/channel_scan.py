@@ -318,8 +318,7 @@ class ChannelScan:
 
 def _sorter(kind: MessageType, *, joints: bool) -> LayoutSorter:
     most = MOST_JOINT_LISTS if joints else MOST_LAYOUTS
-    text = not kind.has_floats
-    return LayoutSorter(partial(layout_of, kind), most=most, in_all=joints or text)
+    return LayoutSorter(partial(layout_of, kind), most=most, in_all=joints or (not kind.has_floats))
 
 
 def _records_in(

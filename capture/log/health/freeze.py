@@ -199,8 +199,7 @@ class _Runs:
         numbers: list[int] = seconds.tolist()
         for k, second in enumerate(numbers):
             if some[k] or not quiet:
-                row = flags[k]
-                run = np.where(row, (run if second == before + 1 else 0) + 1, 0)
+                run = np.where(flags[k], (run if second == before + 1 else 0) + 1, 0)
                 more = run > longest
                 longest = np.where(more, run, longest)
                 longest_at = np.where(more, second + 1 - run, longest_at)

@@ -338,8 +338,7 @@ def judge_following(fault: JointFault) -> Finding:
     """Return the finding on a joint that does not follow its command."""
     when = "" if fault.since_s is None else f" from {fault.since_s:.3g} s"
     when += "" if fault.until_s is None else f" to {fault.until_s:.3g} s"
-    kinds = " or ".join(fault.kinds)
-    return Finding(1, f"{fault.joint}{when} {fault.evidence}: {kinds}")
+    return Finding(1, f"{fault.joint}{when} {fault.evidence}: {' or '.join(fault.kinds)}")
 
 
 def judge_bus(health: BusHealth) -> list[Finding]:

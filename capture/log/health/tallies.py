@@ -150,8 +150,7 @@ class TimingTally:
         regular, gaps, missing, scattered, paused = False, 0, 0, 0, 0.0
         if intervals:
             mean = total / number
-            reached = np.cumsum(number)
-            places = np.searchsorted(reached, np.array(_QUANTILES) * intervals)
+            places = np.searchsorted(np.cumsum(number), np.array(_QUANTILES) * intervals)
             low, median, high, p99 = mean[places].tolist()
             regular = intervals >= MIN_INTERVALS and high - low <= REGULAR_SPREAD * median
             long = (mean > GAP_PERIODS * median) & regular
@@ -239,8 +238,7 @@ class SequenceTally:
         if self._ones < SEQUENCE_COUNTS * (self._count - 1):
             return Sequence("not a count", None, None)
         span = self._high - self._low + 1
-        dropped = max(span - (self._count - self._repeated), 0)
-        return Sequence("counted", dropped, self._reordered)
+        return Sequence("counted", max(span - (self._count - self._repeated), 0), self._reordered)
 
 
 @dataclass(frozen=True)

@@ -380,5 +380,4 @@ class Places:
             run = kind if count == 1 else f"V{count * kind.itemsize}"
             return gather(self.data, self.at, run, shift).view(kind).reshape(len(self.at), count)
         first = int(self.at[0]) + shift if len(self.at) else 0
-        steps = (self.step, kind.itemsize)
-        return np.ndarray((len(self.at), count), kind, self.data, first, steps)
+        return np.ndarray((len(self.at), count), kind, self.data, first, (self.step, kind.itemsize))

@@ -169,8 +169,7 @@ class _Walker:
         if count == 0:
             return  # an empty sequence is not padded to its element's alignment
         size = np.dtype(dtype).itemsize
-        offset = self._take(count * size, size)
-        self.leaves[path] = Leaf(path, dtype, offset, count, is_array)
+        self.leaves[path] = Leaf(path, dtype, self._take(count * size, size), count, is_array)
 
     def _string(self, path: str, field: Field) -> None:
         if field.base != "string":

@@ -171,8 +171,7 @@ class _Parser:
         if base in PRIMITIVES or base in {"string", "wstring"}:
             return Field(match["name"], base, None, length, array is not None)
         if "/" not in base:
-            standard = {"Header": "std_msgs/Header"}
-            base = standard.get(base, f"{owner.partition('/')[0]}/{base}")
+            base = {"Header": "std_msgs/Header"}.get(base, f"{owner.partition('/')[0]}/{base}")
         nested = self.message(_short(base), path)
         return Field(match["name"], None, nested, length, array is not None)
 

@@ -106,8 +106,7 @@ class JointSignals:
         """
         import pandas as pd
 
-        counts = [len(t) for t in self.t_ns]
-        joint = np.repeat(np.array(self.names, dtype=object), counts)
+        joint = np.repeat(np.array(self.names, dtype=object), [len(t) for t in self.t_ns])
         order = pd.CategoricalDtype(categories=list(self.names), ordered=True)
         frame = pd.DataFrame(index=pd.RangeIndex(len(joint)))
         frame["joint"] = pd.Series(joint, dtype=order)

@@ -272,8 +272,7 @@ class DurableSink:
             trouble = error
         number = self._part.number
         if number > 1:
-            end = Metadata(PART_RECORD, {"part": str(number), "parts": str(number)})
-            last = (*last, end)
+            last = (*last, Metadata(PART_RECORD, {"part": str(number), "parts": str(number)}))
         whole = self._messages == self._wal.position  # not so after an interrupt in between
         self._disk.finish(self._part, self._writer, last, self._wal.position if whole else 0)
         self._disk.close()

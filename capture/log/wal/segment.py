@@ -208,8 +208,7 @@ class Segment:
         self._page_end = _PAGE
         self._whole = 0, 0  # start of the page that is being written, last record wholly before it
         try:
-            flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-            self._file = os.open(path, flags, 0o666)
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         except OSError as error:
             raise LogWriteError(path, f"can't be created: {error.strerror}") from error
         try:

@@ -78,8 +78,7 @@ class Template:
         seconds, nanoseconds = divmod(t_ns, _NS)
         for at in stamps:
             _TIME.pack_into(self.message, at, seconds, nanoseconds)
-        log_time = t_ns if log_time_ns is None else log_time_ns
-        self.send(log_time, t_ns, bytes(self.message))
+        self.send(t_ns if log_time_ns is None else log_time_ns, t_ns, bytes(self.message))
 
 
 class _Stamped:
@@ -192,8 +191,7 @@ class TransformChannel:
             positions: [m], shape (k, 3).
             quaternions: x, y, z, w, shape (k, 4).
         """
-        poses = np.concatenate([positions, quaternions], axis=1)
-        rows = np.round(poses / _POSE_STEP) * _POSE_STEP
+        rows = np.round(np.concatenate([positions, quaternions], axis=1) / _POSE_STEP) * _POSE_STEP
         for at, row in zip(self._poses, rows, strict=True):
             self._template.message[at : at + 56] = row.astype("<f8").tobytes()
         self._template.emit(t_ns, log_time_ns, self._stamps)
