@@ -15,7 +15,7 @@ import numpy as np
 
 from ..bus.decoded_topics import DecodedTopics, Message
 from ..bus.decoding import BusDecoder, DecodedSignals, FrameTally
-from ..common.arrays import IntArray
+from ..common.arrays import NS, IntArray
 from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError
 from ..common.files import part_file
@@ -27,8 +27,6 @@ from ..log.write.writer import SessionWriter
 from ..robot.model import Robot
 from .can_logs import log_suffix, open_frame_log
 from .frame_log import FrameLog, LogBlock
-
-_NS = 1_000_000_000
 
 
 @dataclass
@@ -59,7 +57,7 @@ class ImportReport:
     @property
     def duration_s(self) -> float:
         """Time from the first to the last sample or frame [s]."""
-        return (self.end_ns - self.start_ns) / _NS
+        return (self.end_ns - self.start_ns) / NS
 
     @property
     def verdict(self) -> str:

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from mcap.writer import Writer
 
-from ..common.arrays import BoolArray
+from ..common.arrays import NS, BoolArray
 from ..log.messages.cdr import encode, layout_of
 from ..log.messages.definitions import parse_message_type, schema_text
 from ..log.messages.frames import (
@@ -55,8 +55,7 @@ _SCHEMA = (
     + "\nMSG: std_msgs/Header\n"
     + schema_text("std_msgs/msg/Header")
 )
-_NS = 1_000_000_000
-_STAMP_END_NS = 2**31 * _NS
+_STAMP_END_NS = 2**31 * NS
 
 
 class RosFrames:
@@ -125,8 +124,8 @@ class _Template:
         matrix = np.tile(self._example, (len(frames), 1))
         id_flags, t_ns = frames["id_flags"], frames["t_host_ns"]
         columns = {
-            "header.stamp.sec": t_ns // _NS,
-            "header.stamp.nanosec": t_ns % _NS,
+            "header.stamp.sec": t_ns // NS,
+            "header.stamp.nanosec": t_ns % NS,
             "id": id_flags & ID_MASK,
             "is_rtr": (id_flags & REMOTE_FLAG) != 0,
             "is_extended": (id_flags & EXTENDED_FLAG) != 0,
@@ -162,7 +161,7 @@ WriteFrames = Callable[[LogBlock], None]
 """Writes a part of a log; CAN FD frames only where the format holds them."""
 
 
-_BLF_EPOCH_NS = 631_152_000 * _NS  # 1990: python-can takes less for no date
+_BLF_EPOCH_NS = 631_152_000 * NS  # 1990: python-can takes less for no date
 _NUMBERED = re.compile(r"can(0|[1-9]\d{0,3})")
 
 
@@ -264,14 +263,14 @@ class Blf:
         from can import BLFWriter
 
         dated = facts.start_ns >= _BLF_EPOCH_NS
-        start_s = facts.start_ns // _NS if dated else 0
+        start_s = facts.start_ns // NS if dated else 0
         with BLFWriter(path) as writer:
             # Counted from the start, times are exact to 1 ns; as Unix times, which python-can
             # keeps as floating-point seconds, they would be to 240 ns.
             writer.start_timestamp = 0.0
             yield _writing(writer, facts, start_s)
             writer.start_timestamp = float(start_s) if dated else None
-            writer.stop_timestamp = facts.end_ns / _NS
+            writer.stop_timestamp = facts.end_ns / NS
 
 
 class Asc:
@@ -301,7 +300,7 @@ class Asc:
         """Create a file; its times count from the last whole second before the first frame."""
         from can import ASCWriter
 
-        start_s = facts.start_ns // _NS
+        start_s = facts.start_ns // NS
         # The format's dates are local times, and its readers take them as such.
         date = datetime.fromtimestamp(start_s).strftime("%a %b %d %H:%M:%S.000 %Y")  # noqa: DTZ006
         with path.open("w", encoding="ascii", newline="\n") as stream, ASCWriter(stream) as writer:
@@ -357,7 +356,7 @@ def _writing(writer: MessageWriter, facts: FrameFacts, start_s: int) -> WriteFra
     def write(block: LogBlock) -> None:
         frames, data = block.frames, block.frames["data"].tobytes()
         columns = (
-            (block.times_ns() - start_s * _NS).tolist(),
+            (block.times_ns() - start_s * NS).tolist(),
             *(frames[name].tolist() for name in ("id_flags", "len", "dir", "fd_flags")),
             channels[block.bus].tolist(),
             block.is_fd.tolist(),
@@ -365,7 +364,7 @@ def _writing(writer: MessageWriter, facts: FrameFacts, start_s: int) -> WriteFra
         rows = enumerate(zip(*columns, strict=True))
         for i, (t_ns, id_flags, length, way, fd_flags, channel, is_fd) in rows:
             message = Message(
-                timestamp=(t_ns + 0.5) / _NS,  # python-can cuts to whole ns
+                timestamp=(t_ns + 0.5) / NS,  # python-can cuts to whole ns
                 arbitration_id=id_flags & ID_MASK,
                 is_extended_id=bool(id_flags & EXTENDED_FLAG),
                 is_remote_frame=bool(id_flags & REMOTE_FLAG),

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..common.arrays import BoolArray, IntArray
+from ..common.arrays import NS, BoolArray, IntArray
 from ..common.errors import ImportFormatError
 from ..log.mcap.chunk import LAST_NS
 from ..log.messages.frames import (
@@ -201,7 +201,6 @@ _LINE = re.compile(
     r"#([0-9A-Fa-f])((?:[0-9A-Fa-f]{2}){0,64}))"
     r"(?:\s+([RTrt]))?\s*"
 )
-_NS = 1_000_000_000
 
 
 def read_candump(path: Path, lines: Iterator[str]) -> FrameLog:
@@ -261,7 +260,7 @@ def _row(match: re.Match[str], log: FrameLog) -> FrameRow:
         flags |= REMOTE_FLAG
     return FrameRow(
         # No block holds a later time; nor does a stamp, so such frames are left out anyway.
-        min(int(seconds) * _NS + int(fraction.ljust(9, "0")), LAST_NS),
+        min(int(seconds) * NS + int(fraction.ljust(9, "0")), LAST_NS),
         (identifier & ID_MASK) | flags,
         length,
         DIR_TX if way in {"T", "t"} else DIR_RX,
@@ -291,7 +290,7 @@ def candump_lines(
     )
     rows = enumerate(zip(*columns, strict=True))
     for i, (t_ns, id_flags, length, way, fd_flags, bus, is_fd) in rows:
-        seconds, rest = divmod(t_ns, _NS)
+        seconds, rest = divmod(t_ns, NS)
         payload = data[64 * i : 64 * i + min(length, 64 if is_fd else 8)].hex().upper()
         if is_fd:
             payload = f"#{fd_flags & 0xF:X}{payload}"

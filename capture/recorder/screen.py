@@ -21,6 +21,7 @@ from rich.live import Live
 from rich.text import Text
 
 from ..common.amounts import format_size
+from ..common.arrays import NS
 from ..common.console import Cells, Column, cut, fit, plain, table
 from ..log.health.rules import has_rhythm
 from ..log.messages.definitions import ERROR, OK
@@ -42,7 +43,6 @@ _MUTED = "bright_black"
 _EVENTS = 4
 _REASONS = 3
 _SHOWN_ALONE = 3
-_NS = 1_000_000_000
 _DASH = "-"
 
 
@@ -192,7 +192,7 @@ def _verdict(snapshot: RecorderSnapshot, width: int) -> list[Text]:
 
 
 def _event(event: EventLine, snapshot: RecorderSnapshot, width: int) -> Text:
-    ago_s = max(snapshot.now_ns - event.t_ns, 0) / _NS
+    ago_s = max(snapshot.now_ns - event.t_ns, 0) / NS
     at = clock_time(max(snapshot.elapsed_s - ago_s, 0.0))
     line = Text(f"{at} ", no_wrap=True)
     line.append(event.level, _LEVELS.get(event.level, ""))

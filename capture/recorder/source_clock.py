@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..common.arrays import BoolArray, IntArray
+from ..common.arrays import NS, BoolArray, IntArray
 from ..sources.contract import DEVICE_TIMES_END_NS
 
 BUCKETS = 120
@@ -199,7 +199,6 @@ drifts by more meanwhile than the line's uncertainty."""
 
 _WANDER = 2e-6  # of a rate over a silence
 
-_NS = 1_000_000_000
 _BINS_PER_OCTAVE = 8
 _BINS = 64 * _BINS_PER_OCTAVE
 _DELAYS = 4096
@@ -348,8 +347,8 @@ class SourceClock:
             offset_ns=offset,
             drift_ppm=drift,
             drift_uncertainty_ppm=unsure,
-            jitter_s=max(self._moments[1] / count - mean**2, 0.0) ** 0.5 / _NS,
-            delay_p99_s=2.0 ** (place / _BINS_PER_OCTAVE) / _NS if place else 0.0,
+            jitter_s=max(self._moments[1] / count - mean**2, 0.0) ** 0.5 / NS,
+            delay_p99_s=2.0 ** (place / _BINS_PER_OCTAVE) / NS if place else 0.0,
             samples=self._samples,
             resets=self._resets,
             out_of_range=self._out_of_range,
@@ -449,7 +448,7 @@ class SourceClock:
         self._resets += 1
         size_ns = abs((device - self._device) - (host - self._host))
         self._events.append(
-            f"the device's clock {what} by {size_ns / _NS:.3f} s and is measured anew"
+            f"the device's clock {what} by {size_ns / NS:.3f} s and is measured anew"
         )
         rate = self._envelope.line.rate if self._envelope.settled else 0.0
         sigma = SAME_DEVICE if self._envelope.settled else PRIOR

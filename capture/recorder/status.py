@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ..common.arrays import NS
 from ..log.health.bus_tally import ELAPSED, RECORDER, SOURCE_PREFIX
 from ..log.health.rules import GOOD_LOSS, VERDICTS, has_rhythm
 from ..log.messages.definitions import ERROR, OK, STALE, WARN, DiagnosticStatus
@@ -38,16 +39,13 @@ class SessionClock:
         return self._zero + time.monotonic_ns()
 
 
-_NS = 1_000_000_000
-
-
 class EachSecond:
     """Runs tasks once a second each by the clock, at most one a call."""
 
     def __init__(self, tasks: Sequence[Callable[[], object]], now_ns: int) -> None:
         """Spread the tasks over the first second after ``now_ns`` [ns, monotonic]."""
         self._tasks = tuple(tasks)
-        step_ns = _NS // (len(tasks) + 1)
+        step_ns = NS // (len(tasks) + 1)
         self._due_ns = [now_ns + (k + 1) * step_ns for k in range(len(tasks))]
 
     def run(self, now_ns: int) -> None:
@@ -55,8 +53,8 @@ class EachSecond:
         k = min(range(len(self._due_ns)), key=self._due_ns.__getitem__)
         if self._due_ns[k] > now_ns:
             return
-        late = now_ns - self._due_ns[k] >= _NS
-        self._due_ns[k] = now_ns + _NS if late else self._due_ns[k] + _NS
+        late = now_ns - self._due_ns[k] >= NS
+        self._due_ns[k] = now_ns + NS if late else self._due_ns[k] + NS
         self._tasks[k]()
 
 

@@ -21,7 +21,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import NS, FloatArray, IntArray
 from undulog.capture.common.errors import DataError, JointSetError, PlanError, UsageError
 from undulog.capture.common.files import Shelf
 from undulog.capture.log.read.sample_times import JointSignals
@@ -36,8 +36,6 @@ from .plan import PlanGait, is_plan, parse_plan
 COMMANDS = "/joint_commands"
 REPLAY = "replay"
 """The mode of commands whose session names none."""
-
-_NS = 1_000_000_000
 
 
 class _Held:
@@ -137,12 +135,12 @@ class CommandReplay:
     @property
     def duration_s(self) -> float:
         """From the first command to the last, up to a whole control period [s]."""
-        periods = (self._end_ns - self._start_ns) * CONTROL_RATE_HZ / _NS
+        periods = (self._end_ns - self._start_ns) * CONTROL_RATE_HZ / NS
         return max(math.ceil(periods - 1e-6), 1) / CONTROL_RATE_HZ
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:  # noqa: ARG002 - recorded
         """Return the commands in force at a time."""
-        t_ns = self._start_ns + round(time_s * _NS)
+        t_ns = self._start_ns + round(time_s * NS)
         wanted = self._rest.copy()
         given = self._commands.at(t_ns)
         wanted[self._joints] = np.where(np.isnan(given), self._rest[self._joints], given)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
+from undulog.capture.common.arrays import NS
 from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import FrameArray, identifier_text
@@ -33,8 +34,6 @@ from .session import BusSession, GaitPublisher, stamped
 LISTEN_S = 0.5
 """A bus is listened to for so long before anything is sent [s]: whose it is, and how often joints
 report. A robot in lockstep has said its name, and waits for each command."""
-
-_NS = 1_000_000_000
 
 
 def bus_plan(
@@ -140,7 +139,7 @@ def drive_bus(
         opened.callback(link.close)
         virtual = _virtual(link, plan)
         lockstep = virtual is not None and virtual.lockstep
-        epoch_ns = Scenario.epoch_s * _NS if lockstep else clock.epoch_ns
+        epoch_ns = Scenario.epoch_s * NS if lockstep else clock.epoch_ns
         session = BusSession(
             plan.output,
             plan.driven,
@@ -305,7 +304,7 @@ class _Telling:
         if self._simulated_ns is None:
             self._session.write(tick, self._clock.now_ns())
         else:
-            t_ns = self._simulated_ns + tick.tick * (_NS // CONTROL_RATE_HZ)
+            t_ns = self._simulated_ns + tick.tick * (NS // CONTROL_RATE_HZ)
             self._session.write(stamped(tick, t_ns), t_ns)
         for event in self._events.take():
             self._session.log_event(event.level, event.text)

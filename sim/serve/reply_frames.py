@@ -9,7 +9,7 @@ import numpy as np
 
 from undulog.capture.bus.encoding import BusEncoder, BusValue
 from undulog.capture.bus.map_entry import bus_messages, frame_id
-from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.arrays import NS, BoolArray, FloatArray, IntArray
 from undulog.capture.log.messages.frames import DIR_RX, ERROR_FLAG, FrameArray, empty_frames
 from undulog.capture.robot.model import Direction, Quantity, Robot, SensorKind
 from undulog.capture.sources.events import BUS_OFF, RESTARTED
@@ -25,8 +25,7 @@ _OF_JOINT = (
     Quantity.CURRENT,
     Quantity.VOLTAGE,
 )
-_NS = 1_000_000_000
-_PERIOD_NS = _NS // CONTROL_RATE_HZ
+_PERIOD_NS = NS // CONTROL_RATE_HZ
 
 
 class ReplyEncoder:
@@ -110,7 +109,7 @@ class ReplyEncoder:
             if isinstance(sample, JointSample):
                 parts.append(self._cycle(sample, clock_ns))
                 continue
-            values = together.setdefault(round(sample.time_s * _NS), {})
+            values = together.setdefault(round(sample.time_s * NS), {})
             if isinstance(sample, RangeSample):
                 values[sample.name, Quantity.RANGE, ""] = sample.distance
             else:
@@ -148,7 +147,7 @@ class ReplyEncoder:
         frames = self._encoder.encode(values)
         joint = [self._last_joint[each] for each in frames["id_flags"].tolist()]
         start_ns = clock_ns(sample.cycle * _PERIOD_NS)
-        offset_ns = np.rint(sample.offset_s[joint] * _NS).astype(np.int64)
+        offset_ns = np.rint(sample.offset_s[joint] * NS).astype(np.int64)
         frames["t_device_ns"] = start_ns + offset_ns
         return frames
 
@@ -270,7 +269,7 @@ class FaultLine:
                 frames = frames[~self._losses(fault, frames)]
         waiting = sum(fault.value for fault in self._of[FaultKind.DELAY] if fault.acts(time_s))
         if waiting or self._late:
-            self._late.append((now_ns + round(waiting * _NS), frames))
+            self._late.append((now_ns + round(waiting * NS), frames))
             due = [late for due_ns, late in self._late if due_ns <= now_ns]
             self._late = [late for late in self._late if late[0] > now_ns]
             frames = np.concatenate([empty_frames(0), *due])

@@ -16,7 +16,7 @@ from itertools import compress
 import numpy as np
 
 from undulog.capture.bus.decoding import BusDecoder
-from undulog.capture.common.arrays import BoolArray, FloatArray, frozen
+from undulog.capture.common.arrays import NS, BoolArray, FloatArray, frozen
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import FrameArray
 from undulog.capture.robot.model import Direction, Quantity, Robot
@@ -117,8 +117,7 @@ class CommandLatch:
         return (self._time_ns >= 0) & (now_ns - self._time_ns > longest_ns)
 
 
-_NS = 1_000_000_000
-PERIOD_NS = _NS // CONTROL_RATE_HZ
+PERIOD_NS = NS // CONTROL_RATE_HZ
 """Control period [ns]."""
 
 _BEFORE_NS = 1_000_000  # the last pose at rest, before the first tick
@@ -272,17 +271,17 @@ class VirtualRobot:
                 if (late_ns := self._pacer.now_ns() - due_ns) >= 0:
                     self._bus.send(self._at_rest())
                     due_ns += PERIOD_NS * (1 + late_ns // PERIOD_NS)
-                self._serve(max(0.0, (due_ns - self._pacer.now_ns()) / _NS))
+                self._serve(max(0.0, (due_ns - self._pacer.now_ns()) / NS))
             # Half a period on, so that a controller of the same rate speaks between the ticks.
             start_ns = self._pacer.now_ns() + PERIOD_NS // 2
             # Nothing is told at tick 0, so the pose is told just before: else it is a long silence.
             while (left_ns := start_ns - _BEFORE_NS - self._pacer.now_ns()) > 0:
-                self._serve(left_ns / _NS)
+                self._serve(left_ns / NS)
             self._bus.send(self._at_rest())
             self._pacer.start(start_ns)
         else:
             self._pacer.start(self._pacer.now_ns() + PERIOD_NS)
-        self._say("info", f"starts at {self._pacer.start_ns / _NS:.6f} s of its own clock")
+        self._say("info", f"starts at {self._pacer.start_ns / NS:.6f} s of its own clock")
 
     def _idle(self, timeout_s: float) -> None:
         """Serve the bus for a moment; frames of clients wait."""
@@ -310,7 +309,7 @@ class VirtualRobot:
                 pulled += fresh
                 continue
             self._idle(_PATIENCE_S)
-            if not told and time.monotonic_ns() - waited_ns > _PATIENCE_S * _NS:
+            if not told and time.monotonic_ns() - waited_ns > _PATIENCE_S * NS:
                 self._say("warn", f"waits for commands of {self._listed(missing)}")
                 told = True
         self._keep_pace(tick)
@@ -340,7 +339,7 @@ class VirtualRobot:
 
     def _watch(self) -> None:
         """Log when servos get no commands any more."""
-        now_ns, longest_ns = self._pacer.now_ns(), round(WATCHDOG_S * _NS)
+        now_ns, longest_ns = self._pacer.now_ns(), round(WATCHDOG_S * NS)
         silent = self._latch.silent(now_ns, longest_ns)
         if bool(silent.any()) is not self._silent:
             self._silent = bool(silent.any())

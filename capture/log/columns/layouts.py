@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import IntArray
+from ...common.arrays import NS, IntArray
 from ...common.errors import DataError
 from ..file.log_file import FilePages
 from ..mcap.chunk import Places
@@ -27,7 +27,6 @@ MOST_JOINT_LISTS = 256
 TIME = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
 """A ``builtin_interfaces/msg/Time`` in a message."""
 
-_NS = 1_000_000_000
 _STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.nanosec"))
 
 Matrix = NDArray[np.uint8]
@@ -182,7 +181,7 @@ def stamps_of(layout: Layout, matrix: Matrix) -> IntArray | None:
 def time_ns(sec: NDArray[Any], nanosec: NDArray[Any]) -> IntArray:
     """Return times [ns] of their two parts, each of shape (n,)."""
     ns = sec.astype(np.int64)
-    ns *= _NS
+    ns *= NS
     ns += nanosec.astype(np.int64, copy=False)
     return ns
 

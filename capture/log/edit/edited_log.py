@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 from mcap.records import Attachment, Channel
 from mcap.writer import Writer
 
+from ...common.arrays import NS
 from ...common.console import progress, refuse_existing
 from ...common.errors import DataError, UndulogError, UsageError
 from ...common.files import part_file
@@ -25,7 +26,6 @@ from .raw_messages import RawLog, RawMessage
 EDIT_RECORD = "undulog.edit"
 """Metadata record of the sources of an edited log."""
 HEALTH_RECORD = "undulog.health"
-NS = 1_000_000_000
 _MOST_CHANNELS = 2**16 - 1
 _STOP_CHECKED_EVERY = 1024
 

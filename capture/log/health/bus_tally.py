@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...common.arrays import IntArray
+from ...common.arrays import NS, IntArray
 from ...common.errors import DataError
 from ...common.strict_table import Faults
 from ...robot.bus_map import database_messages
@@ -22,7 +22,7 @@ from ..messages.cdr import layout_of
 from ..messages.definitions import NO_VALUES, DiagnosticStatus, MessageType
 from ..messages.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray, holds_fd
 from .rules import BAD_LOSS, GOOD_LOSS, Finding
-from .tallies import NS, BusHealth, TimingTally
+from .tallies import BusHealth, TimingTally
 
 LEAST_DECODED = 0.1
 """Least part of the data frames that the bus map names, unless every joint has samples: other

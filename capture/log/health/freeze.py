@@ -7,9 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from ...common.arrays import BoolArray, FloatArray, IntArray
-
-NS = 1_000_000_000
+from ...common.arrays import NS, BoolArray, FloatArray, IntArray
 
 FROZEN_COMMAND_RAD = 0.05
 """A joint is frozen in a second if its angle is exactly constant while its command moves by more

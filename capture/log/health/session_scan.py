@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import IntArray
+from ...common.arrays import NS, IntArray
 from ...robot.model import Robot
 from ..mcap.chunk import Buffer
 from ..messages.definitions import JOINT_STATE, MessageType
@@ -33,7 +33,7 @@ from .rules import (
     judge_topics,
     verdict_of,
 )
-from .tallies import NS, BusHealth, ChannelHealth, JointHealth, SeriesHealth
+from .tallies import BusHealth, ChannelHealth, JointHealth, SeriesHealth
 
 _MOST_PAIRS = 4096
 """Most pairs of measured and commanded joint sets that are checked for frozen joints."""

@@ -10,9 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...common.arrays import IntArray
-
-NS = 1_000_000_000
+from ...common.arrays import NS, IntArray
 
 GAP_PERIODS = 1.5
 """An interval longer than this many median intervals is a gap: the nearest whole number of

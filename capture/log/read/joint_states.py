@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...common.arrays import FloatArray, IntArray
+from ...common.arrays import NS, FloatArray, IntArray
 from ...common.errors import DataError, MissingChannelError
 from ..columns.blocks import Window
 from ..columns.columns import Messages
@@ -136,11 +136,10 @@ def _warn_changed_set(
         )
 
 
-_NS = 1_000_000_000
-SLACK_NS = 5 * _NS
+SLACK_NS = 5 * NS
 """Largest difference between sampling time and log time for which a window is complete."""
 
-NEAR_NS = _NS // 4
+NEAR_NS = NS // 4
 """The same for logs of undulog, if the samples read cover the window."""
 
 
@@ -372,7 +371,7 @@ class JointReader:
                 lost += 1
                 continue
             stamp = message.header.stamp
-            stamp_ns = int(stamp.sec) * _NS + int(stamp.nanosec)
+            stamp_ns = int(stamp.sec) * NS + int(stamp.nanosec)
             values = np.array([getattr(message, field)], dtype=np.float64)
             times = np.array([stamp_ns]), np.array([item.log_ns])
             rows.append(JointRows(tuple(message.name), *times, values))

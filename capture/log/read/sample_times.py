@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...common.arrays import FloatArray, IntArray
+from ...common.arrays import NS, FloatArray, IntArray
 from ...common.errors import DataError
 from ..columns.blocks import Window
 from ..columns.layouts import stamps_of
@@ -122,8 +122,6 @@ losses, which the estimators allow."""
 BREAK_INTERVALS = 10
 """Shortest break in median intervals, for slow channels."""
 
-_NS = 1_000_000_000
-
 
 @dataclass(frozen=True)
 class Unbroken:
@@ -148,7 +146,7 @@ class Unbroken:
         stretches = "1 other stretch" if self.others == 1 else f"{self.others} other stretches"
         return (
             f"the recording has a gap of {_length(self.gap_s)}: its longest unbroken stretch, "
-            f"{(self.last_ns - self.start_ns) / _NS:.1f} s, is analysed, {stretches} of "
+            f"{(self.last_ns - self.start_ns) / NS:.1f} s, is analysed, {stretches} of "
             f"{self.left_s:.1f} s altogether left out (choose with --start and --stop)"
         )
 
@@ -173,7 +171,7 @@ def longest_unbroken(
     ]
     joined: list[tuple[int, int]] = []
     for first, last in sorted(runs):
-        if joined and first - joined[-1][1] <= BREAK_S * _NS:
+        if joined and first - joined[-1][1] <= BREAK_S * NS:
             joined[-1] = joined[-1][0], max(joined[-1][1], last)
         else:
             joined.append((first, last))
@@ -182,7 +180,7 @@ def longest_unbroken(
     longest = max(joined, key=lambda run: run[1] - run[0])
     gaps = [after[0] - before[1] for before, after in pairwise(joined)]
     left = sum(last - first for first, last in joined) - (longest[1] - longest[0])
-    return Unbroken(*longest, len(joined) - 1, left / _NS, max(gaps, default=0) / _NS)
+    return Unbroken(*longest, len(joined) - 1, left / NS, max(gaps, default=0) / NS)
 
 
 def cut(t_ns: IntArray, window_ns: Window) -> tuple[slice, IntArray]:
@@ -204,7 +202,7 @@ def _runs(t_ns: IntArray) -> list[tuple[int, int]]:
     if not t_ns.size:
         return []
     step = np.diff(t_ns)
-    breaks = np.flatnonzero(step > BREAK_S * _NS)
+    breaks = np.flatnonzero(step > BREAK_S * NS)
     if breaks.size:
         least = BREAK_INTERVALS * float(np.median(step))
         breaks = breaks[step[breaks] > least]
@@ -220,7 +218,7 @@ def _length(seconds: float) -> str:
     return f"{seconds:.1f} s"
 
 
-_FAR_STAMP_NS = 3600 * _NS
+_FAR_STAMP_NS = 3600 * NS
 """Stamps further than this from the log time are on another clock."""
 
 _NEVER_NS = 2**62
@@ -269,7 +267,7 @@ class StampClock:
         shift_ns = clock_shift_ns(stamp_ns, log_ns)
         if shift_ns:
             self._warn(
-                f"header stamps lie {-shift_ns // _NS} s from the log times (another clock, such "
+                f"header stamps lie {-shift_ns // NS} s from the log times (another clock, such "
                 "as simulated time); they are shifted by that"
             )
         return shift_ns
@@ -278,7 +276,7 @@ class StampClock:
 def clock_shift_ns(stamp_ns: int, log_ns: int) -> int:
     """Return the shift to add to a stamp [ns], in whole seconds; 0 on the same clock."""
     apart_ns = log_ns - stamp_ns
-    return round(apart_ns / _NS) * _NS if abs(apart_ns) > _FAR_STAMP_NS else 0
+    return round(apart_ns / NS) * NS if abs(apart_ns) > _FAR_STAMP_NS else 0
 
 
 _FAR_NS = 2.0**60
@@ -358,7 +356,7 @@ def moved(t_ns: IntArray, stamp_ns: IntArray, offset_s: FloatArray) -> IntArray:
 def _steps(offset_s: FloatArray) -> IntArray:
     """Return offsets in ns; those that are not finite or far too large are zero."""
     with np.errstate(over="ignore", invalid="ignore"):
-        steps = offset_s * _NS
+        steps = offset_s * NS
         np.rint(steps, out=steps)
         usable = np.abs(steps) < _FAR_NS
     if not usable.all():

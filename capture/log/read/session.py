@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ...common.arrays import NS
 from ...common.errors import MissingChannelError
 from ...common.process import threads_or_default
 from ...robot.model import Robot
@@ -29,7 +30,6 @@ from .sample_times import JointSignals
 if TYPE_CHECKING:
     import pandas as pd
 
-_NS = 1_000_000_000
 _NO_NAMES: Mapping[str, str] = MappingProxyType({})
 
 
@@ -153,7 +153,7 @@ class SessionView:
     @property
     def duration_s(self) -> float:
         """Time from the first to the last message [s]."""
-        return (self.end_ns - self.start_ns) / _NS
+        return (self.end_ns - self.start_ns) / NS
 
     @property
     def chunk_times_ns(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:

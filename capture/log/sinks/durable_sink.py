@@ -39,6 +39,11 @@ class DurableSink:
     """Keeps accepted messages through kills, full disks and lost power.
 
     One thread defines, writes, splits and closes; the properties may be read from any.
+
+    Attributes:
+        path: The first part.
+        messages: Messages accepted, over all parts.
+        split_trouble: Why the last split failed; the open part is continued.
     """
 
     def __init__(
@@ -89,11 +94,12 @@ class DurableSink:
         self._due = time.monotonic() + self._half_interval_s
         self._mark = 0  # messages that the part had one half of the interval ago
         self._known: list[Description] = []
-        self._messages: int = 0
+        self.messages = 0
         self._last_words = last_words
         self._refused: LogWriteError | None = None
         self._part_began: int = 0
-        self._split_trouble: UndulogError | None = None
+        self.split_trouble: UndulogError | None = None
+        self._reported = ""
         self._open = True
         if not force:
             _refuse_existing(self.path)
@@ -120,11 +126,6 @@ class DurableSink:
     # -- facts -----------------------------------------------------------------------------
 
     @property
-    def messages(self) -> int:
-        """Messages accepted, over all parts."""
-        return self._messages
-
-    @property
     def part(self) -> int:
         """Number of the part that is being written, from 1."""
         return self._part.number
@@ -135,7 +136,7 @@ class DurableSink:
         return self._part.path
 
     @property
-    def bytes_written(self) -> int:
+    def size(self) -> int:
         """Bytes of MCAP so far, over all parts, without the open chunks."""
         return self._disk.bytes_given
 
@@ -143,11 +144,6 @@ class DurableSink:
     def backlog(self) -> int:
         """Bytes that wait for the disk."""
         return self._disk.backlog
-
-    @property
-    def split_trouble(self) -> UndulogError | None:
-        """Why the last split failed; the open part is continued."""
-        return self._split_trouble
 
     @property
     def unsynced(self) -> int:
@@ -201,14 +197,22 @@ class DurableSink:
         part = self._part
         size = part.size
         self._writer.add_message(channel_id, log_time_ns, payload, publish_time_ns, sequence)
-        self._messages += 1
+        self.messages += 1
         if part.size != size:
             self._chunk_done()
         if time.monotonic() >= self._due:
             self._flush()
 
-    def tick(self) -> None:
+    def files(self) -> tuple[Path, ...]:
+        """Return the parts, in order."""
+        later = (part_path(self.path, k) for k in range(2, self.part + 1))
+        return (self.path, *later)
+
+    def tick(self) -> list[tuple[str, str]]:
         """Flush if due; call it once a second for sessions with long pauses.
+
+        Returns:
+            Events, level and one sentence each: a new reason why the next part can't be begun.
 
         Raises:
             LogWriteError: If the session is closed.
@@ -216,6 +220,11 @@ class DurableSink:
         self._refuse_closed()
         if time.monotonic() >= self._due:
             self._flush()
+        trouble = str(self.split_trouble or "")
+        if trouble in ("", self._reported):
+            return []
+        self._reported = trouble
+        return [("error", f"the next part could not be begun, this one goes on: {trouble}")]
 
     def split(self) -> Path:
         """Begin the next part; the former is finalised in the background.
@@ -230,21 +239,21 @@ class DurableSink:
             LogWriteError: If it can't be created; likewise.
         """
         self._refuse_closed()
-        if self._messages == self._part_began:
+        if self.messages == self._part_began:
             return self._part.path
         former, writer = self._part, self._writer
         number = former.number + 1
         following = PartStream(part_path(self.path, number), number, force=self._force)
         begin = Metadata(PART_RECORD, {"part": str(number), "previous": former.path.name})
         try:
-            after = {"after": str(self._messages)}  # for recovery: where the part begins
+            after = {"after": str(self.messages)}  # for recovery: where the part begins
             self._wal.define(Metadata(PART_RECORD, {**begin.metadata, **after}))
         except LogWriteError:
             following.discard()
             raise
         end = Metadata(PART_RECORD, {"part": str(former.number), "next": following.path.name})
         self._disk.finish(former, writer, (end,), self._wal.position)
-        self._part, self._part_began = following, self._messages
+        self._part, self._part_began = following, self.messages
         self._writer = self._new_writer()
         for record in (*self._known, begin):
             write_description(self._writer, record)
@@ -273,7 +282,7 @@ class DurableSink:
         number = self._part.number
         if number > 1:
             last = (*last, Metadata(PART_RECORD, {"part": str(number), "parts": str(number)}))
-        whole = self._messages == self._wal.position  # not so after an interrupt in between
+        whole = self.messages == self._wal.position  # not so after an interrupt in between
         self._disk.finish(self._part, self._writer, last, self._wal.position if whole else 0)
         self._disk.close()
         self._ballast.free()
@@ -329,9 +338,9 @@ class DurableSink:
         """Split; on failure continue the open part."""
         try:
             self.split()
-            self._split_trouble = None
+            self.split_trouble = None
         except (LogWriteError, OutputExistsError) as error:
-            self._split_trouble = error
+            self.split_trouble = error
 
     def _refuse_closed(self) -> None:
         if not self._open:
