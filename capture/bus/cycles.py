@@ -73,8 +73,7 @@ class RoundGatherer:
 
     def finish(self) -> Rounds:
         """Return the last round, complete or not."""
-        starts = _round_starts(self._t_ns, self._joint, self._joints)
-        return self._take(starts, len(self._t_ns))
+        return self._take(_round_starts(self._t_ns, self._joint, self._joints), len(self._t_ns))
 
     def _take(self, starts: list[int], stop: int) -> Rounds:
         """Turn the samples before ``stop`` into rounds and keep the rest."""

@@ -77,8 +77,7 @@ def listed(words: Iterable[str], found: object = None) -> str:
     """List the valid words, ``a, b, c``, and ``(did you mean b?)`` if ``found`` is close to one."""
     valid = list(words)
     near = difflib.get_close_matches(found, valid, n=1) if isinstance(found, str) else []
-    hint = f" (did you mean {near[0]}?)" if near else ""
-    return (", ".join(valid) or "none") + hint
+    return (", ".join(valid) or "none") + (f" (did you mean {near[0]}?)" if near else "")
 
 
 _COMPARISONS: dict[str, Callable[[float, float], bool]] = {

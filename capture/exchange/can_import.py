@@ -112,7 +112,6 @@ def imported_session(
     """
     refuse_existing(output, force=force)
     digest = file_digest(source)
-    metadata = {"source": source.name, "source.sha256": digest, **facts}
     with (
         part_file(output) as part,
         SessionWriter(
@@ -121,7 +120,7 @@ def imported_session(
             epoch_ns=epoch_ns,
             robot=robot,
             clock={"log": str(robot.clock)},
-            metadata=metadata,
+            metadata={"source": source.name, "source.sha256": digest, **facts},
             force=True,
         ) as writer,
     ):

@@ -246,10 +246,8 @@ class Recording:
 
     def status(self) -> Mapping[str, Any]:
         """See :meth:`.RecorderActions.status`."""
-        snapshot = self._snapshot or self._look()
-        facts = dataclasses.asdict(snapshot)
-        path = facts.pop("path")
-        return {"output": path, "bytes": facts.pop("size"), **facts, "trouble": None}
+        facts = dataclasses.asdict(self._snapshot or self._look())
+        return {"output": facts.pop("path"), "bytes": facts.pop("size"), **facts, "trouble": None}
 
     def mark(self, text: str) -> Mapping[str, Any]:
         """See :meth:`.RecorderActions.mark`."""

@@ -161,8 +161,7 @@ def _headline(snapshot: RecorderSnapshot, width: int) -> list[Text]:
     facts.append(f"{snapshot.messages:,} messages")
     if snapshot.free is not None:
         facts.append(_room(snapshot))
-    second = Text(cut(" | ".join(facts), width))
-    return [first, second]
+    return [first, Text(cut(" | ".join(facts), width))]
 
 
 def _room(snapshot: RecorderSnapshot) -> str:

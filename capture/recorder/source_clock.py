@@ -411,8 +411,7 @@ class SourceClock:
     def _take(self, device: IntArray, host: IntArray) -> int:
         """Add the samples before a jump to the envelope; return their number."""
         stop = len(device)
-        front = np.maximum(np.maximum.accumulate(device), self._front)
-        back = device - front < -JUMP_NS
+        back = device - np.maximum(np.maximum.accumulate(device), self._front) < -JUMP_NS
         if back.any():
             stop = int(back.argmax())
             if stop == 0:

@@ -243,8 +243,7 @@ class LinkedSource:
             self._tally.counts.reconnects += 1
             away_s = (now_ns - (self._lost_ns or now_ns)) / 1e9
             text = f"{self._place} is back after {away_s:.1f} s"
-        detail = f" ({link.detail})" if link.detail else ""
-        self._tally.events.log_event("info", text + detail)
+        self._tally.events.log_event("info", text + (f" ({link.detail})" if link.detail else ""))
         self._was_up = True
 
     def _read(self, now_ns: int) -> tuple[FrameArray, ...]:

@@ -111,8 +111,7 @@ class SlcanText:
         if kind in "rR":
             flags |= REMOTE_FLAG
             digits = 0
-        extra = len(rest) - digits
-        if extra not in (0, 4):
+        if (len(rest) - digits) not in (0, 4):
             return None
         device_ns: int | None = t_ns
         if self._stamps is not None:

@@ -259,8 +259,7 @@ def _course(scenario: Scenario) -> HeadingPolicy:
     if isinstance(course, RandomTurns):
         return RandomHeadingPolicy(course, scenario.seed)
     if controller is not None and isinstance(course, TargetHeading) and target is not None:
-        north = scenario.sensing.compass.north
-        x, y = turned(np.array(target.position), -north).tolist()
+        x, y = turned(np.array(target.position), -scenario.sensing.compass.north).tolist()
         radius_m = controller.calibration.turn_radius_m
         return TargetHeadingPolicy(course, (x, y), target.radius, radius_m, scenario.robot)
     return StraightOn()

@@ -350,8 +350,7 @@ def _answer(run: DryRun) -> Iterator[str]:
             yield f"{what} would run, clamped: {_clamps(run)}; {near}"
         case Verdict.STOPS:
             when = f"at {run.duration_s:.2f} s" if run.started else "on the way to the first pose"
-            why = run.fault.text if run.fault is not None else ""
-            yield f"{what} would stop {when}: {why}"
+            yield f"{what} would stop {when}: {run.fault.text if run.fault is not None else ''}"
         case Verdict.UNFINISHED:
             yield (
                 f"{what}: not known, the dry run was stopped at {run.duration_s:g} s of "

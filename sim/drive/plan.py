@@ -244,8 +244,7 @@ def _start(top: Table, scenario: Scenario | None) -> tuple[dict[Plane, PlaneGait
 def _segments(top: Table, start: Mapping[Plane, PlaneGait]) -> tuple[Segment, ...]:
     segments: list[Segment] = []
     for table in top.tables("segments"):
-        planes = segments[-1].planes if segments else start
-        segments.append(_segment(table, planes))
+        segments.append(_segment(table, segments[-1].planes if segments else start))
         table.close()
     if not segments:
         top.fault("segments", "at least one table [[segments]]")

@@ -139,8 +139,7 @@ def integrate(
         k1 = rate(t, x)
         k2 = rate(t + h / 2, x + h / 2 * k1)
         k3 = rate(t + h / 2, x + h / 2 * k2)
-        k4 = rate(t + h, x + h * k3)
-        x = x + h / 6 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        x = x + h / 6 * (k1 + 2.0 * k2 + 2.0 * k3 + rate(t + h, x + h * k3))
     return x
 
 
@@ -399,8 +398,7 @@ class _OscillatorRhythm:
         """Take the servos' reports; joints without one are left out."""
         known = np.isfinite(angle)
         eps = self._chain.feedback
-        deviation = np.where(known, angle - offset, 0.0)
-        self._felt = eps * 2.0 * deviation / self._chain.amplitude
+        self._felt = eps * 2.0 * np.where(known, angle - offset, 0.0) / self._chain.amplitude
         self._steady = np.where(known, eps * self._bias, 0.0)
 
     def _kick(self, time_s: float) -> None:

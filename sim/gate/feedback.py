@@ -60,9 +60,8 @@ class BusCheck:
         told = {s.message for s in bus.signals if s.direction is Direction.RX}
         taken = {s.message for s in bus.signals if s.direction is Direction.TX}
         replies = {frame_id(messages[name]) for name in told}
-        requests = {frame_id(messages[name]) for name in taken}
         # Where a request and its reply share an identifier, hearing it tells nothing.
-        self._commands = _sorted(requests - replies)
+        self._commands = _sorted({frame_id(messages[name]) for name in taken} - replies)
         self.known = 0
         self.strange: Counter[int] = Counter()
 
@@ -304,15 +303,13 @@ class Watch:
         due = beyond & (time_s - since_s >= self._limits.fault_after_s - 1e-9)
         if not due.any():
             return None
-        far = np.where(due, np.abs(values - bound), -np.inf)
-        joint = int(np.argmax(far))
+        joint = int(np.argmax(np.where(due, np.abs(values - bound), -np.inf)))
         name, value, limit = self._limits.joint_names[joint], values[joint], bound[joint]
         than = "less than" if of.less else "more than"
-        lasted = time_s - since_s[joint]
         return GateFault(
             of.kind,
             f"{name}: {of.what} {value:.3g} {of.unit}, {than} {limit:g} {of.unit} "
-            f"for {lasted:.2g} s",
+            f"for {time_s - since_s[joint]:.2g} s",
             joint=name,
             value=float(value),
             limit=float(limit),

@@ -147,8 +147,7 @@ class ReplyEncoder:
         frames = self._encoder.encode(values)
         joint = [self._last_joint[each] for each in frames["id_flags"].tolist()]
         start_ns = clock_ns(sample.cycle * _PERIOD_NS)
-        offset_ns = np.rint(sample.offset_s[joint] * NS).astype(np.int64)
-        frames["t_device_ns"] = start_ns + offset_ns
+        frames["t_device_ns"] = start_ns + np.rint(sample.offset_s[joint] * NS).astype(np.int64)
         return frames
 
 

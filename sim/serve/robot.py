@@ -244,8 +244,8 @@ class VirtualRobot:
         while (wait_s := self._pacer.wait_s(tick)) > 0.0:
             (self._idle if self._lockstep else self._serve)(wait_s)
         if self._twin is not None and tick:
-            told = self._report(self._twin.sensed, tick)
-            self._bus.mark(tick, told if self._lockstep else None)
+            sent = self._report(self._twin.sensed, tick)
+            self._bus.mark(tick, sent if self._lockstep else None)
         if self._lockstep:
             self._listen_to_all(tick)
         else:
@@ -332,8 +332,7 @@ class VirtualRobot:
         """Send the sensor samples of a tick; returns the frames."""
         time_s = tick / CONTROL_RATE_HZ
         frames = self._replies.frames(self._line.samples(samples, time_s), self._pacer.clock_ns)
-        now_ns = self._pacer.clock_ns(tick * PERIOD_NS)
-        shown = self._line.replies(frames, now_ns, time_s)
+        shown = self._line.replies(frames, self._pacer.clock_ns(tick * PERIOD_NS), time_s)
         self._bus.send(shown)
         return shown
 

@@ -57,8 +57,7 @@ class ColumnStore:
         Args:
             rows: Shape (n, width), or (n,) of one number each.
         """
-        count = len(rows)
-        stop = self._count + count
+        stop = self._count + len(rows)
         if stop > self._capacity:
             self._capacity = max(2 * self._capacity, stop)
             old = self.values()

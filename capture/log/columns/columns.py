@@ -135,8 +135,7 @@ def read_messages(
 def _expected(log_file: LogFile, request: Request, blocks: int) -> int:
     """Return the expected number of messages in a number of blocks."""
     counted = sum(log_file.counts.get(channel_id, 0) for channel_id in request.channel_ids)
-    part = blocks / max(len(log_file.blocks), 1)
-    return int(counted * min(part, 1.0)) + 1
+    return int(counted * min(blocks / max(len(log_file.blocks), 1), 1.0)) + 1
 
 
 def message_blocks(

@@ -103,7 +103,6 @@ def cut_log(
             }
             log.note(EDIT_RECORD, facts)
             log.copy_health(source)
-    notes = [] if carry_state else _left_behind(source, state, start_ns)
     return EditReport(
         output=output,
         sources=[{"path": str(path), "session_id": source.session_id, "sha256": source.sha256}],
@@ -111,7 +110,7 @@ def cut_log(
         end_ns=log.last_ns,
         messages=dict(sorted(log.counts.items())),
         warnings=source.warnings,
-        notes=notes,
+        notes=[] if carry_state else _left_behind(source, state, start_ns),
     )
 
 

@@ -108,8 +108,7 @@ class RawLog:
             stop_ns: One past the last log time [Unix ns].
         """
         for block in self.file.blocks:
-            outside = block.start_ns >= stop_ns or block.end_ns < start_ns
-            if not (block.end_ns and outside):
+            if not (block.end_ns and (block.start_ns >= stop_ns or block.end_ns < start_ns)):
                 yield from self._block_messages(block, channel_ids, start_ns, stop_ns)
 
     def last_messages(self, channel_ids: Collection[int], before_ns: int) -> list[RawMessage]:

@@ -406,8 +406,7 @@ def judge_topics(
             sentence = f"{topic} is missing; there are raw CAN frames"
         else:
             sentence = f"{topic} is missing, and no other topic has joints"
-        nothing = not others and not framed
-        found.append(Finding(2 if nothing else 1, sentence))
+        found.append(Finding(2 if (not others and not framed) else 1, sentence))
     present = set(seen)
     missing = [name for name in joints if name not in present]
     if present and missing:

@@ -204,8 +204,7 @@ def _runs(t_ns: IntArray) -> list[tuple[int, int]]:
     step = np.diff(t_ns)
     breaks = np.flatnonzero(step > BREAK_S * NS)
     if breaks.size:
-        least = BREAK_INTERVALS * float(np.median(step))
-        breaks = breaks[step[breaks] > least]
+        breaks = breaks[step[breaks] > BREAK_INTERVALS * float(np.median(step))]
     firsts = t_ns[np.concatenate([[0], breaks + 1])]
     lasts = t_ns[np.concatenate([breaks, [t_ns.size - 1]])]
     return list(zip(firsts.tolist(), lasts.tolist(), strict=True))

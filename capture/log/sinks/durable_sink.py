@@ -205,8 +205,7 @@ class DurableSink:
 
     def files(self) -> tuple[Path, ...]:
         """Return the parts, in order."""
-        later = (part_path(self.path, k) for k in range(2, self.part + 1))
-        return (self.path, *later)
+        return (self.path, *(part_path(self.path, k) for k in range(2, self.part + 1)))
 
     def tick(self) -> list[tuple[str, str]]:
         """Flush if due; call it once a second for sessions with long pauses.

@@ -120,8 +120,7 @@ class _Watch:
         code = ctypes.c_int.from_address(info + 8).value
         address = ctypes.c_size_t.from_address(info + _ADDRESS_AT).value
         for mapping in self._mappings:
-            within = address - mapping.address
-            if code == _BUS_ADRERR and 0 <= within < mapping.size:
+            if code == _BUS_ADRERR and 0 <= address - mapping.address < mapping.size:
                 page = address & -mmap.PAGESIZE
                 left = mapping.address + mapping.size - page
                 access = mmap.PROT_READ | mmap.PROT_WRITE
