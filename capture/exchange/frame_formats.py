@@ -351,31 +351,23 @@ def _writing(writer: MessageWriter, facts: FrameFacts, start_s: int) -> WriteFra
     """Return what hands frames to a writer of python-can, timed from ``start_s`` [Unix s]."""
     from can import Message
 
-    channels = np.array(channel_numbers(facts.buses))
+    channels = channel_numbers(facts.buses)
 
     def write(block: LogBlock) -> None:
-        frames, data = block.frames, block.frames["data"].tobytes()
-        columns = (
-            (block.times_ns() - start_s * NS).tolist(),
-            *(frames[name].tolist() for name in ("id_flags", "len", "dir", "fd_flags")),
-            channels[block.bus].tolist(),
-            block.is_fd.tolist(),
-        )
-        rows = enumerate(zip(*columns, strict=True))
-        for i, (t_ns, id_flags, length, way, fd_flags, channel, is_fd) in rows:
+        for row in block.rows():
             message = Message(
-                timestamp=(t_ns + 0.5) / NS,  # python-can cuts to whole ns
-                arbitration_id=id_flags & ID_MASK,
-                is_extended_id=bool(id_flags & EXTENDED_FLAG),
-                is_remote_frame=bool(id_flags & REMOTE_FLAG),
-                is_error_frame=bool(id_flags & ERROR_FLAG),
-                channel=channel,
-                dlc=length,
-                data=data[64 * i : 64 * i + min(length, 64 if is_fd else 8)],
-                is_rx=way != DIR_TX,
-                is_fd=is_fd,
-                bitrate_switch=bool(fd_flags & FD_BRS),
-                error_state_indicator=bool(fd_flags & FD_ESI),
+                timestamp=(row.t_ns - start_s * NS + 0.5) / NS,  # python-can cuts to whole ns
+                arbitration_id=row.id_flags & ID_MASK,
+                is_extended_id=bool(row.id_flags & EXTENDED_FLAG),
+                is_remote_frame=bool(row.id_flags & REMOTE_FLAG),
+                is_error_frame=bool(row.id_flags & ERROR_FLAG),
+                channel=channels[row.bus],
+                dlc=row.length,
+                data=row.data,
+                is_rx=row.way != DIR_TX,
+                is_fd=row.is_fd,
+                bitrate_switch=bool(row.fd_flags & FD_BRS),
+                error_state_indicator=bool(row.fd_flags & FD_ESI),
             )
             writer(message)
 

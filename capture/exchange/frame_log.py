@@ -123,6 +123,18 @@ class LogBlock:
         frames["len"] = np.minimum(frames["len"], np.where(self.is_fd, 64, 8))
         return frames
 
+    def rows(self) -> Iterator[FrameRow]:
+        """Yield the frames one by one; the inverse of :func:`blocks_of`."""
+        data = self.frames["data"].tobytes()
+        t_ns, id_flags, length, way, fd_flags = (
+            self.frames[name].tolist()
+            for name in ("t_host_ns", "id_flags", "len", "dir", "fd_flags")
+        )
+        columns = (t_ns, id_flags, length, way, self.bus.tolist(), self.is_fd.tolist(), fd_flags)
+        for i, row in enumerate(zip(*columns, strict=True)):
+            most = min(row[2], 64 if row[5] else 8)
+            yield FrameRow(*row, data[64 * i : 64 * i + most])
+
 
 def joined(blocks: Sequence[LogBlock]) -> LogBlock:
     """Join blocks, at least one, into one block."""
@@ -282,16 +294,9 @@ def candump_lines(
         nanoseconds: Whether times have nine decimals; candump writes six.
     """
     digits, unit = (9, 1) if nanoseconds else (6, 1000)
-    frames, data = block.frames, block.frames["data"].tobytes()
-    columns = (
-        *(frames[name].tolist() for name in ("t_host_ns", "id_flags", "len", "dir", "fd_flags")),
-        block.bus.tolist(),
-        block.is_fd.tolist(),
-    )
-    rows = enumerate(zip(*columns, strict=True))
-    for i, (t_ns, id_flags, length, way, fd_flags, bus, is_fd) in rows:
+    for t_ns, id_flags, length, way, bus, is_fd, fd_flags, data in block.rows():
         seconds, rest = divmod(t_ns, NS)
-        payload = data[64 * i : 64 * i + min(length, 64 if is_fd else 8)].hex().upper()
+        payload = data.hex().upper()
         if is_fd:
             payload = f"#{fd_flags & 0xF:X}{payload}"
         elif id_flags & REMOTE_FLAG:

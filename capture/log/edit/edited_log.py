@@ -175,6 +175,11 @@ class EditedLog:
         """Write a metadata record."""
         self._writer.add_metadata(name, dict(facts))
 
+    def measures(self) -> dict[str, Any]:
+        """Return times [Unix ns] and counts of the messages, for the report."""
+        counts = dict(sorted(self.counts.items()))
+        return {"start_ns": self.first_ns, "end_ns": self.last_ns, "messages": counts}
+
     def finish(self) -> None:
         """Write indexes and summary."""
         self._writer.finish()

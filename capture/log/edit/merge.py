@@ -165,7 +165,6 @@ LONGEST_MERGE_GAP_S = 86400.0
 day's session, or a clock was wrong."""
 
 _LATER_S = 60.0
-_FOREVER_NS = 2**64
 
 
 def merge_logs(
@@ -230,13 +229,8 @@ def merge_logs(
                 log.note(name, entries)
     return EditReport(
         output=output,
-        sources=[
-            {"path": str(source.path), "session_id": source.session_id, "sha256": source.sha256}
-            for source in sources
-        ],
-        start_ns=log.first_ns,
-        end_ns=log.last_ns,
-        messages=dict(sorted(log.counts.items())),
+        sources=[source.facts for source in sources],
+        **log.measures(),
         warnings=warnings,
     )
 
@@ -400,6 +394,6 @@ def _in_order(source: RawLog, log: EditedLog) -> Iterator[tuple[int, int, RawMes
     """Yield latest log time so far, new channel id and message, in the order of the file."""
     ids = {c.id: log.channel(source, c) for c in source.file.channels.values()}
     latest_ns = 0
-    for message in source.messages(ids, 0, _FOREVER_NS):
+    for message in source.messages(ids):
         latest_ns = max(latest_ns, message.log_time_ns)
         yield latest_ns, ids[message.channel_id], message

@@ -26,6 +26,7 @@ _LENGTH = struct.Struct("<Q")
 _FIXED = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time
 _BODY_AT = PREFIX_SIZE + _FIXED.size
 _PIECE = 1 << 20
+FOREVER_NS = 1 << 64
 
 
 class RawMessage(NamedTuple):
@@ -60,7 +61,6 @@ class RawLog:
         self.path = path
         self.file = LogFile(path)
         self.warnings = list(self.file.warnings)
-        self._warned = set(self.warnings)
         self.paths = [file.path for file in self.file.files]
         self.sha256 = _hash(self.paths)
         filled = [block for block in self.file.blocks if block.end_ns]
@@ -78,6 +78,11 @@ class RawLog:
         self.file.close()
 
     @property
+    def facts(self) -> dict[str, str]:
+        """Path, id and digest, for the report of an edit."""
+        return {"path": str(self.path), "session_id": self.session_id, "sha256": self.sha256}
+
+    @property
     def metadata(self) -> list[Metadata]:
         """The metadata records, in the order of the file; names may repeat."""
         return [item for item in self.file.appendices if isinstance(item, Metadata)]
@@ -89,8 +94,7 @@ class RawLog:
 
     def warn(self, sentence: str) -> None:
         """Add a warning, once."""
-        if sentence not in self._warned:
-            self._warned.add(sentence)
+        if sentence not in self.warnings:
             self.warnings.append(sentence)
 
     def type_name(self, channel: Channel) -> str:
@@ -99,7 +103,7 @@ class RawLog:
         return schema.name if schema is not None else ""
 
     def messages(
-        self, channel_ids: Collection[int], start_ns: int, stop_ns: int
+        self, channel_ids: Collection[int], start_ns: int = 0, stop_ns: int = FOREVER_NS
     ) -> Iterator[RawMessage]:
         """Yield messages of some channels in a window, in the order of the file.
 
