@@ -164,8 +164,7 @@ class Table:
         """
         self.values = values
         self.faults = faults
-        self._where = where
-        self._defaults = defaults
+        self._where, self._defaults = where, defaults
         self._asked: dict[str, None] = {}
 
     def __contains__(self, key: str) -> bool:

@@ -230,8 +230,7 @@ class _Reader:
 
     def __init__(self, mdf: Any, start_ns: int, log: FrameLog) -> None:
         self.log = log
-        self._mdf = mdf
-        self._start_ns = start_ns
+        self._mdf, self._start_ns = mdf, start_ns
 
     def pieces(self, group: _Group) -> Iterator[_Piece]:
         """Yield the frames of a group, in the order they were logged."""

@@ -294,8 +294,7 @@ class Terminal:
 
     def __init__(self, stream: TextIO, *, quiet: bool = False) -> None:
         """Display on a stream, e.g. ``sys.stderr``, from the first :meth:`show` on."""
-        self._stream = stream
-        self._quiet = quiet
+        self._stream, self._quiet = stream, quiet
         self._latest: RecorderSnapshot | None = None
         self._wake = threading.Condition()
         self._closing = False

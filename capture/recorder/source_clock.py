@@ -267,8 +267,7 @@ class SourceClock:
         self._last = -(2**62)  # the last mapped time
         self._floor = -(2**62)  # what the next may not fall below, at half speed
         self._origin = (0, 0)  # device time, host minus device time
-        self._bucket_ends = 0
-        self._samples = self._resets = self._out_of_range = 0
+        self._bucket_ends = self._samples = self._resets = self._out_of_range = 0
         self._events: list[str] = []
         self._delays: list[IntArray] = []
         self._waiting = 0

@@ -75,12 +75,9 @@ class PythonCanLink:
             detail: Description for messages.
         """
         self.detail = detail
-        self._bus = bus
-        self._tally = tally
-        self._device_time = device_time
+        self._bus, self._tally, self._device_time = bus, tally, device_time
         self._held: deque[tuple[int, can.Message]] = deque()
-        self._lost = 0
-        self._reported = 0
+        self._lost = self._reported = 0
         self._error: OSError | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="undulog-can", daemon=True)

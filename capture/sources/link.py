@@ -142,8 +142,7 @@ class LinkedSource:
         self.facts = facts
         self.directions = directions
         self.finished = False  # it can never work, or it was stopped
-        self._open_link = open_link
-        self._place = place
+        self._open_link, self._place = open_link, place
         self._tally = Tally(lambda: 0)
         self._watch = BusWatch()
         self._backoff = Backoff()

@@ -80,8 +80,7 @@ class SocketcanLink:
 
     def __init__(self, sock: socket.socket, tally: Tally) -> None:
         """Take over a bound socket."""
-        self._socket = sock
-        self._tally = tally
+        self._socket, self._tally = sock, tally
         self._receive = ReceiveMany(_PACKETS, CANFD_MTU + 1)
         self._drops = 0
         self._clock = ArrivalClock(tally.now_ns)

@@ -111,8 +111,7 @@ class UnixSource:
         self._senders: list[_Sender] = []
         self._had_sender = False
         self._waits_since = 0.0
-        self._ending = False
-        self._finished = False
+        self._ending = self._finished = False
 
     @property
     def counts(self) -> SourceCounts:
@@ -368,8 +367,7 @@ class FrameSender:
         self.refused = 0
         """Frames not accepted: no recorder, or its buffer is full."""
         self._socket: socket.socket | None = None
-        self._sequence = 0
-        self._dropped = 0
+        self._sequence = self._dropped = 0
         self._retry_at = 0.0
 
     @property

@@ -93,8 +93,7 @@ class TargetHeadingPolicy:
         """
         self._law = parameters
         self._target = np.array(target)
-        self._target_radius_m = target_radius_m
-        self._turn_radius_m = turn_radius_m
+        self._target_radius_m, self._turn_radius_m = target_radius_m, turn_radius_m
         self._compass = next(s for s in robot.sensors if s.kind is SensorKind.COMPASS)
         self._north: LowPass[FloatArray] | None = None
         self._before = np.zeros(2)
@@ -163,9 +162,7 @@ class AdaptiveGait:
             controller: Parameters of the reactions.
         """
         roles = layout(robot)
-        self._generator = generator
-        self._robot = robot
-        self._course = course
+        self._generator, self._robot, self._course = generator, robot, course
         self._distances = Distances(roles.fold_m, controller.near_hold_s)
         self._reckoning = DeadReckoning(controller.calibration, robot)
         self._lookout = ObstacleMonitor(controller.lookout, roles, robot)
@@ -182,8 +179,7 @@ class AdaptiveGait:
         self._phase_at = generator.names.index(f"{Plane.HORIZONTAL}.phase")
         self._lag_at = generator.names.index(f"{Plane.HORIZONTAL}.lag")
         self._wave: BodyWave | None = None
-        self._phase = 0.0
-        self._time_s = 0.0
+        self._phase = self._time_s = 0.0
         self._mode = WALK
         self._mode_since_s = 0.0
 

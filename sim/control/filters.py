@@ -196,8 +196,7 @@ class SideLatch:
             margin_m: The other side must be freer by more than this [m].
             hold_s: A side is kept at least so long [s].
         """
-        self._margin_m = margin_m
-        self._hold_s = hold_s
+        self._margin_m, self._hold_s = margin_m, hold_s
         self._side = 1.0
         self._since_s = -math.inf
 
@@ -241,8 +240,7 @@ class NearMemory:
                 does not fold back.
             hold_s: How long a near reading is believed [s].
         """
-        self._near_m = near_m
-        self._hold_s = hold_s
+        self._near_m, self._hold_s = near_m, hold_s
         self._seen_m = np.full(len(near_m), math.inf)
         self._until_s = np.full(len(near_m), -math.inf)
 

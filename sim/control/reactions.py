@@ -295,8 +295,7 @@ class TailSpeedUp:
         Args:
             layout: Who looks where.
         """
-        self._law = parameters
-        self._layout = layout
+        self._law, self._layout = parameters, layout
         self._filter = LowPass(parameters.filter_s, 1.0)
         self.hastening = False
         self.values = np.array([1.0, parameters.range_m])

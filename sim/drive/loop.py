@@ -247,8 +247,7 @@ class ControlLoop:
             DataError: If the robot has no bus.
         """
         self.tally = LoopTally()
-        self._gate, self._link, self._pace = gate, link, pace
-        self._spacing = spacing
+        self._gate, self._link, self._pace, self._spacing = gate, link, pace, spacing
         self._encoder, self._known = CommandEncoder(robot), BusReadings(robot)
         self._presence = BusCheck(robot)
         self._polls = poll_frames(robot)

@@ -60,8 +60,7 @@ class NumpyLaws:
         self._ground = tuple(
             GroundContact(ground, radius, row.body, row.contact) for row in self._rows
         )
-        self._servos = servos
-        self._dt = dt
+        self._servos, self._dt = servos, dt
         self._reference = np.zeros(steps.joint_count)
 
     def start(self, k: int) -> None:

@@ -258,8 +258,7 @@ class JointPolling:
         self._servos = servos
         self._noise = np.array([[noise.position], [noise.velocity], [noise.effort]])
         self._random = np.random.default_rng([seed, STREAM])
-        self._count = period_steps
-        self._dt = dt
+        self._count, self._dt = period_steps, dt
         self._kept: deque[_Period] = deque(maxlen=3)
         self._first = 0  # number of the first control period in there
         self._next = 0  # the cycle to be told next

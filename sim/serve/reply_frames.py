@@ -186,8 +186,7 @@ class FaultLine:
         self._held: dict[BusFault, float] = {}
         self._off = False
         self._late: list[tuple[int, FrameArray]] = []
-        self.lost = 0
-        self.hit = 0
+        self.lost = self.hit = 0
 
     def command(self, command: FloatArray, angle: FloatArray, time_s: float) -> FloatArray:
         """Apply the faults to commands.

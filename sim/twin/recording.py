@@ -268,8 +268,7 @@ class TwinSource:
         self.directions = False
         self.robot: Robot | None = scenario.robot
         self.counts = SourceCounts()
-        self._address = address
-        self._scenario = scenario
+        self._address, self._scenario = address, scenario
         self._queue: Queue[Sample | UndulogError | None] = Queue(_AHEAD)
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None

@@ -126,9 +126,7 @@ class EchoColumn:
             dtype: numpy type string of a number.
             others: Columns that it may be equal to, if they get the rows first.
         """
-        self._dtype = dtype
-        self._capacity = capacity
-        self._others = others
+        self._dtype, self._capacity, self._others = dtype, capacity, others
         self._leader: EchoColumn | None = None
         self._own: ColumnStore | None = None
         self._count = 0

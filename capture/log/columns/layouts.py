@@ -67,8 +67,7 @@ class LayoutSorter:
             in_all: Whether ``most`` counts all layouts, instead of those of each length.
         """
         self.is_full = False
-        self._find = find
-        self._most, self._in_all = most, in_all
+        self._find, self._most, self._in_all = find, most, in_all
         self._kept: dict[int, list[tuple[int, Layout]]] = {}
         self._found = self._kept_in_all = 0
 

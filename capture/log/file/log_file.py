@@ -178,8 +178,7 @@ class LogFile:
         """
         self.path = path
         self.warnings: list[str] = []
-        self.profile = ""
-        self.library = ""
+        self.profile = self.library = ""
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.blocks: list[Block] = []

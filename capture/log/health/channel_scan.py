@@ -122,16 +122,14 @@ class ChannelScan:
                 None for a file.
         """
         self.topic = topic
-        self.count = 0
-        self.unread = 0
+        self.count = self.unread = 0
         self.sequence = SequenceTally()
         self.series: dict[tuple[str, ...], Series] = {}
         self.bus = BusTally(horizon_s) if kind is not None and _holds_frames(topic, kind) else None
         self.ends: tuple[bytes, bytes] | None = None
         self._keeps_ends = kind is not None and kind.name == DIAGNOSTICS
         self.kind = kind
-        self._joints = joints
-        self._limits = limits
+        self._joints, self._limits = joints, limits
         self._stamped = kind is not None and _is_stamped(kind)
         self._horizon_s = horizon_s
         self._sorter = None if kind is None else _sorter(kind, joints=joints)

@@ -109,8 +109,7 @@ class SessionScan:
                 summed up, so that memory is bounded, and later ones are not checked for frozen
                 joints. None for a file.
         """
-        self._robot = robot
-        self._horizon_s = horizon_s
+        self._robot, self._horizon_s = robot, horizon_s
         self._freezes: dict[tuple[int, tuple[str, ...], int, tuple[str, ...]], FreezeTally] = {}
         self._scans: dict[int, ChannelScan] = {}
         self._types: dict[int, str] = {}

@@ -97,8 +97,7 @@ class TimingTally:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._count = 0
-        self._first = self._last = self._previous = 0
+        self._count = self._first = self._last = self._previous = 0
         self._duplicates = self._backward = 0
         self._longest = (0, 0)
         self._bins = np.empty(0, np.int64)  # those that have intervals, ascending
@@ -200,8 +199,7 @@ class SequenceTally:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._previous = 0
-        self._count = self._ones = self._repeated = self._reordered = 0
+        self._previous = self._count = self._ones = self._repeated = self._reordered = 0
         self._at = self._low = self._high = 0  # unwrapped, relative to the first
         self._nonzero = False
 

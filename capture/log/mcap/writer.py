@@ -95,8 +95,7 @@ class McapWriter:
             group_of: Topic and type name to the group of a channel; channels of one group share
                 chunks. None for one group, named "".
         """
-        self._stream = stream
-        self._chunk_size = chunk_size
+        self._stream, self._chunk_size = stream, chunk_size
         self._zstd = zstandard.ZstdCompressor(write_checksum=True)
         self._group_of = group_of
         self._shared = _OpenChunk("")

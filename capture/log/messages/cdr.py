@@ -123,8 +123,7 @@ class _Walker:
     """Finds the offsets of the fields of one message."""
 
     def __init__(self, name: str, message: bytes) -> None:
-        self._name = name
-        self._message = message
+        self._name, self._message = name, message
         self._at = _HEADER_SIZE
         self._left = _ELEMENTS_A_BYTE * len(message)  # strings and nested messages
         self.leaves: dict[str, Leaf] = {}

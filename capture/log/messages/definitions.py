@@ -122,8 +122,7 @@ class _Parser:
     """Resolves the sections of one schema."""
 
     def __init__(self, name: str, bodies: dict[str, str]) -> None:
-        self._name = name
-        self._bodies = bodies
+        self._name, self._bodies = name, bodies
         self._done: dict[str, MessageType] = {}
 
     def message(self, short: str, path: tuple[str, ...]) -> MessageType:

@@ -195,10 +195,7 @@ class JointReader:
         self, path: Path, topics: Topics, clock: StampClock, warn: Callable[[str], None]
     ) -> None:
         """Set up a reader; ``warn`` is called with one sentence for each irregularity."""
-        self._path = path
-        self._topics = topics
-        self._clock = clock
-        self._warn = warn
+        self._path, self._topics, self._clock, self._warn = path, topics, clock, warn
         self._offsets: dict[str, Series] = {}
 
     def read(

@@ -229,8 +229,7 @@ class StampClock:
 
     def __init__(self, topics: Topics, warn: Callable[[str], None]) -> None:
         """Set up; ``warn`` is called with one sentence if the stamps are on another clock."""
-        self._topics = topics
-        self._warn = warn
+        self._topics, self._warn = topics, warn
         self._shift_ns: int | None = None
 
     def shift_ns(self, topic: str) -> int:

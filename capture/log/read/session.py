@@ -54,10 +54,8 @@ class SessionView:
             names: Name of a topic in the view to its name in the log, if they differ.
             on_read: Called before each read.
         """
-        self._log = log
-        self._window_ns = window_ns
-        self._names = names
-        self._on_read = on_read
+        self._log, self._window_ns = log, window_ns
+        self._names, self._on_read = names, on_read
 
     def view(
         self,

@@ -86,9 +86,7 @@ class DurableSink:
         if min(limits, default=1) < 1 or not flush_interval_s > 0 or min(ballast, last_words) < 0:
             raise DataError("sizes and times of a recording are positive")
         self.path = Path(path)
-        self._force = force
-        self._split_size = split_size
-        self._split_ns = split_ns
+        self._force, self._split_size, self._split_ns = force, split_size, split_ns
         self._split_at_ns = _NEVER_NS if split_ns is None else 0
         self._half_interval_s = flush_interval_s / 2
         self._due = time.monotonic() + self._half_interval_s

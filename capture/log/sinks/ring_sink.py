@@ -90,9 +90,7 @@ class RingSink:
                 thread that writes.
             max_bytes: The oldest messages go when more than this is held [B].
         """
-        self._path = path
-        self._duration_ns = duration_ns
-        self._max_bytes = max_bytes
+        self._path, self._duration_ns, self._max_bytes = path, duration_ns, max_bytes
         self._definitions: list[Description] = []
         self._types: dict[int, str] = {}
         self._topics: dict[int, str] = {}
@@ -327,8 +325,7 @@ class RingStorage:
             raise LogWriteError(output, f"the folder {output.parent} doesn't exist")
         self.part_path = output
         self.sink = RingSink(output, round(ring_s * 1e9))
-        self.size = 0
-        self._dropped = 0
+        self.size = self._dropped = 0
 
     @property
     def messages(self) -> int:

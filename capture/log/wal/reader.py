@@ -93,9 +93,7 @@ class Recovery(Iterator[WalMessage]):
             LogError: If the folder can't be listed.
         """
         self.folder = folder
-        self.found = 0
-        self.before = 0
-        self.missing = 0
+        self.found = self.before = self.missing = 0
         self.warnings: list[str] = []
         segments = self._open()
         self._segments = [item for item in segments if item.header.stream == MESSAGES]
@@ -243,8 +241,7 @@ class _SegmentReader:
 
     def __init__(self, segment: _Found, file: BinaryIO, last: int) -> None:
         self.last = last
-        self.damaged = 0
-        self.first_damage = 0
+        self.damaged = self.first_damage = 0
         self._file = file
         self._at = HEADER_SIZE
         self._end = segment.end

@@ -202,8 +202,7 @@ class Segment:
         self._at = HEADER_SIZE
         self._end = header.size - HEADER_SIZE
         self._salt = header.salt
-        self._synced_at = 0
-        self._durable = 0
+        self._synced_at = self._durable = 0
         self._page_end = _PAGE
         self._whole = 0, 0  # start of the page that is being written, last record wholly before it
         try:
