@@ -1,18 +1,25 @@
-"""Command ``log info``: what a log holds, of our making or not."""
+"""Commands ``log info``: what a log holds, and ``log check``: its health, from its data alone."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..common.console import echo, emit_json
+from ..common.console import echo, emit_json, progress
 from ..common.errors import DataError
 from ..log.columns.topics import Channel
 from ..log.messages.frames import FD_TOPIC_PREFIX
 from ..log.read.session import Session
+
+if TYPE_CHECKING:
+    from ..log.health.bus_tally import SourceHealth
+    from ..log.health.session_check import SessionHealth
+    from ..log.health.tallies import BusHealth, SeriesHealth
 
 _MESSAGES_PER_LOOK = 1000
 
@@ -147,3 +154,159 @@ def _size(size_bytes: int) -> str:
 
 def _utc(t_ns: int) -> str:
     return datetime.fromtimestamp(t_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def log_check(file: Path, /, *, json: bool = False) -> int:
+    """Judge whether a recorded session is good, degraded or bad, and why.
+
+    Everything is computed from the data: rhythm, gaps, jitter and dropped messages of every
+    channel, values that are not a number, frozen joints and joints at their limits, the CRC of
+    every chunk, error frames and load of the bus. Exit code 1 for a bad session.
+
+    Example: `undulog log check run.mcap`
+
+    Args:
+        file: An MCAP file, of any make.
+        json: Print one JSON object.
+    """
+    from ..log.health.session_check import check_session
+
+    with progress(f"checking {file.name}", 1.0) as bar:
+        health = check_session(file, bar.update)
+    if json:
+        emit_json(as_json(health))
+    else:
+        _print(health)
+    return int(health.verdict == "bad")
+
+
+def as_json(health: SessionHealth) -> dict[str, Any]:
+    """Return a session's health as plain JSON values.
+
+    Returns:
+        ``verdict``, ``reasons``, ``notes``, ``stored``, ``session``, ``file``, ``channels``,
+        ``series``, ``joints``, ``buses``, ``sources``; what can't be computed is null.
+    """
+    series = [
+        asdict(each) | {"timing": asdict(each.timing) | {"rate_hz": each.timing.rate_hz}}
+        for each in health.series
+    ]
+    return {
+        "verdict": health.verdict,
+        "reasons": list(health.reasons),
+        "notes": list(health.notes),
+        "stored": {
+            "verdict": health.stored,
+            "reasons": list(health.stored_reasons),
+            "differs": None if health.stored is None else health.stored != health.verdict,
+        },
+        "session": {
+            "id": health.session_id,
+            "path": str(health.path),
+            "robot": health.robot,
+            "start_ns": health.start_ns,
+            "duration_s": health.duration_s,
+        },
+        "file": asdict(health.file),
+        "channels": [asdict(channel) for channel in health.channels],
+        "series": series,
+        "joints": [asdict(joint) for joint in health.joints],
+        "buses": [asdict(bus) for bus in health.buses],
+        "sources": [asdict(source) for source in health.bus_tally],
+    }
+
+
+def _print(health: SessionHealth) -> None:
+    robot = f"{health.robot}, " if health.robot else ""
+    count = len(health.reasons)
+    why = f", for {count} reason{'s' if count != 1 else ''}" if count else ""
+    echo(f"{health.verdict}: {health.session_id}, {robot}{health.duration_s:.2f} s{why}")
+    echo(*(f"  {sentence}" for sentence in health.reasons))
+    echo(*(f"  note: {sentence}" for sentence in health.notes))
+    _print_stored(health)
+    _print_series(health)
+    for line in (*map(_bus_line, health.buses), *map(_source_line, health.bus_tally)):
+        echo("", line)
+    _print_sequences(health)
+    file = health.file
+    echo(
+        "",
+        f"{file.checked} of {file.chunks} chunks have the CRC that they should have, "
+        f"{file.without_crc} carry none",
+    )
+    echo(
+        "Intervals are between stamps (log times where there are none); a gap is longer than 1.5 "
+        "medians."
+    )
+
+
+def _print_stored(health: SessionHealth) -> None:
+    if health.stored is None:
+        echo("stored verdict: none")
+    elif health.stored == health.verdict:
+        echo(f"stored verdict: {health.stored}, the same")
+    else:
+        reasons = f" ({'; '.join(health.stored_reasons)})" if health.stored_reasons else ""
+        echo(f"stored verdict: {health.stored}{reasons}; from the data: {health.verdict}")
+
+
+def _print_series(health: SessionHealth) -> None:
+    width = max([len(each.label) for each in health.series] + [6])
+    echo(
+        "",
+        f"{'series':<{width}}  {'samples':>8}  {'rate/Hz':>8}  {'gaps':>5}  {'missing':>7}  "
+        f"{'longest/s':>9}  {'jitter':>6}  {'p99':>5}  {'twice':>5}  {'back':>4}  {'NaN':>6}",
+    )
+    echo(*(_series_line(each, width) for each in health.series))
+
+
+def _series_line(each: SeriesHealth, width: int) -> str:
+    timing = each.timing
+    rhythm = timing.regular and timing.median_s
+    jitter = f"{(timing.std_s or 0) / timing.median_s:.1%}" if rhythm and timing.median_s else "-"
+    p99 = f"{(timing.p99_s or 0) / timing.median_s:.2f}" if rhythm and timing.median_s else "-"
+    gaps, missing = (timing.gaps, timing.missing) if rhythm else ("-", "-")
+    rate = f"{timing.rate_hz:.1f}" if timing.rate_hz is not None else "-"
+    return (
+        f"{each.label:<{width}}  {timing.count:>8}  {rate:>8}  {gaps:>5}  {missing:>7}  "
+        f"{timing.longest_s:>9.3g}  {jitter:>6}  {p99:>5}  {timing.duplicates:>5}  "
+        f"{timing.backward:>4}  {each.nan:>6}"
+    )
+
+
+def _print_sequences(health: SessionHealth) -> None:
+    kinds: dict[str, list[str]] = {}
+    for channel in health.channels:
+        kinds.setdefault(channel.sequence.kind, []).append(channel.topic)
+    counted = [each for each in health.channels if each.sequence.kind == "counted"]
+    dropped = math.fsum(each.sequence.dropped or 0 for each in counted)
+    echo("")
+    if counted:
+        echo(f"sequence numbers: {dropped:.0f} messages dropped in {len(counted)} channels")
+    if "none" in kinds:
+        echo(f"no sequence numbers, so drops can't be proved: {', '.join(kinds['none'])}")
+    if "not a count" in kinds:
+        echo(f"sequence numbers that don't count messages: {', '.join(kinds['not a count'])}")
+
+
+def _source_line(source: SourceHealth) -> str:
+    lost = "losses unknown" if source.dropped is None else f"{source.dropped} lost before us"
+    return (
+        f"source {source.name}, as its recorder counted: {source.frames} frames, {lost}, "
+        f"{source.malformed} unreadable, connected again {source.reconnects} times"
+    )
+
+
+def _bus_line(bus: BusHealth) -> str:
+    rate = f", {bus.rate_hz:.1f} Hz" if bus.rate_hz is not None else ""
+    fd = bus.topic.startswith(FD_TOPIC_PREFIX)
+    load = ", load not estimated" if fd else ", load unknown (no bitrate)"
+    if bus.load is not None and bus.peak_load is not None:
+        load = (
+            f", load {bus.load[0]:.1%} to {bus.load[1]:.1%} of the bitrate "
+            f"(busiest second {bus.peak_load[0]:.1%} to {bus.peak_load[1]:.1%})"
+        )
+    return (
+        f"{bus.topic}: {bus.frames} frames{rate}, {bus.error_frames} error frames, "
+        f"longest silence {bus.longest_s:.3g} s{load}"
+    )

@@ -16,10 +16,9 @@ from scipy.ndimage import median_filter
 from scipy.special import bdtrc
 
 from ..common.process import in_threads
-from .effort import powerless, usual_effort
 from .excursions import Excursions, departures, find_excursions, find_holds
 from .fault import Fault, Span, Symptom
-from .kinds import fault_of
+from .kinds import fault_of, powerless, usual_effort
 from .motion import (
     DEGREE,
     FEW_SAMPLES,

@@ -23,8 +23,7 @@ from ..log.sinks.durable_sink import DurableSink
 from ..log.sinks.mcap_sink import Description, MessageFields, MessageSink
 from ..log.sinks.ring_sink import RingStorage
 from ..log.write.writer import SessionWriter
-from ..sources.address import open_sources
-from ..sources.contract import SourceContext
+from ..sources.contract import SourceContext, open_sources
 from .bus_recorder import decoded_source, robot_of
 from .control import ControlServer
 from .control_client import default_sockets

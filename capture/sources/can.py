@@ -37,8 +37,7 @@ from ..log.messages.frames import (
     empty_frames,
 )
 from ..robot.model import ClockDomain
-from .address import flag, only
-from .contract import DEVICE_TIMES_END_NS, Source, SourceAddress
+from .contract import DEVICE_TIMES_END_NS, Source, SourceAddress, flag, only
 from .events import IMPLAUSIBLE_TIME, Tally
 from .link import LinkedSource
 from .slcan import slcan_source

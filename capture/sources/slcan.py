@@ -37,8 +37,16 @@ from ..log.messages.frames import (
     empty_fd_frames,
 )
 from ..robot.model import ClockDomain
-from .address import flag, number, only
-from .contract import SourceAddress, fd_records, pack_fd_record, pack_record, records
+from .contract import (
+    SourceAddress,
+    fd_records,
+    flag,
+    number,
+    only,
+    pack_fd_record,
+    pack_record,
+    records,
+)
 from .events import Tally
 from .link import LinkedSource
 from .reader_thread import DrainedLink

@@ -18,8 +18,7 @@ import numpy as np
 from ..common.errors import SourceError, UsageError
 from ..log.messages.frames import DIR_RX, DIR_TX, FrameArray, empty_fd_frames, empty_frames
 from ..robot.model import ClockDomain
-from .address import flag, only
-from .contract import SourceAddress
+from .contract import SourceAddress, flag, only
 from .events import Tally
 from .link import LinkedSource
 from .reader_thread import DrainedLink

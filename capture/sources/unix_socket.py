@@ -34,7 +34,6 @@ from ..common.files import listen_at
 from ..common.process import share_priority
 from ..log.messages.frames import FRAME_DTYPE, FrameArray, frames_from_bytes
 from ..robot.model import ClockDomain, Robot
-from .address import flag, only
 from .contract import (
     HEAD,
     LONGEST,
@@ -45,6 +44,8 @@ from .contract import (
     SourceAddress,
     SourceContext,
     SourceCounts,
+    flag,
+    only,
 )
 from .events import BusWatch, Tally
 from .reader_thread import ReceiveThread

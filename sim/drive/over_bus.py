@@ -13,8 +13,7 @@ from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import FrameArray, identifier_text
 from undulog.capture.recorder.status import SessionClock
 from undulog.capture.robot.model import Direction, Quantity, Robot
-from undulog.capture.sources.address import parse_address
-from undulog.capture.sources.contract import SourceAddress, SourceCounts
+from undulog.capture.sources.contract import SourceAddress, SourceCounts, parse_address
 from undulog.capture.sources.events import Tally
 
 from ..gait.contract import CONTROL_RATE_HZ

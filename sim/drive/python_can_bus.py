@@ -14,7 +14,6 @@ from undulog.capture.common.arrays import IntArray
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import EXTENDED_FLAG, ID_MASK, FrameArray, holds_fd
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import flag, only
 from undulog.capture.sources.can import (
     DEVICE_TIME,
     PythonCanLink,
@@ -24,7 +23,7 @@ from undulog.capture.sources.can import (
     known_options,
     open_bus,
 )
-from undulog.capture.sources.contract import SourceAddress
+from undulog.capture.sources.contract import SourceAddress, flag, only
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcand import server_of
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from undulog.capture.robot.model import Robot
-from undulog.capture.sources.address import SourceAddress
+from undulog.capture.sources.contract import SourceAddress
 
 from ..gate.limits import GateLimits
 from ..gate.outcome import DriveEnding, GateEvent, Jitter, Outcome

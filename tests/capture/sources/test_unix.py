@@ -17,7 +17,7 @@ from support.processes import python, start, wait_for
 from undulog.capture.common.errors import DataError, SourceError, UsageError
 from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import open_source, parse_address
+from undulog.capture.sources.contract import open_source, parse_address
 from undulog.capture.sources.unix_socket import MOST_SENDERS, FrameSender
 
 # Knows nothing of us but the packets: 32 bytes a frame, packed by struct.

@@ -25,8 +25,7 @@ from undulog.capture.log.messages.frames import (
     REMOTE_FLAG,
     empty_frames,
 )
-from undulog.capture.sources.address import open_source, parse_address
-from undulog.capture.sources.contract import SourceContext, records
+from undulog.capture.sources.contract import SourceContext, open_source, parse_address, records
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcand import SocketcandText
 from undulog.sim.drive.links import find_virtual_robot
