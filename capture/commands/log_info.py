@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..common.console import echo, emit_json, progress
+from ..common.console import emit, progress
 from ..common.errors import DataError
 from ..log.columns.topics import Channel
 from ..log.messages.frames import FD_TOPIC_PREFIX
 from ..log.read.session import Session
 
 if TYPE_CHECKING:
-    from ..log.health.bus_tally import SourceHealth
     from ..log.health.session_check import SessionHealth
+    from ..log.health.sources import SourceHealth
     from ..log.health.tallies import BusHealth, SeriesHealth
 
 _MESSAGES_PER_LOOK = 1000
@@ -98,13 +99,10 @@ def log_info(file: Path, /, *, json: bool = False) -> None:
     """
     with Session.open(file) as session:
         facts = describe(session)
-    if json:
-        emit_json(facts)
-    else:
-        _print_facts(facts)
+    emit(facts, _info_lines(facts), as_json=json)
 
 
-def _print_facts(facts: dict[str, Any]) -> None:
+def _info_lines(facts: dict[str, Any]) -> Iterator[str]:
     session = facts["session"]
     robot = f"{session['robot']}, {session['joints']} joints" if session["robot"] else "no robot"
     messages = sum(topic["messages"] for topic in facts["topics"])
@@ -114,30 +112,30 @@ def _print_facts(facts: dict[str, Any]) -> None:
         if session["start_utc"]
         else "no messages"
     )
-    echo(f"{session['id']}: {robot}, {held}, {_size(session['size_bytes'])}{parts}")
-    echo(*(f"warning: {warning}" for warning in facts["warnings"]))
+    yield f"{session['id']}: {robot}, {held}, {_size(session['size_bytes'])}{parts}"
+    yield from (f"warning: {warning}" for warning in facts["warnings"])
     foreign = Counter(t["encoding"] or "no encoding" for t in facts["topics"] if not t["read"])
     if foreign:
         order = sorted(foreign.items(), key=lambda item: (-item[1], item[0]))
         listed = ", ".join(f"{encoding} {count}" for encoding, count in order)
         topics = "1 topic is" if foreign.total() == 1 else f"{foreign.total()} topics are"
-        echo(f"warning: {topics} not of ROS 2 and can't be read, only listed: {listed}")
+        yield f"warning: {topics} not of ROS 2 and can't be read, only listed: {listed}"
     names = [_type(topic) for topic in facts["topics"]]
     width = max([len(topic["topic"]) for topic in facts["topics"]] + [5])
     kinds = max([len(name) for name in names] + [4])
-    echo("", f"{'topic':<{width}}  {'type':<{kinds}}  {'messages':>8}  {'rate/Hz':>8}  unit")
+    yield ""
+    yield f"{'topic':<{width}}  {'type':<{kinds}}  {'messages':>8}  {'rate/Hz':>8}  unit"
     for topic, name in zip(facts["topics"], names, strict=True):
         rate = f"{topic['rate_hz']:8.1f}" if topic["rate_hz"] is not None else " " * 8
         held = f"{topic['frames']} frames" if topic["frames"] is not None else topic["unit"] or ""
-        echo(
-            f"{topic['topic']:<{width}}  {name:<{kinds}}  {topic['messages']:>8}  "
-            f"{rate}  {held}".rstrip()
-        )
+        start = f"{topic['topic']:<{width}}  {name:<{kinds}}  {topic['messages']:>8}"
+        yield f"{start}  {rate}  {held}".rstrip()
     if facts["attachments"]:
         listed = (f"{name} ({size} bytes)" for name, size in facts["attachments"].items())
-        echo("", f"attached: {', '.join(listed)}")
+        yield ""
+        yield f"attached: {', '.join(listed)}"
     writer = session["library"] or "an unnamed program"
-    echo(f"verdict: {session['verdict'] or 'none stored'}; written by {writer}")
+    yield f"verdict: {session['verdict'] or 'none stored'}; written by {writer}"
 
 
 def _type(topic: dict[str, Any]) -> str:
@@ -173,10 +171,7 @@ def log_check(file: Path, /, *, json: bool = False) -> int:
 
     with progress(f"checking {file.name}", 1.0) as bar:
         health = check_session(file, bar.update)
-    if json:
-        emit_json(as_json(health))
-    else:
-        _print(health)
+    emit(as_json(health), _check_lines(health), as_json=json)
     return int(health.verdict == "bad")
 
 
@@ -212,52 +207,48 @@ def as_json(health: SessionHealth) -> dict[str, Any]:
         "series": series,
         "joints": [asdict(joint) for joint in health.joints],
         "buses": [asdict(bus) for bus in health.buses],
-        "sources": [asdict(source) for source in health.bus_tally],
+        "sources": [asdict(source) for source in health.sources],
     }
 
 
-def _print(health: SessionHealth) -> None:
+def _check_lines(health: SessionHealth) -> Iterator[str]:
     robot = f"{health.robot}, " if health.robot else ""
     count = len(health.reasons)
     why = f", for {count} reason{'s' if count != 1 else ''}" if count else ""
-    echo(f"{health.verdict}: {health.session_id}, {robot}{health.duration_s:.2f} s{why}")
-    echo(*(f"  {sentence}" for sentence in health.reasons))
-    echo(*(f"  note: {sentence}" for sentence in health.notes))
-    _print_stored(health)
-    _print_series(health)
-    for line in (*map(_bus_line, health.buses), *map(_source_line, health.bus_tally)):
-        echo("", line)
-    _print_sequences(health)
+    yield f"{health.verdict}: {health.session_id}, {robot}{health.duration_s:.2f} s{why}"
+    yield from (f"  {sentence}" for sentence in health.reasons)
+    yield from (f"  note: {sentence}" for sentence in health.notes)
+    yield _stored_line(health)
+    yield from _series_lines(health)
+    for line in (*map(_bus_line, health.buses), *map(_source_line, health.sources)):
+        yield from ("", line)
+    yield from _sequence_lines(health)
     file = health.file
-    echo(
-        "",
-        f"{file.checked} of {file.chunks} chunks have the CRC that they should have, "
-        f"{file.without_crc} carry none",
-    )
-    echo(
+    crc = f"{file.checked} of {file.chunks} chunks have the CRC that they should have"
+    yield from ("", f"{crc}, {file.without_crc} carry none")
+    yield (
         "Intervals are between stamps (log times where there are none); a gap is longer than 1.5 "
         "medians."
     )
 
 
-def _print_stored(health: SessionHealth) -> None:
+def _stored_line(health: SessionHealth) -> str:
     if health.stored is None:
-        echo("stored verdict: none")
-    elif health.stored == health.verdict:
-        echo(f"stored verdict: {health.stored}, the same")
-    else:
-        reasons = f" ({'; '.join(health.stored_reasons)})" if health.stored_reasons else ""
-        echo(f"stored verdict: {health.stored}{reasons}; from the data: {health.verdict}")
+        return "stored verdict: none"
+    if health.stored == health.verdict:
+        return f"stored verdict: {health.stored}, the same"
+    reasons = f" ({'; '.join(health.stored_reasons)})" if health.stored_reasons else ""
+    return f"stored verdict: {health.stored}{reasons}; from the data: {health.verdict}"
 
 
-def _print_series(health: SessionHealth) -> None:
+def _series_lines(health: SessionHealth) -> Iterator[str]:
     width = max([len(each.label) for each in health.series] + [6])
-    echo(
-        "",
+    yield ""
+    yield (
         f"{'series':<{width}}  {'samples':>8}  {'rate/Hz':>8}  {'gaps':>5}  {'missing':>7}  "
-        f"{'longest/s':>9}  {'jitter':>6}  {'p99':>5}  {'twice':>5}  {'back':>4}  {'NaN':>6}",
+        f"{'longest/s':>9}  {'jitter':>6}  {'p99':>5}  {'twice':>5}  {'back':>4}  {'NaN':>6}"
     )
-    echo(*(_series_line(each, width) for each in health.series))
+    yield from (_series_line(each, width) for each in health.series)
 
 
 def _series_line(each: SeriesHealth, width: int) -> str:
@@ -274,19 +265,19 @@ def _series_line(each: SeriesHealth, width: int) -> str:
     )
 
 
-def _print_sequences(health: SessionHealth) -> None:
+def _sequence_lines(health: SessionHealth) -> Iterator[str]:
     kinds: dict[str, list[str]] = {}
     for channel in health.channels:
         kinds.setdefault(channel.sequence.kind, []).append(channel.topic)
     counted = [each for each in health.channels if each.sequence.kind == "counted"]
     dropped = math.fsum(each.sequence.dropped or 0 for each in counted)
-    echo("")
+    yield ""
     if counted:
-        echo(f"sequence numbers: {dropped:.0f} messages dropped in {len(counted)} channels")
+        yield f"sequence numbers: {dropped:.0f} messages dropped in {len(counted)} channels"
     if "none" in kinds:
-        echo(f"no sequence numbers, so drops can't be proved: {', '.join(kinds['none'])}")
+        yield f"no sequence numbers, so drops can't be proved: {', '.join(kinds['none'])}"
     if "not a count" in kinds:
-        echo(f"sequence numbers that don't count messages: {', '.join(kinds['not a count'])}")
+        yield f"sequence numbers that don't count messages: {', '.join(kinds['not a count'])}"
 
 
 def _source_line(source: SourceHealth) -> str:

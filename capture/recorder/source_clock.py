@@ -9,7 +9,7 @@ Sources: Zhang, Liu, Xia, "Clock synchronization algorithms for network measurem
 2002; Moon, Skelly, Towsley, "Estimation and removal of clock skew from network delay
 measurements", INFOCOM 1999; Harrison, Newman, "TICSync: knowing when things happened", ICRA 2011.
 
-Method: the line below all delays, :mod:`.capture.recorder.source_clock`. Arrival times don't
+Method: the line below all delays (:class:`Envelope`). Arrival times don't
 determine the least delay itself: mapped times are late by it, the same for all samples of a source.
 """
 

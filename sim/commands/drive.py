@@ -15,8 +15,7 @@ from cyclopts import Parameter
 from undulog.capture.common.console import (
     UNLIMITED,
     complain,
-    echo,
-    emit_json,
+    emit,
     progress,
     refuse_existing,
 )
@@ -133,13 +132,10 @@ def dry_run_on_bus(
             stop=stop,
             on_time=lambda time_s: bar.update(time_s, speed_text(time_s, start)),
         )
-    if as_json:
-        emit_json({"on": on, **reported(dry)})
-    else:
-        width = shutil.get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED
-        echo(*summary_lines(dry, width))
-        if dry.verdict.fit:
-            echo("", f"To send it to {on}, the same with --arm and -o SESSION.mcap")
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED
+    hint = ["", f"To send it to {on}, the same with --arm and -o SESSION.mcap"]
+    lines = [*summary_lines(dry, width), *(hint if dry.verdict.fit else [])]
+    emit({"on": on, **reported(dry)}, lines, as_json=as_json)
     return 0 if dry.verdict.fit else 1
 
 
@@ -224,10 +220,7 @@ def drive(
         if not arm:
             return dry_run_on_bus(driven, on, as_json=json, **given)
         report = drive_armed(driven, on, **given)
-        if json:
-            emit_json(report.facts())
-        else:
-            echo(*report.lines())
+        emit(report.facts(), report.lines(), as_json=json)
         return early_end(report)
     if arm or recorder is not None or robot is not None:
         raise UsageError(
@@ -243,10 +236,8 @@ def drive(
     recording, factor = with_progress(
         driven.name, scenario, partial(drive_twin, driven, scenario, output, force=force)
     )
-    if json:
-        emit_json(_reported(driven, scenario, recording, factor))
-    else:
-        echo(*_summary(driven, scenario, recording, factor))
+    facts = _reported(driven, scenario, recording, factor)
+    emit(facts, _summary(driven, scenario, recording, factor), as_json=json)
     return 0
 
 

@@ -49,7 +49,7 @@ def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path: Path) 
     health = check_session(output)
     assert (health.stored, health.stored_reasons) == (health.verdict, health.reasons)
     assert (report["verdict"], tuple(report["reasons"])) == (health.verdict, health.reasons)
-    (found,) = health.bus_tally
+    (found,) = health.sources
     assert (found.name, found.frames, found.dropped) == ("bus", sent, 12)
     assert any(f"source bus lost 12 of {sent + 12} frames" in text for text in health.reasons)
     with output.open("rb") as stream:
