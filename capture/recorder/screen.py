@@ -114,7 +114,8 @@ def plain_line(snapshot: RecorderSnapshot) -> str:
     if snapshot.free is not None:
         parts.append(_room(snapshot))
     if snapshot.reasons:
-        parts.append(snapshot.reasons[0] + _more(len(snapshot.reasons) - 1))
+        more = len(snapshot.reasons) - 1
+        parts.append(snapshot.reasons[0] + (f" (and {more} more)" if more else ""))
     return plain("; ".join(parts))
 
 
@@ -276,10 +277,6 @@ def _shorter(path: str, width: int) -> str:
     return path if len(path) <= max(width, 8) else "…" + path[1 - max(width, 8) :]
 
 
-def _more(count: int) -> str:
-    return f" (and {count} more)" if count > 0 else ""
-
-
 LINE_EVERY_S = 10.0
 """Interval of the lines without a terminal [s]."""
 
@@ -374,7 +371,8 @@ class Terminal:
         due_s = 0.0
         last: EventLine | None = None
         while (snapshot := self._next()) is not None:
-            for event in _after(snapshot.events, last):
+            events = snapshot.events
+            for event in events[events.index(last) + 1 :] if last in events else events:
                 last = event
                 if event.level in _PRINTED:
                     stream.write(event_line(event) + "\n")
@@ -382,8 +380,3 @@ class Terminal:
                 due_s = snapshot.elapsed_s + LINE_EVERY_S
                 stream.write(plain_line(snapshot) + "\n")
             stream.flush()
-
-
-def _after(events: tuple[EventLine, ...], last: EventLine | None) -> tuple[EventLine, ...]:
-    """Return the events behind the last printed one."""
-    return events[events.index(last) + 1 :] if last in events else events

@@ -126,14 +126,12 @@ class Envelope:
         before = len(self._points) - len(recent)
         if before < STEP_BUCKETS:
             return
-        heights = [self._height(x, y) for x, y in self._points]
+        line = self.line
+        heights = [y - line.offset_ns - line.rate * x for x, y in self._points]
         spread = sum(heights[:before]) / before
         if min(heights[before:]) > max(STEP_NS, STEP_SPREADS * spread):
             self._drop_before(STEP_BUCKETS)
             self._fit()
-
-    def _height(self, x: float, y: float) -> float:
-        return y - self.line.offset_ns - self.line.rate * x
 
     def _drop_before(self, kept: int) -> None:
         """Drop all but the last points; the rate becomes the expected one."""

@@ -380,9 +380,9 @@ def _status(
     values: Mapping[str, float | str | None],
     hardware: str = "",
 ) -> DiagnosticStatus:
-    texts = {key: _text(value) for key, value in values.items() if value not in (None, "")}
+    texts = {
+        key: f"{value:.6g}" if isinstance(value, float) else str(value)
+        for key, value in values.items()
+        if value not in (None, "")
+    }
     return DiagnosticStatus(level, name, message, hardware, texts)
-
-
-def _text(value: float | str | None) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -250,18 +250,20 @@ _COMMON = {"bitrate", "fd", "data_bitrate"}
 _PARAM = re.compile(r":param\s+(?:[^:\n]*?\s)?(\w+):")
 
 
-def check_interface(text: str, interface: str) -> None:
-    """Check that python-can has an interface.
-
-    Args:
-        text: The address, for the message.
+def interface_of(address: SourceAddress) -> tuple[str, str]:
+    """Return interface and channel of an address.
 
     Raises:
-        UsageError: If it has not; lists those that it has.
+        UsageError: If python-can has no such interface (lists those that it has), or the channel
+            is missing.
     """
+    interface, _, channel = address.rest.partition(":")
     if interface not in BACKENDS:
         valid = listed(sorted(BACKENDS), interface)
-        raise UsageError(f"{text!r}: no CAN interface {interface!r}; valid: {valid}")
+        raise UsageError(f"{address.text!r}: no CAN interface {interface!r}; valid: {valid}")
+    if not channel:
+        raise UsageError(f"{address.text!r}: no channel; expected can:INTERFACE:CHANNEL")
+    return interface, channel
 
 
 def known_options(bus: type[can.BusABC]) -> set[str]:
@@ -279,10 +281,7 @@ def open_can(address: SourceAddress) -> Source:
         UsageError: If there is no such interface, or an option is unknown or has no valid value.
         SourceError: If it can never work here.
     """
-    interface, _, channel = address.rest.partition(":")
-    check_interface(address.text, interface)
-    if not channel:
-        raise UsageError(f"{address.text!r}: no channel; expected can:INTERFACE:CHANNEL")
+    interface, channel = interface_of(address)
     if interface in _OWN_LINKS:
         return _OWN_LINKS[interface](address, channel)
     return _open_other(address, interface, channel)

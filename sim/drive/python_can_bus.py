@@ -18,8 +18,8 @@ from undulog.capture.sources.can import (
     DEVICE_TIME,
     PythonCanLink,
     bus_class,
-    check_interface,
     failure,
+    interface_of,
     known_options,
     open_bus,
 )
@@ -78,10 +78,7 @@ class PythonCanBus:
             UsageError: If there is no such interface, or it has no such option.
             SourceError: If it can't be opened.
         """
-        interface, _, channel = address.rest.partition(":")
-        check_interface(address.text, interface)
-        if not channel:
-            raise UsageError(f"{address.text!r}: no channel; expected can:INTERFACE:CHANNEL")
+        interface, channel = interface_of(address)
         device_time = interface in DEVICE_TIME
         self.place = address.text
         self.clock = ClockDomain.DEVICE if device_time else ClockDomain.HOST

@@ -83,11 +83,6 @@ class SocketcandServer:
         return host, port
 
     @property
-    def clients(self) -> int:
-        """Connected clients that have opened the bus."""
-        return sum(client.bus_open for client in self._clients.values())
-
-    @property
     def waiting(self) -> int:
         """Frames that clients sent and nobody has taken yet."""
         return len(self._sent)

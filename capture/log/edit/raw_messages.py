@@ -152,7 +152,8 @@ class RawLog:
             self.warn(f"{error}; its messages are missing")
             return
         loose = not block.start  # the unchunked messages lie between other records
-        places = _loose_places(block) if loose else self._places(block, data, start, stop)
+        offsets = (at for found in (block.offsets or {}).values() for at in found.tolist())
+        places = sorted(offsets) if loose else self._places(block, data, start, stop)
         unknown = 0
         for at in places:
             (length,) = _LENGTH.unpack_from(data, at + 1)
@@ -185,10 +186,6 @@ class RawLog:
                 f"{self.path}: the last {stop - end} bytes of the chunk at byte {block.start} "
                 "are no whole record: left out"
             )
-
-
-def _loose_places(block: Block) -> Iterator[int]:
-    yield from sorted(at for found in (block.offsets or {}).values() for at in found.tolist())
 
 
 def _hash(paths: list[Path]) -> str:

@@ -125,7 +125,9 @@ class ChannelScan:
         self.count = self.unread = 0
         self.sequence = SequenceTally()
         self.series: dict[tuple[str, ...], Series] = {}
-        self.bus = BusTally(horizon_s) if kind is not None and _holds_frames(topic, kind) else None
+        framed = kind is not None and kind.name == "std_msgs/msg/UInt8MultiArray"
+        framed = framed and topic.startswith(FRAME_TOPIC_PREFIXES)
+        self.bus = BusTally(horizon_s) if framed else None
         self.ends: tuple[bytes, bytes] | None = None
         self._keeps_ends = kind is not None and kind.name == DIAGNOSTICS
         self.kind = kind
@@ -364,7 +366,3 @@ def _is_stamped(kind: MessageType) -> bool:
     if first is not None and first.fields and first.fields[0].nested is not None:
         first = first.fields[0].nested
     return first is not None and [part.name for part in first.fields] == ["sec", "nanosec"]
-
-
-def _holds_frames(topic: str, kind: MessageType) -> bool:
-    return topic.startswith(FRAME_TOPIC_PREFIXES) and kind.name == "std_msgs/msg/UInt8MultiArray"

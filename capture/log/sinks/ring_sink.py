@@ -247,10 +247,11 @@ class RingSink:
             self._state[message.channel_id, key] = message
 
     def _next_path(self) -> Path:
-        self._number += 1
-        while (path := _mark_path(self._path, self._number)).exists():
+        while True:
             self._number += 1
-        return path
+            name = f"{self._path.stem}_mark{self._number:04d}{self._path.suffix}"
+            if not (path := self._path.with_name(name)).exists():
+                return path
 
 
 def _write_mark(
@@ -287,10 +288,6 @@ def _write_mark(
         stop_ns=max(times, default=None),
         error=error,
     )
-
-
-def _mark_path(path: Path, number: int) -> Path:
-    return path.with_name(f"{path.stem}_mark{number:04d}{path.suffix}")
 
 
 def _last_number(path: Path) -> int:
