@@ -18,8 +18,8 @@ from ..log.messages.frames import FD_TOPIC_PREFIX
 from ..log.read.session import Session
 
 if TYPE_CHECKING:
+    from ..log.health.bus_tally import SourceHealth
     from ..log.health.session_check import SessionHealth
-    from ..log.health.sources import SourceHealth
     from ..log.health.tallies import BusHealth, SeriesHealth
 
 _MESSAGES_PER_LOOK = 1000

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from ..common.console import complain, emit
-from ..common.errors import UndulogError
+from ..common.errors import UndulogError, some_names
 from .record_control import counted_faults
 
 if TYPE_CHECKING:
@@ -144,8 +144,7 @@ def _live_view(socket: Path, relay: ExitStack) -> Callable[[], str]:
 
 
 def _lines(report: RecordReport) -> Iterator[str]:
-    names = ", ".join(str(file) for file in report.files[:3])
-    names += f" and {len(report.files) - 3} more" if len(report.files) > 3 else ""
+    names = some_names([str(file) for file in report.files], 3)
     yield (
         f"{names or 'nothing written'}: {report.duration_s:.1f} s of {report.robot or 'raw data'}, "
         f"{report.messages} messages, {report.size / 1e6:.1f} MB, verdict {report.verdict}"

@@ -62,7 +62,8 @@ def _oklab(place: FloatArray) -> FloatArray:
     curve = (1 - t) ** 2 * _CURVE[0] + 2 * t * (1 - t) * _CURVE[1] + t**2 * _CURVE[2]
     step = np.linalg.norm(np.diff(curve, axis=0), axis=1)
     arc = np.concatenate([[0.0], np.cumsum(step)]) / step.sum()
-    return np.stack([np.interp(place, arc, curve[:, k]) for k in range(3)], axis=1)
+    channels: list[FloatArray] = [np.interp(place, arc, curve[:, k]) for k in range(3)]
+    return np.stack(channels, axis=1)
 
 
 def _srgb(lab: FloatArray) -> FloatArray:

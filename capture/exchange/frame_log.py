@@ -133,7 +133,7 @@ class LogBlock:
         columns = (t_ns, id_flags, length, way, self.bus.tolist(), self.is_fd.tolist(), fd_flags)
         for i, row in enumerate(zip(*columns, strict=True)):
             most = min(row[2], 64 if row[5] else 8)
-            yield FrameRow(*row, data[64 * i : 64 * i + most])
+            yield FrameRow._make((*row, data[64 * i : 64 * i + most]))
 
 
 def joined(blocks: Sequence[LogBlock]) -> LogBlock:

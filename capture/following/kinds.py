@@ -180,42 +180,27 @@ MOSTLY = 0.5  # share of exact repeats above which a sensor may be frozen
 MIN_RETURNS = 3  # times that a joint stands at one place, which is no chance
 LIMIT_SHARE = 0.02  # nearer to a limit than this share of the range is at it
 
-_KINDS: dict[str, tuple[str, ...]] = {
-    "still": ("dead", "jammed", "stalled", "frozen_sensor"),
-    "held": ("jammed", "dead", "stalled", "frozen_sensor"),
-    "opposite": ("inverted", "inverted_sensor"),
-    "incoherent": ("dead", "noisy_sensor"),
-    "powerless": ("dead",),
-    "astray": ("intermittent",),
-    "noisy": ("noisy_sensor",),
-    "stepped": ("slipped", "slipped_sensor"),
-    "wrapped": ("wrapped_sensor",),
-    "drifting": ("slipped", "drifting_sensor"),
-    "scaled": ("scaled_sensor",),
-    "slight": ("scaled_sensor", "dead", "jammed"),
-    "swapped": ("swapped",),
-    "lost": ("lost_samples",),
-    "stale": ("stale_sensor", "lost_samples"),
+_SYMPTOMS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "still": ("does not move with its command", ("dead", "jammed", "stalled", "frozen_sensor")),
+    "held": (
+        "stands still while its command moves",
+        ("jammed", "dead", "stalled", "frozen_sensor"),
+    ),
+    "opposite": ("moves against its command", ("inverted", "inverted_sensor")),
+    "incoherent": ("does not follow its command", ("dead", "noisy_sensor")),
+    "powerless": ("is not driven", ("dead",)),
+    "astray": ("leaves its usual response", ("intermittent",)),
+    "noisy": ("has bursts of noise", ("noisy_sensor",)),
+    "stepped": ("has shifted", ("slipped", "slipped_sensor")),
+    "wrapped": ("is off by whole turns", ("wrapped_sensor",)),
+    "drifting": ("drifts", ("slipped", "drifting_sensor")),
+    "scaled": ("differs in unit or scale", ("scaled_sensor",)),
+    "slight": ("hardly moves", ("scaled_sensor", "dead", "jammed")),
+    "swapped": ("is swapped", ("swapped",)),
+    "lost": ("lacks samples", ("lost_samples",)),
+    "stale": ("repeats old samples", ("stale_sensor", "lost_samples")),
 }
-"""Symptom to the kinds that fit where nothing else was recorded, the likeliest first."""
-
-_PHRASES = {
-    "still": "does not move with its command",
-    "held": "stands still while its command moves",
-    "opposite": "moves against its command",
-    "incoherent": "does not follow its command",
-    "powerless": "is not driven",
-    "astray": "leaves its usual response",
-    "noisy": "has bursts of noise",
-    "stepped": "has shifted",
-    "wrapped": "is off by whole turns",
-    "drifting": "drifts",
-    "scaled": "differs in unit or scale",
-    "slight": "hardly moves",
-    "swapped": "is swapped",
-    "lost": "lacks samples",
-    "stale": "repeats old samples",
-}
+"""Symptom to its phrase and the kinds that fit where nothing else was recorded, likeliest first."""
 
 
 def fault_of(
@@ -235,8 +220,8 @@ def fault_of(
     begin, end = record_span(motion)
     spans = tuple(sorted(span for each in symptoms for span in each.spans_s))
     whole = any(not each.spans_s for each in symptoms)
-    kinds: list[str] = list(_KINDS[main.name])
-    decided = ""
+    phrase, fitting = _SYMPTOMS[main.name]
+    kinds, decided = list(fitting), ""
     if main.name in ("still", "held") and judged is not None:
         kinds, decided = _standing(motion, judged, main, usual)
         if main.name == "held" and _again(main, end - begin, end, judged.response.period_s):
@@ -247,14 +232,14 @@ def fault_of(
     elif main.name in ("stepped", "drifting"):
         kinds, decided = _shifted(motion, main, kinds)
     for each in symptoms[1:]:
-        kinds += [kind for kind in _KINDS[each.name] if kind not in kinds]
+        kinds += [kind for kind in _SYMPTOMS[each.name][1] if kind not in kinds]
     cycle = judged.response.period_s if judged is not None else 0.0
     since = None if whole or not spans or spans[0][0] - begin < cycle / 2 else spans[0][0]
     until = None if whole or not spans or end - spans[-1][1] < cycle / 2 else spans[-1][1]
     length = sum(b - a for a, b in spans)
     share = 1.0 if whole or end <= begin else min(1.0, length / (end - begin))
-    others = (each.text or _PHRASES[each.name] for each in symptoms[1:])
-    parts = dict.fromkeys([_PHRASES[main.name], main.text, *others])
+    others = (each.text or _SYMPTOMS[each.name][0] for each in symptoms[1:])
+    parts = dict.fromkeys([phrase, main.text, *others])
     evidence = ", ".join(filter(None, parts)) + (f"; {decided}" if decided else "")
     return Fault(motion.name, tuple(kinds), spans, since, until, share, evidence)
 
@@ -292,7 +277,7 @@ def _by_effort(
     motion: JointMotion, judged: Judged, main: Symptom, usual: UsualEffort
 ) -> tuple[list[str], str]:
     """Return kinds of a joint that stands still, by its noise and its effort."""
-    kinds = list(_KINDS[main.name])
+    kinds = list(_SYMPTOMS[main.name][1])
     spans = main.spans_s or (record_span(motion),)
     repeats = _repeats(motion, spans)
     if not repeats:  # new noise in each sample: the sensor measures
@@ -343,7 +328,7 @@ def _opposite(motion: JointMotion) -> tuple[list[str], str]:
         rate = np.gradient(motion.position.values, motion.position.t_s)
         if _correlation(motion.velocity.at(motion.position.t_s), rate) < -MOVING:
             return ["inverted_sensor"], "its velocity has the opposite sign of its position"
-    return list(_KINDS["opposite"]), ""
+    return list(_SYMPTOMS["opposite"][1]), ""
 
 
 def _shifted(motion: JointMotion, main: Symptom, kinds: list[str]) -> tuple[list[str], str]:

@@ -154,7 +154,8 @@ def windowed_response(command: Samples, position: Samples, period_s: float) -> R
     middle, level = median_of(p, 0.0), median_of(c, 0.0)
     rows = np.stack([np.ones_like(c), c - level, d - level, p - middle])
     # Sums over each block, then over the blocks of each window.
-    first = np.searchsorted(t_s, start + block * np.arange(count + 1, dtype=np.float64))
+    edges: FloatArray = start + block * np.arange(count + 1, dtype=np.float64)
+    first = np.searchsorted(t_s, edges)
     moments = np.zeros((windows, 4, 4))
     for row in range(4):
         for column in range(row, 4):

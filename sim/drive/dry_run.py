@@ -20,13 +20,13 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Column, table
-from undulog.capture.common.errors import SimulationError
+from undulog.capture.common.errors import SimulationError, some_names
 from undulog.capture.common.process import StopRequest
 from undulog.capture.robot.model import Robot, Safety
 
 from ..gate.gate import POSE_S, Gate
 from ..gate.limits import GateLimits, Ramp, gate_limits, missing_limits, safety_example
-from ..gate.outcome import DriveEnding, GateEvent, GateFault, some_names
+from ..gate.outcome import DriveEnding, GateEvent, GateFault
 from ..scenario.scenario import LONGEST_S, Scenario
 from ..scenario.scenario_file import parse_scenario
 from ..twin.recording import Driver, open_session

@@ -21,11 +21,11 @@ from typing import NamedTuple
 import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray, frozen
-from undulog.capture.common.errors import UsageError
+from undulog.capture.common.errors import UsageError, some_names
 from undulog.capture.robot.model import JOINT_LIMITS, OnFault, Robot, Safety
 
 from ..gait.wave import smoothstep
-from .outcome import JointStatus, some_names
+from .outcome import JointStatus
 
 _EXAMPLES = {
     "max_rate": "4.0            # rad/s, of commands",

@@ -17,13 +17,13 @@ import numpy as np
 
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.common.arrays import NS, BoolArray, FloatArray, frozen
+from undulog.capture.common.errors import some_names
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import FrameArray
 from undulog.capture.robot.model import Direction, Quantity, Robot
 from undulog.capture.sources.contract import records
 
 from ..gait.contract import CONTROL_RATE_HZ, GaitTick, Readings
-from ..gate.outcome import some_names
 from ..scenario.bus_faults import BusFault
 from ..scenario.scenario import Scenario
 from ..sensing.contract import SensorSample

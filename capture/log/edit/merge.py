@@ -25,7 +25,7 @@ from typing import cast
 
 from mcap.records import Schema
 
-from ...common.errors import DataError, UsageError
+from ...common.errors import DataError, UsageError, some_names
 from ...common.process import StopRequest
 from ..columns.layouts import names_of
 from ..columns.topics import Topics
@@ -328,8 +328,9 @@ def _other_robots(sources: Sequence[RawLog], robot: str) -> list[str]:
     for (one, names), (other, others) in combinations(joints, 2):
         unstated = not one.robot or not other.robot
         if unstated and names and others and names.isdisjoint(others):
+            here, there = (some_names(sorted(each), 3) for each in (names, others))
             warnings.append(
-                f"{one.path} has {_listed(names)}, {other.path} has {_listed(others)}: no joint "
+                f"{one.path} has {here}, {other.path} has {there}: no joint "
                 "is in both, are they of one robot?"
             )
     return warnings
@@ -344,11 +345,6 @@ def _joint_names(source: RawLog) -> set[str]:
                 first = topics.first(topic)
                 found.update(() if first is None else names_of(layout_of(first[2], first[1])))
     return found
-
-
-def _listed(names: set[str]) -> str:
-    listed = sorted(names)
-    return ", ".join(listed[:3]) + (f" and {len(listed) - 3} more" if len(listed) > 3 else "")
 
 
 def _apart(sources: Sequence[RawLog], *, allowed: bool) -> list[str]:

@@ -193,8 +193,7 @@ def _hash(paths: list[Path]) -> str:
     total = hashlib.sha256()
     for path in paths:
         with path.open("rb") as stream:
-            while piece := stream.read(_PIECE):
-                total.update(piece)
+            hashlib.file_digest(stream, lambda: total)
     return total.hexdigest()
 
 

@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ...common.errors import LogError, NotALogError
+from ...common.errors import LogError, NotALogError, some_names
 from ..mcap.file import McapFile
 from ..wal.writer import wal_folder
 
@@ -282,9 +282,8 @@ def _session_in(folder: Path) -> Path:
     if not heads:
         raise NotALogError(folder, "no session (.mcap) is in this folder; name a session's file")
     if len(heads) > 1:
-        listed = ", ".join([path.name for path in heads][:_MOST_LISTED])
-        more = f" and {len(heads) - _MOST_LISTED} more" if len(heads) > _MOST_LISTED else ""
+        listed = some_names([path.name for path in heads], _MOST_LISTED)
         fix = "join them with undulog log merge" if bag else "name one"
         what = "files of a rosbag2 folder" if bag else "sessions"
-        raise LogError(folder, f"{len(heads)} {what} are in this folder; {fix}: {listed}{more}")
+        raise LogError(folder, f"{len(heads)} {what} are in this folder; {fix}: {listed}")
     return next(iter(heads))
