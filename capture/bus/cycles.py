@@ -103,8 +103,8 @@ def _round_starts(t_ns: IntArray, joint: IntArray, joints: int) -> list[int]:
         return []
     order = np.argsort(joint, kind="stable")
     earlier = np.full(len(joint), -1)
-    again = np.diff(joint[order], prepend=-1) == 0
-    earlier[order[1:]] = np.where(again[1:], order[:-1], -1)
+    repeats = np.diff(joint[order], prepend=-1) == 0
+    earlier[order[1:]] = np.where(repeats[1:], order[:-1], -1)
     starts = [0]
     while True:
         start = starts[-1]

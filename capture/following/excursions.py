@@ -214,8 +214,8 @@ def _grows(response: Response, at_s: float) -> bool:
 def _lasting(spans: Sequence[Span], period_s: float, length_s: float) -> bool:
     """Return whether departures repeat, or one of them lasts a cycle."""
     together = sum(stop - start for start, stop in spans)
-    again = len(spans) >= MIN_DEPARTURES and together > AT_TIMES * length_s
-    return again or any(stop - start > period_s for start, stop in spans)
+    often = len(spans) >= MIN_DEPARTURES and together > AT_TIMES * length_s
+    return often or any(stop - start > period_s for start, stop in spans)
 
 
 def _described(found: Excursions, span: Span, end: float, period_s: float) -> tuple[str, str]:

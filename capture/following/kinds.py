@@ -102,12 +102,12 @@ def effort_there(
         return None
     spans = main.spans_s or (record_span(motion),)
     r = windowed_response(motion.command, motion.effort, judged.response.period_s)
-    during, beside = np.zeros_like(r.valid), np.ones_like(r.valid)
+    during, outside = np.zeros_like(r.valid), np.ones_like(r.valid)
     for start, stop in spans:
         during |= (r.start_s >= start) & (r.stop_s <= stop)
-        beside &= (r.start_s >= stop) | (r.stop_s <= start)
+        outside &= (r.start_s >= stop) | (r.stop_s <= start)
     ratio = r.ratio[during & r.valid]
-    own = r.ratio[beside & r.valid]
+    own = r.ratio[outside & r.valid]
     reference = own if main.spans_s and own.size >= BLOCKS else usual.ratio
     if ratio.size >= BLOCKS and reference.size:  # fewer windows hold parts of the usual motion
         here, there = complex_median(ratio), complex_median(reference)
@@ -224,7 +224,7 @@ def fault_of(
     kinds, decided = list(fitting), ""
     if main.name in ("still", "held") and judged is not None:
         kinds, decided = _standing(motion, judged, main, usual)
-        if main.name == "held" and _again(main, end - begin, end, judged.response.period_s):
+        if main.name == "held" and _resumes(main, end - begin, end, judged.response.period_s):
             first = ["intermittent"] if set(kinds) - {"frozen_sensor", "stale_sensor"} else []
             kinds = [*first, *kinds, *(["stale_sensor"] if "frozen_sensor" in kinds else [])]
     elif main.name == "opposite":
@@ -244,7 +244,7 @@ def fault_of(
     return Fault(motion.name, tuple(kinds), spans, since, until, share, evidence)
 
 
-def _again(main: Symptom, length: float, end: float, cycle_s: float) -> bool:
+def _resumes(main: Symptom, length: float, end: float, cycle_s: float) -> bool:
     """Return whether a joint follows again, for a cycle or more, after it stood still."""
     spans = sorted(main.spans_s)
     if any(after[0] - before[1] > cycle_s for before, after in pairwise(spans)):

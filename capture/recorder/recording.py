@@ -370,8 +370,8 @@ class Recording:
             try:
                 self._writer.close()
             except LogWriteError as error:
-                said = str(error) if ending.reason in str(error) else f"{ending.reason}; {error}"
-                ending = Ending(said if ending.failed else str(error), failed=True)
+                full = str(error) if ending.reason in str(error) else f"{ending.reason}; {error}"
+                ending = Ending(full if ending.failed else str(error), failed=True)
         return ending
 
     def _diagnose_last(self, ending: Ending) -> None:

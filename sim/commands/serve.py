@@ -198,7 +198,7 @@ def _print_end(
         "start_s": served.start_ns * 1e-9,
         **asdict(served.pace),
         "frames": bus.sent,
-        "heard": bus.heard,
+        "heard": bus.received,
         "commands": served.commands,
         "lost": served.lost,
         "hit": served.hit,

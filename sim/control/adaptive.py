@@ -128,10 +128,10 @@ class TargetHeadingPolicy:
             return math.nan
         heading = math.atan2(-field[1], field[0]) - self._compass.rpy[2]
         start = heading - now.pose.heading
-        told = np.array([math.cos(start), math.sin(start)])
+        measured = np.array([math.cos(start), math.sin(start)])
         if self._north is None:
-            self._north = LowPass(self._law.filter_s, told)
-        x, y = self._north.step(now.elapsed_s, told)
+            self._north = LowPass(self._law.filter_s, measured)
+        x, y = self._north.step(now.elapsed_s, measured)
         return math.atan2(y, x)
 
 

@@ -131,8 +131,8 @@ class ObstacleMonitor:
         self._seen = [(time_s, point) for time_s, point in self._seen if time_s > kept_s]
         points = np.array([point for _, point in self._seen]).reshape(-1, 2) - now.pose.place
         ahead, left = turned(points.T, -now.pose.way)
-        beside = np.abs(left)
-        chosen = (ahead > beside) & (beside < self._parameters.half_width_m)
+        aside = np.abs(left)
+        chosen = (ahead > aside) & (aside < self._parameters.half_width_m)
         distance = np.maximum(np.hypot(ahead, left)[chosen] - self._nose_m, 0.0)
         left = left[chosen]
         return InTheWay(

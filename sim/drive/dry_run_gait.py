@@ -247,11 +247,11 @@ class NotedGait:
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:
         """Ask the gait."""
-        said = self._gait.step(time_s, readings)
+        result = self._gait.step(time_s, readings)
         if not self._asked:
-            self._asked, self.first = True, said.command.copy()
-        self._cut.update(dict.fromkeys(said.clamped))
-        return said
+            self._asked, self.first = True, result.command.copy()
+        self._cut.update(dict.fromkeys(result.clamped))
+        return result
 
 
 class GatedGait:
@@ -275,7 +275,7 @@ class GatedGait:
         self._gate = gate
         self.tally = DemandTally(robot, limits)
         self.remarks: list[GateEvent] = []
-        self._told = 0
+        self._yielded = 0
         self._command = np.clip(np.zeros(len(robot.joints)), *robot.limits())
         self._unknown = np.full(len(robot.joints), np.nan)
         self._current = self._unknown
@@ -323,5 +323,5 @@ class GatedGait:
 
     def fresh_remarks(self) -> Iterator[GateEvent]:
         """Return the events of the gate since the last call."""
-        told, self._told = self._told, len(self.remarks)
-        yield from self.remarks[told:]
+        shown, self._yielded = self._yielded, len(self.remarks)
+        yield from self.remarks[shown:]

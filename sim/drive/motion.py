@@ -94,8 +94,8 @@ class RecordedCommands:
         """
         commands = session.joints(COMMANDS)
         gait = session.joints("/gait") if "/gait" in session.channels else None
-        told = session.messages("/gait/mode") if "/gait/mode" in session.channels else ()
-        return cls(commands, gait, tuple((t_ns, str(message.data)) for t_ns, message in told))
+        modes = session.messages("/gait/mode") if "/gait/mode" in session.channels else ()
+        return cls(commands, gait, tuple((t_ns, str(message.data)) for t_ns, message in modes))
 
 
 class CommandReplay:
@@ -336,7 +336,7 @@ def _commands(
     facts = {"driven": "commands", "driven.by": path.name}
     with Session.open(path) as session:
         recorded = RecordedCommands.read(session)
-        stored, told = session.attachments, session.metadata
+        stored, meta = session.attachments, session.metadata
         settle_s, described = session.settle_s, session.robot
         if robot is None:
             robot = described if world is None else world.robot
@@ -371,21 +371,21 @@ def _commands(
         facts=facts,
         attachments={name: stored[name] for name in _EXPLAINS if name in stored},
         settle_s=settle_s,
-        records={name: told[name] for name in _RECORDS if name in told},
-        kernels=_kernels(told.get("undulog", {}).get("kernels")),
+        records={name: meta[name] for name in _RECORDS if name in meta},
+        kernels=_kernels(meta.get("undulog", {}).get("kernels")),
         joints=recorded.commands.names,
-        heading_rad=_planned(told, _HEADING, float, path),
+        heading_rad=_planned(meta, _HEADING, float, path),
         # A plan that turns the robot repeats its commands; others change them from run to run.
-        run=_planned(told, _RUN, int, path) if _HEADING in told.get("undulog.plan", {}) else 0,
-        as_run="driven" in told.get("undulog", {}),
+        run=_planned(meta, _RUN, int, path) if _HEADING in meta.get("undulog.plan", {}) else 0,
+        as_run="driven" in meta.get("undulog", {}),
     )
 
 
 def _planned(
-    told: Mapping[str, Mapping[str, str]], key: str, kind: Callable[[str], _Number], path: Path
+    meta: Mapping[str, Mapping[str, str]], key: str, kind: Callable[[str], _Number], path: Path
 ) -> _Number:
     """A number of the plan's record."""
-    text = told.get("undulog.plan", {}).get(key, "0")
+    text = meta.get("undulog.plan", {}).get(key, "0")
     try:
         value = kind(text)
     except ValueError:
@@ -395,6 +395,6 @@ def _planned(
     return value
 
 
-def _kernels(told: str | None) -> Kernels:
+def _kernels(name: str | None) -> Kernels:
     """Return the kernels of a session; the default if unknown."""
-    return Kernels(told) if told in set(Kernels) else Kernels.NUMPY
+    return Kernels(name) if name in set(Kernels) else Kernels.NUMPY

@@ -202,8 +202,8 @@ def drive_bus(
         report.wall_s = time.monotonic() - begun
         report.first_frames = publish.first_frames
     if teller is not None:  # closed: all that could be told is
-        report.told = teller.told
-        report.not_told = teller.error or (
+        report.taken = teller.taken
+        report.not_taken = teller.error or (
             f"{teller.dropped} samples: the recorder was too slow" if teller.dropped else None
         )
     return report
@@ -229,12 +229,12 @@ def _unwritten(
         session.close()
     except LogWriteError as later:  # says what is kept, and where
         error = later
-    said = [str(error).removeprefix(f"{error.path}: ")]
+    reasons = [str(error).removeprefix(f"{error.path}: ")]
     if gate.outcome is not None:
-        said.append(gate.outcome.ended)
+        reasons.append(gate.outcome.ended)
     if tally.untold:
-        said.append(f"the last {tally.untold} control ticks are not in the session")
-    return LogWriteError(error.path, "; ".join(said))
+        reasons.append(f"the last {tally.untold} control ticks are not in the session")
+    return LogWriteError(error.path, "; ".join(reasons))
 
 
 def _feedback(gate: Gate, loop: ControlLoop) -> Feedback | None:

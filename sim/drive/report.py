@@ -91,8 +91,8 @@ class BusReport:
         held_s: How long nothing was sent as the bus was silent [s].
         feedback: What supervised it; None where the robot set the pace, or it was never armed.
         first_frames: The commands of the first tick, as candump writes frames.
-        told: Samples of the gait that the recorder took.
-        not_told: Why the recorder was not told all, or None.
+        taken: Samples of the gait that the recorder took.
+        not_taken: Why the recorder was not told all, or None.
     """
 
     plan: BusPlan
@@ -112,8 +112,8 @@ class BusReport:
     feedback: Feedback | None = None
     wall_s: float = 0.0
     first_frames: list[str] = field(default_factory=list[str])
-    told: int = 0
-    not_told: str | None = None
+    taken: int = 0
+    not_taken: str | None = None
 
     @property
     def complete(self) -> bool:
@@ -184,8 +184,8 @@ class BusReport:
             "lateness": None if self.jitter is None else self.jitter.to_dict(),
             "real_time_factor": tally.loop_s / max(self.wall_s, 1e-3),
             "first_frames": self.first_frames,
-            "gait_told": self.told,
-            "gait_not_told": self.not_told,
+            "gait_told": self.taken,
+            "gait_not_told": self.not_taken,
         }
 
     def lines(self) -> list[str]:
@@ -208,8 +208,8 @@ class BusReport:
             f"session: {plan.output}",
         ]
         if plan.recorder is not None:
-            received = f"received {self.told} samples of the gait"
+            received = f"received {self.taken} samples of the gait"
             lines.append(f"the recorder at {plan.recorder} {received}")
-        if self.not_told is not None:
-            lines.append(f"warning: it did not receive all: {self.not_told}")
+        if self.not_taken is not None:
+            lines.append(f"warning: it did not receive all: {self.not_taken}")
         return lines

@@ -57,11 +57,11 @@ class BusCheck:
         bus, messages = bus_messages(robot)
         self._robot_name = robot.name
         self._known = _sorted({frame_id(message) for message in messages.values()})
-        told = {s.message for s in bus.signals if s.direction is Direction.RX}
-        taken = {s.message for s in bus.signals if s.direction is Direction.TX}
-        replies = {frame_id(messages[name]) for name in told}
+        reported = {s.message for s in bus.signals if s.direction is Direction.RX}
+        commanded = {s.message for s in bus.signals if s.direction is Direction.TX}
+        replies = {frame_id(messages[name]) for name in reported}
         # Where a request and its reply share an identifier, hearing it tells nothing.
-        self._commands = _sorted({frame_id(messages[name]) for name in taken} - replies)
+        self._commands = _sorted({frame_id(messages[name]) for name in commanded} - replies)
         self.known = 0
         self.strange: Counter[int] = Counter()
 

@@ -54,14 +54,14 @@ def missing_limits(robot: Robot) -> tuple[str, ...]:
         Names of fields of :class:`Safety`, in its order; empty if there is nothing to add.
     """
     safety = robot.safety or Safety()
-    told = {
+    reported = {
         str(signal.quantity)
         for signal in (robot.bus.signals if robot.bus is not None else ())
         if signal.direction == "rx"
     }
     missing: list[str] = []
     for limit in _EXAMPLES:
-        if _OF_QUANTITY.get(limit, "") not in {"", *told}:
+        if _OF_QUANTITY.get(limit, "") not in {"", *reported}:
             continue
         if limit in JOINT_LIMITS:
             lacks = bool(np.isnan(safety.values(limit, robot.joint_names)).any())

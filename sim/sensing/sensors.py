@@ -134,10 +134,10 @@ class Accelerometer:
     def _measured(self, force: FloatArray, time_s: float) -> list[VectorSample]:
         force = (force[:, None] @ self._mounts.rotation)[:, 0]  # into the sensors' frames
         force += self._model.noise * self._random.standard_normal(force.shape)
-        told = self._axes * quantised(force, self._model.resolution)
+        measured = self._axes * quantised(force, self._model.resolution)
         return [
             VectorSample(name, time_s, vector)
-            for name, vector in zip(self._names, told, strict=True)
+            for name, vector in zip(self._names, measured, strict=True)
         ]
 
 
@@ -206,10 +206,10 @@ class Compass:
         level = into_frames(quaternion, np.tile(self._field[:, None], len(which)))  # the link's
         field = (level.T[:, None] @ self._mounts.rotation[which])[:, 0]  # R^T B
         field += self._model.noise * self._random.standard_normal(field.shape)
-        told = self._axes[which] * quantised(field, self._model.resolution)
+        measured = self._axes[which] * quantised(field, self._model.resolution)
         return [
             VectorSample(self._names[i], float(k * self._dt), vector)
-            for k, i, vector in zip(step.tolist(), which.tolist(), told, strict=True)
+            for k, i, vector in zip(step.tolist(), which.tolist(), measured, strict=True)
         ]
 
 
@@ -262,7 +262,7 @@ class JointPolling:
         self._kept: deque[_Period] = deque(maxlen=3)
         self._first = 0  # number of the first control period in there
         self._next = 0  # the cycle to be told next
-        self._told = np.full(joint_count, np.nan)
+        self._reported = np.full(joint_count, np.nan)
 
     def observe(self, steps: Steps) -> list[JointSample]:
         """Take in one control period.
@@ -333,10 +333,10 @@ class JointPolling:
     def _encoded(self, angle: FloatArray) -> FloatArray:
         """Return the encoders' angles, given their last ones."""
         if self._servos.dead_band > 0.0:
-            still = np.abs(angle - self._told) <= self._servos.dead_band  # false at the start
-            angle = np.where(still, self._told, angle)
-        self._told = quantised(angle, self._servos.resolution)
-        return self._told
+            still = np.abs(angle - self._reported) <= self._servos.dead_band  # false at the start
+            angle = np.where(still, self._reported, angle)
+        self._reported = quantised(angle, self._servos.resolution)
+        return self._reported
 
 
 def _between(series: FloatArray, at: FloatArray) -> FloatArray:

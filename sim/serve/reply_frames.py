@@ -225,10 +225,10 @@ class FaultLine:
         )
         if not (frozen or drawing):
             return list(samples)
-        told: list[SensorSample] = []
+        reported: list[SensorSample] = []
         for sample in samples:
             if not isinstance(sample, JointSample):
-                told.append(sample)
+                reported.append(sample)
                 continue
             position, current = sample.position.copy(), sample.current.copy()
             for fault in frozen:
@@ -236,8 +236,8 @@ class FaultLine:
                 position[i] = self._held.setdefault(fault, float(position[i]))
             for fault in drawing:
                 current[self._joint[fault.joint]] = fault.value
-            told.append(sample._replace(position=position, current=current))
-        return told
+            reported.append(sample._replace(position=position, current=current))
+        return reported
 
     def is_receiving(self, time_s: float) -> bool:
         """Whether the robot receives frames.

@@ -75,18 +75,18 @@ class CommandLatch:
         """The angles to be reached [rad], shape (m,)."""
         return self._angle.copy()
 
-    def take(self, frames: FrameArray, *, heard: bool = True) -> BoolArray:
+    def take(self, frames: FrameArray, *, received: bool = True) -> BoolArray:
         """Take frames.
 
         Args:
             frames: What was sent on the bus, marked as sent by the computer, with device times;
                 what carries no command is passed over, shape (n,).
-            heard: Whether the servos receive them.
+            received: Whether the servos receive them.
 
         Returns:
             Joints that were commanded, shape (m,).
         """
-        told = np.zeros(len(self._index), dtype=np.bool_)
+        commanded = np.zeros(len(self._index), dtype=np.bool_)
         samples, tally = self._decoder.decode(frames)
         self.frames += tally.decoded
         for decoded in samples:
@@ -96,13 +96,13 @@ class CommandLatch:
             own, values = joint[decoded.member], decoded.values
             known = ~np.isnan(values)
             own, values = own[known], values[known]
-            told[own] = True
-            if heard:
+            commanded[own] = True
+            if received:
                 cut = np.clip(values, self._lower[own], self._upper[own])
                 self.cut |= {self._names[i] for i in own[np.abs(cut - values) > _SLACK].tolist()}
                 self._angle[own] = cut  # of several commands the last one stays
                 self._time_ns[own] = frames["t_device_ns"][decoded.rows[known]]
-        return told
+        return commanded
 
     def silent(self, now_ns: int, longest_ns: int) -> BoolArray:
         """Joints that had commands and have not had one for long.
@@ -295,23 +295,23 @@ class VirtualRobot:
         self._idle(timeout_s)
         if sent := self._bus.pull():
             frames = self._bus.relay(sent, self._pacer.now_ns())
-            self._latch.take(frames, heard=self._line.is_receiving(self._tick / CONTROL_RATE_HZ))
+            self._latch.take(frames, received=self._line.is_receiving(self._tick / CONTROL_RATE_HZ))
 
     def _listen_to_all(self, tick: int) -> None:
         """Lockstep: take frames until every servo has a command, and no more."""
-        heard = self._line.is_receiving(tick / CONTROL_RATE_HZ)
+        receiving = self._line.is_receiving(tick / CONTROL_RATE_HZ)
         missing = self._latch.commanded.copy()
         pulled: list[Sent] = []
-        waited_ns, told = time.monotonic_ns(), False
+        waited_ns, warned = time.monotonic_ns(), False
         while missing.any():
             if fresh := self._bus.pull(int(missing.sum())):
-                missing &= ~self._latch.take(records(s.record for s in fresh), heard=heard)
+                missing &= ~self._latch.take(records(s.record for s in fresh), received=receiving)
                 pulled += fresh
                 continue
             self._idle(_PATIENCE_S)
-            if not told and time.monotonic_ns() - waited_ns > _PATIENCE_S * NS:
+            if not warned and time.monotonic_ns() - waited_ns > _PATIENCE_S * NS:
                 self._say("warn", f"waits for commands of {self._listed(missing)}")
-                told = True
+                warned = True
         self._keep_pace(tick)
         self._bus.relay(pulled, self._pacer.clock_ns(tick * PERIOD_NS))
 

@@ -191,8 +191,8 @@ class SessionLog:
         self._offsets = writer.joint_state("/joint_sample_offset", names, unit="s")
         self._current = writer.joint_state("/joint_current", names, unit="A")
         self._voltage = writer.joint_state("/joint_voltage", names, unit="V")
-        told = twin.gait.names  # recorded commands may come without their gait
-        self._gait = writer.joint_state("/gait", told, unit=GAIT_UNIT) if told else None
+        gait_names = twin.gait.names  # recorded commands may come without their gait
+        self._gait = writer.joint_state("/gait", gait_names, unit=GAIT_UNIT) if gait_names else None
         self._powers = {topic: writer.joint_state(topic, names, unit="W") for topic in _POWER_TERMS}
         self._booked = 0, np.zeros((len(JOINT_TERMS), len(names)))
         self._energy = writer.joint_state("/energy_ledger", TERMS, unit="J")
@@ -206,7 +206,7 @@ class SessionLog:
         self._events = writer.log("/rosout")
         self._lower, self._upper = robot.limits()
         self._last_mode = ""
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
         self._t_ns = self._epoch_ns
         writer.string("/robot_description").write(self._t_ns, description)
         for text in warnings(scenario):
@@ -224,8 +224,8 @@ class SessionLog:
         Args:
             level: ``info``, ``warn`` or ``error``.
         """
-        if text not in self._said:
-            self._said.add(text)
+        if text not in self._logged:
+            self._logged.add(text)
             self._events.write(self._t_ns, level, "twin", text)
 
     def end(self, verdict: str, reason: str) -> None:

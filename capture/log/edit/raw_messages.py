@@ -25,7 +25,6 @@ from ..mcap.chunk import PREFIX_SIZE, Block, Buffer, walk_records
 _LENGTH = struct.Struct("<Q")
 _FIXED = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time
 _BODY_AT = PREFIX_SIZE + _FIXED.size
-_PIECE = 1 << 20
 FOREVER_NS = 1 << 64
 
 

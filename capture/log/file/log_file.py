@@ -317,12 +317,12 @@ class LogFile:
         accepted = wal.accepted if wal.messages else None
         looked = looked and not wal.damaged
         self.recovered = Recovered(wal.folder, wal.live, in_files, len(rest), accepted, looked)
-        told = list(wal.warnings)
+        found = list(wal.warnings)
         if self.recovered.missing == 0:  # then a part that was only begun had no messages
             gone = [text for text in self.parts.missing if "can't be read" in text]
             self.parts.missing = [text for text in self.parts.missing if text not in gone]
-            told = [text for text in told if "no readable header" not in text]
-        self.warnings += [self.recovered.warning, *told]
+            found = [text for text in found if "no readable header" not in text]
+        self.warnings += [self.recovered.warning, *found]
 
     def _define(self, wal: WalContents) -> None:
         """Add definitions of a write-ahead log that the files don't have."""

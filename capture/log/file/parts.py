@@ -217,15 +217,15 @@ def _gaps(found: PartFiles, first: Path, there: set[int], *, bare: bool) -> list
     last = max(found.files)
     end = _part_record(found.files[last])
     gone = [number for number in range(1, last) if number not in there]
-    told = [f"part {number} ({part_path(first, number).name}) is missing" for number in gone]
+    texts = [f"part {number} ({part_path(first, number).name}) is missing" for number in gone]
     if bare:  # the write-ahead log knows how much was recorded after the last file
-        return told
+        return texts
     if "next" in end and last + 1 not in there:
         name = part_path(first, last + 1).name
-        told.append(f"part {last + 1} ({name}) is missing; whether more followed it is unknown")
+        texts.append(f"part {last + 1} ({name}) is missing; whether more followed it is unknown")
     elif "next" not in end and "parts" not in end and last > 1:
-        told.append(f"part {last} is not marked as the last: more may have followed")
-    return told
+        texts.append(f"part {last} is not marked as the last: more may have followed")
+    return texts
 
 
 def _redefines(file: McapFile, others: list[McapFile]) -> bool:

@@ -265,8 +265,10 @@ def read_statuses(kind: MessageType, message: bytes) -> tuple[DiagnosticStatus, 
             values[text[f"{item}.key"]] = text[f"{item}.value"]
             k += 1
         level = message[layout.leaves[f"{at}.level"].offset]
-        name, said, device = (text[f"{at}.{part}"] for part in ("name", "message", "hardware_id"))
-        found.append(DiagnosticStatus(level, name, said, device, values))
+        name, content, device = (
+            text[f"{at}.{part}"] for part in ("name", "message", "hardware_id")
+        )
+        found.append(DiagnosticStatus(level, name, content, device, values))
     return tuple(found)
 
 

@@ -216,8 +216,8 @@ class Recovery(Iterator[WalMessage]):
                 except FileNotFoundError:  # a log in use: released since it was listed
                     continue
                 except OSError as error:
-                    told = f"{segment.path.name} can't be read to its end: {error.strerror}"
-                    self.warnings.append(told)
+                    text = f"{segment.path.name} can't be read to its end: {error.strerror}"
+                    self.warnings.append(text)
                     reader = _closed(reader)
                     continue
                 _closed(former)
@@ -255,7 +255,7 @@ class _SegmentReader:
                 following, stop = self._search(at)
                 # A log in use: this record was being written; a later one exists, so now it is
                 # whole.
-                head = self._again(at) if following is not None else None
+                head = self._reread(at) if following is not None else None
                 if head is not None:
                     following, stop = (at, head), at
                 if stop > at:
@@ -280,7 +280,7 @@ class _SegmentReader:
     def close(self) -> None:
         self._file.close()
 
-    def _again(self, at: int) -> RecordHead | None:
+    def _reread(self, at: int) -> RecordHead | None:
         self._file.seek(0, os.SEEK_END)  # drops the read buffer
         return self._whole(at)
 
