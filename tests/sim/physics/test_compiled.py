@@ -10,7 +10,8 @@ from support.twin_runs import simulate
 from undulog.capture import Session
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.sim import FrictionLaw, Ground, World, load_scenario
-from undulog.sim.physics.bullet import BulletEngine, CompiledBulletEngine
+from undulog.sim.physics.bullet import BulletEngine
+from undulog.sim.physics.compiled_bullet import CompiledBulletEngine
 from undulog.sim.physics.compiled_kernels import CompiledLaws
 from undulog.sim.physics.engine import BodyStart
 from undulog.sim.physics.laws import NumpyLaws
