@@ -22,7 +22,7 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
-from undulog.capture.log.read.signals import Signal
+from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
 from .body.steps import GRAVITY, body_steps

@@ -39,7 +39,7 @@ from undulog.capture import Session
 from undulog.capture.common.console import progress
 from undulog.capture.common.process import threads_or_default
 from undulog.capture.log.read.joint_states import OFFSET_TOPICS
-from undulog.capture.log.read.signals import JointSignals
+from undulog.capture.log.read.sample_times import JointSignals
 
 Loaded = tuple[dict[tuple[str, str], JointSignals], dict[str, pd.DataFrame]]
 

@@ -34,8 +34,7 @@ from measuring import arguments
 
 from undulog.capture import SessionWriter
 from undulog.capture.log.messages.frames import FRAME_DTYPE, empty_frames
-from undulog.capture.sources.address import open_source, parse_address
-from undulog.capture.sources.contract import SourceContext
+from undulog.capture.sources.contract import SourceContext, open_source, parse_address
 
 TICK_S = 0.005
 STREAM_S = 60.0

@@ -21,8 +21,8 @@ from .common.lazy import attach
 
 if TYPE_CHECKING:
     from .log.columns.topics import Channel
+    from .log.read.sample_times import JointSignals, Signal
     from .log.read.session import Session, SessionView
-    from .log.read.signals import JointSignals, Signal
     from .log.write.writer import SessionWriter
     from .robot.description import load_robot, robot_names
     from .robot.model import Robot
@@ -31,12 +31,12 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
     __name__,
     {
         "Channel": "log.columns.topics",
-        "JointSignals": "log.read.signals",
+        "JointSignals": "log.read.sample_times",
         "Robot": "robot.model",
         "Session": "log.read.session",
         "SessionView": "log.read.session",
         "SessionWriter": "log.write.writer",
-        "Signal": "log.read.signals",
+        "Signal": "log.read.sample_times",
         "load_robot": "robot.description",
         "robot_names": "robot.description",
     },

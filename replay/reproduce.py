@@ -23,7 +23,7 @@ from undulog.capture.common.console import echo, emit_json
 from undulog.capture.common.errors import DataError, MissingChannelError, UsageError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.edit.raw_messages import RawLog
-from undulog.sim.commands.drive_bus import drive_armed, drive_on_bus
+from undulog.sim.commands.drive import drive_armed, dry_run_on_bus, early_end
 from undulog.sim.drive.in_process import drive_twin
 from undulog.sim.drive.motion import MotionSource, find_motion
 from undulog.sim.drive.over_bus import bus_address
@@ -270,20 +270,22 @@ def replay_on_bus(
         "force": force,
     }
     if not arm:
-        return drive_on_bus(driven, on, arm=False, as_json=as_json, **given)
-    run = drive_armed(driven, on, **given)
+        return dry_run_on_bus(driven, on, as_json=as_json, **given)
+    report = drive_armed(driven, on, **given)
     comparison, why = None, "it did not run to its end"
-    if run.complete:
-        with Session.open(file) as first, Session.open(run.plan.output) as second:
+    if report.complete:
+        with Session.open(file) as first, Session.open(report.plan.output) as second:
             comparison, why = compared(first, second)
     if as_json:
         told = None if comparison is None else comparison.to_dict()
-        emit_json({"original": str(file), **run.facts(), "comparison": told, "not_compared": why})
+        emit_json(
+            {"original": str(file), **report.facts(), "comparison": told, "not_compared": why}
+        )
     else:
-        echo(*run.lines())
+        echo(*report.lines())
         if comparison is not None:
             show(comparison)
-        elif run.complete:
+        elif report.complete:
             echo(f"Not compared: {why}")
-        echo(*what_next(file, run.plan.output, comparable=comparison is not None))
-    return run.complain()
+        echo(*what_next(file, report.plan.output, comparable=comparison is not None))
+    return early_end(report)

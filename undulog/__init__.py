@@ -28,7 +28,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "import": ("capture import_export:import_log", "Bring in a foreign log: CAN traces, CSV."),
     "log info": ("capture log_info:log_info", "Show what a log holds."),
     "log check": (
-        "capture log_check:log_check",
+        "capture log_info:log_check",
         "Judge whether a session is good, degraded or bad, and why.",
     ),
     "log recover": ("capture log_edit:log_recover", "Write a whole file from what a crash left."),

@@ -18,7 +18,7 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.common.process import in_threads
-from undulog.capture.log.read.signals import LARGEST, Signal
+from undulog.capture.log.read.sample_times import LARGEST, Signal
 
 from ..estimators.series import Series, clean_together
 from ..results.artefact import FALSIFYING, Artefact, Span

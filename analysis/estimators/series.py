@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray, IntArray, frozen
-from undulog.capture.log.read.signals import LARGEST, Signal
+from undulog.capture.log.read.sample_times import LARGEST, Signal
 
 GAP_FACTOR = 3.0
 """An interval longer than this many median intervals is a gap: nothing is assumed inside it."""

@@ -31,7 +31,7 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.common.errors import MissingChannelError, UsageError
-from undulog.capture.log.read.signals import JointSignals, Signal
+from undulog.capture.log.read.sample_times import JointSignals, Signal
 
 from ..signals.columns import RESPONSE_TOPIC, planes_of
 

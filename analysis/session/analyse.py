@@ -12,7 +12,7 @@ from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
-from undulog.capture.log.read.signals import Signal
+from undulog.capture.log.read.sample_times import Signal
 
 from ..artefacts.find import find_artefacts
 from ..body.motion import body_motion

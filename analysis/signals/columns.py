@@ -12,7 +12,7 @@ from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.following.session import MOST_JOINTS
 from undulog.capture.log.messages.definitions import PowerTopic
-from undulog.capture.log.read.signals import JointSignals, Signal
+from undulog.capture.log.read.sample_times import JointSignals, Signal
 from undulog.capture.robot.model import Robot
 
 from ..response.rhythm import DRIVEN_SHARE

@@ -12,8 +12,7 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError, UsageError
-from undulog.capture.log.read.sample_times import longest_unbroken
-from undulog.capture.log.read.signals import Signal
+from undulog.capture.log.read.sample_times import Signal, longest_unbroken
 
 from ..estimators.series import clean
 from ..response.rhythm import MIN_CYCLES

@@ -73,8 +73,7 @@ class RoundGatherer:
 
     def finish(self) -> Rounds:
         """Return the last round, complete or not."""
-        starts = _round_starts(self._t_ns, self._joint, self._joints)
-        return self._take(starts, len(self._t_ns))
+        return self._take(_round_starts(self._t_ns, self._joint, self._joints), len(self._t_ns))
 
     def _take(self, starts: list[int], stop: int) -> Rounds:
         """Turn the samples before ``stop`` into rounds and keep the rest."""
@@ -104,8 +103,8 @@ def _round_starts(t_ns: IntArray, joint: IntArray, joints: int) -> list[int]:
         return []
     order = np.argsort(joint, kind="stable")
     earlier = np.full(len(joint), -1)
-    again = np.diff(joint[order], prepend=-1) == 0
-    earlier[order[1:]] = np.where(again[1:], order[:-1], -1)
+    repeats = np.diff(joint[order], prepend=-1) == 0
+    earlier[order[1:]] = np.where(repeats[1:], order[:-1], -1)
     starts = [0]
     while True:
         start = starts[-1]

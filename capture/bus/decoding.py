@@ -88,37 +88,25 @@ class FrameTally:
 
     def problems(self) -> list[str]:
         """Return a sentence for each kind of frame that is an error or lost its samples."""
-        lines: list[str] = []
-        if self.errors:
-            lines.append(f"{self.errors} error frames")
-        if self.short:
-            lines.append(
-                f"{self.short.total()} values missing from frames too short for them: "
-                f"{counts_text(self.short)}"
-            )
-        if self.undirected:
-            lines.append(
-                f"{self.undirected.total()} frames not decoded: they differ only in direction, "
-                f"which the log does not have: {counts_text(self.undirected)}"
-            )
-        return lines
+        why = "they differ only in direction, which the log does not have"
+        return [
+            *([f"{self.errors} error frames"] if self.errors else []),
+            *_counted(self.short, "values missing from frames too short for them"),
+            *_counted(self.undirected, f"frames not decoded: {why}"),
+        ]
 
     def notes(self) -> list[str]:
         """Return a sentence for each kind of frame that is valid and has no sample."""
-        lines: list[str] = []
-        if self.remote:
-            lines.append(f"{self.remote} remote frames, which carry no data")
-        if self.unknown:
-            lines.append(
-                f"{self.unknown.total()} frames with identifiers that are in no database: "
-                f"{counts_text(self.unknown)}"
-            )
-        if self.silent:
-            lines.append(
-                f"{self.silent.total()} frames of known identifiers with nothing that the map "
-                f"names: {counts_text(self.silent)}"
-            )
-        return lines
+        remote = f"{self.remote} remote frames, which carry no data"
+        return [
+            *([remote] if self.remote else []),
+            *_counted(self.unknown, "frames with identifiers that are in no database"),
+            *_counted(self.silent, "frames of known identifiers with nothing that the map names"),
+        ]
+
+
+def _counted(counts: Counter[str], what: str) -> list[str]:
+    return [f"{counts.total()} {what}: {counts_text(counts)}"] if counts else []
 
 
 @dataclass(frozen=True)

@@ -73,8 +73,7 @@ class _Slot:
     def placed(self, value: float, size: int) -> int:
         if value == math.inf and self.entry.out_of_range is not None:
             return self.code(self.entry.out_of_range, size)
-        physical = self.entry.physical(value)
-        bits = self.entry.bits.raw_bits(physical, self.within)
+        bits = self.entry.bits.raw_bits(self.entry.physical(value), self.within)
         return self.entry.bits.placed(bits, size)
 
     def code(self, raw: int, size: int) -> int:
@@ -189,7 +188,11 @@ def _frames_of(message: Message, signals: list[BusSignal]) -> list[_Frame]:
     """Return one frame for each combination of multiplexer values that the entries need."""
     dbc = {each.name: each for each in message.signals}
     entries = {signal: compile_entry(message, signal) for signal in signals}
-    selections = dict.fromkeys(_selection(entry) for entry in entries.values())
+    # The multiplexers above each entry, with the least values that select it.
+    selections = dict.fromkeys(
+        tuple((bits, min(identifiers)) for bits, identifiers in entry.conditions)
+        for entry in entries.values()
+    )
     if len(selections) > 1:
         selections.pop((), None)  # what is in every frame needs none of its own
     frames: list[_Frame] = []
@@ -216,11 +219,6 @@ def _frames_of(message: Message, signals: list[BusSignal]) -> list[_Frame]:
                 default[key] = slot.code(slot.entry.unknown, message.length)
         frames.append(_Frame(frame_id(message), message.length, fixed, slots, default))
     return frames
-
-
-def _selection(entry: MapEntry) -> tuple[tuple[BitField, int], ...]:
-    """Return the multiplexers above an entry, each with the least value that selects it."""
-    return tuple((bits, min(identifiers)) for bits, identifiers in entry.conditions)
 
 
 def _selected(conditions: Conditions, chosen: Mapping[BitField, int]) -> bool:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from ..common.console import echo, emit_json
+from ..common.console import emit
 from ..common.errors import ImportFormatError, UsageError
 from ..common.files import check_output, is_file
 
 if TYPE_CHECKING:
+    from ..exchange.can_import import ImportReport
     from ..exchange.csv_import import ColumnMap
-    from ..exchange.import_output import ImportReport
     from ..robot.model import Robot
 
 
@@ -67,10 +68,7 @@ def import_log(
             report = import_can(log, output, described, bus=bus, force=force, stop=stop)
         else:
             report = import_csv(log, output, described, column_map, force=force, stop=stop)
-    if json:
-        emit_json(report.as_json())
-    else:
-        _print_import(report)
+    emit(report.as_json(), _import_lines(report), as_json=json)
     return 0 if report.complete else 1
 
 
@@ -133,11 +131,9 @@ def export_log(
             what = f"{counts['frames']} frames of {', '.join(trace.buses)}, "
             what += f"in the format of {trace.title}"
             warnings = trace.warnings
-    if json:
-        facts = {"source": str(session), "output": str(output), **counts, "warnings": warnings}
-        emit_json(facts)
-        return
-    echo(f"{output}: {what}", *(f"  warning: {warning}" for warning in warnings))
+    facts = {"source": str(session), "output": str(output), **counts, "warnings": warnings}
+    lines = [f"{output}: {what}", *(f"  warning: {warning}" for warning in warnings)]
+    emit(facts, lines, as_json=json)
 
 
 def _column_map(
@@ -160,16 +156,14 @@ def _column_map(
     return column_map_from_options(options, robot)
 
 
-def _print_import(report: ImportReport) -> None:
+def _import_lines(report: ImportReport) -> Iterator[str]:
     frames = f"{report.frames} CAN frames, " if report.frames is not None else ""
-    echo(
-        f"{report.output}: {report.duration_s:.1f} s of {report.robot}, {frames}"
-        f"verdict {report.verdict}"
-    )
+    length = f"{report.duration_s:.1f} s of {report.robot}"
+    yield f"{report.output}: {length}, {frames}verdict {report.verdict}"
     if not report.complete:
-        echo("stopped on request; the file is complete up to there")
+        yield "stopped on request; the file is complete up to there"
     width = max(map(len, report.samples), default=0)
     for topic, count in sorted(report.samples.items()):
-        echo(f"  {topic:<{width}}  {count} messages")
-    echo(*(f"  problem: {problem}" for problem in report.problems))
-    echo(*(f"  note: {note}" for note in report.notes))
+        yield f"  {topic:<{width}}  {count} messages"
+    yield from (f"  problem: {problem}" for problem in report.problems)
+    yield from (f"  note: {note}" for note in report.notes)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 from importlib.metadata import PackageNotFoundError, version
 
-from ..common.console import echo, emit_json
+from ..common.console import emit
 
 _BASE = ("undulog", "numpy", "scipy", "pandas", "mcap", "python-can", "cantools")
 _EXTRAS: dict[str, tuple[str, ...]] = {
@@ -46,14 +46,13 @@ def info(*, json: bool = False) -> None:
         extra: {name: package_version(name) for name in packages}
         for extra, packages in _EXTRAS.items()
     }
-    if json:
-        emit_json({"platform": platform.platform(), "packages": base_versions(), "extras": extras})
-        return
-    packages = base_versions()
-    echo(f"undulog {packages['undulog']} on Python {packages['python']}, {platform.platform()}")
-    echo("packages  " + ", ".join(f"{k} {v}" for k, v in packages.items() if k != "undulog"))
+    packages, system = base_versions(), platform.platform()
+    lines = [
+        f"undulog {packages['undulog']} on Python {packages['python']}, {system}",
+        "packages  " + ", ".join(f"{k} {v}" for k, v in packages.items() if k != "undulog"),
+    ]
     for extra, found in extras.items():
-        missing = [name for name, number in found.items() if number is None]
-        listed = ", ".join(f"{name} {number}" for name, number in found.items() if number)
-        state = listed if not missing else f"not installed: pip install 'undulog[{extra}]'"
-        echo(f"{extra:<9} {state}")
+        listed = ", ".join(f"{name} {number}" for name, number in found.items())
+        missing = f"not installed: pip install 'undulog[{extra}]'"
+        lines.append(f"{extra:<9} {missing if None in found.values() else listed}")
+    emit({"platform": system, "packages": packages, "extras": extras}, lines, as_json=json)

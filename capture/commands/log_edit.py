@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from ..common.console import echo, emit_json
+from ..common.console import emit
 from ..common.process import interruptible
 
 if TYPE_CHECKING:
@@ -44,21 +45,14 @@ def log_recover(
 
     with interruptible() as request:
         report = recover_log(file, output or recovered_path(file), force=force, stop=request)
-    if json:
-        emit_json(report.as_json())
-    else:
-        _print_recovered(report)
-
-
-def _print_recovered(report: RecoverReport) -> None:
     messages = sum(report.messages.values())
     missing = {None: "how many are missing is unknown", 0: "none is missing"}
     lost = missing.get(report.missing, f"{report.missing} are missing")
-    echo(
+    first = (
         f"{report.output}: {messages} messages over {report.duration_s:.2f} s, "
-        f"{report.from_wal} of them from the write-ahead log; {lost}",
-        *_remarks(report),
+        f"{report.from_wal} of them from the write-ahead log; {lost}"
     )
+    emit(report.as_json(), [first, *_remarks(report)], as_json=json)
 
 
 def _remarks(report: EditReport | RecoverReport) -> list[str]:
@@ -116,7 +110,7 @@ def log_cut(
             force=force,
             stop=request,
         )
-    _print_report(report, as_json=json)
+    emit(report.as_json(), _lines(report), as_json=json)
 
 
 def log_merge(
@@ -151,19 +145,14 @@ def log_merge(
 
     with interruptible() as request:
         report = merge_logs(files, output, robot=robot, apart=apart, force=force, stop=request)
-    _print_report(report, as_json=json)
+    emit(report.as_json(), _lines(report), as_json=json)
 
 
-def _print_report(report: EditReport, *, as_json: bool) -> None:
-    if as_json:
-        emit_json(report.as_json())
-        return
+def _lines(report: EditReport) -> Iterator[str]:
     messages = sum(report.messages.values())
     origin = ", ".join(dict.fromkeys(source["session_id"] for source in report.sources))
-    echo(
-        f"{report.output}: {report.duration_s:.2f} s of {origin}, {messages} messages, "
-        f"{report.output.stat().st_size / 1e6:.1f} MB",
-        *_remarks(report),
-    )
+    size = f"{report.output.stat().st_size / 1e6:.1f} MB"
+    yield f"{report.output}: {report.duration_s:.2f} s of {origin}, {messages} messages, {size}"
+    yield from _remarks(report)
     width = max(map(len, report.messages), default=0)
-    echo(*(f"  {topic:<{width}}  {count} messages" for topic, count in report.messages.items()))
+    yield from (f"  {topic:<{width}}  {count} messages" for topic, count in report.messages.items())

@@ -1,18 +1,26 @@
-"""Command ``log info``: what a log holds, of our making or not."""
+"""Commands ``log info``: what a log holds, and ``log check``: its health, from its data alone."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..common.console import echo, emit_json
+from ..common.console import emit, progress
 from ..common.errors import DataError
 from ..log.columns.topics import Channel
 from ..log.messages.frames import FD_TOPIC_PREFIX
 from ..log.read.session import Session
+
+if TYPE_CHECKING:
+    from ..log.health.bus_tally import SourceHealth
+    from ..log.health.session_check import SessionHealth
+    from ..log.health.tallies import BusHealth, SeriesHealth
 
 _MESSAGES_PER_LOOK = 1000
 
@@ -91,13 +99,10 @@ def log_info(file: Path, /, *, json: bool = False) -> None:
     """
     with Session.open(file) as session:
         facts = describe(session)
-    if json:
-        emit_json(facts)
-    else:
-        _print_facts(facts)
+    emit(facts, _info_lines(facts), as_json=json)
 
 
-def _print_facts(facts: dict[str, Any]) -> None:
+def _info_lines(facts: dict[str, Any]) -> Iterator[str]:
     session = facts["session"]
     robot = f"{session['robot']}, {session['joints']} joints" if session["robot"] else "no robot"
     messages = sum(topic["messages"] for topic in facts["topics"])
@@ -107,30 +112,30 @@ def _print_facts(facts: dict[str, Any]) -> None:
         if session["start_utc"]
         else "no messages"
     )
-    echo(f"{session['id']}: {robot}, {held}, {_size(session['size_bytes'])}{parts}")
-    echo(*(f"warning: {warning}" for warning in facts["warnings"]))
+    yield f"{session['id']}: {robot}, {held}, {_size(session['size_bytes'])}{parts}"
+    yield from (f"warning: {warning}" for warning in facts["warnings"])
     foreign = Counter(t["encoding"] or "no encoding" for t in facts["topics"] if not t["read"])
     if foreign:
         order = sorted(foreign.items(), key=lambda item: (-item[1], item[0]))
         listed = ", ".join(f"{encoding} {count}" for encoding, count in order)
         topics = "1 topic is" if foreign.total() == 1 else f"{foreign.total()} topics are"
-        echo(f"warning: {topics} not of ROS 2 and can't be read, only listed: {listed}")
+        yield f"warning: {topics} not of ROS 2 and can't be read, only listed: {listed}"
     names = [_type(topic) for topic in facts["topics"]]
     width = max([len(topic["topic"]) for topic in facts["topics"]] + [5])
     kinds = max([len(name) for name in names] + [4])
-    echo("", f"{'topic':<{width}}  {'type':<{kinds}}  {'messages':>8}  {'rate/Hz':>8}  unit")
+    yield ""
+    yield f"{'topic':<{width}}  {'type':<{kinds}}  {'messages':>8}  {'rate/Hz':>8}  unit"
     for topic, name in zip(facts["topics"], names, strict=True):
         rate = f"{topic['rate_hz']:8.1f}" if topic["rate_hz"] is not None else " " * 8
         held = f"{topic['frames']} frames" if topic["frames"] is not None else topic["unit"] or ""
-        echo(
-            f"{topic['topic']:<{width}}  {name:<{kinds}}  {topic['messages']:>8}  "
-            f"{rate}  {held}".rstrip()
-        )
+        start = f"{topic['topic']:<{width}}  {name:<{kinds}}  {topic['messages']:>8}"
+        yield f"{start}  {rate}  {held}".rstrip()
     if facts["attachments"]:
         listed = (f"{name} ({size} bytes)" for name, size in facts["attachments"].items())
-        echo("", f"attached: {', '.join(listed)}")
+        yield ""
+        yield f"attached: {', '.join(listed)}"
     writer = session["library"] or "an unnamed program"
-    echo(f"verdict: {session['verdict'] or 'none stored'}; written by {writer}")
+    yield f"verdict: {session['verdict'] or 'none stored'}; written by {writer}"
 
 
 def _type(topic: dict[str, Any]) -> str:
@@ -147,3 +152,152 @@ def _size(size_bytes: int) -> str:
 
 def _utc(t_ns: int) -> str:
     return datetime.fromtimestamp(t_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def log_check(file: Path, /, *, json: bool = False) -> int:
+    """Judge whether a recorded session is good, degraded or bad, and why.
+
+    Everything is computed from the data: rhythm, gaps, jitter and dropped messages of every
+    channel, values that are not a number, frozen joints and joints at their limits, the CRC of
+    every chunk, error frames and load of the bus. Exit code 1 for a bad session.
+
+    Example: `undulog log check run.mcap`
+
+    Args:
+        file: An MCAP file, of any make.
+        json: Print one JSON object.
+    """
+    from ..log.health.session_check import check_session
+
+    with progress(f"checking {file.name}", 1.0) as bar:
+        health = check_session(file, bar.update)
+    emit(as_json(health), _check_lines(health), as_json=json)
+    return int(health.verdict == "bad")
+
+
+def as_json(health: SessionHealth) -> dict[str, Any]:
+    """Return a session's health as plain JSON values.
+
+    Returns:
+        ``verdict``, ``reasons``, ``notes``, ``stored``, ``session``, ``file``, ``channels``,
+        ``series``, ``joints``, ``buses``, ``sources``; what can't be computed is null.
+    """
+    series = [
+        asdict(each) | {"timing": asdict(each.timing) | {"rate_hz": each.timing.rate_hz}}
+        for each in health.series
+    ]
+    return {
+        "verdict": health.verdict,
+        "reasons": list(health.reasons),
+        "notes": list(health.notes),
+        "stored": {
+            "verdict": health.stored,
+            "reasons": list(health.stored_reasons),
+            "differs": None if health.stored is None else health.stored != health.verdict,
+        },
+        "session": {
+            "id": health.session_id,
+            "path": str(health.path),
+            "robot": health.robot,
+            "start_ns": health.start_ns,
+            "duration_s": health.duration_s,
+        },
+        "file": asdict(health.file),
+        "channels": [asdict(channel) for channel in health.channels],
+        "series": series,
+        "joints": [asdict(joint) for joint in health.joints],
+        "buses": [asdict(bus) for bus in health.buses],
+        "sources": [asdict(source) for source in health.sources],
+    }
+
+
+def _check_lines(health: SessionHealth) -> Iterator[str]:
+    robot = f"{health.robot}, " if health.robot else ""
+    count = len(health.reasons)
+    why = f", for {count} reason{'s' if count != 1 else ''}" if count else ""
+    yield f"{health.verdict}: {health.session_id}, {robot}{health.duration_s:.2f} s{why}"
+    yield from (f"  {sentence}" for sentence in health.reasons)
+    yield from (f"  note: {sentence}" for sentence in health.notes)
+    yield _stored_line(health)
+    yield from _series_lines(health)
+    for line in (*map(_bus_line, health.buses), *map(_source_line, health.sources)):
+        yield from ("", line)
+    yield from _sequence_lines(health)
+    file = health.file
+    crc = f"{file.checked} of {file.chunks} chunks have the CRC that they should have"
+    yield from ("", f"{crc}, {file.without_crc} carry none")
+    yield (
+        "Intervals are between stamps (log times where there are none); a gap is longer than 1.5 "
+        "medians."
+    )
+
+
+def _stored_line(health: SessionHealth) -> str:
+    if health.stored is None:
+        return "stored verdict: none"
+    if health.stored == health.verdict:
+        return f"stored verdict: {health.stored}, the same"
+    reasons = f" ({'; '.join(health.stored_reasons)})" if health.stored_reasons else ""
+    return f"stored verdict: {health.stored}{reasons}; from the data: {health.verdict}"
+
+
+def _series_lines(health: SessionHealth) -> Iterator[str]:
+    width = max([len(each.label) for each in health.series] + [6])
+    yield ""
+    yield (
+        f"{'series':<{width}}  {'samples':>8}  {'rate/Hz':>8}  {'gaps':>5}  {'missing':>7}  "
+        f"{'longest/s':>9}  {'jitter':>6}  {'p99':>5}  {'twice':>5}  {'back':>4}  {'NaN':>6}"
+    )
+    yield from (_series_line(each, width) for each in health.series)
+
+
+def _series_line(each: SeriesHealth, width: int) -> str:
+    timing = each.timing
+    rhythm = timing.regular and timing.median_s
+    jitter = f"{(timing.std_s or 0) / timing.median_s:.1%}" if rhythm and timing.median_s else "-"
+    p99 = f"{(timing.p99_s or 0) / timing.median_s:.2f}" if rhythm and timing.median_s else "-"
+    gaps, missing = (timing.gaps, timing.missing) if rhythm else ("-", "-")
+    rate = f"{timing.rate_hz:.1f}" if timing.rate_hz is not None else "-"
+    return (
+        f"{each.label:<{width}}  {timing.count:>8}  {rate:>8}  {gaps:>5}  {missing:>7}  "
+        f"{timing.longest_s:>9.3g}  {jitter:>6}  {p99:>5}  {timing.duplicates:>5}  "
+        f"{timing.backward:>4}  {each.nan:>6}"
+    )
+
+
+def _sequence_lines(health: SessionHealth) -> Iterator[str]:
+    kinds: dict[str, list[str]] = {}
+    for channel in health.channels:
+        kinds.setdefault(channel.sequence.kind, []).append(channel.topic)
+    counted = [each for each in health.channels if each.sequence.kind == "counted"]
+    dropped = math.fsum(each.sequence.dropped or 0 for each in counted)
+    yield ""
+    if counted:
+        yield f"sequence numbers: {dropped:.0f} messages dropped in {len(counted)} channels"
+    if "none" in kinds:
+        yield f"no sequence numbers, so drops can't be proved: {', '.join(kinds['none'])}"
+    if "not a count" in kinds:
+        yield f"sequence numbers that don't count messages: {', '.join(kinds['not a count'])}"
+
+
+def _source_line(source: SourceHealth) -> str:
+    lost = "losses unknown" if source.dropped is None else f"{source.dropped} lost before us"
+    return (
+        f"source {source.name}, as its recorder counted: {source.frames} frames, {lost}, "
+        f"{source.malformed} unreadable, connected again {source.reconnects} times"
+    )
+
+
+def _bus_line(bus: BusHealth) -> str:
+    rate = f", {bus.rate_hz:.1f} Hz" if bus.rate_hz is not None else ""
+    fd = bus.topic.startswith(FD_TOPIC_PREFIX)
+    load = ", load not estimated" if fd else ", load unknown (no bitrate)"
+    if bus.load is not None and bus.peak_load is not None:
+        load = (
+            f", load {bus.load[0]:.1%} to {bus.load[1]:.1%} of the bitrate "
+            f"(busiest second {bus.peak_load[0]:.1%} to {bus.peak_load[1]:.1%})"
+        )
+    return (
+        f"{bus.topic}: {bus.frames} frames{rate}, {bus.error_frames} error frames, "
+        f"longest silence {bus.longest_s:.3g} s{load}"
+    )

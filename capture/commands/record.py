@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from ..common.console import complain, echo, emit_json
-from ..common.errors import UndulogError
+from ..common.console import complain, emit
+from ..common.errors import UndulogError, some_names
 from .record_control import counted_faults
 
 if TYPE_CHECKING:
@@ -93,10 +93,7 @@ def record(
     resolved = resolve({name: options[name] for name in PARSERS}, os.environ, settings)
     with interruptible() as stop:
         report = _run(resolved, stop)
-    if json:
-        emit_json(report.as_json())
-    elif not resolved.quiet:
-        _print_report(report)
+    emit(report.as_json(), () if resolved.quiet else _lines(report), as_json=json)
     if report.ending.failed:
         complain(f"error: {report.ending.reason}")
     return int(report.ending.failed)
@@ -146,17 +143,16 @@ def _live_view(socket: Path, relay: ExitStack) -> Callable[[], str]:
     return look
 
 
-def _print_report(report: RecordReport) -> None:
-    names = ", ".join(str(file) for file in report.files[:3])
-    names += f" and {len(report.files) - 3} more" if len(report.files) > 3 else ""
-    echo(
+def _lines(report: RecordReport) -> Iterator[str]:
+    names = some_names([str(file) for file in report.files], 3)
+    yield (
         f"{names or 'nothing written'}: {report.duration_s:.1f} s of {report.robot or 'raw data'}, "
         f"{report.messages} messages, {report.size / 1e6:.1f} MB, verdict {report.verdict}"
     )
-    echo(f"  ended: {report.ending.reason}")
+    yield f"  ended: {report.ending.reason}"
     for name, counts in report.sources.items():
         dropped = counts["dropped"]
         lost = "losses unknown" if dropped is None else f"{dropped} lost before us"
         facts = [f"{counts['frames']} frames", lost, *counted_faults(counts)]
-        echo(f"  {name}: {', '.join(facts)}")
-    echo(*(f"  reason: {reason}" for reason in report.reasons))
+        yield f"  {name}: {', '.join(facts)}"
+    yield from (f"  reason: {reason}" for reason in report.reasons)

@@ -15,6 +15,10 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 _Array = TypeVar("_Array", bound=NDArray[Any])
 
 
+NS = 1_000_000_000
+"""Nanoseconds in a second."""
+
+
 def frozen(array: _Array) -> _Array:
     """Mark an array read-only, in place, and return it."""
     array.setflags(write=False)

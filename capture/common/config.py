@@ -171,6 +171,5 @@ def write(value: Any) -> dict[str, Any]:
     for name, one in declared(value.__class__).items():
         part = getattr(value, name)
         if part is not None:
-            nested = dataclasses.is_dataclass(cast("object", part))
-            table[one.key] = write(part) if nested else part
+            table[one.key] = write(part) if dataclasses.is_dataclass(cast("object", part)) else part
     return table

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sys
 import unicodedata
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,6 +101,14 @@ def progress(description: str, total: float) -> Generator[Progress]:
                 bars.update(task, completed=done, note=plain(note))
 
         yield _Bar()
+
+
+def emit(facts: Any, lines: Iterable[str], *, as_json: bool) -> None:
+    """Print a result on stdout, as one JSON value or as lines of text."""
+    if as_json:
+        emit_json(facts)
+    else:
+        echo(*lines)
 
 
 def emit_json(value: Any) -> None:

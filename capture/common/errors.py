@@ -182,6 +182,12 @@ class NotALogError(LogError):
     """Not an MCAP file, or nothing in it can be read."""
 
 
+def some_names(names: Sequence[str], most: int) -> str:
+    """Return a list of at most so many names, and the number of the others."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
 class MissingChannelError(LogError, KeyError):
     """A topic, joint or field that the log does not have."""
 
@@ -189,9 +195,7 @@ class MissingChannelError(LogError, KeyError):
         """Build the message."""
         self.wanted = wanted
         self.available = tuple(available)
-        listed = ", ".join(available[:_MOST_LISTED]) if available else "nothing"
-        if len(available) > _MOST_LISTED:
-            listed += f" and {len(available) - _MOST_LISTED} more"
+        listed = some_names(available, _MOST_LISTED) or "nothing"
         LogError.__init__(self, path, f"has no {wanted}; it has {listed}")
 
     def __str__(self) -> str:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import uuid
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,14 +54,12 @@ class ObjectStore:
         self._parquet: Any = pq
         self.where = where
         self.is_local = "://" not in where
-        try:
+        with _errors(InputFileError, where, (OSError, ValueError)):
             if self.is_local:
                 self.filesystem: Any = self._fs_module.LocalFileSystem()
                 self.base = Path(where).resolve().as_posix()
             else:
                 self.filesystem, self.base = self._fs_module.FileSystem.from_uri(where)
-        except (OSError, ValueError) as error:
-            raise InputFileError(where, str(error)) from error
 
     def path(self, name: str) -> str:
         """Return the path of a file in its file system."""
@@ -72,11 +71,9 @@ class ObjectStore:
         Raises:
             InputFileError: If one can't be made.
         """
-        try:
+        with _errors(InputFileError, self.where):
             for name in names:
                 self.filesystem.create_dir(self.path(name), recursive=True)
-        except OSError as error:
-            raise InputFileError(self.where, str(error)) from error
 
     def files(
         self, folder: str = "", endings: Sequence[str] = ("",), *, recursive: bool = False
@@ -93,10 +90,8 @@ class ObjectStore:
         selector = self._fs_module.FileSelector(
             self.path(folder), allow_not_found=True, recursive=recursive
         )
-        try:
+        with _errors(InputFileError, self.where):
             found = self.filesystem.get_file_info(selector)
-        except OSError as error:
-            raise InputFileError(self.where, str(error)) from error
         start = len(self.base) + 1
         files = [
             StoredFile(info.path[start:], info.size or 0, info.mtime_ns or 0)
@@ -111,11 +106,11 @@ class ObjectStore:
         Raises:
             InputFileError: If it can't be read.
         """
-        try:
-            with self.filesystem.open_input_stream(self.path(name)) as stream:
-                return stream.read()
-        except OSError as error:
-            raise InputFileError(f"{self.where}/{name}", str(error)) from error
+        with (
+            _errors(InputFileError, f"{self.where}/{name}"),
+            self.filesystem.open_input_stream(self.path(name)) as stream,
+        ):
+            return stream.read()
 
     def read_table(self, name: str, columns: Sequence[str] | None = None) -> Any:
         """Read a Parquet file.
@@ -129,12 +124,9 @@ class ObjectStore:
         Raises:
             InputFileError: If it can't be read.
         """
-        try:
-            return self._parquet.read_table(
-                self.path(name), columns=columns, filesystem=self.filesystem
-            )
-        except (OSError, ValueError) as error:
-            raise InputFileError(f"{self.where}/{name}", str(error)) from error
+        path, files = self.path(name), self.filesystem
+        with _errors(InputFileError, f"{self.where}/{name}", (OSError, ValueError)):
+            return self._parquet.read_table(path, columns=columns, filesystem=files)
 
     def write(self, name: str, data: bytes) -> None:
         """Write a file whole or not at all; one that is there is replaced.
@@ -143,7 +135,7 @@ class ObjectStore:
             LogWriteError: If it can't be written.
         """
         path = self.path(name)
-        try:
+        with _errors(LogWriteError, f"{self.where}/{name}"):
             if self.is_local:
                 part = Path(f"{path}.{os.getpid()}-{uuid.uuid4().hex[:8]}.part")
                 try:
@@ -154,8 +146,6 @@ class ObjectStore:
             else:
                 with self.filesystem.open_output_stream(path) as stream:
                     stream.write(data)
-        except OSError as error:
-            raise LogWriteError(f"{self.where}/{name}", str(error)) from error
 
     def write_table(self, name: str, table: Any) -> None:
         """Write a ``pyarrow.Table`` as Parquet, whole or not at all.
@@ -176,9 +166,18 @@ class ObjectStore:
         Raises:
             LogWriteError: If it can't be removed.
         """
-        try:
+        with _errors(LogWriteError, f"{self.where}/{name}"), suppress(FileNotFoundError):
             self.filesystem.delete_file(self.path(name))
-        except FileNotFoundError:
-            return
-        except OSError as error:
-            raise LogWriteError(f"{self.where}/{name}", str(error)) from error
+
+
+@contextmanager
+def _errors(
+    kind: type[InputFileError | LogWriteError],
+    where: str,
+    caught: tuple[type[Exception], ...] = (OSError,),
+) -> Generator[None]:
+    """Turn errors of a file system into one that names the file."""
+    try:
+        yield
+    except caught as error:
+        raise kind(where, str(error)) from error

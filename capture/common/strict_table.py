@@ -77,8 +77,7 @@ def listed(words: Iterable[str], found: object = None) -> str:
     """List the valid words, ``a, b, c``, and ``(did you mean b?)`` if ``found`` is close to one."""
     valid = list(words)
     near = difflib.get_close_matches(found, valid, n=1) if isinstance(found, str) else []
-    hint = f" (did you mean {near[0]}?)" if near else ""
-    return (", ".join(valid) or "none") + hint
+    return (", ".join(valid) or "none") + (f" (did you mean {near[0]}?)" if near else "")
 
 
 _COMPARISONS: dict[str, Callable[[float, float], bool]] = {
@@ -165,8 +164,7 @@ class Table:
         """
         self.values = values
         self.faults = faults
-        self._where = where
-        self._defaults = defaults
+        self._where, self._defaults = where, defaults
         self._asked: dict[str, None] = {}
 
     def __contains__(self, key: str) -> bool:
@@ -193,8 +191,7 @@ class Table:
             found: What stands there; by default the value itself, ``nothing`` when absent.
         """
         where, value = self.look(key)
-        text = found or ("nothing" if value is None else shown(value))
-        self.faults.add(where, text, valid)
+        self.faults.add(where, found or ("nothing" if value is None else shown(value)), valid)
 
     def look(self, key: str) -> tuple[str, object]:
         """Look a key up, first here, then in the defaults.

@@ -47,8 +47,7 @@ from ..log.messages.frames import (
     ID_MASK,
     REMOTE_FLAG,
 )
-from .candump import read_candump
-from .frame_log import LATEST_NS, FrameLog, FrameRow, LogBlock, blocks_of
+from .frame_log import LATEST_NS, FrameLog, FrameRow, LogBlock, blocks_of, read_candump
 from .mf4 import open_mf4
 
 if TYPE_CHECKING:
@@ -276,8 +275,7 @@ def _messages(path: Path, reader: Iterable[Message]) -> Iterator[Message]:
             yield message
             count += 1
     except _READ_ERRORS as error:
-        text = f"can't be read after {count} frames: {error}"
-        raise ImportFormatError(path, text) from error
+        raise ImportFormatError(path, f"can't be read after {count} frames: {error}") from error
 
 
 def _read_part(reader: MessageReader) -> float:

@@ -47,9 +47,9 @@ from ..common.strict_table import NONZERO, Faults, Table, listed, read_toml
 from ..log.write.writer import SessionWriter
 from ..robot.bus_map import JOINT_QUANTITIES, SESSION_UNIT, TIME_UNITS, unit_for, valid_units
 from ..robot.model import Quantity, Robot
+from .can_import import ImportReport, imported_session
 from .can_logs import CSV_HEADER
 from .frame_log import LATEST_NS, RELATIVE_EPOCH_NS
-from .import_output import ImportReport, imported_session
 
 _DELIMITERS = (",", ";", "\t", " ")
 _OPTION_FORM = (
@@ -219,7 +219,7 @@ def _note_repeated(faults: Faults, columns: Sequence[Column]) -> None:
 
 _EARLIEST_NS = 10**17  # 1973: less is no date but a time since the log's start
 _ROWS_PER_UPDATE = 4096
-_BESIDE_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
+_WITH_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
 
 
 def is_frame_csv(path: Path) -> bool:
@@ -340,7 +340,7 @@ class _Topic:
             return
         velocity, effort = (
             self._rest[quantity][row] if quantity in self._rest else ()
-            for quantity in _BESIDE_POSITION
+            for quantity in _WITH_POSITION
         )
         self._channel.write(t_ns, self._position[row], velocity, effort)
         self.count += 1
@@ -348,11 +348,11 @@ class _Topic:
 
 def _topics_of(present: set[Quantity]) -> Iterator[tuple[Quantity, ...]]:
     """Yield the quantities of each topic; a row's velocity and effort belong to its position."""
-    beside = [q for q in _BESIDE_POSITION if q in present and Quantity.POSITION in present]
+    together = [q for q in _WITH_POSITION if q in present and Quantity.POSITION in present]
     for quantity in JOINT_TOPIC:
         if quantity is Quantity.POSITION and quantity in present:
-            yield (quantity, *beside)
-        elif quantity in present and quantity not in beside:
+            yield (quantity, *together)
+        elif quantity in present and quantity not in together:
             yield (quantity,)
 
 
@@ -440,5 +440,4 @@ def _converted(column: Column, values: FloatArray) -> FloatArray:
     if column.wrap:
         known = ~np.isnan(plain)
         plain[known] = np.unwrap(plain[known], period=column.wrap)
-    unit = unit_for(column.unit, column.quantity)
-    return unit.convert(column.scale * plain + column.offset)
+    return unit_for(column.unit, column.quantity).convert(column.scale * plain + column.offset)

@@ -32,8 +32,8 @@ from ..common.files import check_stop, part_file
 from ..common.process import StopRequest
 from ..log.messages.definitions import JOINT_STATE
 from ..log.read.joint_states import UNITS
+from ..log.read.sample_times import JointSignals
 from ..log.read.session import Session
-from ..log.read.signals import JointSignals
 from .frame_blocks import LossTally, chosen_buses, frame_blocks, frame_facts
 from .frame_formats import FRAME_FORMATS
 

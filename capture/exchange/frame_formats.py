@@ -1,7 +1,7 @@
 """Formats of CAN traces that can be written, by suffix.
 
 A format declares what it keeps of frames (:meth:`FrameFormat.kept`) and writes that, so that what
-is lost can be counted before it is lost. Formats: candump (:mod:`.capture.exchange.candump`),
+is lost can be counted before it is lost. Formats: candump (:mod:`.capture.exchange.frame_log`),
 Vector's ASC and BLF by python-can, and messages of ROS 2 (:mod:`.capture.exchange.frame_formats`).
 
 CAN frames as ROS 2 messages, one a frame, for the tools of ROS.
@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from mcap.writer import Writer
 
-from ..common.arrays import BoolArray
+from ..common.arrays import NS, BoolArray
 from ..log.messages.cdr import encode, layout_of
 from ..log.messages.definitions import parse_message_type, schema_text
 from ..log.messages.frames import (
@@ -40,9 +40,8 @@ from ..log.messages.frames import (
     REMOTE_FLAG,
     FrameArray,
 )
-from .candump import candump_lines
 from .frame_blocks import FrameFacts, is_error, is_remote
-from .frame_log import LogBlock
+from .frame_log import LogBlock, candump_lines
 
 if TYPE_CHECKING:
     from can.io.generic import MessageWriter
@@ -56,8 +55,7 @@ _SCHEMA = (
     + "\nMSG: std_msgs/Header\n"
     + schema_text("std_msgs/msg/Header")
 )
-_NS = 1_000_000_000
-_STAMP_END_NS = 2**31 * _NS
+_STAMP_END_NS = 2**31 * NS
 
 
 class RosFrames:
@@ -126,8 +124,8 @@ class _Template:
         matrix = np.tile(self._example, (len(frames), 1))
         id_flags, t_ns = frames["id_flags"], frames["t_host_ns"]
         columns = {
-            "header.stamp.sec": t_ns // _NS,
-            "header.stamp.nanosec": t_ns % _NS,
+            "header.stamp.sec": t_ns // NS,
+            "header.stamp.nanosec": t_ns % NS,
             "id": id_flags & ID_MASK,
             "is_rtr": (id_flags & REMOTE_FLAG) != 0,
             "is_extended": (id_flags & EXTENDED_FLAG) != 0,
@@ -163,7 +161,7 @@ WriteFrames = Callable[[LogBlock], None]
 """Writes a part of a log; CAN FD frames only where the format holds them."""
 
 
-_BLF_EPOCH_NS = 631_152_000 * _NS  # 1990: python-can takes less for no date
+_BLF_EPOCH_NS = 631_152_000 * NS  # 1990: python-can takes less for no date
 _NUMBERED = re.compile(r"can(0|[1-9]\d{0,3})")
 
 
@@ -265,14 +263,14 @@ class Blf:
         from can import BLFWriter
 
         dated = facts.start_ns >= _BLF_EPOCH_NS
-        start_s = facts.start_ns // _NS if dated else 0
+        start_s = facts.start_ns // NS if dated else 0
         with BLFWriter(path) as writer:
             # Counted from the start, times are exact to 1 ns; as Unix times, which python-can
             # keeps as floating-point seconds, they would be to 240 ns.
             writer.start_timestamp = 0.0
             yield _writing(writer, facts, start_s)
             writer.start_timestamp = float(start_s) if dated else None
-            writer.stop_timestamp = facts.end_ns / _NS
+            writer.stop_timestamp = facts.end_ns / NS
 
 
 class Asc:
@@ -302,7 +300,7 @@ class Asc:
         """Create a file; its times count from the last whole second before the first frame."""
         from can import ASCWriter
 
-        start_s = facts.start_ns // _NS
+        start_s = facts.start_ns // NS
         # The format's dates are local times, and its readers take them as such.
         date = datetime.fromtimestamp(start_s).strftime("%a %b %d %H:%M:%S.000 %Y")  # noqa: DTZ006
         with path.open("w", encoding="ascii", newline="\n") as stream, ASCWriter(stream) as writer:
@@ -353,31 +351,23 @@ def _writing(writer: MessageWriter, facts: FrameFacts, start_s: int) -> WriteFra
     """Return what hands frames to a writer of python-can, timed from ``start_s`` [Unix s]."""
     from can import Message
 
-    channels = np.array(channel_numbers(facts.buses))
+    channels = channel_numbers(facts.buses)
 
     def write(block: LogBlock) -> None:
-        frames, data = block.frames, block.frames["data"].tobytes()
-        columns = (
-            (block.times_ns() - start_s * _NS).tolist(),
-            *(frames[name].tolist() for name in ("id_flags", "len", "dir", "fd_flags")),
-            channels[block.bus].tolist(),
-            block.is_fd.tolist(),
-        )
-        rows = enumerate(zip(*columns, strict=True))
-        for i, (t_ns, id_flags, length, way, fd_flags, channel, is_fd) in rows:
+        for row in block.rows():
             message = Message(
-                timestamp=(t_ns + 0.5) / _NS,  # python-can cuts to whole ns
-                arbitration_id=id_flags & ID_MASK,
-                is_extended_id=bool(id_flags & EXTENDED_FLAG),
-                is_remote_frame=bool(id_flags & REMOTE_FLAG),
-                is_error_frame=bool(id_flags & ERROR_FLAG),
-                channel=channel,
-                dlc=length,
-                data=data[64 * i : 64 * i + min(length, 64 if is_fd else 8)],
-                is_rx=way != DIR_TX,
-                is_fd=is_fd,
-                bitrate_switch=bool(fd_flags & FD_BRS),
-                error_state_indicator=bool(fd_flags & FD_ESI),
+                timestamp=(row.t_ns - start_s * NS + 0.5) / NS,  # python-can cuts to whole ns
+                arbitration_id=row.id_flags & ID_MASK,
+                is_extended_id=bool(row.id_flags & EXTENDED_FLAG),
+                is_remote_frame=bool(row.id_flags & REMOTE_FLAG),
+                is_error_frame=bool(row.id_flags & ERROR_FLAG),
+                channel=channels[row.bus],
+                dlc=row.length,
+                data=row.data,
+                is_rx=row.way != DIR_TX,
+                is_fd=row.is_fd,
+                bitrate_switch=bool(row.fd_flags & FD_BRS),
+                error_state_indicator=bool(row.fd_flags & FD_ESI),
             )
             writer(message)
 

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import BoolArray, IntArray
+from ..common.arrays import NS, BoolArray, IntArray
 from ..common.errors import ImportFormatError, MissingExtraError
 from ..common.lazy import undefer
 from ..log.messages.frames import (
@@ -99,7 +99,6 @@ def _noted(problems: list[str]) -> Generator[None]:
 
 
 _KIND_FLAGS = {"CAN_DataFrame": 0, "CAN_RemoteFrame": REMOTE_FLAG, "CAN_ErrorFrame": ERROR_FLAG}
-_NS = 1_000_000_000
 _LOCAL_TIME = 1  # bit of the header's time flags: civil time, of no zone
 _PLACES: IntArray = np.arange(64)
 _VERSION_4 = (b"MDF", b"UnFinMF")
@@ -221,9 +220,9 @@ def _start(header: Any) -> tuple[int, str]:
     start_ns = (int(header.abs_time) + 500) // 1000 * 1000
     if not header.time_flags & _LOCAL_TIME:
         return start_ns, "UTC"
-    seconds, rest = divmod(start_ns, _NS)
+    seconds, rest = divmod(start_ns, NS)
     civil = datetime.fromtimestamp(seconds, UTC).replace(tzinfo=None)
-    return int(civil.timestamp()) * _NS + rest, "local time of no zone, taken as this machine's"
+    return int(civil.timestamp()) * NS + rest, "local time of no zone, taken as this machine's"
 
 
 class _Reader:
@@ -231,8 +230,7 @@ class _Reader:
 
     def __init__(self, mdf: Any, start_ns: int, log: FrameLog) -> None:
         self.log = log
-        self._mdf = mdf
-        self._start_ns = start_ns
+        self._mdf, self._start_ns = mdf, start_ns
 
     def pieces(self, group: _Group) -> Iterator[_Piece]:
         """Yield the frames of a group, in the order they were logged."""
@@ -331,7 +329,7 @@ def _blocks(path: Path, reader: _Reader, groups: list[_Group], total: int) -> It
             if epoch_ns is None:
                 epoch_ns = log.epoch_ns(int(t_ns[0]), "to 1 ns")
             if (earliest := int(t_ns.min()) + epoch_ns) < 0:
-                raise ImportFormatError(path, f"has a frame at {earliest / _NS} s, before 1970")
+                raise ImportFormatError(path, f"has a frame at {earliest / NS} s, before 1970")
             piece.frames["t_host_ns"] = (t_ns + epoch_ns).astype(np.uint64)
             taken += len(piece)
             yield replace(piece, bus=_indices(piece.bus, log), done=taken / total)

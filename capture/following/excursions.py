@@ -214,8 +214,8 @@ def _grows(response: Response, at_s: float) -> bool:
 def _lasting(spans: Sequence[Span], period_s: float, length_s: float) -> bool:
     """Return whether departures repeat, or one of them lasts a cycle."""
     together = sum(stop - start for start, stop in spans)
-    again = len(spans) >= MIN_DEPARTURES and together > AT_TIMES * length_s
-    return again or any(stop - start > period_s for start, stop in spans)
+    often = len(spans) >= MIN_DEPARTURES and together > AT_TIMES * length_s
+    return often or any(stop - start > period_s for start, stop in spans)
 
 
 def _described(found: Excursions, span: Span, end: float, period_s: float) -> tuple[str, str]:
@@ -239,8 +239,7 @@ def _described(found: Excursions, span: Span, end: float, period_s: float) -> tu
     if rough > NOISY and residual.size >= 2 * FEW and spread > abs(mean):
         return "noisy", f"residual of {np.degrees(spread):.2g} degrees"
     if swing > 0.5 * found.amplitude and moved < HELD * swing:
-        level = float(np.median(position))
-        return "held", f"position constant at {np.degrees(level):.1f} degrees"
+        return "held", f"position constant at {np.degrees(float(np.median(position))):.1f} degrees"
     against = float(residual @ expected) < 0 and moved > 0.5 * swing and position.size > 2
     if against and np.corrcoef(position, expected)[0, 1] < -0.7:
         return "opposite", "moves against its command"

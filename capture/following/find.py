@@ -16,10 +16,9 @@ from scipy.ndimage import median_filter
 from scipy.special import bdtrc
 
 from ..common.process import in_threads
-from .effort import powerless, usual_effort
 from .excursions import Excursions, departures, find_excursions, find_holds
 from .fault import Fault, Span, Symptom
-from .kinds import fault_of
+from .kinds import fault_of, powerless, usual_effort
 from .motion import (
     DEGREE,
     FEW_SAMPLES,
@@ -78,10 +77,10 @@ def _record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
 
     found = in_threads(counts, sampled, sum(each.position.t_s.size for each in sampled))
     usual_lost = float(np.median([lost for lost, *_ in found] or [0.0]))
-    usual_stale = float(np.median([again / of for _, again, of, _ in found if of] or [0.0]))
+    usual_stale = float(np.median([repeats / of for _, repeats, of, _ in found if of] or [0.0]))
     usual_spikes = float(np.median([spiky for *_, spiky in found] or [0.0]))
     expected = min(STALE_SHARE + 2 * usual_stale, 1.0)
-    for each, (missing, again, fast, spiky) in zip(sampled, found, strict=True):
+    for each, (missing, repeats, fast, spiky) in zip(sampled, found, strict=True):
         symptoms: list[Symptom] = []
         if spiky > SPIKES + 2 * usual_spikes:
             text = f"{100 * spiky:.2g} % of its samples are far from those around them"
@@ -89,8 +88,8 @@ def _record_faults(motions: Sequence[JointMotion]) -> dict[str, list[Symptom]]:
         if missing > LOST_SHARE + 2 * usual_lost:
             text = f"{100 * missing:.2g} % of its samples missing"
             symptoms.append(Symptom("lost", _silences(each, missing), text))
-        if bdtrc(again - 1, fast, expected) < RARE:
-            text = f"{100 * again / fast:.2g} % of its fast samples repeat the one before"
+        if bdtrc(repeats - 1, fast, expected) < RARE:
+            text = f"{100 * repeats / fast:.2g} % of its fast samples repeat the one before"
             symptoms.append(Symptom("stale", (), text))
         if symptoms:
             result[each.name] = symptoms

@@ -6,18 +6,170 @@ another quantity that was recorded; otherwise all kinds that fit are named.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..common.arrays import BoolArray, FloatArray
-from .effort import PUSHING, SAME, UsualEffort, effort_there
+from ..common.arrays import BoolArray, ComplexArray, FloatArray
 from .fault import Fault, Span, Symptom
-from .motion import JointMotion, Samples, median_of, record_span, robust_deviation, within
+from .motion import (
+    BLOCKS,
+    FEW_SAMPLES,
+    MIN_SHARE,
+    MIN_WINDOWS,
+    JointMotion,
+    Judged,
+    Response,
+    Samples,
+    complex_median,
+    marked_spans,
+    median_of,
+    neighbours,
+    record_span,
+    robust_deviation,
+    whole_or,
+    windowed_response,
+    within,
+)
 
 if TYPE_CHECKING:
     from .motion import Judged
+
+# Effort, as a share of a neighbour's, below which a motor does not drive its joint: friction.
+POWERLESS = 0.2
+# Control error, in those of the neighbours, from which a motor with power would push.
+PUSHING_ERROR_RATIO = 2.5
+ENDS = 2  # joints at either end of a free chain, which little load may keep from any effort
+SAME = 0.35  # change of an effort, as a share of the usual one, up to which it is the usual one
+PUSHING = 1.3  # share of the usual effort above which a motor pushes against something
+
+
+@dataclass(frozen=True)
+class UsualEffort:
+    """Effort of the joints that follow.
+
+    Attributes:
+        size: Median absolute effort of each, shape (k,).
+        ratio: Response of the effort to the command of each, shape (k,).
+    """
+
+    size: FloatArray
+    ratio: ComplexArray
+
+    def size_of(self, motion: JointMotion, main: Symptom) -> float:
+        """Usual absolute effort of a joint: its own where it does not stand, else the others'."""
+        if motion.effort is not None and main.spans_s:
+            outside = motion.effort.values[~within(motion.effort.t_s, main.spans_s)]
+            if outside.size >= FEW_SAMPLES:
+                return float(np.median(np.abs(outside)))
+        return median_of(self.size, 0.0)
+
+
+def usual_effort(judged: Sequence[Judged]) -> UsualEffort:
+    """Return effort of each joint that follows.
+
+    Args:
+        judged: The joints; those without a usual response are left out.
+    """
+    size: list[float] = []
+    ratio: list[complex] = []
+    for each in judged:
+        effort = each.motion.effort
+        if effort is None or not effort.values.size or not each.has_usual:
+            continue
+        r = windowed_response(each.motion.command, effort, each.response.period_s)
+        size.append(float(np.median(np.abs(effort.values))))
+        if r.valid.any():
+            ratio.append(complex_median(r.ratio[r.valid]))
+    return UsualEffort(np.array(size, dtype=np.float64), np.array(ratio, dtype=np.complex128))
+
+
+def effort_there(
+    motion: JointMotion, judged: Judged, main: Symptom, usual: UsualEffort
+) -> tuple[float, float] | None:
+    """Return size and change of the effort while a joint stands, relative to the usual effort.
+
+    The effort's response to the command in windows of one cycle: a joint that is blocked pushes
+    in step with its command, one that moves in step with its own lag behind it.
+
+    Returns:
+        Both; None without an effort to compare with.
+    """
+    if motion.effort is None:
+        return None
+    spans = main.spans_s or (record_span(motion),)
+    r = windowed_response(motion.command, motion.effort, judged.response.period_s)
+    during, outside = np.zeros_like(r.valid), np.ones_like(r.valid)
+    for start, stop in spans:
+        during |= (r.start_s >= start) & (r.stop_s <= stop)
+        outside &= (r.start_s >= stop) | (r.stop_s <= start)
+    ratio = r.ratio[during & r.valid]
+    own = r.ratio[outside & r.valid]
+    reference = own if main.spans_s and own.size >= BLOCKS else usual.ratio
+    if ratio.size >= BLOCKS and reference.size:  # fewer windows hold parts of the usual motion
+        here, there = complex_median(ratio), complex_median(reference)
+        scattered = float(np.median(np.abs(reference - there))) > SAME * abs(there)
+        if abs(there) > 0 and not scattered:
+            return abs(here / there), abs(here / there - 1)
+    # Too short for a window, or no usual response: by its size alone.
+    inside = within(motion.effort.t_s, spans)
+    values, level = motion.effort.values[inside], usual.size_of(motion, main)
+    if values.size < FEW_SAMPLES or not level > 0:
+        return None
+    size = float(np.median(np.abs(values))) / level  # of a sine as large as its root mean square
+    return size, size - 1 if size > PUSHING else 0.0
+
+
+def powerless(judged: Sequence[Judged], k: int) -> list[Symptom]:
+    """Find whether neighbours swing a joint: far from its command, without effort against it."""
+    each, near = judged[k], neighbours(judged, k)
+    r = each.response
+    if each.motion.effort is None or min(k, len(judged) - 1 - k) < ENDS:
+        return []
+    errors = np.array([_usual(one, _control_error(one.response)) for one in near])
+    usual = median_of(errors[np.isfinite(errors)])
+    far = _control_error(r) > np.fmax(PUSHING_ERROR_RATIO * usual, r.asked / 2)
+    off = r.valid & ~each.still & far
+    if not off.any():
+        return []
+    known = [size for one in near if np.isfinite(size := _usual(one, _effort_spread(one)))]
+    if not known:
+        return []
+    effort, pushes = _effort_spread(each), max(known)
+    light = off & (effort < POWERLESS * pushes)
+    if np.count_nonzero(light) < max(MIN_WINDOWS, MIN_SHARE * np.count_nonzero(off)):
+        return []
+    share = 100 * float(np.median(effort[light])) / pushes
+    text = f"moves with its neighbours, at {share:.0f} % of their largest effort"
+    return [Symptom("powerless", whole_or(marked_spans(r, light), r), text)]
+
+
+def _control_error(response: Response) -> FloatArray:
+    """Standard deviation of the position less the command in each window [rad], shape (w,)."""
+    covariance = response.ratio.real * response.asked**2
+    return np.sqrt(np.maximum(response.asked**2 + response.spread**2 - 2 * covariance, 0.0))
+
+
+def _effort_spread(each: Judged) -> FloatArray:
+    """Standard deviation of the effort in each window, shape (w,); NaN where it has no sample."""
+    r, effort = each.response, each.motion.effort
+    if effort is None:
+        return np.full(r.start_s.size, np.nan)
+    i, j = (np.searchsorted(effort.t_s, edges) for edges in (r.start_s, r.stop_s))
+    level = effort.values - median_of(effort.values, 0.0)
+    first, second = (np.concatenate(([0.0], np.cumsum(level**power))) for power in (1, 2))
+    count = np.where(j > i, j - i, np.nan)
+    mean, square = (first[j] - first[i]) / count, (second[j] - second[i]) / count
+    return np.sqrt(np.maximum(square - mean**2, 0.0))
+
+
+def _usual(each: Judged, values: FloatArray) -> float:
+    """Return the median over the judged windows; NaN without any."""
+    return median_of(values[each.response.valid & np.isfinite(values)])
+
 
 MOVING = 0.5  # correlation of a velocity or second sensor with the command that shows motion
 AT_REST = 0.3  # share of its usual motion below which a velocity or second sensor shows rest
@@ -28,42 +180,27 @@ MOSTLY = 0.5  # share of exact repeats above which a sensor may be frozen
 MIN_RETURNS = 3  # times that a joint stands at one place, which is no chance
 LIMIT_SHARE = 0.02  # nearer to a limit than this share of the range is at it
 
-_KINDS: dict[str, tuple[str, ...]] = {
-    "still": ("dead", "jammed", "stalled", "frozen_sensor"),
-    "held": ("jammed", "dead", "stalled", "frozen_sensor"),
-    "opposite": ("inverted", "inverted_sensor"),
-    "incoherent": ("dead", "noisy_sensor"),
-    "powerless": ("dead",),
-    "astray": ("intermittent",),
-    "noisy": ("noisy_sensor",),
-    "stepped": ("slipped", "slipped_sensor"),
-    "wrapped": ("wrapped_sensor",),
-    "drifting": ("slipped", "drifting_sensor"),
-    "scaled": ("scaled_sensor",),
-    "slight": ("scaled_sensor", "dead", "jammed"),
-    "swapped": ("swapped",),
-    "lost": ("lost_samples",),
-    "stale": ("stale_sensor", "lost_samples"),
+_SYMPTOMS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "still": ("does not move with its command", ("dead", "jammed", "stalled", "frozen_sensor")),
+    "held": (
+        "stands still while its command moves",
+        ("jammed", "dead", "stalled", "frozen_sensor"),
+    ),
+    "opposite": ("moves against its command", ("inverted", "inverted_sensor")),
+    "incoherent": ("does not follow its command", ("dead", "noisy_sensor")),
+    "powerless": ("is not driven", ("dead",)),
+    "astray": ("leaves its usual response", ("intermittent",)),
+    "noisy": ("has bursts of noise", ("noisy_sensor",)),
+    "stepped": ("has shifted", ("slipped", "slipped_sensor")),
+    "wrapped": ("is off by whole turns", ("wrapped_sensor",)),
+    "drifting": ("drifts", ("slipped", "drifting_sensor")),
+    "scaled": ("differs in unit or scale", ("scaled_sensor",)),
+    "slight": ("hardly moves", ("scaled_sensor", "dead", "jammed")),
+    "swapped": ("is swapped", ("swapped",)),
+    "lost": ("lacks samples", ("lost_samples",)),
+    "stale": ("repeats old samples", ("stale_sensor", "lost_samples")),
 }
-"""Symptom to the kinds that fit where nothing else was recorded, the likeliest first."""
-
-_PHRASES = {
-    "still": "does not move with its command",
-    "held": "stands still while its command moves",
-    "opposite": "moves against its command",
-    "incoherent": "does not follow its command",
-    "powerless": "is not driven",
-    "astray": "leaves its usual response",
-    "noisy": "has bursts of noise",
-    "stepped": "has shifted",
-    "wrapped": "is off by whole turns",
-    "drifting": "drifts",
-    "scaled": "differs in unit or scale",
-    "slight": "hardly moves",
-    "swapped": "is swapped",
-    "lost": "lacks samples",
-    "stale": "repeats old samples",
-}
+"""Symptom to its phrase and the kinds that fit where nothing else was recorded, likeliest first."""
 
 
 def fault_of(
@@ -83,32 +220,31 @@ def fault_of(
     begin, end = record_span(motion)
     spans = tuple(sorted(span for each in symptoms for span in each.spans_s))
     whole = any(not each.spans_s for each in symptoms)
-    kinds: list[str] = list(_KINDS[main.name])
-    decided = ""
+    phrase, fitting = _SYMPTOMS[main.name]
+    kinds, decided = list(fitting), ""
     if main.name in ("still", "held") and judged is not None:
         kinds, decided = _standing(motion, judged, main, usual)
-        if main.name == "held" and _again(main, end - begin, end, judged.response.period_s):
+        if main.name == "held" and _resumes(main, end - begin, end, judged.response.period_s):
             first = ["intermittent"] if set(kinds) - {"frozen_sensor", "stale_sensor"} else []
-            late = ["stale_sensor"] if "frozen_sensor" in kinds else []
-            kinds = [*first, *kinds, *late]
+            kinds = [*first, *kinds, *(["stale_sensor"] if "frozen_sensor" in kinds else [])]
     elif main.name == "opposite":
         kinds, decided = _opposite(motion)
     elif main.name in ("stepped", "drifting"):
         kinds, decided = _shifted(motion, main, kinds)
     for each in symptoms[1:]:
-        kinds += [kind for kind in _KINDS[each.name] if kind not in kinds]
+        kinds += [kind for kind in _SYMPTOMS[each.name][1] if kind not in kinds]
     cycle = judged.response.period_s if judged is not None else 0.0
     since = None if whole or not spans or spans[0][0] - begin < cycle / 2 else spans[0][0]
     until = None if whole or not spans or end - spans[-1][1] < cycle / 2 else spans[-1][1]
     length = sum(b - a for a, b in spans)
     share = 1.0 if whole or end <= begin else min(1.0, length / (end - begin))
-    others = (each.text or _PHRASES[each.name] for each in symptoms[1:])
-    parts = dict.fromkeys([_PHRASES[main.name], main.text, *others])
+    others = (each.text or _SYMPTOMS[each.name][0] for each in symptoms[1:])
+    parts = dict.fromkeys([phrase, main.text, *others])
     evidence = ", ".join(filter(None, parts)) + (f"; {decided}" if decided else "")
     return Fault(motion.name, tuple(kinds), spans, since, until, share, evidence)
 
 
-def _again(main: Symptom, length: float, end: float, cycle_s: float) -> bool:
+def _resumes(main: Symptom, length: float, end: float, cycle_s: float) -> bool:
     """Return whether a joint follows again, for a cycle or more, after it stood still."""
     spans = sorted(main.spans_s)
     if any(after[0] - before[1] > cycle_s for before, after in pairwise(spans)):
@@ -141,7 +277,7 @@ def _by_effort(
     motion: JointMotion, judged: Judged, main: Symptom, usual: UsualEffort
 ) -> tuple[list[str], str]:
     """Return kinds of a joint that stands still, by its noise and its effort."""
-    kinds = list(_KINDS[main.name])
+    kinds = list(_SYMPTOMS[main.name][1])
     spans = main.spans_s or (record_span(motion),)
     repeats = _repeats(motion, spans)
     if not repeats:  # new noise in each sample: the sensor measures
@@ -192,7 +328,7 @@ def _opposite(motion: JointMotion) -> tuple[list[str], str]:
         rate = np.gradient(motion.position.values, motion.position.t_s)
         if _correlation(motion.velocity.at(motion.position.t_s), rate) < -MOVING:
             return ["inverted_sensor"], "its velocity has the opposite sign of its position"
-    return list(_KINDS["opposite"]), ""
+    return list(_SYMPTOMS["opposite"][1]), ""
 
 
 def _shifted(motion: JointMotion, main: Symptom, kinds: list[str]) -> tuple[list[str], str]:

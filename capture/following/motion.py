@@ -334,8 +334,7 @@ def common_response(own: Sequence[complex | None]) -> complex:
     unit = values / np.abs(values)
     # The circular median: the phase of the joint that is nearest to all others.
     distance = np.abs(np.angle(unit[:, None] * unit.conj()[None, :])).sum(axis=1)
-    gain = median_of(np.abs(values[1:]), 1.0)
-    return complex(gain * unit[int(np.argmin(distance))])
+    return complex(median_of(np.abs(values[1:]), 1.0) * unit[int(np.argmin(distance))])
 
 
 def judge(motion: JointMotion, response: Response, common: complex) -> Judged:
@@ -357,8 +356,7 @@ def judge(motion: JointMotion, response: Response, common: complex) -> Judged:
     still = response.valid & ~follows & ~opposite & ~moves
     chosen = follows if follows.any() else opposite
     ratio = complex_median(response.ratio[chosen]) if chosen.any() else common
-    use = chosen if chosen.any() else response.valid
-    offset = median_of(response.offset[use], 0.0)
+    offset = median_of(response.offset[chosen if chosen.any() else response.valid], 0.0)
     return Judged(motion, response, follows, still, opposite, ratio, offset, common)
 
 

@@ -8,9 +8,8 @@ import numpy as np
 
 from ..common.arrays import FloatArray, IntArray
 from ..common.errors import DataError, LogError, MissingChannelError
-from ..log.read.sample_times import longest_unbroken
+from ..log.read.sample_times import LARGEST, Signal, longest_unbroken
 from ..log.read.session import SessionView
-from ..log.read.signals import LARGEST, Signal
 from .fault import Fault
 from .find import joints_not_following
 from .motion import JointMotion, Samples

@@ -114,7 +114,7 @@ class BusRecorder:
             self._topics = DecodedTopics(writer, robot, self._decoder)
         self._fresh: list[FrameArray] = []
         self._waiting: deque[FrameArray] = deque()
-        self._again: deque[FrameArray] = deque()  # pieces of a slice that failed
+        self._pieces: deque[FrameArray] = deque()  # pieces of a slice that failed
         self._failures = 0
         self._faults: Counter[str] = Counter()
         self._messages: deque[Message] = deque()  # of the slice before, yet to be written
@@ -126,7 +126,7 @@ class BusRecorder:
     @property
     def behind(self) -> bool:
         """Whether decoded messages wait to be written, or a whole slice of frames to be decoded."""
-        return bool(self._messages or self._again) or self.backlog >= self._slice_size
+        return bool(self._messages or self._pieces) or self.backlog >= self._slice_size
 
     @property
     def decodes(self) -> bool:
@@ -194,17 +194,17 @@ class BusRecorder:
                 self._write(self._messages.popleft(), now)
                 now, idle = now_ns(), False
             expected_ns = 0 if idle else self._took_ns
-            nothing = not self._again and not self._waiting
+            nothing = not self._pieces and not self._waiting
             if self._messages or nothing or now + expected_ns >= until_ns:
                 return
-            if not rest and not self._again and self.backlog < self._slice_size:
+            if not rest and not self._pieces and self.backlog < self._slice_size:
                 return
             self._decode_slice()
             now, idle = now_ns(), False
 
     def _decode_slice(self) -> None:
         begun_ns = time.thread_time_ns()
-        frames = self._again.popleft() if self._again else self._mapped()
+        frames = self._pieces.popleft() if self._pieces else self._mapped()
         if self._decoder is not None and self._topics is not None:
             try:
                 samples, tally = self._decoder.decode(frames)
@@ -213,7 +213,7 @@ class BusRecorder:
                 raise
             except Exception as error:  # noqa: BLE001 - reported; the other frames are decoded
                 self._topics.forget()
-                self._try_again(frames, repr(error))
+                self._split(frames, repr(error))
                 return
             self._failures = 0
             self.tally.add(tally)
@@ -242,19 +242,19 @@ class BusRecorder:
             self._faults[repr(error)] += 0
         return frames
 
-    def _try_again(self, frames: FrameArray, fault: str) -> None:
+    def _split(self, frames: FrameArray, fault: str) -> None:
         """Queue failed frames again, in pieces; a single one is given up."""
         self._faults[fault] += 0
         if len(frames) > 1:
             size = -(-len(frames) // _PIECES)
             pieces = [frames[start : start + size] for start in range(0, len(frames), size)]
-            self._again.extendleft(reversed(pieces))
+            self._pieces.extendleft(reversed(pieces))
             return
         self._failures += 1
         self._faults[fault] += 1
         if self._failures >= _MOST_FAILURES:
-            self._faults[fault] += sum(map(len, self._again))
-            self._again.clear()
+            self._faults[fault] += sum(map(len, self._pieces))
+            self._pieces.clear()
             self._failures = 0
 
     def _slice(self) -> FrameArray:

@@ -141,11 +141,6 @@ class ControlServer:
         self._polls = 0
         self._open = True
 
-    @property
-    def clients(self) -> int:
-        """Number of connections."""
-        return len(self._clients)
-
     def serve(self, handler: Handler) -> None:
         """Set the handler.
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Self, cast
 
 from ..common.errors import ControlError, SocketInUseError
-from ..common.unix_listener import listen_at
+from ..common.files import listen_at
 
 _SUFFIX = ".sock"
 _LONGEST_PATH = 107  # bytes of sun_path, less the closing zero

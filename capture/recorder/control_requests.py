@@ -78,7 +78,6 @@ class RecorderActions(Protocol):
 
     def stop(self) -> None:
         """End the recording after this tick."""
-        ...
 
 
 class RequestHandler:

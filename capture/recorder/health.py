@@ -15,11 +15,12 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
+from ..common.arrays import NS
 from ..common.errors import DataError
 from ..log.health.rules import FROZEN_SECONDS, MAX_AT_LIMIT
 from ..log.health.session_scan import ChannelMeasures, SessionMeasures, SessionScan
 from ..log.health.tallies import BusHealth, JointHealth
-from ..log.mcap.records import BODY_AT, FIXED_SIZE, HEAD
+from ..log.mcap.chunk import BODY_AT, FIXED_SIZE, HEAD
 from ..log.messages.definitions import parse_message_type
 from ..log.messages.frames import FRAME_TOPIC_PREFIX, FRAME_TOPIC_PREFIXES
 from ..log.sinks.mcap_sink import Description
@@ -43,7 +44,6 @@ MEASURE_EVERY = 4
 RECENT = 6
 """Rounds over which a rate is computed."""
 
-_NS = 1_000_000_000
 
 _Message = tuple[int, int, bytes]  # log time, sequence number, payload
 
@@ -61,7 +61,7 @@ class _Topic:
         if len(self.recent) < 2:
             return None
         (began, had), (ended, has) = self.recent[0], self.recent[-1]
-        return (has - had) * _NS / (ended - began) if ended > began else None
+        return (has - had) * NS / (ended - began) if ended > began else None
 
 
 class LiveHealth:
@@ -231,7 +231,7 @@ class LiveHealth:
             topic=topic.name,
             count=topic.count,
             rate_hz=topic.rate_hz(),
-            age_s=max(self._now_ns - topic.last_ns, 0) / _NS,
+            age_s=max(self._now_ns - topic.last_ns, 0) / NS,
             gaps=sum(timing.gaps for timing in timings) if whole else None,
             missing=sum(timing.missing for timing in timings) if whole else None,
             jitter=max(jitters) if whole and jitters else None,
@@ -263,7 +263,7 @@ class LiveHealth:
             finished=source.finished,
             frames=frames,
             rate_hz=recent.rate_hz(),
-            age_s=max(self._now_ns - last, 0) / _NS if last else None,
+            age_s=max(self._now_ns - last, 0) / NS if last else None,
             dropped=counts.dropped,
             malformed=counts.malformed,
             error_frames=counts.error_frames,

@@ -8,17 +8,22 @@ import platform
 import shutil
 import uuid
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mcap.records import Metadata
+
+from ..common.arrays import NS
 from ..common.errors import LogWriteError, SocketInUseError, SourceError, UsageError
 from ..common.process import StopRequest
+from ..log.sinks.durable_sink import DurableSink
+from ..log.sinks.mcap_sink import Description, MessageFields, MessageSink
+from ..log.sinks.ring_sink import RingStorage
 from ..log.write.writer import SessionWriter
-from ..sources.address import open_sources
-from ..sources.contract import SourceContext
+from ..sources.contract import SourceContext, open_sources
 from .bus_recorder import decoded_source, robot_of
 from .control import ControlServer
 from .control_client import default_sockets
@@ -29,7 +34,6 @@ from .loop import Ending, Recorder
 from .screen import plain_line
 from .settings import RecordSettings
 from .status import EventLine, RecorderSnapshot, SessionClock, statuses
-from .storage import DiskStorage, RingStorage, TappedSink
 from .systemd import Notifier
 
 
@@ -90,11 +94,37 @@ class RecordReport:
         }
 
 
-_NS = 1_000_000_000
 _EVENTS_SHOWN = 8
 _VIEW, _HEALTH = "live view", "live health"
 _NOT_JUDGED = "the recorder could not judge all of it: 'undulog log check' does"
 _RATE_UPDATES = 10
+
+
+class TappedSink:
+    """Passes records to a sink, and those that it accepted to listeners, which never wait."""
+
+    def __init__(self, sink: MessageSink, listeners: Sequence[LiveHealth | LiveFeed]) -> None:
+        """Connect a sink with its listeners."""
+        self._sink = sink
+        self._write = sink.write
+        self._listeners = tuple(listeners)
+        self._offers = tuple(listener.offer for listener in listeners)
+
+    def define(self, record: Description) -> None:
+        """See :meth:`MessageSink.define`."""
+        self._sink.define(record)
+        for listener in self._listeners:
+            listener.define(record)
+
+    def write(self, *message: *MessageFields) -> None:
+        """See :meth:`MessageSink.write`."""
+        self._write(*message)
+        for offer in self._offers:
+            offer(*message)
+
+    def close(self, last: tuple[Metadata, ...]) -> None:
+        """See :meth:`MessageSink.close`."""
+        self._sink.close(last)
 
 
 class Recording:
@@ -143,8 +173,10 @@ class Recording:
             self._control = _control_of(settings)  # first: two recorders never share one
             opened.callback(self._control.close)
             self._feed = LiveFeed(self._control.path.with_suffix(".live"))
+            self.live_socket = self._feed.path
             opened.callback(self._feed.close)
-            self._storage = _storage_of(settings)
+            self._storage = storage = _storage_of(settings)
+            sink = storage.sink if isinstance(storage, RingStorage) else storage
             self._writer = SessionWriter(
                 settings.output,
                 session_id=self._session_id,
@@ -152,7 +184,7 @@ class Recording:
                 robot=robot,
                 clock={source.name: source.clock for source in self._sources},
                 metadata=self._facts(),
-                sink=TappedSink(self._storage.sink, (self._health, self._feed)),
+                sink=TappedSink(sink, (self._health, self._feed)),
             )
             opened.callback(self._writer.close)
             self._diagnostics = self._writer.diagnostics()
@@ -176,11 +208,6 @@ class Recording:
             _VIEW: self._feed.pump,
             _HEALTH: lambda: self._health.step(self._clock.now_ns()),
         }
-
-    @property
-    def live_socket(self) -> Path:
-        """Socket of the live view."""
-        return self._feed.path
 
     def warn(self, name: str, text: str) -> None:
         """Write a warning to ``/rosout``."""
@@ -218,18 +245,20 @@ class Recording:
 
     def status(self) -> Mapping[str, Any]:
         """See :meth:`.RecorderActions.status`."""
-        snapshot = self._snapshot or self._look()
-        facts = dataclasses.asdict(snapshot)
-        path = facts.pop("path")
-        return {"output": path, "bytes": facts.pop("size"), **facts, "trouble": None}
+        facts = dataclasses.asdict(self._snapshot or self._look())
+        return {"output": facts.pop("path"), "bytes": facts.pop("size"), **facts, "trouble": None}
 
     def mark(self, text: str) -> Mapping[str, Any]:
         """See :meth:`.RecorderActions.mark`."""
-        return self._storage.mark(text)
+        storage = self._storage  # without a ring the mark is in the session like every event
+        return storage.mark(text) if isinstance(storage, RingStorage) else {}
 
     def split(self) -> Mapping[str, Any]:
         """See :meth:`.RecorderActions.split`."""
-        return self._storage.split()
+        if isinstance(self._storage, RingStorage):
+            raise UsageError("a ring has no parts; 'undulog record mark' writes what it holds")
+        path = self._storage.split()
+        return {"part": self._storage.part, "file": str(path)}
 
     def stop(self) -> None:
         """End the recording after this tick."""
@@ -263,14 +292,14 @@ class Recording:
         clocks = self._recorder.clocks
         self._snapshot = RecorderSnapshot(
             session_id=self._session_id,
-            path=str(self._storage.path),
+            path=str(self._storage.part_path),
             robot=self._robot.name if self._robot is not None else None,
             state="recording",
             now_ns=now_ns,
-            elapsed_s=(now_ns - self._clock.epoch_ns) / _NS,
+            elapsed_s=(now_ns - self._clock.epoch_ns) / NS,
             messages=self._storage.messages,
             size=self._storage.size,
-            byte_rate=(has - had) * _NS / (ended - began) if ended > began else None,
+            byte_rate=(has - had) * NS / (ended - began) if ended > began else None,
             free=free_space(self._settings.output),
             part=self._storage.part,
             verdict=measures.verdict,
@@ -341,8 +370,8 @@ class Recording:
             try:
                 self._writer.close()
             except LogWriteError as error:
-                said = str(error) if ending.reason in str(error) else f"{ending.reason}; {error}"
-                ending = Ending(said if ending.failed else str(error), failed=True)
+                full = str(error) if ending.reason in str(error) else f"{ending.reason}; {error}"
+                ending = Ending(full if ending.failed else str(error), failed=True)
         return ending
 
     def _diagnose_last(self, ending: Ending) -> None:
@@ -398,7 +427,7 @@ class Recording:
             files=files,
             session_id=self._session_id,
             robot=self._robot.name if self._robot is not None else None,
-            duration_s=(self._clock.now_ns() - self._clock.epoch_ns) / _NS,
+            duration_s=(self._clock.now_ns() - self._clock.epoch_ns) / NS,
             messages=self._storage.messages,
             size=sum(file.stat().st_size for file in files if file.exists()),
             verdict=measures.verdict,
@@ -409,10 +438,16 @@ class Recording:
         )
 
 
-def _storage_of(settings: RecordSettings) -> DiskStorage | RingStorage:
+def _storage_of(settings: RecordSettings) -> DurableSink | RingStorage:
     if settings.ring_s is not None:
         return RingStorage(settings.output, settings.ring_s)
-    return DiskStorage(settings)
+    split_s = settings.split_time_s
+    return DurableSink(
+        settings.output,
+        force=settings.force,
+        split_size=settings.split_size,
+        split_ns=None if split_s is None else round(split_s * NS),
+    )
 
 
 def _control_of(settings: RecordSettings) -> ControlServer:

@@ -21,6 +21,7 @@ from rich.live import Live
 from rich.text import Text
 
 from ..common.amounts import format_size
+from ..common.arrays import NS
 from ..common.console import Cells, Column, cut, fit, plain, table
 from ..log.health.rules import has_rhythm
 from ..log.messages.definitions import ERROR, OK
@@ -42,7 +43,6 @@ _MUTED = "bright_black"
 _EVENTS = 4
 _REASONS = 3
 _SHOWN_ALONE = 3
-_NS = 1_000_000_000
 _DASH = "-"
 
 
@@ -114,7 +114,8 @@ def plain_line(snapshot: RecorderSnapshot) -> str:
     if snapshot.free is not None:
         parts.append(_room(snapshot))
     if snapshot.reasons:
-        parts.append(snapshot.reasons[0] + _more(len(snapshot.reasons) - 1))
+        more = len(snapshot.reasons) - 1
+        parts.append(snapshot.reasons[0] + (f" (and {more} more)" if more else ""))
     return plain("; ".join(parts))
 
 
@@ -161,8 +162,7 @@ def _headline(snapshot: RecorderSnapshot, width: int) -> list[Text]:
     facts.append(f"{snapshot.messages:,} messages")
     if snapshot.free is not None:
         facts.append(_room(snapshot))
-    second = Text(cut(" | ".join(facts), width))
-    return [first, second]
+    return [first, Text(cut(" | ".join(facts), width))]
 
 
 def _room(snapshot: RecorderSnapshot) -> str:
@@ -192,7 +192,7 @@ def _verdict(snapshot: RecorderSnapshot, width: int) -> list[Text]:
 
 
 def _event(event: EventLine, snapshot: RecorderSnapshot, width: int) -> Text:
-    ago_s = max(snapshot.now_ns - event.t_ns, 0) / _NS
+    ago_s = max(snapshot.now_ns - event.t_ns, 0) / NS
     at = clock_time(max(snapshot.elapsed_s - ago_s, 0.0))
     line = Text(f"{at} ", no_wrap=True)
     line.append(event.level, _LEVELS.get(event.level, ""))
@@ -277,10 +277,6 @@ def _shorter(path: str, width: int) -> str:
     return path if len(path) <= max(width, 8) else "…" + path[1 - max(width, 8) :]
 
 
-def _more(count: int) -> str:
-    return f" (and {count} more)" if count > 0 else ""
-
-
 LINE_EVERY_S = 10.0
 """Interval of the lines without a terminal [s]."""
 
@@ -295,8 +291,7 @@ class Terminal:
 
     def __init__(self, stream: TextIO, *, quiet: bool = False) -> None:
         """Display on a stream, e.g. ``sys.stderr``, from the first :meth:`show` on."""
-        self._stream = stream
-        self._quiet = quiet
+        self._stream, self._quiet = stream, quiet
         self._latest: RecorderSnapshot | None = None
         self._wake = threading.Condition()
         self._closing = False
@@ -376,7 +371,8 @@ class Terminal:
         due_s = 0.0
         last: EventLine | None = None
         while (snapshot := self._next()) is not None:
-            for event in _after(snapshot.events, last):
+            events = snapshot.events
+            for event in events[events.index(last) + 1 :] if last in events else events:
                 last = event
                 if event.level in _PRINTED:
                     stream.write(event_line(event) + "\n")
@@ -384,8 +380,3 @@ class Terminal:
                 due_s = snapshot.elapsed_s + LINE_EVERY_S
                 stream.write(plain_line(snapshot) + "\n")
             stream.flush()
-
-
-def _after(events: tuple[EventLine, ...], last: EventLine | None) -> tuple[EventLine, ...]:
-    """Return the events behind the last printed one."""
-    return events[events.index(last) + 1 :] if last in events else events

@@ -271,7 +271,7 @@ def resolve(
         raise SettingsError(found)
     origin = {name: given[name][0].origin if name in given else "default" for name in PARSERS}
     if file is not None and origin["robot"] == _origin(file):
-        values["robot"] = _beside(file, values["robot"])
+        values["robot"] = _robot_file(file, values["robot"])
     values["output"] = _timed(values["output"], time.time_ns() if now_ns is None else now_ns)
     return RecordSettings(**values, origin=origin)
 
@@ -366,7 +366,7 @@ def _shown(raw: object) -> str:
     return shown(raw)
 
 
-def _beside(file: Path, robot: str) -> str:
+def _robot_file(file: Path, robot: str) -> str:
     """Return the robot's file beside the settings if it exists, else its name."""
     there = file.parent / robot
     return str(there) if is_file(there) else robot

@@ -1,7 +1,7 @@
 """A recording's state, its statuses on ``/diagnostics``, and its clock.
 
 ``undulog log check`` reads the counts of the sources from the statuses; the names of their keys are
-those of :class:`.capture.log.health.sources.SourceHealth`.
+those of :class:`.capture.log.health.bus_tally.SourceHealth`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ..common.arrays import NS
+from ..log.health.bus_tally import ELAPSED, RECORDER, SOURCE_PREFIX
 from ..log.health.rules import GOOD_LOSS, VERDICTS, has_rhythm
-from ..log.health.sources import ELAPSED, RECORDER, SOURCE_PREFIX
 from ..log.messages.definitions import ERROR, OK, STALE, WARN, DiagnosticStatus
 from ..log.messages.frames import FRAME_TOPIC_PREFIXES
 from .source_clock import ClockEstimate
@@ -38,16 +39,13 @@ class SessionClock:
         return self._zero + time.monotonic_ns()
 
 
-_NS = 1_000_000_000
-
-
 class EachSecond:
     """Runs tasks once a second each by the clock, at most one a call."""
 
     def __init__(self, tasks: Sequence[Callable[[], object]], now_ns: int) -> None:
         """Spread the tasks over the first second after ``now_ns`` [ns, monotonic]."""
         self._tasks = tuple(tasks)
-        step_ns = _NS // (len(tasks) + 1)
+        step_ns = NS // (len(tasks) + 1)
         self._due_ns = [now_ns + (k + 1) * step_ns for k in range(len(tasks))]
 
     def run(self, now_ns: int) -> None:
@@ -55,8 +53,8 @@ class EachSecond:
         k = min(range(len(self._due_ns)), key=self._due_ns.__getitem__)
         if self._due_ns[k] > now_ns:
             return
-        late = now_ns - self._due_ns[k] >= _NS
-        self._due_ns[k] = now_ns + _NS if late else self._due_ns[k] + _NS
+        late = now_ns - self._due_ns[k] >= NS
+        self._due_ns[k] = now_ns + NS if late else self._due_ns[k] + NS
         self._tasks[k]()
 
 
@@ -325,8 +323,7 @@ def _session(snapshot: RecorderSnapshot) -> DiagnosticStatus:
     message = ": ".join((snapshot.verdict, *snapshot.reasons[:1]))
     values = {"verdict": snapshot.verdict, "reasons": len(snapshot.reasons)}
     values |= {f"reason.{k + 1}": text for k, text in enumerate(snapshot.reasons[:_REASONS])}
-    level = (OK, WARN, ERROR)[VERDICTS.index(snapshot.verdict)]
-    return _status(level, "session", message, values)
+    return _status((OK, WARN, ERROR)[VERDICTS.index(snapshot.verdict)], "session", message, values)
 
 
 def _source(source: SourceSnapshot) -> DiagnosticStatus:
@@ -383,9 +380,9 @@ def _status(
     values: Mapping[str, float | str | None],
     hardware: str = "",
 ) -> DiagnosticStatus:
-    texts = {key: _text(value) for key, value in values.items() if value not in (None, "")}
+    texts = {
+        key: f"{value:.6g}" if isinstance(value, float) else str(value)
+        for key, value in values.items()
+        if value not in (None, "")
+    }
     return DiagnosticStatus(level, name, message, hardware, texts)
-
-
-def _text(value: float | str | None) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -213,8 +213,7 @@ def read_bus(
         polls[_poll(entry, messages, joints)] = None
         entry.close()
     table.close()
-    bus = Bus(tuple(databases), bitrate, tuple(signals), tuple(polls))
-    return bus, tuple(databases.items())
+    return Bus(tuple(databases), bitrate, tuple(signals), tuple(polls)), tuple(databases.items())
 
 
 def _poll(

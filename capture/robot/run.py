@@ -118,11 +118,10 @@ def run_from_scenario(text: bytes, joint_names: Iterable[str]) -> Run | None:
         scenario = read_toml(text.decode())
         world, each = _table(scenario, "world"), _table(scenario, "servo_of")
         ground, links = _table(world, "ground"), _table(scenario, "link_of")
-        surface = world.get("surface", "flat")
         return Run(
             physics_rate_hz=float(scenario.get("physics_rate_hz", 1000)),
             start_heading_rad=float(world.get("heading", 0.0)),
-            contact=surface != "none" or bool(world.get("obstacles")),
+            contact=world.get("surface", "flat") != "none" or bool(world.get("obstacles")),
             drag_ratio=drag_ratio(ground.get("mu_normal", 0), ground.get("mu_tangential", 0)),
             servo_of={
                 joint: _numbers(_table(scenario, "servo") | _table(each, joint))

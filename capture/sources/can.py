@@ -37,8 +37,7 @@ from ..log.messages.frames import (
     empty_frames,
 )
 from ..robot.model import ClockDomain
-from .address import flag, only
-from .contract import DEVICE_TIMES_END_NS, Source, SourceAddress
+from .contract import DEVICE_TIMES_END_NS, Source, SourceAddress, flag, only
 from .events import IMPLAUSIBLE_TIME, Tally
 from .link import LinkedSource
 from .slcan import slcan_source
@@ -75,12 +74,9 @@ class PythonCanLink:
             detail: Description for messages.
         """
         self.detail = detail
-        self._bus = bus
-        self._tally = tally
-        self._device_time = device_time
+        self._bus, self._tally, self._device_time = bus, tally, device_time
         self._held: deque[tuple[int, can.Message]] = deque()
-        self._lost = 0
-        self._reported = 0
+        self._lost = self._reported = 0
         self._error: OSError | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="undulog-can", daemon=True)
@@ -186,8 +182,7 @@ def failure(error: Exception) -> OSError:
     if isinstance(error, OSError):
         return error
     code = getattr(error, "error_code", None)
-    text = str(error) or type(error).__name__
-    return OSError(code if isinstance(code, int) else 0, text)
+    return OSError(code if isinstance(code, int) else 0, str(error) or type(error).__name__)
 
 
 def open_bus(text: str, bus: type[can.BusABC], options: Mapping[str, object]) -> can.BusABC:
@@ -255,18 +250,20 @@ _COMMON = {"bitrate", "fd", "data_bitrate"}
 _PARAM = re.compile(r":param\s+(?:[^:\n]*?\s)?(\w+):")
 
 
-def check_interface(text: str, interface: str) -> None:
-    """Check that python-can has an interface.
-
-    Args:
-        text: The address, for the message.
+def interface_of(address: SourceAddress) -> tuple[str, str]:
+    """Return interface and channel of an address.
 
     Raises:
-        UsageError: If it has not; lists those that it has.
+        UsageError: If python-can has no such interface (lists those that it has), or the channel
+            is missing.
     """
+    interface, _, channel = address.rest.partition(":")
     if interface not in BACKENDS:
         valid = listed(sorted(BACKENDS), interface)
-        raise UsageError(f"{text!r}: no CAN interface {interface!r}; valid: {valid}")
+        raise UsageError(f"{address.text!r}: no CAN interface {interface!r}; valid: {valid}")
+    if not channel:
+        raise UsageError(f"{address.text!r}: no channel; expected can:INTERFACE:CHANNEL")
+    return interface, channel
 
 
 def known_options(bus: type[can.BusABC]) -> set[str]:
@@ -284,10 +281,7 @@ def open_can(address: SourceAddress) -> Source:
         UsageError: If there is no such interface, or an option is unknown or has no valid value.
         SourceError: If it can never work here.
     """
-    interface, _, channel = address.rest.partition(":")
-    check_interface(address.text, interface)
-    if not channel:
-        raise UsageError(f"{address.text!r}: no channel; expected can:INTERFACE:CHANNEL")
+    interface, channel = interface_of(address)
     if interface in _OWN_LINKS:
         return _OWN_LINKS[interface](address, channel)
     return _open_other(address, interface, channel)

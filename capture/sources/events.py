@@ -155,8 +155,7 @@ class BusWatch:
         """Check new frames, in order."""
         t_ns = frames["t_device_ns"]
         if t_ns.max(initial=0) >= DEVICE_TIMES_END_NS:
-            odd = int((t_ns >= np.uint64(DEVICE_TIMES_END_NS)).sum())
-            tally.malformed(IMPLAUSIBLE_TIME, odd)
+            tally.malformed(IMPLAUSIBLE_TIME, int((t_ns >= np.uint64(DEVICE_TIMES_END_NS)).sum()))
         ids = frames["id_flags"]
         if not np.bitwise_or.reduce(ids) & ERROR_FLAG:
             if len(ids):

@@ -88,7 +88,6 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Release it, also a dead device; safe to call twice."""
-        ...
 
 
 OpenLink = Callable[[Tally], Link]
@@ -143,8 +142,7 @@ class LinkedSource:
         self.facts = facts
         self.directions = directions
         self.finished = False  # it can never work, or it was stopped
-        self._open_link = open_link
-        self._place = place
+        self._open_link, self._place = open_link, place
         self._tally = Tally(lambda: 0)
         self._watch = BusWatch()
         self._backoff = Backoff()
@@ -244,8 +242,7 @@ class LinkedSource:
             self._tally.counts.reconnects += 1
             away_s = (now_ns - (self._lost_ns or now_ns)) / 1e9
             text = f"{self._place} is back after {away_s:.1f} s"
-        detail = f" ({link.detail})" if link.detail else ""
-        self._tally.events.log_event("info", text + detail)
+        self._tally.events.log_event("info", text + (f" ({link.detail})" if link.detail else ""))
         self._was_up = True
 
     def _read(self, now_ns: int) -> tuple[FrameArray, ...]:

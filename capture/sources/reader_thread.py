@@ -58,12 +58,9 @@ class DrainedLink:
                 later.
         """
         self.detail = link.detail
-        self._link = link
-        self._tally = tally
-        self._pause_s = pause_s
+        self._link, self._tally, self._pause_s = link, tally, pause_s
         self._held: deque[FrameArray] = deque()
-        self._count = 0
-        self._taken = 0
+        self._count = self._taken = 0
         self._error: Exception | None = None
         self._stop = threading.Event()
         self._wake = os.pipe()
@@ -144,8 +141,7 @@ class ReceiveThread:
         """
         self.error: OSError | None = None
         """Why the connection broke; None if the other end closed it."""
-        self._sock = sock
-        self._longest = longest
+        self._sock, self._longest = sock, longest
         self._most_waiting = max(2, _MOST_BYTES // (longest * _MOST))
         self._rows = _FEWEST
         self._filled: deque[_Rows] = (

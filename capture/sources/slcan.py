@@ -37,8 +37,16 @@ from ..log.messages.frames import (
     empty_fd_frames,
 )
 from ..robot.model import ClockDomain
-from .address import flag, number, only
-from .contract import SourceAddress, fd_records, pack_fd_record, pack_record, records
+from .contract import (
+    SourceAddress,
+    fd_records,
+    flag,
+    number,
+    only,
+    pack_fd_record,
+    pack_record,
+    records,
+)
 from .events import Tally
 from .link import LinkedSource
 from .reader_thread import DrainedLink
@@ -111,8 +119,7 @@ class SlcanText:
         if kind in "rR":
             flags |= REMOTE_FLAG
             digits = 0
-        extra = len(rest) - digits
-        if extra not in (0, 4):
+        if (len(rest) - digits) not in (0, 4):
             return None
         device_ns: int | None = t_ns
         if self._stamps is not None:

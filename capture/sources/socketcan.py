@@ -18,8 +18,7 @@ import numpy as np
 from ..common.errors import SourceError, UsageError
 from ..log.messages.frames import DIR_RX, DIR_TX, FrameArray, empty_fd_frames, empty_frames
 from ..robot.model import ClockDomain
-from .address import flag, only
-from .contract import SourceAddress
+from .contract import SourceAddress, flag, only
 from .events import Tally
 from .link import LinkedSource
 from .reader_thread import DrainedLink
@@ -80,8 +79,7 @@ class SocketcanLink:
 
     def __init__(self, sock: socket.socket, tally: Tally) -> None:
         """Take over a bound socket."""
-        self._socket = sock
-        self._tally = tally
+        self._socket, self._tally = sock, tally
         self._receive = ReceiveMany(_PACKETS, CANFD_MTU + 1)
         self._drops = 0
         self._clock = ArrivalClock(tally.now_ns)
@@ -125,8 +123,7 @@ class SocketcanLink:
 
     def _count(self, batch: Batch) -> None:
         whole = batch.sizes.count(CAN_MTU) + batch.sizes.count(CANFD_MTU)
-        odd = len(batch.sizes) - whole
-        self._tally.malformed("packet that is no CAN frame", odd)
+        self._tally.malformed("packet that is no CAN frame", len(batch.sizes) - whole)
         if batch.drops is not None and batch.drops != self._drops:
             lost = (batch.drops - self._drops) % 2**32
             self._drops = batch.drops

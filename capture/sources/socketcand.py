@@ -24,8 +24,7 @@ import numpy as np
 from ..common.errors import UsageError
 from ..log.messages.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG, FrameArray
 from ..robot.model import ClockDomain
-from .address import number, only
-from .contract import SourceAddress, pack_record, records
+from .contract import SourceAddress, number, only, pack_record, records
 from .events import IMPLAUSIBLE_TIME, Tally
 from .link import LinkedSource
 from .reader_thread import ReceiveThread
@@ -108,8 +107,7 @@ def _one_by_one(
 ) -> list[bytes]:
     """Records of all messages; ``stops`` are the ends of the pieces that they came in."""
     messages = list(_MESSAGE.finditer(text))
-    broken = text.count("<") + text.count(">") - 2 * len(messages)
-    tally.malformed("malformed message", broken)
+    tally.malformed("malformed message", text.count("<") + text.count(">") - 2 * len(messages))
     return [
         record
         for message in messages

@@ -1,8 +1,15 @@
-"""Sources with the scheme ``unix``: frames from other processes of this computer.
+"""Frames from other processes: sources with the scheme ``unix``, and the sender for them.
 
 The recorder listens at a path; processes of the same user connect and send packets as
 :mod:`.capture.sources.contract` describes them, of up to 256 frames. The kernel stamps the arrival
 of each packet.
+
+>>> sender = FrameSender("/run/user/1000/snake.sock")
+>>> sender.send(frames)          # an array of FRAME_DTYPE; never waits
+128
+
+A process in another language does the same with 20 lines: connect an ``AF_UNIX`` socket of type
+``SOCK_SEQPACKET`` and send packets as :mod:`.capture.sources.contract` describes them.
 """
 
 from __future__ import annotations
@@ -18,15 +25,15 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
-from ..common.errors import SourceError, UsageError
+from ..common.errors import DataError, SourceError, UsageError
+from ..common.files import listen_at
 from ..common.process import share_priority
-from ..common.unix_listener import listen_at
-from ..log.messages.frames import FrameArray, frames_from_bytes
+from ..log.messages.frames import FRAME_DTYPE, FrameArray, frames_from_bytes
 from ..robot.model import ClockDomain, Robot
-from .address import flag, only
 from .contract import (
     HEAD,
     LONGEST,
@@ -37,10 +44,12 @@ from .contract import (
     SourceAddress,
     SourceContext,
     SourceCounts,
+    flag,
+    only,
 )
 from .events import BusWatch, Tally
 from .reader_thread import ReceiveThread
-from .receive_many import ArrivalClock, Batch
+from .receive_many import SO_SNDBUFFORCE, ArrivalClock, Batch, enlarge_buffer
 
 _MOST_PACKETS = 8192  # in one poll, of one sender
 _BACKLOG = 64
@@ -103,8 +112,7 @@ class UnixSource:
         self._senders: list[_Sender] = []
         self._had_sender = False
         self._waits_since = 0.0
-        self._ending = False
-        self._finished = False
+        self._ending = self._finished = False
 
     @property
     def counts(self) -> SourceCounts:
@@ -341,3 +349,111 @@ def _clear(text: str, path: Path) -> None:
             if error.errno not in (errno.EAGAIN, errno.EPROTOTYPE):
                 raise SourceError(text, f"{path}: {error.strerror}") from error
     raise SourceError(text, f"another program listens at {path}")
+
+
+_BUFFER_BYTES = 4 << 20
+
+
+class FrameSender:
+    """Sends frames to a recorder that may start later, be slow, and restart.
+
+    Frames that are not accepted are not kept; their count is reported to the recorder.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Set the path of the recorder; the first :meth:`send` connects."""
+        self.path = Path(path)
+        self.accepted = 0
+        """Frames accepted, over all connections."""
+        self.refused = 0
+        """Frames not accepted: no recorder, or its buffer is full."""
+        self._socket: socket.socket | None = None
+        self._sequence = self._dropped = 0
+        self._retry_at = 0.0
+
+    @property
+    def connected(self) -> bool:
+        """Whether the last attempt to connect succeeded."""
+        return self._socket is not None
+
+    def send(self, frames: FrameArray) -> int:
+        """Send frames, without waiting.
+
+        Args:
+            frames: Records of :data:`.FRAME_DTYPE`, shape (n,). ``t_device_ns``
+                is the sampling time on the sender's own clock; ``t_host_ns`` is set on receipt.
+
+        Returns:
+            Number of accepted frames, from the first one on. The others are lost, and counted.
+
+        Raises:
+            DataError: If the array is of another type.
+            OSError: If the socket can't be used at all, e.g. for want of permission.
+        """
+        if frames.dtype != FRAME_DTYPE or frames.ndim != 1:
+            raise DataError(f"frames are records of 32 bytes, shape (n,); found {frames.dtype}")
+        sock = self._connect()
+        done = 0
+        if sock is not None:
+            payload = np.ascontiguousarray(frames)
+            while done < len(frames):
+                records = payload[done : done + MOST_RECORDS]
+                if not self._put(sock, records.tobytes()):
+                    break
+                done += len(records)
+                self._sequence += len(records)
+            if self._socket is not None:
+                self._sequence += len(frames) - done
+                self._dropped += len(frames) - done
+        self.accepted += done
+        self.refused += len(frames) - done
+        return done
+
+    def close(self) -> None:
+        """Report the last dropped frames, if possible, and disconnect; safe to call twice."""
+        if self._socket is not None and self._dropped:
+            self._put(self._socket, b"")
+        self._disconnect()
+
+    def __enter__(self) -> Self:
+        """Return the sender; its first :meth:`send` connects."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Disconnect."""
+        self.close()
+
+    def _put(self, sock: socket.socket, records: bytes) -> bool:
+        """Send one packet; return False if there is no room or no recorder."""
+        try:
+            sock.send(HEAD.pack(self._sequence, self._dropped) + records)
+        except BlockingIOError:
+            return False
+        except (BrokenPipeError, ConnectionError):
+            self._disconnect()
+            return False
+        return True
+
+    def _connect(self) -> socket.socket | None:
+        if self._socket is not None or time.monotonic() < self._retry_at:
+            return self._socket
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        try:
+            enlarge_buffer(sock, SO_SNDBUFFORCE, socket.SO_SNDBUF, _BUFFER_BYTES)
+            sock.connect(str(self.path))
+        except (FileNotFoundError, ConnectionRefusedError, BlockingIOError):
+            sock.close()
+            self._retry_at = time.monotonic() + _PAUSE_S
+            return None
+        except OSError:
+            sock.close()
+            raise
+        self._socket, self._sequence, self._dropped = sock, 0, 0
+        return sock
+
+    def _disconnect(self) -> None:
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.close()
+            self._socket = None
+            self._retry_at = time.monotonic() + _PAUSE_S

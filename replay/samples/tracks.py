@@ -21,7 +21,7 @@ from undulog.capture import SessionView
 from undulog.capture.bus.decoded_topics import JOINT_TOPIC
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.common.errors import DataError, MissingChannelError
-from undulog.capture.log.read.signals import JointSignals
+from undulog.capture.log.read.sample_times import JointSignals
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 

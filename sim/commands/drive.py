@@ -1,22 +1,155 @@
-"""Command ``drive``."""
+"""Command ``drive``: on the twin, or over a bus."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import sys
+import time
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import echo, emit_json, refuse_existing
+from undulog.capture.common.console import (
+    UNLIMITED,
+    complain,
+    emit,
+    progress,
+    refuse_existing,
+)
 from undulog.capture.common.errors import UsageError
+from undulog.capture.common.process import interruptible
 
-from .run import check_session_name, with_progress
+from .run import check_session_name, speed_text, with_progress
 
 if TYPE_CHECKING:
+    from undulog.capture.robot.model import Robot
+
+    from ..drive.loop import BusTick
     from ..drive.motion import MotionSource
+    from ..drive.report import BusReport
     from ..scenario.scenario import Scenario
     from ..twin.recording import Recording
+
+
+def drive_armed(
+    driven: MotionSource,
+    on: str,
+    *,
+    robot: Robot | None,
+    duration_s: float | None,
+    output: Path | None,
+    recorder: Path | None,
+    force: bool,
+) -> BusReport:
+    """Drive over a bus, with progress on a terminal.
+
+    Args:
+        robot: The robot on the bus; the one that the motion was made for if None.
+        duration_s: Duration [s]; that of the motion if None.
+        recorder: Control socket of a recorder; that of the only running one if None.
+
+    Returns:
+        The report, also where it ended early.
+
+    Raises:
+        UsageError: If the arguments can't be used, e.g. the robot has no limits.
+        SourceError: If the bus is silent, or the robot can't be driven from its pose.
+    """
+    from ..drive.loop import ConsoleWatch
+    from ..drive.over_bus import bus_plan, drive_bus
+
+    if output is None:
+        raise UsageError(
+            "an armed drive is recorded, with every action of the gate: name the session with -o, "
+            "e.g. -o drive.mcap"
+        )
+    recorder = recorder or _only_recorder()
+    plan = bus_plan(driven, on, output, robot, duration_s, recorder=recorder, force=force)
+    console = ConsoleWatch()
+    start = time.monotonic()
+    with interruptible(twice=True) as stop, progress(driven.name, plan.duration_s) as bar:
+
+        def show(tick: BusTick) -> None:
+            note = f"{tick.step.phase}, {speed_text(tick.time_s, start)}"
+            bar.update(min(tick.time_s, plan.duration_s), note)
+
+        report = drive_bus(plan, stop=stop, on_tick=show, console=console)
+        console.gone()  # output is discarded from here on
+    return report
+
+
+def early_end(report: BusReport) -> int:
+    """Print on stderr what ended a drive early; return the exit code, 0 if nothing did."""
+    if report.complete:
+        return 0
+    complain(f"error: {report.outcome.why}; {report.outcome.ended}")
+    return 1
+
+
+def dry_run_on_bus(
+    driven: MotionSource,
+    on: str,
+    *,
+    robot: Robot | None,
+    duration_s: float | None,
+    output: Path | None,
+    recorder: Path | None,
+    force: bool,
+    as_json: bool,
+) -> int:
+    """Run a motion in the twin, through the gate of a bus, and print the report.
+
+    Args:
+        robot: The robot on the bus; the one that the motion was made for if None.
+        duration_s: Duration [s]; that of the motion if None.
+        output: The session to write, or None.
+        as_json: Report as one JSON object.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        UsageError: If the arguments can't be used, e.g. the robot has no bus.
+    """
+    from ..drive.dry_run import dry_run, reported, summary_lines
+    from ..drive.over_bus import check_drivable
+
+    if recorder is not None:
+        raise UsageError("--recorder is for --arm: a dry run sends nothing")
+    check_drivable(driven, robot or driven.robot)
+    start = time.monotonic()
+    length_s = driven.duration_s if duration_s is None else duration_s
+    with interruptible() as stop, progress(f"dry run of {driven.name}", length_s) as bar:
+        dry = dry_run(
+            driven,
+            robot=robot,
+            duration_s=duration_s,
+            output=output,
+            force=force,
+            stop=stop,
+            on_time=lambda time_s: bar.update(time_s, speed_text(time_s, start)),
+        )
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED
+    hint = ["", f"To send it to {on}, the same with --arm and -o SESSION.mcap"]
+    lines = [*summary_lines(dry, width), *(hint if dry.verdict.fit else [])]
+    emit({"on": on, **reported(dry)}, lines, as_json=as_json)
+    return 0 if dry.verdict.fit else 1
+
+
+def _only_recorder() -> Path | None:
+    """Return the control socket of the running recorder, None if there is none."""
+    from undulog.capture.recorder.control_client import find_sockets
+
+    sockets = find_sockets(os.environ)
+    if len(sockets) > 1:
+        listed = "\n".join(f"  --recorder {path}" for path in sockets)
+        raise UsageError(
+            f"{len(sockets)} recorders run; which one is to receive the gait?\n{listed}"
+        )
+    return sockets[0] if sockets else None
 
 
 _TWIN = "twin"
@@ -73,21 +206,22 @@ def drive(
         from undulog.capture import load_robot
 
         from ..drive.over_bus import bus_address
-        from .drive_bus import drive_on_bus
 
         bus_address(on)
         described = load_robot(robot) if robot is not None else None
-        return drive_on_bus(
-            find_motion(what, robot=described),
-            on,
-            arm=arm,
-            robot=described,
-            duration_s=duration,
-            output=output,
-            recorder=recorder,
-            force=force,
-            as_json=json,
-        )
+        driven = find_motion(what, robot=described)
+        given: dict[str, Any] = {
+            "robot": described,
+            "duration_s": duration,
+            "output": output,
+            "recorder": recorder,
+            "force": force,
+        }
+        if not arm:
+            return dry_run_on_bus(driven, on, as_json=json, **given)
+        report = drive_armed(driven, on, **given)
+        emit(report.facts(), report.lines(), as_json=json)
+        return early_end(report)
     if arm or recorder is not None or robot is not None:
         raise UsageError(
             "--arm, --recorder and --robot are for a bus; a run of the twin records itself"
@@ -102,10 +236,8 @@ def drive(
     recording, factor = with_progress(
         driven.name, scenario, partial(drive_twin, driven, scenario, output, force=force)
     )
-    if json:
-        emit_json(_reported(driven, scenario, recording, factor))
-    else:
-        echo(*_summary(driven, scenario, recording, factor))
+    facts = _reported(driven, scenario, recording, factor)
+    emit(facts, _summary(driven, scenario, recording, factor), as_json=json)
     return 0
 
 

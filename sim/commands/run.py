@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import UNLIMITED, echo, emit_json, progress, refuse_existing
+from undulog.capture.common.console import UNLIMITED, emit, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import interruptible
 
@@ -71,27 +71,21 @@ def null(
             on_run=lambda done, total: bar.update(done / total, f"run {done} of {total}"),
         )
     write_null_model(output, model)
-    if json:
-        emit_json(
-            {
-                "path": str(output),
-                "robot": model.robot,
-                "frequency_hz": model.frequency_hz,
-                "joints": list(model.joints),
-                "parameters": {one.name: one.value for one in model.parameters},
-                "error": model.error,
-            }
-        )
-        return
-    echo(
-        f"{output}: {len(model.joints)} driven joints of {model.robot} at {model.frequency_hz:g} "
-        f"Hz; off the twin by at most {model.error:.2g} in ln gain and lag within its reach"
-    )
+    facts = {
+        "path": str(output),
+        "robot": model.robot,
+        "frequency_hz": model.frequency_hz,
+        "joints": list(model.joints),
+        "parameters": {one.name: one.value for one in model.parameters},
+        "error": model.error,
+    }
+    driven = f"{len(model.joints)} driven joints of {model.robot} at {model.frequency_hz:g} Hz"
+    off = f"off the twin by at most {model.error:.2g} in ln gain and lag within its reach"
+    lines = [f"{output}: {driven}; {off}"]
     for one in model.parameters:
-        echo(
-            f"{one.name.replace('_', ' ')} {one.value:g} {one.unit}, by a factor "
-            f"exp(±{one.reach:g})"
-        )
+        value = f"{one.name.replace('_', ' ')} {one.value:g} {one.unit}"
+        lines.append(f"{value}, by a factor exp(±{one.reach:g})")
+    emit(facts, lines, as_json=json)
 
 
 def list_scenarios(*, json: bool = False) -> None:
@@ -105,11 +99,9 @@ def list_scenarios(*, json: bool = False) -> None:
     from ..scenario.scenario_file import load_scenario, scenario_names
 
     scenarios = [load_scenario(name) for name in scenario_names()]
-    if json:
-        emit_json([_described(scenario) for scenario in scenarios])
-        return
     columns = get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED
-    echo(*_listed(scenarios, columns))
+    described = [_described(scenario) for scenario in scenarios]
+    emit(described, _listed(scenarios, columns), as_json=json)
 
 
 def run(
@@ -156,10 +148,8 @@ def run(
         chosen,
         partial(record, chosen, output, force=force, kernels=_kernels(kernels)),
     )
-    if json:
-        emit_json(_reported(chosen, recording, factor))
-    else:
-        echo(*_summary(chosen, recording, factor))
+    facts = _reported(chosen, recording, factor)
+    emit(facts, _summary(chosen, recording, factor), as_json=json)
     return 0 if recording.complete else 1
 
 

@@ -16,7 +16,7 @@ from undulog.capture.common.errors import UsageError
 
 if TYPE_CHECKING:
     from undulog.capture.sources.contract import SourceEvent
-    from undulog.capture.sources.sender import FrameSender
+    from undulog.capture.sources.unix_socket import FrameSender
 
     from ..scenario.bus_faults import BusFault
     from ..scenario.scenario import Scenario
@@ -120,7 +120,7 @@ class _Plan:
 def _run(plan: _Plan) -> int:
     from undulog.capture.common.process import interruptible
     from undulog.capture.sources.events import EventLog
-    from undulog.capture.sources.sender import FrameSender
+    from undulog.capture.sources.unix_socket import FrameSender
 
     from ..serve.pacing import Pacer
     from ..serve.robot import PERIOD_NS, VirtualRobot
@@ -198,7 +198,7 @@ def _print_end(
         "start_s": served.start_ns * 1e-9,
         **asdict(served.pace),
         "frames": bus.sent,
-        "heard": bus.heard,
+        "heard": bus.received,
         "commands": served.commands,
         "lost": served.lost,
         "hit": served.hit,

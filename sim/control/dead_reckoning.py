@@ -59,8 +59,7 @@ class SlipOdometry:
         across = np.column_stack([left[0], left[1], (left * lever).sum(axis=0)])
         weight = math.sqrt(self._slip_ratio)
         known = np.concatenate([(ahead * moved).sum(axis=0), weight * (left * moved).sum(axis=0)])
-        unknown = np.concatenate([along, weight * across])
-        motion = np.linalg.lstsq(unknown, -known)[0]
+        motion = np.linalg.lstsq(np.concatenate([along, weight * across]), -known)[0]
         return np.asarray(motion, dtype=np.float64)
 
     def _from_head(self, joint: FloatArray) -> FloatArray:
@@ -113,8 +112,7 @@ class DeadReckoning:
         """
         if not np.isnan(readings.angle).any():
             motion = self._odometry.velocity(readings.angle, readings.velocity) * elapsed_s
-            middle = self._heading + motion[2] / 2
-            self._place = self._place + turned(motion[:2], middle)
+            self._place = self._place + turned(motion[:2], self._heading + motion[2] / 2)
             self._heading += float(motion[2])
         return Pose(self._place, self._heading, self._path.step(phase, self._heading, offset))
 

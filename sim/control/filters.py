@@ -16,9 +16,6 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray
 
-TURN = 2.0 * math.pi
-"""One gait period, in phase [rad]."""
-
 
 class PhaseHistory:
     """A vector as a function of the past phase, linear between its samples."""
@@ -111,9 +108,9 @@ class PathHeading:
         if math.isfinite(heading):
             if self._rows:
                 last = self._rows[-1][1]
-                heading = last + math.remainder(heading - last, TURN)
+                heading = last + math.remainder(heading - last, math.tau)
             self._rows.append((phase, heading, offset))
-            old = bisect_left(self._rows, phase - TURN, key=lambda row: row[0])
+            old = bisect_left(self._rows, phase - math.tau, key=lambda row: row[0])
             del self._rows[:old]
         if not self._rows:
             return math.nan
@@ -199,8 +196,7 @@ class SideLatch:
             margin_m: The other side must be freer by more than this [m].
             hold_s: A side is kept at least so long [s].
         """
-        self._margin_m = margin_m
-        self._hold_s = hold_s
+        self._margin_m, self._hold_s = margin_m, hold_s
         self._side = 1.0
         self._since_s = -math.inf
 
@@ -244,8 +240,7 @@ class NearMemory:
                 does not fold back.
             hold_s: How long a near reading is believed [s].
         """
-        self._near_m = near_m
-        self._hold_s = hold_s
+        self._near_m, self._hold_s = near_m, hold_s
         self._seen_m = np.full(len(near_m), math.inf)
         self._until_s = np.full(len(near_m), -math.inf)
 

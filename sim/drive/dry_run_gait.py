@@ -99,17 +99,7 @@ class JointDemand:
     @property
     def margin(self) -> float:
         """Least distance of the command from a limit [rad]; negative beyond it."""
-        return min(self.greatest_room, self.least_room)
-
-    @property
-    def greatest_room(self) -> float:
-        """From the greatest command to the upper limit [rad]."""
-        return self.upper - self.greatest
-
-    @property
-    def least_room(self) -> float:
-        """From the lower limit to the least command [rad]."""
-        return self.least - self.lower
+        return min(self.upper - self.greatest, self.least - self.lower)
 
     @property
     def demands(self) -> tuple[Demand, ...]:
@@ -206,27 +196,28 @@ class DemandTally:
             self._torque_squares, self._torque_count, out=squares, where=self._torque_count > 0
         )
         energies = (self._energy - self._energy_before)[list(_ENERGIES)]
+        columns = {
+            "least": self._least,
+            "greatest": self._greatest,
+            "rate": self._rate,
+            "max_rate": rate,
+            "acceleration": self._acceleration,
+            "torque_peak": self._torque,
+            "torque_rms": np.sqrt(squares),
+            "current_peak": self._current,
+            "max_current": current,
+            "tracking_error": self._error,
+            "max_tracking_error": error,
+            **dict(zip(("energy_net_j", "energy_abs_j", "energy_el_j"), energies, strict=True)),
+            "clamped": self._clamped / max(self._ticks, 1),
+        }
         return tuple(
             JointDemand(
                 name=joint.name,
                 lower=joint.lower,
                 upper=joint.upper,
-                least=float(self._least[i]),
-                greatest=float(self._greatest[i]),
-                rate=float(self._rate[i]),
-                max_rate=float(rate[i]),
-                acceleration=float(self._acceleration[i]),
-                torque_peak=float(self._torque[i]),
-                torque_rms=float(np.sqrt(squares[i])),
                 stall_torque=joint.servo.stall_torque,
-                current_peak=float(self._current[i]),
-                max_current=float(current[i]),
-                tracking_error=float(self._error[i]),
-                max_tracking_error=float(error[i]),
-                energy_net_j=float(energies[0, i]),
-                energy_abs_j=float(energies[1, i]),
-                energy_el_j=float(energies[2, i]),
-                clamped=float(self._clamped[i]) / max(self._ticks, 1),
+                **{key: float(values[i]) for key, values in columns.items()},
             )
             for i, joint in enumerate(robot.joints)
         )
@@ -256,11 +247,11 @@ class NotedGait:
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:
         """Ask the gait."""
-        said = self._gait.step(time_s, readings)
+        result = self._gait.step(time_s, readings)
         if not self._asked:
-            self._asked, self.first = True, said.command.copy()
-        self._cut.update(dict.fromkeys(said.clamped))
-        return said
+            self._asked, self.first = True, result.command.copy()
+        self._cut.update(dict.fromkeys(result.clamped))
+        return result
 
 
 class GatedGait:
@@ -284,7 +275,7 @@ class GatedGait:
         self._gate = gate
         self.tally = DemandTally(robot, limits)
         self.remarks: list[GateEvent] = []
-        self._told = 0
+        self._yielded = 0
         self._command = np.clip(np.zeros(len(robot.joints)), *robot.limits())
         self._unknown = np.full(len(robot.joints), np.nan)
         self._current = self._unknown
@@ -317,8 +308,7 @@ class GatedGait:
             self._command = step.command
         if step.gait is None or step.wanted is None:
             return GaitTick(self._command.copy(), self._values, str(step.phase), ())
-        changed = ~(np.abs(self._command - step.wanted) <= _CHANGED)
-        self.tally.command(step.wanted, changed)
+        self.tally.command(step.wanted, ~(np.abs(self._command - step.wanted) <= _CHANGED))
         self._values = step.gait.values
         return step.gait._replace(command=self._command.copy())
 
@@ -333,5 +323,5 @@ class GatedGait:
 
     def fresh_remarks(self) -> Iterator[GateEvent]:
         """Return the events of the gate since the last call."""
-        told, self._told = self._told, len(self.remarks)
-        yield from self.remarks[told:]
+        shown, self._yielded = self._yielded, len(self.remarks)
+        yield from self.remarks[shown:]

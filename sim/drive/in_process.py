@@ -69,8 +69,7 @@ class FadingGait:
             return tick
         if self._begun_s is None:
             self._begun_s = time_s
-        elapsed_s = time_s - self._begun_s + _ROUNDING_S
-        self._passed = min(elapsed_s / self._fade_s, 1.0)
+        self._passed = min((time_s - self._begun_s + _ROUNDING_S) / self._fade_s, 1.0)
         share = 1.0 - smoothstep(self._passed)
         command: FloatArray = self._rest + share * (tick.command - self._rest)
         values = tick.values.copy()
@@ -112,11 +111,10 @@ def drive_twin(
         if gait.at_rest:
             ended.signal = stop.signal if stop is not None else None
 
-    driver = Driver(gait, driven.facts, driven.attachments, driven.records)
     return record(
         scenario,
         path,
-        driver=driver,
+        driver=Driver(gait, driven.facts, driven.attachments, driven.records),
         force=force,
         stop=ended,
         on_sample=after,

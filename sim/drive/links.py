@@ -232,7 +232,6 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Release it; safe to call twice."""
-        ...
 
 
 def find_virtual_robot(address: SourceAddress, tally: Tally) -> VirtualRobotLink | None:

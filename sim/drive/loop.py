@@ -247,8 +247,7 @@ class ControlLoop:
             DataError: If the robot has no bus.
         """
         self.tally = LoopTally()
-        self._gate, self._link, self._pace = gate, link, pace
-        self._spacing = spacing
+        self._gate, self._link, self._pace, self._spacing = gate, link, pace, spacing
         self._encoder, self._known = CommandEncoder(robot), BusReadings(robot)
         self._presence = BusCheck(robot)
         self._polls = poll_frames(robot)
@@ -288,12 +287,12 @@ class ControlLoop:
         while self._gate.phase is not Phase.DONE:
             try:
                 tick, received = self._pace.next()
-                heard = self._receive(tick, received)
+                inputs = self._receive(tick, received)
                 gone = gone or (console is not None and console.gone())
                 step = self._gate.step(
-                    tick, heard, stop_reason(stop, console_gone=gone), at_once=stop.again
+                    tick, inputs, stop_reason(stop, console_gone=gone), at_once=stop.again
                 )
-                sent = self._send(step, heard)
+                sent = self._send(step, inputs)
             except SourceError as error:
                 if not self.tally.commanded:
                     raise
@@ -316,8 +315,7 @@ class ControlLoop:
         time_s, trouble, before = tick / CONTROL_RATE_HZ, None, self._known.angles.copy()
         for frames in received:
             self._known.add(frames, time_s)
-            found: GateFault | None = self._presence.add(frames)
-            trouble = trouble or found
+            trouble = trouble or self._presence.add(frames)
             self.tally.received += len(frames)
         self.tally.decoded = self._known.tally.decoded
         if self._pace.by_the_clock:
@@ -338,7 +336,7 @@ class ControlLoop:
             bounds=bounds,
         )
 
-    def _send(self, step: GateStep, heard: GateInput) -> FrameArray:
+    def _send(self, step: GateStep, inputs: GateInput) -> FrameArray:
         """Send the commands, then the requests where the robot reports only on request.
 
         The requests follow the commands, so that a reply confirms these.
@@ -356,7 +354,7 @@ class ControlLoop:
                     self._confirmation.arm(
                         silence.interval or 1, silence.limit, self._longest_pause
                     )
-                self._confirmation.send(step.command, heard.status.angle)
+                self._confirmation.send(step.command, inputs.status.angle)
             self.tally.commanded = True
         commands = len(frames)
         if self._confirmation is None or self._confirmation.ask():

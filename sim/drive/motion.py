@@ -21,10 +21,10 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from undulog.capture import Session
-from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import NS, FloatArray, IntArray
 from undulog.capture.common.errors import DataError, JointSetError, PlanError, UsageError
 from undulog.capture.common.files import Shelf
-from undulog.capture.log.read.signals import JointSignals
+from undulog.capture.log.read.sample_times import JointSignals
 from undulog.capture.robot.model import Plane, Robot
 
 from ..control.adaptive import build_gait
@@ -36,8 +36,6 @@ from .plan import PlanGait, is_plan, parse_plan
 COMMANDS = "/joint_commands"
 REPLAY = "replay"
 """The mode of commands whose session names none."""
-
-_NS = 1_000_000_000
 
 
 class _Held:
@@ -96,8 +94,8 @@ class RecordedCommands:
         """
         commands = session.joints(COMMANDS)
         gait = session.joints("/gait") if "/gait" in session.channels else None
-        told = session.messages("/gait/mode") if "/gait/mode" in session.channels else ()
-        return cls(commands, gait, tuple((t_ns, str(message.data)) for t_ns, message in told))
+        modes = session.messages("/gait/mode") if "/gait/mode" in session.channels else ()
+        return cls(commands, gait, tuple((t_ns, str(message.data)) for t_ns, message in modes))
 
 
 class CommandReplay:
@@ -137,12 +135,12 @@ class CommandReplay:
     @property
     def duration_s(self) -> float:
         """From the first command to the last, up to a whole control period [s]."""
-        periods = (self._end_ns - self._start_ns) * CONTROL_RATE_HZ / _NS
+        periods = (self._end_ns - self._start_ns) * CONTROL_RATE_HZ / NS
         return max(math.ceil(periods - 1e-6), 1) / CONTROL_RATE_HZ
 
     def step(self, time_s: float, readings: Readings) -> GaitTick:  # noqa: ARG002 - recorded
         """Return the commands in force at a time."""
-        t_ns = self._start_ns + round(time_s * _NS)
+        t_ns = self._start_ns + round(time_s * NS)
         wanted = self._rest.copy()
         given = self._commands.at(t_ns)
         wanted[self._joints] = np.where(np.isnan(given), self._rest[self._joints], given)
@@ -150,8 +148,7 @@ class CommandReplay:
         cut = np.flatnonzero(command != wanted)
         clamped = tuple(self._joint_names[i] for i in cut)
         values = self._gait.at(t_ns) if self._gait is not None else np.empty(0)
-        mode = self._modes[bisect_right(self._since_ns, t_ns)]
-        return GaitTick(command, values, mode, clamped)
+        return GaitTick(command, values, self._modes[bisect_right(self._since_ns, t_ns)], clamped)
 
 
 # Attachments of recorded commands that say what they were made from: they go on to the run.
@@ -339,7 +336,7 @@ def _commands(
     facts = {"driven": "commands", "driven.by": path.name}
     with Session.open(path) as session:
         recorded = RecordedCommands.read(session)
-        stored, told = session.attachments, session.metadata
+        stored, meta = session.attachments, session.metadata
         settle_s, described = session.settle_s, session.robot
         if robot is None:
             robot = described if world is None else world.robot
@@ -374,21 +371,21 @@ def _commands(
         facts=facts,
         attachments={name: stored[name] for name in _EXPLAINS if name in stored},
         settle_s=settle_s,
-        records={name: told[name] for name in _RECORDS if name in told},
-        kernels=_kernels(told.get("undulog", {}).get("kernels")),
+        records={name: meta[name] for name in _RECORDS if name in meta},
+        kernels=_kernels(meta.get("undulog", {}).get("kernels")),
         joints=recorded.commands.names,
-        heading_rad=_planned(told, _HEADING, float, path),
+        heading_rad=_planned(meta, _HEADING, float, path),
         # A plan that turns the robot repeats its commands; others change them from run to run.
-        run=_planned(told, _RUN, int, path) if _HEADING in told.get("undulog.plan", {}) else 0,
-        as_run="driven" in told.get("undulog", {}),
+        run=_planned(meta, _RUN, int, path) if _HEADING in meta.get("undulog.plan", {}) else 0,
+        as_run="driven" in meta.get("undulog", {}),
     )
 
 
 def _planned(
-    told: Mapping[str, Mapping[str, str]], key: str, kind: Callable[[str], _Number], path: Path
+    meta: Mapping[str, Mapping[str, str]], key: str, kind: Callable[[str], _Number], path: Path
 ) -> _Number:
     """A number of the plan's record."""
-    text = told.get("undulog.plan", {}).get(key, "0")
+    text = meta.get("undulog.plan", {}).get(key, "0")
     try:
         value = kind(text)
     except ValueError:
@@ -398,6 +395,6 @@ def _planned(
     return value
 
 
-def _kernels(told: str | None) -> Kernels:
+def _kernels(name: str | None) -> Kernels:
     """Return the kernels of a session; the default if unknown."""
-    return Kernels(told) if told in set(Kernels) else Kernels.NUMPY
+    return Kernels(name) if name in set(Kernels) else Kernels.NUMPY

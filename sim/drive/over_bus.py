@@ -5,22 +5,21 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 
+from undulog.capture.common.arrays import NS
 from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import FrameArray, identifier_text
 from undulog.capture.recorder.status import SessionClock
 from undulog.capture.robot.model import Direction, Quantity, Robot
-from undulog.capture.sources.address import parse_address
-from undulog.capture.sources.contract import SourceAddress, SourceCounts
+from undulog.capture.sources.contract import SourceAddress, SourceCounts, parse_address
 from undulog.capture.sources.events import Tally
 
 from ..gait.contract import CONTROL_RATE_HZ
 from ..gate.confirmation import Confirmation
 from ..gate.gate import Gate
-from ..gate.limits import GateLimits, Spacing, gate_limits
+from ..gate.limits import Spacing, gate_limits
 from ..gate.outcome import DriveEnding, FaultKind, GateFault, Outcome, jitter
 from ..scenario.scenario import LONGEST_S, Scenario
 from ..twin.recording import quick_collections
@@ -28,34 +27,12 @@ from .links import Link, VirtualRobotLink
 from .loop import BusTick, ConsoleWatch, ControlLoop, LockstepPace, LoopTally, WallPace
 from .motion import MotionSource
 from .python_can_bus import open_link
-from .report import UNASKED, BusReport, Feedback, remarks_of
+from .report import UNASKED, BusPlan, BusReport, Feedback
 from .session import BusSession, GaitPublisher, stamped
 
 LISTEN_S = 0.5
 """A bus is listened to for so long before anything is sent [s]: whose it is, and how often joints
 report. A robot in lockstep has said its name, and waits for each command."""
-
-_NS = 1_000_000_000
-
-
-@dataclass(frozen=True)
-class BusPlan:
-    """Parameters of a drive over a bus.
-
-    Attributes:
-        limits: Limits of the robot.
-        duration_s: Time of the gait's last tick.
-        recorder: Control socket of the recorder that receives the gait, or None.
-    """
-
-    driven: MotionSource
-    robot: Robot
-    limits: GateLimits
-    address: SourceAddress
-    duration_s: float
-    output: Path
-    recorder: Path | None = None
-    force: bool = False
 
 
 def bus_plan(
@@ -161,7 +138,7 @@ def drive_bus(
         opened.callback(link.close)
         virtual = _virtual(link, plan)
         lockstep = virtual is not None and virtual.lockstep
-        epoch_ns = Scenario.epoch_s * _NS if lockstep else clock.epoch_ns
+        epoch_ns = Scenario.epoch_s * NS if lockstep else clock.epoch_ns
         session = BusSession(
             plan.output,
             plan.driven,
@@ -214,7 +191,7 @@ def drive_bus(
         try:
             publish.begin()
             loop.run(stop, each_tick, console)
-            report = _report(gate, loop, spacing, tally.counts)
+            report = _report(plan, gate, loop, spacing, tally.counts)
             publish.end(report)
             session.close()
         except LogWriteError as error:
@@ -225,8 +202,8 @@ def drive_bus(
         report.wall_s = time.monotonic() - begun
         report.first_frames = publish.first_frames
     if teller is not None:  # closed: all that could be told is
-        report.told = teller.told
-        report.not_told = teller.error or (
+        report.taken = teller.taken
+        report.not_taken = teller.error or (
             f"{teller.dropped} samples: the recorder was too slow" if teller.dropped else None
         )
     return report
@@ -252,12 +229,12 @@ def _unwritten(
         session.close()
     except LogWriteError as later:  # says what is kept, and where
         error = later
-    said = [str(error).removeprefix(f"{error.path}: ")]
+    reasons = [str(error).removeprefix(f"{error.path}: ")]
     if gate.outcome is not None:
-        said.append(gate.outcome.ended)
+        reasons.append(gate.outcome.ended)
     if tally.untold:
-        said.append(f"the last {tally.untold} control ticks are not in the session")
-    return LogWriteError(error.path, "; ".join(said))
+        reasons.append(f"the last {tally.untold} control ticks are not in the session")
+    return LogWriteError(error.path, "; ".join(reasons))
 
 
 def _feedback(gate: Gate, loop: ControlLoop) -> Feedback | None:
@@ -268,10 +245,13 @@ def _feedback(gate: Gate, loop: ControlLoop) -> Feedback | None:
     return Feedback(loop.by_replies, interval * period_s, gate.silence.limit, period_s)
 
 
-def _report(gate: Gate, loop: ControlLoop, spacing: Spacing | None, bus: SourceCounts) -> BusReport:
+def _report(
+    plan: BusPlan, gate: Gate, loop: ControlLoop, spacing: Spacing | None, bus: SourceCounts
+) -> BusReport:
     outcome = gate.outcome or Outcome(DriveEnding.STOPPED, "", "")
     began = gate.run_from
     return BusReport(
+        plan=plan,
         outcome=outcome,
         tally=loop.tally,
         lockstep=spacing is None,
@@ -323,7 +303,7 @@ class _Telling:
         if self._simulated_ns is None:
             self._session.write(tick, self._clock.now_ns())
         else:
-            t_ns = self._simulated_ns + tick.tick * (_NS // CONTROL_RATE_HZ)
+            t_ns = self._simulated_ns + tick.tick * (NS // CONTROL_RATE_HZ)
             self._session.write(stamped(tick, t_ns), t_ns)
         for event in self._events.take():
             self._session.log_event(event.level, event.text)
@@ -347,7 +327,7 @@ class _Telling:
     def end(self, report: BusReport) -> None:
         for event in self._events.flush():
             self._session.log_event(event.level, event.text)
-        self._session.finish(report.outcome, remarks_of(report))
+        self._session.finish(report.outcome, report.remarks())
         if report.jitter is not None:
             facts = {name: str(value) for name, value in report.jitter.to_dict().items()}
             self._session.writer.note("undulog.gate.jitter", facts)

@@ -149,8 +149,7 @@ class _PlannedRhythm:
         self._transitions = [segment.transition_s for segment in plan.segments]
         self._ramp_s = plan.ramp_s
         self._places = np.arange(joint_count)
-        omega = float(self._values[0, 3])
-        self._phase = IntegratedPhase(gaits[0].phase, omega)
+        self._phase = IntegratedPhase(gaits[0].phase, float(self._values[0, 3]))
 
     def step(self, time_s: float, change: Change, readings: Readings) -> WaveState:  # noqa: ARG002
         segment = bisect_right(self._starts, time_s) - 1
@@ -245,8 +244,7 @@ def _start(top: Table, scenario: Scenario | None) -> tuple[dict[Plane, PlaneGait
 def _segments(top: Table, start: Mapping[Plane, PlaneGait]) -> tuple[Segment, ...]:
     segments: list[Segment] = []
     for table in top.tables("segments"):
-        planes = segments[-1].planes if segments else start
-        segments.append(_segment(table, planes))
+        segments.append(_segment(table, segments[-1].planes if segments else start))
         table.close()
     if not segments:
         top.fault("segments", "at least one table [[segments]]")

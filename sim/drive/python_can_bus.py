@@ -14,17 +14,16 @@ from undulog.capture.common.arrays import IntArray
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import EXTENDED_FLAG, ID_MASK, FrameArray, holds_fd
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import flag, only
 from undulog.capture.sources.can import (
     DEVICE_TIME,
     PythonCanLink,
     bus_class,
-    check_interface,
     failure,
+    interface_of,
     known_options,
     open_bus,
 )
-from undulog.capture.sources.contract import SourceAddress
+from undulog.capture.sources.contract import SourceAddress, flag, only
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcand import server_of
 
@@ -79,10 +78,7 @@ class PythonCanBus:
             UsageError: If there is no such interface, or it has no such option.
             SourceError: If it can't be opened.
         """
-        interface, _, channel = address.rest.partition(":")
-        check_interface(address.text, interface)
-        if not channel:
-            raise UsageError(f"{address.text!r}: no channel; expected can:INTERFACE:CHANNEL")
+        interface, channel = interface_of(address)
         device_time = interface in DEVICE_TIME
         self.place = address.text
         self.clock = ClockDomain.DEVICE if device_time else ClockDomain.HOST

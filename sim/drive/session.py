@@ -45,7 +45,7 @@ class GaitPublisher:
     """One connection to a recorder's control socket.
 
     Attributes:
-        told: Samples of the gait that the recorder took.
+        taken: Samples of the gait that the recorder took.
         dropped: Samples that it had no time for.
         error: Why nothing more is sent; None while it is.
     """
@@ -60,7 +60,7 @@ class GaitPublisher:
         Raises:
             ControlError: If nobody listens there.
         """
-        self.told = self.dropped = 0
+        self.taken = self.dropped = 0
         self.error: str | None = None
         self._client = ControlClient(path)
         self._names = tuple(names)
@@ -93,8 +93,8 @@ class GaitPublisher:
             self.dropped += 1
             return
         values: list[float] = tick.values.tolist()
-        told = [value if math.isfinite(value) else None for value in values]  # as JSON has it
-        named = dict(zip(self._names, told, strict=True))
+        taken = [value if math.isfinite(value) else None for value in values]  # as JSON has it
+        named = dict(zip(self._names, taken, strict=True))
         self._held.append({"do": "gait", "values": named, "t_ns": t_ns})
 
     def close(self) -> None:
@@ -114,7 +114,7 @@ class GaitPublisher:
                 except ControlError as error:
                     self.error = str(error)
                 else:
-                    self.told += sum(request["do"] == "gait" for request in batch)
+                    self.taken += sum(request["do"] == "gait" for request in batch)
             if last:
                 return
 
@@ -187,7 +187,7 @@ class BusSession:
         self._frames = BusRecorder(bus, self.writer, SourceClock(), robot, directions=True)
         self._settle_s = driven.settle_s
         self._last = {"mode": "", "phase": ""}
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
         self._epoch_ns = self._t_ns = epoch_ns
         self._device_minus_host_ns = 0
         self._open = True
@@ -267,8 +267,8 @@ class BusSession:
         Args:
             level: ``info``, ``warn`` or ``error``.
         """
-        if text not in self._said:
-            self._said.add(text)
+        if text not in self._logged:
+            self._logged.add(text)
             self._events.write(self._t_ns, level, _EVENTS_OF, text)
 
     def finish(self, outcome: Outcome, remarks: Sequence[GateEvent]) -> None:

@@ -130,4 +130,3 @@ class Generator(Gait, Protocol):
         Raises:
             UsageError: If it is of another number of joints or has a value that is not finite.
         """
-        ...

@@ -139,8 +139,7 @@ def integrate(
         k1 = rate(t, x)
         k2 = rate(t + h / 2, x + h / 2 * k1)
         k3 = rate(t + h / 2, x + h / 2 * k2)
-        k4 = rate(t + h, x + h * k3)
-        x = x + h / 6 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        x = x + h / 6 * (k1 + 2.0 * k2 + 2.0 * k3 + rate(t + h, x + h * k3))
     return x
 
 
@@ -204,12 +203,10 @@ class HopfOscillators:
         coupling, attraction = self._coupling, self._attraction
 
         def rate(time_s: float, z: ComplexArray) -> ComplexArray:
-            turning = 1j * extra(time_s, np.angle(z)) * z
-            return turning + hopf_rates(z, coupling, attraction)
+            return (1j * extra(time_s, np.angle(z)) * z) + hopf_rates(z, coupling, attraction)
 
         before = self._z
-        bound = fastest + coupling.fastest + 2.0 * attraction
-        self._z = integrate(rate, before, span_s, bound)
+        self._z = integrate(rate, before, span_s, fastest + coupling.fastest + 2.0 * attraction)
         self.theta = self.theta + np.angle(self._z * np.conj(before))
 
     def kick(self, turn: FloatArray) -> None:
@@ -401,8 +398,7 @@ class _OscillatorRhythm:
         """Take the servos' reports; joints without one are left out."""
         known = np.isfinite(angle)
         eps = self._chain.feedback
-        deviation = np.where(known, angle - offset, 0.0)
-        self._felt = eps * 2.0 * deviation / self._chain.amplitude
+        self._felt = eps * 2.0 * np.where(known, angle - offset, 0.0) / self._chain.amplitude
         self._steady = np.where(known, eps * self._bias, 0.0)
 
     def _kick(self, time_s: float) -> None:
@@ -426,7 +422,6 @@ class _OscillatorRhythm:
             return detuning + felt * np.cos(phase + omega * time_s + theta) - steady
 
         if self._chain.feedback > 0.0:
-            fastest = abs(omega) + float(np.abs(felt).max())
-            self._oscillators.advance(elapsed_s, sensed, fastest)
+            self._oscillators.advance(elapsed_s, sensed, abs(omega) + float(np.abs(felt).max()))
         else:
             self._oscillators.advance(elapsed_s, constant, 0.0)

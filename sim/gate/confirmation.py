@@ -75,7 +75,7 @@ class Confirmation:
         self._open: list[deque[int]] = [deque() for _ in rate]  # rounds that may be answered yet
         self._given_up = [0] * len(rate)  # requests taken for lost
         self._round = self._answered = 0
-        self._heard = False  # since the newest round
+        self._received = False  # since the newest round
         self._quiet = self._silent = 0  # ticks without a reply or a request; without a reply
         self._most, self._limit, self._longest = 1, 0, 0
         self._patience = self._wait = _FIRST_PATIENCE
@@ -110,7 +110,7 @@ class Confirmation:
         self._quiet, self._silent = self._quiet + 1, self._silent + 1
         if not replies.any():
             return
-        self._quiet, self._silent, self._wait, self._heard = 0, 0, self._patience, True
+        self._quiet, self._silent, self._wait, self._received = 0, 0, self._patience, True
         for joint, (own, count) in enumerate(zip(self._open, replies.tolist(), strict=True)):
             if count > len(own):
                 self._given_up[joint] -= count - len(own)  # they came after all
@@ -142,7 +142,7 @@ class Confirmation:
                 return False
             if self._silent >= self._limit:  # it is held: less and less often
                 self._wait = min(2 * self._wait, _MOST_PATIENCE)
-        if self._heard:
+        if self._received:
             self._lags.append(lag)
         else:
             self._lags.clear()
@@ -150,7 +150,7 @@ class Confirmation:
             self.pausing = True
             return False
         self._round += 1
-        self._quiet, self._heard = 0, False
+        self._quiet, self._received = 0, False
         for own in self._open:
             own.append(self._round)
         return True

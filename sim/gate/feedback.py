@@ -14,13 +14,13 @@ meanwhile and finds what came as it goes on: its own pause is no silence of the 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from itertools import compress
 
 import numpy as np
 
 from undulog.capture.bus.map_entry import bus_messages, frame_id
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.errors import some_names
 from undulog.capture.log.messages.frames import (
     DIR_RX,
     ERROR_FLAG,
@@ -32,7 +32,7 @@ from undulog.capture.robot.model import Direction, Robot
 from undulog.capture.sources.events import BUS_OFF
 
 from .limits import GateLimits
-from .outcome import FaultKind, GateFault, JointStatus, some_names
+from .outcome import FaultKind, GateFault, JointStatus
 
 _IDENTIFIERS_SHOWN = 6
 
@@ -57,12 +57,11 @@ class BusCheck:
         bus, messages = bus_messages(robot)
         self._robot_name = robot.name
         self._known = _sorted({frame_id(message) for message in messages.values()})
-        told = {s.message for s in bus.signals if s.direction is Direction.RX}
-        taken = {s.message for s in bus.signals if s.direction is Direction.TX}
-        replies = {frame_id(messages[name]) for name in told}
-        requests = {frame_id(messages[name]) for name in taken}
+        reported = {s.message for s in bus.signals if s.direction is Direction.RX}
+        commanded = {s.message for s in bus.signals if s.direction is Direction.TX}
+        replies = {frame_id(messages[name]) for name in reported}
         # Where a request and its reply share an identifier, hearing it tells nothing.
-        self._commands = _sorted(requests - replies)
+        self._commands = _sorted({frame_id(messages[name]) for name in commanded} - replies)
         self.known = 0
         self.strange: Counter[int] = Counter()
 
@@ -216,8 +215,7 @@ class CurrentLimiter:
             Joint angles [rad], shape (m,); untouched where nothing gives way.
         """
         beyond = np.abs(current) > self._limit  # False for NaN
-        grown = np.minimum(self._share + _MORE, 1.0)
-        self._share = np.where(beyond, self._share * _LESS, grown)
+        self._share = np.where(beyond, self._share * _LESS, np.minimum(self._share + _MORE, 1.0))
         pulls = self.yields & np.isfinite(angle)
         pulled = np.where(pulls, angle, 0.0)
         pulled += self._share * (wanted - pulled)
@@ -227,38 +225,14 @@ class CurrentLimiter:
 _SHOWN = 4
 
 
-@dataclass(frozen=True)
-class _Excess:
-    """One quantity that must not stay beyond its limit."""
-
-    kind: FaultKind
-    what: str
-    unit: str
-    less: bool = False
-
-
-_EXCESSES = (
-    _Excess(FaultKind.CURRENT, "current", "A"),
-    _Excess(FaultKind.TEMPERATURE, "temperature", "degC"),
-    _Excess(FaultKind.VOLTAGE, "voltage", "V", less=True),
-    _Excess(FaultKind.TRACKING, "tracking error", "rad"),
-)
-
-
 class Watch:
     """Checks the readings of each tick against the limits."""
 
     def __init__(self, limits: GateLimits) -> None:
         """Start without a fault."""
         self._limits = limits
-        self._bounds = {
-            FaultKind.CURRENT: limits.current,
-            FaultKind.TEMPERATURE: limits.temperature,
-            FaultKind.VOLTAGE: limits.voltage,
-            FaultKind.TRACKING: limits.tracking_error,
-        }
-        count = len(limits.joint_names)
-        self._since_s = {each.kind: np.full(count, np.nan) for each in _EXCESSES}
+        never: FloatArray = np.full(len(limits.joint_names), np.nan)
+        self._since_s = dict.fromkeys(FaultKind, never)
 
     def look(self, time_s: float, status: JointStatus, command: FloatArray) -> GateFault | None:
         """Check the readings at a tick.
@@ -270,15 +244,15 @@ class Watch:
         Returns:
             The fault, None if all is well.
         """
-        values = {
-            FaultKind.CURRENT: np.abs(status.current),
-            FaultKind.TEMPERATURE: status.temperature,
-            FaultKind.VOLTAGE: status.voltage,
-            FaultKind.TRACKING: np.abs(status.angle - command),
-        }
-        lost = self._lost(time_s, status.silence_s)
-        found = [self._excess(each, time_s, values[each.kind]) for each in _EXCESSES]
-        return next((fault for fault in (lost, *found) if fault is not None), None)
+        of, error = self._limits, np.abs(status.angle - command)
+        found = (
+            self._lost(time_s, status.silence_s),
+            self._excess(time_s, FaultKind.CURRENT, "A", np.abs(status.current), of.current),
+            self._excess(time_s, FaultKind.TEMPERATURE, "degC", status.temperature, of.temperature),
+            self._excess(time_s, FaultKind.VOLTAGE, "V", status.voltage, of.voltage),
+            self._excess(time_s, FaultKind.TRACKING, "rad", error, of.tracking_error),
+        )
+        return next((fault for fault in found if fault is not None), None)
 
     def _lost(self, time_s: float, silence_s: FloatArray) -> GateFault | None:
         limit_s = self._limits.reply_timeout_s
@@ -296,24 +270,24 @@ class Watch:
             since_s=time_s - value,
         )
 
-    def _excess(self, of: _Excess, time_s: float, values: FloatArray) -> GateFault | None:
-        bound = self._bounds[of.kind]
-        beyond = values < bound if of.less else values > bound  # False for NaN
-        began = self._since_s[of.kind]
+    def _excess(
+        self, time_s: float, kind: FaultKind, unit: str, values: FloatArray, bound: FloatArray
+    ) -> GateFault | None:
+        beyond = values < bound if kind is FaultKind.VOLTAGE else values > bound  # False for NaN
+        began = self._since_s[kind]
         since_s = np.where(beyond, np.where(np.isnan(began), time_s, began), np.nan)
-        self._since_s[of.kind] = since_s
+        self._since_s[kind] = since_s
         due = beyond & (time_s - since_s >= self._limits.fault_after_s - 1e-9)
         if not due.any():
             return None
-        far = np.where(due, np.abs(values - bound), -np.inf)
-        joint = int(np.argmax(far))
+        joint = int(np.argmax(np.where(due, np.abs(values - bound), -np.inf)))
         name, value, limit = self._limits.joint_names[joint], values[joint], bound[joint]
-        than = "less than" if of.less else "more than"
-        lasted = time_s - since_s[joint]
+        what = "tracking error" if kind is FaultKind.TRACKING else str(kind)
+        than = "less than" if kind is FaultKind.VOLTAGE else "more than"
         return GateFault(
-            of.kind,
-            f"{name}: {of.what} {value:.3g} {of.unit}, {than} {limit:g} {of.unit} "
-            f"for {lasted:.2g} s",
+            kind,
+            f"{name}: {what} {value:.3g} {unit}, {than} {limit:g} {unit} "
+            f"for {time_s - since_s[joint]:.2g} s",
             joint=name,
             value=float(value),
             limit=float(limit),

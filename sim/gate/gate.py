@@ -88,7 +88,7 @@ class Gate:
         self.silence = Silence()
         self.held_ticks = 0
         self._silent_ticks = 0  # those of the silence that were counted by then
-        self._received_again = False  # in the tick before this one, while holding
+        self._was_received = False  # in the tick before this one, while holding
         self._gait, self._limits, self._place = gait, limits, place
         self._listen_s = listen_s
         self._last = round(duration_s * CONTROL_RATE_HZ)
@@ -99,7 +99,7 @@ class Gate:
         self._progress_s = 0.0
         self._tick: int | None = None  # the last one in which something was sent
         self._reported: GateFault | None = None
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
         self._remarks: list[GateEvent] = []
 
     @property
@@ -113,7 +113,7 @@ class Gate:
         return dict(self._clamp.cuts) if self._clamp is not None else {}
 
     def step(
-        self, tick: int, heard: GateInput, stop: str = "", *, at_once: bool = False
+        self, tick: int, inputs: GateInput, stop: str = "", *, at_once: bool = False
     ) -> GateStep:
         """Return the command of a tick.
 
@@ -134,17 +134,17 @@ class Gate:
             return self._quiet()
         if not tick:
             self._remark("info", f"gate: {Phase.POSE}")
-        self.silence.tick(tick, received=heard.received, expected=heard.expected)
-        clamp = self._clamp or self._begin(tick, heard, stop)
+        self.silence.tick(tick, received=inputs.received, expected=inputs.expected)
+        clamp = self._clamp or self._begin(tick, inputs, stop)
         if clamp is None:
             return self._quiet()
-        self._log_skipped(tick, heard.late_s)
-        self._follow(tick, heard, clamp, stop, at_once=at_once)
+        self._log_skipped(tick, inputs.late_s)
+        self._follow(tick, inputs, clamp, stop, at_once=at_once)
         if self.phase in {Phase.DONE, Phase.HOLD}:
             return self._quiet()
-        wanted, gait = self._wanted(tick, heard, clamp)
-        pulled = self._yielding.apply(wanted, heard.status.angle, heard.status.current)
-        given = clamp.apply(pulled, heard.bounds)
+        wanted, gait = self._wanted(tick, inputs, clamp)
+        pulled = self._yielding.apply(wanted, inputs.status.angle, inputs.status.current)
+        given = clamp.apply(pulled, inputs.bounds)
         self._log_changes(given)
         phase = self.phase
         self._end_in_time()
@@ -164,10 +164,10 @@ class Gate:
 
     # -- reading the pose ------------------------------------------------------------------
 
-    def _begin(self, tick: int, heard: GateInput, stop: str) -> Clamp | None:
+    def _begin(self, tick: int, inputs: GateInput, stop: str) -> Clamp | None:
         """Start from the pose, once it is known; None while it isn't."""
         waited_s = tick / CONTROL_RATE_HZ
-        if (trouble := heard.trouble or self._reported) is not None:
+        if (trouble := inputs.trouble or self._reported) is not None:
             raise SourceError(self._place, f"no command was sent: {trouble.text}")
         if stop:
             self.outcome = Outcome(DriveEnding.STOPPED, stop, "no command was sent")
@@ -175,9 +175,9 @@ class Gate:
             return None
         if waited_s < self._listen_s:
             return None
-        if self._listen_s and heard.another_robot is not None:
-            raise UsageError(f"{self._place}: no command was sent: {heard.another_robot}")
-        angle, limits = heard.status.angle, self._limits
+        if self._listen_s and inputs.another_robot is not None:
+            raise UsageError(f"{self._place}: no command was sent: {inputs.another_robot}")
+        angle, limits = inputs.status.angle, self._limits
         measured = not self._listen_s or self.silence.measure()
         if (np.isnan(angle).any() or not measured) and waited_s < POSE_S:
             return None
@@ -187,7 +187,7 @@ class Gate:
             why = f"too few reports of joint angles in {waited_s:.2g} s to supervise a drive"
             raise SourceError(self._place, f"no command was sent: {why}")
         clamp = self._clamp = Clamp(limits, angle, _PERIOD_S)
-        first = self._first = self._gait.step(0.0, heard.readings)
+        first = self._first = self._gait.step(0.0, inputs.readings)
         target = np.clip(first.command, limits.lower, limits.upper)
         target = np.where(np.isfinite(target), target, clamp.last)
         far = np.abs(target - clamp.last)
@@ -206,7 +206,7 @@ class Gate:
     # -- what is wanted --------------------------------------------------------------------
 
     def _wanted(
-        self, tick: int, heard: GateInput, clamp: Clamp
+        self, tick: int, inputs: GateInput, clamp: Clamp
     ) -> tuple[FloatArray, GaitTick | None]:
         """Return the requested command of the phase, before limits."""
         if self.phase is not Phase.RUN and self._way is not None:
@@ -214,18 +214,17 @@ class Gate:
             if self.phase is Phase.ENDING or self._progress_s < self._way.duration_s:
                 return self._way.at(self._progress_s), None
             self._run(tick)
-        run_tick = min(tick - (self.run_from or 0), self._last)
-        self.run_s = run_tick / CONTROL_RATE_HZ
+        self.run_s = min(tick - (self.run_from or 0), self._last) / CONTROL_RATE_HZ
         self.run_ticks += 1
-        said, self._first = self._first, None
+        stated, self._first = self._first, None
         try:
-            said = said or self._gait.step(self.run_s, heard.readings)
+            stated = stated or self._gait.step(self.run_s, inputs.readings)
         except Exception as error:  # noqa: BLE001 (whatever it is, the joints come to rest)
             self.gait_error = error
             text = f"the gait failed: {type(error).__name__}: {error}"
             self.report(GateFault(FaultKind.GAIT, text))
             return clamp.last, None
-        return said.command, said
+        return stated.command, stated
 
     def _end_in_time(self) -> None:
         """End the drive if the last command was the final one."""
@@ -244,41 +243,40 @@ class Gate:
     # -- what goes wrong -------------------------------------------------------------------
 
     def _follow(
-        self, tick: int, heard: GateInput, clamp: Clamp, stop: str, *, at_once: bool
+        self, tick: int, inputs: GateInput, clamp: Clamp, stop: str, *, at_once: bool
     ) -> None:
         """Change the phase on a fault or a stop request."""
-        found = self._trouble(tick, heard, clamp)
+        found = self._trouble(tick, inputs, clamp)
         if self.phase is Phase.HOLD and (found is None or found.kind not in MUTE):
-            self._go_on_holding(clamp, heard.status, at_once=at_once)
+            self._go_on_holding(clamp, inputs.status, at_once=at_once)
             return
         ending = self.phase is Phase.ENDING or self.silence.silent
         if found is not None and (not ending or found.kind in MUTE):
-            self._fail(found, clamp, heard.status)
+            self._fail(found, clamp, inputs.status)
             return
         if self.silence.silent:
-            self._fail(self._silent(tick), clamp, heard.status)
+            self._fail(self._silent(tick), clamp, inputs.status)
             return
-        if found is not None and f"{found.kind} {found.joint}" not in self._said:
-            self._said.add(f"{found.kind} {found.joint}")
+        if found is not None and f"{found.kind} {found.joint}" not in self._logged:
+            self._logged.add(f"{found.kind} {found.joint}")
             self._remark("error", f"fault while ending: {found.text}")
         if at_once:
             self._halt(f"{stop}, twice")
         elif stop and self.phase is not Phase.ENDING:
             self.outcome = Outcome(DriveEnding.STOPPED, stop, "")
-            self._end(clamp, heard.status)
+            self._end(clamp, inputs.status)
 
-    def _trouble(self, tick: int, heard: GateInput, clamp: Clamp) -> GateFault | None:
-        if heard.trouble is not None or self._reported is not None:
-            return heard.trouble or self._reported
-        if heard.late_s > self._limits.late_s:
-            text = (
-                f"a control tick was {heard.late_s:.2g} s late, more than {self._limits.late_s:g} s"
-            )
-            return GateFault(FaultKind.LATE, text, "", heard.late_s, self._limits.late_s)
-        return self._watch.look(tick / CONTROL_RATE_HZ, heard.status, clamp.last)
+    def _trouble(self, tick: int, inputs: GateInput, clamp: Clamp) -> GateFault | None:
+        if inputs.trouble is not None or self._reported is not None:
+            return inputs.trouble or self._reported
+        if inputs.late_s > self._limits.late_s:
+            late_s, most_s = inputs.late_s, self._limits.late_s
+            text = f"a control tick was {late_s:.2g} s late, more than {most_s:g} s"
+            return GateFault(FaultKind.LATE, text, "", late_s, most_s)
+        return self._watch.look(tick / CONTROL_RATE_HZ, inputs.status, clamp.last)
 
     def _fail(self, fault: GateFault, clamp: Clamp, status: JointStatus) -> None:
-        self._said.add(f"{fault.kind} {fault.joint}")
+        self._logged.add(f"{fault.kind} {fault.joint}")
         self._remark("error", f"fault: {fault.text}")
         if self.outcome is None or self.outcome.how is DriveEnding.STOPPED:
             self.outcome = Outcome(DriveEnding.FAULT, fault.text, "", fault)
@@ -309,14 +307,14 @@ class Gate:
         back, and the first command of the ending doesn't join it.
         """
         if not self.silence.silent:
-            if self._received_again:
+            if self._was_received:
                 self._end(clamp, status)
             else:
-                self._received_again = True
+                self._was_received = True
                 self.held_ticks += 1
                 self._remark("info", "gate: a joint was received again")
             return
-        self._received_again = False
+        self._was_received = False
         self.held_ticks += self.silence.ticks - self._silent_ticks
         self._silent_ticks = self.silence.ticks
         if at_once or self.silence.ticks >= HOLD_S * CONTROL_RATE_HZ:
@@ -354,8 +352,7 @@ class Gate:
         if left_out > 0:
             many = f"{left_out} control ticks were" if left_out > 1 else "a control tick was"
             of_gait = f", {left_out / CONTROL_RATE_HZ:g} s of the gait" * (self.phase is Phase.RUN)
-            text = f"gate: {late_s:.3f} s late, {many} left out{of_gait}"
-            self._remark("warn", text)
+            self._remark("warn", f"gate: {late_s:.3f} s late, {many} left out{of_gait}")
 
     def _become(self, phase: Phase, detail: str = "") -> None:
         self.phase = phase
@@ -383,7 +380,7 @@ class Gate:
         )
         for key, joints, text in reasons:
             for i in np.flatnonzero(joints).tolist():
-                if f"{key} {names[i]}" not in self._said:
-                    self._said.add(f"{key} {names[i]}")
-                    said = text.format(rate=limits.rate[i], current=limits.current[i])
-                    self._remark("warn", f"gate: {names[i]}: {said}")
+                if f"{key} {names[i]}" not in self._logged:
+                    self._logged.add(f"{key} {names[i]}")
+                    stated = text.format(rate=limits.rate[i], current=limits.current[i])
+                    self._remark("warn", f"gate: {names[i]}: {stated}")

@@ -21,11 +21,11 @@ from typing import NamedTuple
 import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray, frozen
-from undulog.capture.common.errors import UsageError
+from undulog.capture.common.errors import UsageError, some_names
 from undulog.capture.robot.model import JOINT_LIMITS, OnFault, Robot, Safety
 
 from ..gait.wave import smoothstep
-from .outcome import JointStatus, some_names
+from .outcome import JointStatus
 
 _EXAMPLES = {
     "max_rate": "4.0            # rad/s, of commands",
@@ -54,14 +54,14 @@ def missing_limits(robot: Robot) -> tuple[str, ...]:
         Names of fields of :class:`Safety`, in its order; empty if there is nothing to add.
     """
     safety = robot.safety or Safety()
-    told = {
+    reported = {
         str(signal.quantity)
         for signal in (robot.bus.signals if robot.bus is not None else ())
         if signal.direction == "rx"
     }
     missing: list[str] = []
     for limit in _EXAMPLES:
-        if _OF_QUANTITY.get(limit, "") not in {"", *told}:
+        if _OF_QUANTITY.get(limit, "") not in {"", *reported}:
             continue
         if limit in JOINT_LIMITS:
             lacks = bool(np.isnan(safety.values(limit, robot.joint_names)).any())

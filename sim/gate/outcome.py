@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -12,12 +11,6 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 
 from ..gait.contract import GaitTick, Readings
-
-
-def some_names(names: Sequence[str], most: int) -> str:
-    """Return a list of at most so many names, and the number of the others."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
 
 
 class FaultKind(StrEnum):
@@ -117,13 +110,12 @@ def jitter(late_s: list[float]) -> Jitter | None:
         return None
     late = np.array(late_s)
     place = np.searchsorted(np.array(_EDGES_MS) * 1e-3, late, side="left")
-    counts = np.bincount(place, minlength=len(_EDGES_MS) + 1)
     return Jitter(
         ticks=len(late),
         median_s=float(np.median(late)),
         p99_s=float(np.quantile(late, 0.99)),
         worst_s=float(late.max()),
-        counts=tuple(counts.tolist()),
+        counts=tuple(np.bincount(place, minlength=len(_EDGES_MS) + 1).tolist()),
     )
 
 

@@ -71,7 +71,6 @@ class Engine(Protocol):
             force: In the world [N], shape (3, n).
             point: Points of action in the world [m], shape (3, n).
         """
-        ...
 
     def step(self, torque: FloatArray) -> None:
         """Advance by one step, semi-implicit Euler.
@@ -79,11 +78,9 @@ class Engine(Protocol):
         Args:
             torque: Of the joints [N m], shape (m,).
         """
-        ...
 
     def close(self) -> None:
         """Free the physics world; safe to call twice."""
-        ...
 
 
 class BodyStart(NamedTuple):

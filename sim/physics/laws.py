@@ -25,7 +25,6 @@ class Laws(Protocol):
 
     def start(self, k: int) -> None:
         """Complete a step whose body and rotors are there."""
-        ...
 
     def follow(self, k: int) -> None:
         """Complete a step whose body is there, and which follows the row before it.
@@ -33,7 +32,6 @@ class Laws(Protocol):
         Args:
             k: Its row, not the first.
         """
-        ...
 
     def command(self, k: int, reference: FloatArray) -> None:
         """Give the servos a command, which they hold until the next.
@@ -42,7 +40,6 @@ class Laws(Protocol):
             k: Row of the step at which it comes.
             reference: Joint angles q_ref [rad], shape (m,).
         """
-        ...
 
 
 class NumpyLaws:
@@ -63,8 +60,7 @@ class NumpyLaws:
         self._ground = tuple(
             GroundContact(ground, radius, row.body, row.contact) for row in self._rows
         )
-        self._servos = servos
-        self._dt = dt
+        self._servos, self._dt = servos, dt
         self._reference = np.zeros(steps.joint_count)
 
     def start(self, k: int) -> None:

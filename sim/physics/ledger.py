@@ -204,14 +204,11 @@ class Ledger:
             dt: Step [s].
             start: The state at which all flows are zero.
         """
-        self._kernels = kernels
-        self._servos = servos
+        self._kernels, self._servos = kernels, servos
         self._mass = np.array([link.mass for link in robot.links])
         self._inertia = np.array([link.inertia for link in robot.links]).T.copy()
-        self._gravity = gravity
-        self._stiffness = stiffness
-        self._obstacle_stiffness = obstacle_stiffness
-        self._dt = dt
+        self._gravity, self._stiffness = gravity, stiffness
+        self._obstacle_stiffness, self._dt = obstacle_stiffness, dt
         self._joints = np.zeros((len(JOINT_TERMS), len(robot.joints)))
         self._ground = np.zeros(len(GROUND_TERMS))
         self._obstacles = np.zeros(len(OBSTACLE_TERMS))

@@ -198,8 +198,7 @@ class Servos:
         """
         into_angle, into_speed = out or (None, None)
         torque = self.torque_constant * drive.current - self.viscous * rotors.speed
-        friction = self.friction(rotors, drive, dt)
-        torque -= friction + drive.torque
+        torque -= self.friction(rotors, drive, dt) + drive.torque
         speed = np.add(rotors.speed, dt * torque / self.inertia, out=into_speed)
         if self.resting.size:
             # Exactly zero, which rounding would miss.

@@ -74,8 +74,7 @@ class Steps(Sequence[Step]):
             link_count: n.
             joint_count: m.
         """
-        width = 22 * link_count + 7 * joint_count
-        return cls(np.zeros((count, width)), link_count, joint_count)
+        return cls(np.zeros((count, 22 * link_count + 7 * joint_count)), link_count, joint_count)
 
     @property
     def links(self) -> FloatArray:

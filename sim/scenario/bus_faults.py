@@ -96,16 +96,14 @@ class BusFault:
 
     def as_table(self) -> dict[str, Any]:
         """Its table in a scenario; what is as by default is left out."""
-        table: dict[str, Any] = {"kind": str(self.kind)}
-        if self.joint:
-            table["joint"] = self.joint
-        if _GRAMMAR[self.kind].value is not None:
-            table["value"] = self.value
-        if self.from_s:
-            table["from_s"] = self.from_s
-        if math.isfinite(self.for_s):
-            table["for_s"] = self.for_s
-        return table
+        stated = {
+            "joint": self.joint or None,
+            "value": None if _GRAMMAR[self.kind].value is None else self.value,
+            "from_s": self.from_s or None,
+            "for_s": self.for_s if math.isfinite(self.for_s) else None,
+        }
+        known = {key: value for key, value in stated.items() if value is not None}
+        return {"kind": str(self.kind), **known}
 
 
 def read_faults(top: Table, robot: Robot | None) -> tuple[BusFault, ...]:

@@ -107,8 +107,7 @@ def _apart(middle: FloatArray, half: FloatArray, size: FloatArray) -> Closest:
     ends = np.array([-1.0, 1.0])[:, None] * np.ones(middle.shape[1])
     signs = np.array([[-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, -1.0, 1.0]])
     corners = signs[:, :, None] * size[:, None]  # (2, 4, p)
-    feet = _place(middle[:, None], half[:, None], corners)
-    s = np.concatenate([ends, feet])  # (6, p)
+    s = np.concatenate([ends, _place(middle[:, None], half[:, None], corners)])  # (6, p)
     point = middle[:, None] + s * half[:, None]
     limit = size[:, None]
     # The rectangle's nearest point to any point is found by clipping; for a corner's foot that is
@@ -138,15 +137,13 @@ def _overlapping(
     )  # (3, 2, p)
     normal = normals[axis, :, pair].T
     deepest_end = -_side((half * normal).sum(axis=0))
-    corner = np.copysign(size, normal)
-    s = np.where(axis == 2, _place(middle, half, corner), deepest_end)
+    s = np.where(axis == 2, _place(middle, half, np.copysign(size, normal)), deepest_end)
     return Closest(s, gaps[axis, pair], normal)
 
 
 def _place(middle: FloatArray, half: FloatArray, point: FloatArray) -> FloatArray:
     """Place on a segment that is nearest to a point."""
-    square = (half * half).sum(axis=0)
-    s = ((point - middle) * half).sum(axis=0) / np.maximum(square, _TINY)
+    s = ((point - middle) * half).sum(axis=0) / np.maximum((half * half).sum(axis=0), _TINY)
     return np.minimum(np.maximum(s, -1.0), 1.0)
 
 

@@ -174,7 +174,7 @@ class SonarModel:
 
 @dataclass(frozen=True)
 class AccelerometerModel:
-    """Accelerometers, :mod:`.sim.sensing.inertial`.
+    """Accelerometers, :mod:`.sim.sensing.sensors`.
 
     Attributes:
         rate_hz: Measurements a second, each a mean over its period.
@@ -189,7 +189,7 @@ class AccelerometerModel:
 
 @dataclass(frozen=True)
 class CompassModel:
-    """Magnetometers, :mod:`.sim.sensing.inertial`.
+    """Magnetometers, :mod:`.sim.sensing.sensors`.
 
     Attributes:
         rate_hz: Measurements a second.

@@ -276,8 +276,7 @@ def read_world(table: Table, robot: Robot | None, seed: int) -> World:
     )
     if "field" in table:
         field = read(table.table("field"), RandomField)
-        faultless = not table.faults.all()
-        if robot is not None and faultless:  # NaN stands for what is faulty
+        if robot is not None and not table.faults.all():  # NaN stands for what is faulty
             try:
                 world = world.scattered(field, seed, body_length(robot))
             except UsageError as error:

@@ -168,8 +168,7 @@ class Ranging:
         self._caster = caster
         self._schedule = Schedule(period_s, len(sensors), dt)
         self._bundles = (self._mounts.rotation @ bundles).transpose(1, 0, 2)  # (3, k, r)
-        self._sees_ground = sees_ground
-        self._dt = dt
+        self._sees_ground, self._dt = sees_ground, dt
         self._limits = np.array([(one.range_min, one.range_max) for one in sensors], np.float64)
         self._random = np.random.default_rng(seed)
 

@@ -16,6 +16,7 @@ import time
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 
+from undulog.capture.common.arrays import NS
 from undulog.capture.common.errors import UsageError
 
 
@@ -57,7 +58,6 @@ old when they come; together that stays below the 0.1 s by which a recorder tell
 late from a clock that was set back."""
 
 _ON_THEIR_WAY = 5  # ticks: no sample arrives later than that
-_NS = 1_000_000_000
 
 
 @dataclass
@@ -134,7 +134,7 @@ class Pacer:
         if self._fast:
             self._present_ns = self.clock_ns(tick * self.period_ns)
             return 0.0
-        return max(0, self.clock_ns(tick * self.period_ns) - self.now_ns()) / _NS
+        return max(0, self.clock_ns(tick * self.period_ns) - self.now_ns()) / NS
 
     def begin(self, tick: int) -> float:
         """Note that a tick begins.
@@ -146,15 +146,15 @@ class Pacer:
         tally = self.tally
         tally.ticks += 1
         tally.overruns += late_ns >= self.period_ns
-        tally.worst_s = max(tally.worst_s, late_ns / _NS)
+        tally.worst_s = max(tally.worst_s, late_ns / NS)
         if late_ns < PATIENCE_NS:
             return 0.0
         start_ns = _whole_us(self._start_ns[-1] + late_ns)
         first = max(tick - _ON_THEIR_WAY, 0)
         place = bisect_left(self._from_tick, first)
         self._from_tick[place:], self._start_ns[place:] = [first], [start_ns]
-        tally.stood_still_s += late_ns / _NS
-        return late_ns / _NS
+        tally.stood_still_s += late_ns / NS
+        return late_ns / NS
 
 
 def _whole_us(t_ns: int) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 
 from undulog.capture.bus.encoding import BusEncoder, BusValue
 from undulog.capture.bus.map_entry import bus_messages, frame_id
-from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.arrays import NS, BoolArray, FloatArray, IntArray
 from undulog.capture.log.messages.frames import DIR_RX, ERROR_FLAG, FrameArray, empty_frames
 from undulog.capture.robot.model import Direction, Quantity, Robot, SensorKind
 from undulog.capture.sources.events import BUS_OFF, RESTARTED
@@ -25,8 +25,7 @@ _OF_JOINT = (
     Quantity.CURRENT,
     Quantity.VOLTAGE,
 )
-_NS = 1_000_000_000
-_PERIOD_NS = _NS // CONTROL_RATE_HZ
+_PERIOD_NS = NS // CONTROL_RATE_HZ
 
 
 class ReplyEncoder:
@@ -110,7 +109,7 @@ class ReplyEncoder:
             if isinstance(sample, JointSample):
                 parts.append(self._cycle(sample, clock_ns))
                 continue
-            values = together.setdefault(round(sample.time_s * _NS), {})
+            values = together.setdefault(round(sample.time_s * NS), {})
             if isinstance(sample, RangeSample):
                 values[sample.name, Quantity.RANGE, ""] = sample.distance
             else:
@@ -148,8 +147,7 @@ class ReplyEncoder:
         frames = self._encoder.encode(values)
         joint = [self._last_joint[each] for each in frames["id_flags"].tolist()]
         start_ns = clock_ns(sample.cycle * _PERIOD_NS)
-        offset_ns = np.rint(sample.offset_s[joint] * _NS).astype(np.int64)
-        frames["t_device_ns"] = start_ns + offset_ns
+        frames["t_device_ns"] = start_ns + np.rint(sample.offset_s[joint] * NS).astype(np.int64)
         return frames
 
 
@@ -188,8 +186,7 @@ class FaultLine:
         self._held: dict[BusFault, float] = {}
         self._off = False
         self._late: list[tuple[int, FrameArray]] = []
-        self.lost = 0
-        self.hit = 0
+        self.lost = self.hit = 0
 
     def command(self, command: FloatArray, angle: FloatArray, time_s: float) -> FloatArray:
         """Apply the faults to commands.
@@ -228,10 +225,10 @@ class FaultLine:
         )
         if not (frozen or drawing):
             return list(samples)
-        told: list[SensorSample] = []
+        reported: list[SensorSample] = []
         for sample in samples:
             if not isinstance(sample, JointSample):
-                told.append(sample)
+                reported.append(sample)
                 continue
             position, current = sample.position.copy(), sample.current.copy()
             for fault in frozen:
@@ -239,8 +236,8 @@ class FaultLine:
                 position[i] = self._held.setdefault(fault, float(position[i]))
             for fault in drawing:
                 current[self._joint[fault.joint]] = fault.value
-            told.append(sample._replace(position=position, current=current))
-        return told
+            reported.append(sample._replace(position=position, current=current))
+        return reported
 
     def is_receiving(self, time_s: float) -> bool:
         """Whether the robot receives frames.
@@ -270,7 +267,7 @@ class FaultLine:
                 frames = frames[~self._losses(fault, frames)]
         waiting = sum(fault.value for fault in self._of[FaultKind.DELAY] if fault.acts(time_s))
         if waiting or self._late:
-            self._late.append((now_ns + round(waiting * _NS), frames))
+            self._late.append((now_ns + round(waiting * NS), frames))
             due = [late for due_ns, late in self._late if due_ns <= now_ns]
             self._late = [late for late in self._late if late[0] > now_ns]
             frames = np.concatenate([empty_frames(0), *due])
@@ -280,8 +277,7 @@ class FaultLine:
 
     def _losses(self, fault: BusFault, frames: FrameArray) -> BoolArray:
         struck = self._random.random(len(frames)) < fault.value
-        own = self._replies.identifiers(fault.joint)
-        struck &= np.isin(frames["id_flags"], own)
+        struck &= np.isin(frames["id_flags"], self._replies.identifiers(fault.joint))
         self.lost += int(struck.sum())
         return struck
 

@@ -16,14 +16,14 @@ from itertools import compress
 import numpy as np
 
 from undulog.capture.bus.decoding import BusDecoder
-from undulog.capture.common.arrays import BoolArray, FloatArray, frozen
+from undulog.capture.common.arrays import NS, BoolArray, FloatArray, frozen
+from undulog.capture.common.errors import some_names
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import FrameArray
 from undulog.capture.robot.model import Direction, Quantity, Robot
 from undulog.capture.sources.contract import records
 
 from ..gait.contract import CONTROL_RATE_HZ, GaitTick, Readings
-from ..gate.outcome import some_names
 from ..scenario.bus_faults import BusFault
 from ..scenario.scenario import Scenario
 from ..sensing.contract import SensorSample
@@ -75,18 +75,18 @@ class CommandLatch:
         """The angles to be reached [rad], shape (m,)."""
         return self._angle.copy()
 
-    def take(self, frames: FrameArray, *, heard: bool = True) -> BoolArray:
+    def take(self, frames: FrameArray, *, received: bool = True) -> BoolArray:
         """Take frames.
 
         Args:
             frames: What was sent on the bus, marked as sent by the computer, with device times;
                 what carries no command is passed over, shape (n,).
-            heard: Whether the servos receive them.
+            received: Whether the servos receive them.
 
         Returns:
             Joints that were commanded, shape (m,).
         """
-        told = np.zeros(len(self._index), dtype=np.bool_)
+        commanded = np.zeros(len(self._index), dtype=np.bool_)
         samples, tally = self._decoder.decode(frames)
         self.frames += tally.decoded
         for decoded in samples:
@@ -96,13 +96,13 @@ class CommandLatch:
             own, values = joint[decoded.member], decoded.values
             known = ~np.isnan(values)
             own, values = own[known], values[known]
-            told[own] = True
-            if heard:
+            commanded[own] = True
+            if received:
                 cut = np.clip(values, self._lower[own], self._upper[own])
                 self.cut |= {self._names[i] for i in own[np.abs(cut - values) > _SLACK].tolist()}
                 self._angle[own] = cut  # of several commands the last one stays
                 self._time_ns[own] = frames["t_device_ns"][decoded.rows[known]]
-        return told
+        return commanded
 
     def silent(self, now_ns: int, longest_ns: int) -> BoolArray:
         """Joints that had commands and have not had one for long.
@@ -117,8 +117,7 @@ class CommandLatch:
         return (self._time_ns >= 0) & (now_ns - self._time_ns > longest_ns)
 
 
-_NS = 1_000_000_000
-PERIOD_NS = _NS // CONTROL_RATE_HZ
+PERIOD_NS = NS // CONTROL_RATE_HZ
 """Control period [ns]."""
 
 _BEFORE_NS = 1_000_000  # the last pose at rest, before the first tick
@@ -190,8 +189,7 @@ class VirtualRobot:
         robot = self._robot = scenario.robot
         self._replies = ReplyEncoder(robot)
         self._latch = CommandLatch(robot)
-        ordered = (*scenario.faults, *faults)
-        self._line = FaultLine(ordered, robot, self._replies, scenario.seed)
+        self._line = FaultLine((*scenario.faults, *faults), robot, self._replies, scenario.seed)
         self._tick = 0
         self._silent = False
         self._logged_cuts: set[str] = set()
@@ -246,8 +244,8 @@ class VirtualRobot:
         while (wait_s := self._pacer.wait_s(tick)) > 0.0:
             (self._idle if self._lockstep else self._serve)(wait_s)
         if self._twin is not None and tick:
-            told = self._report(self._twin.sensed, tick)
-            self._bus.mark(tick, told if self._lockstep else None)
+            sent = self._report(self._twin.sensed, tick)
+            self._bus.mark(tick, sent if self._lockstep else None)
         if self._lockstep:
             self._listen_to_all(tick)
         else:
@@ -273,17 +271,17 @@ class VirtualRobot:
                 if (late_ns := self._pacer.now_ns() - due_ns) >= 0:
                     self._bus.send(self._at_rest())
                     due_ns += PERIOD_NS * (1 + late_ns // PERIOD_NS)
-                self._serve(max(0.0, (due_ns - self._pacer.now_ns()) / _NS))
+                self._serve(max(0.0, (due_ns - self._pacer.now_ns()) / NS))
             # Half a period on, so that a controller of the same rate speaks between the ticks.
             start_ns = self._pacer.now_ns() + PERIOD_NS // 2
             # Nothing is told at tick 0, so the pose is told just before: else it is a long silence.
             while (left_ns := start_ns - _BEFORE_NS - self._pacer.now_ns()) > 0:
-                self._serve(left_ns / _NS)
+                self._serve(left_ns / NS)
             self._bus.send(self._at_rest())
             self._pacer.start(start_ns)
         else:
             self._pacer.start(self._pacer.now_ns() + PERIOD_NS)
-        self._say("info", f"starts at {self._pacer.start_ns / _NS:.6f} s of its own clock")
+        self._say("info", f"starts at {self._pacer.start_ns / NS:.6f} s of its own clock")
 
     def _idle(self, timeout_s: float) -> None:
         """Serve the bus for a moment; frames of clients wait."""
@@ -297,23 +295,23 @@ class VirtualRobot:
         self._idle(timeout_s)
         if sent := self._bus.pull():
             frames = self._bus.relay(sent, self._pacer.now_ns())
-            self._latch.take(frames, heard=self._line.is_receiving(self._tick / CONTROL_RATE_HZ))
+            self._latch.take(frames, received=self._line.is_receiving(self._tick / CONTROL_RATE_HZ))
 
     def _listen_to_all(self, tick: int) -> None:
         """Lockstep: take frames until every servo has a command, and no more."""
-        heard = self._line.is_receiving(tick / CONTROL_RATE_HZ)
+        receiving = self._line.is_receiving(tick / CONTROL_RATE_HZ)
         missing = self._latch.commanded.copy()
         pulled: list[Sent] = []
-        waited_ns, told = time.monotonic_ns(), False
+        waited_ns, warned = time.monotonic_ns(), False
         while missing.any():
             if fresh := self._bus.pull(int(missing.sum())):
-                missing &= ~self._latch.take(records(s.record for s in fresh), heard=heard)
+                missing &= ~self._latch.take(records(s.record for s in fresh), received=receiving)
                 pulled += fresh
                 continue
             self._idle(_PATIENCE_S)
-            if not told and time.monotonic_ns() - waited_ns > _PATIENCE_S * _NS:
+            if not warned and time.monotonic_ns() - waited_ns > _PATIENCE_S * NS:
                 self._say("warn", f"waits for commands of {self._listed(missing)}")
-                told = True
+                warned = True
         self._keep_pace(tick)
         self._bus.relay(pulled, self._pacer.clock_ns(tick * PERIOD_NS))
 
@@ -334,14 +332,13 @@ class VirtualRobot:
         """Send the sensor samples of a tick; returns the frames."""
         time_s = tick / CONTROL_RATE_HZ
         frames = self._replies.frames(self._line.samples(samples, time_s), self._pacer.clock_ns)
-        now_ns = self._pacer.clock_ns(tick * PERIOD_NS)
-        shown = self._line.replies(frames, now_ns, time_s)
+        shown = self._line.replies(frames, self._pacer.clock_ns(tick * PERIOD_NS), time_s)
         self._bus.send(shown)
         return shown
 
     def _watch(self) -> None:
         """Log when servos get no commands any more."""
-        now_ns, longest_ns = self._pacer.now_ns(), round(WATCHDOG_S * _NS)
+        now_ns, longest_ns = self._pacer.now_ns(), round(WATCHDOG_S * NS)
         silent = self._latch.silent(now_ns, longest_ns)
         if bool(silent.any()) is not self._silent:
             self._silent = bool(silent.any())

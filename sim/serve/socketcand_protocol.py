@@ -126,7 +126,7 @@ class BusClient:
         bus_open: Whether it has opened the bus.
         raw: Whether it is in raw mode and gets all frames.
         marks: Whether it is told of control ticks.
-        heard: Time of the monotonic clock of its last message, or of its connection [s].
+        received_s: Time of the monotonic clock of its last message, or of its connection [s].
         held_until: Nothing is sent to it before this time of the monotonic clock [s].
         out: What waits to be sent to it.
         watched: The selector's events that it is registered for; 0: it is not.
@@ -142,7 +142,7 @@ class BusClient:
         self.peer = f"client {number} at port {port}"
         self.text = ClientText()
         self.bus_open = self.raw = self.marks = False
-        self.heard = time.monotonic()
+        self.received_s = time.monotonic()
         self.held_until = 0.0
         self.out = bytearray()
         self.watched = selectors.EVENT_READ

@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from undulog.capture.common.errors import UsageError
 from undulog.capture.log.messages.frames import FrameArray, empty_frames
 from undulog.capture.sources.contract import records
-from undulog.capture.sources.sender import FrameSender
+from undulog.capture.sources.unix_socket import FrameSender
 
 from .pacing import listen_on_loopback
 from .socketcand_protocol import BusClient, Sent, frame_text, sent_frame
@@ -81,11 +81,6 @@ class SocketcandServer:
         """Where it listens: address and port."""
         host, port = self._listener.getsockname()[:2]
         return host, port
-
-    @property
-    def clients(self) -> int:
-        """Connected clients that have opened the bus."""
-        return sum(client.bus_open for client in self._clients.values())
 
     @property
     def waiting(self) -> int:
@@ -174,7 +169,7 @@ class SocketcandServer:
             return
         idle = [client for client in self._clients.values() if not client.raw]
         if len(self._clients) >= MOST_CLIENTS and idle:
-            longest = min(idle, key=lambda client: (client.bus_open, client.heard))
+            longest = min(idle, key=lambda client: (client.bus_open, client.received_s))
             self._drop(longest, "was silent; its place goes to another one")
         if len(self._clients) >= MOST_CLIENTS:
             self._say("warn", f"no more than {MOST_CLIENTS} clients are let in")
@@ -200,7 +195,7 @@ class SocketcandServer:
             self._drop(client, f"makes no sense: {error}")
             return
         if messages:
-            client.heard = time.monotonic()
+            client.received_s = time.monotonic()
         for message in messages:
             if client.number not in self._clients:
                 return
@@ -222,8 +217,8 @@ class SocketcandServer:
                 self._sent.append(Sent(client.number, record))
         elif word in ("echo", "undulog"):
             client.marks |= word == "undulog"
-            said = "echo" if word == "echo" else f"undulog {self.identity}"
-            self._give(client, f"< {said} >".encode())
+            answer = "echo" if word == "echo" else f"undulog {self.identity}"
+            self._give(client, f"< {answer} >".encode())
         elif not client.bus_open:
             if word == "open" and rest.strip() == self._bus:
                 client.bus_open = True
@@ -324,7 +319,7 @@ class VirtualBus:
         Raises:
             UsageError: If the recorder's socket can never be used.
         """
-        self.sent = self.heard = 0
+        self.sent = self.received = 0
         self._server, self._sender, self._say = server, sender, log_event
         self._recorder = False
         if sender is not None:
@@ -378,12 +373,11 @@ class VirtualBus:
             most: How many at most.
 
         Returns:
-            The frames; nobody else has heard them yet, see :meth:`relay`.
+            The frames; nobody else has received them yet, see :meth:`relay`.
         """
         if self._server is None:
             return []
-        taken = iter(self._server.take, None)
-        return list(itertools.islice(taken, most))
+        return list(itertools.islice(iter(self._server.take, None), most))
 
     def relay(self, sent: Sequence[Sent], t_ns: int) -> FrameArray:
         """Send frames of clients to everyone but their senders.
@@ -396,7 +390,7 @@ class VirtualBus:
         """
         frames = records(each.record for each in sent)
         frames["t_device_ns"] = t_ns
-        self.heard += len(frames)
+        self.received += len(frames)
         start = 0
         for client, group in itertools.groupby(each.client for each in sent):
             stop = start + len(list(group))

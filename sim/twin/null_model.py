@@ -68,8 +68,7 @@ def steady_frequency(scenario: Scenario) -> float:
         raise UsageError(
             f"{scenario.name}: a null model is of a steady gait: kind serpentine, no controller"
         )
-    servos = {joint.servo for joint in scenario.robot.joints}
-    if len(servos) > 1 or scenario.modules.link_of:
+    if len({joint.servo for joint in scenario.robot.joints}) > 1 or scenario.modules.link_of:
         raise UsageError(
             f"{scenario.name}: a null model is of identical modules; leave out servo_of and link_of"
         )

@@ -80,8 +80,8 @@ class Driver:
         Returns:
             32 hexadecimal digits.
         """
-        told = [f"{key}={value}".encode() for key, value in sorted(self.facts.items())]
-        parts = [scenario.session_id.encode(), *told, *self.attachments.values()]
+        lines = [f"{key}={value}".encode() for key, value in sorted(self.facts.items())]
+        parts = [scenario.session_id.encode(), *lines, *self.attachments.values()]
         return hashlib.sha256(b"\0".join(parts)).hexdigest()[:32]
 
 

@@ -55,8 +55,7 @@ def urdf(robot: Robot) -> str:
         damping and no friction (the servos bring their own).
     """
     root = ET.Element("robot", name=robot.name)
-    material = ET.SubElement(root, "material", name="body")
-    ET.SubElement(material, "color", rgba="0.55 0.6 0.65 1")
+    ET.SubElement(ET.SubElement(root, "material", name="body"), "color", rgba="0.55 0.6 0.65 1")
     for i, link in enumerate(robot.links):
         _add_link(root, link, 0.0 if i == 0 else -link.length / 2)
     for i, joint in enumerate(robot.joints):
@@ -93,14 +92,12 @@ def _add_link(root: ET.Element, link: Link, centre: float) -> None:
     if link.mesh:
         visual = ET.SubElement(element, "visual")
         ET.SubElement(visual, "origin", xyz=f"{centre!r} 0 0", rpy="0 0 0")
-        scale = " ".join([repr(link.mesh_scale)] * 3)
-        shape = {"filename": link.mesh, "scale": scale}
+        shape = {"filename": link.mesh, "scale": " ".join([repr(link.mesh_scale)] * 3)}
         ET.SubElement(ET.SubElement(visual, "geometry"), "mesh", shape)
         return
     half, radius = link.length / 2, repr(link.radius)
-    tube = {"radius": radius, "length": repr(link.length)}
     for shape, at, size in (
-        ("cylinder", centre, tube),
+        ("cylinder", centre, {"radius": radius, "length": repr(link.length)}),
         ("sphere", centre + half, {"radius": radius}),
         ("sphere", centre - half, {"radius": radius}),
     ):
@@ -194,8 +191,8 @@ class SessionLog:
         self._offsets = writer.joint_state("/joint_sample_offset", names, unit="s")
         self._current = writer.joint_state("/joint_current", names, unit="A")
         self._voltage = writer.joint_state("/joint_voltage", names, unit="V")
-        told = twin.gait.names  # recorded commands may come without their gait
-        self._gait = writer.joint_state("/gait", told, unit=GAIT_UNIT) if told else None
+        gait_names = twin.gait.names  # recorded commands may come without their gait
+        self._gait = writer.joint_state("/gait", gait_names, unit=GAIT_UNIT) if gait_names else None
         self._powers = {topic: writer.joint_state(topic, names, unit="W") for topic in _POWER_TERMS}
         self._booked = 0, np.zeros((len(JOINT_TERMS), len(names)))
         self._energy = writer.joint_state("/energy_ledger", TERMS, unit="J")
@@ -209,7 +206,7 @@ class SessionLog:
         self._events = writer.log("/rosout")
         self._lower, self._upper = robot.limits()
         self._last_mode = ""
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
         self._t_ns = self._epoch_ns
         writer.string("/robot_description").write(self._t_ns, description)
         for text in warnings(scenario):
@@ -227,8 +224,8 @@ class SessionLog:
         Args:
             level: ``info``, ``warn`` or ``error``.
         """
-        if text not in self._said:
-            self._said.add(text)
+        if text not in self._logged:
+            self._logged.add(text)
             self._events.write(self._t_ns, level, "twin", text)
 
     def end(self, verdict: str, reason: str) -> None:
@@ -258,8 +255,7 @@ class SessionLog:
         )
         if sample.tick % _TF_EVERY == 0:
             centres, turns = body.position.T, body.quaternion.T
-            origins = frame_origins(self._scenario.robot, centres, turns)
-            self._transforms.write(t_ns, origins, turns)
+            self._transforms.write(t_ns, frame_origins(self._scenario.robot, centres, turns), turns)
         if sample.gait.mode != self._last_mode:
             self._last_mode = sample.gait.mode
             self._mode.write(t_ns, sample.gait.mode)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping
 from queue import Empty, Full, Queue
 
+from undulog.capture.common.arrays import NS
 from undulog.capture.common.errors import SimulationError, SourceError, UndulogError, UsageError
 from undulog.capture.robot.model import ClockDomain, Robot
 from undulog.capture.sources.contract import (
@@ -26,7 +27,7 @@ from .twin import Sample, Twin
 
 _AHEAD = 100  # samples that the twin may be ahead of the recording
 
-_PERIOD_NS = 1_000_000_000 // CONTROL_RATE_HZ
+_PERIOD_NS = NS // CONTROL_RATE_HZ
 
 
 class TwinSource:
@@ -43,8 +44,7 @@ class TwinSource:
         self.directions = False
         self.robot: Robot | None = scenario.robot
         self.counts = SourceCounts()
-        self._address = address
-        self._scenario = scenario
+        self._address, self._scenario = address, scenario
         self._queue: Queue[Sample | UndulogError | None] = Queue(_AHEAD)
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None

@@ -5,7 +5,7 @@ import pytest
 
 from undulog.analysis.energy import add_up, integrate, power_of
 from undulog.analysis.estimators.series import Series, clean, coverage, sample_weights
-from undulog.capture.log.read.signals import Signal
+from undulog.capture.log.read.sample_times import Signal
 
 SECOND = 10**9
 

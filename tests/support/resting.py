@@ -8,7 +8,7 @@ from undulog.analysis.dead_band.find import dead_bands
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.response.fitting import fit_gait
 from undulog.analysis.signals.columns import Columns
-from undulog.capture.log.read.signals import Signal
+from undulog.capture.log.read.sample_times import Signal
 
 STEP = 2 * np.pi / 4096
 FINE = 20

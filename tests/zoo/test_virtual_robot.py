@@ -10,7 +10,7 @@ import pytest
 import undulog
 from support.processes import serving
 from undulog.capture import Session, load_robot
-from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.contract import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.sim.drive.links import find_virtual_robot
 from undulog.sim.drive.loop import CommandEncoder

@@ -26,8 +26,17 @@ from mcap.opcode import Opcode
 from ...common.arrays import IntArray
 from ...common.errors import LogError
 from ..file.log_file import LogFile, keep_freed, new_pages
-from ..mcap.chunk import LAST_NS, PREFIX_SIZE, Block, Buffer
-from ..mcap.records import BODY_AT, FIXED_SIZE, Places, gather, read_message_heads
+from ..mcap.chunk import (
+    BODY_AT,
+    FIXED_SIZE,
+    LAST_NS,
+    PREFIX_SIZE,
+    Block,
+    Buffer,
+    Places,
+    gather,
+    read_message_heads,
+)
 
 _T = TypeVar("_T")
 
@@ -314,8 +323,7 @@ def _records(
         at = starts.offsets
         records = _alike(data, starts) if len(at) else Records(at, at, None, Places(data, at))
         if records is None:
-            ends = np.repeat(starts.ends, starts.counts)
-            if read_message_heads(data, at, ends) is None:
+            if read_message_heads(data, at, np.repeat(starts.ends, starts.counts)) is None:
                 raise LogError(
                     log_file.path, "a message index points to something that is not a message"
                 )

@@ -57,8 +57,7 @@ class ColumnStore:
         Args:
             rows: Shape (n, width), or (n,) of one number each.
         """
-        count = len(rows)
-        stop = self._count + count
+        stop = self._count + len(rows)
         if stop > self._capacity:
             self._capacity = max(2 * self._capacity, stop)
             old = self.values()
@@ -127,9 +126,7 @@ class EchoColumn:
             dtype: numpy type string of a number.
             others: Columns that it may be equal to, if they get the rows first.
         """
-        self._dtype = dtype
-        self._capacity = capacity
-        self._others = others
+        self._dtype, self._capacity, self._others = dtype, capacity, others
         self._leader: EchoColumn | None = None
         self._own: ColumnStore | None = None
         self._count = 0

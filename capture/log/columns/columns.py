@@ -16,8 +16,7 @@ import numpy as np
 from ...common.arrays import IntArray
 from ...common.errors import DataError
 from ..file.log_file import FilePages, LogFile
-from ..mcap.chunk import PREFIX_SIZE, Buffer
-from ..mcap.records import BODY_AT, FIXED_SIZE, MESSAGE, Places
+from ..mcap.chunk import BODY_AT, FIXED_SIZE, MESSAGE, PREFIX_SIZE, Buffer, Places
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import JOINT_STATE, MessageType
 from .blocks import Records, Window, blocks_in, record_batches
@@ -136,8 +135,7 @@ def read_messages(
 def _expected(log_file: LogFile, request: Request, blocks: int) -> int:
     """Return the expected number of messages in a number of blocks."""
     counted = sum(log_file.counts.get(channel_id, 0) for channel_id in request.channel_ids)
-    part = blocks / max(len(log_file.blocks), 1)
-    return int(counted * min(part, 1.0)) + 1
+    return int(counted * min(blocks / max(len(log_file.blocks), 1), 1.0)) + 1
 
 
 def message_blocks(
@@ -213,8 +211,7 @@ class _GroupReader:
             else:
                 self._sort_in(length, places, log_ns, np.arange(first, self._count))
             return
-        heads = Places(places.data, places.at - BODY_AT)
-        lengths = heads.field("<i8", _LENGTH_AT) - FIXED_SIZE
+        lengths = Places(places.data, places.at - BODY_AT).field("<i8", _LENGTH_AT) - FIXED_SIZE
         for length in np.unique(lengths).tolist():
             rows = np.flatnonzero(lengths == length)
             self._sort_in(length, places.take(rows), log_ns[rows], first + rows)

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import IntArray
+from ...common.arrays import NS, IntArray
 from ...common.errors import DataError
 from ..file.log_file import FilePages
-from ..mcap.records import Places
+from ..mcap.chunk import Places
 from ..messages.cdr import Layout, Leaf
 from .buffers import ColumnStore, Times, TimeStore
 
@@ -27,7 +27,6 @@ MOST_JOINT_LISTS = 256
 TIME = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
 """A ``builtin_interfaces/msg/Time`` in a message."""
 
-_NS = 1_000_000_000
 _STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.nanosec"))
 
 Matrix = NDArray[np.uint8]
@@ -68,8 +67,7 @@ class LayoutSorter:
             in_all: Whether ``most`` counts all layouts, instead of those of each length.
         """
         self.is_full = False
-        self._find = find
-        self._most, self._in_all = most, in_all
+        self._find, self._most, self._in_all = find, most, in_all
         self._kept: dict[int, list[tuple[int, Layout]]] = {}
         self._found = self._kept_in_all = 0
 
@@ -182,7 +180,7 @@ def stamps_of(layout: Layout, matrix: Matrix) -> IntArray | None:
 def time_ns(sec: NDArray[Any], nanosec: NDArray[Any]) -> IntArray:
     """Return times [ns] of their two parts, each of shape (n,)."""
     ns = sec.astype(np.int64)
-    ns *= _NS
+    ns *= NS
     ns += nanosec.astype(np.int64, copy=False)
     return ns
 
@@ -210,8 +208,7 @@ class Stamping:
             stamp: Leaves of the stamps: seconds and nanoseconds.
         """
         seconds, rest = stamp
-        pair = (seconds.dtype, rest.dtype, rest.offset - seconds.offset)
-        if pair != ("<i4", "<u4", 4):
+        if (seconds.dtype, rest.dtype, rest.offset - seconds.offset) != ("<i4", "<u4", 4):
             parts = (places.field(leaf.dtype, leaf.offset) for leaf in stamp)
             return Times.of(log_ns, time_ns(*parts))
         raw = np.ascontiguousarray(places.field("V8", seconds.offset)).view("<i8")

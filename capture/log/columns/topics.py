@@ -59,9 +59,7 @@ class Topics:
             warn: Called with one sentence for each irregularity.
             threads: Number of decompressing threads.
         """
-        self._file = log_file
-        self._threads = threads
-        self._warn = warn
+        self._file, self._threads, self._warn = log_file, threads, warn
         self._types: dict[int, MessageType | DataError] = {}  # by schema
         self._layouts: dict[str, dict[int, Layout]] = {}
         self._ids: dict[str, list[int]] = {}

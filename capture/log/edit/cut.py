@@ -31,9 +31,7 @@ from .edited_log import (
     portable,
     refuse_output,
 )
-from .raw_messages import RawLog, RawMessage
-
-_FOREVER_NS = 2**64
+from .raw_messages import FOREVER_NS, RawLog, RawMessage
 
 
 def cut_log(
@@ -68,7 +66,7 @@ def cut_log(
     stop = stop or StopRequest()
     with RawLog(path) as source:
         start_ns = source.start_ns + round(start_s * NS)
-        stop_ns = _FOREVER_NS if stop_s is None else source.start_ns + round(stop_s * NS)
+        stop_ns = FOREVER_NS if stop_s is None else source.start_ns + round(stop_s * NS)
         kept = _channels(source, topics)
         latched = [channel for channel in kept if is_latched(source.type_name(channel), channel)]
         state = _state_before(source, latched, start_ns)
@@ -103,15 +101,12 @@ def cut_log(
             }
             log.note(EDIT_RECORD, facts)
             log.copy_health(source)
-    notes = [] if carry_state else _left_behind(source, state, start_ns)
     return EditReport(
         output=output,
-        sources=[{"path": str(path), "session_id": source.session_id, "sha256": source.sha256}],
-        start_ns=log.first_ns,
-        end_ns=log.last_ns,
-        messages=dict(sorted(log.counts.items())),
+        sources=[source.facts],
+        **log.measures(),
         warnings=source.warnings,
-        notes=notes,
+        notes=[] if carry_state else _left_behind(source, state, start_ns),
     )
 
 

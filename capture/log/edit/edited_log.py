@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 from mcap.records import Attachment, Channel
 from mcap.writer import Writer
 
+from ...common.arrays import NS
 from ...common.console import progress, refuse_existing
 from ...common.errors import DataError, UndulogError, UsageError
 from ...common.files import part_file
@@ -25,7 +26,6 @@ from .raw_messages import RawLog, RawMessage
 EDIT_RECORD = "undulog.edit"
 """Metadata record of the sources of an edited log."""
 HEALTH_RECORD = "undulog.health"
-NS = 1_000_000_000
 _MOST_CHANNELS = 2**16 - 1
 _STOP_CHECKED_EVERY = 1024
 
@@ -174,6 +174,11 @@ class EditedLog:
     def note(self, name: str, facts: Mapping[str, str]) -> None:
         """Write a metadata record."""
         self._writer.add_metadata(name, dict(facts))
+
+    def measures(self) -> dict[str, Any]:
+        """Return times [Unix ns] and counts of the messages, for the report."""
+        counts = dict(sorted(self.counts.items()))
+        return {"start_ns": self.first_ns, "end_ns": self.last_ns, "messages": counts}
 
     def finish(self) -> None:
         """Write indexes and summary."""

@@ -25,7 +25,7 @@ from typing import cast
 
 from mcap.records import Schema
 
-from ...common.errors import DataError, UsageError
+from ...common.errors import DataError, UsageError, some_names
 from ...common.process import StopRequest
 from ..columns.layouts import names_of
 from ..columns.topics import Topics
@@ -165,7 +165,6 @@ LONGEST_MERGE_GAP_S = 86400.0
 day's session, or a clock was wrong."""
 
 _LATER_S = 60.0
-_FOREVER_NS = 2**64
 
 
 def merge_logs(
@@ -230,13 +229,8 @@ def merge_logs(
                 log.note(name, entries)
     return EditReport(
         output=output,
-        sources=[
-            {"path": str(source.path), "session_id": source.session_id, "sha256": source.sha256}
-            for source in sources
-        ],
-        start_ns=log.first_ns,
-        end_ns=log.last_ns,
-        messages=dict(sorted(log.counts.items())),
+        sources=[source.facts for source in sources],
+        **log.measures(),
         warnings=warnings,
     )
 
@@ -334,8 +328,9 @@ def _other_robots(sources: Sequence[RawLog], robot: str) -> list[str]:
     for (one, names), (other, others) in combinations(joints, 2):
         unstated = not one.robot or not other.robot
         if unstated and names and others and names.isdisjoint(others):
+            here, there = (some_names(sorted(each), 3) for each in (names, others))
             warnings.append(
-                f"{one.path} has {_listed(names)}, {other.path} has {_listed(others)}: no joint "
+                f"{one.path} has {here}, {other.path} has {there}: no joint "
                 "is in both, are they of one robot?"
             )
     return warnings
@@ -350,11 +345,6 @@ def _joint_names(source: RawLog) -> set[str]:
                 first = topics.first(topic)
                 found.update(() if first is None else names_of(layout_of(first[2], first[1])))
     return found
-
-
-def _listed(names: set[str]) -> str:
-    listed = sorted(names)
-    return ", ".join(listed[:3]) + (f" and {len(listed) - 3} more" if len(listed) > 3 else "")
 
 
 def _apart(sources: Sequence[RawLog], *, allowed: bool) -> list[str]:
@@ -400,6 +390,6 @@ def _in_order(source: RawLog, log: EditedLog) -> Iterator[tuple[int, int, RawMes
     """Yield latest log time so far, new channel id and message, in the order of the file."""
     ids = {c.id: log.channel(source, c) for c in source.file.channels.values()}
     latest_ns = 0
-    for message in source.messages(ids, 0, _FOREVER_NS):
+    for message in source.messages(ids):
         latest_ns = max(latest_ns, message.log_time_ns)
         yield latest_ns, ids[message.channel_id], message

@@ -25,7 +25,7 @@ from ..mcap.chunk import PREFIX_SIZE, Block, Buffer, walk_records
 _LENGTH = struct.Struct("<Q")
 _FIXED = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time
 _BODY_AT = PREFIX_SIZE + _FIXED.size
-_PIECE = 1 << 20
+FOREVER_NS = 1 << 64
 
 
 class RawMessage(NamedTuple):
@@ -60,7 +60,6 @@ class RawLog:
         self.path = path
         self.file = LogFile(path)
         self.warnings = list(self.file.warnings)
-        self._warned = set(self.warnings)
         self.paths = [file.path for file in self.file.files]
         self.sha256 = _hash(self.paths)
         filled = [block for block in self.file.blocks if block.end_ns]
@@ -78,6 +77,11 @@ class RawLog:
         self.file.close()
 
     @property
+    def facts(self) -> dict[str, str]:
+        """Path, id and digest, for the report of an edit."""
+        return {"path": str(self.path), "session_id": self.session_id, "sha256": self.sha256}
+
+    @property
     def metadata(self) -> list[Metadata]:
         """The metadata records, in the order of the file; names may repeat."""
         return [item for item in self.file.appendices if isinstance(item, Metadata)]
@@ -89,8 +93,7 @@ class RawLog:
 
     def warn(self, sentence: str) -> None:
         """Add a warning, once."""
-        if sentence not in self._warned:
-            self._warned.add(sentence)
+        if sentence not in self.warnings:
             self.warnings.append(sentence)
 
     def type_name(self, channel: Channel) -> str:
@@ -99,7 +102,7 @@ class RawLog:
         return schema.name if schema is not None else ""
 
     def messages(
-        self, channel_ids: Collection[int], start_ns: int, stop_ns: int
+        self, channel_ids: Collection[int], start_ns: int = 0, stop_ns: int = FOREVER_NS
     ) -> Iterator[RawMessage]:
         """Yield messages of some channels in a window, in the order of the file.
 
@@ -108,8 +111,7 @@ class RawLog:
             stop_ns: One past the last log time [Unix ns].
         """
         for block in self.file.blocks:
-            outside = block.start_ns >= stop_ns or block.end_ns < start_ns
-            if not (block.end_ns and outside):
+            if not (block.end_ns and (block.start_ns >= stop_ns or block.end_ns < start_ns)):
                 yield from self._block_messages(block, channel_ids, start_ns, stop_ns)
 
     def last_messages(self, channel_ids: Collection[int], before_ns: int) -> list[RawMessage]:
@@ -125,8 +127,7 @@ class RawLog:
         """
         # With log time, and file and place of its block.
         last: dict[int, tuple[tuple[int, int, int], RawMessage]] = {}
-        backward = sorted(self.file.blocks, key=lambda b: (b.end_ns, b.part, b.start))[::-1]
-        for block in backward:
+        for block in sorted(self.file.blocks, key=lambda b: (b.end_ns, b.part, b.start))[::-1]:
             if block.end_ns and block.start_ns >= before_ns:
                 continue
             open_ids = {k for k in channel_ids if k not in last or last[k][0][0] <= block.end_ns}
@@ -150,7 +151,8 @@ class RawLog:
             self.warn(f"{error}; its messages are missing")
             return
         loose = not block.start  # the unchunked messages lie between other records
-        places = _loose_places(block) if loose else self._places(block, data, start, stop)
+        offsets = (at for found in (block.offsets or {}).values() for at in found.tolist())
+        places = sorted(offsets) if loose else self._places(block, data, start, stop)
         unknown = 0
         for at in places:
             (length,) = _LENGTH.unpack_from(data, at + 1)
@@ -185,17 +187,12 @@ class RawLog:
             )
 
 
-def _loose_places(block: Block) -> Iterator[int]:
-    yield from sorted(at for found in (block.offsets or {}).values() for at in found.tolist())
-
-
 def _hash(paths: list[Path]) -> str:
     """Return the SHA-256 of one file, or of all parts one after the other."""
     total = hashlib.sha256()
     for path in paths:
         with path.open("rb") as stream:
-            while piece := stream.read(_PIECE):
-                total.update(piece)
+            hashlib.file_digest(stream, lambda: total)
     return total.hexdigest()
 
 

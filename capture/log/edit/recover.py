@@ -25,8 +25,6 @@ from .raw_messages import RawLog
 RECOVERED_RECORD = "undulog.recovered"
 """Metadata record of the sources of a recovered log."""
 
-_ALL_NS = (0, 1 << 64)
-
 
 @dataclass
 class RecoverReport(EditReport):
@@ -92,7 +90,7 @@ def recover_log(
                     log.note(record.name, record.metadata)
             channels = source.file.channels.values()
             ids = {channel.id: log.channel(source, channel) for channel in channels}
-            messages = source.messages(ids, *_ALL_NS)
+            messages = source.messages(ids)
             log.write_all(
                 f"recovering {path.name}",
                 ((ids[message.channel_id], message) for message in messages),
@@ -103,13 +101,8 @@ def recover_log(
                 raise DataError(f"{path}: no message of it can be read")
             report = RecoverReport(
                 output=output,
-                sources=[
-                    {"path": str(each), "session_id": source.session_id, "sha256": source.sha256}
-                    for each in source.paths
-                ],
-                start_ns=log.first_ns,
-                end_ns=log.last_ns,
-                messages=dict(sorted(log.counts.items())),
+                sources=[{**source.facts, "path": str(each)} for each in source.paths],
+                **log.measures(),
                 warnings=source.warnings,
                 from_wal=found.from_wal if found is not None else 0,
                 missing=_missing(source, log),

@@ -23,10 +23,9 @@ from mcap.records import Attachment, Channel, Header, Metadata, Schema
 from numpy.typing import NDArray
 
 from ...common.errors import LogError, NotALogError
-from ..mcap.chunk import LAST_NS, Block
+from ..mcap.chunk import LAST_NS, Block, read_message_heads
 from ..mcap.file import McapFile
-from ..mcap.records import read_message_heads
-from ..wal.tail import MessageKey, WalContents, WalTail, beyond, read_wal
+from ..wal.reader import MessageKey, WalContents, WalTail, beyond, read_wal
 from .parts import PART_RECORD, PartFiles, first_part, open_parts
 
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
@@ -179,8 +178,7 @@ class LogFile:
         """
         self.path = path
         self.warnings: list[str] = []
-        self.profile = ""
-        self.library = ""
+        self.profile = self.library = ""
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.blocks: list[Block] = []
@@ -319,12 +317,12 @@ class LogFile:
         accepted = wal.accepted if wal.messages else None
         looked = looked and not wal.damaged
         self.recovered = Recovered(wal.folder, wal.live, in_files, len(rest), accepted, looked)
-        told = list(wal.warnings)
+        found = list(wal.warnings)
         if self.recovered.missing == 0:  # then a part that was only begun had no messages
             gone = [text for text in self.parts.missing if "can't be read" in text]
             self.parts.missing = [text for text in self.parts.missing if text not in gone]
-            told = [text for text in told if "no readable header" not in text]
-        self.warnings += [self.recovered.warning, *told]
+            found = [text for text in found if "no readable header" not in text]
+        self.warnings += [self.recovered.warning, *found]
 
     def _define(self, wal: WalContents) -> None:
         """Add definitions of a write-ahead log that the files don't have."""

@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ...common.errors import LogError, NotALogError
+from ...common.errors import LogError, NotALogError, some_names
 from ..mcap.file import McapFile
 from ..wal.writer import wal_folder
 
@@ -217,15 +217,15 @@ def _gaps(found: PartFiles, first: Path, there: set[int], *, bare: bool) -> list
     last = max(found.files)
     end = _part_record(found.files[last])
     gone = [number for number in range(1, last) if number not in there]
-    told = [f"part {number} ({part_path(first, number).name}) is missing" for number in gone]
+    texts = [f"part {number} ({part_path(first, number).name}) is missing" for number in gone]
     if bare:  # the write-ahead log knows how much was recorded after the last file
-        return told
+        return texts
     if "next" in end and last + 1 not in there:
         name = part_path(first, last + 1).name
-        told.append(f"part {last + 1} ({name}) is missing; whether more followed it is unknown")
+        texts.append(f"part {last + 1} ({name}) is missing; whether more followed it is unknown")
     elif "next" not in end and "parts" not in end and last > 1:
-        told.append(f"part {last} is not marked as the last: more may have followed")
-    return told
+        texts.append(f"part {last} is not marked as the last: more may have followed")
+    return texts
 
 
 def _redefines(file: McapFile, others: list[McapFile]) -> bool:
@@ -282,9 +282,8 @@ def _session_in(folder: Path) -> Path:
     if not heads:
         raise NotALogError(folder, "no session (.mcap) is in this folder; name a session's file")
     if len(heads) > 1:
-        listed = ", ".join([path.name for path in heads][:_MOST_LISTED])
-        more = f" and {len(heads) - _MOST_LISTED} more" if len(heads) > _MOST_LISTED else ""
+        listed = some_names([path.name for path in heads], _MOST_LISTED)
         fix = "join them with undulog log merge" if bag else "name one"
         what = "files of a rosbag2 folder" if bag else "sessions"
-        raise LogError(folder, f"{len(heads)} {what} are in this folder; {fix}: {listed}{more}")
+        raise LogError(folder, f"{len(heads)} {what} are in this folder; {fix}: {listed}")
     return next(iter(heads))

@@ -25,8 +25,7 @@ from ..columns.layouts import (
     time_ns,
     values_of,
 )
-from ..mcap.chunk import LAST_NS, Buffer
-from ..mcap.records import BODY_AT, FIXED_SIZE, gather
+from ..mcap.chunk import BODY_AT, FIXED_SIZE, LAST_NS, Buffer, gather
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import MessageType
 from ..messages.frames import (
@@ -123,16 +122,16 @@ class ChannelScan:
                 None for a file.
         """
         self.topic = topic
-        self.count = 0
-        self.unread = 0
+        self.count = self.unread = 0
         self.sequence = SequenceTally()
         self.series: dict[tuple[str, ...], Series] = {}
-        self.bus = BusTally(horizon_s) if kind is not None and _holds_frames(topic, kind) else None
+        framed = kind is not None and kind.name == "std_msgs/msg/UInt8MultiArray"
+        framed = framed and topic.startswith(FRAME_TOPIC_PREFIXES)
+        self.bus = BusTally(horizon_s) if framed else None
         self.ends: tuple[bytes, bytes] | None = None
         self._keeps_ends = kind is not None and kind.name == DIAGNOSTICS
         self.kind = kind
-        self._joints = joints
-        self._limits = limits
+        self._joints, self._limits = joints, limits
         self._stamped = kind is not None and _is_stamped(kind)
         self._horizon_s = horizon_s
         self._sorter = None if kind is None else _sorter(kind, joints=joints)
@@ -319,8 +318,7 @@ class ChannelScan:
 
 def _sorter(kind: MessageType, *, joints: bool) -> LayoutSorter:
     most = MOST_JOINT_LISTS if joints else MOST_LAYOUTS
-    text = not kind.has_floats
-    return LayoutSorter(partial(layout_of, kind), most=most, in_all=joints or text)
+    return LayoutSorter(partial(layout_of, kind), most=most, in_all=joints or (not kind.has_floats))
 
 
 def _records_in(
@@ -368,7 +366,3 @@ def _is_stamped(kind: MessageType) -> bool:
     if first is not None and first.fields and first.fields[0].nested is not None:
         first = first.fields[0].nested
     return first is not None and [part.name for part in first.fields] == ["sec", "nanosec"]
-
-
-def _holds_frames(topic: str, kind: MessageType) -> bool:
-    return topic.startswith(FRAME_TOPIC_PREFIXES) and kind.name == "std_msgs/msg/UInt8MultiArray"

@@ -7,9 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from ...common.arrays import BoolArray, FloatArray, IntArray
-
-NS = 1_000_000_000
+from ...common.arrays import NS, BoolArray, FloatArray, IntArray
 
 FROZEN_COMMAND_RAD = 0.05
 """A joint is frozen in a second if its angle is exactly constant while its command moves by more
@@ -199,8 +197,7 @@ class _Runs:
         numbers: list[int] = seconds.tolist()
         for k, second in enumerate(numbers):
             if some[k] or not quiet:
-                row = flags[k]
-                run = np.where(row, (run if second == before + 1 else 0) + 1, 0)
+                run = np.where(flags[k], (run if second == before + 1 else 0) + 1, 0)
                 more = run > longest
                 longest = np.where(more, run, longest)
                 longest_at = np.where(more, second + 1 - run, longest_at)

@@ -338,8 +338,7 @@ def judge_following(fault: JointFault) -> Finding:
     """Return the finding on a joint that does not follow its command."""
     when = "" if fault.since_s is None else f" from {fault.since_s:.3g} s"
     when += "" if fault.until_s is None else f" to {fault.until_s:.3g} s"
-    kinds = " or ".join(fault.kinds)
-    return Finding(1, f"{fault.joint}{when} {fault.evidence}: {kinds}")
+    return Finding(1, f"{fault.joint}{when} {fault.evidence}: {' or '.join(fault.kinds)}")
 
 
 def judge_bus(health: BusHealth) -> list[Finding]:
@@ -407,8 +406,7 @@ def judge_topics(
             sentence = f"{topic} is missing; there are raw CAN frames"
         else:
             sentence = f"{topic} is missing, and no other topic has joints"
-        nothing = not others and not framed
-        found.append(Finding(2 if nothing else 1, sentence))
+        found.append(Finding(2 if (not others and not framed) else 1, sentence))
     present = set(seen)
     missing = [name for name in joints if name not in present]
     if present and missing:

@@ -13,12 +13,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import IntArray
+from ...common.arrays import NS, IntArray
 from ...robot.model import Robot
 from ..mcap.chunk import Buffer
 from ..messages.definitions import JOINT_STATE, MessageType
 from ..messages.frames import identifier_text
-from .bus_tally import named_identifiers, undecoded
+from .bus_tally import SourceHealth, judge_source, measure_sources, named_identifiers, undecoded
 from .channel_scan import ChannelScan, Limits, Series
 from .freeze import FreezeTally
 from .rules import (
@@ -33,8 +33,7 @@ from .rules import (
     judge_topics,
     verdict_of,
 )
-from .sources import SourceHealth, judge_source, measure_sources
-from .tallies import NS, BusHealth, ChannelHealth, JointHealth, SeriesHealth
+from .tallies import BusHealth, ChannelHealth, JointHealth, SeriesHealth
 
 _MOST_PAIRS = 4096
 """Most pairs of measured and commanded joint sets that are checked for frozen joints."""
@@ -110,8 +109,7 @@ class SessionScan:
                 summed up, so that memory is bounded, and later ones are not checked for frozen
                 joints. None for a file.
         """
-        self._robot = robot
-        self._horizon_s = horizon_s
+        self._robot, self._horizon_s = robot, horizon_s
         self._freezes: dict[tuple[int, tuple[str, ...], int, tuple[str, ...]], FreezeTally] = {}
         self._scans: dict[int, ChannelScan] = {}
         self._types: dict[int, str] = {}
@@ -147,7 +145,7 @@ class SessionScan:
         Args:
             data: Bytes that hold their records.
             offsets: Offsets of the records, in the order of the session, shape (n,).
-            heads: The records' heads, of :data:`.capture.log.mcap.records.HEAD`, shape (n,).
+            heads: The records' heads, of :data:`.capture.log.mcap.chunk.HEAD`, shape (n,).
         """
         self._scans[key].add(data, offsets, heads)
 

@@ -10,9 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...common.arrays import IntArray
-
-NS = 1_000_000_000
+from ...common.arrays import NS, IntArray
 
 GAP_PERIODS = 1.5
 """An interval longer than this many median intervals is a gap: the nearest whole number of
@@ -99,8 +97,7 @@ class TimingTally:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._count = 0
-        self._first = self._last = self._previous = 0
+        self._count = self._first = self._last = self._previous = 0
         self._duplicates = self._backward = 0
         self._longest = (0, 0)
         self._bins = np.empty(0, np.int64)  # those that have intervals, ascending
@@ -150,8 +147,7 @@ class TimingTally:
         regular, gaps, missing, scattered, paused = False, 0, 0, 0, 0.0
         if intervals:
             mean = total / number
-            reached = np.cumsum(number)
-            places = np.searchsorted(reached, np.array(_QUANTILES) * intervals)
+            places = np.searchsorted(np.cumsum(number), np.array(_QUANTILES) * intervals)
             low, median, high, p99 = mean[places].tolist()
             regular = intervals >= MIN_INTERVALS and high - low <= REGULAR_SPREAD * median
             long = (mean > GAP_PERIODS * median) & regular
@@ -203,8 +199,7 @@ class SequenceTally:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._previous = 0
-        self._count = self._ones = self._repeated = self._reordered = 0
+        self._previous = self._count = self._ones = self._repeated = self._reordered = 0
         self._at = self._low = self._high = 0  # unwrapped, relative to the first
         self._nonzero = False
 
@@ -239,8 +234,7 @@ class SequenceTally:
         if self._ones < SEQUENCE_COUNTS * (self._count - 1):
             return Sequence("not a count", None, None)
         span = self._high - self._low + 1
-        dropped = max(span - (self._count - self._repeated), 0)
-        return Sequence("counted", dropped, self._reordered)
+        return Sequence("counted", max(span - (self._count - self._repeated), 0), self._reordered)
 
 
 @dataclass(frozen=True)

@@ -38,8 +38,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from .chunk import MAGIC
-from .records import FIXED_SIZE, MESSAGE
+from .chunk import FIXED_SIZE, MAGIC, MESSAGE
 
 CHUNK_SIZE = 1 << 20
 """Bytes of messages after which a chunk is written."""
@@ -64,7 +63,6 @@ class Stream(Protocol):
 
     def flush(self) -> None:
         """Flush buffered bytes."""
-        ...
 
 
 @dataclass(slots=True)
@@ -97,8 +95,7 @@ class McapWriter:
             group_of: Topic and type name to the group of a channel; channels of one group share
                 chunks. None for one group, named "".
         """
-        self._stream = stream
-        self._chunk_size = chunk_size
+        self._stream, self._chunk_size = stream, chunk_size
         self._zstd = zstandard.ZstdCompressor(write_checksum=True)
         self._group_of = group_of
         self._shared = _OpenChunk("")

@@ -123,8 +123,7 @@ class _Walker:
     """Finds the offsets of the fields of one message."""
 
     def __init__(self, name: str, message: bytes) -> None:
-        self._name = name
-        self._message = message
+        self._name, self._message = name, message
         self._at = _HEADER_SIZE
         self._left = _ELEMENTS_A_BYTE * len(message)  # strings and nested messages
         self.leaves: dict[str, Leaf] = {}
@@ -169,8 +168,7 @@ class _Walker:
         if count == 0:
             return  # an empty sequence is not padded to its element's alignment
         size = np.dtype(dtype).itemsize
-        offset = self._take(count * size, size)
-        self.leaves[path] = Leaf(path, dtype, offset, count, is_array)
+        self.leaves[path] = Leaf(path, dtype, self._take(count * size, size), count, is_array)
 
     def _string(self, path: str, field: Field) -> None:
         if field.base != "string":

@@ -122,8 +122,7 @@ class _Parser:
     """Resolves the sections of one schema."""
 
     def __init__(self, name: str, bodies: dict[str, str]) -> None:
-        self._name = name
-        self._bodies = bodies
+        self._name, self._bodies = name, bodies
         self._done: dict[str, MessageType] = {}
 
     def message(self, short: str, path: tuple[str, ...]) -> MessageType:
@@ -171,8 +170,7 @@ class _Parser:
         if base in PRIMITIVES or base in {"string", "wstring"}:
             return Field(match["name"], base, None, length, array is not None)
         if "/" not in base:
-            standard = {"Header": "std_msgs/Header"}
-            base = standard.get(base, f"{owner.partition('/')[0]}/{base}")
+            base = {"Header": "std_msgs/Header"}.get(base, f"{owner.partition('/')[0]}/{base}")
         nested = self.message(_short(base), path)
         return Field(match["name"], None, nested, length, array is not None)
 

@@ -97,8 +97,7 @@ def read_facts(name: str, size: int, read: Callable[[int, int], bytes]) -> LogFa
         raise NotALogError(name, "no MCAP file: it doesn't start as one")
     metadata: dict[str, dict[str, str]] = {}
     _add_metadata(metadata, _records(head, len(MAGIC)))
-    tail_start = max(0, size - _EDGE)
-    tail = ranges.get(tail_start, size) or b""
+    tail = ranges.get(max(0, size - _EDGE), size) or b""
     if size < 2 * len(MAGIC) + 29 or not tail.endswith(MAGIC):
         return LogFacts(metadata=metadata, damage="it has no end: undulog log recover")
     try:

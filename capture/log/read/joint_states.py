@@ -12,15 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ...common.arrays import FloatArray, IntArray
+from ...common.arrays import NS, FloatArray, IntArray
 from ...common.errors import DataError, MissingChannelError
 from ..columns.blocks import Window
 from ..columns.columns import Messages
 from ..columns.layouts import Group, names_of
 from ..columns.topics import Topics
 from ..messages.definitions import JOINT_STATE, MessageType
-from .sample_times import Series, StampClock, cut, own_times
-from .signals import JointSignals
+from .sample_times import JointSignals, Series, StampClock, cut, own_times
 
 _EARLY_OR_LATE = 0.1
 """A joint that is missing for more than this part of the topic's span causes a warning."""
@@ -137,11 +136,10 @@ def _warn_changed_set(
         )
 
 
-_NS = 1_000_000_000
-SLACK_NS = 5 * _NS
+SLACK_NS = 5 * NS
 """Largest difference between sampling time and log time for which a window is complete."""
 
-NEAR_NS = _NS // 4
+NEAR_NS = NS // 4
 """The same for logs of undulog, if the samples read cover the window."""
 
 
@@ -197,10 +195,7 @@ class JointReader:
         self, path: Path, topics: Topics, clock: StampClock, warn: Callable[[str], None]
     ) -> None:
         """Set up a reader; ``warn`` is called with one sentence for each irregularity."""
-        self._path = path
-        self._topics = topics
-        self._clock = clock
-        self._warn = warn
+        self._path, self._topics, self._clock, self._warn = path, topics, clock, warn
         self._offsets: dict[str, Series] = {}
 
     def read(
@@ -373,7 +368,7 @@ class JointReader:
                 lost += 1
                 continue
             stamp = message.header.stamp
-            stamp_ns = int(stamp.sec) * _NS + int(stamp.nanosec)
+            stamp_ns = int(stamp.sec) * NS + int(stamp.nanosec)
             values = np.array([getattr(message, field)], dtype=np.float64)
             times = np.array([stamp_ns]), np.array([item.log_ns])
             rows.append(JointRows(tuple(message.name), *times, values))

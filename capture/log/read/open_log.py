@@ -21,8 +21,7 @@ from ..columns.topics import Topics
 from ..file.log_file import LogFile
 from ..messages.frames import FrameArray, join_batches
 from .joint_states import JointReader
-from .sample_times import StampClock
-from .signals import JointSignals
+from .sample_times import JointSignals, StampClock
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,7 +40,6 @@ class OpenLog:
         self.path = path
         self.file = LogFile(path, column_folder)
         self.warnings = list(self.file.warnings)
-        self._warned = set(self.warnings)
         self.topics = Topics(self.file, self._warn, threads=threads)
         self._clock = StampClock(self.topics, self._warn)
         self._joints = JointReader(path, self.topics, self._clock, self._warn)
@@ -113,8 +111,7 @@ class OpenLog:
         return self.robot.joint_names if self.robot is not None else ()
 
     def _warn(self, sentence: str) -> None:
-        if sentence not in self._warned:
-            self._warned.add(sentence)
+        if sentence not in self.warnings:
             self.warnings.append(sentence)
 
     def _groups(self, topic: str, found: Messages) -> list[Group]:

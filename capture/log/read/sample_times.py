@@ -1,4 +1,4 @@
-"""Sampling times: stamps plus logged offsets, on the log's clock, and breaks of a session.
+"""Joint signals and their sampling times: stamps plus offsets, on the log's clock, and breaks.
 
 A log of a simulation may have simulated time in its headers and wall time in the container.
 Windows, plots and alignment need one clock, so such stamps are shifted to the log's.
@@ -11,16 +11,109 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...common.arrays import FloatArray, IntArray
+from ...common.arrays import NS, FloatArray, IntArray
 from ...common.errors import DataError
 from ..columns.blocks import Window
 from ..columns.layouts import stamps_of
 from ..columns.topics import Topics
 from ..messages.cdr import layout_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LARGEST = 1e100
+"""A larger value counts as missing: no sensor sends it, and its powers are not finite."""
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Samples of one quantity of one joint.
+
+    Attributes:
+        t_ns: Sampling times [Unix ns], not decreasing, shape (n,).
+        values: Shape (n,).
+    """
+
+    name: str
+    unit: str
+    t_ns: IntArray
+    values: FloatArray
+
+
+@dataclass(frozen=True)
+class JointSignals:
+    """One quantity of several joints, head to tail; each joint has its own sampling times.
+
+    Attributes:
+        topic: Where it was read from.
+        field: ``position``, ``velocity`` or ``effort`` of the JointState.
+        t_ns: Sampling times [Unix ns], one array of shape (n_j,) per joint. Joints sampled
+            together share one array.
+        values: One array of shape (n_j,) per joint; NaN samples are kept.
+    """
+
+    topic: str
+    field: str
+    unit: str
+    names: tuple[str, ...]
+    t_ns: tuple[IntArray, ...]
+    values: tuple[FloatArray, ...]
+
+    @cached_property
+    def _place(self) -> dict[str, int]:
+        """Name to its first place."""
+        return {name: j for j, name in reversed([*enumerate(self.names)])}
+
+    def signal(self, name: str) -> Signal:
+        """Return the samples of one joint.
+
+        Raises:
+            DataError: If there is no such joint.
+        """
+        j = self._place.get(name)
+        if j is None:
+            raise DataError(f"{self.topic} has no joint {name!r}; it has {', '.join(self.names)}")
+        return Signal(name, self.unit, self.t_ns[j], self.values[j])
+
+    def select(self, names: Iterable[str]) -> JointSignals:
+        """Return the same quantity of some joints, in the order of ``names``.
+
+        Raises:
+            DataError: If there is no such joint.
+        """
+        chosen = [self.signal(name) for name in names]
+        return JointSignals(
+            self.topic,
+            self.field,
+            self.unit,
+            tuple(signal.name for signal in chosen),
+            tuple(signal.t_ns for signal in chosen),
+            tuple(signal.values for signal in chosen),
+        )
+
+    def frame(self) -> pd.DataFrame:
+        """Return all samples in long form.
+
+        Returns:
+            Columns ``joint`` (categorical, in chain order), ``t_ns`` and the field's name with its
+            unit, e.g. ``position [rad]``; one row per sample.
+        """
+        import pandas as pd
+
+        joint = np.repeat(np.array(self.names, dtype=object), [len(t) for t in self.t_ns])
+        order = pd.CategoricalDtype(categories=list(self.names), ordered=True)
+        frame = pd.DataFrame(index=pd.RangeIndex(len(joint)))
+        frame["joint"] = pd.Series(joint, dtype=order)
+        frame["t_ns"] = np.concatenate([*self.t_ns, np.empty(0, dtype=np.int64)])
+        frame[f"{self.field} [{self.unit}]"] = np.concatenate([*self.values, np.empty(0)])
+        return frame
+
 
 BREAK_S = 10.0
 """A session breaks if none of its channels has a sample for longer than this [s]; shorter gaps are
@@ -28,8 +121,6 @@ losses, which the estimators allow."""
 
 BREAK_INTERVALS = 10
 """Shortest break in median intervals, for slow channels."""
-
-_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -55,7 +146,7 @@ class Unbroken:
         stretches = "1 other stretch" if self.others == 1 else f"{self.others} other stretches"
         return (
             f"the recording has a gap of {_length(self.gap_s)}: its longest unbroken stretch, "
-            f"{(self.last_ns - self.start_ns) / _NS:.1f} s, is analysed, {stretches} of "
+            f"{(self.last_ns - self.start_ns) / NS:.1f} s, is analysed, {stretches} of "
             f"{self.left_s:.1f} s altogether left out (choose with --start and --stop)"
         )
 
@@ -80,7 +171,7 @@ def longest_unbroken(
     ]
     joined: list[tuple[int, int]] = []
     for first, last in sorted(runs):
-        if joined and first - joined[-1][1] <= BREAK_S * _NS:
+        if joined and first - joined[-1][1] <= BREAK_S * NS:
             joined[-1] = joined[-1][0], max(joined[-1][1], last)
         else:
             joined.append((first, last))
@@ -89,7 +180,7 @@ def longest_unbroken(
     longest = max(joined, key=lambda run: run[1] - run[0])
     gaps = [after[0] - before[1] for before, after in pairwise(joined)]
     left = sum(last - first for first, last in joined) - (longest[1] - longest[0])
-    return Unbroken(*longest, len(joined) - 1, left / _NS, max(gaps, default=0) / _NS)
+    return Unbroken(*longest, len(joined) - 1, left / NS, max(gaps, default=0) / NS)
 
 
 def cut(t_ns: IntArray, window_ns: Window) -> tuple[slice, IntArray]:
@@ -111,10 +202,9 @@ def _runs(t_ns: IntArray) -> list[tuple[int, int]]:
     if not t_ns.size:
         return []
     step = np.diff(t_ns)
-    breaks = np.flatnonzero(step > BREAK_S * _NS)
+    breaks = np.flatnonzero(step > BREAK_S * NS)
     if breaks.size:
-        least = BREAK_INTERVALS * float(np.median(step))
-        breaks = breaks[step[breaks] > least]
+        breaks = breaks[step[breaks] > BREAK_INTERVALS * float(np.median(step))]
     firsts = t_ns[np.concatenate([[0], breaks + 1])]
     lasts = t_ns[np.concatenate([breaks, [t_ns.size - 1]])]
     return list(zip(firsts.tolist(), lasts.tolist(), strict=True))
@@ -127,7 +217,7 @@ def _length(seconds: float) -> str:
     return f"{seconds:.1f} s"
 
 
-_FAR_STAMP_NS = 3600 * _NS
+_FAR_STAMP_NS = 3600 * NS
 """Stamps further than this from the log time are on another clock."""
 
 _NEVER_NS = 2**62
@@ -139,8 +229,7 @@ class StampClock:
 
     def __init__(self, topics: Topics, warn: Callable[[str], None]) -> None:
         """Set up; ``warn`` is called with one sentence if the stamps are on another clock."""
-        self._topics = topics
-        self._warn = warn
+        self._topics, self._warn = topics, warn
         self._shift_ns: int | None = None
 
     def shift_ns(self, topic: str) -> int:
@@ -176,7 +265,7 @@ class StampClock:
         shift_ns = clock_shift_ns(stamp_ns, log_ns)
         if shift_ns:
             self._warn(
-                f"header stamps lie {-shift_ns // _NS} s from the log times (another clock, such "
+                f"header stamps lie {-shift_ns // NS} s from the log times (another clock, such "
                 "as simulated time); they are shifted by that"
             )
         return shift_ns
@@ -185,7 +274,7 @@ class StampClock:
 def clock_shift_ns(stamp_ns: int, log_ns: int) -> int:
     """Return the shift to add to a stamp [ns], in whole seconds; 0 on the same clock."""
     apart_ns = log_ns - stamp_ns
-    return round(apart_ns / _NS) * _NS if abs(apart_ns) > _FAR_STAMP_NS else 0
+    return round(apart_ns / NS) * NS if abs(apart_ns) > _FAR_STAMP_NS else 0
 
 
 _FAR_NS = 2.0**60
@@ -265,7 +354,7 @@ def moved(t_ns: IntArray, stamp_ns: IntArray, offset_s: FloatArray) -> IntArray:
 def _steps(offset_s: FloatArray) -> IntArray:
     """Return offsets in ns; those that are not finite or far too large are zero."""
     with np.errstate(over="ignore", invalid="ignore"):
-        steps = offset_s * _NS
+        steps = offset_s * NS
         np.rint(steps, out=steps)
         usable = np.abs(steps) < _FAR_NS
     if not usable.all():

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ...common.arrays import NS
 from ...common.errors import MissingChannelError
 from ...common.process import threads_or_default
 from ...robot.model import Robot
@@ -24,12 +25,11 @@ from ..columns.blocks import Window
 from ..columns.topics import Channel
 from ..messages.frames import FD_FRAME_DTYPE, FD_FRAME_LAYOUT, FRAME_DTYPE, FRAME_LAYOUT, FrameArray
 from .open_log import OpenLog
-from .signals import JointSignals
+from .sample_times import JointSignals
 
 if TYPE_CHECKING:
     import pandas as pd
 
-_NS = 1_000_000_000
 _NO_NAMES: Mapping[str, str] = MappingProxyType({})
 
 
@@ -54,10 +54,8 @@ class SessionView:
             names: Name of a topic in the view to its name in the log, if they differ.
             on_read: Called before each read.
         """
-        self._log = log
-        self._window_ns = window_ns
-        self._names = names
-        self._on_read = on_read
+        self._log, self._window_ns = log, window_ns
+        self._names, self._on_read = names, on_read
 
     def view(
         self,
@@ -153,7 +151,7 @@ class SessionView:
     @property
     def duration_s(self) -> float:
         """Time from the first to the last message [s]."""
-        return (self.end_ns - self.start_ns) / _NS
+        return (self.end_ns - self.start_ns) / NS
 
     @property
     def chunk_times_ns(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:

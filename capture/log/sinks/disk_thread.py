@@ -53,8 +53,7 @@ class PartStream:
         try:
             if force:
                 path.unlink(missing_ok=True)
-            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-            self._file = os.open(path, flags, 0o666)
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         except FileExistsError as error:
             raise OutputExistsError(path) from error
         except OSError as error:
@@ -158,8 +157,7 @@ class DiskThread:
             wal: Released up to the last message in the files.
             ballast: Freed when the disk is full.
         """
-        self._wal = wal
-        self._ballast = ballast
+        self._wal, self._ballast = wal, ballast
         self._queue: SimpleQueue[_Bytes | _Finish | None] = SimpleQueue()
         self._failure: LogWriteError | None = None
         self._shortage: LogWriteError | None = None
@@ -167,8 +165,7 @@ class DiskThread:
         self._ends = 0  # and by this one
         self._written = 0
         self._hash = ""
-        self._unsynced = 0
-        self._covered = 0
+        self._unsynced = self._covered = 0
         self._thread = threading.Thread(target=self._work, name=f"disk {wal.folder}", daemon=True)
         self._thread.start()
 

@@ -39,6 +39,11 @@ class DurableSink:
     """Keeps accepted messages through kills, full disks and lost power.
 
     One thread defines, writes, splits and closes; the properties may be read from any.
+
+    Attributes:
+        path: The first part.
+        messages: Messages accepted, over all parts.
+        split_trouble: Why the last split failed; the open part is continued.
     """
 
     def __init__(
@@ -81,19 +86,18 @@ class DurableSink:
         if min(limits, default=1) < 1 or not flush_interval_s > 0 or min(ballast, last_words) < 0:
             raise DataError("sizes and times of a recording are positive")
         self.path = Path(path)
-        self._force = force
-        self._split_size = split_size
-        self._split_ns = split_ns
+        self._force, self._split_size, self._split_ns = force, split_size, split_ns
         self._split_at_ns = _NEVER_NS if split_ns is None else 0
         self._half_interval_s = flush_interval_s / 2
         self._due = time.monotonic() + self._half_interval_s
         self._mark = 0  # messages that the part had one half of the interval ago
         self._known: list[Description] = []
-        self._messages: int = 0
+        self.messages = 0
         self._last_words = last_words
         self._refused: LogWriteError | None = None
         self._part_began: int = 0
-        self._split_trouble: UndulogError | None = None
+        self.split_trouble: UndulogError | None = None
+        self._reported = ""
         self._open = True
         if not force:
             _refuse_existing(self.path)
@@ -120,11 +124,6 @@ class DurableSink:
     # -- facts -----------------------------------------------------------------------------
 
     @property
-    def messages(self) -> int:
-        """Messages accepted, over all parts."""
-        return self._messages
-
-    @property
     def part(self) -> int:
         """Number of the part that is being written, from 1."""
         return self._part.number
@@ -135,7 +134,7 @@ class DurableSink:
         return self._part.path
 
     @property
-    def bytes_written(self) -> int:
+    def size(self) -> int:
         """Bytes of MCAP so far, over all parts, without the open chunks."""
         return self._disk.bytes_given
 
@@ -143,11 +142,6 @@ class DurableSink:
     def backlog(self) -> int:
         """Bytes that wait for the disk."""
         return self._disk.backlog
-
-    @property
-    def split_trouble(self) -> UndulogError | None:
-        """Why the last split failed; the open part is continued."""
-        return self._split_trouble
 
     @property
     def unsynced(self) -> int:
@@ -201,14 +195,21 @@ class DurableSink:
         part = self._part
         size = part.size
         self._writer.add_message(channel_id, log_time_ns, payload, publish_time_ns, sequence)
-        self._messages += 1
+        self.messages += 1
         if part.size != size:
             self._chunk_done()
         if time.monotonic() >= self._due:
             self._flush()
 
-    def tick(self) -> None:
+    def files(self) -> tuple[Path, ...]:
+        """Return the parts, in order."""
+        return (self.path, *(part_path(self.path, k) for k in range(2, self.part + 1)))
+
+    def tick(self) -> list[tuple[str, str]]:
         """Flush if due; call it once a second for sessions with long pauses.
+
+        Returns:
+            Events, level and one sentence each: a new reason why the next part can't be begun.
 
         Raises:
             LogWriteError: If the session is closed.
@@ -216,6 +217,11 @@ class DurableSink:
         self._refuse_closed()
         if time.monotonic() >= self._due:
             self._flush()
+        trouble = str(self.split_trouble or "")
+        if trouble in ("", self._reported):
+            return []
+        self._reported = trouble
+        return [("error", f"the next part could not be begun, this one goes on: {trouble}")]
 
     def split(self) -> Path:
         """Begin the next part; the former is finalised in the background.
@@ -230,21 +236,21 @@ class DurableSink:
             LogWriteError: If it can't be created; likewise.
         """
         self._refuse_closed()
-        if self._messages == self._part_began:
+        if self.messages == self._part_began:
             return self._part.path
         former, writer = self._part, self._writer
         number = former.number + 1
         following = PartStream(part_path(self.path, number), number, force=self._force)
         begin = Metadata(PART_RECORD, {"part": str(number), "previous": former.path.name})
         try:
-            after = {"after": str(self._messages)}  # for recovery: where the part begins
+            after = {"after": str(self.messages)}  # for recovery: where the part begins
             self._wal.define(Metadata(PART_RECORD, {**begin.metadata, **after}))
         except LogWriteError:
             following.discard()
             raise
         end = Metadata(PART_RECORD, {"part": str(former.number), "next": following.path.name})
         self._disk.finish(former, writer, (end,), self._wal.position)
-        self._part, self._part_began = following, self._messages
+        self._part, self._part_began = following, self.messages
         self._writer = self._new_writer()
         for record in (*self._known, begin):
             write_description(self._writer, record)
@@ -272,9 +278,8 @@ class DurableSink:
             trouble = error
         number = self._part.number
         if number > 1:
-            end = Metadata(PART_RECORD, {"part": str(number), "parts": str(number)})
-            last = (*last, end)
-        whole = self._messages == self._wal.position  # not so after an interrupt in between
+            last = (*last, Metadata(PART_RECORD, {"part": str(number), "parts": str(number)}))
+        whole = self.messages == self._wal.position  # not so after an interrupt in between
         self._disk.finish(self._part, self._writer, last, self._wal.position if whole else 0)
         self._disk.close()
         self._ballast.free()
@@ -330,9 +335,9 @@ class DurableSink:
         """Split; on failure continue the open part."""
         try:
             self.split()
-            self._split_trouble = None
+            self.split_trouble = None
         except (LogWriteError, OutputExistsError) as error:
-            self._split_trouble = error
+            self.split_trouble = error
 
     def _refuse_closed(self) -> None:
         if not self._open:

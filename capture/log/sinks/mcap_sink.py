@@ -35,6 +35,10 @@ Description: TypeAlias = Schema | Channel | Attachment | Metadata
 """Definitions, which come before the messages that need them."""
 
 
+MessageFields: TypeAlias = tuple[int, int, int, int, bytes]
+"""Channel id, log time [ns], publish time [ns], sequence number and payload of a message."""
+
+
 class MessageSink(Protocol):
     """Stores the records of a session writer, in order; called by one thread."""
 
@@ -48,16 +52,8 @@ class MessageSink(Protocol):
         Raises:
             LogWriteError: If it can't be stored.
         """
-        ...
 
-    def write(
-        self,
-        channel_id: int,
-        log_time_ns: int,
-        publish_time_ns: int,
-        sequence: int,
-        payload: bytes,
-    ) -> None:
+    def write(self, *message: *MessageFields) -> None:
         """Store one message.
 
         Args:
@@ -68,7 +64,6 @@ class MessageSink(Protocol):
         Raises:
             LogWriteError: If it can't be stored.
         """
-        ...
 
     def close(self, last: tuple[Metadata, ...]) -> None:
         """Finalise; safe to call twice.
@@ -79,7 +74,6 @@ class MessageSink(Protocol):
         Raises:
             LogWriteError: If it can't be finalised.
         """
-        ...
 
 
 PROFILE = "ros2"
@@ -111,15 +105,9 @@ class McapSink:
         """
         write_description(self._writer, record)
 
-    def write(
-        self,
-        channel_id: int,
-        log_time_ns: int,
-        publish_time_ns: int,
-        sequence: int,
-        payload: bytes,
-    ) -> None:
+    def write(self, *message: *MessageFields) -> None:
         """See :meth:`MessageSink.write`."""
+        channel_id, log_time_ns, publish_time_ns, sequence, payload = message
         self._writer.add_message(channel_id, log_time_ns, payload, publish_time_ns, sequence)
 
     def close(self, last: tuple[Metadata, ...]) -> None:

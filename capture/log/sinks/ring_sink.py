@@ -16,10 +16,11 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mcap.records import Channel, Metadata, Schema
 
+from ...common.amounts import format_size
 from ...common.errors import LogWriteError, UndulogError
 from ..messages.definitions import adds_up, is_latched
 from ..wal.segment import sync_folder
@@ -89,9 +90,7 @@ class RingSink:
                 thread that writes.
             max_bytes: The oldest messages go when more than this is held [B].
         """
-        self._path = path
-        self._duration_ns = duration_ns
-        self._max_bytes = max_bytes
+        self._path, self._duration_ns, self._max_bytes = path, duration_ns, max_bytes
         self._definitions: list[Description] = []
         self._types: dict[int, str] = {}
         self._topics: dict[int, str] = {}
@@ -248,10 +247,11 @@ class RingSink:
             self._state[message.channel_id, key] = message
 
     def _next_path(self) -> Path:
-        self._number += 1
-        while (path := _mark_path(self._path, self._number)).exists():
+        while True:
             self._number += 1
-        return path
+            name = f"{self._path.stem}_mark{self._number:04d}{self._path.suffix}"
+            if not (path := self._path.with_name(name)).exists():
+                return path
 
 
 def _write_mark(
@@ -290,10 +290,6 @@ def _write_mark(
     )
 
 
-def _mark_path(path: Path, number: int) -> Path:
-    return path.with_name(f"{path.stem}_mark{number:04d}{path.suffix}")
-
-
 def _last_number(path: Path) -> int:
     """Return the highest number of an existing mark."""
     pattern = re.compile(rf"{re.escape(path.stem)}_mark(\d{{4,9}}){re.escape(path.suffix)}")
@@ -302,3 +298,72 @@ def _last_number(path: Path) -> int:
     except OSError:  # the folder may not exist: the first mark reports it
         return 0
     return max((int(found[1]) for found in map(pattern.fullmatch, names) if found), default=0)
+
+
+class RingStorage:
+    """A ring in memory, written to a file when marked.
+
+    Attributes:
+        part_path: Output of the recording, which names the marks: ``run.mcap`` gives
+            ``run_mark0001.mcap`` and so on.
+        size: Bytes of all marks so far.
+    """
+
+    part: int | None = None
+    shortage: LogWriteError | None = None
+
+    def __init__(self, output: Path, ring_s: float) -> None:
+        """Start with an empty ring of the last ``ring_s`` [s].
+
+        Raises:
+            LogWriteError: If the output's folder doesn't exist.
+        """
+        if not output.parent.is_dir():
+            raise LogWriteError(output, f"the folder {output.parent} doesn't exist")
+        self.part_path = output
+        self.sink = RingSink(output, round(ring_s * 1e9))
+        self.size = self._dropped = 0
+
+    @property
+    def messages(self) -> int:
+        """Number of messages accepted."""
+        return self.sink.accepted
+
+    @property
+    def unsynced(self) -> int:
+        """Number of messages that power loss would cost: all that the ring holds."""
+        return self.sink.messages
+
+    def tick(self) -> list[tuple[str, str]]:
+        """Return events of the marks: level and one sentence each; called once a second."""
+        events: list[tuple[str, str]] = []
+        for mark in self.sink.take_marks():
+            if mark.error is not None:
+                events.append(("error", f"a mark is not whole: {mark.error}"))
+                continue
+            size = mark.path.stat().st_size if mark.path.exists() else 0
+            self.size += size
+            text = f"{mark.path.name} is written: {mark.messages} messages, {format_size(size)}"
+            events.append(("info", text))
+        if self.sink.dropped and not self._dropped:
+            held_s = self.sink.span_ns / 1e9
+            events.append(("warn", f"the ring is full of bytes and holds only {held_s:.1f} s"))
+        self._dropped = self.sink.dropped
+        return events
+
+    def mark(self, text: str) -> dict[str, Any]:
+        """Write the messages of the ring.
+
+        Returns:
+            The ``file`` that is being written, its number of ``messages`` and its ``seconds``.
+
+        Raises:
+            LogWriteError: If too many marks wait already.
+        """
+        held_s, messages = self.sink.span_ns / 1e9, self.sink.messages
+        path = self.sink.mark(text)
+        return {"file": str(path), "messages": messages, "seconds": round(held_s, 3)}
+
+    def files(self) -> tuple[Path, ...]:
+        """Return the marks that are whole, in order."""
+        return tuple(mark.path for mark in self.sink.marks if mark.error is None)

@@ -10,16 +10,19 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.records import Channel
 
+from ...common.arrays import IntArray
 from ...common.errors import LogError, NotALogError
+from ..mcap.chunk import FIXED_SIZE, MESSAGE, Block
 from .format import (
     DEFINITIONS,
     HEADER_SIZE,
@@ -33,9 +36,11 @@ from .format import (
     Definition,
     RecordHead,
     SegmentHeader,
+    is_live,
     segment_files,
     unpack_definition,
 )
+from .writer import wal_folder
 
 _PIECE = 1 << 20  # the most that is read at once before a CRC vouches for a length
 _FIRST_LOOK = 1 << 12
@@ -88,9 +93,7 @@ class Recovery(Iterator[WalMessage]):
             LogError: If the folder can't be listed.
         """
         self.folder = folder
-        self.found = 0
-        self.before = 0
-        self.missing = 0
+        self.found = self.before = self.missing = 0
         self.warnings: list[str] = []
         segments = self._open()
         self._segments = [item for item in segments if item.header.stream == MESSAGES]
@@ -213,8 +216,8 @@ class Recovery(Iterator[WalMessage]):
                 except FileNotFoundError:  # a log in use: released since it was listed
                     continue
                 except OSError as error:
-                    told = f"{segment.path.name} can't be read to its end: {error.strerror}"
-                    self.warnings.append(told)
+                    text = f"{segment.path.name} can't be read to its end: {error.strerror}"
+                    self.warnings.append(text)
                     reader = _closed(reader)
                     continue
                 _closed(former)
@@ -238,8 +241,7 @@ class _SegmentReader:
 
     def __init__(self, segment: _Found, file: BinaryIO, last: int) -> None:
         self.last = last
-        self.damaged = 0
-        self.first_damage = 0
+        self.damaged = self.first_damage = 0
         self._file = file
         self._at = HEADER_SIZE
         self._end = segment.end
@@ -253,7 +255,7 @@ class _SegmentReader:
                 following, stop = self._search(at)
                 # A log in use: this record was being written; a later one exists, so now it is
                 # whole.
-                head = self._again(at) if following is not None else None
+                head = self._reread(at) if following is not None else None
                 if head is not None:
                     following, stop = (at, head), at
                 if stop > at:
@@ -278,7 +280,7 @@ class _SegmentReader:
     def close(self) -> None:
         self._file.close()
 
-    def _again(self, at: int) -> RecordHead | None:
+    def _reread(self, at: int) -> RecordHead | None:
         self._file.seek(0, os.SEEK_END)  # drops the read buffer
         return self._whole(at)
 
@@ -362,3 +364,136 @@ def recover(folder: Path | str) -> Recovery:
         LogError: If the folder can't be listed.
     """
     return Recovery(Path(folder))
+
+
+MessageKey = tuple[int, int, int]
+"""Channel, sequence number and log time: no two messages of a session share all three."""
+
+
+@dataclass(frozen=True)
+class WalContents:
+    """Contents of a write-ahead log.
+
+    Attributes:
+        definitions: Headers, schemas, channels, metadata, attachments, in the order given.
+        messages: In the order they were accepted.
+        live: Whether a recorder is writing it.
+        warnings: What was damaged, one sentence each.
+    """
+
+    folder: Path
+    definitions: tuple[Definition, ...]
+    messages: tuple[WalMessage, ...]
+    live: bool
+    warnings: tuple[str, ...]
+
+    @property
+    def accepted(self) -> int:
+        """Number of messages that the recorder accepted; 0 if unknown."""
+        return self.messages[-1].position if self.messages else 0
+
+    @property
+    def before(self) -> int:
+        """Number of messages accepted before the first one in the log."""
+        return self.messages[0].position - 1 if self.messages else 0
+
+    @property
+    def damaged(self) -> bool:
+        """Whether a part can't be read, so that it may have had more messages."""
+        return any("header" not in text for text in self.warnings)
+
+
+def read_wal(first: Path) -> WalContents | None:
+    """Read the write-ahead log of a session, without changing it.
+
+    Args:
+        first: The session's first file; it need not be there.
+
+    Returns:
+        Its contents; None if there is no log.
+
+    Raises:
+        LogError: If its folder can't be listed.
+    """
+    folder = wal_folder(first)
+    if not folder.is_dir():
+        return None
+    live = is_live(folder)
+    try:
+        recovery = recover(folder)
+        messages = tuple(recovery)
+    except NotALogError as error:
+        warnings = () if live else (str(error),)
+        return WalContents(folder, (), (), live, warnings)
+    except LogError:
+        if not folder.is_dir():  # its recorder has just finished
+            return None
+        raise
+    # Only log and file together show whether a message is missing.
+    warnings = [text for text in recovery.warnings if "messages are missing" not in text]
+    return WalContents(folder, recovery.definitions, messages, live, tuple(warnings))
+
+
+class WalTail:
+    """A block in memory; read like a file's."""
+
+    def __init__(self, messages: Iterable[WalMessage]) -> None:
+        """Lay out messages as MCAP records.
+
+        Args:
+            messages: At least one, in order.
+        """
+        data = bytearray()
+        places: dict[int, list[int]] = {}
+        start_ns, end_ns = 1 << 63, 0
+        for item in messages:
+            places.setdefault(item.channel_id, []).append(len(data))
+            data += MESSAGE.pack(
+                Opcode.MESSAGE,
+                FIXED_SIZE + len(item.payload),
+                item.channel_id,
+                item.sequence,
+                item.log_time_ns,
+                item.publish_time_ns,
+            )
+            data += item.payload
+            start_ns = min(start_ns, item.log_time_ns)
+            end_ns = max(end_ns, item.log_time_ns)
+        self._data = bytes(data)
+        self.counts = {channel_id: len(at) for channel_id, at in places.items()}
+        offsets = {channel_id: np.array(at, dtype=np.int64) for channel_id, at in places.items()}
+        size = len(self._data)
+        self.blocks = [Block(0, size, "", size, 0, start_ns, end_ns, offsets=offsets)]
+
+    def payload(self, block: Block) -> tuple[bytes, int, int]:
+        """See :meth:`.McapPayloads.payload`."""
+        return self._data, block.start, block.stop
+
+    payload_once = payload
+
+    def offsets(self, block: Block, channel_id: int) -> IntArray:
+        """See :meth:`.McapFile.offsets`."""
+        return (block.offsets or {}).get(channel_id, np.empty(0, dtype=np.int64))
+
+    def indexed(self, block: Block, channel_ids: Sequence[int]) -> list[IntArray]:
+        """See :meth:`.McapFile.indexed`."""
+        return [self.offsets(block, channel_id) for channel_id in channel_ids]
+
+    def inflates(self, block: Block, limit: int) -> bool:  # noqa: ARG002 (as a file has it)
+        """Return False: nothing is compressed."""
+        return False
+
+    def inflate_into(self, block: Block, room: memoryview) -> None:
+        """See :meth:`.McapPayloads.inflate_into`."""
+        room[:] = self._data[block.start : block.stop]
+
+
+def beyond(messages: Iterable[WalMessage], known: Collection[MessageKey]) -> list[WalMessage]:
+    """Return the messages that a file lacks.
+
+    Args:
+        known: Keys of the file's messages: at least of the last ones, as many as the log has.
+    """
+    return [
+        item for item in messages if (item.channel_id, item.sequence, item.log_time_ns) not in known
+    ]

@@ -120,8 +120,7 @@ class _Watch:
         code = ctypes.c_int.from_address(info + 8).value
         address = ctypes.c_size_t.from_address(info + _ADDRESS_AT).value
         for mapping in self._mappings:
-            within = address - mapping.address
-            if code == _BUS_ADRERR and 0 <= within < mapping.size:
+            if code == _BUS_ADRERR and 0 <= address - mapping.address < mapping.size:
                 page = address & -mmap.PAGESIZE
                 left = mapping.address + mapping.size - page
                 access = mmap.PROT_READ | mmap.PROT_WRITE
@@ -203,13 +202,11 @@ class Segment:
         self._at = HEADER_SIZE
         self._end = header.size - HEADER_SIZE
         self._salt = header.salt
-        self._synced_at = 0
-        self._durable = 0
+        self._synced_at = self._durable = 0
         self._page_end = _PAGE
         self._whole = 0, 0  # start of the page that is being written, last record wholly before it
         try:
-            flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-            self._file = os.open(path, flags, 0o666)
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         except OSError as error:
             raise LogWriteError(path, f"can't be created: {error.strerror}") from error
         try:

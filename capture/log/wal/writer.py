@@ -105,11 +105,9 @@ class WriteAheadLog:
                 f"got {segment_size} bytes, {sync_interval_s} s"
             )
         self.folder = Path(folder)
-        self._segment_size = segment_size
-        self._interval_s = sync_interval_s
+        self._segment_size, self._interval_s = segment_size, sync_interval_s
         self._log_id = secrets.token_bytes(16)
-        self._position = 0
-        self._defined = 0
+        self._position = self._defined = 0
         self._released = -1
         self._synced = 0
         self._numbers = {MESSAGES: 0, DEFINITIONS: 0}

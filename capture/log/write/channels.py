@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...common.arrays import FloatArray
+from ...common.arrays import NS, FloatArray
 from ...common.errors import DataError
 from ..messages.cdr import Leaf, encode
 from ..messages.definitions import DiagnosticStatus, message_type
@@ -35,7 +35,6 @@ Send = Callable[[int, int, bytes], None]
 """Writes one message: log time [ns], publish time [ns], bytes."""
 
 _TIME = struct.Struct("<iI")
-_NS = 1_000_000_000
 _POSE_STEP = 2.0**-14  # transforms are a view aid: rounded, they compress
 
 _LEVELS = {"debug": 10, "info": 20, "warn": 30, "error": 40, "fatal": 50}
@@ -75,11 +74,10 @@ class Template:
             log_time_ns: Time of recording [Unix ns]; the sampling time if None.
             stamps: Byte offsets of the header stamps in the message.
         """
-        seconds, nanoseconds = divmod(t_ns, _NS)
+        seconds, nanoseconds = divmod(t_ns, NS)
         for at in stamps:
             _TIME.pack_into(self.message, at, seconds, nanoseconds)
-        log_time = t_ns if log_time_ns is None else log_time_ns
-        self.send(log_time, t_ns, bytes(self.message))
+        self.send(t_ns if log_time_ns is None else log_time_ns, t_ns, bytes(self.message))
 
 
 class _Stamped:
@@ -192,8 +190,7 @@ class TransformChannel:
             positions: [m], shape (k, 3).
             quaternions: x, y, z, w, shape (k, 4).
         """
-        poses = np.concatenate([positions, quaternions], axis=1)
-        rows = np.round(poses / _POSE_STEP) * _POSE_STEP
+        rows = np.round(np.concatenate([positions, quaternions], axis=1) / _POSE_STEP) * _POSE_STEP
         for at, row in zip(self._poses, rows, strict=True):
             self._template.message[at : at + 56] = row.astype("<f8").tobytes()
         self._template.emit(t_ns, log_time_ns, self._stamps)
@@ -273,7 +270,7 @@ class TimeReferenceChannel(_Stamped):
         """
         message, at = self._template.message, self._template.leaves["time_ref.sec"].offset
         try:
-            _TIME.pack_into(message, at, *divmod(t_device_ns, _NS))
+            _TIME.pack_into(message, at, *divmod(t_device_ns, NS))
         except struct.error as error:
             raise DataError(
                 f"a device time of {t_device_ns} ns doesn't fit 32 bits of s"
@@ -374,5 +371,5 @@ class FrameChannel:
 
 
 def _stamp(t_ns: int) -> dict[str, int]:
-    seconds, nanoseconds = divmod(t_ns, _NS)
+    seconds, nanoseconds = divmod(t_ns, NS)
     return {"sec": seconds, "nanosec": nanoseconds}

@@ -198,8 +198,7 @@ class SessionWriter:
             topic: E.g. ``/imu``.
             frame: The sensor's frame.
         """
-        unknown = [-1.0] + [0.0] * 8
-        values = {"header": {"frame_id": frame}, "orientation_covariance": unknown}
+        values = {"header": {"frame_id": frame}, "orientation_covariance": ([-1.0] + [0.0] * 8)}
         return ImuChannel(self._template(topic, "sensor_msgs/msg/Imu", values))
 
     def magnetic_field(self, topic: str, *, frame: str) -> MagneticFieldChannel:

@@ -37,8 +37,7 @@ from undulog.capture.log.messages.frames import (
 )
 from undulog.capture.recorder.loop import Ending, Recorder
 from undulog.capture.recorder.status import SessionClock
-from undulog.capture.sources.address import open_source, parse_address
-from undulog.capture.sources.contract import SourceContext
+from undulog.capture.sources.contract import SourceContext, open_source, parse_address
 
 S = 1_000_000_000
 FD = "/can_fd/can0"

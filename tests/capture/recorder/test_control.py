@@ -77,7 +77,7 @@ def test_a_client_that_ends_its_side_still_hears_the_reply_even_without_a_newlin
     client.sendall(b'{"do": "a"}\n{"do": "b"}')
     client.shutdown(socket.SHUT_WR)
     assert [reply["got"]["do"] for reply in drain(server, client, 2)] == ["a", "b"]
-    polls(server, lambda: server.clients == 0)
+    polls(server, lambda: len(server._clients) == 0)
     assert client.recv(10) == b""
 
 
@@ -120,11 +120,11 @@ def test_a_mistake_of_ours_is_told_and_ends_nothing(server, client):
 def test_whatever_comes_each_line_gets_one_line(server, data):
     wanted = sum(bool(line.strip()) for line in data.split(b"\n"))
     with connected(server) as client:
-        polls(server, lambda: server.clients == 1)
+        polls(server, lambda: len(server._clients) == 1)
         client.sendall(data)
         client.shutdown(socket.SHUT_WR)
         got = b""
-        polls(server, lambda: server.clients == 0)
+        polls(server, lambda: len(server._clients) == 0)
         while piece := client.recv(65536):
             got += piece
     assert got.count(b"\n") == wanted
@@ -171,31 +171,31 @@ def test_a_request_without_end_is_refused_and_the_client_let_go(server, client):
         with contextlib.suppress(BlockingIOError, BrokenPipeError):
             client.send(b"x" * 8192)
         server.poll()
-        if server.clients == 0 and data:
+        if len(server._clients) == 0 and data:
             break
         with contextlib.suppress(BlockingIOError):
             data += client.recv(4096)
     (reply,) = replies(data)
     assert "longer than 65536 bytes" in reply["error"]
-    assert server.clients == 0
+    assert len(server._clients) == 0
 
 
 def test_silent_clients_make_room_for_the_next_the_longest_silent_first(server):
     silent = [connected(server) for _ in range(MAX_CLIENTS)]
-    polls(server, lambda: server.clients == MAX_CLIENTS)
+    polls(server, lambda: len(server._clients) == MAX_CLIENTS)
     for client in silent[1:]:
         client.sendall(b'{"do": "x"}\n')
         drain(server, client, 1)
     with connected(server) as late:
         late.sendall(b'{"do": "stop"}\n')
         assert drain(server, late, 1)[0]["ok"]
-        assert server.clients == MAX_CLIENTS
+        assert len(server._clients) == MAX_CLIENTS
         (told,) = replies(silent[0].recv(4096))
         assert not told["ok"]
         assert silent[0].recv(10) == b""
     for client in silent:
         client.close()
-    polls(server, lambda: server.clients == 0)
+    polls(server, lambda: len(server._clients) == 0)
 
 
 def test_a_flood_is_taken_in_portions(server, client, monkeypatch):
@@ -217,7 +217,7 @@ def test_clients_that_vanish_leave_nothing_behind(server):
         client.close()
     for _ in range(10):
         server.poll()
-    polls(server, lambda: server.clients == 0)
+    polls(server, lambda: len(server._clients) == 0)
     assert len(server._selector.get_map()) == 1
 
 

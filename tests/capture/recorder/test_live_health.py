@@ -27,7 +27,7 @@ from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
 from undulog.capture.log.sinks.mcap_sink import Description, McapSink, MessageSink
 from undulog.capture.recorder import health as live_health
 from undulog.capture.recorder.health import LiveHealth
-from undulog.capture.recorder.storage import TappedSink
+from undulog.capture.recorder.recording import TappedSink
 from undulog.capture.sources.contract import SourceCounts
 
 EPOCH_NS = 1_700_000_000_000_000_000

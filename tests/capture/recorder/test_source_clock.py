@@ -16,8 +16,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from undulog.capture.common.arrays import IntArray
-from undulog.capture.recorder.clock_envelope import Envelope
-from undulog.capture.recorder.source_clock import JUMP_NS, ClockEstimate, SourceClock
+from undulog.capture.recorder.source_clock import JUMP_NS, ClockEstimate, Envelope, SourceClock
 from undulog.capture.sources.contract import DEVICE_TIMES_END_NS
 
 EPOCH_NS = 1_700_000_000_000_000_000

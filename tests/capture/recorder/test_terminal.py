@@ -22,7 +22,7 @@ from rich.console import Console
 
 from support.paths import ROOT
 from support.processes import python
-from undulog.capture.log.health.sources import measure_sources, read_statuses
+from undulog.capture.log.health.bus_tally import measure_sources, read_statuses
 from undulog.capture.log.messages.definitions import ERROR, OK, STALE, WARN
 from undulog.capture.recorder.screen import Terminal, clock_time, plain_line, screen, time_left
 from undulog.capture.recorder.source_clock import ClockEstimate

@@ -7,7 +7,7 @@ import pytest
 
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import open_source, open_sources, parse_address, schemes
+from undulog.capture.sources.contract import open_source, open_sources, parse_address, schemes
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_a_source_without_its_extra_says_which() -> None:
     code = (
         "import sys; sys.modules['pybullet'] = None\n"
         "from undulog.capture.common.errors import MissingExtraError\n"
-        "from undulog.capture.sources.address import open_sources\n"
+        "from undulog.capture.sources.contract import open_sources\n"
         "try:\n"
         "    open_sources(['twin:flat'])\n"
         "except MissingExtraError as error:\n"

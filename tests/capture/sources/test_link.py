@@ -10,7 +10,7 @@ from support.processes import wait_for
 from undulog.capture.common.errors import SourceError
 from undulog.capture.log.messages.frames import FRAME_DTYPE
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.contract import parse_address
 from undulog.capture.sources.link import LinkedSource
 from undulog.capture.sources.reader_thread import DrainedLink
 from undulog.capture.sources.receive_many import SO_RXQ_OVFL, SO_TIMESTAMPNS

@@ -8,7 +8,6 @@ from support.can_messages import can_message
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import DIR_RX, ERROR_FLAG, FD_ESI
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import open_source, parse_address
 from undulog.capture.sources.can import (
     DEVICE_TIME,
     LISTEN_ONLY,
@@ -19,6 +18,7 @@ from undulog.capture.sources.can import (
     known_options,
     open_can,
 )
+from undulog.capture.sources.contract import open_source, parse_address
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from support.processes import wait_for
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import EXTENDED_FLAG, FD_BRS, ID_MASK, REMOTE_FLAG
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import open_source, parse_address
+from undulog.capture.sources.contract import open_source, parse_address
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.slcan import STAMP_PERIOD_MS, SlcanText
 

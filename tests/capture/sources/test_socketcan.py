@@ -16,7 +16,7 @@ from support.can_messages import can_message
 from undulog.capture.common.errors import SourceError
 from undulog.capture.log.messages.frames import DIR_RX, DIR_TX, FD_BRS, FD_ESI
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import open_source, parse_address
+from undulog.capture.sources.contract import open_source, parse_address
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.receive_many import (
     SO_RXQ_OVFL,

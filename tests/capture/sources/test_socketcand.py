@@ -14,7 +14,7 @@ from support.processes import start
 from undulog.capture.common.errors import UsageError
 from undulog.capture.log.messages.frames import ERROR_FLAG, EXTENDED_FLAG, ID_MASK, REMOTE_FLAG
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import open_source, parse_address
+from undulog.capture.sources.contract import open_source, parse_address
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcand import SocketcandText
 

@@ -17,9 +17,8 @@ from support.processes import python, start, wait_for
 from undulog.capture.common.errors import DataError, SourceError, UsageError
 from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources.address import open_source, parse_address
-from undulog.capture.sources.sender import FrameSender
-from undulog.capture.sources.unix_socket import MOST_SENDERS
+from undulog.capture.sources.contract import open_source, parse_address
+from undulog.capture.sources.unix_socket import MOST_SENDERS, FrameSender
 
 # Knows nothing of us but the packets: 32 bytes a frame, packed by struct.
 FOREIGN = """
@@ -40,7 +39,7 @@ peer.close()
 OURS = """
 import json, sys, time
 import numpy as np
-from undulog.capture.sources.sender import FrameSender
+from undulog.capture.sources.unix_socket import FrameSender
 frames = np.load(sys.argv[1])
 with FrameSender(sys.argv[2]) as sender:
     at = 0

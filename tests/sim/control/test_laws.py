@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from undulog.sim.control.filters import (
-    TURN,
     BodyWave,
     LowPass,
     NearMemory,
@@ -121,10 +120,10 @@ def test_phase_history_gives_back_a_linear_function_exactly(steps, back):
 def swing(turn_rate, periods=6, gain=1.6):
     """Headings of a head that swings by 0.6 rad while its path turns, and what is made of them."""
     path, rows = PathHeading(gain), []
-    for phase in np.arange(0.0, periods * TURN, 0.03):
-        bent = 0.0 if phase < 2 * TURN else -turn_rate / gain
-        way = math.pi + turn_rate * max(phase - 2 * TURN, 0.0)
-        told = math.remainder(way + 0.6 * math.sin(phase), TURN)
+    for phase in np.arange(0.0, periods * math.tau, 0.03):
+        bent = 0.0 if phase < 2 * math.tau else -turn_rate / gain
+        way = math.pi + turn_rate * max(phase - 2 * math.tau, 0.0)
+        told = math.remainder(way + 0.6 * math.sin(phase), math.tau)
         rows.append((phase, way, path.step(phase, told, bent)))
     return np.array(rows).T
 
@@ -133,15 +132,15 @@ def swing(turn_rate, periods=6, gain=1.6):
 def test_path_heading_has_neither_the_swing_nor_half_a_period_of_delay(turn_rate):
     """Across the cut at pi, and while a turn begins: without the model it would be pi c Y late."""
     phase, way, told = swing(turn_rate)
-    error = np.abs([math.remainder(e, TURN) for e in told - way])
-    assert error[phase > TURN].max() < 0.005  # the trapezoidal rule, and a sample more or less
-    assert error[phase < TURN].max() > 0.1  # not yet a period
+    error = np.abs([math.remainder(e, math.tau) for e in told - way])
+    assert error[phase > math.tau].max() < 0.005  # the trapezoidal rule, and a sample more or less
+    assert error[phase < math.tau].max() > 0.1  # not yet a period
 
 
 def test_path_heading_goes_on_over_a_full_turn():
     phase, way, told = swing(0.3, periods=12)
-    assert way[-1] - way[0] > 2 * TURN
-    steps = np.diff(told[phase > TURN])
+    assert way[-1] - way[0] > 2 * math.tau
+    steps = np.diff(told[phase > math.tau])
     assert np.abs(steps).max() < 0.05
 
 

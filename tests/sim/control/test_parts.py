@@ -9,10 +9,18 @@ import pytest
 from undulog.capture.robot.description import load_robot
 from undulog.capture.robot.model import Plane, Robot, Sensor, SensorKind
 from undulog.sim import PlaneGait, Readings, Serpentine
-from undulog.sim.control.adaptive import AVOID, HASTEN, SHRINK, TURN, AdaptiveGait
+from undulog.sim.control.adaptive import (
+    AVOID,
+    HASTEN,
+    SHRINK,
+    TURN,
+    AdaptiveGait,
+    RandomHeadingPolicy,
+    StraightOn,
+    TargetHeadingPolicy,
+)
 from undulog.sim.control.dead_reckoning import Pose, SlipOdometry
-from undulog.sim.control.heading import RandomHeadingPolicy, StraightOn, TargetHeadingPolicy
-from undulog.sim.control.obstacle_monitor import ControlInput, Distances, ObstacleMonitor
+from undulog.sim.control.reactions import ControlInput, Distances, ObstacleMonitor
 from undulog.sim.gait.contract import WALK
 from undulog.sim.scenario.controllers import (
     Controller,

@@ -22,7 +22,7 @@ from undulog.capture.common.errors import LogWriteError, SourceError, UsageError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import DIR_TX
 from undulog.capture.robot.model import Direction, OnFault, Quantity
-from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.contract import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.sim import load_scenario
 from undulog.sim.control.adaptive import build_gait

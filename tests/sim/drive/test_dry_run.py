@@ -14,8 +14,7 @@ from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Safety
-from undulog.sim.drive.dry_run import Verdict, dry_run, nominal_world
-from undulog.sim.drive.dry_run_text import reported, summary_lines
+from undulog.sim.drive.dry_run import Verdict, dry_run, nominal_world, reported, summary_lines
 from undulog.sim.drive.motion import find_motion
 
 RATE_HZ = 100

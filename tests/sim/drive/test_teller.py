@@ -45,7 +45,7 @@ def test_everything_is_told_in_order(tmp_path):
         for k in range(300):
             teller.publish(tick(k, "walk" if k < 200 else "avoid"), 10**18 + k)
         teller.close()
-    assert (teller.told, teller.dropped, teller.error) == (300, 0, None)
+    assert (teller.taken, teller.dropped, teller.error) == (300, 0, None)
     gait = [request for request in heard if request["do"] == "gait"]
     assert [request["t_ns"] - 10**18 for request in gait] == list(range(300))
     assert gait[7]["values"] == dict(zip(NAMES, [7.0, 8.0, 9.0, 10.0, 11.0], strict=True))
@@ -74,24 +74,24 @@ def test_commands_without_a_gait_tell_their_mode_only(tmp_path):
         teller.publish(tick(0, "replay", count=0), 1)
         teller.close()
     assert heard == [{"do": "mode", "text": "replay"}]
-    assert teller.told == 0
+    assert teller.taken == 0
 
 
 def test_a_recorder_that_goes_or_refuses_is_told_nothing_more(tmp_path):
     with control_socket(tmp_path / "a.sock"):
         teller = GaitPublisher(tmp_path / "a.sock", NAMES)
         teller.publish(tick(0), 1)
-        wait_for(lambda: teller.told == 1)
+        wait_for(lambda: teller.taken == 1)
     for k in range(5000):  # more than is held: nothing waits, nothing fails
         teller.publish(tick(k), k)
     teller.close()
-    assert teller.told == 1
+    assert teller.taken == 1
     assert "went" in teller.error
     with control_socket(tmp_path / "b.sock", refuse=("gait",)):
         teller = GaitPublisher(tmp_path / "b.sock", NAMES)
         teller.publish(tick(0), 1)
         teller.close()
-    assert (teller.told, teller.error) == (0, "a source writes that topic")
+    assert (teller.taken, teller.error) == (0, "a source writes that topic")
 
 
 def test_no_recorder_there_is_an_error(tmp_path):

@@ -11,7 +11,7 @@ from undulog.capture.robot.model import Sensor, SensorKind
 from undulog.sim.physics.steps import Steps
 from undulog.sim.scenario.sensors import AccelerometerModel, CompassModel
 from undulog.sim.sensing.contract import rotation_from_rpy
-from undulog.sim.sensing.inertial import Accelerometer, Compass
+from undulog.sim.sensing.sensors import Accelerometer, Compass
 
 DT, PERIOD, G = 1e-3, 10, 9.81
 GRAVITY = (0.0, 0.0, -G)

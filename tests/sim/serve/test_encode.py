@@ -165,7 +165,7 @@ def test_servos_hold_their_last_command_within_their_limits(robot):
     assert latch.cut == {"joint03"}
     latch.take(np.concatenate([commands(robot, {"joint02": a}) for a in (0.3, 0.2)]))
     assert latch.angle[1] == pytest.approx(0.2, abs=1e-4)  # the later one
-    assert latch.take(commands(robot, {"joint02": -0.2}), heard=False)[1]
+    assert latch.take(commands(robot, {"joint02": -0.2}), received=False)[1]
     assert latch.angle[1] == pytest.approx(0.2, abs=1e-4)
     assert latch.frames == 6
 

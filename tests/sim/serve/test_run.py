@@ -22,7 +22,7 @@ from support.paths import ROOT
 from support.processes import UNDULOG, process, serving, undulog, wait_for
 from undulog.capture import Session, load_robot
 from undulog.capture.log.health.session_check import check_session
-from undulog.capture.sources.address import parse_address
+from undulog.capture.sources.contract import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.sim.drive.links import find_virtual_robot
 from undulog.sim.drive.loop import CommandEncoder

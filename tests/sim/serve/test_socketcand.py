@@ -25,8 +25,7 @@ from undulog.capture.log.messages.frames import (
     REMOTE_FLAG,
     empty_frames,
 )
-from undulog.capture.sources.address import open_source, parse_address
-from undulog.capture.sources.contract import SourceContext, records
+from undulog.capture.sources.contract import SourceContext, open_source, parse_address, records
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcand import SocketcandText
 from undulog.sim.drive.links import find_virtual_robot
@@ -377,7 +376,7 @@ def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(
         for _ in range(3):
             serving.server.broadcast(own)
         assert serving.server.waiting == 0
-    wait_for(lambda: not serving.server.clients)
+    wait_for(lambda: not any(c.bus_open for c in serving.server._clients.values()))
     assert same(records(one.record for one in iter(serving.server.take, None)), own)
     link.close()  # again, and nothing happens
 

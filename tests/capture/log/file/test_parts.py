@@ -88,7 +88,7 @@ def test_parts_by_size(tmp_path):
     sizes = [path.stat().st_size for path in sorted(tmp_path.iterdir())]
     assert len(sizes) == sink.part > 2
     assert all(200_000 <= size < 200_000 + 600_000 for size in sizes[:-1])  # and one chunk
-    assert sum(sizes) == sink.bytes_written
+    assert sum(sizes) == sink.size
     assert read(tmp_path) == (recorder.truth(8000), [])
 
 

@@ -21,7 +21,7 @@ from undulog.capture.common.errors import DataError, LogWriteError, OutputExists
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.definitions import ERROR, OK, DiagnosticStatus, schema_text
 from undulog.capture.log.sinks.durable_sink import DurableSink
-from undulog.capture.recorder.storage import TappedSink
+from undulog.capture.recorder.recording import TappedSink
 
 CHILD = recorder.__file__
 EPOCH_NS = recorder.EPOCH_NS
@@ -83,7 +83,7 @@ def test_listeners_hear_what_was_accepted_and_nothing_else(tmp_path):
     expected = [(c, t, p, s, data) for c, s, t, p, data in map(recorder.message, range(100))]
     assert offered == expected
     assert (kept.messages, kept.part) == (100, 1)
-    assert kept.bytes_written == (tmp_path / "run.mcap").stat().st_size
+    assert kept.size == (tmp_path / "run.mcap").stat().st_size
 
 
 def test_a_quiet_session_reaches_the_file_by_itself(tmp_path):

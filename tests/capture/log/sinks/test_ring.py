@@ -18,11 +18,16 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from support.processes import python, wait_for
 from support.read_back import messages_of, metadata_of
 from undulog.capture import Session
-from undulog.capture.common.errors import LogWriteError, UsageError
+from undulog.capture.common.errors import LogWriteError
 from undulog.capture.log.sinks.mcap_sink import McapSink
-from undulog.capture.log.sinks.ring_sink import MARK_RECORD, MAX_WAITING, MESSAGE_OVERHEAD, RingSink
+from undulog.capture.log.sinks.ring_sink import (
+    MARK_RECORD,
+    MAX_WAITING,
+    MESSAGE_OVERHEAD,
+    RingSink,
+    RingStorage,
+)
 from undulog.capture.log.write.writer import SessionWriter
-from undulog.capture.recorder.storage import RingStorage
 
 EPOCH_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
@@ -347,15 +352,13 @@ def test_a_recording_kept_in_a_ring_tells_of_its_marks(tmp_path):
         ring.write(1, EPOCH_NS + k * SECOND, EPOCH_NS, k, b"x")
     path = folder / "run_mark0001.mcap"
     assert storage.mark("slipped") == {"file": str(path), "messages": 2, "seconds": 1.0}
-    with pytest.raises(UsageError, match="a ring has no parts"):
-        storage.split()
     wait_for(lambda: not ring.waiting, "the marks")
     ((level, text),) = storage.tick()
     assert storage.size == path.stat().st_size
     assert level == "info"
     assert "run_mark0001.mcap is written: 2 messages" in text
     shutil.rmtree(folder)
-    storage.mark()
+    storage.mark("")
     wait_for(lambda: not ring.waiting, "the marks")
     ((level, text),) = storage.tick()
     assert level == "error"

@@ -16,7 +16,7 @@ from support.wal_messages import message
 from undulog.capture import Session
 from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.log.wal.writer import WriteAheadLog
-from undulog.capture.sources.sender import FrameSender
+from undulog.capture.sources.unix_socket import FrameSender
 
 PAGE = resource.getpagesize()
 
