@@ -13,7 +13,7 @@ from undulog.capture.common.console import emit_json, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output, write_text
 
-from .options import PAGES, chosen, opened, show
+from .analyse import PAGES, chosen, opened, show
 
 if TYPE_CHECKING:
     from ..results.comparison import Comparison

@@ -12,7 +12,7 @@ from undulog.capture.common.console import emit_json
 from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.common.files import check_output
 
-from .options import chosen, show
+from .analyse import chosen, experiment_of, show
 
 if TYPE_CHECKING:
     from ..results.coupling import Coupling, LocalCoupling
@@ -66,7 +66,6 @@ def predict(
 
     from ..experiment.kicks.prediction import closed_loop
     from ..present.text import render_loop
-    from .analyse import experiment_of
 
     first, *others = files
     if any(one.suffix.lower() == ".json" for one in files):

@@ -13,7 +13,7 @@ from undulog.capture.common.console import echo, emit_json, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output, write_text
 
-from .options import PAGES, chosen
+from .analyse import PAGES, chosen, experiment_of
 
 if TYPE_CHECKING:
     from ..results.analysis import Analysis
@@ -125,7 +125,6 @@ def _fleet(where: str, find: str, output: Path) -> tuple[str, dict[str, Any], in
 def _several(files: Sequence[Path], options: Options) -> tuple[str, dict[str, Any], int]:
     """Return the page on an experiment, all answers, and the number of warnings."""
     from ..present.page.page import render
-    from .analyse import experiment_of
 
     experiment = experiment_of(files, options, "report")
     page = render(experiment)

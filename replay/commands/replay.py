@@ -123,7 +123,7 @@ def replay(
 
 def _show(comparison: Comparison) -> None:
     """Print a comparison below the output before it."""
-    from undulog.analysis.commands.options import show
+    from undulog.analysis.commands.analyse import show
     from undulog.analysis.present.text_experiment import render_comparison
 
     echo("")

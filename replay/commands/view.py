@@ -19,8 +19,7 @@ from undulog.capture.common.process import interruptible
 
 from ..samples.content import Layer
 from ..viewer import viewer
-from .view_film import view_clip
-from .view_options import ClipOptions, OverlayOptions, SingleOptions
+from .view_recorded import ClipOptions, OverlayOptions, SingleOptions, view_clip, view_overlay
 
 if TYPE_CHECKING:
     from ..feed.recording import Recording
@@ -94,8 +93,6 @@ def view(
     elif len(files) == 1:
         _view_session(files[0], single or SingleOptions(), web=web)
     else:
-        from .view_overlay import view_overlay
-
         view_overlay(files, beside or OverlayOptions(), save=save, web=web, json=json)
 
 

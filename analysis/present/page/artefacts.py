@@ -19,7 +19,7 @@ from ...results.analysis import Analysis, JointResult
 from ...results.artefact import KINDS, Artefact, Span
 from ...results.formats import degrees, estimate, short
 from ...signals.columns import COMMAND_TOPIC, RESPONSE_TOPIC
-from .svg import REFERENCE, WIDTH_IN, Drawing, drawing, inline_svg, key, legend, new_figure
+from .svg import REFERENCE, Drawing, drawing, inline_svg, key, legend
 from .tables import element, is_driven
 
 CYCLES = 2.5
@@ -131,8 +131,7 @@ def command_response(traces: Sequence[Trace], joint_count: int, prefix: str) -> 
         prefix: For identifiers, unique in the page.
     """
     colors = joint_hex(joint_count)
-    with drawing():
-        figure = new_figure(WIDTH_IN, 0.7 + 1.35 * len(traces))
+    with drawing(0.7 + 1.35 * len(traces)) as figure:
         grid = figure.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)
         for (axes,), trace in zip(grid, traces, strict=True):
             command, response = np.degrees(trace.command_rad), np.degrees(trace.response_rad)

@@ -20,14 +20,12 @@ from .svg import (
     DASHED,
     MUTED,
     REFERENCE,
-    WIDTH_IN,
     Axes,
     Drawing,
     drawing,
     inline_svg,
     key,
     legend,
-    new_figure,
 )
 from .tables import Fact
 
@@ -118,8 +116,7 @@ def _drawing(
     if change.quantity == "energy":
         values /= own["stop_s"] - own["start_s"]
     colors = dict(zip(history.joints, joint_hex(len(history.joints)), strict=True))
-    with drawing():
-        figure = new_figure(WIDTH_IN, 2.4)
+    with drawing(2.4) as figure:
         axes: Axes = figure.subplots()
         for name in history.joints:
             rows = own["joint"] == name

@@ -13,11 +13,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from undulog.capture import SessionView
+from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import plain
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.palette import joint_hex
@@ -29,17 +31,17 @@ from ...results.answer import beyond
 from ...results.comparison import Comparison
 from ...results.estimate import Provenance
 from ...results.experiment import Experiment
+from ...results.oscillators import ChainCoupling
 from ...session.cycles import CycleMaps
 from .. import tables
+from ..text import chain_detail
 from .artefacts import artefact_rows, command_response, flagged_joints, read_traces
 from .comparison_view import comparison_view
 from .experiment_view import experiment_view
 from .fleet_view import change_text, fleet_view, spread_text
 from .maps import cycle_drawings
-from .matrix import entries_of, matrix_picture
-from .motion import body_motion
-from .oscillators import chain_view
-from .segments import segments
+from .matrix import Entries, entries_of, matrix_picture
+from .segments import body_motion, segments
 from .tables import (
     cut,
     digits,
@@ -99,6 +101,47 @@ def _any_number(joints: Sequence[JointResult]) -> bool:
     return any(
         v is not None for j in joints for v in (j.gain.value, j.energy_net_j, j.energy_abs_j)
     )
+
+
+def chain_view(chain: ChainCoupling, prefix: str) -> dict[str, Any]:
+    """Return what the template shows of one chain of oscillators, by name.
+
+    Args:
+        prefix: For identifiers, unique in the page.
+    """
+    lines = list(chain_detail(chain))
+    lags = [formats.degrees(link.lag_rad) for link in chain.links]
+    rates = chain.oscillators
+    return {
+        "chain": chain,
+        "sentence": lines[0].partition(": ")[2] if chain.identifiable else None,
+        "method": lines[-1].removeprefix("Method: ") if chain.identifiable else "",
+        "matrix": matrix_picture(_couplings(chain), prefix) if chain.links else None,
+        "decimals": (  # of K, of the rates and of the feedback
+            formats.decimals_for((link.K for link in chain.links), most=3),
+            formats.decimals_for((one.omega for one in rates), most=4),
+            formats.decimals_for((one.feedback for one in rates), most=3),
+        ),
+        "lags": lags,
+        "lag_decimals": formats.decimals_for(lags, most=2),
+        "fed": any(one.feedback.value is not None for one in rates),
+    }
+
+
+def _couplings(chain: ChainCoupling) -> Entries:
+    """Return K as a matrix with NaN for couplings that were not estimated."""
+    names = tuple(one.name for one in chain.oscillators)
+    place = {name: k for k, name in enumerate(names)}
+    value: FloatArray = np.full((len(names), len(names)), np.nan)
+    half: FloatArray = np.zeros_like(value)
+    for link in chain.links:
+        at = place[link.target], place[link.source]
+        value[at] = link.K.value or 0.0
+        if link.K.ci95 is not None:
+            half[at] = (link.K.ci95[1] - link.K.ci95[0]) / 2
+    meaning = f"coupling of oscillators, {chain.plane} [1/s]; looked for up to {chain.reach} apart"
+    words = ("the oscillator that is turned", "the oscillator that turns it", "is turned by")
+    return Entries("K", meaning, names, names, value, half, *words)
 
 
 LARGEST_BYTES = 3_000_000
