@@ -36,8 +36,17 @@ from undulog.capture.common.process import StopRequest
 from undulog.capture.log.file.parts import split_part_path
 from undulog.capture.log.read.facts import LogFacts, read_facts
 
-from .query import connect, put_together
-from .rows import SCHEMAS, Row, is_result, result_rows, session_row, sweep_rows, table_of
+from .rows import (
+    SCHEMAS,
+    Row,
+    connect,
+    is_result,
+    put_together,
+    result_rows,
+    session_row,
+    sweep_rows,
+    table_of,
+)
 
 _ARROW: Any = pa  # comes without types
 _PARQUET: Any = pq
@@ -276,11 +285,7 @@ class Catalog:
         for name in self._files("sources"):
             columns = self._store.read_table(name).to_pydict()
             for source, size, modified, scanned, removed in zip(
-                *(
-                    columns[key]
-                    for key in ("source", "size", "modified_ns", "scanned_ns", "removed")
-                ),
-                strict=True,
+                *(columns[key] for key in _SCANNED), strict=True
             ):
                 if source not in latest or latest[source][2] < scanned:
                     latest[source] = size, modified, scanned, removed
@@ -424,6 +429,7 @@ def _is_base(name: str) -> bool:
     return PurePosixPath(name).name.startswith("all-")
 
 
+_SCANNED = "source", "size", "modified_ns", "scanned_ns", "removed"
 _SOURCES: Any = _ARROW.schema(
     [
         ("source", _ARROW.string()),

@@ -1,4 +1,7 @@
-"""Compare two sessions, or two groups of them."""
+"""Compare two sessions, or two groups of them, joint by joint.
+
+They can be compared where the same commands drove the same joints.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +15,19 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
 from undulog.capture.common.console import Warn, plain
-from undulog.capture.common.errors import UsageError
+from undulog.capture.common.errors import DataError, UsageError
 
 from ..estimators.intervals import CONFIDENCE, around, t_factor
+from ..results import formats
 from ..results.answer import NotFollowing, StandOut
 from ..results.comparison import BrokenJoint, Comparison, Waveform
 from ..results.estimate import Estimate, Provenance
 from ..segments.answer import deviation_in_words, fault_in_words
 from ..segments.examine import OFFSET_RAD
+from ..session.runs import SAME_COMMAND, GaitRun, command_change, other_frequency
 from ..signals.stretch import Options
-from .alignment import Alignment, align, changes
 from .decisions import Margins, answer_of, decide, differ, estimates_of, family
-from .side import ComparedSession, Quantities, phases_rad, see, turned
+from .side import ComparedSession, Quantities, changes, phases_rad, see, turned
 
 
 def broken_joints(
@@ -70,6 +74,117 @@ def _first(several: Sequence[_Entry]) -> list[_Entry]:
     for each in several:
         found.setdefault(each.joint, each)
     return list(found.values())
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Common joints and gait of the sessions of both sides.
+
+    Attributes:
+        names: Joints that can be compared, head to tail.
+        left_out: Joints that can't, and why.
+        gaits_differ: How the gaits differ, or None.
+    """
+
+    names: tuple[str, ...]
+    left_out: dict[str, str]
+    gaits_differ: str | None
+
+
+def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False) -> Alignment:
+    """Find the joints that can be compared.
+
+    Args:
+        a: Runs of one side, at least one.
+        b: Runs of the other, at least one.
+        any_gait: Compare the responses although the gaits differ.
+
+    Raises:
+        DataError: If a session has no gait, no joint is in all of them, or the gaits differ and
+            that is not allowed.
+    """
+    runs = [*a, *b]
+    for run in runs:
+        if not run.names:
+            raise DataError(f"{run.label} has no gait, so there is no gait phase to align it by")
+    _refuse_copies(a, "A")
+    _refuse_copies(b, "B")
+    joints = list(dict.fromkeys(name for run in runs for name in run.names))
+    answered = [
+        {name for name, ratio in zip(run.names, run.ratio, strict=True) if np.isfinite(ratio)}
+        for run in runs
+    ]
+    names = tuple(name for name in joints if all(name in known for known in answered))
+    if not names:
+        raise DataError(
+            f"no joint has gain and lag in all sessions: {a[0].label} drives "
+            f"{_some(a[0].names)}, {b[0].label} {_some(b[0].names)}"
+        )
+    left_out = {
+        name: "no gain and lag in "
+        + ", ".join(r.label for r, known in zip(runs, answered, strict=True) if name not in known)
+        for name in joints
+        if name not in names
+    }
+    faults = [fault for run in runs[1:] if (fault := gait_fault(run, runs[0], names)) is not None]
+    if faults and not any_gait:
+        raise DataError(
+            f"the gaits differ, so joints would answer differently anyway: {faults[0]}; record the "
+            "same gait, or compare nevertheless with --any-gait"
+        )
+    return Alignment(names, left_out, faults[0] if faults else None)
+
+
+def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None:
+    """Return the difference of a run's gait from the model's.
+
+    Args:
+        model: The run that it is held against.
+        names: Joints to look at, driven in both.
+
+    Returns:
+        The reason, or None within 0.5 % of the frequency and 1 % of every command's amplitude.
+    """
+    different = other_frequency(run, model)
+    if different is not None:
+        return f"{run.label} has {different[0]} Hz, {model.label} {different[1]} Hz"
+    own, other = (
+        np.array([one.command[one.names.index(name)] for name in names]) for one in (run, model)
+    )
+    groups, others = ([one.group[one.names.index(name)] for name in names] for one in (run, model))
+    if groups != others:
+        return f"{run.label} has other joints than {model.label} at one frequency"
+    change = np.ones_like(own)
+    for group in set(groups):
+        members = [k for k, one in enumerate(groups) if one == group]
+        change[members] = command_change(own[members], other[members])
+    deviation = np.abs(change - 1)
+    worst = int(np.argmax(deviation))
+    if deviation[worst] <= SAME_COMMAND:
+        return None
+    percent = formats.number(100 * (float(np.abs(change[worst])) - 1), 1)
+    degrees = formats.number(float(np.degrees(np.angle(change[worst]))), 1)
+    return (
+        f"at {names[worst]} the command of {run.label} is {percent} % in amplitude and {degrees} "
+        f"degrees in phase off that of {model.label}"
+    )
+
+
+def _refuse_copies(runs: Sequence[GaitRun], side: str) -> None:
+    """Raise an error for copies: two copies of one run would show no scatter."""
+    seen: dict[bytes, str] = {}
+    for run in runs:
+        numbers = run.ratio.tobytes()
+        if numbers in seen:
+            raise DataError(
+                f"{run.label} is a copy of the numbers of {seen[numbers]} on side {side}: a copy "
+                "is not a run of its own"
+            )
+        seen[numbers] = run.label
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
 
 
 @dataclass(frozen=True)

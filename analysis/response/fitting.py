@@ -14,8 +14,15 @@ from ..estimators.harmonic import LINEAR, HarmonicFit, fit_at, fit_shared
 from ..estimators.series import Series
 from ..estimators.spectrum import Noise, omega_variance, residual_noise, residual_spectrum
 from ..results.answer import Lacking, Note, distinct, percent
-from .groups import Groups, find_groups
-from .mixing import RESOLUTION, MixedTone, group_model, mixed_tones, with_mixed_lines
+from .groups import (
+    RESOLUTION,
+    Groups,
+    MixedTone,
+    find_groups,
+    group_model,
+    mixed_tones,
+    with_mixed_lines,
+)
 from .response import Response, respond
 from .rhythm import (
     HARMONICS,

@@ -23,8 +23,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from undulog.analysis.compare.alignment import facts_of
-from undulog.analysis.compare.side import ComparedSession, see
+from undulog.analysis.compare.side import ComparedSession, facts_of, see
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray

@@ -24,9 +24,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
-from undulog.analysis.compare.alignment import changes
 from undulog.analysis.compare.compare import Choices, compare_fitted
-from undulog.analysis.compare.side import ComparedSession
+from undulog.analysis.compare.side import ComparedSession, changes
 from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.files import check_stop

@@ -1,4 +1,4 @@
-"""Results to files and back."""
+"""Results to files and back, and as a notebook shows them."""
 
 from __future__ import annotations
 
