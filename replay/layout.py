@@ -219,8 +219,7 @@ def _mean_plots(content: Content) -> list[rrb.View]:
 def _angle_views(content: Content) -> list[rrb.View]:
     views: list[rrb.View] = []
     if content.places is not None:
-        three = len(content.places.names) == 3
-        title = "Head, middle, tail [°]" if three else "Angle [°]"
+        title = "Head, middle, tail [°]" if len(content.places.names) == 3 else "Angle [°]"
         views.append(plot(title, [f"{lines.PLACES}/**"]))
     for plane in Plane:
         names = _names(content.robot, plane)
@@ -335,8 +334,7 @@ def build_blueprint(content: Content, front: Tab = "session") -> rrb.Blueprint:
     pages: dict[Tab, rrb.Container] = {"session": _session(content, views)}
     if views.maps or views.steps:
         rows = [rrb.Horizontal(*row) for row in (views.maps, views.steps) if row]
-        shares = [1.35, 1.0][: len(rows)]
-        pages["cycles"] = rrb.Vertical(*rows, row_shares=shares, name="Cycles")
+        pages["cycles"] = rrb.Vertical(*rows, row_shares=[1.35, 1.0][: len(rows)], name="Cycles")
     if views.mean_plots and views.mean_words is not None:
         pages["mean-cycle"] = _mean(views, views.mean_words)
     shown: Tab = front if front in pages else "session"

@@ -89,8 +89,7 @@ def find_jumps(position: Series, most_rate: float, released: tuple[Span, ...] = 
         return nothing
     own = step[at] - _beside(step, at)  # without what the joint itself did meanwhile
     turn = float(np.median(np.abs(own)))
-    ordinary = float(np.median(np.abs(step)))
-    spread = SAME_SIZE * turn + 2 * ordinary
+    spread = SAME_SIZE * turn + 2 * float(np.median(np.abs(step)))
     alike = bool(np.all(np.abs(np.abs(own) - turn) < spread))
     # Lone steps of any size may be a jump; a counter's single wrap is known by its size.
     known = any(abs(turn - one) < spread for one in _TURNS)
@@ -100,8 +99,7 @@ def find_jumps(position: Series, most_rate: float, released: tuple[Span, ...] = 
     turns[at + 1] = np.rint(own / turn)
     count = np.cumsum(turns)
     levels, index = np.unique(count, return_inverse=True)
-    usual = levels[np.argmax(np.bincount(index))]
-    return Jumps(spans_of(t_s, count != usual), turn, ())
+    return Jumps(spans_of(t_s, count != levels[np.argmax(np.bincount(index))]), turn, ())
 
 
 def _alone(step: FloatArray, dt: FloatArray, most_rate: float) -> BoolArray:
@@ -111,8 +109,7 @@ def _alone(step: FloatArray, dt: FloatArray, most_rate: float) -> BoolArray:
     if not np.any(alone):
         return alone
     # Over a gap a joint goes further; the usual step grows with it.
-    usual = np.median(size[size > 0])
-    alone &= size > ABOVE_USUAL * usual * np.maximum(dt / np.median(dt), 1.0)
+    alone &= size > ABOVE_USUAL * np.median(size[size > 0]) * np.maximum(dt / np.median(dt), 1.0)
     for k in np.flatnonzero(alone):
         near = np.concatenate((size[max(k - _BESIDE, 0) : k], size[k + 1 : k + 1 + _BESIDE]))
         calm = near[near <= possible[k]]

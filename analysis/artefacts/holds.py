@@ -236,8 +236,7 @@ def _centred(
 
 def _holds(value: FloatArray) -> tuple[IntArray, IntArray]:
     """First sample and one past the last of each run of two or more equal values."""
-    same: BoolArray = np.diff(value) == 0
-    first, stop = runs(same)
+    first, stop = runs(np.diff(value) == 0)
     return first, stop + 1
 
 
@@ -246,8 +245,7 @@ def _around(marked: BoolArray) -> IntArray:
     half = _BOX // 2
     so_far: IntArray = np.cumsum(marked, dtype=np.int64)
     before: IntArray = np.concatenate((np.zeros(half + 1, dtype=np.int64), so_far))
-    after: IntArray = np.concatenate((so_far, np.full(half, so_far[-1])))
-    return after[half:] - before[: marked.size]
+    return np.concatenate((so_far, np.full(half, so_far[-1])))[half:] - before[: marked.size]
 
 
 def _stands(way: Series, span: Span, least: float) -> bool:

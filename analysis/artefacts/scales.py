@@ -204,8 +204,7 @@ def against_command(one: Compared) -> dict[str, tuple[Span, ...]]:
     full = (one.ratio > FULL_SIZE[0]) & (one.ratio < FULL_SIZE[1])
     opposite = (one.correlation < OPPOSITE) & (full | degrees)
     # A sign changes no more than the sign: near a resonance the phase is anything, cycle by cycle.
-    usable = np.isfinite(one.correlation)
-    along = np.abs(one.correlation[usable]) > -OPPOSITE
+    along = np.abs(one.correlation[np.isfinite(one.correlation)]) > -OPPOSITE
     opposite &= np.count_nonzero(along) >= EITHER_WAY * along.size
     return _found(one, {"wrong_sign": opposite, "wrong_unit": degrees | radians})
 

@@ -99,8 +99,7 @@ def centre_of_mass(
     known_s, position, quaternion = poses
     # q and -q are one orientation: neighbours must not differ by the sign.
     flips = np.where(np.einsum("ij,ij->i", quaternion[1:], quaternion[:-1]) < 0, -1.0, 1.0)
-    same_side = quaternion * np.cumprod(np.append(1.0, flips))[:, None]
-    turn = _at(t_s, known_s, same_side)
+    turn = _at(t_s, known_s, quaternion * np.cumprod(np.append(1.0, flips))[:, None])
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
     head = _at(t_s, known_s, position)
     centres, _ = link_poses(robot, head, rotation_from_quaternion(turn), angles)

@@ -357,8 +357,7 @@ def put_together(database: Any, kind: str) -> Any:
     if kind == "analyses":
         columns = f"* replace ({_LATEST} as latest)"
     query = f"select {columns}, false as removed from {view}"  # noqa: S608
-    table = database.sql(query).to_arrow_table()
-    return table.select(SCHEMAS[kind].names).cast(SCHEMAS[kind])
+    return database.sql(query).to_arrow_table().select(SCHEMAS[kind].names).cast(SCHEMAS[kind])
 
 
 def _open_rows(

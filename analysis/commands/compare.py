@@ -81,8 +81,7 @@ def compare(
     )
     with progress("compare", total=sum(map(len, sides))) as bar:
         first = opened(sides[0], bar)
-        second = opened(sides[1], bar, len(sides[0]))
-        result = compare_sessions(first, second, choices)
+        result = compare_sessions(first, opened(sides[1], bar, len(sides[0])), choices)
     if output is not None:
         _write(result, output)
     if json:

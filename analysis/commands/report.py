@@ -64,8 +64,7 @@ def report(
     options = chosen(start, stop, command_topic, response_topic)
     if catalog is not None and options != chosen(None, None, "/joint_commands", "/joint_states"):
         raise UsageError("--catalog shows results as they are; leave out window and topics")
-    why = "the report is an HTML page; end its name in .html"
-    check_output(output, PAGES, why, force=force)
+    check_output(output, PAGES, "the report is an HTML page; end its name in .html", force=force)
     if catalog is not None:
         page, facts, warnings = _fleet(catalog, find, output)
     else:

@@ -360,8 +360,7 @@ def _by_first(one: ComparedSession, name: str, names: Sequence[str]) -> Quantiti
     run = one.run
     group = run.group[run.names.index(name)]
     members = [k for k, own in enumerate(run.group) if own == group]
-    reference = next(k for k in members if run.names[k] in names)
-    commands = run.command[[members[0], reference]]
+    commands = run.command[[members[0], next(k for k in members if run.names[k] in names)]]
     return turned(one.cycles[name], float(np.angle(commands[0] / commands[1])))
 
 

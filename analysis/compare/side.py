@@ -197,8 +197,7 @@ def cycles_by_phase(
     cycle_s = 2 * np.pi / fit.omega
     first = -zero_rad / fit.omega
     first += np.ceil((start_s - first) / cycle_s - 1e-6) * cycle_s
-    count = max(0, int(np.floor((stop_s - first) / cycle_s + 1e-6)))
-    starts = first + cycle_s * np.arange(count)
+    starts = first + cycle_s * np.arange(max(0, int(np.floor((stop_s - first) / cycle_s + 1e-6))))
     times = starts[:, None] + cycle_s * np.arange(PHASES) / PHASES
     rest = one.values - fit.predict(channel, one.t_s)
     left = Series(one.name, one.t_s, rest).at(times.ravel()).reshape(times.shape)
@@ -342,8 +341,7 @@ def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
     """
     measured = measure_session(session, options, with_dead_bands=False)
     analysis = measured.analysis
-    label = Path(analysis.session.path).name
-    run = gait_run(label, session.robot, analysis, measured.gait)
+    run = gait_run(Path(analysis.session.path).name, session.robot, analysis, measured.gait)
     estimates = _responses(measured, run) | _energies(measured)
     total = _total_energy(measured)
     steps = None

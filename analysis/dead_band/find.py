@@ -309,8 +309,7 @@ def _without(cycles: Cycles, joint: int, lag: float, omega: float) -> tuple[floa
         return (command.at(t_s + near_s) - command.at(t_s - near_s)) / (2 * near_s)
 
     late_s = lag / (2 * np.pi) * span_s
-    moves = rate(times)
-    plain = np.column_stack((np.ones_like(times), command.at(times), moves))
+    plain = np.column_stack((np.ones_like(times), command.at(times), rate(times)))
     square = np.sign(rate(times - late_s))
     measured = cycles.measured[joint, :, cycles.first :].ravel()
     alone = np.linalg.lstsq(plain, measured, rcond=None)[0]

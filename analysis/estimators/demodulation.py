@@ -206,8 +206,7 @@ def _amplitudes(one: Series, phase: Phase, edges_s: FloatArray) -> tuple[Complex
     waves, cross, power = _moments(turned, swing, starts)
     usable &= np.isfinite(power) & (power > 0)
     chosen = np.flatnonzero(usable)
-    normal = _normal(filled, waves)[chosen]
-    fitted = np.linalg.solve(normal, cross.T[chosen, :, None])[..., 0]
+    fitted = np.linalg.solve(_normal(filled, waves)[chosen], cross.T[chosen, :, None])[..., 0]
     amplitude[chosen] = fitted[:, 1] - 1j * fitted[:, 2]
     explained[chosen] = filled[chosen] * np.abs(amplitude[chosen]) ** 2 / 2 / power[chosen]
     return amplitude, explained

@@ -79,8 +79,7 @@ def analyse_experiment(
         fitted = examine_session(session, options)
         analysis, robot = fitted.analysis, session.robot
         lay = posture(session, analysis.gait.windows)
-        label = Path(analysis.session.path).name
-        runs.append(gait_run(label, robot, analysis, fitted.gait, lay))
+        runs.append(gait_run(Path(analysis.session.path).name, robot, analysis, fitted.gait, lay))
         analyses.append(analysis)
         gaits.append(fitted.gait)
         robots.append(robot)

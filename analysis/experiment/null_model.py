@@ -135,8 +135,7 @@ def null_test(response: Response, joints: IntArray, model: NullModel) -> NullTes
         gain, deviation, error = _one_by_one(system, named)
         noise_gain, noise_deviation, noise_error = _one_by_one(drawn, named)
         others = [j for j in range(len(kinds)) if j not in named]
-        largest = noise_gain[:, others].max(axis=1)
-        p[others] = _share(largest[:, None], gain[others])
+        p[others] = _share(noise_gain[:, others].max(axis=1)[:, None], gain[others])
         best = others[int(np.argmax(gain[others]))]
         if p[best] >= SIGNIFICANT or len(named) + 1 >= most:
             break
@@ -293,8 +292,7 @@ def analyse_with_null(
     measured = measure_session(session, options)
     analysis = measured.analysis
     response, joints = _answered(measured, model, file)
-    test = null_test(response, joints, model)
-    result = _result(test, model, file)
+    result = _result(null_test(response, joints, model), model, file)
     outside = [one.name for one in result.parameters if not one.within]
     warnings = list(analysis.warnings)
     if outside:
@@ -339,8 +337,7 @@ def _other_gait(gait: GaitFit | None, model: NullModel) -> str | None:
     if abs(own - frequency) > SAME_FREQUENCY * frequency:
         texts = distinct(own, frequency)
         return f"its gait has {texts[0]} Hz, the model's {texts[1]} Hz"
-    command = gait.fit.fundamental[: len(gait.driven)]
-    change = command / model.command
+    change = gait.fit.fundamental[: len(gait.driven)] / model.command
     off = np.abs(change * np.exp(-1j * np.angle(np.sum(change))) - 1)
     worst = int(np.argmax(off))
     if off[worst] <= SAME_COMMAND:

@@ -225,8 +225,7 @@ def pooled_answer(
 def _scatter(values: FloatArray, variance: FloatArray) -> Scatter:
     """Return the scatter of the mean of values (r, m): r - 1 columns, and added noise (m,)."""
     runs = len(values)
-    centred = values - values.mean(axis=0)
     # Helmert's contrasts between the runs are orthonormal, so the columns are independent.
-    columns = (helmert(runs) @ centred).T / runs**0.5
+    columns = (helmert(runs) @ (values - values.mean(axis=0))).T / runs**0.5
     raised: FloatArray = np.maximum(variance - np.mean(columns**2, axis=1), 0.0)
     return Scatter(columns, raised, np.zeros_like(raised))

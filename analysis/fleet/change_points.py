@@ -177,8 +177,7 @@ def _largest(residuals: FloatArray, shapes: _Shapes, freedom: int) -> FloatArray
     """Return t squared of each shape and series, shape (n_shapes, n_series)."""
     explained = (shapes.unit @ residuals) ** 2
     total = np.sum(residuals**2, axis=0)
-    left = np.maximum(total - explained, 1e-12 * total)
-    return freedom * explained / left
+    return freedom * explained / np.maximum(total - explained, 1e-12 * total)
 
 
 def _left(residual: FloatArray, shapes: _Shapes) -> FloatArray:
@@ -202,12 +201,10 @@ def _fit(
     noise = residual - signal
     noise *= np.sqrt(n / max(1, n - basis.shape[1] - 2))
     # The likelihood ratio of the true shape, where there is such a change in such noise.
-    drawn: FloatArray = noise[rng.integers(n, size=(n, _SIMULATIONS))]
-    simulated = signal[:, None] + _residuals(drawn, basis)
+    simulated = signal[:, None] + _residuals(noise[rng.integers(n, size=(n, _SIMULATIONS))], basis)
     left_simulated = _left(simulated, shapes)
     ratio = n * np.log(left_simulated[best] / left_simulated.min(axis=0))
-    accepted = n * np.log(left / left[best]) <= np.quantile(ratio, _CONFIDENCE)
-    starts = shapes.starts[accepted]
+    starts = shapes.starts[n * np.log(left / left[best]) <= np.quantile(ratio, _CONFIDENCE)]
     unit, raw = shapes.unit[best], shapes.raw[best]
     size = float(unit @ residual) / float(unit @ raw)
     start = int(shapes.starts[best])

@@ -229,8 +229,7 @@ def _history(
     tables = {name: table for name, table in tables.items() if table is not None}
     if "gain" not in tables or len(tables["gain"]) < LEAST_SESSIONS:
         return None
-    paths = tables["gain"].index
-    ordered = sessions[sessions["path"].isin(paths)].set_index("path")
+    ordered = sessions[sessions["path"].isin(tables["gain"].index)].set_index("path")
     tables = {name: table.reindex(ordered.index) for name, table in tables.items()}
     conditions = _conditions(own, ordered)
     times_s = ordered["start"].astype("int64").to_numpy() / 1e9
@@ -263,8 +262,7 @@ def _table(joints: _Frame, values: _Frame) -> _Frame | None:
     if latest.empty:
         return None
     table = latest.pivot_table(index="path", columns="joint", values="value", aggfunc="last")
-    order = latest.groupby("joint")["position"].first().sort_values().index
-    table = table.reindex(columns=order)
+    table = table.reindex(columns=latest.groupby("joint")["position"].first().sort_values().index)
     table = table.loc[:, table.notna().mean() >= 0.5].dropna()
     return table if table.shape[1] >= _LEAST_JOINTS and len(table) else None
 
@@ -368,8 +366,7 @@ def _components(name: str, table: _Frame, conditions: IntArray) -> Components:
     formula = "value ~ C(condition)" if len(np.unique(conditions)) > 1 else "value ~ 1"
     parts = {"session": "0 + C(session)", "joint": "0 + C(joint)"}
     if len(rows) > _MOST_ROWS:  # the model's matrices have a row and a column each
-        kept = table.index[:: -(-len(rows) // _MOST_ROWS)]
-        rows = rows[rows["session"].isin(kept)]
+        rows = rows[rows["session"].isin(table.index[:: -(-len(rows) // _MOST_ROWS)])]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

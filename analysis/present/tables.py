@@ -197,8 +197,7 @@ def joint_table(analysis: Analysis, joints: Sequence[JointResult]) -> Table[Join
 
 def energy_table(joints: Sequence[JointResult]) -> Table[JointResult]:
     """Return the energies of every joint over the analysed windows, all with the same digits."""
-    every = [Estimate(of(joint)) for _, _, of, _ in _ENERGIES for joint in joints]
-    digits = _significant(4)(every)
+    digits = _significant(4)([Estimate(of(joint)) for _, _, of, _ in _ENERGIES for joint in joints])
     columns: list[Column[JointResult]] = [Column(None, "joint", lambda j: j.name, kind="word")]
     for name, note, of, _ in _ENERGIES:
         columns.append(Column(None, f"{name} [J]", of, (0, digits), note=note))

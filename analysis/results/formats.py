@@ -148,8 +148,7 @@ def decimals_for_values(values: Iterable[float | None], digits: int = 3) -> int:
     Returns:
         Digits after the point, 0 to 6.
     """
-    finite = [abs(v) for v in values if v is not None and math.isfinite(v)]
-    largest = max(finite, default=0.0)
+    largest = max([abs(v) for v in values if v is not None and math.isfinite(v)], default=0.0)
     if largest == 0.0:
         return 0
     return min(max(digits - 1 - math.floor(math.log10(largest)), 0), 6)

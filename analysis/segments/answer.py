@@ -227,8 +227,7 @@ def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str
         return Verdict.NOTHING, lead, _why_not(facts, "gain and lag are null")
     if len(known) == 1:
         return _single(facts, known[0], named=named)
-    detail = _responding(facts, known) + _caveat(facts.joints)
-    return *_compared(facts, named=named), detail
+    return *_compared(facts, named=named), _responding(facts, known) + _caveat(facts.joints)
 
 
 def _single(facts: Facts, joint: JointResult, *, named: bool) -> tuple[Verdict, str, str]:

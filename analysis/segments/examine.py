@@ -151,8 +151,7 @@ def profile_of(chain: Chain, quantity: str) -> Profile:
     place = np.array([chain.commanded.index(name) for name in chain.names], dtype=np.float64)
     count = len(chain.commanded)
     if quantity == "gain":
-        margin = math.log1p(_MARGINS["gain"])
-        return Profile(place, count, np.log(response.gain), gains, margin)
+        return Profile(place, count, np.log(response.gain), gains, math.log1p(_MARGINS["gain"]))
     return Profile(place, count, response.lag_near_mean_rad, lags, _MARGINS["lag"])
 
 

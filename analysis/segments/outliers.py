@@ -332,5 +332,4 @@ def _beside_neighbours(profile: Profile, others: IntArray, joint: int) -> tuple[
     if near.size < 2:
         return (flat,)
     slope = (values[near[0]] - values[near[1]]) / (place[near[0]] - place[near[1]])
-    line = flat - float(slope * (own - place[near[0]]))
-    return flat, line
+    return flat, flat - float(slope * (own - place[near[0]]))

@@ -267,8 +267,7 @@ def measure_session(
     facts = Facts(
         analysis.gait, joints, commanded, faulty, findings, analysis.warnings, left_out=left_out
     )
-    answer = compose(facts)
-    analysis = dataclasses.replace(analysis, answer=answer)
+    analysis = dataclasses.replace(analysis, answer=compose(facts))
     return SessionMeasurement(analysis, gait, sound, energies, span, follows.offsets)
 
 

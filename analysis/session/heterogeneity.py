@@ -148,8 +148,7 @@ def response_indices(response: Response) -> dict[str, Index]:
         "equivalence_lag": _equivalence(lag - lag.mean(), lag_variance, dof, EQUIVALENT_LAG_RAD),
     }
     if count >= MIDDLE + ENDS:
-        scaled = response.log_gain_variance * gain**2
-        found["boundary_contrast_gain"] = _contrast(gain, scaled, dof)
+        found["boundary_contrast_gain"] = _contrast(gain, response.log_gain_variance * gain**2, dof)
         found["boundary_contrast_lag"] = _contrast(lag, lag_variance, dof)
     return {name: index(name, *numbers) for name, numbers in found.items()}
 
@@ -183,8 +182,7 @@ def gini(values: FloatArray) -> float:
     """
     ordered = np.sort(values)
     k = ordered.size
-    rank = 2 * np.arange(1, k + 1) - k - 1
-    return float(rank @ ordered / (k * ordered.sum()))
+    return float((2 * np.arange(1, k + 1) - k - 1) @ ordered / (k * ordered.sum()))
 
 
 def spread(values: FloatArray, variance: FloatArray, dof: FloatArray, blocks: int = 1) -> Spread:

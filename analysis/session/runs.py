@@ -142,8 +142,7 @@ def _lean_of(session: SessionView, sensor: Sensor, windows: Sequence[Window]) ->
     cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)
     x = float(mean @ [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr])
-    z = float(mean @ [-sp, cp * sr, cp * cr])
-    return math.atan2(-x, z)
+    return math.atan2(-x, float(mean @ [-sp, cp * sr, cp * cr]))
 
 
 SAME_COMMAND = 0.01
@@ -313,12 +312,10 @@ def responses(runs: Sequence[GaitRun]) -> tuple[tuple[str, ...], ComplexArray]:
     known = np.all(np.isfinite(ratio), axis=0)
     known &= known[::-1]
     ratio = ratio[:, known]
-    unit: ComplexArray = ratio / np.abs(ratio)
-    turn = np.angle(unit.sum())
+    turn = np.angle((ratio / np.abs(ratio)).sum())
     phase: FloatArray = turn + np.angle(ratio * np.exp(-1j * turn))
     names = tuple(name for name, sound in zip(runs[0].names, known, strict=True) if sound)
-    y = (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
-    return names, y
+    return names, (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
 
 
 def mirror_fault(robot: Robot | None, driven: Sequence[str]) -> str | None:

@@ -148,15 +148,13 @@ def read_columns(
             option = "--command-topic" if key == "command" else "--response-topic"
             spare = [one for one in others if one not in (command_topic, response_topic)]
             named = f" (other JointStates: {', '.join(spare)}; choose with {option})"
-            told = f"no {kind} on {topic}: gain and lag are null{named if spare else ''}"
-            warn(Lacking(told))
+            warn(Lacking(f"no {kind} on {topic}: gain and lag are null{named if spare else ''}"))
     accumulated = PowerTopic.MECHANICAL in found and PowerTopic.MECHANICAL_PLUS in found
     if not accumulated and ("velocity" not in found or "effort" not in found):
         lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)
         warn(Note(f"{response_topic} carries no {lacking}: mechanical energies are null"))
     _check_voltage(session, found, warn)
-    names = session.robot.joint_names if session.robot is not None else ()
-    seen = dict.fromkeys(names)
+    seen = dict.fromkeys(session.robot.joint_names if session.robot is not None else ())
     for key in ("command", "position"):
         if key in found:
             seen |= dict.fromkeys(found[key].names)

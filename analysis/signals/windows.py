@@ -80,8 +80,7 @@ def steady_part(commands: Sequence[Series], start_s: float, stop_s: float) -> tu
         if (stop_s - start_s) / period_s > sum(one.t_s.size for one in members):
             continue  # most of these cycles have no sample: there is no soft start to be seen
         edges_s = np.arange(start_s, stop_s + 1e-6 * period_s, period_s / _PARTS)
-        size = amplitude_by_cycle(members, omega, edges_s)
-        lead, tail = soft_ends(size)
+        lead, tail = soft_ends(amplitude_by_cycle(members, omega, edges_s))
         if lead:
             first_s = max(first_s, float(edges_s[lead]))
         if tail:
@@ -121,8 +120,7 @@ def amplitude_by_cycle(commands: Sequence[Series], omega: float, edges_s: FloatA
         values = one.values - one.values.mean()
         usable: BoolArray = end - begin >= _LEAST_SAMPLES
         gram = np.stack([_sums(rows * row, begin, end) for row in rows], axis=1)[usable]
-        right = _sums(rows * values, begin, end)[usable]
-        solved = np.linalg.solve(gram, right[..., None])[..., 0]
+        solved = np.linalg.solve(gram, _sums(rows * values, begin, end)[usable][..., None])[..., 0]
         power[usable] += solved[:, 1] ** 2 + solved[:, 2] ** 2
         power[~usable] = np.nan
         filled = np.maximum(end - begin, 1)

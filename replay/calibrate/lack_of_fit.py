@@ -180,8 +180,7 @@ def lack_of_fit(
             found[joint] = periodic(t, rest, omega, step_of(angle))
         else:
             found[joint] = JointFit(ljung_box(rest), None)
-    hz = None if omega is None else omega / (2 * np.pi)
-    return LackOfFit(found, unfitted, others, hz)
+    return LackOfFit(found, unfitted, others, None if omega is None else omega / (2 * np.pi))
 
 
 def periodic(t: FloatArray, residual: FloatArray, omega: float, step: float = 0.0) -> JointFit:
@@ -208,8 +207,7 @@ def periodic(t: FloatArray, residual: FloatArray, omega: float, step: float = 0.
     reach = min(BETWEEN, int((cycles - 1) / 2))
     statistic, power = 0.0, 0.0
     for k in range(1, most + 1):
-        others = np.hstack([trend, *lines[: k - 1], *lines[k:]])
-        at_line = _power(residual, lines[k - 1], others)
+        at_line = _power(residual, lines[k - 1], np.hstack([trend, *lines[: k - 1], *lines[k:]]))
         near = [
             _power(rest, _waves(t, k * omega + 2 * np.pi * d / duration), whole)
             for d in range(-reach, reach + 1)

@@ -160,8 +160,7 @@ def with_values(scenario: Scenario, wanted: Sequence[Unknown], x: FloatArray) ->
     )
     robot, world = dataclasses.replace(scenario.robot, joints=joints), scenario.world
     if world.ground is not None:
-        ground = dataclasses.replace(world.ground, **of_ground)
-        world = dataclasses.replace(world, ground=ground)
+        world = dataclasses.replace(world, ground=dataclasses.replace(world.ground, **of_ground))
     return dataclasses.replace(scenario, robot=robot, world=world)
 
 
@@ -300,8 +299,7 @@ class Answers:
         # The joints share one table of breaks; a spline of one joint is a column of it.
         found: list[FloatArray] = []
         for joint, times_s in zip(self.measured.joints, self.measured.times_s, strict=True):
-            j = names.index(joint)
-            one = CubicHermiteSpline.construct_fast(track.c[:, :, j], track.x)
+            one = CubicHermiteSpline.construct_fast(track.c[:, :, names.index(joint)], track.x)
             angle = np.asarray(one(np.clip(times_s - late_s, track.x[0], track.x[-1])))
             found.append(angle - angle.mean())
         return tuple(found)

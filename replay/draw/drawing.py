@@ -206,8 +206,7 @@ class Drawing:
         Returns:
             What is missing or was assumed by now, a sentence each.
         """
-        notes = [*layer.notes, *self._sources.warnings, *session.warnings]
-        told = list(dict.fromkeys(notes))
+        told = list(dict.fromkeys([*layer.notes, *self._sources.warnings, *session.warnings]))
         text = facts.markdown(
             session,
             layer.analysis,

@@ -165,8 +165,7 @@ def _dashed(values: FloatArray, t_ns: IntArray, rank: int) -> FloatArray:
     """
     step_s = max(typical_step_ns(t_ns), 1) * 1e-9
     drawn = max(round(_DASH_S[(rank - 1) % len(_DASH_S)] / step_s), 2)
-    left_out = max(round(_SPACE_S / step_s), 1)
-    is_drawn = np.arange(len(values)) % (drawn + left_out) < drawn
+    is_drawn = np.arange(len(values)) % (drawn + max(round(_SPACE_S / step_s), 1)) < drawn
     return np.where(is_drawn[:, None], values, np.nan)
 
 

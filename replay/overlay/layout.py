@@ -116,8 +116,7 @@ def _table(sides: Sequence[Side]) -> str:
 
 def _changes(first: Side, other: Side, changed: Sequence[Change]) -> str:
     if not changed:
-        said = f"{other.name} is described as {first.name}: nothing was changed."
-        return escaped(said)
+        return escaped(f"{other.name} is described as {first.name}: nothing was changed.")
     lines = [escaped(f"What was changed ({first.name}, then {other.name}):"), ""]
     for one in changed[:_CHANGES]:
         before, after = ("not set" if side is None else side for side in (one.a, one.b))

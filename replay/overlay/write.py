@@ -267,8 +267,7 @@ def _log(
     for rank, one in enumerate(sessions[1:], start=1):
         b, own = one.side, one.recording.content
         placed = placements.get(b.name, Placement())
-        places = draw.places_in(b, content.places, own.places)
-        lines = draw.log_lines(rec, b, rank, places)
+        lines = draw.log_lines(rec, b, rank, draw.places_in(b, content.places, own.places))
         angles = draw.angle_differences(a, b, how)
         angles = draw.log_differences(rec, a, f"{b.own}{ANGLES}", angles, content.measured)
         apart = _log_apart(rec, (a, b), how, placed, draw.tint(rank))

@@ -182,8 +182,7 @@ def comes(session: SessionView, topic: str, one: str) -> bool:
 
 def _segments(robot: Robot, tracks: Sequence[Track], thin: int) -> FloatArray:
     """Power of the links at some times [W], shape (n, links)."""
-    at_ns = tracks[0].t_ns[::thin]
-    return segment_power(resampled(tracks, robot.joint_names, at_ns, interpolate))
+    return segment_power(resampled(tracks, robot.joint_names, tracks[0].t_ns[::thin], interpolate))
 
 
 def _parts(tracks: Sequence[Track], *, turns: bool) -> list[tuple[str, ...]]:

@@ -362,8 +362,7 @@ def decimate(t_ns: IntArray, rate_hz: float) -> IntArray:
         return np.zeros(0, dtype=np.int64)
     period = round(1e9 / rate_hz)
     slot = (t_ns - t_ns[0] + period // 4) // period
-    first = np.flatnonzero(np.diff(slot, prepend=slot[0] - 1))
-    return first.astype(np.int64)
+    return np.flatnonzero(np.diff(slot, prepend=slot[0] - 1)).astype(np.int64)
 
 
 def interpolate(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArray:
@@ -388,8 +387,7 @@ def interpolate(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArr
     exact = inside & (t_ns[np.maximum(left, 0)] == at_ns)
     found[exact] = values[left[exact]]
     if t_ns.size > 1:
-        joined = np.append(~gaps(t_ns), False)
-        between = inside & ~exact & joined[np.maximum(left, 0)]
+        between = inside & ~exact & np.append(~gaps(t_ns), False)[np.maximum(left, 0)]
         i = left[between]
         share = (at_ns[between] - t_ns[i]) / (t_ns[i + 1] - t_ns[i])
         share = share.reshape(-1, *[1] * (values.ndim - 1))

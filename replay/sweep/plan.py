@@ -201,8 +201,7 @@ def _parameter(key: str, table: Table) -> Parameter:
 
 
 def _count(plan: SweepPlan) -> int:
-    points = plan.points or math.prod(len(one.values) for one in plan.parameters)
-    return points * plan.seeds
+    return (plan.points or math.prod(len(one.values) for one in plan.parameters)) * plan.seeds
 
 
 def points_of(plan: SweepPlan) -> list[dict[str, Any]]:

@@ -184,8 +184,7 @@ class RowStore:
                 shutil.move(path, f"{goal}.part")
                 Path(f"{goal}.part").replace(goal)
             else:
-                filesystem = self._store.filesystem
-                _FS.copy_files(path.as_posix(), goal, _FS.LocalFileSystem(), filesystem)
+                _FS.copy_files(path.as_posix(), goal, _FS.LocalFileSystem(), self._store.filesystem)
         except OSError as error:
             raise LogWriteError(f"{self.where}/{name}", str(error)) from error
         return name

@@ -228,8 +228,7 @@ def run_sweep(
                 on_row(row, before)
         store.gather()
     wall_s = time.monotonic() - start
-    planned = len(sweep.jobs)
-    return SweepReport(store.where, planned, before, run, failed, wall_s, run_s, error)
+    return SweepReport(store.where, len(sweep.jobs), before, run, failed, wall_s, run_s, error)
 
 
 def processors() -> int:

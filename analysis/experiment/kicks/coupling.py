@@ -211,9 +211,8 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
     first = experiment.ratio[experiment.runs.base[0]]
     others = np.log(experiment.ratio[list(experiment.runs.base)] / first)
     base = (first * np.exp(others.mean(axis=0))).astype(np.complex128)
-    deviation = experiment.runs.deviation
     # ln a = ln c + ln H, and both of a run's phases are counted from the same instant.
-    change = deviation + np.log(experiment.ratio / base)
+    change = experiment.runs.deviation + np.log(experiment.ratio / base)
     each = [kicks.get(k) for k in used]
     answers = ResponseMatrices(
         change, experiment.log_gain_variance, experiment.lag_variance, experiment.dof

@@ -273,8 +273,7 @@ def lti_reading(
         X: ComplexArray = np.linalg.inv(H).astype(np.complex128)
         draws = noise_draws(stacked(((P,), (R,)), correlation), 11)
         noise = scale * (draws[:, : len(H)] - 1j * draws[:, len(H) :])
-        error: ComplexArray = np.linalg.inv(H + noise).astype(np.complex128) - X
-        shape = reciprocity(X, error)
+        shape = reciprocity(X, np.linalg.inv(H + noise).astype(np.complex128) - X)
     finite = condition if np.isfinite(condition) else None
     return Lti(LTI_LABEL, rows_of(H.real), rows_of(H.imag), finite, *shape)
 

@@ -82,8 +82,7 @@ def closed_loop(
         for k, rate in enumerate(modes_here.rates.tolist())
     )
     omega = 2 * math.pi * base.frequency_hz
-    spread = here - here.mean(axis=0)
-    fastest = eps * float(np.linalg.norm(spread, ord=2))
+    fastest = eps * float(np.linalg.norm(here - here.mean(axis=0), ord=2))
     relaxed = None
     if kick:
         turned = np.array([kick.get(name, 0.0) for name in coupling.joints])

@@ -144,8 +144,7 @@ def mirror_test(
     if strata is None:
         strata = np.zeros(r1, dtype=np.int64), np.zeros(r2, dtype=np.int64)
     design = Strata.of(*strata)
-    mirrored = reverse[:, ::-1]
-    both = np.concatenate([forward, mirrored])
+    both = np.concatenate([forward, reverse[:, ::-1]])
     half = m // 2
     # Contrast and common are taken run by run: both joints of a pair share what a run does to all.
     odd, even = (both - both[:, ::-1]) / 2, (both + both[:, ::-1]) / 2
@@ -317,8 +316,7 @@ class Strata:
             - runs[(self.index == s) & ~plus].mean(axis=0)
             for s in range(self.strata)
         ]
-        mean: ComplexArray = (self.weights[:, None] * np.stack(each)).sum(axis=0)
-        return mean
+        return (self.weights[:, None] * np.stack(each)).sum(axis=0)
 
     def residuals(self, runs: FloatArray) -> FloatArray:
         """Subtract the mean of each run's way in its stratum.
@@ -375,5 +373,4 @@ def family_wise_p(scores: FloatArray) -> FloatArray:
     Returns:
         Share of the labellings whose largest abs(t) reaches each observed abs(t), shape (..., c).
     """
-    largest = scores.max(axis=-1)[..., :, None]
-    return np.mean(largest >= scores[..., :1, :] * (1 - _TIE), axis=-2)
+    return np.mean(scores.max(axis=-1)[..., :, None] >= scores[..., :1, :] * (1 - _TIE), axis=-2)

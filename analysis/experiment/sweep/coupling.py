@@ -133,8 +133,7 @@ def inverse(H: MeasuredMatrix) -> ComplexArray:
     Returns:
         Shape (DRAWS, m, m).
     """
-    X = np.linalg.inv(H.value)
-    return (np.linalg.inv(H.value + H.draws) - X).astype(np.complex128)
+    return (np.linalg.inv(H.value + H.draws) - np.linalg.inv(H.value)).astype(np.complex128)
 
 
 def impedance_behind_servos(
@@ -153,8 +152,7 @@ def impedance_behind_servos(
     """
     X: ComplexArray = np.linalg.inv(H.value).astype(np.complex128)
     size = np.abs(X) ** 2
-    scale = np.abs(D_r)[:, None]
-    error = scale * np.sqrt(size @ H.error**2 @ size)
+    error = np.abs(D_r)[:, None] * np.sqrt(size @ H.error**2 @ size)
     return MeasuredMatrix(
         (D_r[:, None] * X - np.diag(D_q)).astype(np.complex128),
         error,
@@ -268,8 +266,7 @@ def sweep_coupling(
 def _tone(data: SweepData, k: int, hold_s: float, servos: Sequence[Servo] | None) -> ToneCoupling:
     omega = float(data.omega[k])
     # A command held over its period acts half of it late; the twin's steps look ahead by half one.
-    command: ComplexArray = data.command[k] * np.exp(-1j * omega * hold_s)
-    H = transfer(command, data.response[k])
+    H = transfer(data.command[k] * np.exp(-1j * omega * hold_s), data.response[k])
     condition = float(np.linalg.cond(H.value))
     regular = condition < SINGULAR
     side = None if servos is None else servo_side(servos, omega)

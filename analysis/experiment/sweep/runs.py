@@ -254,8 +254,7 @@ def sweep_data(
         commands.append(fit_tones(commanded_series, tones.omega, np.zeros(0)).amplitude)
         responses.append(fit_tones(series, tones.omega, own))
         if all(name in effort for name in sweep.names):
-            efforts = [effort[name] for name in sweep.names]
-            torques.append(fit_tones(efforts, tones.omega, own))
+            torques.append(fit_tones([effort[name] for name in sweep.names], tones.omega, own))
         periods_s.append(max(one.period_s for one in commanded_series))
         drifts.append(_drift(series, tones.omega, responses[-1], len(sweep.index)))
     touched = [None if one is None else one.contact for one in twins]
@@ -324,13 +323,11 @@ def _drift(series: Sequence[Series], omega: FloatArray, fit: ToneFit, runs: int)
     tones = omega.size
     first, second = (fit_tones(half, omega, lines).amplitude[:, :tones] for half in halves)
     change: ComplexArray = second - first
-    span = middle - float(series[0].t_s[0])
-    cycles = omega * span / (2 * np.pi)
+    cycles = omega * (middle - float(series[0].t_s[0])) / (2 * np.pi)
     size: FloatArray = np.linalg.norm(change, axis=0)
     size = size / np.linalg.norm(fit.amplitude[:, :tones], axis=0)
     # Two halves, each with twice the variance of the whole, in two parts.
-    scatter: FloatArray = np.sum(8 * fit.variance[:, :tones], axis=0)
-    ratio = np.sum(np.abs(change) ** 2, axis=0) / scatter
+    ratio = np.sum(np.abs(change) ** 2, axis=0) / np.sum(8 * fit.variance[:, :tones], axis=0)
     worst = 0.0
     for tone, per_cycle in enumerate((size / cycles).tolist()):
         dof = float(fit.dof[:, tone].sum())

@@ -98,8 +98,7 @@ def distortion(omega: float, tone: Phasors, beside: Beside) -> float:
         Root mean square of a free line, of the nearest ones, over that of the tone; noise taken
         off.
     """
-    apart: FloatArray = np.abs(beside.omega - omega)
-    nearest: list[int] = np.argsort(apart)[:_NEAREST].tolist()
+    nearest: list[int] = np.argsort(np.abs(beside.omega - omega))[:_NEAREST].tolist()
     near = _joined(tuple(beside.lines[k] for k in nearest))
     energy = float(np.sum(np.abs(near.value) ** 2 - 2 * near.variance)) / len(nearest)
     return float(np.sqrt(max(0.0, energy)) / np.linalg.norm(tone.value))
@@ -305,8 +304,7 @@ def fit_tones(series: Sequence[Series], omega: FloatArray, beside: FloatArray) -
         for tone in range(tones):
             level, bins = _level(t_s, residual, float(omega[tone]), rows, inverse)
             own = [tone, *(tones + np.flatnonzero(nearest == tone)).tolist()]
-            noise = np.maximum(level, floor)[:, None] * of_part[None, own]
-            variance[np.ix_(members, own)] = noise
+            variance[np.ix_(members, own)] = np.maximum(level, floor)[:, None] * of_part[None, own]
             dof[members, tone] = 2.0 * bins
     dof[:, tones:] = dof[:, :tones].min(axis=1, keepdims=True)
     return ToneFit(amplitude, variance, dof)

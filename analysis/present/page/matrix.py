@@ -56,8 +56,7 @@ class Entries:
             return self.ends
         size = np.nan_to_num(np.abs(self.value))
         beside = size[~np.eye(*size.shape, dtype=np.bool_)]
-        largest = float(beside.max()) if beside.size else 0.0
-        return largest or float(size.max()) or 1.0
+        return (float(beside.max()) if beside.size else 0.0) or float(size.max()) or 1.0
 
     def entry_text(self, i: int, j: int, decimals: int) -> str:
         """Return an entry as text, e.g. ``-0.21 ± 0.01``."""
@@ -308,8 +307,7 @@ def _column_names(entries: Entries, left: float, top: float, cell: float, *, sma
 
 def _tail(name: str) -> str:
     """Return the number at a name's end, or else a short form of the name."""
-    digits = name[len(name.rstrip("0123456789")) :]
-    return digits or short(name, 5)
+    return name[len(name.rstrip("0123456789")) :] or short(name, 5)
 
 
 def _color_bar(limit: float, box: _Box, unit: float) -> Markup:

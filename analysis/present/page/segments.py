@@ -244,8 +244,7 @@ def body_motion(body: BodyResult, prefix: str) -> Drawing:
             _harmonic(axes, point, cycle, color, "-")
             axes.set_title(short(f"{point.place} ({point.link})", 28))
             axes.set_xticks([0.0, 90.0, 180.0, 270.0, 360.0])
-        sideways = body.plane != "vertical"
-        grid[0, 0].set_ylabel("left of the heading [mm]" if sideways else "up [mm]")
+        grid[0, 0].set_ylabel("left of the heading [mm]" if body.plane != "vertical" else "up [mm]")
         figure.supxlabel("phase of the gait [°], zero at the head link's peak", fontsize=8.0)
         nulls = [
             key(color=REFERENCE, linestyle=style, label=short(f"perfect tracking, {name}"))
@@ -254,8 +253,7 @@ def body_motion(body: BodyResult, prefix: str) -> Drawing:
         legend(figure, key(color=colors[len(colors) // 2], label="measured, 95 %"), *nulls)
         title = f"Motion of {', '.join(p.place for p in points)} over one gait cycle"
         dashed = ". Dashed grey: the same body with every joint exactly on its command."
-        description = "; ".join(map(_point_in_words, points)) + dashed
-        svg = inline_svg(figure, prefix, title, description)
+        svg = inline_svg(figure, prefix, title, "; ".join(map(_point_in_words, points)) + dashed)
     caption = (
         "Motion of the links at the gait frequency, across the mean heading. Dashed grey is a "
         "perfect-tracking null: the same body with every joint exactly on its command. Head, "

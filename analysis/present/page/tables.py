@@ -90,8 +90,7 @@ def color_bar(
     left: float, top: float, width: float, height: float, *, signed: bool
 ) -> list[Markup]:
     """Return the rectangles of a colour scale."""
-    step = width / (LEVELS + 1)
-    sizes = {"y": top, "width": step + 0.4, "height": height}
+    sizes = {"y": top, "width": width / (LEVELS + 1) + 0.4, "height": height}
     return [
         element("rect", x=left + width * n / (LEVELS + 1), **sizes, **hue(n, signed=signed))
         for n in range(LEVELS + 1)
@@ -266,8 +265,7 @@ def key_figures(analysis: Analysis) -> list[Fact]:
     points = analysis.body.observed if analysis.body is not None else ()
     sizes = [formats.number(formats.scaled(p.amplitude_m, 1000.0).value, 0) for p in points]
     amplitude = " / ".join(sizes) + " mm" if sizes else formats.MISSING
-    places = plain(" / ".join(p.place for p in points))
-    return [*facts, Fact("Body amplitude", amplitude, places)]
+    return [*facts, Fact("Body amplitude", amplitude, plain(" / ".join(p.place for p in points)))]
 
 
 def _range(name: str, values: Sequence[tuple[float, str]], decimals: int, unit: str) -> Fact:

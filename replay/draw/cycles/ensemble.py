@@ -226,8 +226,7 @@ def body_frame(robot: Robot, angles: FloatArray) -> tuple[FloatArray, FloatArray
     known = np.isfinite(centre[..., 0])
     many = np.count_nonzero(known, axis=1)[:, None]
     middle = np.where(known[..., None], centre, 0.0).sum(axis=1) / many
-    whole = np.where(known[..., None, None], rotation, 0.0).sum(axis=1)
-    u, _, vt = np.linalg.svd(whole)
+    u, _, vt = np.linalg.svd(np.where(known[..., None, None], rotation, 0.0).sum(axis=1))
     # Det of U V^T is +1 or -1: only the former is a rotation.
     sign = np.ones((len(angles), 3))
     sign[:, 2] = np.linalg.det(u @ vt)
@@ -261,8 +260,7 @@ def _fitted(
     if model is None or series.count <= model.size + 1:
         return None
     crest = float(np.angle(fit_at([series], omega, model).fundamental[0]))
-    steps = 2 + int(cycles * PHASES)
-    at_s = np.linspace(*window, steps)
+    at_s = np.linspace(*window, 2 + int(cycles * PHASES))
     ends = omega * window[0] + crest, omega * window[1] + crest
     at_ns = start_ns + np.round(at_s * _NS).astype(np.int64)
     return Pace(at_ns, omega * at_s + crest, *window, ends, logged=False)

@@ -191,8 +191,7 @@ def _log_bar(rec: rr.RecordingStream, shown: HeatMap) -> None:
     unit = shown.table.quantity.unit
     told = [f"{end}{'' if unit == '°' else ' '}{unit}" for end in shown.ends]
     y = _BAR_TOP - 8.0
-    points = [(left - 32.0, y), (left + _BAR[0] + 32.0, y)]
-    _log_text(rec, f"{shown.entity}/ends", points, told)
+    _log_text(rec, f"{shown.entity}/ends", [(left - 32.0, y), (left + _BAR[0] + 32.0, y)], told)
 
 
 def _log_text(

@@ -194,8 +194,7 @@ def _over_time(joints: Sequence[JointOverTime]) -> list[CycleTable]:
 def _about_its_mean(lag_rad: FloatArray) -> FloatArray:
     """Lags within pi of each joint's mean direction, so that no step is a mere turn, (m, c)."""
     mean = np.angle(np.nansum(np.exp(1j * lag_rad), axis=1, keepdims=True))
-    turned: FloatArray = mean + np.angle(np.exp(1j * (lag_rad - mean)))
-    return turned
+    return mean + np.angle(np.exp(1j * (lag_rad - mean)))
 
 
 def _energy(analysis: Analysis) -> list[CycleTable]:
@@ -388,6 +387,5 @@ def bar_of(
     """
     if estimate.value is None:
         return None
-    ends = [scale * (end - baseline) for end in estimate.ci95 or ()]
-    far = max(ends, key=abs, default=None)
+    far = max([scale * (end - baseline) for end in estimate.ci95 or ()], key=abs, default=None)
     return Bar(joint, place, scale * (estimate.value - baseline), far)

@@ -70,8 +70,7 @@ def head_middle_tail(robot: Robot | None, moving: Sequence[Track]) -> Places | N
         }
         plane = max(Plane, key=lambda p: max((swing.get(n, -1.0) for n in planes[p]), default=-1.0))
         names = tuple(name for name in planes[plane] if name in swing) or tuple(swing)
-    chosen = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
-    return Places(tuple(chosen), plane)
+    return Places(tuple(dict.fromkeys((names[0], names[len(names) // 2], names[-1]))), plane)
 
 
 def places_look(places: Places, kind: str) -> dict[str, Any]:
@@ -177,8 +176,7 @@ def log_rows(
         shown = rounded(shown, steps)
     packed = shown.astype(np.float32)
     for rows, times in clock.rows(t_ns):
-        batch = Float32Batch(packed[rows].ravel())
-        column = rr.ComponentColumn(_DESCRIPTORS[component], batch)
+        column = rr.ComponentColumn(_DESCRIPTORS[component], Float32Batch(packed[rows].ravel()))
         size = np.full(rows.stop - rows.start, values.shape[1])
         rec.send_columns(entity, times, [column.partition(size)])
 
@@ -303,8 +301,7 @@ def log_lines(rec: rr.RecordingStream, clock: Clock, events: Sequence[tuple[int,
         events: When each happened [ns], and its ``rcl_interfaces/msg/Log``.
     """
     lines = [(t_ns, f"{one.name}: {one.msg}" if one.name else one.msg) for t_ns, one in events]
-    levels = [_LEVELS.get(event.level, INFO) for _, event in events]
-    log_texts(rec, clock, EVENTS, lines, levels)
+    log_texts(rec, clock, EVENTS, lines, [_LEVELS.get(event.level, INFO) for _, event in events])
 
 
 def log_texts(
