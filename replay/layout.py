@@ -111,17 +111,16 @@ def _body_view(content: Content) -> rrb.Spatial3DView | None:
         return None
     span = sum(link.length for link in robot.links) if robot is not None else 1.0
     # From behind its right shoulder and above, where the wave shows along the whole body.
-    eye = rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital,
-        position=_beside(start, (-0.92 * span, -0.55 * span, 0.65 * span)),
-        look_target=_beside(start, (-0.5 * span, 0.0, 0.0)),
-        eye_up=(0.0, 0.0, 1.0),
-        tracking_entity=body.MEASURED,
-    )
     return rrb.Spatial3DView(
         name=body_title(content),
         origin="/world",
-        eye_controls=eye,
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=_beside(start, (-0.92 * span, -0.55 * span, 0.65 * span)),
+            look_target=_beside(start, (-0.5 * span, 0.0, 0.0)),
+            eye_up=(0.0, 0.0, 1.0),
+            tracking_entity=body.MEASURED,
+        ),
         background=_BACKGROUND,
         line_grid=_grid(span),
         overrides={trail.TRAIL: trail_window()},
@@ -133,16 +132,15 @@ def _mean_scene(content: Content) -> rrb.Spatial3DView | None:
         return None
     span = sum(link.length for link in content.robot.links)
     # The frame goes along with the body: its middle stays where it is.
-    eye = rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital,
-        position=(-0.35 * span, -0.6 * span, 0.75 * span),
-        look_target=(0.0, 0.0, 0.0),
-        eye_up=(0.0, 0.0, 1.0),
-    )
     return rrb.Spatial3DView(
         name="Mean cycle: body",
         origin=mean_cycle.BODY,
-        eye_controls=eye,
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=(-0.35 * span, -0.6 * span, 0.75 * span),
+            look_target=(0.0, 0.0, 0.0),
+            eye_up=(0.0, 0.0, 1.0),
+        ),
         background=_BACKGROUND,
         line_grid=_grid(span),
     )

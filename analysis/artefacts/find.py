@@ -445,8 +445,7 @@ def _at_limits(joint: _Joint) -> _Found:
         ]
     for quantity, most, note in sizes:
         if quantity in joint.series:
-            slack = (1 - AT_LIMIT) * most
-            if spans := saturated(joint.series[quantity], -most, most, slack):
+            if spans := saturated(joint.series[quantity], -most, most, (1 - AT_LIMIT) * most):
                 yield quantity, "saturated", spans, note
 
 

@@ -269,10 +269,9 @@ class Catalog:
 
     def _listed(self) -> list[StoredFile]:
         """Sessions and files that may hold results."""
-        found = self._store.files("", [".mcap", ".json", ".parquet"], recursive=True)
         return [
             file
-            for file in found
+            for file in self._store.files("", [".mcap", ".json", ".parquet"], recursive=True)
             for path in [PurePosixPath(file.name)]
             if FOLDER not in path.parts
             and not (path.suffix == ".json" and path.parent.name in ("pending", "settings"))

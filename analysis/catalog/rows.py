@@ -186,7 +186,7 @@ def result_rows(result: Mapping[str, Any]) -> tuple[Row, list[Row]]:
     if result.get("energy") is not None:
         transport = result["energy"]["transport"]
         analysis |= {"distance_m": transport["distance_m"], "cost_of_transport": transport["abs"]}
-    joints = [
+    return analysis, [
         window
         | {"joint": joint["name"], "plane": joint["plane"], "position": position}
         | {name: joint[name] for name in ("frequency_hz", *_JOINT_NUMBERS)}
@@ -195,7 +195,6 @@ def result_rows(result: Mapping[str, Any]) -> tuple[Row, list[Row]]:
         | _estimate("lag_rad", joint["lag_rad"], joint["lag_ci95"])
         for position, joint in enumerate(result["joints"])
     ]
-    return analysis, joints
 
 
 def _estimate(name: str, value: float | None, ci95: Sequence[float] | None) -> Row:
@@ -224,7 +223,7 @@ def sweep_rows(row: Mapping[str, Any]) -> tuple[Row, list[Row]] | None:
         for name in (*_JOINT_NUMBERS, *_with_interval("gain", "lag_rad"))
         if isinstance(row.get(name), list)
     ]
-    joints = [
+    return analysis, [
         {
             "session_id": row["session_id"],
             "joint": joint,
@@ -234,7 +233,6 @@ def sweep_rows(row: Mapping[str, Any]) -> tuple[Row, list[Row]] | None:
         }
         for position, joint in enumerate(names)
     ]
-    return analysis, joints
 
 
 _MEMORY = "800MB"

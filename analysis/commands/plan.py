@@ -312,13 +312,11 @@ def settling(base: BaseGait, session: SessionView) -> tuple[float, dict[str, str
     if robot is None:
         return _LEAST_SETTLE_S, {}
     mode = slowest_mode(robot, [base.names[k] for k in base.driven])
-    needed_s = RAMP_S + math.ceil(TIME_CONSTANTS * mode.time_constant_s)
-    facts = {
+    return max(_LEAST_SETTLE_S, RAMP_S + math.ceil(TIME_CONSTANTS * mode.time_constant_s)), {
         "mode_hz": f"{mode.frequency_hz:.4g}",
         "mode_damping": f"{mode.damping:.4g}",
         "mode_tau_s": f"{mode.time_constant_s:.4g}",
     }
-    return max(_LEAST_SETTLE_S, needed_s), facts
 
 
 def check_servos(base: BaseGait, runs: tuple[PlannedRun, ...], session: SessionView) -> None:

@@ -322,8 +322,7 @@ def _errors(
     mean, common = design.mean(axis=1), residual.mean(axis=0)
     segment = np.arange(samples, dtype=np.int64) * _SEGMENTS // samples
     parts = [mean[:, segment == s] for s in range(_SEGMENTS)]
-    repeated = _repeated(residual)
-    spread += repeated * _jackknife(
+    spread += _repeated(residual) * _jackknife(
         np.stack([part @ part.T for part in parts]),
         np.stack([part @ common[segment == s] for s, part in enumerate(parts)]),
     )

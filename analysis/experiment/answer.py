@@ -85,12 +85,11 @@ def _linear(coupling: LocalCoupling) -> str | None:
 
 
 def _rows_that_fail(coupling: LocalCoupling) -> str:
-    parts = (("P", 1, coupling.phase_rows), ("R", 0, coupling.gain_rows))
     off = {
         f"rows of {symbol} don't sum to {total}": max(
             _off(row) / max(row.standard_error, 1e-12) for row in rows
         )
-        for symbol, total, rows in parts
+        for symbol, total, rows in (("P", 1, coupling.phase_rows), ("R", 0, coupling.gain_rows))
     }
     return max(off, key=lambda text: off[text])
 

@@ -174,15 +174,13 @@ def _linear(
     variance = variance + model.error_at(x) ** 2
     x = _fitted(y, variance, joints, model, own)
     weight, prior = 1 / np.sqrt(variance), _root(model)
-    slope = model.at(x)[1][:, joints]
-    system = _System(
-        shared=np.concatenate([weight[:, None] * parts(slope).T, prior]),
+    return x, _System(
+        shared=np.concatenate([weight[:, None] * parts(model.at(x)[1][:, joints]).T, prior]),
         modules=np.concatenate(
             [weight[:, None, None] * columns, np.zeros((x.size, *columns.shape[1:]))]
         ),
         rest=np.concatenate([weight * _residual(y, joints, model, x), -prior @ x]),
     )
-    return x, system
 
 
 def _root(model: NullModel) -> FloatArray:
@@ -369,25 +367,24 @@ def _result(test: NullTest, model: NullModel, file: Path) -> NullModelResult:
     named = [model.joints[j] for j in test.named]
     p = float(test.p[test.named[0]] if test.named else test.p.min())
     reach = t_factor(np.inf) * test.x_error
-    parameters = tuple(
-        SharedEstimate(
-            name=one.name,
-            unit=one.unit,
-            assumed=one.value,
-            fitted=Estimate(
-                one.value * float(np.exp(x)),
-                (one.value * float(np.exp(x - r)), one.value * float(np.exp(x + r))),
-            ),
-            within=bool(abs(x) <= one.reach),
-        )
-        for one, x, r in zip(model.parameters, test.x, reach, strict=True)
-    )
     return NullModelResult(
         answer=null_answer(modules, named, p, test.fit_p),
         condition=f"conditional on the model {file.name}",
         file=str(file),
         made_by=model.made_by,
-        parameters=parameters,
+        parameters=tuple(
+            SharedEstimate(
+                name=one.name,
+                unit=one.unit,
+                assumed=one.value,
+                fitted=Estimate(
+                    one.value * float(np.exp(x)),
+                    (one.value * float(np.exp(x - r)), one.value * float(np.exp(x + r))),
+                ),
+                within=bool(abs(x) <= one.reach),
+            )
+            for one, x, r in zip(model.parameters, test.x, reach, strict=True)
+        ),
         fit=test.fit,
         fit_p=test.fit_p,
         p=p,
@@ -400,10 +397,9 @@ def _result(test: NullTest, model: NullModel, file: Path) -> NullModelResult:
 
 def _provenance(analysis: Analysis, file: Path) -> Provenance:
     own = analysis.provenance
-    digest = hashlib.sha256(file.read_bytes()).hexdigest()
     return dataclasses.replace(
         own,
         command=f"{own.command} {shlex.join(['--null', str(file)])}",
-        inputs={**own.inputs, str(file): digest},
+        inputs={**own.inputs, str(file): hashlib.sha256(file.read_bytes()).hexdigest()},
         options={**own.options, "null": str(file), "draws": DRAWS},
     )

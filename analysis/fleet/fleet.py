@@ -333,17 +333,15 @@ def _trends(sessions: _Frame) -> list[Trend]:
             continue
         tau: Any = stats.kendalltau(days[known], values[known])
         slope: Any = stats.theilslopes(values[known], days[known], alpha=0.95)
-        ends = (float(slope.low_slope), float(slope.high_slope))
-        count = int(np.count_nonzero(known))
         found.append(
             Trend(
                 name,
                 "date",
                 float(slope.slope),
-                ends,
+                (float(slope.low_slope), float(slope.high_slope)),
                 float(tau.statistic),
                 float(tau.pvalue),
-                count,
+                int(np.count_nonzero(known)),
             )
         )
     corrected, trends = 0.0, list[Trend]()

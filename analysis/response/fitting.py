@@ -279,12 +279,11 @@ def _pick(noise: Noise, index: np.ndarray[tuple[int], np.dtype[np.int64]]) -> No
 
 def _warn_undriven(*, held: list[str], astray: list[str], unusable: list[str], warn: Warn) -> None:
     """Say once why joints have no gain and lag."""
-    reasons = (
+    for joints, why in (
         (held, "held still by the command"),
         (astray, "commanded something else than the common rhythm"),
         (unusable, "commanded too seldom or too briefly"),
-    )
-    for joints, why in reasons:
+    ):
         if joints:
             count = f"{len(joints)} joints are" if len(joints) > 1 else "1 joint is"
             told = f"{count} {why}, gain and lag are null: {', '.join(joints)}"

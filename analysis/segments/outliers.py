@@ -94,10 +94,9 @@ def standing_out(profile: Profile, critical: float) -> list[Deviation]:
     Returns:
         Their deviations from the prediction of the rest, the largest first.
     """
-    searches = (_trimmed(profile, critical), _grown(profile, critical))
     trimmed, grown = (
         [one for joint in state.outside if (one := _kept(profile, state, joint, critical))]
-        for state in searches
+        for state in (_trimmed(profile, critical), _grown(profile, critical))
     )
     # Two that stand out hide each other from the one search, a profile its joints from the other.
     # Where both agree, the shapes that the data ask for predict more closely than a parabola.

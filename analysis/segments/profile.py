@@ -81,9 +81,8 @@ def scatter_of(errors: ResponseErrors) -> tuple[Scatter, Scatter]:
         near the gait frequency the noise of both is the same.
     """
     columns = np.concatenate([errors.bins.real, errors.bins.imag], axis=1)
-    nothing = np.zeros_like(errors.turn)
     return (
-        Scatter(columns, errors.rounding[:, 0, 0], nothing),
+        Scatter(columns, errors.rounding[:, 0, 0], np.zeros_like(errors.turn)),
         Scatter(columns, errors.rounding[:, 1, 1], errors.turn),
     )
 

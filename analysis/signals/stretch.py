@@ -244,11 +244,10 @@ def _in_motion(
 
 def _warn_soft(motion: tuple[float, float], steady: tuple[float, float], warn: Warn) -> None:
     """Report what is left out by the amplitude of the commands."""
-    ends = (
+    for kind, when, left_s, option in (
         ("start", "before", steady[0] - motion[0], "--start"),
         ("stop", "after", motion[1] - steady[1], "--stop"),
-    )
-    for kind, when, left_s, option in ends:
+    ):
         if left_s > 0:
             warn(
                 f"soft {kind}: {left_s:.1f} s {when} the commands have their steady amplitude are "

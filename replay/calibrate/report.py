@@ -83,12 +83,11 @@ def scenario_text(calibration: Calibration, robot_file: Path, scenario_file: Pat
         for joint in scenario.robot.joints
         if joint.name in modules
     }
-    named = dataclasses.replace(
+    return dataclasses.replace(
         scenario,
         robot_name=os.path.relpath(robot_file, scenario_file.parent),
         modules=Modules({}, own, scenario.modules.link_of),
-    )
-    return named.toml()
+    ).toml()
 
 
 def write_calibration(

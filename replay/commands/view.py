@@ -200,14 +200,13 @@ def _view_live(
 def _report_live(report: RelayReport, save: Path | None, *, json: bool) -> None:
     lag = report.lag_s
     if json:
-        names = ("p50", "p99", "max")
         facts = {
             "path": None if save is None else str(save),
             "sessions": list(report.sessions),
             "shown": report.shown,
             "dropped": report.dropped,
             "unread": report.unread,
-            "lag_s": None if lag is None else dict(zip(names, lag, strict=True)),
+            "lag_s": None if lag is None else dict(zip(("p50", "p99", "max"), lag, strict=True)),
         }
         emit_json(facts)
         return

@@ -360,8 +360,7 @@ def placement_text(placed: Placement, name: str, first: str) -> str:
     Returns:
         One sentence without its full stop.
     """
-    step = math.hypot(placed.x, placed.y)
-    if step < _SAME_M and abs(placed.turn) < _SAME_RAD:
+    if math.hypot(placed.x, placed.y) < _SAME_M and abs(placed.turn) < _SAME_RAD:
         return f"{name} starts where {first} does"
     return (
         f"{name} is drawn where {first} starts: turned by {math.degrees(placed.turn):.1f}° about "

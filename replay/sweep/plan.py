@@ -123,8 +123,7 @@ class SweepPlan:
         """Yield keys that don't fit together, and what would be valid."""
         if (self.points is None) != (self.design is Design.GRID):
             yield "points", "a number for the designs random and sobol, none for grid"
-        keys = {one.key for one in self.parameters}
-        if self.duration_s is not None and "duration_s" in keys:
+        if self.duration_s is not None and "duration_s" in {one.key for one in self.parameters}:
             yield "duration_s", "left out, since it is a parameter"
         ranges = [one.key for one in self.parameters if not one.values]
         if self.design is Design.GRID and ranges:

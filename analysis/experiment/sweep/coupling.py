@@ -117,11 +117,10 @@ def impedance(response: Phasors, torque: Phasors) -> MeasuredMatrix:
     parts = np.stack([torque.variance, through])
     # A joint's torque with its own few bins, the responses together with no fewer than the least.
     least = np.broadcast_to(response.dof.min(axis=0), torque.dof.shape)
-    dof = welch_satterthwaite(parts, np.stack([torque.dof, least]))
     return MeasuredMatrix(
         Z,
         np.sqrt(variance @ power),
-        _dof(variance, dof, power),
+        _dof(variance, welch_satterthwaite(parts, np.stack([torque.dof, least])), power),
         float(np.linalg.cond(response.value)),
         (torque.draws(22) - Z @ response.draws(23)) @ weights,
     )
@@ -244,11 +243,10 @@ def sweep_coupling(
     if data.beside is not None:
         beside = sideband_energy(data.response, data.beside)
     _warn(data, beside, tones, warn)
-    first = np.array(tones[0].H.real) + 1j * np.array(tones[0].H.imag)
     return LinearCoupling(
         identifiable=True,
         why=f"{len(sweep.index)} runs of a {plan}: H = Y C^-1",
-        matrix=rows_of(np.abs(first)),
+        matrix=rows_of(np.abs(np.array(tones[0].H.real) + 1j * np.array(tones[0].H.imag))),
         condition_number=tones[0].condition_number,
         plan=plan,
         joints=sweep.names,

@@ -117,8 +117,7 @@ def command_tones(
     gait, robot = examined.gait, examined.analysis.session.robot
     if gait is not None and gait.driven and not gait.others:
         m = len(gait.driven)
-        left = float(gait.fit.rss[:m].sum() / gait.fit.total[:m].sum())
-        if left < _PURE:
+        if float(gait.fit.rss[:m].sum() / gait.fit.total[:m].sum()) < _PURE:
             omega = np.array([gait.fit.omega])
             return CommandTones(gait.driven, robot, omega, gait.fit.fundamental[:m, None])
     commands = [one for one in read_signals(session, options)[0].values() if one.count > 64]

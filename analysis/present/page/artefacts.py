@@ -245,9 +245,8 @@ def times_text(spans: tuple[Span, ...]) -> str:
 def _row(same: Sequence[Artefact], analysis: Analysis) -> ArtefactRow:
     one = same[0]
     about, text = KINDS[one.flag]
-    names = [plain(each.joint) for each in same]
     return ArtefactRow(
-        joints=_named(names, len(analysis.joints)),
+        joints=_named([plain(each.joint) for each in same], len(analysis.joints)),
         where=f"{one.quantity} on {one.topic}" if one.topic else one.quantity,
         flag=one.flag,
         meaning=f"values {text}" + (f"; {one.note}" if one.note else ""),

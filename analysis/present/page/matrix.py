@@ -98,12 +98,6 @@ def entries_of(coupling: Coupling, names: tuple[str, ...]) -> tuple[Entries, ...
     """
     if isinstance(coupling, LocalCoupling):
         amplitude = "log amplitude"
-        known = (
-            ("P", "phase", "phase", coupling.P),
-            ("R", amplitude, "phase", coupling.R),
-            ("G", amplitude, amplitude, coupling.G),
-            ("S", "phase", amplitude, coupling.S),
-        )
         return tuple(
             _entries(
                 symbol,
@@ -112,7 +106,12 @@ def entries_of(coupling: Coupling, names: tuple[str, ...]) -> tuple[Entries, ...
                 matrix.value,
                 matrix.ci95_half,
             )
-            for symbol, what, of, matrix in known
+            for symbol, what, of, matrix in (
+                ("P", "phase", "phase", coupling.P),
+                ("R", amplitude, "phase", coupling.R),
+                ("G", amplitude, amplitude, coupling.G),
+                ("S", "phase", amplitude, coupling.S),
+            )
             if matrix is not None
         )
     if isinstance(coupling, LinearCoupling):
@@ -313,14 +312,13 @@ def _tail(name: str) -> str:
 def _color_bar(limit: float, box: _Box, unit: float) -> Markup:
     left, top, width = box
     digits = decimals_for_values([limit], 2)
-    ends = (
-        (number(-limit, digits), left, "start"),
-        ("0", left + width / 2, "middle"),
-        (number(limit, digits), left + width, "end"),
-    )
     ticks = [
         element("text", text, x=x, y=top + 20 * unit, text_anchor=anchor, class_="name")
-        for text, x, anchor in ends
+        for text, x, anchor in (
+            (number(-limit, digits), left, "start"),
+            ("0", left + width / 2, "middle"),
+            (number(limit, digits), left + width, "end"),
+        )
     ]
     return element("g", *color_bar(left, top, width, 9 * unit, signed=True), *ticks)
 

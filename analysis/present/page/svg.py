@@ -227,8 +227,7 @@ def _plain_text_style(text: ET.Element) -> None:
             text.set(attribute, found[1])
     fill = _FILL.search(style)
     text.set("style", f"fill: {fill[1] if fill is not None else INK}")
-    transform = text.get("transform", "")
-    if transform.startswith("rotate(-0 "):
+    if text.get("transform", "").startswith("rotate(-0 "):
         del text.attrib["transform"]
 
 

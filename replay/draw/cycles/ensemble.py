@@ -74,13 +74,12 @@ class Pace:
             return self
         stop_ns = start_ns + round(stop_s * _NS)
         j = int(np.searchsorted(self.t_ns, stop_ns)) + 1
-        end = float(np.interp(stop_ns, self.t_ns, self.phase_rad))
         return replace(
             self,
             t_ns=self.t_ns[:j],
             phase_rad=self.phase_rad[:j],
             stop_s=stop_s,
-            ends_rad=(self.ends_rad[0], end),
+            ends_rad=(self.ends_rad[0], float(np.interp(stop_ns, self.t_ns, self.phase_rad))),
         )
 
 

@@ -230,7 +230,6 @@ class Plot:
             values[:, [one.names.index(name) for name in table.names]] = table.values
             t_ns, values = mark_gaps(table.t_ns, values, span.known_ns)
             rows = span.rows(t_ns)
-            steps: FloatArray = np.array([self._steps.get(name, 0.0) for name in one.names])
             log_rows(
                 rec,
                 clock,
@@ -239,7 +238,7 @@ class Plot:
                 values[rows],
                 degrees=self._degrees,
                 component=one.component,
-                steps=steps,
+                steps=np.array([self._steps.get(name, 0.0) for name in one.names]),
             )
 
 
