@@ -444,9 +444,10 @@ def _at_limits(joint: _Joint) -> _Found:
             ("voltage", limits.voltage, "voltage"),
         ]
     for quantity, most, note in sizes:
-        if quantity in joint.series:
-            if spans := saturated(joint.series[quantity], -most, most, (1 - AT_LIMIT) * most):
-                yield quantity, "saturated", spans, note
+        slack = (1 - AT_LIMIT) * most
+        one = joint.series.get(quantity)
+        if one is not None and (spans := saturated(one, -most, most, slack)):
+            yield quantity, "saturated", spans, note
 
 
 def _of_record(quantity: str, joint: _Joint, origin_ns: int) -> _Found:

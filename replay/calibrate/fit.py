@@ -101,10 +101,6 @@ def find_weak_module(
     return Search(best, p, len(joints)), fitted
 
 
-SPREAD = 0.5
-WITHIN = 0.05
-
-
 @dataclass(frozen=True)
 class Wanted:
     """What is to be fitted.
@@ -122,8 +118,8 @@ class Wanted:
     module: str | None = None
     search: bool = False
     delay: bool = False
-    spread: float = SPREAD
-    within: float = WITHIN
+    spread: float = 0.5
+    within: float = 0.05
     settle_s: float | None = None
 
 
@@ -199,7 +195,7 @@ def calibrate(
         wanted: What is to be fitted.
         kernels: What computes the force laws.
         on_tick: Called at every tick of every run; may raise to end the fit.
-        on_iteration: Told each iteration, the residuals' RMS [rad] and the real-time factor.
+        on_iteration: Called with each iteration, the residuals' RMS [rad] and the real-time factor.
 
     Raises:
         UsageError: If no world is known, or what is wanted isn't there.

@@ -101,11 +101,8 @@ def ridges(unknowns: Sequence[Unknown], covariance: FloatArray) -> tuple[Correla
         way = vectors[:, k] * spread
         way = way * np.sign(way[np.argmax(np.abs(way))])
         order: list[int] = np.argsort(-np.abs(way)).tolist()
-        moved = [i for i in order if abs(way[i]) > _MOVED]
-        factors = {
-            unknowns[i].label: unknowns[i].value(float(way[i])) / (unknowns[i].start or 1.0)
-            for i in moved
-        }
+        moved = [(unknowns[i], float(way[i])) for i in order if abs(way[i]) > _MOVED]
+        factors = {one.label: one.value(size) / (one.start or 1.0) for one, size in moved}
         found.append(CorrelatedParameters(left, factors))
     return tuple(found)
 

@@ -138,8 +138,7 @@ class LackOfFit:
         if self.unfitted is not None:
             checks.append(self.unfitted.p)
         for laws in (True, False):
-            others = [one.p for one in self.alternatives if one.widens is laws]
-            if others:
+            if others := [one.p for one in self.alternatives if one.widens is laws]:
                 checks.append(len(others) * min(others))
         return min(1.0, len(checks) * min(checks))
 
@@ -151,9 +150,8 @@ class LackOfFit:
     @property
     def worst(self) -> str:
         """The joint that fits worst."""
-        return min(
-            self.joints, key=lambda j: (self.joints[j].p, -(self.joints[j].periodic_rad or 0.0))
-        )
+        joints = self.joints
+        return min(joints, key=lambda j: (joints[j].p, -(joints[j].periodic_rad or 0.0)))
 
 
 def lack_of_fit(
@@ -173,9 +171,8 @@ def lack_of_fit(
         others: From :func:`.replay.calibrate.identifiability.alternatives`.
     """
     found: dict[str, JointFit] = {}
-    for joint, t, angle, rest in zip(
-        measured.joints, measured.times_s, measured.angles, residuals, strict=True
-    ):
+    rows = zip(measured.joints, measured.times_s, measured.angles, residuals, strict=True)
+    for joint, t, angle, rest in rows:
         if omega is not None and float(t[-1] - t[0]) * omega / (2 * np.pi) >= FEWEST_CYCLES:
             found[joint] = periodic(t, rest, omega, step_of(angle))
         else:

@@ -146,9 +146,7 @@ def _summary(again: ReproducedRun) -> Iterator[str]:
 
 def _same(same: LogDifference) -> Iterator[str]:
     if same.exact:
-        yield (
-            f"The same to the last bit: all {same.messages} messages on {len(same.same)} topics."
-        )
+        yield f"The same to the last bit: all {same.messages} messages on {len(same.same)} topics."
         return
     if same.differs_s:
         first = sorted(same.differs_s.items(), key=lambda item: item[1])

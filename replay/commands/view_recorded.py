@@ -82,12 +82,8 @@ class SingleOptions(_Options):
         names = dict(zip((_COMMANDS, _STATES), self.topics, strict=True))
         if all(usual == topic for usual, topic in names.items()):
             return session
-        given = {
-            usual: topic
-            for usual, topic in names.items()
-            if topic != usual or topic in session.channels
-        }
-        return session.view(rename=given)
+        known = session.channels
+        return session.view(rename={a: b for a, b in names.items() if a != b or b in known})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,17 +173,15 @@ def _shot(options: ClipOptions, duration_s: float, file: Path) -> Shot:
     end_s = duration_s if options.end is None else options.end
     if end_s > duration_s:
         raise UsageError(f"--to {end_s:g}: {file.name} ends at {duration_s:.3f} s")
-    size = None if options.size is None else _size(options.size)
-    given = {"fps": options.fps, "speed": options.speed, "size": size}
-    chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    given: dict[str, Any] = {"fps": options.fps, "speed": options.speed}
+    chosen = {name: value for name, value in given.items() if value is not None}
+    if options.size is not None:
+        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", options.size)
+        if match is None:
+            text = "expected WIDTHxHEIGHT in pixels, e.g. 960x540"
+            raise UsageError(f"--size {options.size}: {text}")
+        chosen["size"] = int(match[1]), int(match[2])
     return Shot(options.start or 0.0, end_s, **chosen)
-
-
-def _size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
-    if match is None:
-        raise UsageError(f"--size {text}: expected WIDTHxHEIGHT in pixels, e.g. 960x540")
-    return int(match[1]), int(match[2])
 
 
 def _report_clip(clip: Path, shot: Shot, frames: int, recording: Recording, *, json: bool) -> None:

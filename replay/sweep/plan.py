@@ -130,18 +130,6 @@ class SweepPlan:
             yield "design", f"random or sobol, since {ranges[0]} has a range instead of values"
 
 
-@dataclass(frozen=True)
-class PlannedRun:
-    """One run of a sweep.
-
-    Attributes:
-        changes: Key to value of its point in the design.
-    """
-
-    changes: dict[str, Any]
-    seed: int
-
-
 def read_plan(path: Path) -> SweepPlan:
     """Read a plan.
 
@@ -210,10 +198,8 @@ def points_of(plan: SweepPlan) -> list[dict[str, Any]]:
     """
     keys = [one.key for one in plan.parameters]
     if plan.design is Design.GRID:
-        return [
-            dict(zip(keys, values, strict=True))
-            for values in itertools.product(*(one.values for one in plan.parameters))
-        ]
+        every = itertools.product(*(one.values for one in plan.parameters))
+        return [dict(zip(keys, values, strict=True)) for values in every]
     count = plan.points or 0
     if plan.design is Design.SOBOL:
         from scipy.stats.qmc import Sobol
@@ -228,9 +214,7 @@ def points_of(plan: SweepPlan) -> list[dict[str, Any]]:
     ]
 
 
-def runs_of(plan: SweepPlan) -> Iterator[PlannedRun]:
-    """Yield the runs of a plan: each point with each seed."""
+def runs_of(plan: SweepPlan) -> Iterator[tuple[dict[str, Any], int]]:
+    """Yield the runs of a plan: the changes of each point with each seed."""
     seeds = range(plan.first_seed, plan.first_seed + plan.seeds)
-    for changes in points_of(plan):
-        for seed in seeds:
-            yield PlannedRun(changes, seed)
+    yield from itertools.product(points_of(plan), seeds)

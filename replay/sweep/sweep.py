@@ -136,6 +136,7 @@ def prepare(plan: SweepPlan, folder: Path, output: str) -> PreparedSweep:
     """
     beside = folder / plan.scenario
     found = scenario_text(beside if beside.is_file() else plan.scenario)
+    address = output if "://" in output else str(Path(output).resolve())
     setting = Setting(
         scenario=found.text,
         name=found.source.name,
@@ -144,7 +145,7 @@ def prepare(plan: SweepPlan, folder: Path, output: str) -> PreparedSweep:
         kernels=plan.kernels,
         options=plan.analysis,
         software=software(),
-        sessions=_address(output) if plan.sessions else None,
+        sessions=address if plan.sessions else None,
     )
     points, simulated_s = points_of(plan), 0.0
     for changes in (points[-1], points[0]):
@@ -152,9 +153,9 @@ def prepare(plan: SweepPlan, folder: Path, output: str) -> PreparedSweep:
         options_of(setting, changes)
     digest = digest_of(setting.facts())
     jobs = {
-        key: Job(key, run.changes, run.seed)
-        for run in runs_of(plan)
-        for key in [run_key(digest, run.changes, run.seed)]
+        key: Job(key, changes, seed)
+        for changes, seed in runs_of(plan)
+        for key in [run_key(digest, changes, seed)]
     }
     return PreparedSweep(plan, len(points), setting, digest, tuple(jobs.values()), simulated_s)
 
@@ -246,23 +247,17 @@ def _missing(sweep: PreparedSweep, there: Mapping[str, Row], *, retry: bool) -> 
     return [job for job in sweep.jobs if missing(job)]
 
 
-def _address(output: str) -> str:
-    return output if "://" in output else str(Path(output).resolve())
-
-
 def _robots(plan: SweepPlan, scenario: str, folder: Path) -> dict[str, RobotText]:
     """Read the robots that the scenario or a parameter names; a wrong name is found later."""
     names: list[Any] = []
     with suppress(ValueError):
         names.append(read_toml(scenario).get("robot"))
-    for one in plan.parameters:
-        if one.key == "robot":
-            names += one.values
+    names += [value for one in plan.parameters if one.key == "robot" for value in one.values]
     found: dict[str, RobotText] = {}
     for name in map(str, names):
-        path = folder / name
-        if name in robot_names() or path.is_file():
-            robot = load_robot(name if name in robot_names() else path)
+        shipped = name in robot_names()
+        if shipped or (folder / name).is_file():
+            robot = load_robot(name if shipped else folder / name)
             found[name] = RobotText(robot.toml, dict(robot.databases))
     return found
 
@@ -287,11 +282,9 @@ def _one_thread_each() -> Generator[None]:
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in _THREADS:
+            del os.environ[name]
+        os.environ.update((name, value) for name, value in before.items() if value is not None)
 
 
 def _begin_worker() -> None:

@@ -115,11 +115,11 @@ def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
         )
         description = "Joints: " + ", ".join(short(one.name) for one, _ in shown) + "."
         svg = inline_svg(figure, prefix, "Mean cycles by gait phase", description)
-    caption = (
+    return Drawing(
+        svg,
         "Mean cycle of the joints that differ most, by the phase of the commands: A in grey, B in "
-        "the joint's colour, and their difference with its 95 % interval at each phase."
+        "the joint's colour, and their difference with its 95 % interval at each phase.",
     )
-    return Drawing(svg, caption)
 
 
 _VERDICTS = {

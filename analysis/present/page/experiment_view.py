@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -109,9 +110,6 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
     names = tuple(name for name in dict.fromkeys(j.name for j in joints) if name in known)
     entries = entries_of(coupling, names)
     trials = experiment_trials(experiment)
-    mirror = None
-    if reversal is not None:
-        mirror = mirror_profile(profiles(experiment, reversal), reversal, "mirror-figure")
     if isinstance(coupling, LinearCoupling):
         trials += _sweep_trials(coupling)
     return {
@@ -122,13 +120,15 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
         "detail": [] if reversal is None else list(reversal_detail(reversal)),
         "facts": _facts(experiment),
         "answers": [one.answer.sentence for one in experiment.sessions],
-        "mirror": mirror,
+        "mirror": None
+        if reversal is None
+        else mirror_profile(profiles(experiment, reversal), reversal, "mirror-figure"),
         "entries": entries,
         "matrices": [
             matrix_picture(one, f"matrix-{k + 1}", small=k > 0) for k, one in enumerate(entries)
         ],
         "told": _checks(coupling),
-        "modes": None if body is None else modes_drawing(body, "modes-figure"),
+        "modes": None if body is None else modes_drawing(body),
         "body_facts": [] if body is None else body_facts(body),
         "entrainment": None if body is None else entrainment_entries(body),
         "trials": trials,
@@ -193,10 +193,7 @@ def _flagged(experiment: Experiment) -> list[tuple[str, str]]:
 
 def _facts(experiment: Experiment) -> list[Fact]:
     runs = experiment.runs
-    roles: dict[str, int] = {}
-    for run in runs:
-        word = run.role or "left out"
-        roles[word] = roles.get(word, 0) + 1
+    roles = Counter(run.role or "left out" for run in runs)
     counts = ", ".join(f"{count} {word}" for word, count in roles.items())
     facts = [Fact("Sessions", str(len(runs)), counts)]
     frequencies = [v for s in experiment.sessions if (v := s.gait.frequency_hz.value) is not None]
@@ -315,13 +312,13 @@ def mirror_profile(seen: Profiles, reversal: Reversal, prefix: str) -> Drawing:
         )
         title = "Gain and lag of both directions, and their differences"
         svg = inline_svg(figure, prefix, title, _mirror_in_words(reversal), tooltips)
-    caption = (
+    return Drawing(
+        svg,
         "Identical modules mirror: the profile with the wave from tail to head, read from tail to "
         "head, lies on the other one, whatever the free ends do to both. The intervals of the "
         "differences hold all together at 95 %: a pair differs where its interval leaves out zero. "
-        "The name of a weak module stands at its difference."
+        "The name of a weak module stands at its difference.",
     )
-    return Drawing(svg, caption)
 
 
 def _profile(axes: Axes, one: FloatArray, other: FloatArray, colors: Sequence[str]) -> None:
@@ -353,10 +350,11 @@ def _differences(
         if value.value is None or value.ci95 is None:
             continue
         size, edge = (5.2, 0.9) if leaves_out_zero(value.ci95) else (3.6, 0.4)
-        gid = f"{what}-{k}"
-        style: dict[str, Any] = {"markersize": size, "markeredgewidth": edge, "gid": gid}
-        plot_estimate(axes, k + 1, value, color, bar=2.2, **style)
-        tooltips[gid] = f"{joint.name} against {joint.mirror}: {what} {estimate(value, unit)}"
+        style: dict[str, Any] = {"markersize": size, "markeredgewidth": edge}
+        plot_estimate(axes, k + 1, value, color, bar=2.2, gid=f"{what}-{k}", **style)
+        tooltips[f"{what}-{k}"] = (
+            f"{joint.name} against {joint.mirror}: {what} {estimate(value, unit)}"
+        )
         if joint.name in named:
             above = value.value > 0
             axes.annotate(
@@ -385,9 +383,8 @@ def body_facts(body: BodyOscillators) -> list[Fact]:
     slowest = formats.estimate(body.slowest, " eps", most=4)
     strong = f"{formats.number(body.strong.value, 0)} of {len(body.modes)}"
     growth = formats.estimate(body.growth, " eps")
-    explicit = "none is enough"
-    if body.explicit_coupling.value is not None:
-        explicit = formats.estimate(body.explicit_coupling, " eps")
+    lifts = body.explicit_coupling
+    explicit = "none is enough" if lifts.value is None else formats.estimate(lifts, " eps")
     return [
         Fact("Slowest pattern", slowest, "negative: grows"),
         Fact("Strong patterns", strong, f"relax faster than {bound}"),
@@ -396,12 +393,11 @@ def body_facts(body: BodyOscillators) -> list[Fact]:
     ]
 
 
-def modes_drawing(body: BodyOscillators, prefix: str) -> Drawing:
+def modes_drawing(body: BodyOscillators) -> Drawing:
     """Draw the rates at which patterns of phases relax, and those of a homogeneous chain.
 
     Args:
         body: With at least one mode.
-        prefix: For identifiers, unique in the page.
     """
     count = len(body.modes)
     tooltips: dict[str, str] = {}
@@ -429,13 +425,13 @@ def modes_drawing(body: BodyOscillators, prefix: str) -> Drawing:
         )
         title = "Rates at which patterns of phases relax through the body"
         description = f"{count} patterns; the table below holds every number."
-        svg = inline_svg(figure, prefix, title, description, tooltips)
-    caption = (
+        svg = inline_svg(figure, "modes-figure", title, description, tooltips)
+    return Drawing(
+        svg,
         "What oscillators that feel their own servos would do without any other coupling, eps the "
         "strength of that feeling: a pattern above zero relaxes, below zero it grows. All phases "
-        "together are left out: they neither relax nor grow."
+        "together are left out: they neither relax nor grow.",
     )
-    return Drawing(svg, caption)
 
 
 def entrainment_entries(body: BodyOscillators) -> Entries | None:

@@ -61,12 +61,8 @@ class Map:
         return low - short_by, high + short_by
 
 
-def cycle_drawings(cycles: CycleMaps, prefix: str) -> tuple[Drawing, ...]:
-    """Draw gain, lag and power, as far as any cycle has them.
-
-    Args:
-        prefix: For identifiers, unique in the page.
-    """
+def cycle_drawings(cycles: CycleMaps) -> tuple[Drawing, ...]:
+    """Draw gain, lag and power, as far as any cycle has them."""
     shown = (
         ("Gain", cycles.driven, cycles.gain, False, 0.02),
         ("Lag [°]", cycles.driven, np.degrees(cycles.lag_rad), False, 1.0),
@@ -76,7 +72,7 @@ def cycle_drawings(cycles: CycleMaps, prefix: str) -> tuple[Drawing, ...]:
     for title, names, value, signed, least in shown:
         if np.isfinite(value).any():
             one = Map(title, names, *_thinned(cycles, value), signed, least)
-            drawings.append(_draw(one, f"{prefix}-{len(drawings)}", _caption(cycles, one)))
+            drawings.append(_draw(one, f"map-{len(drawings)}", _caption(cycles, one)))
     return tuple(drawings)
 
 
@@ -205,8 +201,8 @@ def _caption(cycles: CycleMaps, shown: Map) -> str:
     name = shown.title.partition(" [")[0].capitalize()
     text = f"{name}: each column is one of {count} cycles."
     if step > 1:
-        text = f"{name}: {count} cycles are too many to show one by one; "
-        text += f"each column is the mean of {step}."
+        many = f"{count} cycles are too many to show one by one"
+        text = f"{name}: {many}; each column is the mean of {step}."
     if shown.signed:
         text += " Negative: driven by the rest of the body."
     if shown.holed.any():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from pathlib import Path, PurePosixPath
@@ -31,7 +31,7 @@ from undulog.capture.common.palette import joint_hex
 from ...fleet.fleet import QUANTITIES, Fleet, JointChange, RobotHistory
 from ...fleet.fleet import sentence as change_sentence
 from ...results import formats
-from ...results.analysis import Analysis, JointResult
+from ...results.analysis import Analysis
 from ...results.answer import beyond
 from ...results.comparison import Comparison
 from ...results.estimate import Provenance
@@ -77,6 +77,8 @@ def _session_view(
     answer = analysis.answer
     others = [w for w in map(formats.sentence, analysis.warnings) if w not in answer.detail]
     entries = entries_of(analysis.coupling, tuple(j.name for j in joints if is_driven(j)))
+    drawn = [(j.gain.value, j.energy_net_j, j.energy_abs_j) for j in joints]
+    numbers = any(value is not None for values in drawn for value in values)
     return {
         "analysis": analysis,
         "answer": answer,
@@ -87,9 +89,9 @@ def _session_view(
             for color, joint in zip(colors, joints, strict=True)
         ],
         "trials": session_trials(analysis.heterogeneity),
-        "segments": segments(joints, "segments-figure") if _any_number(joints) else None,
-        "signals": command_response(traces, len(joints), "signals-figure") if traces else None,
-        "maps": () if cycles is None else cycle_drawings(cycles, "map"),
+        "segments": segments(joints, "segments-figure") if numbers else None,
+        "signals": command_response(traces, len(joints)) if traces else None,
+        "maps": () if cycles is None else cycle_drawings(cycles),
         "artefacts": artefact_rows(analysis),
         "flagged": flagged_joints(joints),
         "body": body_motion(body, "body-figure") if body is not None and body.observed else None,
@@ -100,13 +102,6 @@ def _session_view(
             for k, chain in enumerate(analysis.oscillators, start=1)
         ],
     }
-
-
-def _any_number(joints: Sequence[JointResult]) -> bool:
-    """Return whether any joint has a value in the figure of segments."""
-    return any(
-        v is not None for j in joints for v in (j.gain.value, j.energy_net_j, j.energy_abs_j)
-    )
 
 
 def chain_view(chain: ChainCoupling, prefix: str) -> dict[str, Any]:
@@ -179,11 +174,8 @@ def render(
         page = _page(result, None, None, left_out=True)
     size = len(page.encode())
     if size > LARGEST_BYTES:
-        count = 1
-        if isinstance(result, Comparison):
-            count = len(result.a) + len(result.b)
-        elif isinstance(result, Experiment):
-            count = len(result.sessions)
+        count = len(getattr(result, "sessions", getattr(result, "a", ("",))))
+        count += len(getattr(result, "b", ()))
         whose = f"{count} sessions" if count > 1 else "one session"
         megabytes = beyond(size / 1e6, LARGEST_BYTES / 1e6, 3)
         raise UsageError(
@@ -328,7 +320,7 @@ def _change_drawing(
             key(color=MUTED, linestyle=DASHED, label="change, 95 % interval"),
         )
         svg = inline_svg(figure, prefix, f"{change.joint} over the sessions", label)
-    return Drawing(svg, f"{change_sentence(change).capitalize()}.")
+        return Drawing(svg, f"{change_sentence(change).capitalize()}.")
 
 
 def render_fleet(fleet: Fleet, joints: pd.DataFrame, where: str, page: Path) -> str:
@@ -378,35 +370,20 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    filters: dict[str, Callable[..., object]] = {
-        "number": formats.number,
-        "utc": formats.utc,
-        "plain": plain,
-        "filename": formats.filename,
-        "scaled": formats.scaled,
-        "decimals": formats.decimals_for,
-        "softer": softer,
-        "typeset": typeset,
-        "cut": cut,
-        "digits": digits,
-        "sentence": sentence,
-        "again": _commands_to_reproduce,
-    }
-    environment.filters.update(filters)
-    values: dict[str, Any] = {
-        "tables": tables,
-        "grid": grid,
-        "num": number,
-        "est": estimate,
-        "p": p_value,
-        "known": known,
-        "style": Markup(_template_text("style.css")),  # noqa: S704  our own file
-        "words": _glossary(),
-        "body_gradient": ", ".join(joint_hex(9)),
-        "MISSING": formats.MISSING,
-        "LEVEL_NOTE": LEVEL_NOTE,
-    }
-    environment.globals.update(values)
+    shared = (formats.number, formats.utc, plain, formats.filename, formats.scaled)
+    for of in (*shared, softer, typeset, cut, digits, sentence):
+        environment.filters[of.__name__] = of
+    environment.filters.update(decimals=formats.decimals_for, again=_commands_to_reproduce)
+    environment.globals.update(
+        tables=tables, grid=grid, num=number, est=estimate, p=p_value, known=known
+    )
+    environment.globals.update(
+        style=Markup(_template_text("style.css")),  # noqa: S704  our own file
+        words=_glossary(),
+        body_gradient=", ".join(joint_hex(9)),
+        MISSING=formats.MISSING,
+        LEVEL_NOTE=LEVEL_NOTE,
+    )
     return environment
 
 

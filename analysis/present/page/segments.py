@@ -254,13 +254,13 @@ def body_motion(body: BodyResult, prefix: str) -> Drawing:
         title = f"Motion of {', '.join(p.place for p in points)} over one gait cycle"
         dashed = ". Dashed grey: the same body with every joint exactly on its command."
         svg = inline_svg(figure, prefix, title, "; ".join(map(_point_in_words, points)) + dashed)
-    caption = (
+    return Drawing(
+        svg,
         "Motion of the links at the gait frequency, across the mean heading. Dashed grey is a "
         "perfect-tracking null: the same body with every joint exactly on its command. Head, "
         "middle and tail differ there already, by kinematics alone, so only what departs from the "
-        "dashed line speaks of the joints."
+        "dashed line speaks of the joints.",
     )
-    return Drawing(svg, caption)
 
 
 def _harmonic(axes: Axes, point: BodyPoint, cycle: FloatArray, color: str, style: object) -> None:

@@ -65,9 +65,7 @@ def head_middle_tail(robot: Robot | None, moving: Sequence[Track]) -> Places | N
     if robot is None:
         names, plane = tuple(swing), None
     else:
-        planes = {
-            plane: [joint.name for joint in robot.joints if joint.plane is plane] for plane in Plane
-        }
+        planes = {one: [j.name for j in robot.joints if j.plane is one] for one in Plane}
         plane = max(Plane, key=lambda p: max((swing.get(n, -1.0) for n in planes[p]), default=-1.0))
         names = tuple(name for name in planes[plane] if name in swing) or tuple(swing)
     return Places(tuple(dict.fromkeys((names[0], names[len(names) // 2], names[-1]))), plane)
@@ -79,11 +77,10 @@ def places_look(places: Places, kind: str) -> dict[str, Any]:
     Args:
         kind: ``measured`` or ``commanded``.
     """
-    titles = {
-        name: line_title(name, label if kind == "measured" else "command")
-        for name, label in places.labelled.items()
-    }
-    return {"titles": titles, "width": 2.0 if kind == "measured" else 1.0}
+    own = kind == "measured"
+    labels = places.labelled.items()
+    titles = {name: line_title(name, label if own else "command") for name, label in labels}
+    return {"titles": titles, "width": 2.0 if own else 1.0}
 
 
 def part_entities(entity: str, parts: Sequence[Sequence[str]]) -> list[str]:
