@@ -147,16 +147,8 @@ def _plan(
         base = base_gait(session)
         planned = design(base, session)
         settle_s, measure_s = planned.settle_s, planned.measure_s
-        files = write_plan(
-            plan,
-            base,
-            planned.runs,
-            session,
-            folder,
-            settle_s=settle_s,
-            measure_s=measure_s,
-            facts=planned.facts,
-        )
+        times = {"settle_s": settle_s, "measure_s": measure_s}
+        files = write_plan(plan, base, planned.runs, session, folder, **times, facts=planned.facts)
     if as_json:
         emit_json({"plan": plan, "files": [str(file) for file in files], "settle_s": settle_s})
         return
@@ -169,8 +161,7 @@ def _plan(
         "Drive each, in this order, with undulog drive FILE --on ...; then undulog analyse "
         f"--start {settle_s:g} of all recordings"
     )
-    for note in planned.notes:
-        echo(note)
+    echo(*planned.notes)
 
 
 _AMPLITUDE = 0.02

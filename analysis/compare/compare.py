@@ -57,12 +57,11 @@ def broken_joints(
 
 def _moved(joint: str, own: Sequence[ComparedSession], other: Sequence[ComparedSession]) -> bool:
     """Return whether a joint's mean differs between the sides, too: both may share a zero."""
-    here, there = (
-        [one.offsets[joint] for one in side if joint in one.offsets] for side in (own, other)
-    )
-    if not here or not there:
+    sides = [[one.offsets[joint] for one in side if joint in one.offsets] for side in (own, other)]
+    if not all(sides):
         return True
-    return abs(float(np.median(here)) - float(np.median(there))) > OFFSET_RAD
+    here, there = (float(np.median(side)) for side in sides)
+    return abs(here - there) > OFFSET_RAD
 
 
 _Entry = TypeVar("_Entry", NotFollowing, StandOut)
@@ -145,8 +144,7 @@ def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None
     Returns:
         The reason, or None within 0.5 % of the frequency and 1 % of every command's amplitude.
     """
-    different = other_frequency(run, model)
-    if different is not None:
+    if (different := other_frequency(run, model)) is not None:
         return f"{run.label} has {different[0]} Hz, {model.label} {different[1]} Hz"
     own, other = (
         np.array([one.command[one.names.index(name)] for name in names]) for one in (run, model)
@@ -228,16 +226,14 @@ def compare_sessions(
 
         return see(session, choices.session, warn)
 
-    sides = [
-        [seen(one) for one in ([side] if isinstance(side, SessionView) else side)]
-        for side in (a, b)
-    ]
+    groups = ([side] if isinstance(side, SessionView) else side for side in (a, b))
+    sides = [list(map(seen, group)) for group in groups]
     every = sum(map(len, sides))
     noted = [
         f"{sentence} ({'all sessions' if len(names) == every else ', '.join(names)})"
         for sentence, names in warnings.items()
     ]
-    return compare_fitted(sides[0], sides[1], choices, noted)
+    return compare_fitted(*sides, choices, noted)
 
 
 def compare_fitted(
@@ -258,7 +254,8 @@ def compare_fitted(
     if not a or not b:
         raise UsageError("a comparison needs at least one session a side")
     every_warning = list(warnings)
-    design = _design(a, b, choices)
+    unpaired = "sessions" if len(a) == len(b) == 1 else "groups"
+    design = "pairs" if choices.paired else unpaired
     aligned = align([one.run for one in a], [one.run for one in b], any_gait=choices.any_gait)
     keys = family(a, b, aligned.names)
     # Lags near pi must not part company: all are taken within pi of the first session's.
@@ -287,12 +284,6 @@ def compare_fitted(
         warnings=tuple(every_warning),
         provenance=_provenance(a, b, choices),
     )
-
-
-def _design(a: Sequence[ComparedSession], b: Sequence[ComparedSession], choices: Choices) -> str:
-    if choices.paired:
-        return "pairs"
-    return "sessions" if len(a) == len(b) == 1 else "groups"
 
 
 def _partial(aligned: Alignment) -> str | None:
@@ -337,6 +328,7 @@ def _waveforms(
         first, second, difference = differ(sides[0], sides[1], design)
         half = difference.error * [t_factor(dof) for dof in difference.dof.tolist()]
         worst = int(np.argmax(np.abs(difference.value)))
+        most = float(difference.value[worst])
         found.append(
             Waveform(
                 name=name,
@@ -345,10 +337,7 @@ def _waveforms(
                 difference_rad=tuple(difference.value.tolist()),
                 half_rad=tuple(half.tolist()),
                 rms_rad=float(np.sqrt(np.mean(difference.value**2))),
-                largest=Estimate(
-                    float(difference.value[worst]),
-                    around(float(difference.value[worst]), float(half[worst])),
-                ),
+                largest=Estimate(most, around(most, float(half[worst]))),
                 largest_at_rad=float(phases_rad()[worst]),
             )
         )
@@ -377,13 +366,10 @@ def _provenance(
     if margins.lag_rad != default.lag_rad:
         words.append(f"margin-lag-deg={float(np.degrees(margins.lag_rad))!r}")
     options = [f"--{word.replace('_', '-')}" for word in words]
-    inputs: dict[str, str] = {}
-    for one in (*a, *b):
-        inputs |= one.analysis.provenance.inputs
     return Provenance(
         command=shlex.join(["undulog", "compare", *files, *options, *choices.session.arguments()]),
         versions=base_versions(),
-        inputs=inputs,
+        inputs={k: v for one in (*a, *b) for k, v in one.analysis.provenance.inputs.items()},
         options={
             **asdict(choices.session),
             "paired": choices.paired,

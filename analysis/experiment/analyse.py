@@ -102,17 +102,15 @@ def analyse_experiment(
         why = {k: reason for k, reason in why.items() if parts[k] is None}
     parts_of = {k: part for k, part in enumerate(parts) if part is not None}
     parts_of |= {} if only_kicks else {k: role.value for k, role in roles.items()}
-    for k, reason in why.items():
-        warnings.append(f"{runs[k].label} {reason}; it is left out of the reversal test")
+    warnings += [
+        f"{runs[k].label} {text}; it is left out of the reversal test" for k, text in why.items()
+    ]
     chosen = [runs[k] for k in roles]
     names, y = responses(chosen) if chosen else ((), np.zeros((0, 0), dtype=np.complex128))
     ways = list(roles.values())
     forward, reverse = (y[[way is one for way in ways]] for one in (Role.FORWARD, Role.REVERSE))
-    pooled = (
-        pool_runs(chosen[0].names, [run.response for run in chosen])
-        if len(set(ways)) == 1
-        else None
-    )
+    alike = len(set(ways)) == 1
+    pooled = pool_runs(chosen[0].names, [one.response for one in chosen]) if alike else None
     robot = robots[next(iter(roles))] if roles else None
     joints = None
     if pooled is not None:
@@ -232,11 +230,9 @@ def _both_ways(
         warn(f"without gain and lag at it or its mirror joint in every run: {', '.join(lost)}")
     if robot is None:
         warn("no robot description: the log's order of joints is taken as a chain, head to tail")
-    starts = {
-        role: [run.start_ns for run, way in zip(runs, ways, strict=True) if way is role]
-        for role in Role
-    }
-    first, second = sorted(starts.values(), key=min)
+    both = list(zip(runs, ways, strict=True))
+    starts = [[run.start_ns for run, way in both if way is role] for role in Role]
+    first, second = sorted(starts, key=min)
     if max(first) < min(second):
         warn(
             "all runs one way come before all runs the other way: warming up looks like a "
@@ -259,14 +255,11 @@ def _warn_headings(reversal: Reversal, warn: Warn) -> None:
     """Warn where a tilted floor isn't cancelled and could change what is named."""
     if reversal.p >= SIGNIFICANT or reversal.tilt.headings is Headings.BALANCED:
         return
-    why = (
-        "the robot's heading is not recorded"
-        if reversal.tilt.headings is Headings.UNKNOWN
-        else "the robot's headings are not balanced"
-    )
+    known = reversal.tilt.headings is not Headings.UNKNOWN
+    why = "headings are not balanced" if known else "heading is not recorded"
     warn(
-        f"{why}, so a tilted floor doesn't cancel; turn the robot by half a turn in half of the "
-        "runs of each direction (undulog plan reversal)"
+        f"the robot's {why}, so a tilted floor doesn't cancel; turn the robot by half a turn "
+        "in half of the runs of each direction (undulog plan reversal)"
     )
 
 
@@ -276,12 +269,11 @@ def _run(one: Analysis, run: GaitRun, role: str | None, why: str | None) -> Run:
 
 def _provenance(analyses: Sequence[Analysis], options: Options) -> Provenance:
     paths = [one.session.path for one in analyses]
+    named = zip(paths, analyses, strict=True)
     return Provenance(
         command=shlex.join(["undulog", "analyse", *paths, *options.arguments()]),
         versions=base_versions(),
-        inputs={
-            path: one.provenance.inputs[path] for path, one in zip(paths, analyses, strict=True)
-        },
+        inputs={path: one.provenance.inputs[path] for path, one in named},
         options={
             **asdict(options),
             "confidence": CONFIDENCE,

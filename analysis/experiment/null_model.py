@@ -298,8 +298,7 @@ def analyse_with_null(
             f"{', '.join(outside)}: fitted beyond where {file.name} holds; make a null model "
             "around the fitted values"
         )
-    silent = len(model.joints) - len(joints)
-    if silent:
+    if silent := len(model.joints) - len(joints):
         warnings.append(f"{silent} joints without gain and lag are not held to the null model")
     known: dict[str, Any] = {**vars(analysis), "warnings": tuple(warnings)}
     known["provenance"] = _provenance(analysis, file)

@@ -184,17 +184,14 @@ def _alike(chain: Chain, excluded: set[int]) -> bool:
     index = [k for k in range(len(chain.names)) if k not in excluded]
     if len(index) < 2:
         return False
-    m = len(index)
-    rows = np.eye(m) - 1 / m
+    rows = np.eye(len(index)) - 1 / len(index)
     for quantity, margin in _MARGINS.items():
         profile = profile_of(chain, quantity)
-        values = profile.values[index]
+        values = profile.values[index] - profile.values[index].mean()
         scatter = profile.scatter.select(index)
         error = np.sqrt(scatter.variance(rows))
         dof = float(scatter.columns.shape[1])
-        deviation = values - values.mean()
-        if quantity == "gain":
-            deviation = np.expm1(deviation)
+        deviation = np.expm1(values) if quantity == "gain" else values
         if equivalence_p(deviation, error, dof, margin) >= LEVEL:
             return False
     return True

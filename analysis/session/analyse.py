@@ -95,17 +95,13 @@ def _warn_flags(
             "limit": "a limit of the robot, not a fault of the sensor",
         }[about]
         notes = ", ".join(dict.fromkeys(one.note for one in same if one.note))
-        told = f"{flag}, {notes}" if notes else flag
-        warn(f"{', '.join(one.joint for one in same)}: {where}: values {text} ({told}): {meaning}")
-    holed = [joint.name for joint in joints if "gaps" in joint.flags]
-    if holed:
+        named = f"{flag}, {notes}" if notes else flag
+        warn(f"{', '.join(one.joint for one in same)}: {where}: values {text} ({named}): {meaning}")
+    if holed := [joint.name for joint in joints if "gaps" in joint.flags]:
         warn(f"{', '.join(holed)}: positions have gaps (an artefact of the record, not mechanics)")
-    lost = [
-        joint.name
-        for joint in joints
-        if gait is not None and joint.name in gait.all_answered and joint.lag_rad.value is None
-    ]
-    if lost:
+    answered = () if gait is None else gait.all_answered
+    silent = [joint.name for joint in joints if joint.lag_rad.value is None]
+    if lost := [name for name in silent if name in answered]:
         warn(
             f"{', '.join(lost)}: no response at the gait frequency that differs from noise: "
             "gain and lag are null"
@@ -206,9 +202,7 @@ def measure_session(
     faulty = not_following(follows, held, columns.names, whole.duration_s)
     broken = stopped(faulty)  # whose plateaus are no dead bands
     moving = {name: one for name, one in sound.items() if name not in broken}
-    dead: dict[str, DeadBand] = {}
-    if with_dead_bands:
-        dead = dead_bands(columns, commands, moving, gait, origin_ns)
+    dead = dead_bands(columns, commands, moving, gait, origin_ns) if with_dead_bands else {}
     del commands
     session.forget()
     energies = joint_energies(session, columns, held, span, warn)

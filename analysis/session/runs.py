@@ -38,24 +38,18 @@ def coupling_of_one_gait(joints: int) -> Coupling:
     Returns:
         Not identifiable, with the reason and the plan to record.
     """
-    if joints == 0:
-        return Coupling(
-            identifiable=False,
-            why="no joint's response to a gait is known",
-            record="a session with a steady gait, commands and responses",
-        )
-    if joints == 1:
-        return Coupling(
-            identifiable=False,
-            why="one joint has no neighbour whose response is known",
-            record="a session with a chain of driven joints",
-        )
-    return Coupling(
-        identifiable=False,
-        why=f"one gait gives {joints} complex numbers for {joints * joints} unknown couplings",
-        record=f"phase-kicks around this gait ({4 * joints} runs: each joint's command kicked up "
-        f"and down, in phase and in amplitude), or without contact a lag-sweep of {joints} gaits",
+    why = f"one gait gives {joints} complex numbers for {joints * joints} unknown couplings"
+    record = (
+        f"phase-kicks around this gait ({4 * joints} runs: each joint's command kicked up "
+        f"and down, in phase and in amplitude), or without contact a lag-sweep of {joints} gaits"
     )
+    if joints == 0:
+        why = "no joint's response to a gait is known"
+        record = "a session with a steady gait, commands and responses"
+    elif joints == 1:
+        why = "one joint has no neighbour whose response is known"
+        record = "a session with a chain of driven joints"
+    return Coupling(identifiable=False, why=why, record=record)
 
 
 HEADING = "heading_rad"
@@ -281,20 +275,15 @@ def sort_runs(runs: Sequence[GaitRun]) -> tuple[dict[int, Role], dict[int, str]]
     roles: dict[int, Role] = {}
     first: dict[bytes, int] = {}
     for k in fit:
-        run = runs[k]
-        different = _difference(run, model)
-        if different is not None:
+        run, numbers = runs[k], runs[k].ratio.tobytes()
+        if (different := _difference(run, model)) is not None:
             why[k] = different
-            continue
-        numbers = run.ratio.tobytes()
-        if numbers in first:
-            why[k] = (
-                f"is a copy of the numbers of {runs[first[numbers]].label}: a copy is not a run of "
-                "its own"
-            )
-            continue
-        first[numbers] = k
-        roles[k] = Role.FORWARD if run.wave == "head-to-tail" else Role.REVERSE
+        elif numbers in first:
+            copied = f"is a copy of the numbers of {runs[first[numbers]].label}"
+            why[k] = f"{copied}: a copy is not a run of its own"
+        else:
+            first[numbers] = k
+            roles[k] = Role.FORWARD if run.wave == "head-to-tail" else Role.REVERSE
     return roles, why
 
 
@@ -398,8 +387,7 @@ def _other_drive(run: GaitRun, model: GaitRun) -> str | None:
 
 def _difference(run: GaitRun, model: GaitRun) -> str | None:
     """What makes a run another gait than the model's or its reverse; None if nothing does."""
-    drive = _other_drive(run, model)
-    if drive is not None:
+    if (drive := _other_drive(run, model)) is not None:
         return drive
     same = [own == way for own, way in zip(run.waves, model.waves, strict=True)]
     if any(same) != all(same):

@@ -137,9 +137,10 @@ class LackOfFit:
         checks = [len(self.joints) * min(one.p for one in self.joints.values())]
         if self.unfitted is not None:
             checks.append(self.unfitted.p)
-        for laws in (True, False):
-            if others := [one.p for one in self.alternatives if one.widens is laws]:
-                checks.append(len(others) * min(others))
+        kinds = (
+            [one.p for one in self.alternatives if one.widens is laws] for laws in (True, False)
+        )
+        checks += [len(others) * min(others) for others in kinds if others]
         return min(1.0, len(checks) * min(checks))
 
     @property

@@ -36,7 +36,6 @@ from .local import (
     LocalMatrices,
     MeasuredDerivatives,
     ResponseMatrices,
-    RowSums,
     local_matrices,
     lti_reading,
     nonlinearity,
@@ -192,16 +191,14 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
     m = len(experiment.names)
     plan = f"phase-kicks around this gait ({4 * m} runs and one without a kick)"
     known = np.isfinite(experiment.ratio[used])
-    lost = [name for i, name in enumerate(experiment.names) if not known[:, i].all()]
-    if lost:
+    if lost := [name for i, name in enumerate(experiment.names) if not known[:, i].all()]:
         return Coupling(
             identifiable=False,
             why=f"{', '.join(lost)}: gain and lag are not known in every run, so rows of the "
             "matrices are missing",
             record=plan,
         )
-    lacking = missing_kicks(list(kicks.values()), Kind.PHASE, experiment.names)
-    if lacking:
+    if lacking := missing_kicks(list(kicks.values()), Kind.PHASE, experiment.names):
         return Coupling(
             identifiable=False,
             why="central differences need each joint's phase kicked both up and down by the same "
@@ -315,7 +312,7 @@ def _held_out(
     )
 
 
-def _rows(names: Sequence[str], sums: RowSums, expected: float) -> tuple[RowCheck, ...]:
+def _rows(names: Sequence[str], sums: MeasuredDerivatives, expected: float) -> tuple[RowCheck, ...]:
     """Return sums with their intervals, one by one."""
     half = sums.error * stdtrit(sums.dof, 0.5 + CONFIDENCE / 2)
     return tuple(

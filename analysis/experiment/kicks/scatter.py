@@ -123,12 +123,10 @@ def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray
         pairs = sides(kicks, kind)
         if len(pairs) < 2:
             continue
-        middle = np.array(
-            [
-                (values[up].mean(axis=0) + values[down].mean(axis=0)) / 2
-                for up, down in pairs.values()
-            ]
-        )
+        means = [
+            (values[up].mean(axis=0), values[down].mean(axis=0)) for up, down in pairs.values()
+        ]
+        middle = np.array([(high + low) / 2 for high, low in means])
         for k, (joint, (up, down)) in enumerate(pairs.items()):
             own = [joint, m + joint]
             others = np.delete(middle[:, own], k, axis=0).mean(axis=0)
