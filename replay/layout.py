@@ -148,10 +148,7 @@ def _mean_scene(content: Content) -> rrb.Spatial3DView | None:
 
 def _grid(span: float) -> rrb.LineGrid3D:
     return rrb.LineGrid3D(
-        visible=True,
-        spacing=_grid_spacing(span),
-        stroke_width=1.0,
-        color=(255, 255, 255, 12),
+        visible=True, spacing=_grid_spacing(span), stroke_width=1.0, color=(255, 255, 255, 12)
     )
 
 
@@ -233,9 +230,8 @@ def _angle_views(content: Content) -> list[rrb.View]:
 
 
 def _names(robot: Robot | None, plane: Plane) -> set[str]:
-    if robot is None:
-        return set()
-    return {joint.name for joint in robot.joints if joint.plane is plane}
+    joints = () if robot is None else robot.joints
+    return {joint.name for joint in joints if joint.plane is plane}
 
 
 def _plane_of_places(content: Content) -> set[str] | None:
@@ -309,12 +305,9 @@ def _window(before_s: float, after_s: float, *timelines: str) -> rrb.VisibleTime
     """Return a window about the cursor, by default on the session's timelines."""
     start = rrb.TimeRangeBoundary.cursor_relative(seconds=-before_s)
     end = rrb.TimeRangeBoundary.cursor_relative(seconds=after_s)
-    return rrb.VisibleTimeRanges(
-        [
-            rrb.VisibleTimeRange(timeline, start=start, end=end)
-            for timeline in timelines or (SESSION_TIME, GAIT_CYCLE)
-        ]
-    )
+    names = timelines or (SESSION_TIME, GAIT_CYCLE)
+    ranges = [rrb.VisibleTimeRange(name, start=start, end=end) for name in names]
+    return rrb.VisibleTimeRanges(ranges)
 
 
 def build_blueprint(content: Content, front: Tab = "session") -> rrb.Blueprint:
@@ -359,9 +352,8 @@ def _session(content: Content, views: Views) -> rrb.Container:
     # A mode that never changes isn't worth a lane of its own.
     lane = [views.mode] if views.mode is not None and content.modes > 1 else []
     words = [*views.words, *([views.mode] if views.mode is not None and not lane else [])]
-    plots: list[rrb.View | rrb.Container] = [
-        tabs(group) for group in (views.angles, views.effort) if group
-    ]
+    groups = [group for group in (views.angles, views.effort) if group]
+    plots: list[rrb.View | rrb.Container] = [tabs(group) for group in groups]
     heights = [3.0, 2.4][: len(plots)]
     if views.bars:
         plots.append(rrb.Horizontal(*views.bars))

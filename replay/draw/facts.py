@@ -146,8 +146,8 @@ def _wave(gait: GaitFacts | GroupFacts, joints: str = "") -> str:
     parts = [f"{gait.frequency_hz.value:.3f} Hz{joints}"]
     if gait.wave is not None:
         parts.append(f"wave {gait.wave}")
-    for plane, lag in gait.lag_per_joint_rad.items():
-        parts.append(f"{math.degrees(lag):.1f}° a joint ({plane})")
+    lags = gait.lag_per_joint_rad.items()
+    parts += [f"{math.degrees(lag):.1f}° a joint ({plane})" for plane, lag in lags]
     return ", ".join(parts)
 
 

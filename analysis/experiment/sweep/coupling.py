@@ -239,9 +239,7 @@ def sweep_coupling(
     hold_s = (data.period_s - step_s) / 2
     servos, servo_why = _servos(data, sweep.names)
     tones = tuple(_tone(data, k, hold_s, servos) for k in range(len(sweep.tones)))
-    beside = Estimate()
-    if data.beside is not None:
-        beside = sideband_energy(data.response, data.beside)
+    beside = Estimate() if data.beside is None else sideband_energy(data.response, data.beside)
     _warn(data, beside, tones, warn)
     return LinearCoupling(
         identifiable=True,
@@ -342,11 +340,8 @@ def _warn(data: SweepData, beside: Estimate, tones: Sequence[ToneCoupling], warn
         )
     if beside.value is None:
         warn("too short to measure energy beside the tones; record two periods of the multisine")
-    bent = [one for one in tones if (one.distortion or 0.0) > NONLINEAR]
-    if bent:
-        at = ", ".join(
-            f"{one.frequency_hz:.4g} Hz ({100 * (one.distortion or 0):.2g} %)" for one in bent
-        )
+    bent = [(one.frequency_hz, one.distortion or 0.0) for one in tones]
+    if at := ", ".join(f"{hz:.4g} Hz ({100 * by:.2g} %)" for hz, by in bent if by > NONLINEAR):
         warn(
             "not linear: where nothing is commanded, lines reach more than 1 % of the tone beside "
             f"them, at {at}; H and Z hold for these motions only, take a smaller amplitude"
@@ -359,9 +354,5 @@ def _warn(data: SweepData, beside: Estimate, tones: Sequence[ToneCoupling], warn
 
 
 def _matrix(matrix: MeasuredMatrix) -> ComplexMatrix:
-    return ComplexMatrix(
-        rows_of(matrix.value.real),
-        rows_of(matrix.value.imag),
-        rows_of(matrix.error),
-        rows_of(matrix.half),
-    )
+    value = matrix.value
+    return ComplexMatrix(*map(rows_of, (value.real, value.imag, matrix.error, matrix.half)))

@@ -7,7 +7,7 @@ neither repeats of a gait nor kicks around one have it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from scipy.special import fdtrc
 from undulog.capture import Session, SessionView
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import DataError
+from undulog.capture.log.read.signals import Signal
 from undulog.capture.robot.model import Robot
 from undulog.capture.robot.run import Run
 
@@ -93,17 +94,13 @@ def read_signals(session: SessionView, options: Options) -> Signals:
     stretch = choose_stretch(session, columns, options, unused)
     origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
     half_s = stretch.duration_s / 2
-    command, position, effort = (
-        {
-            name: clean(name, signals[name].t_ns, signals[name].values, origin_ns).between(
-                -half_s, half_s
-            )
-            for name in columns.names
-            if name in signals
-        }
-        for signals in (columns.command, columns.position, columns.effort)
-    )
-    return command, position, effort
+
+    def part(signals: Mapping[str, Signal]) -> dict[str, Series]:
+        known = [(name, signals[name]) for name in columns.names if name in signals]
+        cleaned = {name: clean(name, one.t_ns, one.values, origin_ns) for name, one in known}
+        return {name: one.between(-half_s, half_s) for name, one in cleaned.items()}
+
+    return part(columns.command), part(columns.position), part(columns.effort)
 
 
 def command_tones(
@@ -166,11 +163,8 @@ def _sweep(index: Sequence[int], runs: Sequence[CommandTones]) -> Sweep | None:
         return Sweep(tuple(index), runs[0].names, tones, lines) if tones else None
     # Fewer runs than joints: part of a sweep if they are all at right angles to each other.
     unit = C / np.linalg.norm(C, axis=0)
-    apart = [
-        k
-        for k in range(lines)
-        if np.abs(unit[:, :, k].conj().T @ unit[:, :, k] - np.eye(r)).max() < _ORTHOGONAL
-    ]
+    gram = [np.abs(unit[:, :, k].conj().T @ unit[:, :, k] - np.eye(r)) for k in range(lines)]
+    apart = [k for k, one in enumerate(gram) if one.max() < _ORTHOGONAL]
     if not apart or r < max(3, m / 2):
         return None
     return Sweep(tuple(index), runs[0].names, tuple(apart), lines, lacking=m - r)
@@ -241,8 +235,7 @@ def sweep_data(
             robot = robot or session.robot_as_run
             twins.append(session.run)
             command, position, effort = read_signals(session, options)
-        lost = [name for name in sweep.names if name not in position]
-        if lost:
+        if lost := [name for name in sweep.names if name not in position]:
             raise DataError(f"{paths[k]}: no responses of {', '.join(lost)}")
         commanded_series, series = (
             [kind[name] for name in sweep.names] for kind in (command, position)
@@ -314,10 +307,8 @@ def _drift(series: Sequence[Series], omega: FloatArray, fit: ToneFit, runs: int)
     the noise rejects that they are noise, the chance of a false alarm shared among the runs.
     """
     middle = float(series[0].t_s[0] + series[0].t_s[-1]) / 2
-    halves = [
-        [one.between(start, stop) for one in series]
-        for start, stop in ((-np.inf, middle), (middle, np.inf))
-    ]
+    ends = ((-np.inf, middle), (middle, np.inf))
+    halves = [[one.between(start, stop) for one in series] for start, stop in ends]
     lines = omega[0] * np.array([2.0, 3.0]) if omega.size == 1 else np.zeros(0)
     tones = omega.size
     first, second = (fit_tones(half, omega, lines).amplitude[:, :tones] for half in halves)

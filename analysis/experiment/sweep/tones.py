@@ -105,11 +105,8 @@ def distortion(omega: float, tone: Phasors, beside: Beside) -> float:
 
 
 def _joined(parts: tuple[Phasors, ...]) -> Phasors:
-    return Phasors(
-        np.concatenate([one.value for one in parts], axis=1),
-        np.concatenate([one.variance for one in parts], axis=1),
-        np.concatenate([one.dof for one in parts], axis=1),
-    )
+    columns = zip(*((one.value, one.variance, one.dof) for one in parts), strict=True)
+    return Phasors(*(np.concatenate(one, axis=1) for one in columns))
 
 
 MOST_TONES = 12
@@ -118,6 +115,9 @@ EXPLAINED = 0.98
 
 FAINT = 0.005
 """A line below this share of the strongest is no tone."""
+
+MOST_MULTIPLE = 24
+"""Largest multiple of the tones' common step that the lowest of them may be."""
 
 MULTIPLE = 1e-3
 """How near to a whole number a ratio of frequencies must be to count as one."""
@@ -165,17 +165,16 @@ def find_tones(commands: Sequence[Series]) -> FloatArray | None:
     return None if np.all(np.abs(multiples - np.round(multiples)) < MULTIPLE) else omega
 
 
-def common_step(omega: FloatArray, most: int = 24) -> float | None:
+def common_step(omega: FloatArray) -> float | None:
     """Find the largest frequency of which all tones are multiples.
 
     Args:
         omega: Rising [rad/s].
-        most: Largest multiple that the lowest tone may be.
 
     Returns:
         It [rad/s], or None where there is none.
     """
-    for multiple in range(1, most + 1):
+    for multiple in range(1, MOST_MULTIPLE + 1):
         place: FloatArray = omega * multiple / omega[0]
         if np.all(np.abs(place - np.round(place)) < MULTIPLE * multiple):
             return float(np.mean(omega / np.round(place)))
