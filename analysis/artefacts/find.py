@@ -248,7 +248,8 @@ def stalled(
     # Speed over a tenth of a second, so that an encoder's steps and noise are none.
     half = STALL_S / 4
     at = np.flatnonzero(pushing)
-    rate = _moved(position, effort.t_s[at], half) / (2 * half)
+    ends = position.at(effort.t_s[at] + half), position.at(effort.t_s[at] - half)
+    rate = (ends[0] - ends[1]) / (2 * half)
     pushing[at[np.abs(rate) >= STANDING * usual_rate]] = False
     found = spans_of(effort.t_s, pushing, join=2)
     long = STALL_S
@@ -268,10 +269,6 @@ def _constant(effort: Series, span: Span) -> bool:
     i, j = np.searchsorted(effort.t_s, span)
     inside = effort.values[i : j + 1]
     return bool(np.std(inside) < CONSTANT * abs(float(np.mean(inside))))
-
-
-def _moved(position: Series, t_s: FloatArray, half: float) -> FloatArray:
-    return position.at(t_s + half) - position.at(t_s - half)
 
 
 GAP_SHARE = 1e-3
@@ -303,11 +300,8 @@ def find_artefacts(session: SessionView, columns: Columns) -> tuple[Artefact, ..
     origin_ns = session.start_ns
 
     def of_joint(name: str) -> list[Artefact]:
-        raw = {
-            key: signals[name]
-            for key in QUANTITIES
-            if name in (signals := columns.of(key)) and signals[name].t_ns.size
-        }
+        own = {key: columns.of(key).get(name) for key in QUANTITIES}
+        raw = {key: one for key, one in own.items() if one is not None and one.t_ns.size}
         series = {key: one for key, one in clean_together(raw, origin_ns).items() if one.count}
         joint = _Joint(name, raw, series, limits.get(name), name in commanded)
         return [
@@ -337,11 +331,9 @@ def _of_joint(joint: _Joint, origin_ns: int) -> _Found:
 def _of_sensors(joint: _Joint) -> _Found:
     levels = () if joint.limits is None else joint.limits.values
     command = joint.series.get("command") if joint.driven else None
-    tops = {
-        key: clipped(one, levels, command if key == "position" else None)
-        for key, one in joint.series.items()
-        if key != "command"
-    }
+    sensed = {key: one for key, one in joint.series.items() if key != "command"}
+    against = {"position": command}
+    tops = {key: clipped(one, levels, against.get(key)) for key, one in sensed.items()}
     if "position" not in joint.series:
         yield "position", "not_recorded", (), ""
     else:
@@ -356,8 +348,7 @@ def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Fo
     way = None if velocity is None or velocity.count < 2 else integral(velocity)
     # Without a command the velocity says that a joint moves; one that is held still may stand.
     motion = way if command is None else command if joint.driven else None
-    stopped = _stalled(joint)
-    if stopped:
+    if stopped := _stalled(joint):
         yield "effort", "stalled", stopped, ""
     held: tuple[Span, ...] = ()
     if motion is not None:
@@ -376,9 +367,8 @@ def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Fo
     # A sign or unit that changes makes a step, somewhere in the cycles around.
     if jumps.jumped:
         cycle = 0.0 if motion is None else _cycle_s(motion)
-        other = [
-            (a - cycle, b + cycle) for q, _, spans, _ in scales if q == "position" for a, b in spans
-        ]
+        own = chain.from_iterable(spans for q, _, spans, _ in scales if q == "position")
+        other = [(a - cycle, b + cycle) for a, b in own]
         if left := _apart(jumps.jumped, other):
             yield "position", "jump", left, ""
 
@@ -387,7 +377,7 @@ def _of_scale(
     joint: _Joint, position: Series, command: Series | None, way: Series | None
 ) -> _Found:
     """Sign, unit and scale against the command, a second sensor and the velocity's integral."""
-    told: set[str] = set()
+    found: set[str] = set()
     command, second, way = (
         one if one is not None and np.ptp(one.values) > 0 else None
         for one in (command, joint.series.get("reference"), way)
@@ -398,19 +388,19 @@ def _of_scale(
     edges = turns(leader)
     if command is not None:
         for flag, spans in against_command(compare(position, command, edges)).items():
-            told.add(flag)
+            found.add(flag)
             yield "position", flag, spans, ""
     if second is not None:
         by_second = compare(position, second, edges, noisy=True)
         for flag, spans in against_witness(by_second, SAME_SCALE).items():
-            told.add(flag)
+            found.add(flag)
             scale = float(np.nanmedian(by_second.ratio))
             yield "position", flag, spans, f"{scale:.3g} of the second sensor's"
     if way is not None:
         by_rate = against_witness(compare(position, way, edges, noisy=True), SAME_RATE)
         # What the position is blamed for already is no fault of the velocity.
         for flag, spans in by_rate.items():
-            if flag not in told:
+            if flag not in found:
                 yield "velocity", flag, spans, ""
 
 
@@ -467,9 +457,7 @@ def _of_record(quantity: str, joint: _Joint, origin_ns: int) -> _Found:
 
 def _apart(spans: Sequence[Span], others: Sequence[Span]) -> tuple[Span, ...]:
     """Return the stretches that meet none of some others."""
-    return tuple(
-        s for s in spans if not any(s[0] < stop and s[1] > start for start, stop in others)
-    )
+    return tuple(s for s in spans if not any(s[0] < end and s[1] > start for start, end in others))
 
 
 def _cycle_s(motion: Series) -> float:

@@ -91,9 +91,7 @@ def frozen(position: Series, motion: Series, way: Series | None = None) -> tuple
         marked &= ~_at_reversals(position, motion, first, travel, asked)
         marked &= ~_gentle(position, motion, first, stop)
     spans = _span_each(position.t_s, first[marked], stop[marked])
-    if way is None:
-        return spans
-    return tuple(span for span in spans if not _stands(way, span, least))
+    return tuple(span for span in spans if way is None or not _stands(way, span, least))
 
 
 def stale(position: Series) -> tuple[Span, ...]:
@@ -114,21 +112,20 @@ def stale(position: Series) -> tuple[Span, ...]:
     if not np.any(_around(repeats) > STALE_SHARE * _FEW):
         return ()
     travel = np.abs(value[4:] - value[:-4])
-    fast = (travel > 0.5 * np.percentile(travel, 95)) & (
-        travel > 2 * RESOLVED * resolution_of(value)
-    )
+    least = max(0.5 * np.percentile(travel, 95), 2 * RESOLVED * resolution_of(value))
+    fast = travel > least
     of, among = (_around(one) for one in (fast & repeats, fast))
-    told = np.flatnonzero(among >= _FEW)
-    if told.size == 0:
+    known = np.flatnonzero(among >= _FEW)
+    if known.size == 0:
         return ()
-    old = of[told] > STALE_SHARE * among[told]
+    old = of[known] > STALE_SHARE * among[known]
     marked = np.zeros(value.size, dtype=np.bool_)
     for k, stop in zip(*runs(old), strict=True):
-        seen = slice(max(told[k] - _BOX // 2, 0), told[stop - 1] + _BOX // 2 + 1)
+        seen = slice(max(known[k] - _BOX // 2, 0), known[stop - 1] + _BOX // 2 + 1)
         again, quick = int((fast & repeats)[seen].sum()), int(fast[seen].sum())
         # A few of the many windows of a noisy coarse encoder exceed the share by chance.
         if binom.sf(again - 1, quick, _BY_CHANCE) < _RARE:
-            marked[told[k] + 2 : told[stop - 1] + 3] = True
+            marked[known[k] + 2 : known[stop - 1] + 3] = True
     return spans_of(position.t_s, marked)
 
 

@@ -136,9 +136,8 @@ class Compared:
             marked: Shape (c,).
         """
         found: list[Span] = []
-        for start, stop in zip(
-            self.start_s[marked].tolist(), self.stop_s[marked].tolist(), strict=True
-        ):
+        starts, stops = self.start_s[marked].tolist(), self.stop_s[marked].tolist()
+        for start, stop in zip(starts, stops, strict=True):
             if found and found[-1][1] == start:
                 found[-1] = (found[-1][0], stop)
             else:
@@ -219,21 +218,14 @@ def against_witness(one: Compared, same: float) -> dict[str, tuple[Span, ...]]:
     Returns:
         ``wrong_sign``, ``wrong_unit`` and ``scale_mismatch`` to stretches, those that were found.
     """
-    told = np.abs(one.correlation) > MIN_CORRELATION
-    ratio = np.where(told, one.ratio, np.nan)
-    known = np.flatnonzero(told)
-    if known.size:
-        ratio[known] = _smoothed(ratio[known])
+    clear = np.abs(one.correlation) > MIN_CORRELATION
+    ratio = np.where(clear, one.ratio, np.nan)
+    if clear.any():
+        ratio[clear] = _smoothed(ratio[clear])
     unit = _near(ratio, DEGREE) | _near(ratio, 1 / DEGREE)
     off = np.abs(np.log(ratio)) > np.log(same) + SURE * one.error
-    return _found(
-        one,
-        {
-            "wrong_sign": told & (one.correlation < 0),
-            "wrong_unit": unit,
-            "scale_mismatch": told & off & ~unit,
-        },
-    )
+    signs = {"wrong_sign": clear & (one.correlation < 0), "wrong_unit": unit}
+    return _found(one, signs | {"scale_mismatch": clear & off & ~unit})
 
 
 def integral(velocity: Series) -> Series:

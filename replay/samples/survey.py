@@ -164,10 +164,8 @@ def _carried(session: SessionView) -> dict[str, list[str]]:
     try:
         session.joint_columns(wanted, stop_ns=stop_ns)
     except (MissingChannelError, DataError):
-        return {
-            topic: [one for one in fields if comes(session, topic, one)]
-            for topic, fields in wanted.items()
-        }
+        every = wanted.items()
+        return {k: [one for one in fields if comes(session, k, one)] for k, fields in every}
     return wanted
 
 

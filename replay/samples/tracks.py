@@ -138,10 +138,8 @@ def read_columns(
 
 
 def _tracks(signals: JointSignals) -> tuple[Track, ...]:
-    tracks = [
-        without_filler(Track(name, *ordered(t_ns, values)))
-        for name, t_ns, values in zip(signals.names, signals.t_ns, signals.values, strict=True)
-    ]
+    rows = zip(signals.names, signals.t_ns, signals.values, strict=True)
+    tracks = [without_filler(Track(name, *ordered(t_ns, values))) for name, t_ns, values in rows]
     return tuple(track for track in tracks if np.isfinite(track.values).any())
 
 
@@ -155,9 +153,8 @@ def without_filler(track: Track) -> Track:
         The track without its NaN where they are half or more, else the track itself.
     """
     known = np.isfinite(track.values)
-    if 2 * np.count_nonzero(known) > known.size:
-        return track
-    return Track(track.name, track.t_ns[known], track.values[known])
+    whole = 2 * np.count_nonzero(known) > known.size
+    return track if whole else Track(track.name, track.t_ns[known], track.values[known])
 
 
 def pairs(first: Sequence[Track], second: Sequence[Track]) -> list[tuple[Track, Track]]:
@@ -185,14 +182,12 @@ def tables(tracks: Sequence[Track]) -> tuple[Table, ...]:
     together: dict[bytes, list[Track]] = {}
     for track in tracks:
         together.setdefault(track.t_ns.tobytes(), []).append(track)
-    return tuple(
-        Table(
-            tuple(track.name for track in group),
-            group[0].t_ns,
-            np.stack([track.values for track in group], axis=1),
-        )
-        for group in together.values()
-    )
+
+    def table(group: Sequence[Track]) -> Table:
+        values = np.stack([track.values for track in group], axis=1)
+        return Table(tuple(track.name for track in group), group[0].t_ns, values)
+
+    return tuple(map(table, together.values()))
 
 
 def in_turn(first: IntArray, other: IntArray) -> bool:
@@ -339,10 +334,8 @@ def mark_gaps(
         before = np.append(before, t_ns.size - 1)
     if not before.size:
         return t_ns, values
-    return (
-        np.insert(t_ns, before + 1, t_ns[before] + step),
-        np.insert(values, before + 1, np.nan, axis=0),
-    )
+    after = before + 1
+    return np.insert(t_ns, after, t_ns[before] + step), np.insert(values, after, np.nan, axis=0)
 
 
 def decimate(t_ns: IntArray, rate_hz: float) -> IntArray:

@@ -179,10 +179,8 @@ def falsified(analysis: Analysis | None, start_s: float, stop_s: float) -> tuple
         Their names, each once.
     """
     artefacts = () if analysis is None else analysis.artefacts
-    found = (
-        one.joint for one in artefacts if one.falsifies("position") and one.within(start_s, stop_s)
-    )
-    return tuple(dict.fromkeys(found))
+    false = (one for one in artefacts if one.falsifies("position"))
+    return tuple(dict.fromkeys(one.joint for one in false if one.within(start_s, stop_s)))
 
 
 def mean_cycles(tracks: Sequence[Track], pace: Pace) -> MeanCycles | None:
@@ -278,14 +276,8 @@ def _cut(track: Track, pace: Pace) -> FloatArray:
     model = allowed_model([one], 1.0)
     if one.count <= model.size + 1 or 4 * one.period_s > np.pi:
         return nothing
-    return cycles_by_phase(
-        one,
-        fit_at([one], 1.0, model),
-        0,
-        zero_rad=0.0,
-        start_s=pace.ends_rad[0],
-        stop_s=pace.ends_rad[1],
-    )
+    fit, (start, stop) = fit_at([one], 1.0, model), pace.ends_rad
+    return cycles_by_phase(one, fit, 0, zero_rad=0.0, start_s=start, stop_s=stop)
 
 
 def _half(cut: FloatArray) -> FloatArray:
