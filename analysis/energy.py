@@ -453,7 +453,7 @@ def transport(
         warn(Note(f"cost of transport is not applicable: {why}"))
         return Transport(distance, mass, *[nothing] * 5, why=why)
     weighed = steps.mass_kg * GRAVITY * steps.forward_m
-    sums = {name: _sum([one.per_cycle(name) for one in energies.values()]) for name in TERMS}
+    sums = {name: in_all([one.per_cycle(name) for one in energies.values()]) for name in TERMS}
     kinds = dict.fromkeys(TERMS[name][0] for name, total in sums.items() if total is None)
     lacking = [f"no {kind} energy of some joints" for kind in kinds]
     if lacking:
@@ -479,8 +479,8 @@ def _goes_nowhere(way: FloatArray, distance: Estimate, robot: Robot) -> list[str
     return [f"{moved}, which does not differ significantly from 0"]
 
 
-def _sum(found: Sequence[FloatArray | None]) -> FloatArray | None:
-    """Return the energy of all joints together in each cycle; None if one is unknown."""
+def in_all(found: Sequence[FloatArray | None]) -> FloatArray | None:
+    """Return the energy of all joints together in each cycle [J]; None if one is unknown."""
     known = [one for one in found if one is not None]
     return np.sum(known, axis=0) if known and len(known) == len(found) else None
 

@@ -30,7 +30,7 @@ from .draw.scene import body
 from .draw.scene import stage as trail
 from .draw.scene.body import body_title
 from .samples import content as entities
-from .samples.content import AwaitedMap, Content, HeatMap, Series, Start, Tab
+from .samples.content import Content, Series, Start, Tab
 from .samples.timeline import ENSEMBLE_CYCLE, GAIT_CYCLE, SESSION_TIME
 
 BEFORE_CURSOR_S = 4.0
@@ -84,6 +84,7 @@ def build_views(content: Content) -> Views:
     mode = rrb.StateTimelineView(name="Gait mode", contents=[lines.MODE])
     about = rrb.TextDocumentView(name="About the mean cycle", contents=[mean_cycle.ABOUT])
     angles, effort = _angle_views(content), _effort_views(content)
+    bounds = rrb.VisualBounds2D(x_range=VISIBLE[0], y_range=VISIBLE[1])
     if content.live:  # nothing comes after the cursor
         for one in (*angles, *effort):
             one.properties["VisibleTimeRanges"] = _window(BEFORE_CURSOR_S + AFTER_CURSOR_S, 0.0)
@@ -94,7 +95,10 @@ def build_views(content: Content) -> Views:
         angles=angles,
         effort=effort,
         bars=[bar_chart(one.title, f"{SEGMENTS}/{one.key}/**") for one in content.charts],
-        maps=[_map_view(one) for one in content.maps],
+        maps=[
+            rrb.Spatial2DView(name=one.title, origin=one.entity, visual_bounds=bounds)
+            for one in content.maps
+        ],
         steps=[
             _whole_plot(f"{one.name} by cycle [{one.unit}]", [part.entity for part in series])
             for one, series in content.cycles
@@ -183,11 +187,6 @@ def bar_chart(title: str, contents: str) -> rrb.BarChartView:
     """Return a view of bars without a legend."""
     legend = rrb.PlotLegend(visible=False)
     return rrb.BarChartView(name=title, contents=[contents], plot_legend=legend)
-
-
-def _map_view(shown: HeatMap | AwaitedMap) -> rrb.Spatial2DView:
-    bounds = rrb.VisualBounds2D(x_range=VISIBLE[0], y_range=VISIBLE[1])
-    return rrb.Spatial2DView(name=shown.title, origin=shown.entity, visual_bounds=bounds)
 
 
 def _mean_plots(content: Content) -> list[rrb.View]:

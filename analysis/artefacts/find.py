@@ -17,7 +17,7 @@ from itertools import chain
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.process import in_threads
 from undulog.capture.log.read.signals import LARGEST, Signal
 from undulog.capture.robot.model import Joint
@@ -87,7 +87,8 @@ def find_jumps(position: Series, most_rate: float, released: tuple[Span, ...] = 
         at = at[~held[near].any(axis=1)]
     if at.size == 0:
         return nothing
-    own = step[at] - _beside(step, at)  # without what the joint itself did meanwhile
+    before, after = np.maximum(at - 1, 0), np.minimum(at + 1, step.size - 1)
+    own = step[at] - (step[before] + step[after]) / 2  # without what the joint itself did meanwhile
     turn = float(np.median(np.abs(own)))
     spread = SAME_SIZE * turn + 2 * float(np.median(np.abs(step)))
     alike = bool(np.all(np.abs(np.abs(own) - turn) < spread))
@@ -115,12 +116,6 @@ def _alone(step: FloatArray, dt: FloatArray, most_rate: float) -> BoolArray:
         calm = near[near <= possible[k]]
         alone[k] = calm.size > 1 and size[k] > ABOVE_NEIGHBOURS * float(calm.max())
     return alone
-
-
-def _beside(step: FloatArray, at: IntArray) -> FloatArray:
-    """Return the mean of the steps just before and after each."""
-    before, after = np.maximum(at - 1, 0), np.minimum(at + 1, step.size - 1)
-    return (step[before] + step[after]) / 2
 
 
 AT_LIMIT_RAD = 1e-4
@@ -366,7 +361,8 @@ def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Fo
     yield from scales
     # A sign or unit that changes makes a step, somewhere in the cycles around.
     if jumps.jumped:
-        cycle = 0.0 if motion is None else _cycle_s(motion)
+        edges = np.zeros(0) if motion is None else turns(motion)
+        cycle = float(np.median(np.diff(edges))) if edges.size > 1 else 0.0
         own = chain.from_iterable(spans for q, _, spans, _ in scales if q == "position")
         other = [(a - cycle, b + cycle) for a, b in own]
         if left := _apart(jumps.jumped, other):
@@ -458,9 +454,3 @@ def _of_record(quantity: str, joint: _Joint, origin_ns: int) -> _Found:
 def _apart(spans: Sequence[Span], others: Sequence[Span]) -> tuple[Span, ...]:
     """Return the stretches that meet none of some others."""
     return tuple(s for s in spans if not any(s[0] < end and s[1] > start for start, end in others))
-
-
-def _cycle_s(motion: Series) -> float:
-    """Return the median length of the cycles of a motion [s]; 0 where it has none."""
-    edges = turns(motion)
-    return float(np.median(np.diff(edges))) if edges.size > 1 else 0.0

@@ -80,7 +80,8 @@ def frozen(position: Series, motion: Series, way: Series | None = None) -> tuple
     asked = float(np.ptp(motion.values)) if motion.count else 0.0
     if position.count < 3 or asked == 0:
         return ()
-    first, stop = _holds(position.values)
+    first, stop = runs(np.diff(position.values) == 0)
+    stop = stop + 1  # one past the last of each run of two or more equal values
     travelled = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(motion.values)))))
     begin, end = (np.interp(position.t_s[k], motion.t_s, travelled) for k in (first, stop - 1))
     seen = float(np.ptp(position.values))
@@ -229,12 +230,6 @@ def _centred(
             extremum = float(command.t_s[low:up][at].mean()) + delay
             marked[k] = extremum - begin > _CENTRED * (end - begin)
     return marked
-
-
-def _holds(value: FloatArray) -> tuple[IntArray, IntArray]:
-    """First sample and one past the last of each run of two or more equal values."""
-    first, stop = runs(np.diff(value) == 0)
-    return first, stop + 1
 
 
 def _around(marked: BoolArray) -> IntArray:

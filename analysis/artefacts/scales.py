@@ -221,7 +221,8 @@ def against_witness(one: Compared, same: float) -> dict[str, tuple[Span, ...]]:
     clear = np.abs(one.correlation) > MIN_CORRELATION
     ratio = np.where(clear, one.ratio, np.nan)
     if clear.any():
-        ratio[clear] = _smoothed(ratio[clear])
+        near = np.pad(ratio[clear], 1, mode="edge")
+        ratio[clear] = np.median(np.stack([near[:-2], near[1:-1], near[2:]]), axis=0)
     unit = _near(ratio, DEGREE) | _near(ratio, 1 / DEGREE)
     off = np.abs(np.log(ratio)) > np.log(same) + SURE * one.error
     signs = {"wrong_sign": clear & (one.correlation < 0), "wrong_unit": unit}
@@ -257,12 +258,6 @@ def _correlated(residual: FloatArray) -> float:
     first = float(residual[1:] @ residual[:-1]) / power if power > 0 else 0.0
     first = min(max(first, 0.0), 0.99)
     return float(((1 + first) / (1 - first)) ** 0.5)
-
-
-def _smoothed(ratio: FloatArray) -> FloatArray:
-    """Return the median of each value and its two neighbours; the ends count twice."""
-    padded = np.pad(ratio, 1, mode="edge")
-    return np.median(np.stack([padded[:-2], ratio, padded[2:]]), axis=0)
 
 
 def _near(ratio: FloatArray, factor: float) -> BoolArray:

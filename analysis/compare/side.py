@@ -28,6 +28,7 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.common.strict_table import read_toml
 
 from ..body.steps import body_steps, cost_of_transport, mean_of_cycles, speed
+from ..energy import in_all
 from ..estimators.harmonic import HarmonicFit
 from ..estimators.intervals import CONFIDENCE, welch_satterthwaite
 from ..estimators.series import GAP_FACTOR, Series
@@ -290,15 +291,12 @@ def _flat(value: Any, before: str = "") -> dict[str, str]:
                 name = cast("dict[str, Any]", one).get("name", k)
                 parts[f"{before}[{name}]"] = one
     if not parts:
-        return {} if value == {} else {before: _text(value)}
+        text = f"{value:g}" if isinstance(value, float) else str(value)
+        return {} if value == {} else {before: text}
     flat: dict[str, str] = {}
     for key, one in parts.items():
         flat |= _flat(one, key)
     return flat
-
-
-def _text(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 Key = tuple[str, str]
@@ -343,7 +341,8 @@ def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
     analysis = measured.analysis
     run = gait_run(Path(analysis.session.path).name, session.robot, analysis, measured.gait)
     estimates = _responses(measured, run) | _energies(measured)
-    total = _total_energy(measured)
+    powers = [energies.mechanical for energies in measured.energies.values()]
+    total = in_all([None if power is None else power.abs_j for power in powers])
     steps = None
     if measured.gait is not None:
         steps = body_steps(session, measured.responses, measured.span, warn)
@@ -408,13 +407,6 @@ def _energies(measured: SessionMeasurement) -> dict[Key, Known]:
         if known is not None:
             found["energy_abs", name] = known
     return found
-
-
-def _total_energy(measured: SessionMeasurement) -> FloatArray | None:
-    """Return E_abs of all joints together in each cycle [J]; None where one is not known."""
-    powers = [energies.mechanical for energies in measured.energies.values()]
-    known = [power.abs_j for power in powers if power is not None]
-    return np.sum(known, axis=0) if known and len(known) == len(powers) else None
 
 
 def _cycles(measured: SessionMeasurement, run: GaitRun) -> dict[str, Quantities]:

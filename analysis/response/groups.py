@@ -21,7 +21,7 @@ from itertools import combinations, pairwise
 import numpy as np
 from scipy.special import gammainccinv
 
-from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 from ..estimators.harmonic import HarmonicFit, HarmonicModel, chunks, fit_at
 from ..estimators.series import Series, shared_times
@@ -115,8 +115,11 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
     if common is None:
         return None
     moving = [one for one in series if one.name in common.names]
-    lively = _lively(common.fit)
-    if np.all(_own(common.fit)[lively]):
+    size = np.sqrt(common.fit.total / common.fit.count)
+    lively = size > DRIVEN_SHARE * np.max(size, initial=0.0)
+    # Whether the common rhythm is each channel's own and not a subharmonic of it.
+    own = (common.fit.explained >= _CLEAR) & (_fundamental_share(common.fit) >= _OWN_SHARE)
+    if np.all(own[lively]):
         return Groups((common,), common.explained)
     active = [one for one, chosen in zip(moving, lively, strict=True) if chosen]
     tones = [
@@ -147,16 +150,6 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
     grouped = {name for rhythm in rhythms for name in rhythm.names}
     astray = tuple(one.name for one in active if one.name not in grouped | left)
     return Groups(tuple(rhythms), known / total, tuple(unresolved), astray)
-
-
-def _lively(fit: HarmonicFit) -> BoolArray:
-    size = np.sqrt(fit.total / fit.count)
-    return size > DRIVEN_SHARE * np.max(size, initial=0.0)
-
-
-def _own(fit: HarmonicFit) -> BoolArray:
-    """Return whether the common rhythm is each channel's own and not a subharmonic of it."""
-    return (fit.explained >= _CLEAR) & (_fundamental_share(fit) >= _OWN_SHARE)
 
 
 def _fundamental_share(fit: HarmonicFit) -> FloatArray:

@@ -297,7 +297,10 @@ def _out_of_profile(
     """
     reach = float(np.ptp(profile.values[others]))
     beside = _beside_neighbours(profile, others, one.joint)
-    extrapolated = _at_an_end(profile, others, one.joint) and abs(one.value) <= reach
+    place = profile.place
+    first, last = place[others].min(), place[others].max()
+    at_an_end = not first <= place[one.joint] <= last
+    extrapolated = at_an_end and abs(one.value) <= reach
     if (extrapolated and not smooth) or min(each / one.value for each in beside) < LOCAL:
         return False
     mirror = np.flatnonzero(profile.place == profile.count - 1 - profile.place[one.joint])
@@ -308,12 +311,6 @@ def _out_of_profile(
     beside = _beside_neighbours(profile, others[others != partner], partner)
     shown = [abs(each / one.value) for each in (by_model, *beside)]
     return not any(MIRRORED <= share <= 1 / MIRRORED for share in shown)
-
-
-def _at_an_end(profile: Profile, others: IntArray, joint: int) -> bool:
-    """Return whether all other joints are on one side of a joint."""
-    place = profile.place
-    return bool(place[joint] < place[others].min() or place[joint] > place[others].max())
 
 
 def _beside_neighbours(profile: Profile, others: IntArray, joint: int) -> tuple[float, ...]:

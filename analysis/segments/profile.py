@@ -280,10 +280,6 @@ def everyone(profile: Profile) -> BoolArray:
     return np.ones(profile.values.size, dtype=np.bool_)
 
 
-def _design(shapes: Sequence[FloatArray], size: int) -> FloatArray:
-    return np.stack([np.ones(size), *shapes], axis=1)
-
-
 def deviation_weights(
     profile: Profile, active: BoolArray, shapes: Sequence[FloatArray]
 ) -> FloatArray:
@@ -297,7 +293,7 @@ def deviation_weights(
         A row for each joint, whose sum over the values is its deviation, shape (m, m).
     """
     size = profile.values.size
-    design = _design(shapes, size)
+    design = np.stack([np.ones(size), *shapes], axis=1)
     weight = np.where(active, profile.precision, 0.0)
     hat = design @ np.linalg.pinv(design.T @ (weight[:, None] * design)) @ (design.T * weight)
     # Of a joint that takes part, the leave-one-out residual: (1 - h_ii)^-1 of the residual.

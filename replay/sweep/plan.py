@@ -146,7 +146,8 @@ def read_plan(path: Path) -> SweepPlan:
     top = Table(values, "", faults)
     plan = read_fields(top, SweepPlan, parameters=lambda: _parameters(top))
     top.close()
-    runs = _count(plan)
+    points = plan.points or math.prod(len(one.values) for one in plan.parameters)
+    runs = points * plan.seeds
     if runs > MOST_RUNS:
         top.fault("points", f"at most {MOST_RUNS} runs", str(runs))
     if found := faults.all():
@@ -185,10 +186,6 @@ def _parameter(key: str, table: Table) -> Parameter:
         table.fault("low", "above 0, since log is true")
     table.close()
     return one
-
-
-def _count(plan: SweepPlan) -> int:
-    return (plan.points or math.prod(len(one.values) for one in plan.parameters)) * plan.seeds
 
 
 def points_of(plan: SweepPlan) -> list[dict[str, Any]]:

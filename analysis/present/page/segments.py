@@ -85,30 +85,29 @@ def _estimates(
             gid = f"{what}-{i}"
             plot_estimate(axes, i + 1, quantity, colors[i], marker=marker(joint.plane), gid=gid)
             tooltips[gid] = _tooltip(joint, f"{what} {estimate(quantity, '°' if lag else '')}")
-    _mean_lines(axes, joints, of, _circular_mean_deg if lag else fmean)
+    _mean_lines(axes, joints, of, circular=lag)
     if drawn:
         _keep_span(axes, least=1.0 if lag else 0.02)
     else:
         _empty(axes, f"no {what}: see the warnings")
 
 
-def _circular_mean_deg(values: Sequence[float]) -> float:
-    """Return the mean direction [°] (Fisher, Statistical Analysis of Circular Data, Eq. 2.9)."""
-    return float(np.degrees(np.angle(np.mean(np.exp(1j * np.radians(values))))))
-
-
 def _mean_lines(
     axes: Axes,
     joints: Sequence[JointResult],
     of: Callable[[JointResult], Estimate],
-    average: Callable[[Sequence[float]], float],
+    *,
+    circular: bool,
 ) -> None:
     """Draw the mean over the joints of each plane: the position of all if they moved alike."""
     for plane in _PLANES:
         members = [(i + 1, of(j).value) for i, j in enumerate(joints) if j.plane == plane]
         known = [(place, value) for place, value in members if value is not None]
         if len(known) > 1:
-            mean = average([value for _, value in known])
+            values = [value for _, value in known]
+            # Mean direction (Fisher, Statistical Analysis of Circular Data, Eq. 2.9).
+            turn = np.angle(np.mean(np.exp(1j * np.radians(values))))
+            mean = float(np.degrees(turn)) if circular else fmean(values)
             ends = [known[0][0] - 0.4, known[-1][0] + 0.4]
             axes.plot(ends, [mean, mean], color=REFERENCE, linestyle=DASHED, zorder=1)
 

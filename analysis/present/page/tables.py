@@ -250,9 +250,13 @@ def key_figures(analysis: Analysis) -> list[Fact]:
         sum_j = math.fsum(energies)
         total = f"{formats.number(sum_j, formats.decimals_for_values([sum_j]))} J"
         energy_note = f"{len(energies)} of {len(joints)} joints"
+    steps = [
+        f"{formats.number(math.degrees(lag), 1)}° a joint, {plain(plane)}"
+        for plane, lag in gait.lag_per_joint_rad.items()
+    ]
     facts = [
         Fact("Gait frequency", formats.gait_frequency(gait), _analysed(analysis)),
-        Fact("Wave", (gait.wave or formats.MISSING).replace("-", " "), _lag_per_joint(analysis)),
+        Fact("Wave", (gait.wave or formats.MISSING).replace("-", " "), ", ".join(steps)),
         Fact("Joints in the gait", count),
         _range("Gain", gains, formats.decimals_for((j.gain for j in joints), most=3), ""),
         _range("Lag", lags, 1, "°"),
@@ -286,10 +290,3 @@ def _analysed(analysis: Analysis) -> str:
     spans = ", ".join(f"{w.start_s:.2f} to {w.stop_s:.2f} s" for w in windows[:3])
     more = f" and {len(windows) - 3} more" if len(windows) > 3 else ""
     return f"{cycles:.0f} cycles, {spans}{more}" if cycles else f"{spans}{more}"
-
-
-def _lag_per_joint(analysis: Analysis) -> str:
-    return ", ".join(
-        f"{formats.number(math.degrees(lag), 1)}° a joint, {plain(plane)}"
-        for plane, lag in analysis.gait.lag_per_joint_rad.items()
-    )
