@@ -118,7 +118,7 @@ class ReproducedRun:
         original: The session that commands were taken from.
         scenario: Where they were given again.
         same: What of it is the same to the last bit; None where the first is no run of the twin.
-        comparison: What differs as the analysis has it; None where it can't be told.
+        comparison: What differs as the analysis has it; None where there is none.
         not_compared: Why it can't.
     """
 

@@ -241,7 +241,7 @@ def _around(marked: BoolArray) -> IntArray:
 
 
 def _stands(way: Series, span: Span, least: float) -> bool:
-    """Whether a velocity is told anew over a stretch, and the joint goes no farther than so."""
+    """Whether a velocity changes over a stretch, and the joint goes no farther than that."""
     start, stop = np.searchsorted(way.t_s, span)
     inside = way.values[start:stop]
     if inside.size < 3:

@@ -86,7 +86,7 @@ OPPOSITE = -0.7
 degrees from opposite phase."""
 
 EITHER_WAY = 0.75
-"""Share of the cycles that must follow the command, upright or upside down, for a sign to be told:
+"""Share of the cycles that must follow the command, upright or not, for a sign to be decided:
 of a multisine near a resonance every cycle has another phase."""
 
 FULL_SIZE = (0.5, 2.0)

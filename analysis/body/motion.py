@@ -255,8 +255,8 @@ def body_motion(
         if name not in fitted.driven and abs(float(responses[name].values.mean())) > _BENT_RAD
     ]
     if bent:
-        told = f"{', '.join(bent)} are bent though not driven: the body's null takes them straight"
-        warn(Note(told))
+        text = f"{', '.join(bent)} are bent though not driven: the body's null takes them straight"
+        warn(Note(text))
     return result
 
 

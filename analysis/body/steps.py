@@ -61,8 +61,7 @@ def body_steps(
     if span.cycles < MIN_CYCLES:
         warn(f"{_NOTHING}: {span.cycles} whole cycles are too few")
         return None
-    unknown = [n for n in robot.joint_names if n not in responses or responses[n].count < 2]
-    if unknown:
+    if unknown := [n for n in robot.joint_names if n not in responses or responses[n].count < 2]:
         warn(f"{_NOTHING}: no angles of {', '.join(unknown)}")
         return None
     try:
@@ -109,10 +108,7 @@ def centre_of_mass(
 
 def _at(t_s: FloatArray, known_s: FloatArray, columns: FloatArray) -> FloatArray:
     """Columns, shape (n, k), at other times."""
-    found = np.empty((t_s.size, columns.shape[1]))
-    for k, column in enumerate(columns.T):
-        found[:, k] = np.interp(t_s, known_s, column)
-    return found
+    return np.stack([np.interp(t_s, known_s, column) for column in columns.T], axis=1)
 
 
 def mean_of_cycles(per_cycle: FloatArray) -> tuple[float, float, float] | None:
@@ -126,11 +122,8 @@ def mean_of_cycles(per_cycle: FloatArray) -> tuple[float, float, float] | None:
     """
     if per_cycle.size < MIN_CYCLES:
         return None
-    return (
-        float(per_cycle.mean()),
-        float(per_cycle.var(ddof=1) / per_cycle.size),
-        per_cycle.size - 1.0,
-    )
+    count = per_cycle.size
+    return float(per_cycle.mean()), float(per_cycle.var(ddof=1) / count), count - 1.0
 
 
 def speed(steps: Steps) -> tuple[float, float, float] | None:

@@ -56,9 +56,8 @@ def predict(
     turned = _kicks(kick or ())
     options = chosen(start, stop, "/joint_commands", "/joint_states")
     if output is not None:
-        check_output(
-            output, (".json",), "the prediction is JSON; end its name in .json", force=force
-        )
+        why = "the prediction is JSON; end its name in .json"
+        check_output(output, (".json",), why, force=force)
     from dataclasses import asdict
     from json import dumps
 

@@ -76,8 +76,8 @@ def report(
         emit_json({"page": str(output), "bytes": size, **facts})
         return
     echo(facts["answer"])
-    said = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
-    echo(f"{output}: {size / 1e3:.0f} kB{said}")
+    noted = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
+    echo(f"{output}: {size / 1e3:.0f} kB{noted}")
 
 
 def _one(file: Path, options: Options) -> tuple[str, dict[str, Any], int]:
@@ -135,10 +135,6 @@ def _several(files: Sequence[Path], options: Options) -> tuple[str, dict[str, An
 
 
 def _summary(analysis: Analysis) -> dict[str, Any]:
-    answer = analysis.answer
-    return {
-        "session": analysis.session.id,
-        "path": analysis.session.path,
-        "verdict": answer.verdict,
-        "sentence": answer.sentence,
-    }
+    session, answer = analysis.session, analysis.answer
+    facts = {"session": session.id, "path": session.path}
+    return facts | {"verdict": answer.verdict, "sentence": answer.sentence}

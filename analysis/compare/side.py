@@ -238,8 +238,7 @@ def facts_of(session: SessionView) -> dict[str, str]:
     """
     facts = {"robot": "" if session.robot is None else session.robot.name}
     for file in _FILES:
-        data = session.attachments.get(file)
-        if data is None:
+        if (data := session.attachments.get(file)) is None:
             continue
         try:
             table = read_toml(data.decode())
@@ -248,10 +247,8 @@ def facts_of(session: SessionView) -> dict[str, str]:
             continue
         kept = {key: value for key, value in table.items() if key not in _TEXTS}
         facts |= {f"{file}: {key}": text for key, text in _flat(kept).items()}
-    recorded = session.metadata.get("undulog", {})
-    return facts | {
-        f"session: {key}": value for key, value in recorded.items() if key not in _OF_THE_RUN
-    }
+    recorded = session.metadata.get("undulog", {}).items()
+    return facts | {f"session: {key}": one for key, one in recorded if key not in _OF_THE_RUN}
 
 
 def changes(a: Sequence[Mapping[str, str]], b: Sequence[Mapping[str, str]]) -> tuple[Change, ...]:
@@ -403,8 +400,8 @@ def _responses(measured: SessionMeasurement, run: GaitRun) -> dict[Key, Known]:
 def _energies(measured: SessionMeasurement) -> dict[Key, Known]:
     found: dict[Key, Known] = {}
     for name, energies in measured.energies.items():
-        known = None if energies.mechanical is None else mean_of_cycles(energies.mechanical.abs_j)
-        if known is not None:
+        power = energies.mechanical
+        if power is not None and (known := mean_of_cycles(power.abs_j)) is not None:
             found["energy_abs", name] = known
     return found
 
@@ -416,14 +413,10 @@ def _cycles(measured: SessionMeasurement, run: GaitRun) -> dict[str, Quantities]
         return found
     for group, members in zip(gait.groups, run.by_group, strict=True):
         for k, name in enumerate(group.answered):
-            cut = cycles_by_phase(
-                measured.responses[name],
-                group.fit,
-                len(group.driven) + k,
-                zero_rad=float(np.angle(run.command[members[0]])),
-                start_s=span.start_s,
-                stop_s=span.stop_s,
-            )
+            zero_rad = float(np.angle(run.command[members[0]]))
+            window = {"zero_rad": zero_rad, "start_s": span.start_s, "stop_s": span.stop_s}
+            at = len(group.driven) + k
+            cut = cycles_by_phase(measured.responses[name], group.fit, at, **window)
             if len(cut) > 1:
                 found[name] = from_runs(cut)
     return found

@@ -286,12 +286,12 @@ def _warn_dropped(
         if lost:
             nan = sum(one.dropped_nan for one in lost)
             double = sum(one.dropped_duplicates for one in lost)
-            told = (
+            text = (
                 f"left out of the {kind}s: {nan} samples that are not numbers and {double} with a "
                 f"time that was there already ({', '.join(one.name for one in lost)})"
             )
             few = nan + double <= _FEW * sum(one.count for one in series.values())
-            warn(Note(told) if few else told)
+            warn(Note(text) if few else text)
 
 
 def _span(stretch: Stretch, origin_ns: int, gait: GaitFit | None) -> Span:

@@ -1,4 +1,4 @@
-"""Which sessions are runs of one gait, and which way its wave runs: told from the commands alone.
+"""Which sessions are runs of one gait, and which way its wave runs, by the commands alone.
 
 With c the complex amplitudes of a run's commands, head to tail, another run has the same gait if
 its c is the same but for a common phase (it started at another time), and the reverse gait if its

@@ -67,7 +67,7 @@ class CorrelatedParameters:
     """A direction in the parameters that a session doesn't determine.
 
     Attributes:
-        left: Standard deviation along it, as a share of the prior's: 1 where nothing is told.
+        left: Standard deviation along it, as a share of the prior's: 1 where nothing is known.
         factors: Parameter to the factor (of a dead time: the change in seconds) by which it goes
             along, one prior deviation up the ridge; those that hardly move are left out.
     """

@@ -1,6 +1,6 @@
 """Rerun's own viewer as a process of ours, reachable from this machine only.
 
-Rerun's ``spawn`` and ``serve`` listen on all interfaces unless told; here every server is bound to
+Rerun's ``spawn`` and ``serve`` listen on all interfaces by default; here every server is bound to
 127.0.0.1.
 """
 

@@ -127,7 +127,7 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
         "matrices": [
             matrix_picture(one, f"matrix-{k + 1}", small=k > 0) for k, one in enumerate(entries)
         ],
-        "told": _checks(coupling),
+        "checks": _checks(coupling),
         "modes": None if body is None else modes_drawing(body),
         "body_facts": [] if body is None else body_facts(body),
         "entrainment": None if body is None else entrainment_entries(body),
