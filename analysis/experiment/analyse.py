@@ -24,7 +24,7 @@ from ..results.analysis import Analysis
 from ..results.coupling import LocalCoupling
 from ..results.estimate import Provenance
 from ..results.experiment import Experiment, Headings, PooledJoint, PooledRuns, Reversal, Run
-from ..session.analyse import examine_session
+from ..session.analyse import measure_session
 from ..session.runs import (
     SAME_COMMAND,
     SAME_FREQUENCY,
@@ -76,14 +76,15 @@ def analyse_experiment(
     commanded: list[CommandTones | None] = []
     runs: list[GaitRun] = []
     for session in sessions:
-        fitted = examine_session(session, options)
-        analysis, robot = fitted.analysis, session.robot
-        lay = posture(session, analysis.gait.windows)
-        runs.append(gait_run(Path(analysis.session.path).name, robot, analysis, fitted.gait, lay))
+        measured = measure_session(session, options)
+        analysis, gait, robot = measured.analysis, measured.gait, session.robot
+        del measured  # heavy: no two at a time
+        label, lay = Path(analysis.session.path).name, posture(session, analysis.gait.windows)
+        runs.append(gait_run(label, robot, analysis, gait, lay))
         analyses.append(analysis)
-        gaits.append(fitted.gait)
+        gaits.append(gait)
         robots.append(robot)
-        commanded.append(command_tones(session, options, fitted))
+        commanded.append(command_tones(session, options, gait, analysis.session.robot))
     if not runs:
         raise UsageError("an experiment needs at least one session")
     warnings: list[str] = []
@@ -109,8 +110,11 @@ def analyse_experiment(
     names, y = responses(chosen) if chosen else ((), np.zeros((0, 0), dtype=np.complex128))
     ways = list(roles.values())
     forward, reverse = (y[[way is one for way in ways]] for one in (Role.FORWARD, Role.REVERSE))
-    alike = len(set(ways)) == 1
-    pooled = pool_runs(chosen[0].names, [one.response for one in chosen]) if alike else None
+    pooled = (
+        pool_runs(chosen[0].names, [run.response for run in chosen])
+        if len(set(ways)) == 1
+        else None
+    )
     robot = robots[next(iter(roles))] if roles else None
     joints = None
     if pooled is not None:

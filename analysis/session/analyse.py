@@ -113,27 +113,18 @@ _FEW = 1e-3
 
 
 @dataclass(frozen=True)
-class FittedSession:
-    """One session's numbers, and the fit that an experiment of several sessions builds on.
-
-    Attributes:
-        gait: The fitted gait, or None.
-    """
-
-    analysis: Analysis
-    gait: GaitFit | None
-
-
-@dataclass(frozen=True)
-class SessionMeasurement(FittedSession):
+class SessionMeasurement:
     """One session's numbers with what they were computed from; heavy, so not to be kept.
 
     Attributes:
+        gait: The fitted gait, or None.
         responses: Measured joint angles by name, on the analysed stretch.
         span: Whole cycles over which energies are taken.
         offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
     """
 
+    analysis: Analysis
+    gait: GaitFit | None
     responses: Mapping[str, Series]
     energies: Mapping[str, Energies]
     span: Span
@@ -151,15 +142,7 @@ def analyse_session(session: SessionView, options: Options | None = None) -> Ana
         DataError: If they hold no samples.
         UsageError: If the options leave nothing of the session.
     """
-    return examine_session(session, options).analysis
-
-
-def examine_session(
-    session: SessionView, options: Options | None = None, *, with_dead_bands: bool = True
-) -> FittedSession:
-    """Analyse one session as :func:`measure_session` does, and keep the fit only."""
-    measured = measure_session(session, options, with_dead_bands=with_dead_bands)
-    return FittedSession(measured.analysis, measured.gait)
+    return measure_session(session, options).analysis
 
 
 def measure_session(

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from undulog.analysis.session.analyse import examine_session
+from undulog.analysis.session.analyse import measure_session
 from undulog.capture import Session, SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError, UndulogError
@@ -246,7 +246,7 @@ def calibrate(
 def _omega(session: SessionView) -> float | None:
     """Angular frequency of the commands [rad/s], or None where they are no steady gait."""
     try:
-        gait = examine_session(session, with_dead_bands=False).gait
+        gait = measure_session(session, with_dead_bands=False).gait
     except UndulogError:  # a session without a gait can be fitted, too
         return None
     return None if gait is None or not gait.driven else gait.fit.omega

@@ -23,9 +23,9 @@ from undulog.capture.robot.run import Run
 
 from ...estimators.cycle_sums import DRIFT_PER_CYCLE, SIGNIFICANT
 from ...estimators.series import Series, clean
+from ...response.fitting import GaitFit
 from ...response.rhythm import DRIVEN_SHARE, NYQUIST_SHARE
 from ...results.answer import Remarks
-from ...session.analyse import FittedSession
 from ...session.runs import SAME_FREQUENCY
 from ...signals.columns import read_columns
 from ...signals.stretch import Options, choose_stretch
@@ -104,14 +104,17 @@ def read_signals(session: SessionView, options: Options) -> Signals:
 
 
 def command_tones(
-    session: SessionView, options: Options, examined: FittedSession
+    session: SessionView, options: Options, gait: GaitFit | None, robot: str | None
 ) -> CommandTones | None:
     """Find the tones of a session's commands.
+
+    Args:
+        gait: The fitted gait, or None.
+        robot: Name of the robot, or None.
 
     Returns:
         The gait's frequency alone, or the tones of a multisine; None of anything else.
     """
-    gait, robot = examined.gait, examined.analysis.session.robot
     if gait is not None and gait.driven and not gait.others:
         m = len(gait.driven)
         if float(gait.fit.rss[:m].sum() / gait.fit.total[:m].sum()) < _PURE:
