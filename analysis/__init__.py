@@ -16,11 +16,11 @@ Names are imported when first used, so that ``import undulog.analysis`` costs no
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from undulog.capture.common.lazy import attach
 
-from .results.shown import Presentation, present_with
+from .results.shown import present_with
 
 if TYPE_CHECKING:
     from .catalog.catalog import Catalog
@@ -40,10 +40,10 @@ if TYPE_CHECKING:
     from .signals.stretch import Options
 
 
-def _presentation() -> Presentation:
-    from .present.notebook.text import Presenter
+def _presentation() -> Any:
+    from .present.notebook import files
 
-    return Presenter()
+    return files
 
 
 present_with(_presentation)

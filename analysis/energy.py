@@ -22,6 +22,8 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
+from undulog.capture.common.process import in_threads
+from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
@@ -31,6 +33,7 @@ from .estimators.intervals import around, t_factor
 from .estimators.series import Series, clean
 from .results.analysis import Closure, Each, EnergyResult, JointCycles, Transport
 from .results.answer import Note
+from .results.artefact import Artefact
 from .results.estimate import Estimate
 from .signals.columns import Columns
 from .signals.windows import Span
@@ -132,10 +135,8 @@ def power_of(first: Signal, second: Signal, origin_ns: int) -> Series:
     Returns:
         The power [W].
     """
-    if np.array_equal(first.t_ns, second.t_ns):
-        factor = second.values
-    else:
-        factor = _interpolate(first.t_ns, second)
+    alike = np.array_equal(first.t_ns, second.t_ns)
+    factor = second.values if alike else _interpolate(first.t_ns, second)
     return clean(first.name, first.t_ns, first.values * factor, origin_ns)
 
 
@@ -182,6 +183,66 @@ class Energies:
         return None if energy is None else getattr(energy, attribute)
 
 
+GAP_SHARE = 0.01
+"""More of the window without samples is worth a flag, or of power a warning."""
+
+
+def joint_energies(
+    session: SessionView, columns: Columns, artefacts: Iterable[Artefact], span: Span, warn: Warn
+) -> dict[str, Energies]:
+    """Return the energies of all joints; warn of powers with gaps or falsified by a sensor."""
+    wrong = list(artefacts)
+    false = {one.joint for one in wrong if one.falsifies("velocity", "effort")}
+    false_el = {one.joint for one in wrong if one.falsifies("current", "voltage")}
+    for joints, kind in ((false, "mechanical"), (false_el, "electrical")):
+        if joints:
+            named = ", ".join(name for name in columns.names if name in joints)
+            warn(f"{named}: {kind} energies are null, since a sensor falsifies them")
+
+    def of_joint(name: str) -> Energies:
+        powers: dict[str, Series] = {}
+        found: dict[str, Energy | None] = {}
+        window = span.start_s, span.stop_s, max(span.cycles, 1)
+        for kind, (first, second), wrong in (
+            ("mechanical", (columns.effort, columns.velocity), false),
+            ("electrical", (columns.current, columns.voltage), false_el),
+        ):
+            if name in wrong:  # what accumulates powers goes by the same sensors
+                continue
+            found[kind] = _accumulated(columns, kind, name, span.origin_ns, window)
+            if found[kind] is None and name in first and name in second:
+                powers[kind] = power_of(first[name], second[name], span.origin_ns)
+        found |= zip(powers, integrate([*powers.values()], *window), strict=True)
+        return Energies(found.get("mechanical"), found.get("electrical"), frozenset(powers))
+
+    samples = sum(one.t_ns.size for one in (*columns.effort.values(), *columns.current.values()))
+    found = in_threads(of_joint, columns.names, samples, session.forget)
+    result = dict(zip(columns.names, found, strict=True))
+
+    def has_gaps(one: Energies) -> bool:
+        both = one.mechanical, one.electrical
+        return any(each is not None and each.coverage < 1 - GAP_SHARE for each in both)
+
+    if thin := [name for name, one in result.items() if has_gaps(one)]:
+        warn(
+            f"the power of {', '.join(thin)} has gaps, which are not bridged: energies count only "
+            "the time that has samples"
+        )
+    return result
+
+
+def _accumulated(
+    columns: Columns, kind: str, name: str, origin_ns: int, window: tuple[float, float, int]
+) -> Energy | None:
+    """Return the energy by the powers that the log has themselves, or None."""
+    topics = (PowerTopic[kind.upper()], PowerTopic[f"{kind.upper()}_PLUS"])
+    net, plus = (columns.powers[topic].get(name) for topic in topics)
+    if net is None or plus is None:
+        return None
+    mean, positive = (clean(name, one.t_ns, one.values, origin_ns) for one in (net, plus))
+    return add_up(mean, positive, *window)
+
+
 STEADY_SHARE = 0.2
 """A voltage that varies by less than this part of its mean is a supply's: a motor's follows the
 duty, through zero and back in every cycle."""
@@ -209,12 +270,10 @@ def energy_result(
         )
         for name, one in energies.items()
     ]
-    source = electrical_source(session, columns)
-    if source == "supply":
-        topic = columns.topics["voltage"]
+    if (source := electrical_source(session, columns)) == "supply":
         warn(
-            f"{topic} stays as it is while the joints work, so it is the supply's, not the "
-            "motors': E_el is an upper bound"
+            f"{columns.topics['voltage']} stays as it is while the joints work, so it is the "
+            "supply's, not the motors': E_el is an upper bound"
         )
     return EnergyResult(
         tuple(edges[:-1].tolist()),
@@ -277,7 +336,7 @@ def check_ledger(
     """Compare the joints' energies with the ledger's over the same window, and close its balance.
 
     Args:
-        warn: Told where they differ by more than ``TOLERANCE``.
+        warn: Called where they differ by more than ``TOLERANCE``.
 
     Returns:
         The closure, or None where the session has no ledger.
@@ -351,9 +410,8 @@ def whole_robot(energies: Iterable[Energies]) -> Mapping[str, float]:
         ("mechanical", ("net", "plus", "abs")),
         ("electrical", ("el", "el_clipped", "el_abs")),
     ):
-        known = [one for one in (getattr(joint, kind) for joint in joints) if one is not None]
-        for name, part in zip(names, ("net_j", "plus_j", "abs_j"), strict=True):
-            if known:
+        if known := [one for joint in joints if (one := getattr(joint, kind)) is not None]:
+            for name, part in zip(names, ("net_j", "plus_j", "abs_j"), strict=True):
                 sums[name] = sum(float(getattr(one, part).sum()) for one in known)
     return sums
 
@@ -374,14 +432,13 @@ def transport(
     Args:
         responses: Measured joint angles that can be trusted, by name.
         energies: By joint name, in cycles.
-        warn: Told why there is no value.
+        warn: Called with the reason why there is no value.
 
     Returns:
         The cost, or the reason why it is not applicable.
     """
     mass = None if session.robot is None else session.robot.total_mass
-    nothing = Estimate()
-    distance = nothing
+    distance = nothing = Estimate()
     reasons: list[str] = []
 
     def refuse(sentence: str) -> None:
@@ -396,7 +453,7 @@ def transport(
         warn(Note(f"cost of transport is not applicable: {why}"))
         return Transport(distance, mass, *[nothing] * 5, why=why)
     weighed = steps.mass_kg * GRAVITY * steps.forward_m
-    sums = {name: _sum([one.per_cycle(name) for one in energies.values()]) for name in TERMS}
+    sums = {name: in_all([one.per_cycle(name) for one in energies.values()]) for name in TERMS}
     kinds = dict.fromkeys(TERMS[name][0] for name, total in sums.items() if total is None)
     lacking = [f"no {kind} energy of some joints" for kind in kinds]
     if lacking:
@@ -422,8 +479,8 @@ def _goes_nowhere(way: FloatArray, distance: Estimate, robot: Robot) -> list[str
     return [f"{moved}, which does not differ significantly from 0"]
 
 
-def _sum(found: Sequence[FloatArray | None]) -> FloatArray | None:
-    """Return the energy of all joints together in each cycle; None if one is unknown."""
+def in_all(found: Sequence[FloatArray | None]) -> FloatArray | None:
+    """Return the energy of all joints together in each cycle [J]; None if one is unknown."""
     known = [one for one in found if one is not None]
     return np.sum(known, axis=0) if known and len(known) == len(found) else None
 

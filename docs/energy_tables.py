@@ -11,9 +11,8 @@ import dataclasses
 import tempfile
 from pathlib import Path
 
-from undulog.analysis.energy import TERMS, booked_energies, whole_robot
+from undulog.analysis.energy import TERMS, booked_energies, joint_energies, whole_robot
 from undulog.analysis.session.analyse import measure_session
-from undulog.analysis.session.joints import joint_energies
 from undulog.analysis.signals.columns import RESPONSE_TOPIC, read_columns
 from undulog.capture import Session
 from undulog.sim import load_scenario, scenario_names

@@ -30,7 +30,7 @@ from .draw.scene import body
 from .draw.scene import stage as trail
 from .draw.scene.body import body_title
 from .samples import content as entities
-from .samples.content import AwaitedMap, Content, HeatMap, Series, Start, Tab
+from .samples.content import Content, Series, Start, Tab
 from .samples.timeline import ENSEMBLE_CYCLE, GAIT_CYCLE, SESSION_TIME
 
 BEFORE_CURSOR_S = 4.0
@@ -84,6 +84,7 @@ def build_views(content: Content) -> Views:
     mode = rrb.StateTimelineView(name="Gait mode", contents=[lines.MODE])
     about = rrb.TextDocumentView(name="About the mean cycle", contents=[mean_cycle.ABOUT])
     angles, effort = _angle_views(content), _effort_views(content)
+    bounds = rrb.VisualBounds2D(x_range=VISIBLE[0], y_range=VISIBLE[1])
     if content.live:  # nothing comes after the cursor
         for one in (*angles, *effort):
             one.properties["VisibleTimeRanges"] = _window(BEFORE_CURSOR_S + AFTER_CURSOR_S, 0.0)
@@ -94,7 +95,10 @@ def build_views(content: Content) -> Views:
         angles=angles,
         effort=effort,
         bars=[bar_chart(one.title, f"{SEGMENTS}/{one.key}/**") for one in content.charts],
-        maps=[_map_view(one) for one in content.maps],
+        maps=[
+            rrb.Spatial2DView(name=one.title, origin=one.entity, visual_bounds=bounds)
+            for one in content.maps
+        ],
         steps=[
             _whole_plot(f"{one.name} by cycle [{one.unit}]", [part.entity for part in series])
             for one, series in content.cycles
@@ -111,17 +115,16 @@ def _body_view(content: Content) -> rrb.Spatial3DView | None:
         return None
     span = sum(link.length for link in robot.links) if robot is not None else 1.0
     # From behind its right shoulder and above, where the wave shows along the whole body.
-    eye = rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital,
-        position=_beside(start, (-0.92 * span, -0.55 * span, 0.65 * span)),
-        look_target=_beside(start, (-0.5 * span, 0.0, 0.0)),
-        eye_up=(0.0, 0.0, 1.0),
-        tracking_entity=body.MEASURED,
-    )
     return rrb.Spatial3DView(
         name=body_title(content),
         origin="/world",
-        eye_controls=eye,
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=_beside(start, (-0.92 * span, -0.55 * span, 0.65 * span)),
+            look_target=_beside(start, (-0.5 * span, 0.0, 0.0)),
+            eye_up=(0.0, 0.0, 1.0),
+            tracking_entity=body.MEASURED,
+        ),
         background=_BACKGROUND,
         line_grid=_grid(span),
         overrides={trail.TRAIL: trail_window()},
@@ -133,16 +136,15 @@ def _mean_scene(content: Content) -> rrb.Spatial3DView | None:
         return None
     span = sum(link.length for link in content.robot.links)
     # The frame goes along with the body: its middle stays where it is.
-    eye = rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital,
-        position=(-0.35 * span, -0.6 * span, 0.75 * span),
-        look_target=(0.0, 0.0, 0.0),
-        eye_up=(0.0, 0.0, 1.0),
-    )
     return rrb.Spatial3DView(
         name="Mean cycle: body",
         origin=mean_cycle.BODY,
-        eye_controls=eye,
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=(-0.35 * span, -0.6 * span, 0.75 * span),
+            look_target=(0.0, 0.0, 0.0),
+            eye_up=(0.0, 0.0, 1.0),
+        ),
         background=_BACKGROUND,
         line_grid=_grid(span),
     )
@@ -150,10 +152,7 @@ def _mean_scene(content: Content) -> rrb.Spatial3DView | None:
 
 def _grid(span: float) -> rrb.LineGrid3D:
     return rrb.LineGrid3D(
-        visible=True,
-        spacing=_grid_spacing(span),
-        stroke_width=1.0,
-        color=(255, 255, 255, 12),
+        visible=True, spacing=_grid_spacing(span), stroke_width=1.0, color=(255, 255, 255, 12)
     )
 
 
@@ -190,11 +189,6 @@ def bar_chart(title: str, contents: str) -> rrb.BarChartView:
     return rrb.BarChartView(name=title, contents=[contents], plot_legend=legend)
 
 
-def _map_view(shown: HeatMap | AwaitedMap) -> rrb.Spatial2DView:
-    bounds = rrb.VisualBounds2D(x_range=VISIBLE[0], y_range=VISIBLE[1])
-    return rrb.Spatial2DView(name=shown.title, origin=shown.entity, visual_bounds=bounds)
-
-
 def _mean_plots(content: Content) -> list[rrb.View]:
     mean = content.mean
     if mean is None:
@@ -219,8 +213,7 @@ def _mean_plots(content: Content) -> list[rrb.View]:
 def _angle_views(content: Content) -> list[rrb.View]:
     views: list[rrb.View] = []
     if content.places is not None:
-        three = len(content.places.names) == 3
-        title = "Head, middle, tail [°]" if three else "Angle [°]"
+        title = "Head, middle, tail [°]" if len(content.places.names) == 3 else "Angle [°]"
         views.append(plot(title, [f"{lines.PLACES}/**"]))
     for plane in Plane:
         names = _names(content.robot, plane)
@@ -236,9 +229,8 @@ def _angle_views(content: Content) -> list[rrb.View]:
 
 
 def _names(robot: Robot | None, plane: Plane) -> set[str]:
-    if robot is None:
-        return set()
-    return {joint.name for joint in robot.joints if joint.plane is plane}
+    joints = () if robot is None else robot.joints
+    return {joint.name for joint in joints if joint.plane is plane}
 
 
 def _plane_of_places(content: Content) -> set[str] | None:
@@ -312,12 +304,9 @@ def _window(before_s: float, after_s: float, *timelines: str) -> rrb.VisibleTime
     """Return a window about the cursor, by default on the session's timelines."""
     start = rrb.TimeRangeBoundary.cursor_relative(seconds=-before_s)
     end = rrb.TimeRangeBoundary.cursor_relative(seconds=after_s)
-    return rrb.VisibleTimeRanges(
-        [
-            rrb.VisibleTimeRange(timeline, start=start, end=end)
-            for timeline in timelines or (SESSION_TIME, GAIT_CYCLE)
-        ]
-    )
+    names = timelines or (SESSION_TIME, GAIT_CYCLE)
+    ranges = [rrb.VisibleTimeRange(name, start=start, end=end) for name in names]
+    return rrb.VisibleTimeRanges(ranges)
 
 
 def build_blueprint(content: Content, front: Tab = "session") -> rrb.Blueprint:
@@ -335,8 +324,7 @@ def build_blueprint(content: Content, front: Tab = "session") -> rrb.Blueprint:
     pages: dict[Tab, rrb.Container] = {"session": _session(content, views)}
     if views.maps or views.steps:
         rows = [rrb.Horizontal(*row) for row in (views.maps, views.steps) if row]
-        shares = [1.35, 1.0][: len(rows)]
-        pages["cycles"] = rrb.Vertical(*rows, row_shares=shares, name="Cycles")
+        pages["cycles"] = rrb.Vertical(*rows, row_shares=[1.35, 1.0][: len(rows)], name="Cycles")
     if views.mean_plots and views.mean_words is not None:
         pages["mean-cycle"] = _mean(views, views.mean_words)
     shown: Tab = front if front in pages else "session"
@@ -363,9 +351,8 @@ def _session(content: Content, views: Views) -> rrb.Container:
     # A mode that never changes isn't worth a lane of its own.
     lane = [views.mode] if views.mode is not None and content.modes > 1 else []
     words = [*views.words, *([views.mode] if views.mode is not None and not lane else [])]
-    plots: list[rrb.View | rrb.Container] = [
-        tabs(group) for group in (views.angles, views.effort) if group
-    ]
+    groups = [group for group in (views.angles, views.effort) if group]
+    plots: list[rrb.View | rrb.Container] = [tabs(group) for group in groups]
     heights = [3.0, 2.4][: len(plots)]
     if views.bars:
         plots.append(rrb.Horizontal(*views.bars))

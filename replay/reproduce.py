@@ -71,20 +71,17 @@ def compare_logs(one: Path, other: Path) -> LogDifference:
         LogError: If one can't be read.
     """
     with RawLog(one) as first, RawLog(other) as second:
-        own, others = (
-            {channel.topic: key for key, channel in log.file.channels.items()}
-            for log in (first, second)
-        )
+        channels = first.file.channels, second.file.channels
+        own, others = ({one.topic: key for key, one in log.items()} for log in channels)
         same: list[str] = []
         differs_s: dict[str, float] = {}
         messages = 0
         for topic in [one for one in own if one in others and one != EVENTS]:
-            for a, b in zip_longest(
-                _messages_of(first, own[topic]), _messages_of(second, others[topic])
-            ):
+            pair = _messages_of(first, own[topic]), _messages_of(second, others[topic])
+            for a, b in zip_longest(*pair):
                 messages += a is not None
                 if a != b:
-                    at_ns = min(told[0] for told in (a, b) if told is not None)
+                    at_ns = min(message[0] for message in (a, b) if message is not None)
                     differs_s[topic] = (at_ns - first.start_ns) * 1e-9
                     break
             else:
@@ -121,7 +118,7 @@ class ReproducedRun:
         original: The session that commands were taken from.
         scenario: Where they were given again.
         same: What of it is the same to the last bit; None where the first is no run of the twin.
-        comparison: What differs as the analysis has it; None where it can't be told.
+        comparison: What differs as the analysis has it; None where there is none.
         not_compared: Why it can't.
     """
 
@@ -178,7 +175,7 @@ def replay_in_twin(
     Args:
         repetition: What, and where.
         stop: Looked at between samples: the joints come to rest, then the run ends.
-        on_sample: Told of each sample after it was written.
+        on_sample: Called with each sample after it was written.
 
     Raises:
         SimulationError: If the twin's state becomes impossible.
@@ -262,13 +259,8 @@ def replay_on_bus(
     driven = find_motion(str(file), robot=described)
     if driven.kind != "commands":
         raise UsageError(f"{file} is no session; 'undulog drive {file} --on {on}' drives a gait")
-    given: dict[str, Any] = {
-        "robot": described,
-        "duration_s": duration_s,
-        "output": output,
-        "recorder": recorder,
-        "force": force,
-    }
+    given: dict[str, Any] = {"robot": described, "duration_s": duration_s, "output": output}
+    given |= {"recorder": recorder, "force": force}
     if not arm:
         return dry_run_on_bus(driven, on, as_json=as_json, **given)
     report = drive_armed(driven, on, **given)
@@ -277,9 +269,9 @@ def replay_on_bus(
         with Session.open(file) as first, Session.open(report.plan.output) as second:
             comparison, why = compared(first, second)
     if as_json:
-        told = None if comparison is None else comparison.to_dict()
+        facts = None if comparison is None else comparison.to_dict()
         emit_json(
-            {"original": str(file), **report.facts(), "comparison": told, "not_compared": why}
+            {"original": str(file), **report.facts(), "comparison": facts, "not_compared": why}
         )
     else:
         echo(*report.lines())

@@ -4,7 +4,8 @@ An encoder that wraps around, or loses its place: steps that no joint can make.
 
 Steps of one common size P, up and down, are the wrap of a counter: the position is right again
 but for whole turns of P. Any other such step is a jump: from then on the position is another one,
-or one sample was wrong.
+or one sample was wrong. A joint at the limits of its robot is saturated or stalled, which is
+neither sensor nor spread.
 """
 
 from __future__ import annotations
@@ -16,15 +17,15 @@ from itertools import chain
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
+from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.process import in_threads
 from undulog.capture.log.read.sample_times import LARGEST, Signal
+from undulog.capture.robot.model import Joint
 
 from ..estimators.series import Series, clean_together
 from ..results.artefact import FALSIFYING, Artefact, Span
 from ..signals.columns import QUANTITIES, Columns
 from .holds import clipped, frozen, stale
-from .limits import AT_LIMIT, AT_LIMIT_RAD, Limits, limits_of, saturated, stalled
 from .scales import (
     SAME_RATE,
     SAME_SCALE,
@@ -86,10 +87,10 @@ def find_jumps(position: Series, most_rate: float, released: tuple[Span, ...] = 
         at = at[~held[near].any(axis=1)]
     if at.size == 0:
         return nothing
-    own = step[at] - _beside(step, at)  # without what the joint itself did meanwhile
+    before, after = np.maximum(at - 1, 0), np.minimum(at + 1, step.size - 1)
+    own = step[at] - (step[before] + step[after]) / 2  # without what the joint itself did meanwhile
     turn = float(np.median(np.abs(own)))
-    ordinary = float(np.median(np.abs(step)))
-    spread = SAME_SIZE * turn + 2 * ordinary
+    spread = SAME_SIZE * turn + 2 * float(np.median(np.abs(step)))
     alike = bool(np.all(np.abs(np.abs(own) - turn) < spread))
     # Lone steps of any size may be a jump; a counter's single wrap is known by its size.
     known = any(abs(turn - one) < spread for one in _TURNS)
@@ -99,8 +100,7 @@ def find_jumps(position: Series, most_rate: float, released: tuple[Span, ...] = 
     turns[at + 1] = np.rint(own / turn)
     count = np.cumsum(turns)
     levels, index = np.unique(count, return_inverse=True)
-    usual = levels[np.argmax(np.bincount(index))]
-    return Jumps(spans_of(t_s, count != usual), turn, ())
+    return Jumps(spans_of(t_s, count != levels[np.argmax(np.bincount(index))]), turn, ())
 
 
 def _alone(step: FloatArray, dt: FloatArray, most_rate: float) -> BoolArray:
@@ -110,8 +110,7 @@ def _alone(step: FloatArray, dt: FloatArray, most_rate: float) -> BoolArray:
     if not np.any(alone):
         return alone
     # Over a gap a joint goes further; the usual step grows with it.
-    usual = np.median(size[size > 0])
-    alone &= size > ABOVE_USUAL * usual * np.maximum(dt / np.median(dt), 1.0)
+    alone &= size > ABOVE_USUAL * np.median(size[size > 0]) * np.maximum(dt / np.median(dt), 1.0)
     for k in np.flatnonzero(alone):
         near = np.concatenate((size[max(k - _BESIDE, 0) : k], size[k + 1 : k + 1 + _BESIDE]))
         calm = near[near <= possible[k]]
@@ -119,10 +118,152 @@ def _alone(step: FloatArray, dt: FloatArray, most_rate: float) -> BoolArray:
     return alone
 
 
-def _beside(step: FloatArray, at: IntArray) -> FloatArray:
-    """Return the mean of the steps just before and after each."""
-    before, after = np.maximum(at - 1, 0), np.minimum(at + 1, step.size - 1)
-    return (step[before] + step[after]) / 2
+AT_LIMIT_RAD = 1e-4
+"""A position this close to its limit, or beyond it, is at the limit."""
+
+AT_LIMIT = 0.995
+"""So large a part of any other limit is at the limit."""
+
+AT_LIMIT_SHARE = 0.01
+"""Less of the time at a limit is touching it."""
+
+STALL_SHARE = 0.9
+"""Part of the stall torque that a stalled joint gives at least."""
+
+STALL_S = 0.2
+DWELL = 3.0
+"""Times the turning point of a sine that a joint of unknown stall torque stands still."""
+
+CONSTANT = 0.05
+"""Standard deviation over mean below which an effort is constant."""
+
+STANDING = 0.05
+"""Standing still: slower than this part of what the joint does at most."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one joint can do, from the robot's description.
+
+    Attributes:
+        lower: Angle [rad].
+        upper: Angle [rad].
+        rate: [rad/s].
+        torque: At standstill and full voltage [N m].
+        current: At standstill and full voltage [A].
+        voltage: Of the supply [V].
+        known: Whether the servo's values are known rather than assumed.
+    """
+
+    lower: float
+    upper: float
+    rate: float
+    torque: float
+    current: float
+    voltage: float
+    known: bool
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """All of them, both signs: values at which a channel may stay by itself."""
+        sizes = (self.rate, self.torque, self.current, self.voltage)
+        return (self.lower, self.upper, *sizes, *(-one for one in sizes))
+
+
+def limits_of(session: SessionView) -> dict[str, Limits]:
+    """Return the limits of the session's joints.
+
+    Args:
+        session: An open session; a twin may have run other servos than the robot's own.
+
+    Returns:
+        By joint name; empty without a robot description.
+    """
+    robot = session.robot_as_run
+    if robot is None:
+        return {}
+    # A twin's servos are as they are stated, whatever the robot's may be.
+    known = session.run is not None or not {"servo", "joints"} & set(robot.assumed)
+    return {joint.name: _limits(joint, known) for joint in robot.joints}
+
+
+def _limits(joint: Joint, known: bool) -> Limits:
+    servo = joint.servo
+    return Limits(
+        joint.lower,
+        joint.upper,
+        joint.max_velocity,
+        servo.stall_torque,
+        servo.supply_v / servo.resistance_ohm,
+        servo.supply_v,
+        known,
+    )
+
+
+def saturated(one: Series, lower: float, upper: float, slack: float) -> tuple[Span, ...]:
+    """Return the stretches in which a channel is at a limit.
+
+    Args:
+        slack: This close to a limit is at it.
+
+    Returns:
+        The stretches; none if they are less than ``AT_LIMIT_SHARE`` of the samples.
+    """
+    at = (one.values <= lower + slack) | (one.values >= upper - slack)
+    if np.count_nonzero(at) <= AT_LIMIT_SHARE * one.count:
+        return ()
+    return spans_of(one.t_s, at, join=2)
+
+
+def stalled(
+    effort: Series, position: Series, most: float | None, asked: Series
+) -> tuple[Span, ...]:
+    """Return the stretches in which a joint pushes with all it has, and stands still.
+
+    Without a known stall torque, a joint has stalled where its effort stays constant at its
+    largest value for far longer than a sine at its turning point stands still.
+
+    Args:
+        effort: Torque, or motor current.
+        most: Torque or current at standstill and full voltage; None where it is not known.
+        asked: Its command, or else its position: what it does at most, 95 % of the time less,
+            tells what standing still is.
+
+    Returns:
+        Stretches of ``STALL_S`` or more.
+    """
+    largest = float(np.percentile(np.abs(effort.values), 99.5)) if effort.count else 0.0
+    pushing = np.abs(effort.values) >= STALL_SHARE * (largest if most is None else most)
+    pushing &= largest > 0
+    if position.count < 2 or asked.count < 2 or not np.any(pushing):
+        return ()
+    usual_rate = float(np.percentile(np.abs(np.diff(asked.values)) / np.diff(asked.t_s), 95))
+    if usual_rate <= 0:
+        return ()
+    # Speed over a tenth of a second, so that an encoder's steps and noise are none.
+    half = STALL_S / 4
+    at = np.flatnonzero(pushing)
+    ends = position.at(effort.t_s[at] + half), position.at(effort.t_s[at] - half)
+    rate = (ends[0] - ends[1]) / (2 * half)
+    pushing[at[np.abs(rate) >= STANDING * usual_rate]] = False
+    found = spans_of(effort.t_s, pushing, join=2)
+    long = STALL_S
+    if most is None:
+        edges = turns(asked)
+        if edges.size < 2:
+            return ()
+        # A sine is slower than the share s of its peak speed for 2 arcsin(s) / omega.
+        omega = 2 * np.pi / float(np.median(np.diff(edges)))
+        long = max(STALL_S, DWELL * 2 * float(np.arcsin(STANDING)) / omega)
+        found = tuple(span for span in found if _constant(effort, span))
+    return tuple(span for span in found if span[1] - span[0] >= long)
+
+
+def _constant(effort: Series, span: Span) -> bool:
+    """Return whether an effort keeps one value over a span."""
+    i, j = np.searchsorted(effort.t_s, span)
+    inside = effort.values[i : j + 1]
+    return bool(np.std(inside) < CONSTANT * abs(float(np.mean(inside))))
 
 
 GAP_SHARE = 1e-3
@@ -154,11 +295,8 @@ def find_artefacts(session: SessionView, columns: Columns) -> tuple[Artefact, ..
     origin_ns = session.start_ns
 
     def of_joint(name: str) -> list[Artefact]:
-        raw = {
-            key: signals[name]
-            for key in QUANTITIES
-            if name in (signals := columns.of(key)) and signals[name].t_ns.size
-        }
+        own = {key: columns.of(key).get(name) for key in QUANTITIES}
+        raw = {key: one for key, one in own.items() if one is not None and one.t_ns.size}
         series = {key: one for key, one in clean_together(raw, origin_ns).items() if one.count}
         joint = _Joint(name, raw, series, limits.get(name), name in commanded)
         return [
@@ -188,11 +326,9 @@ def _of_joint(joint: _Joint, origin_ns: int) -> _Found:
 def _of_sensors(joint: _Joint) -> _Found:
     levels = () if joint.limits is None else joint.limits.values
     command = joint.series.get("command") if joint.driven else None
-    tops = {
-        key: clipped(one, levels, command if key == "position" else None)
-        for key, one in joint.series.items()
-        if key != "command"
-    }
+    sensed = {key: one for key, one in joint.series.items() if key != "command"}
+    against = {"position": command}
+    tops = {key: clipped(one, levels, against.get(key)) for key, one in sensed.items()}
     if "position" not in joint.series:
         yield "position", "not_recorded", (), ""
     else:
@@ -207,8 +343,7 @@ def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Fo
     way = None if velocity is None or velocity.count < 2 else integral(velocity)
     # Without a command the velocity says that a joint moves; one that is held still may stand.
     motion = way if command is None else command if joint.driven else None
-    stopped = _stalled(joint)
-    if stopped:
+    if stopped := _stalled(joint):
         yield "effort", "stalled", stopped, ""
     held: tuple[Span, ...] = ()
     if motion is not None:
@@ -226,10 +361,10 @@ def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Fo
     yield from scales
     # A sign or unit that changes makes a step, somewhere in the cycles around.
     if jumps.jumped:
-        cycle = 0.0 if motion is None else _cycle_s(motion)
-        other = [
-            (a - cycle, b + cycle) for q, _, spans, _ in scales if q == "position" for a, b in spans
-        ]
+        edges = np.zeros(0) if motion is None else turns(motion)
+        cycle = float(np.median(np.diff(edges))) if edges.size > 1 else 0.0
+        own = chain.from_iterable(spans for q, _, spans, _ in scales if q == "position")
+        other = [(a - cycle, b + cycle) for a, b in own]
         if left := _apart(jumps.jumped, other):
             yield "position", "jump", left, ""
 
@@ -238,7 +373,7 @@ def _of_scale(
     joint: _Joint, position: Series, command: Series | None, way: Series | None
 ) -> _Found:
     """Sign, unit and scale against the command, a second sensor and the velocity's integral."""
-    told: set[str] = set()
+    found: set[str] = set()
     command, second, way = (
         one if one is not None and np.ptp(one.values) > 0 else None
         for one in (command, joint.series.get("reference"), way)
@@ -249,19 +384,19 @@ def _of_scale(
     edges = turns(leader)
     if command is not None:
         for flag, spans in against_command(compare(position, command, edges)).items():
-            told.add(flag)
+            found.add(flag)
             yield "position", flag, spans, ""
     if second is not None:
         by_second = compare(position, second, edges, noisy=True)
         for flag, spans in against_witness(by_second, SAME_SCALE).items():
-            told.add(flag)
+            found.add(flag)
             scale = float(np.nanmedian(by_second.ratio))
             yield "position", flag, spans, f"{scale:.3g} of the second sensor's"
     if way is not None:
         by_rate = against_witness(compare(position, way, edges, noisy=True), SAME_RATE)
         # What the position is blamed for already is no fault of the velocity.
         for flag, spans in by_rate.items():
-            if flag not in told:
+            if flag not in found:
                 yield "velocity", flag, spans, ""
 
 
@@ -295,10 +430,10 @@ def _at_limits(joint: _Joint) -> _Found:
             ("voltage", limits.voltage, "voltage"),
         ]
     for quantity, most, note in sizes:
-        if quantity in joint.series:
-            slack = (1 - AT_LIMIT) * most
-            if spans := saturated(joint.series[quantity], -most, most, slack):
-                yield quantity, "saturated", spans, note
+        slack = (1 - AT_LIMIT) * most
+        one = joint.series.get(quantity)
+        if one is not None and (spans := saturated(one, -most, most, slack)):
+            yield quantity, "saturated", spans, note
 
 
 def _of_record(quantity: str, joint: _Joint, origin_ns: int) -> _Found:
@@ -318,12 +453,4 @@ def _of_record(quantity: str, joint: _Joint, origin_ns: int) -> _Found:
 
 def _apart(spans: Sequence[Span], others: Sequence[Span]) -> tuple[Span, ...]:
     """Return the stretches that meet none of some others."""
-    return tuple(
-        s for s in spans if not any(s[0] < stop and s[1] > start for start, stop in others)
-    )
-
-
-def _cycle_s(motion: Series) -> float:
-    """Return the median length of the cycles of a motion [s]; 0 where it has none."""
-    edges = turns(motion)
-    return float(np.median(np.diff(edges))) if edges.size > 1 else 0.0
+    return tuple(s for s in spans if not any(s[0] < end and s[1] > start for start, end in others))

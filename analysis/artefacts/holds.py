@@ -80,7 +80,8 @@ def frozen(position: Series, motion: Series, way: Series | None = None) -> tuple
     asked = float(np.ptp(motion.values)) if motion.count else 0.0
     if position.count < 3 or asked == 0:
         return ()
-    first, stop = _holds(position.values)
+    first, stop = runs(np.diff(position.values) == 0)
+    stop = stop + 1  # one past the last of each run of two or more equal values
     travelled = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(motion.values)))))
     begin, end = (np.interp(position.t_s[k], motion.t_s, travelled) for k in (first, stop - 1))
     seen = float(np.ptp(position.values))
@@ -91,9 +92,7 @@ def frozen(position: Series, motion: Series, way: Series | None = None) -> tuple
         marked &= ~_at_reversals(position, motion, first, travel, asked)
         marked &= ~_gentle(position, motion, first, stop)
     spans = _span_each(position.t_s, first[marked], stop[marked])
-    if way is None:
-        return spans
-    return tuple(span for span in spans if not _stands(way, span, least))
+    return tuple(span for span in spans if way is None or not _stands(way, span, least))
 
 
 def stale(position: Series) -> tuple[Span, ...]:
@@ -114,21 +113,20 @@ def stale(position: Series) -> tuple[Span, ...]:
     if not np.any(_around(repeats) > STALE_SHARE * _FEW):
         return ()
     travel = np.abs(value[4:] - value[:-4])
-    fast = (travel > 0.5 * np.percentile(travel, 95)) & (
-        travel > 2 * RESOLVED * resolution_of(value)
-    )
+    least = max(0.5 * np.percentile(travel, 95), 2 * RESOLVED * resolution_of(value))
+    fast = travel > least
     of, among = (_around(one) for one in (fast & repeats, fast))
-    told = np.flatnonzero(among >= _FEW)
-    if told.size == 0:
+    known = np.flatnonzero(among >= _FEW)
+    if known.size == 0:
         return ()
-    old = of[told] > STALE_SHARE * among[told]
+    old = of[known] > STALE_SHARE * among[known]
     marked = np.zeros(value.size, dtype=np.bool_)
     for k, stop in zip(*runs(old), strict=True):
-        seen = slice(max(told[k] - _BOX // 2, 0), told[stop - 1] + _BOX // 2 + 1)
+        seen = slice(max(known[k] - _BOX // 2, 0), known[stop - 1] + _BOX // 2 + 1)
         again, quick = int((fast & repeats)[seen].sum()), int(fast[seen].sum())
         # A few of the many windows of a noisy coarse encoder exceed the share by chance.
         if binom.sf(again - 1, quick, _BY_CHANCE) < _RARE:
-            marked[told[k] + 2 : told[stop - 1] + 3] = True
+            marked[known[k] + 2 : known[stop - 1] + 3] = True
     return spans_of(position.t_s, marked)
 
 
@@ -234,24 +232,16 @@ def _centred(
     return marked
 
 
-def _holds(value: FloatArray) -> tuple[IntArray, IntArray]:
-    """First sample and one past the last of each run of two or more equal values."""
-    same: BoolArray = np.diff(value) == 0
-    first, stop = runs(same)
-    return first, stop + 1
-
-
 def _around(marked: BoolArray) -> IntArray:
     """How many are marked in a box around each sample, shape (n,)."""
     half = _BOX // 2
     so_far: IntArray = np.cumsum(marked, dtype=np.int64)
     before: IntArray = np.concatenate((np.zeros(half + 1, dtype=np.int64), so_far))
-    after: IntArray = np.concatenate((so_far, np.full(half, so_far[-1])))
-    return after[half:] - before[: marked.size]
+    return np.concatenate((so_far, np.full(half, so_far[-1])))[half:] - before[: marked.size]
 
 
 def _stands(way: Series, span: Span, least: float) -> bool:
-    """Whether a velocity is told anew over a stretch, and the joint goes no farther than so."""
+    """Whether a velocity changes over a stretch, and the joint goes no farther than that."""
     start, stop = np.searchsorted(way.t_s, span)
     inside = way.values[start:stop]
     if inside.size < 3:

@@ -86,7 +86,7 @@ OPPOSITE = -0.7
 degrees from opposite phase."""
 
 EITHER_WAY = 0.75
-"""Share of the cycles that must follow the command, upright or upside down, for a sign to be told:
+"""Share of the cycles that must follow the command, upright or not, for a sign to be decided:
 of a multisine near a resonance every cycle has another phase."""
 
 FULL_SIZE = (0.5, 2.0)
@@ -136,9 +136,8 @@ class Compared:
             marked: Shape (c,).
         """
         found: list[Span] = []
-        for start, stop in zip(
-            self.start_s[marked].tolist(), self.stop_s[marked].tolist(), strict=True
-        ):
+        starts, stops = self.start_s[marked].tolist(), self.stop_s[marked].tolist()
+        for start, stop in zip(starts, stops, strict=True):
             if found and found[-1][1] == start:
                 found[-1] = (found[-1][0], stop)
             else:
@@ -204,8 +203,7 @@ def against_command(one: Compared) -> dict[str, tuple[Span, ...]]:
     full = (one.ratio > FULL_SIZE[0]) & (one.ratio < FULL_SIZE[1])
     opposite = (one.correlation < OPPOSITE) & (full | degrees)
     # A sign changes no more than the sign: near a resonance the phase is anything, cycle by cycle.
-    usable = np.isfinite(one.correlation)
-    along = np.abs(one.correlation[usable]) > -OPPOSITE
+    along = np.abs(one.correlation[np.isfinite(one.correlation)]) > -OPPOSITE
     opposite &= np.count_nonzero(along) >= EITHER_WAY * along.size
     return _found(one, {"wrong_sign": opposite, "wrong_unit": degrees | radians})
 
@@ -220,21 +218,15 @@ def against_witness(one: Compared, same: float) -> dict[str, tuple[Span, ...]]:
     Returns:
         ``wrong_sign``, ``wrong_unit`` and ``scale_mismatch`` to stretches, those that were found.
     """
-    told = np.abs(one.correlation) > MIN_CORRELATION
-    ratio = np.where(told, one.ratio, np.nan)
-    known = np.flatnonzero(told)
-    if known.size:
-        ratio[known] = _smoothed(ratio[known])
+    clear = np.abs(one.correlation) > MIN_CORRELATION
+    ratio = np.where(clear, one.ratio, np.nan)
+    if clear.any():
+        near = np.pad(ratio[clear], 1, mode="edge")
+        ratio[clear] = np.median(np.stack([near[:-2], near[1:-1], near[2:]]), axis=0)
     unit = _near(ratio, DEGREE) | _near(ratio, 1 / DEGREE)
     off = np.abs(np.log(ratio)) > np.log(same) + SURE * one.error
-    return _found(
-        one,
-        {
-            "wrong_sign": told & (one.correlation < 0),
-            "wrong_unit": unit,
-            "scale_mismatch": told & off & ~unit,
-        },
-    )
+    signs = {"wrong_sign": clear & (one.correlation < 0), "wrong_unit": unit}
+    return _found(one, signs | {"scale_mismatch": clear & off & ~unit})
 
 
 def integral(velocity: Series) -> Series:
@@ -266,12 +258,6 @@ def _correlated(residual: FloatArray) -> float:
     first = float(residual[1:] @ residual[:-1]) / power if power > 0 else 0.0
     first = min(max(first, 0.0), 0.99)
     return float(((1 + first) / (1 - first)) ** 0.5)
-
-
-def _smoothed(ratio: FloatArray) -> FloatArray:
-    """Return the median of each value and its two neighbours; the ends count twice."""
-    padded = np.pad(ratio, 1, mode="edge")
-    return np.median(np.stack([padded[:-2], ratio, padded[2:]]), axis=0)
 
 
 def _near(ratio: FloatArray, factor: float) -> BoolArray:

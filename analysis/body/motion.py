@@ -111,8 +111,7 @@ def observed(robot: Robot, plane: Plane, seen: Track, omega: float) -> tuple[Bod
         counts the noise of both as independent.
     """
     left = np.array([-seen.heading[1], seen.heading[0], 0.0])
-    normal = left if plane is Plane.HORIZONTAL else np.array([0.0, 0.0, 1.0])
-    across = seen.position @ normal
+    across = seen.position @ (left if plane is Plane.HORIZONTAL else np.array([0.0, 0.0, 1.0]))
     series = [Series(place, seen.t_s, across[:, k]) for k, place in enumerate(PLACES)]
     fit = fit_at(series, omega, allowed_model(series, omega, TREND))
     noise = residual_noise(series, fit)
@@ -168,8 +167,7 @@ def perfect_tracking(
     links = place_links(len(robot.links))
     result: dict[str, tuple[BodyPoint, ...]] = {}
     for name, chain in chains.items():
-        motion = one_cycle(chain, amplitudes, offsets, omega)
-        path = places(chain, motion, links, cycles)
+        path = places(chain, one_cycle(chain, amplitudes, offsets, omega), links, cycles)
         heading = np.sum(path[:, 0] - path[:, -1])
         across = np.imag(path * np.conj(heading) / np.abs(heading))
         t_s = np.linspace(0.0, 2 * np.pi * cycles / omega, path.shape[0], endpoint=False)
@@ -257,8 +255,8 @@ def body_motion(
         if name not in fitted.driven and abs(float(responses[name].values.mean())) > _BENT_RAD
     ]
     if bent:
-        told = f"{', '.join(bent)} are bent though not driven: the body's null takes them straight"
-        warn(Note(told))
+        text = f"{', '.join(bent)} are bent though not driven: the body's null takes them straight"
+        warn(Note(text))
     return result
 
 

@@ -104,8 +104,7 @@ def one_cycle(chain: Chain, amplitudes: ComplexArray, offsets: FloatArray, omega
     order: FloatArray = np.arange(1.0, amplitudes.shape[1] + 1)
     wave = np.exp(1j * np.outer(phase, order))
     angles = offsets + np.real(wave @ amplitudes.T)
-    rates = np.real((1j * order * omega * wave) @ amplitudes.T)
-    velocity = _head_velocity(chain, angles, rates)
+    velocity = _head_velocity(chain, angles, np.real((1j * order * omega * wave) @ amplitudes.T))
     omegas: FloatArray = omega * np.fft.fftfreq(SAMPLES, 1 / SAMPLES).astype(np.float64)
     spinning = np.fft.fft(velocity[:, 2]) / SAMPLES
     mean_turn = float(spinning[0].real)

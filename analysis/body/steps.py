@@ -61,8 +61,7 @@ def body_steps(
     if span.cycles < MIN_CYCLES:
         warn(f"{_NOTHING}: {span.cycles} whole cycles are too few")
         return None
-    unknown = [n for n in robot.joint_names if n not in responses or responses[n].count < 2]
-    if unknown:
+    if unknown := [n for n in robot.joint_names if n not in responses or responses[n].count < 2]:
         warn(f"{_NOTHING}: no angles of {', '.join(unknown)}")
         return None
     try:
@@ -99,8 +98,7 @@ def centre_of_mass(
     known_s, position, quaternion = poses
     # q and -q are one orientation: neighbours must not differ by the sign.
     flips = np.where(np.einsum("ij,ij->i", quaternion[1:], quaternion[:-1]) < 0, -1.0, 1.0)
-    same_side = quaternion * np.cumprod(np.append(1.0, flips))[:, None]
-    turn = _at(t_s, known_s, same_side)
+    turn = _at(t_s, known_s, quaternion * np.cumprod(np.append(1.0, flips))[:, None])
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
     head = _at(t_s, known_s, position)
     centres, _ = link_poses(robot, head, rotation_from_quaternion(turn), angles)
@@ -110,10 +108,7 @@ def centre_of_mass(
 
 def _at(t_s: FloatArray, known_s: FloatArray, columns: FloatArray) -> FloatArray:
     """Columns, shape (n, k), at other times."""
-    found = np.empty((t_s.size, columns.shape[1]))
-    for k, column in enumerate(columns.T):
-        found[:, k] = np.interp(t_s, known_s, column)
-    return found
+    return np.stack([np.interp(t_s, known_s, column) for column in columns.T], axis=1)
 
 
 def mean_of_cycles(per_cycle: FloatArray) -> tuple[float, float, float] | None:
@@ -127,11 +122,8 @@ def mean_of_cycles(per_cycle: FloatArray) -> tuple[float, float, float] | None:
     """
     if per_cycle.size < MIN_CYCLES:
         return None
-    return (
-        float(per_cycle.mean()),
-        float(per_cycle.var(ddof=1) / per_cycle.size),
-        per_cycle.size - 1.0,
-    )
+    count = per_cycle.size
+    return float(per_cycle.mean()), float(per_cycle.var(ddof=1) / count), count - 1.0
 
 
 def speed(steps: Steps) -> tuple[float, float, float] | None:

@@ -171,12 +171,10 @@ class Catalog:
         begun, stop = time.monotonic(), stop or StopRequest()
         listed = {file.name: file for file in self._listed()}
         known = self._known()
-        scanned_ns = self._next_scan(known)
-        fresh = [
-            file
-            for file in listed.values()
-            if known.get(file.name, (None,))[:2] != (file.size, file.modified_ns)
-        ]
+        # Later than all scans before, whatever the clocks of others say.
+        scanned_ns = max([time.time_ns(), *(scanned + 1 for _, _, scanned in known.values())])
+        facts = {name: (file.size, file.modified_ns) for name, file in listed.items()}
+        fresh = [one for one in listed.values() if known.get(one.name, (0,))[:2] != facts[one.name]]
         gone = [name for name in known if name not in listed and not name.startswith(_ANALYSED)]
         changed = [*gone, *(file.name for file in fresh if file.name in known)]
         stale = [_ANALYSED + name for name in changed if name.endswith(".mcap")]
@@ -192,11 +190,10 @@ class Catalog:
                 damaged += bool(fault)
                 on_read(read, len(fresh))
                 stamp = {"scanned_ns": scanned_ns, "modified_ns": file.modified_ns}
+                common = {"source": file.name, "removed": False}
                 for kind, own in found.items():
-                    rows[kind] += [
-                        {"source": file.name, "removed": False, **row, **stamp} for row in own
-                    ]
-                sources.append(_source(file, fault) | stamp)
+                    rows[kind] += [common | row | stamp for row in own]
+                sources.append(common | {"size": file.size, "fault": fault or None} | stamp)
             for kind, own in rows.items():
                 self._write(kind, table_of(kind, own))
             self._write("sources", _ARROW.Table.from_pylist(sources, _SOURCES))
@@ -260,10 +257,9 @@ class Catalog:
 
     def _listed(self) -> list[StoredFile]:
         """Sessions and files that may hold results."""
-        found = self._store.files("", [".mcap", ".json", ".parquet"], recursive=True)
         return [
             file
-            for file in found
+            for file in self._store.files("", [".mcap", ".json", ".parquet"], recursive=True)
             for path in [PurePosixPath(file.name)]
             if FOLDER not in path.parts
             and not (path.suffix == ".json" and path.parent.name in ("pending", "settings"))
@@ -275,20 +271,11 @@ class Catalog:
         latest: dict[str, tuple[int, int, int, bool]] = {}
         for name in self._files("sources"):
             columns = self._store.read_table(name).to_pydict()
-            for source, size, modified, scanned, removed in zip(
-                *(
-                    columns[key]
-                    for key in ("source", "size", "modified_ns", "scanned_ns", "removed")
-                ),
-                strict=True,
-            ):
+            rows = zip(*(columns[key] for key in _SCANNED), strict=True)
+            for source, size, modified, scanned, removed in rows:
                 if source not in latest or latest[source][2] < scanned:
                     latest[source] = size, modified, scanned, removed
         return {name: facts[:3] for name, facts in latest.items() if not facts[3]}
-
-    def _next_scan(self, known: Mapping[str, tuple[int, int, int]]) -> int:
-        """A time later than those of all scans before, whatever the clocks of others say."""
-        return max([time.time_ns(), *(scanned + 1 for _, _, scanned in known.values())])
 
     def _read_files(
         self, files: Sequence[StoredFile]
@@ -308,32 +295,23 @@ class Catalog:
                 return file, self._sweep(file), ""
             return file, self._result(file), ""
         except (UndulogError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            rows = (
-                [_session(file, LogFacts(damage=str(error)))] if file.name.endswith(".mcap") else []
-            )
-            return file, {"sessions": rows}, str(error)
+            facts = [LogFacts(damage=str(error))] if file.name.endswith(".mcap") else []
+            return file, {"sessions": [_session(file, one) for one in facts]}, str(error)
 
     def _facts(self, file: StoredFile) -> LogFacts:
         path = self._store.path(file.name)
         if self._store.is_local:
             with open(path, "rb", buffering=0) as stream:  # noqa: PTH123 - unbuffered, of a path
-                descriptor = stream.fileno()
-                return read_facts(
-                    path, file.size, lambda start, stop: os.pread(descriptor, stop - start, start)
-                )
+                own = stream.fileno()
+                return read_facts(path, file.size, lambda a, b: os.pread(own, b - a, a))
         with self._store.filesystem.open_input_file(path) as stream:
-            return read_facts(
-                path, file.size, lambda start, stop: stream.read_at(stop - start, start)
-            )
+            return read_facts(path, file.size, lambda a, b: stream.read_at(b - a, a))
 
     def _sweep(self, file: StoredFile) -> dict[str, list[Row]]:
-        analyses: list[Row] = []
-        joints: list[Row] = []
-        for row in self._store.read_table(file.name).to_pylist():
-            if (found := sweep_rows(row)) is not None:
-                analyses.append(found[0])
-                joints += found[1]
-        return {"analyses": analyses, "joints": joints}
+        every = map(sweep_rows, self._store.read_table(file.name).to_pylist())
+        known = [found for found in every if found is not None]
+        joints = [joint for _, own in known for joint in own]
+        return {"analyses": [analysis for analysis, _ in known], "joints": joints}
 
     def _result(self, file: StoredFile) -> dict[str, list[Row]]:
         if file.size > _MOST_RESULT:
@@ -424,6 +402,7 @@ def _is_base(name: str) -> bool:
     return PurePosixPath(name).name.startswith("all-")
 
 
+_SCANNED = "source", "size", "modified_ns", "scanned_ns", "removed"
 _SOURCES: Any = _ARROW.schema(
     [
         ("source", _ARROW.string()),
@@ -446,10 +425,6 @@ def _lock(path: Path) -> Generator[bool]:
             yield False
             return
         yield True
-
-
-def _source(file: StoredFile, fault: str) -> Row:
-    return {"source": file.name, "size": file.size, "removed": False, "fault": fault or None}
 
 
 def _session(file: StoredFile, facts: LogFacts) -> Row:

@@ -100,11 +100,13 @@ SCHEMAS: Mapping[str, Any] = {
 def table_of(kind: str, rows: Sequence[Row]) -> Any:
     """Return rows of a kind as a ``pyarrow.Table``; columns that a row lacks are null."""
     schema = SCHEMAS[kind]
-    columns = {name: [row.get(name) for row in rows] for name in schema.names}
-    return _ARROW.table(
-        [_ARROW.array(columns[name], type=schema.field(name).type) for name in schema.names],
-        schema=schema,
-    )
+    columns = [
+        _ARROW.array([row.get(field.name) for row in rows], type=field.type) for field in schema
+    ]
+    return _ARROW.table(columns, schema=schema)
+
+
+_OF_SESSION = ("session_id", "robot", "scenario", "operator", "engine")
 
 
 def session_row(facts: LogFacts) -> Row:
@@ -117,11 +119,7 @@ def session_row(facts: LogFacts) -> Row:
         if max(start_ns, end_ns) >= 1 << 63:  # beyond what a time can be
             start_ns = end_ns = None
     return {
-        "session_id": own.get("session_id"),
-        "robot": own.get("robot"),
-        "scenario": own.get("scenario"),
-        "operator": own.get("operator"),
-        "engine": own.get("engine"),
+        **{name: own.get(name) for name in _OF_SESSION},
         "software": own.get("undulog"),
         "seed": _integer(own.get("seed")),
         "part": _integer(part.get("part")) or 1,
@@ -177,13 +175,12 @@ def result_rows(result: Mapping[str, Any]) -> tuple[Row, list[Row]]:
         **_estimate("frequency_hz", gait["frequency_hz"], gait["frequency_ci95"]),
     }
     for name in INDICES:
-        index = result["heterogeneity"].get(name)
-        if index is not None:
+        if (index := result["heterogeneity"].get(name)) is not None:
             analysis |= _estimate(name, index["value"], index["ci95"])
     if result.get("energy") is not None:
         transport = result["energy"]["transport"]
         analysis |= {"distance_m": transport["distance_m"], "cost_of_transport": transport["abs"]}
-    joints = [
+    return analysis, [
         window
         | {"joint": joint["name"], "plane": joint["plane"], "position": position}
         | {name: joint[name] for name in ("frequency_hz", *_JOINT_NUMBERS)}
@@ -192,7 +189,6 @@ def result_rows(result: Mapping[str, Any]) -> tuple[Row, list[Row]]:
         | _estimate("lag_rad", joint["lag_rad"], joint["lag_ci95"])
         for position, joint in enumerate(result["joints"])
     ]
-    return analysis, joints
 
 
 def _estimate(name: str, value: float | None, ci95: Sequence[float] | None) -> Row:
@@ -217,12 +213,9 @@ def sweep_rows(row: Mapping[str, Any]) -> tuple[Row, list[Row]] | None:
         "changes": row.get("changes"),
         **{name: row.get(name) for name in _SWEPT},
     }
-    columns = [
-        name
-        for name in (*_JOINT_NUMBERS, *_with_interval("gain", "lag_rad"))
-        if isinstance(row.get(name), list)
-    ]
-    joints = [
+    numbers = (*_JOINT_NUMBERS, *_with_interval("gain", "lag_rad"))
+    columns = [name for name in numbers if isinstance(row.get(name), list)]
+    return analysis, [
         {
             "session_id": row["session_id"],
             "joint": joint,
@@ -232,4 +225,3 @@ def sweep_rows(row: Mapping[str, Any]) -> tuple[Row, list[Row]] | None:
         }
         for position, joint in enumerate(names)
     ]
-    return analysis, joints

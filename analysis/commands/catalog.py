@@ -102,13 +102,8 @@ def catalog(
     for name, why in faults.items():
         complain(f"{name}: {why}")
     if json:
-        emit_json(
-            {
-                "scan": None if report is None else asdict(report),
-                "faults": faults,
-                "rows": _plain(rows),
-            }
-        )
+        scanned = None if report is None else asdict(report)
+        emit_json({"scan": scanned, "faults": faults, "rows": _plain(rows)})
     else:
         _print(rows, None if sql else _COLUMNS[joints], report)
     return 0 if complete and not faults else 1
@@ -139,12 +134,12 @@ def _print(rows: Any, names: tuple[str, ...] | None, report: ScanReport | None) 
         for row in rows.loc[:, list(names)].head(_SHOWN).itertuples(index=False)
     ]
     columns = [
-        Column(name, left=not _is_number(rows[name]), spare=_SPARE.get(name, 0)) for name in names
+        Column(name, left=rows[name].dtype.kind not in "iuf", spare=_SPARE.get(name, 0))
+        for name in names
     ]
     lines, _ = table(columns, cells, width, cropped=width != UNLIMITED)
     echo(*(line.plain for line in lines))
-    more = len(rows) - _SHOWN
-    if more > 0:
+    if (more := len(rows) - _SHOWN) > 0:
         echo(f"... and {more} more; -o FILE.csv or .parquet has all of them, with all columns")
     summary = f"{len(rows)} row{'' if len(rows) == 1 else 's'}"
     if report is not None:
@@ -153,10 +148,6 @@ def _print(rows: Any, names: tuple[str, ...] | None, report: ScanReport | None) 
         if report.damaged:
             summary += f", {report.damaged} of them damaged (column damage)"
     echo(summary)
-
-
-def _is_number(column: Any) -> bool:
-    return column.dtype.kind in "iuf"
 
 
 def _text(value: Any) -> str:

@@ -13,7 +13,7 @@ from undulog.capture.common.console import emit_json, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output, write_text
 
-from .options import PAGES, chosen, opened, show
+from .analyse import PAGES, chosen, opened, show
 
 if TYPE_CHECKING:
     from ..results.comparison import Comparison
@@ -81,8 +81,7 @@ def compare(
     )
     with progress("compare", total=sum(map(len, sides))) as bar:
         first = opened(sides[0], bar)
-        second = opened(sides[1], bar, len(sides[0]))
-        result = compare_sessions(first, second, choices)
+        result = compare_sessions(first, opened(sides[1], bar, len(sides[0])), choices)
     if output is not None:
         _write(result, output)
     if json:

@@ -147,16 +147,8 @@ def _plan(
         base = base_gait(session)
         planned = design(base, session)
         settle_s, measure_s = planned.settle_s, planned.measure_s
-        files = write_plan(
-            plan,
-            base,
-            planned.runs,
-            session,
-            folder,
-            settle_s=settle_s,
-            measure_s=measure_s,
-            facts=planned.facts,
-        )
+        times = {"settle_s": settle_s, "measure_s": measure_s}
+        files = write_plan(plan, base, planned.runs, session, folder, **times, facts=planned.facts)
     if as_json:
         emit_json({"plan": plan, "files": [str(file) for file in files], "settle_s": settle_s})
         return
@@ -169,8 +161,7 @@ def _plan(
         "Drive each, in this order, with undulog drive FILE --on ...; then undulog analyse "
         f"--start {settle_s:g} of all recordings"
     )
-    for note in planned.notes:
-        echo(note)
+    echo(*planned.notes)
 
 
 _AMPLITUDE = 0.02
@@ -312,13 +303,11 @@ def settling(base: BaseGait, session: SessionView) -> tuple[float, dict[str, str
     if robot is None:
         return _LEAST_SETTLE_S, {}
     mode = slowest_mode(robot, [base.names[k] for k in base.driven])
-    needed_s = RAMP_S + math.ceil(TIME_CONSTANTS * mode.time_constant_s)
-    facts = {
+    return max(_LEAST_SETTLE_S, RAMP_S + math.ceil(TIME_CONSTANTS * mode.time_constant_s)), {
         "mode_hz": f"{mode.frequency_hz:.4g}",
         "mode_damping": f"{mode.damping:.4g}",
         "mode_tau_s": f"{mode.time_constant_s:.4g}",
     }
-    return max(_LEAST_SETTLE_S, needed_s), facts
 
 
 def check_servos(base: BaseGait, runs: tuple[PlannedRun, ...], session: SessionView) -> None:

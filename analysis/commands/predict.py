@@ -12,7 +12,7 @@ from undulog.capture.common.console import emit_json
 from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.common.files import check_output
 
-from .options import chosen, show
+from .analyse import chosen, experiment_of, show
 
 if TYPE_CHECKING:
     from ..results.coupling import Coupling, LocalCoupling
@@ -56,9 +56,8 @@ def predict(
     turned = _kicks(kick or ())
     options = chosen(start, stop, "/joint_commands", "/joint_states")
     if output is not None:
-        check_output(
-            output, (".json",), "the prediction is JSON; end its name in .json", force=force
-        )
+        why = "the prediction is JSON; end its name in .json"
+        check_output(output, (".json",), why, force=force)
     from dataclasses import asdict
     from json import dumps
 
@@ -66,7 +65,6 @@ def predict(
 
     from ..experiment.kicks.prediction import closed_loop
     from ..present.text import render_loop
-    from .analyse import experiment_of
 
     first, *others = files
     if any(one.suffix.lower() == ".json" for one in files):

@@ -13,7 +13,7 @@ from undulog.capture.common.console import echo, emit_json, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output, write_text
 
-from .options import PAGES, chosen
+from .analyse import PAGES, chosen, experiment_of
 
 if TYPE_CHECKING:
     from ..results.analysis import Analysis
@@ -64,8 +64,7 @@ def report(
     options = chosen(start, stop, command_topic, response_topic)
     if catalog is not None and options != chosen(None, None, "/joint_commands", "/joint_states"):
         raise UsageError("--catalog shows results as they are; leave out window and topics")
-    why = "the report is an HTML page; end its name in .html"
-    check_output(output, PAGES, why, force=force)
+    check_output(output, PAGES, "the report is an HTML page; end its name in .html", force=force)
     if catalog is not None:
         page, facts, warnings = _fleet(catalog, find, output)
     else:
@@ -77,8 +76,8 @@ def report(
         emit_json({"page": str(output), "bytes": size, **facts})
         return
     echo(facts["answer"])
-    said = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
-    echo(f"{output}: {size / 1e3:.0f} kB{said}")
+    noted = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
+    echo(f"{output}: {size / 1e3:.0f} kB{noted}")
 
 
 def _one(file: Path, options: Options) -> tuple[str, dict[str, Any], int]:
@@ -125,7 +124,6 @@ def _fleet(where: str, find: str, output: Path) -> tuple[str, dict[str, Any], in
 def _several(files: Sequence[Path], options: Options) -> tuple[str, dict[str, Any], int]:
     """Return the page on an experiment, all answers, and the number of warnings."""
     from ..present.page.page import render
-    from .analyse import experiment_of
 
     experiment = experiment_of(files, options, "report")
     page = render(experiment)
@@ -137,10 +135,6 @@ def _several(files: Sequence[Path], options: Options) -> tuple[str, dict[str, An
 
 
 def _summary(analysis: Analysis) -> dict[str, Any]:
-    answer = analysis.answer
-    return {
-        "session": analysis.session.id,
-        "path": analysis.session.path,
-        "verdict": answer.verdict,
-        "sentence": answer.sentence,
-    }
+    session, answer = analysis.session, analysis.answer
+    facts = {"session": session.id, "path": session.path}
+    return facts | {"verdict": answer.verdict, "sentence": answer.sentence}

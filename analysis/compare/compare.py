@@ -1,4 +1,7 @@
-"""Compare two sessions, or two groups of them."""
+"""Compare two sessions, or two groups of them, joint by joint.
+
+They can be compared where the same commands drove the same joints.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +15,19 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
 from undulog.capture.common.console import Warn, plain
-from undulog.capture.common.errors import UsageError
+from undulog.capture.common.errors import DataError, UsageError
 
 from ..estimators.intervals import CONFIDENCE, around, t_factor
+from ..results import formats
 from ..results.answer import NotFollowing, StandOut
 from ..results.comparison import BrokenJoint, Comparison, Waveform
 from ..results.estimate import Estimate, Provenance
 from ..segments.answer import deviation_in_words, fault_in_words
 from ..segments.examine import OFFSET_RAD
+from ..session.runs import SAME_COMMAND, GaitRun, command_change, other_frequency
 from ..signals.stretch import Options
-from .alignment import Alignment, align, changes
 from .decisions import Margins, answer_of, decide, differ, estimates_of, family
-from .side import ComparedSession, Quantities, phases_rad, see, turned
+from .side import ComparedSession, Quantities, changes, phases_rad, see, turned
 
 
 def broken_joints(
@@ -53,12 +57,11 @@ def broken_joints(
 
 def _moved(joint: str, own: Sequence[ComparedSession], other: Sequence[ComparedSession]) -> bool:
     """Return whether a joint's mean differs between the sides, too: both may share a zero."""
-    here, there = (
-        [one.offsets[joint] for one in side if joint in one.offsets] for side in (own, other)
-    )
-    if not here or not there:
+    sides = [[one.offsets[joint] for one in side if joint in one.offsets] for side in (own, other)]
+    if not all(sides):
         return True
-    return abs(float(np.median(here)) - float(np.median(there))) > OFFSET_RAD
+    here, there = (float(np.median(side)) for side in sides)
+    return abs(here - there) > OFFSET_RAD
 
 
 _Entry = TypeVar("_Entry", NotFollowing, StandOut)
@@ -70,6 +73,116 @@ def _first(several: Sequence[_Entry]) -> list[_Entry]:
     for each in several:
         found.setdefault(each.joint, each)
     return list(found.values())
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Common joints and gait of the sessions of both sides.
+
+    Attributes:
+        names: Joints that can be compared, head to tail.
+        left_out: Joints that can't, and why.
+        gaits_differ: How the gaits differ, or None.
+    """
+
+    names: tuple[str, ...]
+    left_out: dict[str, str]
+    gaits_differ: str | None
+
+
+def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False) -> Alignment:
+    """Find the joints that can be compared.
+
+    Args:
+        a: Runs of one side, at least one.
+        b: Runs of the other, at least one.
+        any_gait: Compare the responses although the gaits differ.
+
+    Raises:
+        DataError: If a session has no gait, no joint is in all of them, or the gaits differ and
+            that is not allowed.
+    """
+    runs = [*a, *b]
+    for run in runs:
+        if not run.names:
+            raise DataError(f"{run.label} has no gait, so there is no gait phase to align it by")
+    _refuse_copies(a, "A")
+    _refuse_copies(b, "B")
+    joints = list(dict.fromkeys(name for run in runs for name in run.names))
+    answered = [
+        {name for name, ratio in zip(run.names, run.ratio, strict=True) if np.isfinite(ratio)}
+        for run in runs
+    ]
+    names = tuple(name for name in joints if all(name in known for known in answered))
+    if not names:
+        raise DataError(
+            f"no joint has gain and lag in all sessions: {a[0].label} drives "
+            f"{_some(a[0].names)}, {b[0].label} {_some(b[0].names)}"
+        )
+    left_out = {
+        name: "no gain and lag in "
+        + ", ".join(r.label for r, known in zip(runs, answered, strict=True) if name not in known)
+        for name in joints
+        if name not in names
+    }
+    faults = [fault for run in runs[1:] if (fault := gait_fault(run, runs[0], names)) is not None]
+    if faults and not any_gait:
+        raise DataError(
+            f"the gaits differ, so joints would answer differently anyway: {faults[0]}; record the "
+            "same gait, or compare nevertheless with --any-gait"
+        )
+    return Alignment(names, left_out, faults[0] if faults else None)
+
+
+def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None:
+    """Return the difference of a run's gait from the model's.
+
+    Args:
+        model: The run that it is held against.
+        names: Joints to look at, driven in both.
+
+    Returns:
+        The reason, or None within 0.5 % of the frequency and 1 % of every command's amplitude.
+    """
+    if (different := other_frequency(run, model)) is not None:
+        return f"{run.label} has {different[0]} Hz, {model.label} {different[1]} Hz"
+    own, other = (
+        np.array([one.command[one.names.index(name)] for name in names]) for one in (run, model)
+    )
+    groups, others = ([one.group[one.names.index(name)] for name in names] for one in (run, model))
+    if groups != others:
+        return f"{run.label} has other joints than {model.label} at one frequency"
+    change = np.ones_like(own)
+    for group in set(groups):
+        members = [k for k, one in enumerate(groups) if one == group]
+        change[members] = command_change(own[members], other[members])
+    deviation = np.abs(change - 1)
+    worst = int(np.argmax(deviation))
+    if deviation[worst] <= SAME_COMMAND:
+        return None
+    percent = formats.number(100 * (float(np.abs(change[worst])) - 1), 1)
+    degrees = formats.number(float(np.degrees(np.angle(change[worst]))), 1)
+    return (
+        f"at {names[worst]} the command of {run.label} is {percent} % in amplitude and {degrees} "
+        f"degrees in phase off that of {model.label}"
+    )
+
+
+def _refuse_copies(runs: Sequence[GaitRun], side: str) -> None:
+    """Raise an error for copies: two copies of one run would show no scatter."""
+    seen: dict[bytes, str] = {}
+    for run in runs:
+        numbers = run.ratio.tobytes()
+        if numbers in seen:
+            raise DataError(
+                f"{run.label} is a copy of the numbers of {seen[numbers]} on side {side}: a copy "
+                "is not a run of its own"
+            )
+        seen[numbers] = run.label
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
 
 
 @dataclass(frozen=True)
@@ -113,16 +226,14 @@ def compare_sessions(
 
         return see(session, choices.session, warn)
 
-    sides = [
-        [seen(one) for one in ([side] if isinstance(side, SessionView) else side)]
-        for side in (a, b)
-    ]
+    groups = ([side] if isinstance(side, SessionView) else side for side in (a, b))
+    sides = [list(map(seen, group)) for group in groups]
     every = sum(map(len, sides))
     noted = [
         f"{sentence} ({'all sessions' if len(names) == every else ', '.join(names)})"
         for sentence, names in warnings.items()
     ]
-    return compare_fitted(sides[0], sides[1], choices, noted)
+    return compare_fitted(*sides, choices, noted)
 
 
 def compare_fitted(
@@ -143,7 +254,8 @@ def compare_fitted(
     if not a or not b:
         raise UsageError("a comparison needs at least one session a side")
     every_warning = list(warnings)
-    design = _design(a, b, choices)
+    unpaired = "sessions" if len(a) == len(b) == 1 else "groups"
+    design = "pairs" if choices.paired else unpaired
     aligned = align([one.run for one in a], [one.run for one in b], any_gait=choices.any_gait)
     keys = family(a, b, aligned.names)
     # Lags near pi must not part company: all are taken within pi of the first session's.
@@ -172,12 +284,6 @@ def compare_fitted(
         warnings=tuple(every_warning),
         provenance=_provenance(a, b, choices),
     )
-
-
-def _design(a: Sequence[ComparedSession], b: Sequence[ComparedSession], choices: Choices) -> str:
-    if choices.paired:
-        return "pairs"
-    return "sessions" if len(a) == len(b) == 1 else "groups"
 
 
 def _partial(aligned: Alignment) -> str | None:
@@ -222,6 +328,7 @@ def _waveforms(
         first, second, difference = differ(sides[0], sides[1], design)
         half = difference.error * [t_factor(dof) for dof in difference.dof.tolist()]
         worst = int(np.argmax(np.abs(difference.value)))
+        most = float(difference.value[worst])
         found.append(
             Waveform(
                 name=name,
@@ -230,10 +337,7 @@ def _waveforms(
                 difference_rad=tuple(difference.value.tolist()),
                 half_rad=tuple(half.tolist()),
                 rms_rad=float(np.sqrt(np.mean(difference.value**2))),
-                largest=Estimate(
-                    float(difference.value[worst]),
-                    around(float(difference.value[worst]), float(half[worst])),
-                ),
+                largest=Estimate(most, around(most, float(half[worst]))),
                 largest_at_rad=float(phases_rad()[worst]),
             )
         )
@@ -245,8 +349,7 @@ def _by_first(one: ComparedSession, name: str, names: Sequence[str]) -> Quantiti
     run = one.run
     group = run.group[run.names.index(name)]
     members = [k for k, own in enumerate(run.group) if own == group]
-    reference = next(k for k in members if run.names[k] in names)
-    commands = run.command[[members[0], reference]]
+    commands = run.command[[members[0], next(k for k in members if run.names[k] in names)]]
     return turned(one.cycles[name], float(np.angle(commands[0] / commands[1])))
 
 
@@ -263,13 +366,10 @@ def _provenance(
     if margins.lag_rad != default.lag_rad:
         words.append(f"margin-lag-deg={float(np.degrees(margins.lag_rad))!r}")
     options = [f"--{word.replace('_', '-')}" for word in words]
-    inputs: dict[str, str] = {}
-    for one in (*a, *b):
-        inputs |= one.analysis.provenance.inputs
     return Provenance(
         command=shlex.join(["undulog", "compare", *files, *options, *choices.session.arguments()]),
         versions=base_versions(),
-        inputs=inputs,
+        inputs={k: v for one in (*a, *b) for k, v in one.analysis.provenance.inputs.items()},
         options={
             **asdict(choices.session),
             "paired": choices.paired,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -75,8 +76,7 @@ def family(
         Quantities and where, in the order of ``UNITS``.
     """
     every = [one.estimates for one in (*a, *b)]
-    places = (*joints, BODY)
-    keys = [(quantity, place) for quantity in UNITS for place in places]
+    keys = itertools.product(UNITS, (*joints, BODY))
     return [key for key in keys if all(key in known for known in every)]
 
 
@@ -182,13 +182,9 @@ def _named(decisions: Sequence[Difference]) -> tuple[NamedJoint, ...]:
         if one.quantity in ("gain", "lag"):
             parts.setdefault(one.place, []).append(one)
     named = [
-        NamedJoint(
-            name,
-            float(np.hypot.reduce([one.size for one in both])),
-            min(one.p_holm for one in both),
-        )
+        NamedJoint(name, float(np.hypot.reduce([one.size for one in both])), least)
         for name, both in parts.items()
-        if min(one.p_holm for one in both) < SIGNIFICANT_DIFFERENCE
+        if (least := min(one.p_holm for one in both)) < SIGNIFICANT_DIFFERENCE
     ]
     return tuple(sorted(named, key=lambda one: -one.size))
 
@@ -241,9 +237,8 @@ def answer_of(
     beyond_doubt = _beyond_doubt(decided)
     tests = {one.quantity: one for one in decided.equivalence}
     same = all(tests[quantity].p < SIGNIFICANT_DIFFERENCE for quantity in ("gain", "lag"))
-    margins = (
-        f"{_short(100 * tests['gain'].margin)} % and {_short(math.degrees(tests['lag'].margin))}°"
-    )
+    gain, lag = tests["gain"].margin, math.degrees(tests["lag"].margin)
+    margins = f"{_short(100 * gain)} % and {_short(lag)}°"
     whole = " (partial comparison)" if partial else ""
     joints = len({one.place for one in decided.differences if one.place != BODY})
     which = "the joint" if joints == 1 else f"all {joints} joints"

@@ -1,11 +1,8 @@
-"""Estimates with variances, and mean cycles, of one session of a comparison.
+"""One session of a comparison: facts, estimates with variances, mean cycles, differences.
 
-The mean cycle of a joint by gait phase, the phase that the commands define.
-
+A mean cycle goes by gait phase, the phase that the commands define.
 Phase 0 is the crest of the fundamental of the first compared joint's command, in every session, so
 cycles are laid over each other by what the controller meant and not by the clock.
-
-Differences of two sides with errors, p-values of a family, intervals that hold together.
 
 Two single sessions differ by B minus A, each with the standard error of its own noise; groups of
 runs by the difference of their means, after Welch (Biometrika 34, 1947), or, run by run, by the
@@ -16,9 +13,10 @@ interval may contain 0 where Holm's sharper procedure decides.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 from scipy.special import stdtr, stdtrit
@@ -27,17 +25,18 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import UsageError
+from undulog.capture.common.strict_table import read_toml
 
 from ..body.steps import body_steps, cost_of_transport, mean_of_cycles, speed
+from ..energy import in_all
 from ..estimators.harmonic import HarmonicFit
 from ..estimators.intervals import CONFIDENCE, welch_satterthwaite
 from ..estimators.series import GAP_FACTOR, Series
 from ..results.analysis import Analysis
-from ..results.comparison import BODY
+from ..results.comparison import BODY, Change
 from ..session.analyse import SessionMeasurement, measure_session
 from ..session.runs import GaitRun, gait_run
 from ..signals.stretch import Options
-from .alignment import facts_of
 
 MIN_RUNS = 2
 """Runs a side below which nothing is known of their scatter."""
@@ -199,8 +198,7 @@ def cycles_by_phase(
     cycle_s = 2 * np.pi / fit.omega
     first = -zero_rad / fit.omega
     first += np.ceil((start_s - first) / cycle_s - 1e-6) * cycle_s
-    count = max(0, int(np.floor((stop_s - first) / cycle_s + 1e-6)))
-    starts = first + cycle_s * np.arange(count)
+    starts = first + cycle_s * np.arange(max(0, int(np.floor((stop_s - first) / cycle_s + 1e-6))))
     times = starts[:, None] + cycle_s * np.arange(PHASES) / PHASES
     rest = one.values - fit.predict(channel, one.t_s)
     left = Series(one.name, one.t_s, rest).at(times.ravel()).reshape(times.shape)
@@ -214,6 +212,88 @@ def _whole(one: Series, start_s: float, stop_s: float) -> bool:
     inside = one.between(start_s, stop_s).t_s
     edges = np.concatenate([[start_s], inside, [stop_s]])
     return inside.size > 1 and bool(np.max(np.diff(edges)) <= longest)
+
+
+_OF_THE_RUN = frozenset(
+    {
+        *("session_id", "epoch_ns", "seed", "scenario", "source_session"),
+        *("driven.by", "driven.session_id", "planned_duration_s"),
+    }
+)
+"""Facts that name a run rather than describe how it was made."""
+
+_TEXTS = frozenset({"name", "description", "seed", "epoch_s", "robot"})
+"""Keys of an attached file without an effect."""
+
+_FILES = ("robot.toml", "scenario.toml", "plan.toml", "calibration.toml")
+_ORDER = ("robot", *_FILES, "session")
+
+
+def facts_of(session: SessionView) -> dict[str, str]:
+    """Read the facts that a session records of itself.
+
+    Returns:
+        Dotted names to text: of the attached robot, scenario and plan (e.g.
+        ``scenario.toml: servo_of.joint03.stall_torque``), and of the metadata.
+    """
+    facts = {"robot": "" if session.robot is None else session.robot.name}
+    for file in _FILES:
+        if (data := session.attachments.get(file)) is None:
+            continue
+        try:
+            table = read_toml(data.decode())
+        except ValueError:
+            facts[f"{file}: text"] = repr(data)
+            continue
+        kept = {key: value for key, value in table.items() if key not in _TEXTS}
+        facts |= {f"{file}: {key}": text for key, text in _flat(kept).items()}
+    recorded = session.metadata.get("undulog", {}).items()
+    return facts | {f"session: {key}": one for key, one in recorded if key not in _OF_THE_RUN}
+
+
+def changes(a: Sequence[Mapping[str, str]], b: Sequence[Mapping[str, str]]) -> tuple[Change, ...]:
+    """List the facts that differ between the sides.
+
+    Args:
+        a: Facts of each session of side A.
+        b: Of each session of side B.
+
+    Returns:
+        Robot first, then scenario, then versions; values that only one side has are None on the
+        other.
+    """
+    names = list(dict.fromkeys(name for facts in (*a, *b) for name in facts))
+    found = [
+        Change(name, *sides)
+        for name in names
+        if (sides := (_recorded_value(a, name), _recorded_value(b, name)))[0] != sides[1]
+    ]
+    return tuple(sorted(found, key=lambda one: _ORDER.index(one.name.partition(":")[0])))
+
+
+def _recorded_value(side: Sequence[Mapping[str, str]], name: str) -> str | None:
+    values = sorted({facts[name] for facts in side if name in facts})
+    return ", ".join(values) if values else None
+
+
+def _flat(value: Any, before: str = "") -> dict[str, str]:
+    """Flatten a TOML table to dotted names; entries of a list go by their name or index."""
+    parts: dict[str, Any] = {}
+    if isinstance(value, dict):
+        table = cast("dict[str, Any]", value)
+        parts = {f"{before}.{key}" if before else key: one for key, one in table.items()}
+    elif isinstance(value, list):
+        for k, one in enumerate(cast("list[Any]", value)):
+            if isinstance(one, dict):
+                name = cast("dict[str, Any]", one).get("name", k)
+                parts[f"{before}[{name}]"] = one
+    if not parts:
+        text = f"{value:g}" if isinstance(value, float) else str(value)
+        return {} if value == {} else {before: text}
+    flat: dict[str, str] = {}
+    for key, one in parts.items():
+        flat |= _flat(one, key)
+    return flat
 
 
 Key = tuple[str, str]
@@ -256,10 +336,10 @@ def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
     """
     measured = measure_session(session, options, with_dead_bands=False)
     analysis = measured.analysis
-    label = Path(analysis.session.path).name
-    run = gait_run(label, session.robot, analysis, measured.gait)
+    run = gait_run(Path(analysis.session.path).name, session.robot, analysis, measured.gait)
     estimates = _responses(measured, run) | _energies(measured)
-    total = _total_energy(measured)
+    powers = [energies.mechanical for energies in measured.energies.values()]
+    total = in_all([None if power is None else power.abs_j for power in powers])
     steps = None
     if measured.gait is not None:
         steps = body_steps(session, measured.responses, measured.span, warn)
@@ -320,17 +400,10 @@ def _responses(measured: SessionMeasurement, run: GaitRun) -> dict[Key, Known]:
 def _energies(measured: SessionMeasurement) -> dict[Key, Known]:
     found: dict[Key, Known] = {}
     for name, energies in measured.energies.items():
-        known = None if energies.mechanical is None else mean_of_cycles(energies.mechanical.abs_j)
-        if known is not None:
+        power = energies.mechanical
+        if power is not None and (known := mean_of_cycles(power.abs_j)) is not None:
             found["energy_abs", name] = known
     return found
-
-
-def _total_energy(measured: SessionMeasurement) -> FloatArray | None:
-    """Return E_abs of all joints together in each cycle [J]; None where one is not known."""
-    powers = [energies.mechanical for energies in measured.energies.values()]
-    known = [power.abs_j for power in powers if power is not None]
-    return np.sum(known, axis=0) if known and len(known) == len(powers) else None
 
 
 def _cycles(measured: SessionMeasurement, run: GaitRun) -> dict[str, Quantities]:
@@ -340,14 +413,10 @@ def _cycles(measured: SessionMeasurement, run: GaitRun) -> dict[str, Quantities]
         return found
     for group, members in zip(gait.groups, run.by_group, strict=True):
         for k, name in enumerate(group.answered):
-            cut = cycles_by_phase(
-                measured.responses[name],
-                group.fit,
-                len(group.driven) + k,
-                zero_rad=float(np.angle(run.command[members[0]])),
-                start_s=span.start_s,
-                stop_s=span.stop_s,
-            )
+            zero_rad = float(np.angle(run.command[members[0]]))
+            window = {"zero_rad": zero_rad, "start_s": span.start_s, "stop_s": span.stop_s}
+            at = len(group.driven) + k
+            cut = cycles_by_phase(measured.responses[name], group.fit, at, **window)
             if len(cut) > 1:
                 found[name] = from_runs(cut)
     return found

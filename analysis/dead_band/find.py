@@ -52,12 +52,11 @@ class Witness:
     @classmethod
     def of(cls, columns: Columns, name: str, origin_ns: int) -> Witness:
         """Return a joint's motor current, or else its effort, which may be the gear's."""
-        found = clean_together(
-            {key: columns.of(key)[name] for key in _WITNESSES if name in columns.of(key)}, origin_ns
-        )
-        quantity = next(
-            (key for key in ("current", "effort") if key in found and found[key].count), ""
-        )
+        kinds = {key: columns.of(key) for key in _WITNESSES}
+        own = {key: signals[name] for key, signals in kinds.items() if name in signals}
+        found = clean_together(own, origin_ns)
+        known = (key for key in ("current", "effort") if key in found and found[key].count)
+        quantity = next(known, "")
         return cls(found.get(quantity), quantity, found.get("reference"))
 
 
@@ -76,7 +75,7 @@ def decide(cycles: Cycles, joint: int, one: Fitted, witness: Witness) -> tuple[s
     across = (command - one.follower[:, fitted]) / max(float(one.parameters[WIDTH]) / 2, 1e-12)
     if witness.second is not None:
         along = _slopes(command, witness.second.at(times.ravel()).reshape(times.shape), rests)
-        if _mean_beyond(along, _ALONG):
+        if along.size >= _FEW and float(along.mean()) > _ALONG and _sure(along):
             return PLAY, "a second sensor goes along with the command meanwhile"
     if witness.effort is None:
         return EITHER, "no current and no effort is recorded"
@@ -113,10 +112,6 @@ def _sure(values: FloatArray) -> bool:
         return False
     error = float(values.std(ddof=1)) / values.size**0.5
     return abs(float(values.mean())) > _SURE * error
-
-
-def _mean_beyond(values: FloatArray, bound: float) -> bool:
-    return values.size >= _FEW and float(values.mean()) > bound and _sure(values)
 
 
 def rested(command: FloatArray, width: float, top: float, bottom: float) -> FloatArray:
@@ -227,12 +222,8 @@ def dead_bands(
     found: dict[str, DeadBand] = {}
     for group in shared_times(measured):
         own = [names[i] for i in group]
-        cycles = whole_cycles(
-            [commands[name] for name in own],
-            [responses[name] for name in own],
-            gait.fit.omega,
-            MOST_CYCLES,
-        )
+        both = [commands[name] for name in own], [responses[name] for name in own]
+        cycles = whole_cycles(*both, gait.fit.omega, MOST_CYCLES)
         if cycles is not None:
             found |= _of_group(own, cycles, gait.fit.omega, columns, origin_ns)
     return found
@@ -254,20 +245,15 @@ def _of_group(
     chosen = np.flatnonzero(hinted)
     if chosen.size == 0:
         return {}
-    part = Cycles(
-        tuple(cycles.commands[j] for j in chosen),
-        cycles.t_s,
-        cycles.first,
-        cycles.measured[chosen],
-    )
+    some = tuple(cycles.commands[j] for j in chosen)
+    part = Cycles(some, cycles.t_s, cycles.first, cycles.measured[chosen])
     fits = fit_dead_bands(part, omega, amplitude[chosen], lag[chosen], resolution[chosen])
     found: dict[str, DeadBand] = {}
     for k, (j, one) in enumerate(zip(chosen.tolist(), fits, strict=True)):
         least = RESOLVED * resolution[j] / abs(one.gain) if one.gain else np.inf
         clearer = one.independent * np.log(linear[j, 0] / one.cost)
-        if one.gain <= 0 or clearer < _CLEAR or np.any(one.travel[:, 0] < least):
-            continue
-        if np.any(one.travel[:, 1] <= 0):
+        shown = one.gain > 0 and clearer >= _CLEAR and not np.any(one.travel[:, 0] < least)
+        if not shown or np.any(one.travel[:, 1] <= 0):
             continue
         rest_s = _rests(part, k, one, float(resolution[j]))
         if rest_s is not None:
@@ -309,8 +295,7 @@ def _without(cycles: Cycles, joint: int, lag: float, omega: float) -> tuple[floa
         return (command.at(t_s + near_s) - command.at(t_s - near_s)) / (2 * near_s)
 
     late_s = lag / (2 * np.pi) * span_s
-    moves = rate(times)
-    plain = np.column_stack((np.ones_like(times), command.at(times), moves))
+    plain = np.column_stack((np.ones_like(times), command.at(times), rate(times)))
     square = np.sign(rate(times - late_s))
     measured = cycles.measured[joint, :, cycles.first :].ravel()
     alone = np.linalg.lstsq(plain, measured, rcond=None)[0]

@@ -90,8 +90,7 @@ def fit_dead_bands(
     scales = _Scales(cycles.period_s, omega, amplitude, resolution)
     starts = _starts(cycles.period_s, omega, amplitude, lag)
     each = misfit(cycles.some(5), np.repeat(joints, starts.shape[1]), starts.reshape(-1, 5))
-    best = each.cost.reshape(starts.shape[:2]).argmin(axis=1)
-    first = starts[joints, best]
+    first = starts[joints, each.cost.reshape(starts.shape[:2]).argmin(axis=1)]
     # The profile over b: d, T and w are fitted, b is a share of w.
     rows = np.repeat(joints, _SHARES.size)
     ties = np.zeros((rows.size, PARAMETERS, 3))
@@ -155,8 +154,7 @@ def _chosen(cycles: Cycles, joint: int, found: _Candidates, scales: _Scales) -> 
     travel[:, 1:] += np.outer(error[:2], [-1, 1])
     step[:, 1:] += np.outer(error[2:], [-1, 1])
     if taken < len(_NEEDED):
-        loss = independent * np.log(found.costs / least)
-        low, high, most = _possible(found.profile, loss)
+        low, high, most = _possible(found.profile, independent * np.log(found.costs / least))
         travel[:, 1] = np.minimum(travel[:, 1], low - error[:2])
         travel[:, 2] = np.maximum(travel[:, 2], high + error[:2])
         step[:, 2] = np.maximum(step[:, 2], most)
@@ -236,8 +234,7 @@ def _levenberg(
         best = costs.argmin(axis=1)
         better = costs[here, best] < np.square(left).sum(axis=(1, 2)) * (1 - _SAME)
         values[better] = tried[here, best][better]
-        eased = np.clip(damping * _FACTORS[best], 1e-6, 1e4)
-        damping = np.where(better, eased, 100 * damping)
+        damping = np.where(better, np.clip(damping * _FACTORS[best], 1e-6, 1e4), 100 * damping)
         idle = np.where(better, 0, idle + 1)
         if np.all(idle >= 2):
             break
@@ -266,8 +263,7 @@ def _independent(residual: FloatArray) -> float:
     square = _mean(own**2)
     if square == 0:
         return float(residual.size)
-    products: FloatArray = own[:, 1:] * own[:, :-1]
-    along = max(0.0, _mean(products) / square)
+    along = max(0.0, _mean(own[:, 1:] * own[:, :-1]) / square)
     share = _mean(residual.mean(axis=0) ** 2) / square * _repeated(residual)
     cycles, samples = residual.shape
     return samples * (1 - along) / (1 + along) / (share + (1 - share) / cycles)
@@ -308,8 +304,7 @@ def _errors(
     chosen, tie = fitted
     n = tie.shape[1]
     nudge, unit = scales.nudge[joint, :n], scales.unit[joint, :n]
-    at_bound = chosen[:n] <= scales.lower[:n] + 1e-12
-    free = np.flatnonzero(~at_bound)
+    free = np.flatnonzero(~(chosen[:n] <= scales.lower[:n] + 1e-12))
     sets = chosen + tie[:, free].T * nudge[free, np.newaxis]
     still = one.follower[0, :, cycles.first :]
     moved: FloatArray = np.empty((0, *still.shape))
@@ -327,8 +322,7 @@ def _errors(
     mean, common = design.mean(axis=1), residual.mean(axis=0)
     segment = np.arange(samples, dtype=np.int64) * _SEGMENTS // samples
     parts = [mean[:, segment == s] for s in range(_SEGMENTS)]
-    repeated = _repeated(residual)
-    spread += repeated * _jackknife(
+    spread += _repeated(residual) * _jackknife(
         np.stack([part @ part.T for part in parts]),
         np.stack([part @ common[segment == s] for s, part in enumerate(parts)]),
     )

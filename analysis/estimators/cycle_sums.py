@@ -170,6 +170,5 @@ def _each_cycle(one: Series, fit: HarmonicFit, channel: int) -> ComplexArray:
     if cycles < 1 or filled.min() < 2:
         return nothing
     parts = [part.turned[:, 0] for part in residuals([one], fit, [channel])]
-    turned = np.concatenate(parts, axis=1)
-    real, imaginary = cycle_sums(turned, starts)
+    real, imaginary = cycle_sums(np.concatenate(parts, axis=1), starts)
     return 2 * (real + 1j * imaginary) / filled / amplitude

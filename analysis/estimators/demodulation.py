@@ -10,7 +10,7 @@ each one command and response are fitted by least squares::
 where <x> is the mean of x over one cycle around each sample: it follows the offset that steers the
 robot, and has no part of a steady oscillation (a comb filter).
 
-The noise of H is told by its scatter from cycle to cycle: what truly changes slowly drops out of
+The noise of H shows in its scatter from cycle to cycle: what truly changes slowly drops out of
 the second differences H[k-1] - 2 H[k] + H[k+1] (von Neumann, Ann. Math. Stat. 12, 1941, for the
 first ones). What changes fast counts as noise, so the intervals are conservative then.
 """
@@ -41,7 +41,7 @@ DRIVEN_SHARE = 0.05
 """A cycle whose command is smaller than this share of the joint's largest is not driven."""
 
 MIN_DIFFERENCES = 3
-"""Second differences that the noise is told by, at least."""
+"""Second differences that the noise is estimated from, at least."""
 
 _TURN = 2 * np.pi
 _TOGETHER = 8192
@@ -159,10 +159,10 @@ def cycles_of(
         squares.append(second / (share[:-2] + 4 * share[1:-1] + share[2:]))
     ratio = np.concatenate(ratios)
     known = np.concatenate(squares)
-    told, after = np.isfinite(known), np.concatenate(late)
-    if np.count_nonzero(told & after) >= MIN_DIFFERENCES:
-        told &= after
-    known = known[told]
+    usable, after = np.isfinite(known), np.concatenate(late)
+    if np.count_nonzero(usable & after) >= MIN_DIFFERENCES:
+        usable &= after
+    known = known[usable]
     answer = np.abs(np.concatenate(given)) ** 2
     variance = np.full(ratio.size, np.nan)
     dof = 0.0
@@ -206,8 +206,7 @@ def _amplitudes(one: Series, phase: Phase, edges_s: FloatArray) -> tuple[Complex
     waves, cross, power = _moments(turned, swing, starts)
     usable &= np.isfinite(power) & (power > 0)
     chosen = np.flatnonzero(usable)
-    normal = _normal(filled, waves)[chosen]
-    fitted = np.linalg.solve(normal, cross.T[chosen, :, None])[..., 0]
+    fitted = np.linalg.solve(_normal(filled, waves)[chosen], cross.T[chosen, :, None])[..., 0]
     amplitude[chosen] = fitted[:, 1] - 1j * fitted[:, 2]
     explained[chosen] = filled[chosen] * np.abs(amplitude[chosen]) ** 2 / 2 / power[chosen]
     return amplitude, explained

@@ -309,8 +309,7 @@ class HarmonicFit:
     @property
     def explained(self) -> FloatArray:
         """Share of each channel's variance that the model explains, shape (K,); 0 if constant."""
-        moving = self.total > 0
-        ratio = np.divide(self.rss, self.total, out=np.ones_like(self.rss), where=moving)
+        ratio = np.divide(self.rss, self.total, out=np.ones_like(self.rss), where=self.total > 0)
         return np.clip(1 - ratio, 0.0, 1.0)
 
     def parameters(self, channels: Sequence[int], scale: float) -> FloatArray:

@@ -148,16 +148,9 @@ def welch_satterthwaite(variances: FloatArray, dof: FloatArray) -> FloatArray:
     return np.divide(total**2, scatter, out=np.min(dof, axis=0), where=scatter > 0)
 
 
-def t_factor(dof: float, confidence: float = CONFIDENCE) -> float:
-    """Two-sided Student factor.
-
-    Args:
-        confidence: E.g. 0.95.
-
-    Returns:
-        The factor on the standard error.
-    """
-    return float(stdtrit(dof, 0.5 + confidence / 2))
+def t_factor(dof: float) -> float:
+    """Two-sided Student factor on a standard error, at 95 %."""
+    return float(stdtrit(dof, 0.5 + CONFIDENCE / 2))
 
 
 def around(value: float, half: float) -> Interval:

@@ -167,8 +167,7 @@ def residual_spectrum(series: Sequence[Series], fit: HarmonicFit) -> tuple[Noise
         usable = own.usable()
         level[members] = np.mean(own.power()[:, usable] / own.kept[usable], axis=1)
         dof[members] = 2.0 * np.count_nonzero(usable)
-    exact = RELATIVE_FLOOR * fit.total / np.maximum(fit.count, 1.0)
-    floor = np.maximum(exact - level, 0.0)
+    floor = np.maximum(RELATIVE_FLOOR * fit.total / np.maximum(fit.count, 1.0) - level, 0.0)
     level += floor
     first = fit.model.first
     block = fit.inverse_gram[:, first : first + 2, first : first + 2]
@@ -215,8 +214,7 @@ def _common_bins(
     rounding: FloatArray,
 ) -> ResidualBins:
     """The bins of all groups in the order of the channels; a pair that a fit took is left out."""
-    left = np.min([one.kept / one.count for one in found], axis=0)
-    pairs = left.reshape(-1, 2).min(axis=1)
+    pairs = np.min([one.kept / one.count for one in found], axis=0).reshape(-1, 2).min(axis=1)
     usable = np.repeat(pairs > min(KEPT_POWER, 0.999 * float(pairs.max())), 2)
     values = np.zeros((spread.size, np.count_nonzero(usable)), dtype=np.complex128)
     for members, one in zip(groups, found, strict=True):

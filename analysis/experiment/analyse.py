@@ -24,7 +24,7 @@ from ..results.analysis import Analysis
 from ..results.coupling import LocalCoupling
 from ..results.estimate import Provenance
 from ..results.experiment import Experiment, Headings, PooledJoint, PooledRuns, Reversal, Run
-from ..session.analyse import examine_session
+from ..session.analyse import measure_session
 from ..session.runs import (
     SAME_COMMAND,
     SAME_FREQUENCY,
@@ -76,15 +76,15 @@ def analyse_experiment(
     commanded: list[CommandTones | None] = []
     runs: list[GaitRun] = []
     for session in sessions:
-        fitted = examine_session(session, options)
-        analysis, robot = fitted.analysis, session.robot
-        lay = posture(session, analysis.gait.windows)
-        label = Path(analysis.session.path).name
-        runs.append(gait_run(label, robot, analysis, fitted.gait, lay))
+        measured = measure_session(session, options)
+        analysis, gait, robot = measured.analysis, measured.gait, session.robot
+        del measured  # heavy: no two at a time
+        label, lay = Path(analysis.session.path).name, posture(session, analysis.gait.windows)
+        runs.append(gait_run(label, robot, analysis, gait, lay))
         analyses.append(analysis)
-        gaits.append(fitted.gait)
+        gaits.append(gait)
         robots.append(robot)
-        commanded.append(command_tones(session, options, fitted))
+        commanded.append(command_tones(session, options, gait, analysis.session.robot))
     if not runs:
         raise UsageError("an experiment needs at least one session")
     warnings: list[str] = []
@@ -103,8 +103,9 @@ def analyse_experiment(
         why = {k: reason for k, reason in why.items() if parts[k] is None}
     parts_of = {k: part for k, part in enumerate(parts) if part is not None}
     parts_of |= {} if only_kicks else {k: role.value for k, role in roles.items()}
-    for k, reason in why.items():
-        warnings.append(f"{runs[k].label} {reason}; it is left out of the reversal test")
+    warnings += [
+        f"{runs[k].label} {text}; it is left out of the reversal test" for k, text in why.items()
+    ]
     chosen = [runs[k] for k in roles]
     names, y = responses(chosen) if chosen else ((), np.zeros((0, 0), dtype=np.complex128))
     ways = list(roles.values())
@@ -233,11 +234,9 @@ def _both_ways(
         warn(f"without gain and lag at it or its mirror joint in every run: {', '.join(lost)}")
     if robot is None:
         warn("no robot description: the log's order of joints is taken as a chain, head to tail")
-    starts = {
-        role: [run.start_ns for run, way in zip(runs, ways, strict=True) if way is role]
-        for role in Role
-    }
-    first, second = sorted(starts.values(), key=min)
+    both = list(zip(runs, ways, strict=True))
+    starts = [[run.start_ns for run, way in both if way is role] for role in Role]
+    first, second = sorted(starts, key=min)
     if max(first) < min(second):
         warn(
             "all runs one way come before all runs the other way: warming up looks like a "
@@ -260,14 +259,11 @@ def _warn_headings(reversal: Reversal, warn: Warn) -> None:
     """Warn where a tilted floor isn't cancelled and could change what is named."""
     if reversal.p >= SIGNIFICANT or reversal.tilt.headings is Headings.BALANCED:
         return
-    why = (
-        "the robot's heading is not recorded"
-        if reversal.tilt.headings is Headings.UNKNOWN
-        else "the robot's headings are not balanced"
-    )
+    known = reversal.tilt.headings is not Headings.UNKNOWN
+    why = "headings are not balanced" if known else "heading is not recorded"
     warn(
-        f"{why}, so a tilted floor doesn't cancel; turn the robot by half a turn in half of the "
-        "runs of each direction (undulog plan reversal)"
+        f"the robot's {why}, so a tilted floor doesn't cancel; turn the robot by half a turn "
+        "in half of the runs of each direction (undulog plan reversal)"
     )
 
 
@@ -277,12 +273,11 @@ def _run(one: Analysis, run: GaitRun, role: str | None, why: str | None) -> Run:
 
 def _provenance(analyses: Sequence[Analysis], options: Options) -> Provenance:
     paths = [one.session.path for one in analyses]
+    named = zip(paths, analyses, strict=True)
     return Provenance(
         command=shlex.join(["undulog", "analyse", *paths, *options.arguments()]),
         versions=base_versions(),
-        inputs={
-            path: one.provenance.inputs[path] for path, one in zip(paths, analyses, strict=True)
-        },
+        inputs={path: one.provenance.inputs[path] for path, one in named},
         options={
             **asdict(options),
             "confidence": CONFIDENCE,

@@ -78,19 +78,17 @@ def _linear(coupling: LocalCoupling) -> str | None:
         return f"nonlinearity {formats.percent(index)}"
     if index.ci95 is None:
         return "whether it is linear is open"
-    most = formats.number(
-        100 * index.ci95[1], formats.decimals_for_values([100 * index.ci95[1]], 2)
-    )
+    end = 100 * index.ci95[1]
+    most = formats.number(end, formats.decimals_for_values([end], 2))
     return f"no nonlinearity is shown (at most {most} %)"
 
 
 def _rows_that_fail(coupling: LocalCoupling) -> str:
-    parts = (("P", 1, coupling.phase_rows), ("R", 0, coupling.gain_rows))
     off = {
         f"rows of {symbol} don't sum to {total}": max(
             _off(row) / max(row.standard_error, 1e-12) for row in rows
         )
-        for symbol, total, rows in parts
+        for symbol, total, rows in (("P", 1, coupling.phase_rows), ("R", 0, coupling.gain_rows))
     }
     return max(off, key=lambda text: off[text])
 
@@ -190,19 +188,15 @@ def sweep_answer(coupling: Coupling) -> str:
 
 def sweep_detail(coupling: LinearCoupling) -> Iterable[str]:
     """Yield the sentences that follow the answer."""
-    for tone in coupling.tones:
-        yield _tone(tone)
+    yield from map(_tone, coupling.tones)
     yield from sweep_checks(coupling)
 
 
 def sweep_checks(coupling: LinearCoupling) -> Iterable[str]:
     """Yield the results of the checks of all tones."""
     yield f"{coupling.route_why[0].upper()}{coupling.route_why[1:]}."
-    settled = (
-        "settled"
-        if coupling.drift_per_cycle == 0
-        else f"NOT settled, drift {100 * coupling.drift_per_cycle:.2g} % per cycle"
-    )
+    drift = coupling.drift_per_cycle
+    settled = f"NOT settled, drift {100 * drift:.2g} % per cycle" if drift != 0 else "settled"
     energy, beside = coupling.sideband_energy.value, "energy beside the tones unknown"
     if energy is not None:
         share = "less than 0.001 %" if energy < 1e-5 else f"{100 * energy:.2g} %"
@@ -225,11 +219,9 @@ def sweep_method(coupling: LinearCoupling) -> str:
 
 
 def _tone(tone: ToneCoupling) -> str:
-    cond = [f"C {tone.command_condition:.3g}"]
-    if tone.condition_number is not None:
-        cond.append(f"H {tone.condition_number:.3g}")
-    if tone.route is Route.TORQUE and tone.inverted_condition is not None:
-        cond.append(f"Y {tone.inverted_condition:.3g}")
+    inverted = tone.inverted_condition if tone.route is Route.TORQUE else None
+    numbers = {"C": tone.command_condition, "H": tone.condition_number, "Y": inverted}
+    cond = [f"{of} {number:.3g}" for of, number in numbers.items() if number is not None]
     text = f"{tone.frequency_hz:.4g} Hz: condition numbers {', '.join(cond)}"
     if tone.asymmetry.value is not None:
         of = "X = H^-1" if tone.Z is None else "Z"
@@ -239,10 +231,8 @@ def _tone(tone: ToneCoupling) -> str:
         )
         text += f"; {of}: asymmetry {formats.percent(tone.asymmetry)}, off-diagonal energy {bands}"
     if tone.servo_difference is not None:
-        text += (
-            f"; Z behind the described servos is {formats.number(100 * tone.servo_difference, 1)} "
-            "% off"
-        )
+        off = formats.number(100 * tone.servo_difference, 1)
+        text += f"; Z behind the described servos is {off} % off"
     if tone.distortion is not None:
         text += f"; distortion {100 * tone.distortion:.2g} %"
     return f"{text}."

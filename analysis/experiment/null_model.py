@@ -135,8 +135,7 @@ def null_test(response: Response, joints: IntArray, model: NullModel) -> NullTes
         gain, deviation, error = _one_by_one(system, named)
         noise_gain, noise_deviation, noise_error = _one_by_one(drawn, named)
         others = [j for j in range(len(kinds)) if j not in named]
-        largest = noise_gain[:, others].max(axis=1)
-        p[others] = _share(largest[:, None], gain[others])
+        p[others] = _share(noise_gain[:, others].max(axis=1)[:, None], gain[others])
         best = others[int(np.argmax(gain[others]))]
         if p[best] >= SIGNIFICANT or len(named) + 1 >= most:
             break
@@ -175,15 +174,13 @@ def _linear(
     variance = variance + model.error_at(x) ** 2
     x = _fitted(y, variance, joints, model, own)
     weight, prior = 1 / np.sqrt(variance), _root(model)
-    slope = model.at(x)[1][:, joints]
-    system = _System(
-        shared=np.concatenate([weight[:, None] * parts(slope).T, prior]),
+    return x, _System(
+        shared=np.concatenate([weight[:, None] * parts(model.at(x)[1][:, joints]).T, prior]),
         modules=np.concatenate(
             [weight[:, None, None] * columns, np.zeros((x.size, *columns.shape[1:]))]
         ),
         rest=np.concatenate([weight * _residual(y, joints, model, x), -prior @ x]),
     )
-    return x, system
 
 
 def _root(model: NullModel) -> FloatArray:
@@ -293,8 +290,7 @@ def analyse_with_null(
     measured = measure_session(session, options)
     analysis = measured.analysis
     response, joints = _answered(measured, model, file)
-    test = null_test(response, joints, model)
-    result = _result(test, model, file)
+    result = _result(null_test(response, joints, model), model, file)
     outside = [one.name for one in result.parameters if not one.within]
     warnings = list(analysis.warnings)
     if outside:
@@ -302,8 +298,7 @@ def analyse_with_null(
             f"{', '.join(outside)}: fitted beyond where {file.name} holds; make a null model "
             "around the fitted values"
         )
-    silent = len(model.joints) - len(joints)
-    if silent:
+    if silent := len(model.joints) - len(joints):
         warnings.append(f"{silent} joints without gain and lag are not held to the null model")
     known: dict[str, Any] = {**vars(analysis), "warnings": tuple(warnings)}
     known["provenance"] = _provenance(analysis, file)
@@ -339,8 +334,7 @@ def _other_gait(gait: GaitFit | None, model: NullModel) -> str | None:
     if abs(own - frequency) > SAME_FREQUENCY * frequency:
         texts = distinct(own, frequency)
         return f"its gait has {texts[0]} Hz, the model's {texts[1]} Hz"
-    command = gait.fit.fundamental[: len(gait.driven)]
-    change = command / model.command
+    change = gait.fit.fundamental[: len(gait.driven)] / model.command
     off = np.abs(change * np.exp(-1j * np.angle(np.sum(change))) - 1)
     worst = int(np.argmax(off))
     if off[worst] <= SAME_COMMAND:
@@ -372,25 +366,24 @@ def _result(test: NullTest, model: NullModel, file: Path) -> NullModelResult:
     named = [model.joints[j] for j in test.named]
     p = float(test.p[test.named[0]] if test.named else test.p.min())
     reach = t_factor(np.inf) * test.x_error
-    parameters = tuple(
-        SharedEstimate(
-            name=one.name,
-            unit=one.unit,
-            assumed=one.value,
-            fitted=Estimate(
-                one.value * float(np.exp(x)),
-                (one.value * float(np.exp(x - r)), one.value * float(np.exp(x + r))),
-            ),
-            within=bool(abs(x) <= one.reach),
-        )
-        for one, x, r in zip(model.parameters, test.x, reach, strict=True)
-    )
     return NullModelResult(
         answer=null_answer(modules, named, p, test.fit_p),
         condition=f"conditional on the model {file.name}",
         file=str(file),
         made_by=model.made_by,
-        parameters=parameters,
+        parameters=tuple(
+            SharedEstimate(
+                name=one.name,
+                unit=one.unit,
+                assumed=one.value,
+                fitted=Estimate(
+                    one.value * float(np.exp(x)),
+                    (one.value * float(np.exp(x - r)), one.value * float(np.exp(x + r))),
+                ),
+                within=bool(abs(x) <= one.reach),
+            )
+            for one, x, r in zip(model.parameters, test.x, reach, strict=True)
+        ),
         fit=test.fit,
         fit_p=test.fit_p,
         p=p,
@@ -403,10 +396,9 @@ def _result(test: NullTest, model: NullModel, file: Path) -> NullModelResult:
 
 def _provenance(analysis: Analysis, file: Path) -> Provenance:
     own = analysis.provenance
-    digest = hashlib.sha256(file.read_bytes()).hexdigest()
     return dataclasses.replace(
         own,
         command=f"{own.command} {shlex.join(['--null', str(file)])}",
-        inputs={**own.inputs, str(file): digest},
+        inputs={**own.inputs, str(file): hashlib.sha256(file.read_bytes()).hexdigest()},
         options={**own.options, "null": str(file), "draws": DRAWS},
     )

@@ -141,7 +141,10 @@ def pool_runs(names: Sequence[str], runs: Sequence[Response]) -> PooledResponse:
     ]
     known = np.flatnonzero(np.all(sound, axis=0))
     chosen = [one.select(known.tolist()) for one in runs]
-    each = _log_response(np.stack([one.ratio for one in chosen]))
+    ratio = np.stack([one.ratio for one in chosen])
+    turn: FloatArray = np.angle((ratio / np.abs(ratio)).sum(axis=0))
+    phase = turn + np.angle(ratio * np.exp(-1j * turn))  # of a joint within pi of their mean
+    each = (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
     mean = each.mean(axis=0)
     count, m = len(runs), len(known)
     within = np.concatenate(
@@ -173,13 +176,6 @@ def pool_runs(names: Sequence[str], runs: Sequence[Response]) -> PooledResponse:
         each=frozen(each),
         covariance=frozen(covariance),
     )
-
-
-def _log_response(ratio: ComplexArray) -> ComplexArray:
-    """Return ln H of each run, the phases of a joint within pi of their mean, shape (r, m)."""
-    turn: FloatArray = np.angle((ratio / np.abs(ratio)).sum(axis=0))
-    phase = turn + np.angle(ratio * np.exp(-1j * turn))
-    return (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
 
 
 def pooled_answer(
@@ -225,8 +221,7 @@ def pooled_answer(
 def _scatter(values: FloatArray, variance: FloatArray) -> Scatter:
     """Return the scatter of the mean of values (r, m): r - 1 columns, and added noise (m,)."""
     runs = len(values)
-    centred = values - values.mean(axis=0)
     # Helmert's contrasts between the runs are orthonormal, so the columns are independent.
-    columns = (helmert(runs) @ centred).T / runs**0.5
+    columns = (helmert(runs) @ (values - values.mean(axis=0))).T / runs**0.5
     raised: FloatArray = np.maximum(variance - np.mean(columns**2, axis=1), 0.0)
     return Scatter(columns, raised, np.zeros_like(raised))

@@ -96,7 +96,7 @@ def relative_to_others(values: FloatArray, conditions: IntArray) -> FloatArray:
 
 
 def find_change_points(
-    series: Sequence[FloatArray], times_s: FloatArray, conditions: IntArray, seed: int = 0
+    series: Sequence[FloatArray], times_s: FloatArray, conditions: IntArray
 ) -> list[list[ChangePoint]]:
     """Find joints whose series change, at most one change a series.
 
@@ -105,7 +105,6 @@ def find_change_points(
             gives them; a joint with a NaN is passed over.
         times_s: Of the sessions, in increasing order [s], shape (n_sessions,).
         conditions: Number of each session's condition, shape (n_sessions,).
-        seed: Of the permutations.
 
     Returns:
         For each quantity the changes whose family-wise p-value is at most :data:`LEVEL`, the most
@@ -130,13 +129,9 @@ def find_change_points(
     raw = np.stack([series[quantity][:, joint] for quantity, joint in columns], axis=1)
     residuals = _residuals(raw, basis)
     observed = _largest(residuals, shapes, freedom).max(axis=0)
-    rng = np.random.default_rng(seed)
-    null = np.array(
-        [
-            _largest(_residuals(residuals[rng.permutation(n)], basis), shapes, freedom).max()
-            for _ in range(_PERMUTATIONS)
-        ]
-    )
+    rng = np.random.default_rng(0)
+    dealt = (_residuals(residuals[rng.permutation(n)], basis) for _ in range(_PERMUTATIONS))
+    null = np.array([_largest(one, shapes, freedom).max() for one in dealt])
     for column, (quantity, joint) in enumerate(columns):
         p = (1 + np.count_nonzero(null >= observed[column])) / (1 + len(null))
         if p <= LEVEL:
@@ -153,10 +148,9 @@ def _shapes(times_s: FloatArray, basis: FloatArray) -> _Shapes:
     steps = (np.arange(n)[None, :] >= starts[:, None]).astype(float)
     begin_s = times_s[starts - 1][:, None]
     left_s = np.maximum(times_s[-1] - begin_s, np.finfo(float).tiny)
-    raw = np.concatenate(
-        [steps]
-        + [np.clip((times_s[None, :] - begin_s) / (part * left_s), 0.0, 1.0) for part in _PARTS]
-    )
+    since_s = times_s[None, :] - begin_s
+    ramps = [np.clip(since_s / (part * left_s), 0.0, 1.0) for part in _PARTS]
+    raw = np.concatenate([steps, *ramps])
     across = _residuals(raw.T, basis).T
     norm = np.linalg.norm(across, axis=1)
     kept = norm > 1e-6 * np.linalg.norm(raw, axis=1)
@@ -177,8 +171,7 @@ def _largest(residuals: FloatArray, shapes: _Shapes, freedom: int) -> FloatArray
     """Return t squared of each shape and series, shape (n_shapes, n_series)."""
     explained = (shapes.unit @ residuals) ** 2
     total = np.sum(residuals**2, axis=0)
-    left = np.maximum(total - explained, 1e-12 * total)
-    return freedom * explained / left
+    return freedom * explained / np.maximum(total - explained, 1e-12 * total)
 
 
 def _left(residual: FloatArray, shapes: _Shapes) -> FloatArray:
@@ -202,12 +195,10 @@ def _fit(
     noise = residual - signal
     noise *= np.sqrt(n / max(1, n - basis.shape[1] - 2))
     # The likelihood ratio of the true shape, where there is such a change in such noise.
-    drawn: FloatArray = noise[rng.integers(n, size=(n, _SIMULATIONS))]
-    simulated = signal[:, None] + _residuals(drawn, basis)
+    simulated = signal[:, None] + _residuals(noise[rng.integers(n, size=(n, _SIMULATIONS))], basis)
     left_simulated = _left(simulated, shapes)
     ratio = n * np.log(left_simulated[best] / left_simulated.min(axis=0))
-    accepted = n * np.log(left / left[best]) <= np.quantile(ratio, _CONFIDENCE)
-    starts = shapes.starts[accepted]
+    starts = shapes.starts[n * np.log(left / left[best]) <= np.quantile(ratio, _CONFIDENCE)]
     unit, raw = shapes.unit[best], shapes.raw[best]
     size = float(unit @ residual) / float(unit @ raw)
     start = int(shapes.starts[best])

@@ -161,15 +161,12 @@ class Fleet:
         return asdict(self)
 
 
-def analyse_fleet(
-    sessions: pd.DataFrame, joints: pd.DataFrame, *, components: bool = True
-) -> Fleet:
+def analyse_fleet(sessions: pd.DataFrame, joints: pd.DataFrame) -> Fleet:
     """Compare the sessions of each robot over time.
 
     Args:
         sessions: Rows of the view ``catalog``, as :meth:`.Catalog.find` returns them.
         joints: Rows of the view ``joints`` of the same sessions.
-        components: Also fit the mixed-effects models, which take most of the time.
 
     Raises:
         MissingExtraError: If statsmodels is not installed.
@@ -179,13 +176,12 @@ def analyse_fleet(
     histories: list[RobotHistory] = []
     left_out: list[str] = []
     for robot, own in analysed.groupby(analysed["robot"].fillna("(no name)"), sort=True):
-        history = _history(str(robot), own.sort_values("start"), joints, components=components)
+        history = _history(str(robot), own.sort_values("start"), joints)
         if history is None:
             left_out.append(f"{robot}: no {LEAST_SESSIONS} analysed sessions with the same joints")
         else:
             histories.append(history)
-    missing = len(sessions) - len(analysed)
-    if missing:
+    if missing := len(sessions) - len(analysed):
         left_out.append(f"{missing} sessions are not analysed: undulog catalog --analyse")
     return Fleet(_answer(histories), tuple(histories), tuple(left_out))
 
@@ -206,10 +202,8 @@ def _answer(histories: list[RobotHistory]) -> str:
 
 def sentence(change: JointChange) -> str:
     """Return a change in words, without a full stop."""
-    if change.quantity == "lag":
-        size = f"{abs(math.degrees(change.change)):.2g}°"
-    else:
-        size = f"{abs(change.change) * 100:.2g} %"
+    by = abs(change.change)
+    size = f"{math.degrees(by):.2g}°" if change.quantity == "lag" else f"{by * 100:.2g} %"
     way = "rises" if change.change > 0 else "falls"
     gradually = ", gradually," if change.gradual else ""
     return (
@@ -218,9 +212,7 @@ def sentence(change: JointChange) -> str:
     )
 
 
-def _history(
-    robot: str, sessions: _Frame, joints: _Frame, *, components: bool
-) -> RobotHistory | None:
+def _history(robot: str, sessions: _Frame, joints: _Frame) -> RobotHistory | None:
     own = joints[joints["path"].isin(sessions["path"])]
     tables = {
         "gain": _table(own, np.log(own["gain"].where(own["gain"] > 0))),
@@ -230,15 +222,12 @@ def _history(
     tables = {name: table for name, table in tables.items() if table is not None}
     if "gain" not in tables or len(tables["gain"]) < LEAST_SESSIONS:
         return None
-    paths = tables["gain"].index
-    ordered = sessions[sessions["path"].isin(paths)].set_index("path")
+    ordered = sessions[sessions["path"].isin(tables["gain"].index)].set_index("path")
     tables = {name: table.reindex(ordered.index) for name, table in tables.items()}
     conditions = _conditions(own, ordered)
     times_s = ordered["start"].astype("int64").to_numpy() / 1e9
-    relative = {
-        name: relative_to_others(table.to_numpy(float), conditions)
-        for name, table in tables.items()
-    }
+    values = {name: table.to_numpy(float) for name, table in tables.items()}
+    relative = {name: relative_to_others(one, conditions) for name, one in values.items()}
     changes = _changes(tables, relative, ordered, times_s, conditions)
     dropped = len(sessions) - len(ordered)
     return RobotHistory(
@@ -250,9 +239,7 @@ def _history(
         conditions=len(np.unique(conditions)),
         changes=tuple(changes),
         trends=tuple(_trends(ordered)),
-        components=tuple(
-            _components(name, table, conditions) for name, table in tables.items() if components
-        ),
+        components=tuple(_components(name, one, conditions) for name, one in tables.items()),
         outliers=tuple(_outliers(tables, relative, ordered, changes, conditions)),
         warnings=(f"{dropped} sessions lack the response of a joint",) if dropped else (),
     )
@@ -264,8 +251,7 @@ def _table(joints: _Frame, values: _Frame) -> _Frame | None:
     if latest.empty:
         return None
     table = latest.pivot_table(index="path", columns="joint", values="value", aggfunc="last")
-    order = latest.groupby("joint")["position"].first().sort_values().index
-    table = table.reindex(columns=order)
+    table = table.reindex(columns=latest.groupby("joint")["position"].first().sort_values().index)
     table = table.loc[:, table.notna().mean() >= 0.5].dropna()
     return table if table.shape[1] >= _LEAST_JOINTS and len(table) else None
 
@@ -282,10 +268,8 @@ def _conditions(joints: _Frame, sessions: _Frame) -> IntArray:
     driven = joints[joints["gain"].notna()]
     amplitude = driven.groupby("path")["command_amplitude_rad"].mean().reindex(sessions.index)
     frequency = driven.groupby("path")["frequency_hz"].mean().reindex(sessions.index)
-    keys = [
-        "/".join(f"{value:.1e}" for value in pair)
-        for pair in zip(amplitude.fillna(0.0), frequency.fillna(0.0), strict=True)
-    ]
+    pairs = zip(amplitude.fillna(0.0), frequency.fillna(0.0), strict=True)
+    keys = [f"{size:.1e}/{rate:.1e}" for size, rate in pairs]
     return np.unique(keys, return_inverse=True)[1].astype(np.int64)
 
 
@@ -381,8 +365,7 @@ def _components(name: str, table: _Frame, conditions: IntArray) -> Components:
     formula = "value ~ C(condition)" if len(np.unique(conditions)) > 1 else "value ~ 1"
     parts = {"session": "0 + C(session)", "joint": "0 + C(joint)"}
     if len(rows) > _MOST_ROWS:  # the model's matrices have a row and a column each
-        kept = table.index[:: -(-len(rows) // _MOST_ROWS)]
-        rows = rows[rows["session"].isin(kept)]
+        rows = rows[rows["session"].isin(table.index[:: -(-len(rows) // _MOST_ROWS)])]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

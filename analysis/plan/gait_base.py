@@ -26,7 +26,7 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Joint, Plane, Robot
 
 from ..results.answer import Remarks, percent
-from ..session.analyse import examine_session
+from ..session.analyse import measure_session
 from ..signals.columns import COMMAND_TOPIC, RESPONSE_TOPIC, read_columns
 
 TIME_CONSTANTS = 5.0
@@ -150,7 +150,7 @@ def base_gait(session: SessionView) -> BaseGait:
     Raises:
         UsageError: If it commands no steady gait of sines.
     """
-    gait = examine_session(session, with_dead_bands=False).gait
+    gait = measure_session(session, with_dead_bands=False).gait
     if gait is None or not gait.driven:
         raise UsageError(f"{session.path}: it commands no steady gait; name a session that does")
     if gait.others:

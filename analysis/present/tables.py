@@ -197,11 +197,11 @@ def joint_table(analysis: Analysis, joints: Sequence[JointResult]) -> Table[Join
 
 def energy_table(joints: Sequence[JointResult]) -> Table[JointResult]:
     """Return the energies of every joint over the analysed windows, all with the same digits."""
-    every = [Estimate(of(joint)) for _, _, of, _ in _ENERGIES for joint in joints]
-    digits = _significant(4)(every)
-    columns: list[Column[JointResult]] = [Column(None, "joint", lambda j: j.name, kind="word")]
-    for name, note, of, _ in _ENERGIES:
-        columns.append(Column(None, f"{name} [J]", of, (0, digits), note=note))
+    digits = _significant(4)([Estimate(of(joint)) for _, _, of, _ in _ENERGIES for joint in joints])
+    columns: list[Column[JointResult]] = [
+        Column(None, "joint", lambda j: j.name, kind="word"),
+        *(Column(None, f"{k} [J]", of, (0, digits), note=note) for k, note, of, _ in _ENERGIES),
+    ]
     return Table(columns, joints, numbered=True)
 
 
@@ -214,18 +214,18 @@ def body_table(body: BodyResult) -> Table[tuple[BodyPoint, ...]]:
     names = [("seen mm (95 %)", "phase° (95 %)"), *((f"{n} null mm", "phase°") for n in body.null)]
     for k, (amplitude, phase) in enumerate(names):
         columns += [
-            Column(amplitude, None, partial(_amplitude_mm, k), (1, 1), spare=2 if k else 0),
-            Column(phase, None, partial(_phase_deg, k), (1, 1), spare=1 if k else 0),
+            Column(amplitude, None, lambda row, k=k: _mm(row[k]), (1, 1), spare=2 if k else 0),
+            Column(phase, None, lambda row, k=k: _deg(row[k]), (1, 1), spare=1 if k else 0),
         ]
     return Table(columns, list(zip(body.observed, *body.null.values(), strict=True)))
 
 
-def _amplitude_mm(k: int, points: tuple[BodyPoint, ...]) -> Estimate:
-    return scaled(points[k].amplitude_m, 1000.0)
+def _mm(point: BodyPoint) -> Estimate:
+    return scaled(point.amplitude_m, 1000.0)
 
 
-def _phase_deg(k: int, points: tuple[BodyPoint, ...]) -> Estimate:
-    return degrees(points[k].phase_rad)
+def _deg(point: BodyPoint) -> Estimate:
+    return degrees(point.phase_rad)
 
 
 def point_table(body: BodyResult) -> Table[tuple[str, BodyPoint]]:
@@ -239,8 +239,8 @@ def point_table(body: BodyResult) -> Table[tuple[str, BodyPoint]]:
         Column(None, "place", lambda row: row[1].place, kind="word"),
         Column(None, "link", lambda row: row[1].link, kind="word"),
         Column(None, "of", lambda row: row[0], kind="word"),
-        Column(None, "amplitude [mm]", lambda row: scaled(row[1].amplitude_m, 1000.0), (1, 1)),
-        Column(None, "phase [°]", lambda row: degrees(row[1].phase_rad), (1, 1)),
+        Column(None, "amplitude [mm]", lambda row: _mm(row[1]), (1, 1)),
+        Column(None, "phase [°]", lambda row: _deg(row[1]), (1, 1)),
     ]
     return Table(columns, rows)
 
@@ -310,8 +310,9 @@ def run_table(experiment: Experiment) -> Table[tuple[Run, Analysis]]:
 
 def difference_table(comparison: Comparison) -> Table[Difference]:
     """Every quantity of both sides."""
+    where = {BODY: "the body"}
     columns: list[Column[Difference]] = [
-        Column("joint", "where", lambda one: _place(one.place), kind="word"),
+        Column("joint", "where", lambda one: where.get(one.place, one.place), kind="word"),
         Column("quantity", "quantity", lambda one: WORDS[one.quantity], kind="word"),
         Column("A", "A", lambda one: _side(one, one.a), spare=2),
         Column("B", "B", lambda one: _side(one, one.b), spare=2),
@@ -323,10 +324,6 @@ def difference_table(comparison: Comparison) -> Table[Difference]:
     ]
     rows = comparison.differences
     return Table(columns, rows, bold=lambda one: one.p_holm < SIGNIFICANT_DIFFERENCE)
-
-
-def _place(place: str) -> str:
-    return "the body" if place == BODY else place
 
 
 def _side(one: Difference, value: float) -> str:

@@ -73,8 +73,7 @@ def _dead_bands(analysis: Analysis) -> Iterator[str]:
 def _energy(energy: EnergyResult) -> Iterator[str]:
     cost = energy.transport
     named = (("E_net", cost.net), ("E_abs", cost.abs), ("E_el", cost.el))
-    known = [f"{name} {formats.estimate(one, most=4)}" for name, one in named if one.value]
-    if known:
+    if known := [f"{name} {formats.estimate(one, most=4)}" for name, one in named if one.value]:
         way = formats.estimate(cost.distance_m, " m", most=3)
         yield f"Cost of transport E/(m g d): {', '.join(known)}, over {way}"
     if energy.unknown is not None:
@@ -124,10 +123,9 @@ def chain_detail(chain: ChainCoupling) -> Iterable[str]:
     )
     couplings = [f"{one.source} on {one.target} {formats.estimate(one.K)}" for one in chain.links]
     yield f"K [1/s]: {'; '.join(couplings)}."
-    fed = [one for one in chain.oscillators if one.feedback.value is not None]
-    if fed:
-        told = ", ".join(f"{one.name} {formats.estimate(one.feedback)}" for one in fed)
-        yield f"Feedback of each servo's own angle [1/s]: {told}."
+    if fed := [one for one in chain.oscillators if one.feedback.value is not None]:
+        values = ", ".join(f"{one.name} {formats.estimate(one.feedback)}" for one in fed)
+        yield f"Feedback of each servo's own angle [1/s]: {values}."
     yield f"Method: {chain.why}, {chain.duration_s:.3g} s of phases."
 
 
@@ -171,6 +169,11 @@ class Sheet:
         """Add a sentence; line ends and control characters are escaped."""
         self._console.print(plain(line), style=style)
 
+    def lines(self, lines: Iterable[str], style: str = "") -> None:
+        """Add sentences."""
+        for line in lines:
+            self.print(line, style)
+
     def table(self, table: tables.AnyTable) -> None:
         """Add a table; columns that can be spared are left out on a narrow terminal."""
         columns = [column for column in table.columns if column.text is not None]
@@ -180,15 +183,12 @@ class Sheet:
             text_table.Column(column.text or "", left=column.kind != "number", spare=column.spare)
             for column in columns
         ]
-        rows = [
-            [(_shown(cell), style) for cell in row]
-            for row, style in zip(cells, styles, strict=True)
-        ]
+        styled = zip(cells, styles, strict=True)
+        rows = [[(_shown(cell), style) for cell in row] for row, style in styled]
         lines, left_out = text_table.table(heads, rows, self._console.width)
         for line in lines:
             self._console.print(line, soft_wrap=True)
-        if left_out:
-            names = ", ".join(left_out)
+        if names := ", ".join(left_out):
             self.print(f"Without {names}: the terminal is too narrow; --json has all.", "dim")
 
     def text(self) -> str:
@@ -232,21 +232,16 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
         sheet.print()
         sheet.table(table)
     sheet.print()
-    for line in more_lines(analysis):
-        sheet.print(line)
+    sheet.lines(more_lines(analysis))
     if not analysis.coupling.identifiable:
         sheet.print(unidentified(analysis.coupling))
     for chain in analysis.oscillators:
-        for line in chain_detail(chain):
-            sheet.print(line)
+        sheet.lines(chain_detail(chain))
     if isinstance(analysis, ModelledAnalysis):
-        for line in null_model_text(analysis.null_model):
-            sheet.print(line)
-    for warning in analysis.warnings:
-        sheet.print(f"Warning: {warning}")
+        sheet.lines(null_model_text(analysis.null_model))
+    sheet.lines(f"Warning: {warning}" for warning in analysis.warnings)
     sheet.print(_method(analysis), "dim")
-    for note in analysis.notes:
-        sheet.print(f"Note: {note}", "dim")
+    sheet.lines((f"Note: {note}" for note in analysis.notes), "dim")
     return sheet.text()
 
 
@@ -279,8 +274,7 @@ def render_loop(loop: ClosedLoop, *, width: int = UNLIMITED, color: bool = False
     """Return a prediction as text; see :func:`render`."""
     sheet = Sheet(width, color=color)
     sheet.print(formats.sentence(loop.answer), "bold")
-    for line in loop.limits:
-        sheet.print(formats.sentence(line))
+    sheet.lines(map(formats.sentence, loop.limits))
     sheet.print()
     sheet.table(_mode_table(loop))
     if loop.relaxation is not None:

@@ -42,8 +42,7 @@ def render_comparison(
     if comparison.partial is not None:
         sheet.print(f"Partial: {comparison.partial}")
     sheet.print()
-    for line in _changed(comparison.changed):
-        sheet.print(line)
+    sheet.lines(_changed(comparison.changed))
     sheet.print()
     sheet.table(difference_table(comparison))
     if comparison.waveforms:
@@ -51,8 +50,7 @@ def render_comparison(
         sheet.table(waveform_table(comparison))
     sheet.print()
     sheet.print(_equivalence(comparison))
-    for warning in comparison.warnings:
-        sheet.print(f"Warning: {plain(warning)}")
+    sheet.lines(f"Warning: {plain(warning)}" for warning in comparison.warnings)
     sheet.print(f"Method: {comparison_method(comparison)}", "dim")
     return sheet.text()
 
@@ -62,9 +60,7 @@ def _changed(changed: tuple[Change, ...]) -> list[str]:
         return ["What was changed: not recorded; the recorded facts are the same."]
     lines = ["What was changed (A, then B):"]
     for one in changed[:MOST_CHANGES]:
-        a, b = (
-            formats.short(value) if value is not None else "not set" for value in (one.a, one.b)
-        )
+        a, b = ("not set" if side is None else formats.short(side) for side in (one.a, one.b))
         lines.append(f"  {plain(one.name)}: {a} -> {b}")
     rest = len(changed) - MOST_CHANGES
     return [*lines, f"  and {rest} more (--json)"] if rest > 0 else lines
@@ -76,9 +72,8 @@ def margin_text(one: Equivalence, value: float | None = None) -> str:
     Args:
         value: In the test's unit; its margin if None.
     """
-    factor, unit = {"rad": (math.degrees(1), "°"), "1": (1.0, "")}.get(
-        one.unit, (1.0, f" {one.unit}")
-    )
+    units = {"rad": (math.degrees(1), "°"), "1": (1.0, "")}
+    factor, unit = units.get(one.unit, (1.0, f" {one.unit}"))
     if one.quantity == "gain":
         factor, unit = 100.0, " %"
     return f"{(one.margin if value is None else value) * factor:.2g}{unit}"
@@ -118,30 +113,25 @@ def render_experiment(
     sheet.print(f"{count} session{'s' if count > 1 else ''}: {experiment.answer}.", "bold")
     reversal = experiment.reversal
     if reversal is not None:
-        for line in reversal_detail(reversal):
-            sheet.print(line)
+        sheet.lines(reversal_detail(reversal))
         sheet.print()
         sheet.table(mirror_table(reversal))
     if isinstance(experiment.coupling, LocalCoupling):
-        for line in kick_detail(experiment.coupling):
-            sheet.print(line)
+        sheet.lines(kick_detail(experiment.coupling))
     if experiment.oscillators is not None:
-        for line in body_detail(experiment.oscillators):
-            sheet.print(line)
+        sheet.lines(body_detail(experiment.oscillators))
     if isinstance(experiment.coupling, LinearCoupling):
-        for line in sweep_detail(experiment.coupling):
-            sheet.print(line)
+        sheet.lines(sweep_detail(experiment.coupling))
     sheet.print()
     sheet.table(run_table(experiment))
     sheet.print()
     own = [f"{warning} ({names})" for warning, names in by_sentence(experiment, "warnings")]
-    for warning in (*experiment.warnings, *own):
-        sheet.print(f"Warning: {warning}")
+    sheet.lines(f"Warning: {warning}" for warning in (*experiment.warnings, *own))
     if not experiment.coupling.identifiable:
         sheet.print(unidentified(experiment.coupling))
     sheet.print(f"Method: {method(experiment)}", "dim")
-    for note, names in by_sentence(experiment, "notes"):
-        sheet.print(f"Note: {note} ({names})", "dim")
+    notes = by_sentence(experiment, "notes")
+    sheet.lines((f"Note: {note} ({names})" for note, names in notes), "dim")
     return sheet.text()
 
 

@@ -14,8 +14,15 @@ from ..estimators.harmonic import LINEAR, HarmonicFit, fit_at, fit_shared
 from ..estimators.series import Series
 from ..estimators.spectrum import Noise, omega_variance, residual_noise, residual_spectrum
 from ..results.answer import Lacking, Note, distinct, percent
-from .groups import Groups, find_groups
-from .mixing import RESOLUTION, MixedTone, group_model, mixed_tones, with_mixed_lines
+from .groups import (
+    RESOLUTION,
+    Groups,
+    MixedTone,
+    find_groups,
+    group_model,
+    mixed_tones,
+    with_mixed_lines,
+)
 from .response import Response, respond
 from .rhythm import (
     HARMONICS,
@@ -272,16 +279,15 @@ def _pick(noise: Noise, index: np.ndarray[tuple[int], np.dtype[np.int64]]) -> No
 
 def _warn_undriven(*, held: list[str], astray: list[str], unusable: list[str], warn: Warn) -> None:
     """Say once why joints have no gain and lag."""
-    reasons = (
+    for joints, why in (
         (held, "held still by the command"),
         (astray, "commanded something else than the common rhythm"),
         (unusable, "commanded too seldom or too briefly"),
-    )
-    for joints, why in reasons:
+    ):
         if joints:
             count = f"{len(joints)} joints are" if len(joints) > 1 else "1 joint is"
-            told = f"{count} {why}, gain and lag are null: {', '.join(joints)}"
-            warn(Note(told) if joints is held else told)
+            text = f"{count} {why}, gain and lag are null: {', '.join(joints)}"
+            warn(Note(text) if joints is held else text)
 
 
 def _warn_groups(found: Groups, fits: Sequence[HarmonicFit], duration_s: float, warn: Warn) -> None:
@@ -289,11 +295,8 @@ def _warn_groups(found: Groups, fits: Sequence[HarmonicFit], duration_s: float, 
     for close in found.unresolved:
         low, high = distinct(close.low_hz, close.high_hz)
         need_s = RESOLUTION / (close.high_hz - close.low_hz)
-        nulls = (
-            f"gain and lag of {', '.join(close.left)} are null"
-            if close.left
-            else "they are analysed as one group"
-        )
+        nulls = f"gain and lag of {', '.join(close.left)} are null"
+        nulls = nulls if close.left else "they are analysed as one group"
         warn(
             f"one group or two can't be decided: {len(close.kept) + len(close.left)} joints are "
             f"commanded at {low} to {high} Hz, closer than {RESOLUTION:g}/T in {duration_s:.3g} s; "
@@ -302,8 +305,7 @@ def _warn_groups(found: Groups, fits: Sequence[HarmonicFit], duration_s: float, 
     if len(fits) < 2:
         return
     names = [f"{fit.frequency_hz:.4g} Hz" for fit in fits]
-    tones = mixed_tones([fit.omega for fit in fits], duration_s)
-    if tones:
+    if tones := mixed_tones([fit.omega for fit in fits], duration_s):
         falls = "; ".join(_mixed(tone, names) for tone in tones)
         warn(
             f"frequencies of the groups are commensurate within {RESOLUTION:g}/T: {falls}; what a "

@@ -3,23 +3,39 @@
 The gait of a snake robot may have a frequency for each plane (omega_h and omega_v in Eqs. 2 and 6
 of Meister et al., 2011) or for any other part of its joints. Each channel's own frequency is
 estimated, and channels whose frequencies the record's length T can't resolve are one group: two
-tones closer than about 1.5/T can't be told apart in a response that holds both.
+tones closer than about 1.5/T can't be separated in a response that holds both.
+
+Each response holds the other groups' tones, so the model of every channel has the harmonics of all
+groups, and coincident ones, as 2 omega_1 and 3 omega_2 at 3:2, only once (:func:`group_model`).
+A nonlinear body makes tones at m omega_1 + n omega_2, too. Those that stand out of the noise near
+a group's tone are fitted with it, or they would count as noise (:func:`with_mixed_lines`); one that
+falls on the tone itself can't be separated from the response (:func:`mixed_tones`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
 
 import numpy as np
+from scipy.special import gammainccinv
 
-from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import FloatArray
 
-from ..estimators.harmonic import HarmonicFit, fit_at
-from ..estimators.series import Series
-from .mixing import COINCIDENT, RESOLUTION, group_model
-from .rhythm import DRIVEN_SHARE, MIN_EXPLAINED, Rhythm, find_rhythm, refine
+from ..estimators.harmonic import HarmonicFit, HarmonicModel, chunks, fit_at
+from ..estimators.series import Series, shared_times
+from ..estimators.spectrum import residual_noise
+from .rhythm import (
+    DRIVEN_SHARE,
+    HARMONICS,
+    MIN_EXPLAINED,
+    NYQUIST_SHARE,
+    Rhythm,
+    allowed_model,
+    find_rhythm,
+    refine,
+)
 
 _CLEAR = 0.98
 """A command explained to less than this may have a frequency of its own: a tenth of a cycle over
@@ -99,8 +115,11 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
     if common is None:
         return None
     moving = [one for one in series if one.name in common.names]
-    lively = _lively(common.fit)
-    if np.all(_own(common.fit)[lively]):
+    size = np.sqrt(common.fit.total / common.fit.count)
+    lively = size > DRIVEN_SHARE * np.max(size, initial=0.0)
+    # Whether the common rhythm is each channel's own and not a subharmonic of it.
+    own = (common.fit.explained >= _CLEAR) & (_fundamental_share(common.fit) >= _OWN_SHARE)
+    if np.all(own[lively]):
         return Groups((common,), common.explained)
     active = [one for one, chosen in zip(moving, lively, strict=True) if chosen]
     tones = [
@@ -131,16 +150,6 @@ def find_groups(series: Sequence[Series], duration_s: float) -> Groups | None:
     grouped = {name for rhythm in rhythms for name in rhythm.names}
     astray = tuple(one.name for one in active if one.name not in grouped | left)
     return Groups(tuple(rhythms), known / total, tuple(unresolved), astray)
-
-
-def _lively(fit: HarmonicFit) -> BoolArray:
-    size = np.sqrt(fit.total / fit.count)
-    return size > DRIVEN_SHARE * np.max(size, initial=0.0)
-
-
-def _own(fit: HarmonicFit) -> BoolArray:
-    """Return whether the common rhythm is each channel's own and not a subharmonic of it."""
-    return (fit.explained >= _CLEAR) & (_fundamental_share(fit) >= _OWN_SHARE)
 
 
 def _fundamental_share(fit: HarmonicFit) -> FloatArray:
@@ -217,3 +226,208 @@ def _with_compound(
         else:
             result.append(Rhythm(tuple(one.name for one in members), fit))
     return result
+
+
+RESOLUTION = 1.5
+"""Frequencies closer than this many cycles over the record are not resolved."""
+
+COINCIDENT = 0.5
+"""Harmonics of two groups closer than this many cycles over the record are one column."""
+
+MIXING_ORDER = 6
+"""Highest |m| + |n| of a tone m f1 + n f2 that is looked for at a group's tone."""
+
+MODELLED_ORDER = 11
+"""Highest |m| + |n| of a mixed tone that is looked for beside a group's tone."""
+
+_FAR = 30.0
+"""Cycles over the record from a group's tone beyond which a tone hardly reaches its noise."""
+
+_APART = 0.75
+"""Mixed tones closer to another line than this many cycles over the record are left out."""
+
+_ORTHOGONAL = 1.0
+"""Mixed tones closer to the group's own than this many cycles over the record are part of it: tones
+whole cycles apart are orthogonal, and up to 1.5 apart a line costs 5 % of the variance."""
+
+_MOST_MIXED = 24
+"""Mixed tones that are fitted at most, the strongest first."""
+
+_CHANCE = 1e-3
+"""Chance of fitting a mixed tone that is none, for each group."""
+
+_SAMPLES_PER_LINE = 8
+"""Samples that a channel needs for each line beside the group's harmonics."""
+
+
+@dataclass(frozen=True)
+class MixedTone:
+    """A harmonic of a group, or a tone of two groups together, that falls on a group's own tone.
+
+    Attributes:
+        group: Index of the group on whose frequency it falls.
+        factors: Whole factor of each group's frequency in it, by index; none of them is 0, and
+            the sum is above 0.
+    """
+
+    group: int
+    factors: Mapping[int, int]
+
+
+def group_model(
+    series: Sequence[Series], omegas: Sequence[float], group: int, duration_s: float
+) -> HarmonicModel:
+    """Return the basis of a group's channels: own harmonics, and those of the other groups.
+
+    Args:
+        omegas: Angular frequencies of all groups [rad/s].
+        duration_s: Length of the record [s].
+
+    Returns:
+        As many lines as the slowest channel's sampling rate and samples allow.
+    """
+    model = allowed_model(series, omegas[group])
+    lines = further_lines(omegas, group, model.harmonics, _highest(series), duration_s)
+    return replace(model, lines=lines[: _most_lines(series)])
+
+
+def further_lines(
+    omegas: Sequence[float], group: int, harmonics: int, highest: float, duration_s: float
+) -> tuple[float, ...]:
+    """Return the frequencies of the other groups' harmonics, for the model of one group's channels.
+
+    Args:
+        omegas: Angular frequencies of all groups [rad/s].
+        harmonics: How many harmonics of its own its model has.
+        highest: Highest frequency that the sampling rate allows [rad/s].
+        duration_s: Length of the record [s].
+
+    Returns:
+        Angular frequencies [rad/s] without those that coincide with an own harmonic, with zero or
+        with each other.
+    """
+    near = COINCIDENT * 2 * np.pi / duration_s
+    taken = [0.0, *(order * omegas[group] for order in range(1, harmonics + 1))]
+    lines: list[float] = []
+    for order in range(1, HARMONICS + 1):
+        for k, omega in enumerate(omegas):
+            line = order * omega
+            apart = min(abs(line - other) for other in (*taken, *lines))
+            if k != group and line <= highest and apart > near:
+                lines.append(line)
+    return tuple(lines)
+
+
+def with_mixed_lines(
+    responses: Sequence[Series],
+    omegas: Sequence[float],
+    group: int,
+    model: HarmonicModel,
+    duration_s: float,
+) -> HarmonicModel:
+    """Add the mixed tones that stand out of the noise beside a group's tone, strongest first.
+
+    Args:
+        responses: Of the group's joints, k of them.
+        omegas: Angular frequencies of all groups [rad/s].
+        model: From :func:`group_model`.
+        duration_s: Length of the record [s].
+
+    Returns:
+        The model with these lines; the periodogram of what it leaves, over the noise level and
+        averaged over the channels, is nowhere larger at a mixed tone of order up to
+        ``MODELLED_ORDER`` than noise explains (a gamma variable of shape k).
+    """
+    omega = omegas[group]
+    bin_rad_s = 2 * np.pi / duration_s
+    candidates: list[float] = _candidates(omegas, group, model, _highest(responses), bin_rad_s)
+    most = min(_MOST_MIXED, _most_lines(responses) - len(model.lines))
+    for _ in range(max(most, 0)):
+        if not candidates:
+            break
+        fit = fit_at(responses, omega, model)
+        level = residual_noise(responses, fit).level
+        power = _periodogram(responses, fit, np.array(candidates, dtype=np.float64))
+        known = level > 0
+        total = np.sum(power[known] / level[known, None], axis=0)
+        best = int(np.argmax(total))
+        shape = max(int(np.count_nonzero(known)), 1)
+        if float(total[best]) <= float(gammainccinv(shape, _CHANCE / len(candidates))):
+            break
+        line = candidates[best]
+        model = replace(model, lines=(*model.lines, line))
+        candidates = [one for one in candidates if abs(one - line) > _APART * bin_rad_s]
+    return model
+
+
+def mixed_tones(omegas: Sequence[float], duration_s: float) -> list[MixedTone]:
+    """Find the tones of other groups, or of several together, that fall on a group's own tone.
+
+    Args:
+        omegas: Angular frequencies of the groups [rad/s].
+        duration_s: Length of the record [s].
+
+    Returns:
+        For each group the tone of lowest order |m| + |n|, up to ``MIXING_ORDER``, that the record
+        does not resolve from it.
+    """
+    near = RESOLUTION * 2 * np.pi / duration_s
+    found: list[MixedTone] = []
+    for group, omega in enumerate(omegas):
+        for factors in _combinations(len(omegas), MIXING_ORDER):
+            tone = sum(factor * omegas[k] for k, factor in factors.items())
+            if factors != {group: 1} and abs(abs(tone) - omega) < near:
+                sign = 1 if tone > 0 else -1
+                found.append(MixedTone(group, {k: sign * one for k, one in factors.items()}))
+                break
+    return found
+
+
+def _highest(series: Sequence[Series]) -> float:
+    """Highest frequency that the slowest channel's sampling rate allows [rad/s]."""
+    return NYQUIST_SHARE * 2 * np.pi / max(one.period_s for one in series)
+
+
+def _most_lines(series: Sequence[Series]) -> int:
+    return min(one.count for one in series) // _SAMPLES_PER_LINE
+
+
+def _candidates(
+    omegas: Sequence[float], group: int, model: HarmonicModel, highest: float, bin_rad_s: float
+) -> list[float]:
+    """Mixed tones near a group's tone, resolved from it, its harmonics and the lines there are."""
+    omega = omegas[group]
+    own = [0.0, *(order * omega for order in range(1, model.harmonics + 1))]
+    found: list[float] = []
+    for factors in _combinations(len(omegas), MODELLED_ORDER):
+        line = abs(sum((factor * omegas[k] for k, factor in factors.items()), 0.0))
+        resolved = min(abs(line - other) for other in own) > _ORTHOGONAL * bin_rad_s
+        apart = min((abs(line - other) for other in model.lines), default=float("inf"))
+        near = abs(line - omega) <= _FAR * bin_rad_s
+        if near and line <= highest and resolved and apart > _APART * bin_rad_s:
+            found.append(line)
+    return found
+
+
+def _periodogram(series: Sequence[Series], fit: HarmonicFit, omegas: FloatArray) -> FloatArray:
+    """|sum of the residual times exp(-j omega t)|^2 / n of each channel, shape (k, f)."""
+    power = np.zeros((len(series), omegas.size))
+    for members in shared_times(series):
+        t_s = series[members[0]].t_s
+        total = np.zeros((len(members), omegas.size), dtype=np.complex128)
+        for part in chunks(t_s.size):
+            rest = np.stack([series[k].values[part] - fit.predict(k, t_s[part]) for k in members])
+            total += rest @ np.exp(-1j * np.outer(t_s[part], omegas))
+        power[members] = np.abs(total) ** 2 / t_s.size
+    return power
+
+
+def _combinations(count: int, highest: int) -> Iterator[dict[int, int]]:
+    """Whole factors of one or two frequencies, of rising order, each tone with one sign."""
+    for order in range(1, highest + 1):
+        for k in range(count):
+            yield {k: order}
+        for a, b in combinations(range(count), 2):
+            for first in range(1, order):
+                yield {a: first, b: order - first}
+                yield {a: first, b: first - order}

@@ -110,9 +110,7 @@ def respond(
         gain_parts.append(noise.along(unit) / squared)
         lag_parts.append(noise.along(1j * unit) / squared)
     lag_variance = lag_parts[0] + lag_parts[1]
-    dof = welch_satterthwaite(
-        np.stack(lag_parts), np.stack([command_noise.dof, response_noise.dof])
-    )
+    dofs = np.stack([command_noise.dof, response_noise.dof])
     errors = None
     if bins is not None:
         errors = response_errors(
@@ -127,7 +125,7 @@ def respond(
         ratio=ratio,
         log_gain_variance=gain_parts[0] + gain_parts[1],
         lag_variance=lag_variance + omega_variance * np.square(delay_between_s),
-        dof=dof,
+        dof=welch_satterthwaite(np.stack(lag_parts), dofs),
         errors=errors,
     )
 

@@ -172,8 +172,7 @@ def _refined(scouts: Sequence[Series], series: Sequence[Series], omega: float) -
     if any(one.count <= model.size + 1 for one in series):
         return None
     try:
-        found = fit_shared(scouts, omega, model).omega
-        fit = fit_at(series, found, model)
+        fit = fit_at(series, fit_shared(scouts, omega, model).omega, model)
     except DataError:
         return None
     return Rhythm(tuple(one.name for one in series), fit)

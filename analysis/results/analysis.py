@@ -386,19 +386,9 @@ class Analysis(PresentedResult):
         An estimate becomes two keys, e.g. ``gain`` and ``gain_ci95``; ``lag_rad`` has its
         interval in ``lag_ci95``.
         """
-        gait = dataclasses.asdict(self.gait) | _flat("frequency_hz", self.gait.frequency_hz)
-        gait["groups"] = [
-            dataclasses.asdict(group) | _flat("frequency_hz", group.frequency_hz)
-            for group in self.gait.groups
-        ]
         return dataclasses.asdict(self) | {
-            "gait": gait,
-            "joints": [
-                dataclasses.asdict(joint)
-                | _flat("gain", joint.gain)
-                | _flat("lag_rad", joint.lag_rad)
-                for joint in self.joints
-            ],
+            "gait": _record(self.gait) | {"groups": [_record(one) for one in self.gait.groups]},
+            "joints": [_record(joint) for joint in self.joints],
             "body": None if self.body is None else _body_dict(self.body),
             "energy": None if self.energy is None else _energy_dict(self.energy),
             "artefacts": [dataclasses.asdict(one) | {"about": one.about} for one in self.artefacts],
@@ -420,31 +410,28 @@ def interval_key(key: str) -> str:
     return f"{key.rsplit('_', 1)[0] if key in with_unit else key}_ci95"
 
 
-def _flat(key: str, estimate: Estimate) -> dict[str, Any]:
-    return {key: estimate.value, interval_key(key): estimate.ci95}
+def _estimates(record: Any) -> dict[str, Any]:
+    """Return each estimate of a record as two keys: its value and its interval."""
+    flat: dict[str, Any] = {}
+    for key, one in vars(record).items():
+        if isinstance(one, Estimate):
+            flat |= {key: one.value, interval_key(key): one.ci95}
+    return flat
+
+
+def _record(record: Any) -> dict[str, Any]:
+    return dataclasses.asdict(record) | _estimates(record)
 
 
 def _energy_dict(energy: EnergyResult) -> dict[str, Any]:
     cost = energy.transport
-    named = ("net", "plus", "abs", "el", "el_clipped")
-    flat = {"distance_m": cost.distance_m, **{name: getattr(cost, name) for name in named}}
-    transport: dict[str, Any] = {"mass_kg": cost.mass_kg, "why": cost.why}
-    for key, estimate in flat.items():
-        transport |= _flat(key, estimate)
-    return dataclasses.asdict(energy) | {"transport": transport}
-
-
-def _point_dict(point: BodyPoint) -> dict[str, Any]:
-    return (
-        {"place": point.place, "link": point.link}
-        | _flat("amplitude_m", point.amplitude_m)
-        | _flat("phase_rad", point.phase_rad)
-    )
+    known = {"mass_kg": cost.mass_kg, "why": cost.why} | _estimates(cost)
+    return dataclasses.asdict(energy) | {"transport": known}
 
 
 def _body_dict(body: BodyResult) -> dict[str, Any]:
-    return {
-        "plane": body.plane,
-        "observed": [_point_dict(point) for point in body.observed],
-        "null": {name: [_point_dict(p) for p in points] for name, points in body.null.items()},
-    }
+    def points(some: tuple[BodyPoint, ...]) -> list[dict[str, Any]]:
+        return [{"place": one.place, "link": one.link} | _estimates(one) for one in some]
+
+    null = {name: points(some) for name, some in body.null.items()}
+    return {"plane": body.plane, "observed": points(body.observed), "null": null}

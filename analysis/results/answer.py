@@ -55,16 +55,13 @@ def _same_side(printed: float, value: float, limit: float) -> bool:
     return value == limit or (printed != limit and (printed > limit) == (value > limit))
 
 
-def distinct(first: float, second: float, digits: int = 4) -> tuple[str, str]:
+def distinct(first: float, second: float) -> tuple[str, str]:
     """Print two numbers so that they read as different if they are.
 
-    Args:
-        digits: Significant digits, at least.
-
     Returns:
-        Both with the same number of significant digits.
+        Both with the same number of significant digits, at least 4.
     """
-    for count in range(digits, _MOST):
+    for count in range(4, _MOST):
         texts = f"{first:.{count}g}", f"{second:.{count}g}"
         if texts[0] != texts[1] or first == second:
             return texts

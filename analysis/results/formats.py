@@ -120,10 +120,8 @@ def decimals_for(quantities: Iterable[Estimate], least: int = 1, most: int = 5) 
         interval, four digits of the largest value.
     """
     known = list(quantities)
-    half = sorted(
-        0.5 * (q.ci95[1] - q.ci95[0]) for q in known if q.ci95 is not None and q.ci95[1] > q.ci95[0]
-    )
-    if half:
+    ends = (q.ci95 for q in known if q.ci95 is not None)
+    if half := sorted(0.5 * (high - low) for low, high in ends if high > low):
         wanted = _decimals_of(half[len(half) // 2])
     else:
         wanted = decimals_for_values((q.value for q in known), 4)
@@ -148,11 +146,9 @@ def decimals_for_values(values: Iterable[float | None], digits: int = 3) -> int:
     Returns:
         Digits after the point, 0 to 6.
     """
-    finite = [abs(v) for v in values if v is not None and math.isfinite(v)]
-    largest = max(finite, default=0.0)
-    if largest == 0.0:
-        return 0
-    return min(max(digits - 1 - math.floor(math.log10(largest)), 0), 6)
+    largest = max([abs(v) for v in values if v is not None and math.isfinite(v)], default=0.0)
+    power = math.floor(math.log10(largest)) if largest else digits
+    return min(max(digits - 1 - power, 0), 6)
 
 
 def degrees(quantity: Estimate) -> Estimate:
@@ -197,10 +193,8 @@ def coverage(share: float) -> str:
     Returns:
         For example ``98 %`` or ``99.9 %``.
     """
-    percents = 100.0 * share
-    if percents > 99.0:
-        return f"{math.floor(10 * percents + 1e-6) / 10:g} %"
-    return f"{math.floor(percents + 1e-6):d} %"
+    factor = 10 if 100.0 * share > 99.0 else 1
+    return f"{math.floor(factor * (100.0 * share) + 1e-6) / factor:g} %"
 
 
 def relative(log_gain: Estimate) -> Estimate:
@@ -265,9 +259,8 @@ def short(text: str, most: int = 40) -> str:
         most: Characters kept at most; the middle gives way, since names differ at their ends.
     """
     known = plain(text)
-    if len(known) <= most:
-        return known
-    return known[: most // 2] + "\N{HORIZONTAL ELLIPSIS}" + known[-(most - most // 2 - 1) :]
+    cut = known[: most // 2] + "\N{HORIZONTAL ELLIPSIS}" + known[-(most - most // 2 - 1) :]
+    return known if len(known) <= most else cut
 
 
 def filename(path: str) -> str:

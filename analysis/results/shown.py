@@ -21,28 +21,10 @@ class PictureProtocol(Protocol):
     def save(self, path: Path | str, *, force: bool = False) -> Path: ...  # noqa: D102
 
 
-class Presentation(Protocol):
-    """The implementation of the methods of :class:`PresentedResult`, which is above all results."""
-
-    def text(self, result: PresentedResult) -> str: ...  # noqa: D102
-    def headline(self, result: PresentedResult) -> str: ...  # noqa: D102
-    def html(self, result: PresentedResult) -> str: ...  # noqa: D102
-    def frames(self, result: PresentedResult) -> dict[str, pd.DataFrame]: ...  # noqa: D102
-    def picture(  # noqa: D102
-        self, result: PresentedResult, what: str | None
-    ) -> PictureProtocol: ...
-    def save(  # noqa: D102
-        self, result: PresentedResult, path: Path, *, force: bool
-    ) -> Path: ...
-    def save_tables(  # noqa: D102
-        self, result: PresentedResult, folder: Path, *, force: bool
-    ) -> list[Path]: ...
+_make: list[Callable[[], Any]] = []
 
 
-_make: list[Callable[[], Presentation]] = []
-
-
-def present_with(make: Callable[[], Presentation]) -> None:
+def present_with(make: Callable[[], Any]) -> None:
     """Set what presents results.
 
     Args:
@@ -51,7 +33,7 @@ def present_with(make: Callable[[], Presentation]) -> None:
     _make[:] = [make]
 
 
-def _presentation() -> Presentation:
+def _presentation() -> Any:
     return _make[0]()
 
 

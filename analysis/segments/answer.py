@@ -81,9 +81,7 @@ def compose(facts: Facts) -> Answer:
         verdict = Verdict.UNLIKE
         detail = _responding(facts, known) + _caveat(facts.joints)
     findings = facts.findings
-    alike: bool | None = None
-    if first or findings.shape or findings.undecided:
-        alike = False
+    alike = False if first or findings.shape or findings.undecided else None
     if verdict is Verdict.ALIKE and facts.commanded and _everyone(facts):
         alike = True
     return Answer(
@@ -169,8 +167,7 @@ def _named(facts: Facts) -> str:
     if len(by_joint) > NAMED:
         names = [plain(joint) for joint in list(by_joint)[NAMED:]]
         clauses.append(f"{', '.join(names)} respond differently, too")
-    undecided = _undecided(facts)
-    if undecided:
+    if undecided := _undecided(facts):
         clauses.append(undecided)
     # A joint's name keeps its letters at the beginning, too: a reader searches for it.
     return f"{'; '.join(clauses)}." if clauses else ""
@@ -227,8 +224,7 @@ def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str
         return Verdict.NOTHING, lead, _why_not(facts, "gain and lag are null")
     if len(known) == 1:
         return _single(facts, known[0], named=named)
-    detail = _responding(facts, known) + _caveat(facts.joints)
-    return *_compared(facts, named=named), detail
+    return *_compared(facts, named=named), _responding(facts, known) + _caveat(facts.joints)
 
 
 def _single(facts: Facts, joint: JointResult, *, named: bool) -> tuple[Verdict, str, str]:
@@ -320,14 +316,10 @@ def _responding(facts: Facts, known: Sequence[JointResult]) -> str:
     silent = {each.joint for each in facts.not_following}
     responding = [joint for joint in known if joint.name not in silent]
     text = f"{len(responding)} of {len(facts.joints)} joints respond to a gait of {frequency}"
-    lags = [joint for joint in responding if joint.lag_rad.value is not None]
-    if lags:
-        first = min(lags, key=lambda joint: joint.lag_rad.value or 0.0)
-        last = max(lags, key=lambda joint: joint.lag_rad.value or 0.0)
-        text += "; lag runs from " + " to ".join(
-            f"{formats.number(math.degrees(j.lag_rad.value or 0.0), 1)}° ({plain(j.name)})"
-            for j in (first, last)
-        )
+    if lags := [(lag, j.name) for j in responding if (lag := j.lag_rad.value) is not None]:
+        first, last = (of(lags, key=lambda pair: pair[0]) for of in (min, max))
+        ends = [f"{formats.number(math.degrees(v), 1)}° ({plain(k)})" for v, k in (first, last)]
+        text += f"; lag runs from {' to '.join(ends)}"
     evidence = [
         f" {plain(each.joint)} {each.evidence}."
         for each in facts.not_following[:NAMED]

@@ -151,8 +151,7 @@ def profile_of(chain: Chain, quantity: str) -> Profile:
     place = np.array([chain.commanded.index(name) for name in chain.names], dtype=np.float64)
     count = len(chain.commanded)
     if quantity == "gain":
-        margin = math.log1p(_MARGINS["gain"])
-        return Profile(place, count, np.log(response.gain), gains, margin)
+        return Profile(place, count, np.log(response.gain), gains, math.log1p(_MARGINS["gain"]))
     return Profile(place, count, response.lag_near_mean_rad, lags, _MARGINS["lag"])
 
 
@@ -185,17 +184,14 @@ def _alike(chain: Chain, excluded: set[int]) -> bool:
     index = [k for k in range(len(chain.names)) if k not in excluded]
     if len(index) < 2:
         return False
-    m = len(index)
-    rows = np.eye(m) - 1 / m
+    rows = np.eye(len(index)) - 1 / len(index)
     for quantity, margin in _MARGINS.items():
         profile = profile_of(chain, quantity)
-        values = profile.values[index]
+        values = profile.values[index] - profile.values[index].mean()
         scatter = profile.scatter.select(index)
         error = np.sqrt(scatter.variance(rows))
         dof = float(scatter.columns.shape[1])
-        deviation = values - values.mean()
-        if quantity == "gain":
-            deviation = np.expm1(deviation)
+        deviation = np.expm1(values) if quantity == "gain" else values
         if equivalence_p(deviation, error, dof, margin) >= LEVEL:
             return False
     return True

@@ -94,10 +94,9 @@ def standing_out(profile: Profile, critical: float) -> list[Deviation]:
     Returns:
         Their deviations from the prediction of the rest, the largest first.
     """
-    searches = (_trimmed(profile, critical), _grown(profile, critical))
     trimmed, grown = (
         [one for joint in state.outside if (one := _kept(profile, state, joint, critical))]
-        for state in searches
+        for state in (_trimmed(profile, critical), _grown(profile, critical))
     )
     # Two that stand out hide each other from the one search, a profile its joints from the other.
     # Where both agree, the shapes that the data ask for predict more closely than a parabola.
@@ -298,7 +297,10 @@ def _out_of_profile(
     """
     reach = float(np.ptp(profile.values[others]))
     beside = _beside_neighbours(profile, others, one.joint)
-    extrapolated = _at_an_end(profile, others, one.joint) and abs(one.value) <= reach
+    place = profile.place
+    first, last = place[others].min(), place[others].max()
+    at_an_end = not first <= place[one.joint] <= last
+    extrapolated = at_an_end and abs(one.value) <= reach
     if (extrapolated and not smooth) or min(each / one.value for each in beside) < LOCAL:
         return False
     mirror = np.flatnonzero(profile.place == profile.count - 1 - profile.place[one.joint])
@@ -309,12 +311,6 @@ def _out_of_profile(
     beside = _beside_neighbours(profile, others[others != partner], partner)
     shown = [abs(each / one.value) for each in (by_model, *beside)]
     return not any(MIRRORED <= share <= 1 / MIRRORED for share in shown)
-
-
-def _at_an_end(profile: Profile, others: IntArray, joint: int) -> bool:
-    """Return whether all other joints are on one side of a joint."""
-    place = profile.place
-    return bool(place[joint] < place[others].min() or place[joint] > place[others].max())
 
 
 def _beside_neighbours(profile: Profile, others: IntArray, joint: int) -> tuple[float, ...]:
@@ -332,5 +328,4 @@ def _beside_neighbours(profile: Profile, others: IntArray, joint: int) -> tuple[
     if near.size < 2:
         return (flat,)
     slope = (values[near[0]] - values[near[1]]) / (place[near[0]] - place[near[1]])
-    line = flat - float(slope * (own - place[near[0]]))
-    return flat, line
+    return flat, flat - float(slope * (own - place[near[0]]))

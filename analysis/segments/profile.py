@@ -81,9 +81,8 @@ def scatter_of(errors: ResponseErrors) -> tuple[Scatter, Scatter]:
         near the gait frequency the noise of both is the same.
     """
     columns = np.concatenate([errors.bins.real, errors.bins.imag], axis=1)
-    nothing = np.zeros_like(errors.turn)
     return (
-        Scatter(columns, errors.rounding[:, 0, 0], nothing),
+        Scatter(columns, errors.rounding[:, 0, 0], np.zeros_like(errors.turn)),
         Scatter(columns, errors.rounding[:, 1, 1], errors.turn),
     )
 
@@ -135,8 +134,7 @@ def _largest(member: Member, rng: np.random.Generator, draws: int) -> FloatArray
     error = error + scatter.turn * rng.standard_normal((draws, 1))
     variance = np.mean((weights @ blocks[:, :, :-1]) ** 2, axis=-1)
     variance += weights**2 @ scatter.own + (weights @ scatter.turn) ** 2
-    studentised = np.abs(error @ weights.T) / np.sqrt(np.maximum(variance, _TINY))
-    return np.max(studentised, axis=1)
+    return np.max(np.abs(error @ weights.T) / np.sqrt(np.maximum(variance, _TINY)), axis=1)
 
 
 def _shrinkage(columns: FloatArray) -> float:
@@ -148,8 +146,7 @@ def _shrinkage(columns: FloatArray) -> float:
     squares = float(np.sum(correlation[off] ** 2))
     if squares == 0:
         return 1.0
-    noise = float(np.sum((1 + correlation[off] ** 2) / count))
-    return float(np.clip(noise / squares, 0.0, 1.0))
+    return float(np.clip(float(np.sum((1 + correlation[off] ** 2) / count)) / squares, 0.0, 1.0))
 
 
 MIN_JOINTS = 4
@@ -283,10 +280,6 @@ def everyone(profile: Profile) -> BoolArray:
     return np.ones(profile.values.size, dtype=np.bool_)
 
 
-def _design(shapes: Sequence[FloatArray], size: int) -> FloatArray:
-    return np.stack([np.ones(size), *shapes], axis=1)
-
-
 def deviation_weights(
     profile: Profile, active: BoolArray, shapes: Sequence[FloatArray]
 ) -> FloatArray:
@@ -300,13 +293,12 @@ def deviation_weights(
         A row for each joint, whose sum over the values is its deviation, shape (m, m).
     """
     size = profile.values.size
-    design = _design(shapes, size)
+    design = np.stack([np.ones(size), *shapes], axis=1)
     weight = np.where(active, profile.precision, 0.0)
     hat = design @ np.linalg.pinv(design.T @ (weight[:, None] * design)) @ (design.T * weight)
     # Of a joint that takes part, the leave-one-out residual: (1 - h_ii)^-1 of the residual.
     lever = np.where(active, np.diag(hat), 0.0)
-    rows = (np.eye(size) - hat) / np.maximum(1 - lever, 1e-9)[:, None]
-    return np.asarray(rows, dtype=np.float64)
+    return np.asarray((np.eye(size) - hat) / np.maximum(1 - lever, 1e-9)[:, None], dtype=np.float64)
 
 
 def coefficient_weights(

@@ -155,8 +155,7 @@ def not_following(
         # A flat top moves the mean of the position, which by itself is a zero that moved.
         new = known is None or (artefact.flag == "clipped" and _ZERO.issuperset(known.kinds))
         if kinds and new and (share >= _LASTING or artefact.falsifies("position")):
-            always = artefact.flag == "stale" and share > _WHOLE
-            spans = () if always else artefact.spans_s
+            spans = () if artefact.flag == "stale" and share > _WHOLE else artefact.spans_s
             since, until = (spans[0][0], spans[-1][1]) if spans else (None, None)
             text = f"{artefact.quantity} {artefact.flag}"
             text += f" ({artefact.note})" if artefact.note else ""

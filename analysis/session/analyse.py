@@ -5,26 +5,45 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+
+import numpy as np
 
 from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.log.read.sample_times import Signal
+from undulog.capture.robot.model import Robot
 
 from ..artefacts.find import find_artefacts
 from ..body.motion import body_motion
 from ..dead_band.find import dead_bands
-from ..energy import Energies, check_ledger, energy_result, transport
-from ..estimators.intervals import CONFIDENCE
-from ..estimators.series import Series, clean_together
+from ..energy import (
+    GAP_SHARE,
+    TERMS,
+    Energies,
+    check_ledger,
+    energy_result,
+    joint_energies,
+    transport,
+)
+from ..estimators.intervals import CONFIDENCE, around, t_factor
+from ..estimators.series import Series, clean_together, coverage
 from ..estimators.spectrum import BINS_PER_SIDE
 from ..oscillators.chain import session_couplings
 from ..response.fitting import GaitFit, fit_gait
-from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
-from ..results.analysis import Analysis, GaitFacts, JointResult, SessionFacts, Window
+from ..response.response import gain_estimate, lag_estimate
+from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED, phase_step, wave_name
+from ..results.analysis import (
+    Analysis,
+    GaitFacts,
+    GroupFacts,
+    JointResult,
+    SessionFacts,
+    Window,
+)
 from ..results.answer import Note, Remarks
 from ..results.artefact import KINDS, Artefact, DeadBand, flags_by_joint
 from ..results.estimate import Estimate, Provenance
@@ -36,7 +55,7 @@ from ..segments.session import (
     stopped,
     unrefuted,
 )
-from ..signals.columns import drag_ratio, read_columns
+from ..signals.columns import Columns, by_plane, drag_ratio, planes_of, read_columns
 from ..signals.stretch import (
     Options,
     SharedTimes,
@@ -47,7 +66,6 @@ from ..signals.stretch import (
 )
 from ..signals.windows import Span, Stretch, whole_cycles
 from .heterogeneity import heterogeneity_indices
-from .joints import group_facts, joint_energies, joint_results
 from .over_time import response_over_time
 from .runs import coupling_of_one_gait
 
@@ -77,17 +95,13 @@ def _warn_flags(
             "limit": "a limit of the robot, not a fault of the sensor",
         }[about]
         notes = ", ".join(dict.fromkeys(one.note for one in same if one.note))
-        told = f"{flag}, {notes}" if notes else flag
-        warn(f"{', '.join(one.joint for one in same)}: {where}: values {text} ({told}): {meaning}")
-    holed = [joint.name for joint in joints if "gaps" in joint.flags]
-    if holed:
+        named = f"{flag}, {notes}" if notes else flag
+        warn(f"{', '.join(one.joint for one in same)}: {where}: values {text} ({named}): {meaning}")
+    if holed := [joint.name for joint in joints if "gaps" in joint.flags]:
         warn(f"{', '.join(holed)}: positions have gaps (an artefact of the record, not mechanics)")
-    lost = [
-        joint.name
-        for joint in joints
-        if gait is not None and joint.name in gait.all_answered and joint.lag_rad.value is None
-    ]
-    if lost:
+    answered = () if gait is None else gait.all_answered
+    silent = [joint.name for joint in joints if joint.lag_rad.value is None]
+    if lost := [name for name in silent if name in answered]:
         warn(
             f"{', '.join(lost)}: no response at the gait frequency that differs from noise: "
             "gain and lag are null"
@@ -99,27 +113,18 @@ _FEW = 1e-3
 
 
 @dataclass(frozen=True)
-class FittedSession:
-    """One session's numbers, and the fit that an experiment of several sessions builds on.
-
-    Attributes:
-        gait: The fitted gait, or None.
-    """
-
-    analysis: Analysis
-    gait: GaitFit | None
-
-
-@dataclass(frozen=True)
-class SessionMeasurement(FittedSession):
+class SessionMeasurement:
     """One session's numbers with what they were computed from; heavy, so not to be kept.
 
     Attributes:
+        gait: The fitted gait, or None.
         responses: Measured joint angles by name, on the analysed stretch.
         span: Whole cycles over which energies are taken.
         offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
     """
 
+    analysis: Analysis
+    gait: GaitFit | None
     responses: Mapping[str, Series]
     energies: Mapping[str, Energies]
     span: Span
@@ -137,15 +142,7 @@ def analyse_session(session: SessionView, options: Options | None = None) -> Ana
         DataError: If they hold no samples.
         UsageError: If the options leave nothing of the session.
     """
-    return examine_session(session, options).analysis
-
-
-def examine_session(
-    session: SessionView, options: Options | None = None, *, with_dead_bands: bool = True
-) -> FittedSession:
-    """Analyse one session as :func:`measure_session` does, and keep the fit only."""
-    measured = measure_session(session, options, with_dead_bands=with_dead_bands)
-    return FittedSession(measured.analysis, measured.gait)
+    return measure_session(session, options).analysis
 
 
 def measure_session(
@@ -188,14 +185,12 @@ def measure_session(
     faulty = not_following(follows, held, columns.names, whole.duration_s)
     broken = stopped(faulty)  # whose plateaus are no dead bands
     moving = {name: one for name, one in sound.items() if name not in broken}
-    dead: dict[str, DeadBand] = {}
-    if with_dead_bands:
-        dead = dead_bands(columns, commands, moving, gait, origin_ns)
+    dead = dead_bands(columns, commands, moving, gait, origin_ns) if with_dead_bands else {}
     del commands
     session.forget()
     energies = joint_energies(session, columns, held, span, warn)
     closure = check_ledger(session, energies.values(), span, warn)
-    joints = joint_results(
+    joints = _joint_results(
         session.robot,
         columns,
         responses=responses,
@@ -249,8 +244,7 @@ def measure_session(
     facts = Facts(
         analysis.gait, joints, commanded, faulty, findings, analysis.warnings, left_out=left_out
     )
-    answer = compose(facts)
-    analysis = dataclasses.replace(analysis, answer=answer)
+    analysis = dataclasses.replace(analysis, answer=compose(facts))
     return SessionMeasurement(analysis, gait, sound, energies, span, follows.offsets)
 
 
@@ -275,12 +269,12 @@ def _warn_dropped(
         if lost:
             nan = sum(one.dropped_nan for one in lost)
             double = sum(one.dropped_duplicates for one in lost)
-            told = (
+            text = (
                 f"left out of the {kind}s: {nan} samples that are not numbers and {double} with a "
                 f"time that was there already ({', '.join(one.name for one in lost)})"
             )
             few = nan + double <= _FEW * sum(one.count for one in series.values())
-            warn(Note(told) if few else told)
+            warn(Note(text) if few else text)
 
 
 def _span(stretch: Stretch, origin_ns: int, gait: GaitFit | None) -> Span:
@@ -299,7 +293,7 @@ def _gait_facts(
     window = Window(span.start_s + shift_s, span.stop_s + shift_s, float(span.cycles))
     if gait is None:
         return GaitFacts(Estimate(), (window,))
-    groups = group_facts(session.robot, gait, span, stretch, session.start_ns)
+    groups = _group_facts(session.robot, gait, span, stretch, session.start_ns)
     return GaitFacts(
         frequency_hz=groups[0].frequency_hz,
         windows=(window,),
@@ -312,6 +306,107 @@ def _gait_facts(
         ),
         groups=groups,
     )
+
+
+def _group_facts(
+    robot: Robot | None, gait: GaitFit, span: Span, stretch: Stretch, start_ns: int
+) -> tuple[GroupFacts, ...]:
+    """Return frequency, whole cycles and wave of each group, the largest first.
+
+    Args:
+        span: The largest group's whole cycles.
+        start_ns: Unix time of the session's start [ns].
+    """
+    ends = [(t - start_ns) / _NS for t in (stretch.start_ns, stretch.stop_ns)]
+    shift_s = (span.origin_ns - start_ns) / _NS
+    result: list[GroupFacts] = []
+    for index, group in enumerate(gait.groups):
+        frequency = group.fit.frequency_hz
+        half = t_factor(group.omega_dof) * group.omega_error / (2 * np.pi)
+        if index == 0:
+            window = Window(span.start_s + shift_s, span.stop_s + shift_s, float(span.cycles))
+        else:
+            first_s, last_s, cycles = whole_cycles(ends[0], ends[1], frequency)
+            window = Window(first_s, last_s, float(cycles))
+        wave, steps = _wave(robot, group)
+        estimate = Estimate(frequency, around(frequency, half))
+        result.append(GroupFacts(estimate, group.driven, (window,), wave, steps))
+    return tuple(result)
+
+
+def _wave(robot: Robot | None, gait: GaitFit) -> tuple[str | None, dict[str, float]]:
+    """Direction of the wave of the plane with the largest command, and each plane's phase step."""
+    steps: dict[str, float] = {}
+    main, largest = None, 0.0
+    for plane, names in by_plane(robot, gait.driven).items():
+        if len(names) > 1:
+            waves = gait.fit.fundamental[[gait.driven.index(name) for name in names]]
+            steps[plane] = phase_step(waves)
+            if np.abs(waves).max() > largest:
+                main, largest = plane, float(np.abs(waves).max())
+    return None if main is None else wave_name(steps[main]), steps
+
+
+def _joint_results(
+    robot: Robot | None,
+    columns: Columns,
+    *,
+    responses: Mapping[str, Series],
+    gait: GaitFit | None,
+    energies: Mapping[str, Energies],
+    flags: Mapping[str, Sequence[str]],
+    dead: Mapping[str, DeadBand],
+    span: Span,
+) -> tuple[JointResult, ...]:
+    """Return the results of all joints, head to tail.
+
+    Args:
+        flags: Artefacts of each joint in the analysed window, by name.
+        dead: Dead bands, by name.
+        span: The window of energies and coverage.
+    """
+    planes = planes_of(robot)
+    results: list[JointResult] = []
+    for name in columns.names:
+        response = responses.get(name)
+        part = None if response is None else response.between(span.start_s, span.stop_s)
+        fraction = 0.0 if part is None else coverage(part.t_s, span.start_s, span.stop_s)
+        own = [flag for flag in flags.get(name, ()) if flag != "gaps"]
+        if fraction < 1 - GAP_SHARE and "not_recorded" not in own:
+            own.append("gaps")
+        index = None if gait is None else gait.group_of(name)
+        group = None if gait is None or index is None else gait.groups[index]
+        gain, lag = _estimates(group, name)
+        per_cycle = {term: energies[name].per_cycle(term) for term in TERMS}
+        results.append(
+            JointResult(
+                name=name,
+                plane=planes.get(name),
+                command_amplitude_rad=None if gait is None else gait.command_amplitudes.get(name),
+                gain=gain,
+                lag_rad=lag,
+                **{
+                    f"energy_{term}_j": None if found is None else float(np.sum(found))
+                    for term, found in per_cycle.items()
+                },
+                coverage=fraction,
+                samples=0 if part is None else part.count,
+                flags=tuple(own),
+                group=index,
+                frequency_hz=None if group is None else group.fit.frequency_hz,
+                dead_band=dead.get(name),
+            )
+        )
+    return tuple(results)
+
+
+def _estimates(gait: GaitFit | None, name: str) -> tuple[Estimate, Estimate]:
+    if gait is None or gait.response is None or name not in gait.answered:
+        return Estimate(), Estimate()
+    place = gait.answered.index(name)
+    lag = lag_estimate(gait.response, place)
+    # A phase that noise leaves open means an amplitude that isn't there.
+    return (gain_estimate(gait.response, place) if lag.value is not None else Estimate()), lag
 
 
 def _provenance(session: SessionView, options: Options) -> Provenance:

@@ -148,8 +148,7 @@ def response_indices(response: Response) -> dict[str, Index]:
         "equivalence_lag": _equivalence(lag - lag.mean(), lag_variance, dof, EQUIVALENT_LAG_RAD),
     }
     if count >= MIDDLE + ENDS:
-        scaled = response.log_gain_variance * gain**2
-        found["boundary_contrast_gain"] = _contrast(gain, scaled, dof)
+        found["boundary_contrast_gain"] = _contrast(gain, response.log_gain_variance * gain**2, dof)
         found["boundary_contrast_lag"] = _contrast(lag, lag_variance, dof)
     return {name: index(name, *numbers) for name, numbers in found.items()}
 
@@ -167,7 +166,9 @@ def energy_indices(per_cycle_j: FloatArray) -> dict[str, Index]:
     if per_cycle_j.shape[0] < 2 or not np.any(per_cycle_j):
         return {}
     return {
-        "energy_cv": index("energy_cv", *_jackknifed(per_cycle_j, _cv)),
+        "energy_cv": index(
+            "energy_cv", *_jackknifed(per_cycle_j, lambda one: float(one.std() / one.mean()))
+        ),
         "energy_gini": index("energy_gini", *_jackknifed(per_cycle_j, gini)),
     }
 
@@ -183,8 +184,7 @@ def gini(values: FloatArray) -> float:
     """
     ordered = np.sort(values)
     k = ordered.size
-    rank = 2 * np.arange(1, k + 1) - k - 1
-    return float(rank @ ordered / (k * ordered.sum()))
+    return float((2 * np.arange(1, k + 1) - k - 1) @ ordered / (k * ordered.sum()))
 
 
 def spread(values: FloatArray, variance: FloatArray, dof: FloatArray, blocks: int = 1) -> Spread:
@@ -226,9 +226,8 @@ def _noncentral_root(value: float, dof: float, quantile: float) -> float:
     """Root of the noncentrality whose chi-square has the value at this quantile; 0 if none has."""
     if value > _ASYMPTOTIC:
         return float(value**0.5 - ndtri(quantile))
-    if chdtr(dof, value) <= quantile:
-        return 0.0
-    return float(chndtrinc(value, dof, quantile)) ** 0.5
+    central = chdtr(dof, value) <= quantile
+    return 0.0 if central else float(chndtrinc(value, dof, quantile)) ** 0.5
 
 
 def _contrast(
@@ -243,11 +242,8 @@ def _contrast(
     parts = weight**2 * variance
     value, error = float(weight @ values), float(parts.sum()) ** 0.5
     freedom = float(parts.sum() ** 2 / np.sum(parts**2 / dof)) if error > 0 else float(dof.min())
-    return value, around(value, t_factor(freedom) * error), _t_p(value, error, freedom)
-
-
-def _t_p(value: float, error: float, dof: float) -> float:
-    return float(2 * stdtr(dof, -abs(value) / error)) if error > 0 else float(value == 0)
+    p = float(2 * stdtr(freedom, -abs(value) / error)) if error > 0 else float(value == 0)
+    return value, around(value, t_factor(freedom) * error), p
 
 
 def _equivalence(
@@ -257,10 +253,6 @@ def _equivalence(
     m = deviation.size
     error = np.sqrt(variance * (1 - 2 / m) + variance.sum() / m**2)
     return float(np.max(np.abs(deviation))), None, equivalence_p(deviation, error, dof, margin)
-
-
-def _cv(values: FloatArray) -> float:
-    return float(values.std() / values.mean())
 
 
 def _jackknifed(
@@ -322,8 +314,8 @@ def heterogeneity_indices(
         suffix = f"_{plane}" if len(planes) > 1 else ""
         suffix += f"_group{k}" if several else ""
         result |= {f"{name}{suffix}": one for name, one in found.items()}
-    told = "boundary or module: not separable from a wave in one direction (module_share is null)"
-    warn(Note(f"{told}; record the reverse"))
+    text = "boundary or module: not separable from a wave in one direction (module_share is null)"
+    warn(Note(f"{text}; record the reverse"))
     return result
 
 

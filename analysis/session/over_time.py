@@ -114,7 +114,7 @@ def response_over_time(
         The response over time, or None.
     """
     if not columns.command or not columns.position:
-        return None  # said where they were read
+        return None  # with a warning where they were read
     logged = _logged(session, warn)
     if logged is None:
         return None
@@ -205,10 +205,9 @@ def _joint(
     for start, stop in false:
         found.ratio[(found.start_s < stop) & (found.stop_s > start)] = np.nan
     frequency = 1 / (found.stop_s - found.start_s)
-    start, stop, frequency = (
-        tuple(one.tolist()) for one in (found.start_s, found.stop_s, frequency)
-    )
-    return JointOverTime(command.name, start, stop, tuple(number), frequency, *_estimates(found))
+    start, stop = tuple(found.start_s.tolist()), tuple(found.stop_s.tolist())
+    rates = tuple(frequency.tolist())
+    return JointOverTime(command.name, start, stop, tuple(number), rates, *_estimates(found))
 
 
 def _rising(t_s: FloatArray, value: FloatArray) -> Phase | None:
@@ -235,8 +234,7 @@ def _estimates(found: Cycles) -> tuple[Maybe, Intervals, Maybe, Intervals]:
     )
 
 
-def _where(told: BoolArray, values: Iterable[_Value]) -> tuple[_Value | None, ...]:
-    """Return the values, or None where they are not told."""
-    return tuple(
-        value if known else None for value, known in zip(values, told.tolist(), strict=True)
-    )
+def _where(known: BoolArray, values: Iterable[_Value]) -> tuple[_Value | None, ...]:
+    """Return the values, or None where they are not known."""
+    pairs = zip(values, known.tolist(), strict=True)
+    return tuple(value if there else None for value, there in pairs)

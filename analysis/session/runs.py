@@ -1,4 +1,4 @@
-"""Which sessions are runs of one gait, and which way its wave runs: told from the commands alone.
+"""Which sessions are runs of one gait, and which way its wave runs, by the commands alone.
 
 With c the complex amplitudes of a run's commands, head to tail, another run has the same gait if
 its c is the same but for a common phase (it started at another time), and the reverse gait if its
@@ -38,24 +38,18 @@ def coupling_of_one_gait(joints: int) -> Coupling:
     Returns:
         Not identifiable, with the reason and the plan to record.
     """
-    if joints == 0:
-        return Coupling(
-            identifiable=False,
-            why="no joint's response to a gait is known",
-            record="a session with a steady gait, commands and responses",
-        )
-    if joints == 1:
-        return Coupling(
-            identifiable=False,
-            why="one joint has no neighbour whose response is known",
-            record="a session with a chain of driven joints",
-        )
-    return Coupling(
-        identifiable=False,
-        why=f"one gait gives {joints} complex numbers for {joints * joints} unknown couplings",
-        record=f"phase-kicks around this gait ({4 * joints} runs: each joint's command kicked up "
-        f"and down, in phase and in amplitude), or without contact a lag-sweep of {joints} gaits",
+    why = f"one gait gives {joints} complex numbers for {joints * joints} unknown couplings"
+    record = (
+        f"phase-kicks around this gait ({4 * joints} runs: each joint's command kicked up "
+        f"and down, in phase and in amplitude), or without contact a lag-sweep of {joints} gaits"
     )
+    if joints == 0:
+        why = "no joint's response to a gait is known"
+        record = "a session with a steady gait, commands and responses"
+    elif joints == 1:
+        why = "one joint has no neighbour whose response is known"
+        record = "a session with a chain of driven joints"
+    return Coupling(identifiable=False, why=why, record=record)
 
 
 HEADING = "heading_rad"
@@ -142,8 +136,7 @@ def _lean_of(session: SessionView, sensor: Sensor, windows: Sequence[Window]) ->
     cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)
     x = float(mean @ [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr])
-    z = float(mean @ [-sp, cp * sr, cp * cr])
-    return math.atan2(-x, z)
+    return math.atan2(-x, float(mean @ [-sp, cp * sr, cp * cr]))
 
 
 SAME_COMMAND = 0.01
@@ -282,20 +275,15 @@ def sort_runs(runs: Sequence[GaitRun]) -> tuple[dict[int, Role], dict[int, str]]
     roles: dict[int, Role] = {}
     first: dict[bytes, int] = {}
     for k in fit:
-        run = runs[k]
-        different = _difference(run, model)
-        if different is not None:
+        run, numbers = runs[k], runs[k].ratio.tobytes()
+        if (different := _difference(run, model)) is not None:
             why[k] = different
-            continue
-        numbers = run.ratio.tobytes()
-        if numbers in first:
-            why[k] = (
-                f"is a copy of the numbers of {runs[first[numbers]].label}: a copy is not a run of "
-                "its own"
-            )
-            continue
-        first[numbers] = k
-        roles[k] = Role.FORWARD if run.wave == "head-to-tail" else Role.REVERSE
+        elif numbers in first:
+            copied = f"is a copy of the numbers of {runs[first[numbers]].label}"
+            why[k] = f"{copied}: a copy is not a run of its own"
+        else:
+            first[numbers] = k
+            roles[k] = Role.FORWARD if run.wave == "head-to-tail" else Role.REVERSE
     return roles, why
 
 
@@ -313,12 +301,10 @@ def responses(runs: Sequence[GaitRun]) -> tuple[tuple[str, ...], ComplexArray]:
     known = np.all(np.isfinite(ratio), axis=0)
     known &= known[::-1]
     ratio = ratio[:, known]
-    unit: ComplexArray = ratio / np.abs(ratio)
-    turn = np.angle(unit.sum())
+    turn = np.angle((ratio / np.abs(ratio)).sum())
     phase: FloatArray = turn + np.angle(ratio * np.exp(-1j * turn))
     names = tuple(name for name, sound in zip(runs[0].names, known, strict=True) if sound)
-    y = (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
-    return names, y
+    return names, (np.log(np.abs(ratio)) + 1j * phase).astype(np.complex128)
 
 
 def mirror_fault(robot: Robot | None, driven: Sequence[str]) -> str | None:
@@ -401,8 +387,7 @@ def _other_drive(run: GaitRun, model: GaitRun) -> str | None:
 
 def _difference(run: GaitRun, model: GaitRun) -> str | None:
     """What makes a run another gait than the model's or its reverse; None if nothing does."""
-    drive = _other_drive(run, model)
-    if drive is not None:
+    if (drive := _other_drive(run, model)) is not None:
         return drive
     same = [own == way for own, way in zip(run.waves, model.waves, strict=True)]
     if any(same) != all(same):

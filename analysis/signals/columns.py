@@ -119,9 +119,8 @@ def read_columns(
     }
     if reference_topic is not None:
         wanted["reference"] = (reference_topic, "position")
-    joint_topics = sorted(
-        topic for topic, one in session.channels.items() if one.type_name == _JOINT_STATE
-    )
+    channels = session.channels.items()
+    joint_topics = sorted(topic for topic, one in channels if one.type_name == _JOINT_STATE)
     asked = [(command_topic, response_topic)]
     asked += [] if reference_topic is None else [(reference_topic,)]
     named = [(command_topic, COMMAND_TOPIC), (response_topic, RESPONSE_TOPIC)]
@@ -148,15 +147,13 @@ def read_columns(
             option = "--command-topic" if key == "command" else "--response-topic"
             spare = [one for one in others if one not in (command_topic, response_topic)]
             named = f" (other JointStates: {', '.join(spare)}; choose with {option})"
-            told = f"no {kind} on {topic}: gain and lag are null{named if spare else ''}"
-            warn(Lacking(told))
+            warn(Lacking(f"no {kind} on {topic}: gain and lag are null{named if spare else ''}"))
     accumulated = PowerTopic.MECHANICAL in found and PowerTopic.MECHANICAL_PLUS in found
     if not accumulated and ("velocity" not in found or "effort" not in found):
         lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)
         warn(Note(f"{response_topic} carries no {lacking}: mechanical energies are null"))
     _check_voltage(session, found, warn)
-    names = session.robot.joint_names if session.robot is not None else ()
-    seen = dict.fromkeys(names)
+    seen = dict.fromkeys(session.robot.joint_names if session.robot is not None else ())
     for key in ("command", "position"):
         if key in found:
             seen |= dict.fromkeys(found[key].names)
@@ -200,11 +197,9 @@ def by_plane(robot: Robot | None, names: Iterable[str]) -> dict[str, list[str]]:
 
 def _read(session: SessionView, wanted: Mapping[str, tuple[str, str]]) -> dict[str, JointSignals]:
     """All in one pass if all are there; else one by one, leaving out what is empty."""
-    topics: dict[str, list[str]] = {}
-    for topic, field in wanted.values():
-        fields = topics.setdefault(topic, [])
-        if field not in fields:
-            fields.append(field)
+    topics: dict[str, list[str]] = {topic: [] for topic, _ in wanted.values()}
+    for topic, field in dict.fromkeys(wanted.values()):
+        topics[topic].append(field)
     try:
         found = session.joint_columns(topics)
         return {key: found[one] for key, one in wanted.items()}
@@ -220,11 +215,8 @@ def _read(session: SessionView, wanted: Mapping[str, tuple[str, str]]) -> dict[s
 
 def _check_voltage(session: SessionView, found: dict[str, JointSignals], warn: Warn) -> None:
     """E_el needs the voltage at the motor: a bridge's duty times the supply, not the supply."""
-    lacking = [
-        topic
-        for key, topic in (("current", CURRENT_TOPIC), ("voltage", VOLTAGE_TOPIC))
-        if key not in found
-    ]
+    both = {"current": CURRENT_TOPIC, "voltage": VOLTAGE_TOPIC}
+    lacking = [topic for key, topic in both.items() if key not in found]
     accumulated = PowerTopic.ELECTRICAL in found and PowerTopic.ELECTRICAL_PLUS in found
     if lacking:
         if not accumulated:
@@ -232,9 +224,5 @@ def _check_voltage(session: SessionView, found: dict[str, JointSignals], warn: W
         found.pop("current", None)
         return
     if not accumulated and "scenario" not in session.metadata.get("undulog", {}):
-        warn(
-            Note(
-                f"{VOLTAGE_TOPIC} is taken as the voltage at the motor: if it is the supply's, "
-                "E_el is too large"
-            )
-        )
+        taken = f"{VOLTAGE_TOPIC} is taken as the voltage at the motor"
+        warn(Note(f"{taken}: if it is the supply's, E_el is too large"))

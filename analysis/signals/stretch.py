@@ -47,8 +47,7 @@ class Options:
         """Return the command-line arguments for these options, without defaults."""
         arguments: list[str] = []
         for field in fields(self):
-            value = getattr(self, field.name)
-            if value != field.default:
+            if (value := getattr(self, field.name)) != field.default:
                 option = field.name.removesuffix("_s").replace("_", "-")
                 arguments += [f"--{option}", str(value)]
         return arguments
@@ -172,11 +171,8 @@ def recorded(session: SessionView, columns: Columns, options: Options) -> Stretc
         raise DataError(
             f"{session.path}: commands and responses don't overlap in time; their clocks differ"
         )
-    limits = (
-        None if time_s is None else session.start_ns + round(time_s * _NS)
-        for time_s in (options.start_s, options.stop_s)
-    )
-    return both.intersect(*limits)
+    chosen_s, first_ns = (options.start_s, options.stop_s), session.start_ns
+    return both.intersect(*(None if t is None else first_ns + round(t * _NS) for t in chosen_s))
 
 
 def _gait_runs(session: SessionView, chosen: Stretch, settle_s: float, warn: Warn) -> list[Stretch]:
@@ -229,10 +225,8 @@ def _in_motion(
     if not stated:
         soft = span
         span = steady_part([one.between(span[0], span[1]) for one in series], *span)
-        span = (
-            span[0] if options.start_s is None else soft[0],
-            span[1] if options.stop_s is None else soft[1],
-        )
+        start_s = span[0] if options.start_s is None else soft[0]
+        span = start_s, span[1] if options.stop_s is None else soft[1]
         _warn_soft(soft, span, warn)
     start, stop = (origin + round(time_s * _NS) for time_s in span)
     period = max((one.period_s for one in series if one.count > 1), default=0.0)
@@ -243,11 +237,10 @@ def _in_motion(
 
 def _warn_soft(motion: tuple[float, float], steady: tuple[float, float], warn: Warn) -> None:
     """Report what is left out by the amplitude of the commands."""
-    ends = (
+    for kind, when, left_s, option in (
         ("start", "before", steady[0] - motion[0], "--start"),
         ("stop", "after", motion[1] - steady[1], "--stop"),
-    )
-    for kind, when, left_s, option in ends:
+    ):
         if left_s > 0:
             warn(
                 f"soft {kind}: {left_s:.1f} s {when} the commands have their steady amplitude are "

@@ -80,15 +80,13 @@ def steady_part(commands: Sequence[Series], start_s: float, stop_s: float) -> tu
         if (stop_s - start_s) / period_s > sum(one.t_s.size for one in members):
             continue  # most of these cycles have no sample: there is no soft start to be seen
         edges_s = np.arange(start_s, stop_s + 1e-6 * period_s, period_s / _PARTS)
-        size = amplitude_by_cycle(members, omega, edges_s)
-        lead, tail = soft_ends(size)
+        lead, tail = soft_ends(amplitude_by_cycle(members, omega, edges_s))
         if lead:
             first_s = max(first_s, float(edges_s[lead]))
         if tail:
             last_s = min(last_s, float(edges_s[edges_s.size - 1 - tail]))
-    if last_s - first_s < MIN_CYCLES * slowest_s:
-        return start_s, stop_s
-    return first_s, last_s
+    short = last_s - first_s < MIN_CYCLES * slowest_s
+    return (start_s, stop_s) if short else (first_s, last_s)
 
 
 def _strongest(rhythm: Rhythm) -> int:
@@ -121,8 +119,7 @@ def amplitude_by_cycle(commands: Sequence[Series], omega: float, edges_s: FloatA
         values = one.values - one.values.mean()
         usable: BoolArray = end - begin >= _LEAST_SAMPLES
         gram = np.stack([_sums(rows * row, begin, end) for row in rows], axis=1)[usable]
-        right = _sums(rows * values, begin, end)[usable]
-        solved = np.linalg.solve(gram, right[..., None])[..., 0]
+        solved = np.linalg.solve(gram, _sums(rows * values, begin, end)[usable][..., None])[..., 0]
         power[usable] += solved[:, 1] ** 2 + solved[:, 2] ** 2
         power[~usable] = np.nan
         filled = np.maximum(end - begin, 1)
@@ -162,9 +159,8 @@ def soft_ends(size: FloatArray) -> tuple[int, int]:
     level = float(np.median(plateau))
     scatter = 1.4826 * float(np.median(np.abs(plateau - level))) / level
     lacking = level * (1 - min(max(REACHED, 3 * scatter), STEADY))
-    return _lead(size, first, level, lacking), _lead(
-        size[::-1], size.size - 1 - last, level, lacking
-    )
+    end = size.size - 1 - last
+    return _lead(size, first, level, lacking), _lead(size[::-1], end, level, lacking)
 
 
 def _commonest(size: FloatArray) -> float:
@@ -336,14 +332,9 @@ def moving(commands: Sequence[Series]) -> tuple[float, float] | None:
     Returns:
         Times [s], or None where no command ever moves.
     """
-    starts: list[float] = []
-    stops: list[float] = []
-    for one in commands:
-        moves = np.flatnonzero(np.diff(one.values) != 0)
-        if moves.size:
-            starts.append(float(one.t_s[moves[0]]))
-            stops.append(float(one.t_s[moves[-1] + 1]))
-    return (min(starts), max(stops)) if starts else None
+    each = [(one.t_s, np.flatnonzero(np.diff(one.values) != 0)) for one in commands]
+    known = [(float(t_s[k[0]]), float(t_s[k[-1] + 1])) for t_s, k in each if k.size]
+    return (min(known)[0], max(stop for _, stop in known)) if known else None
 
 
 def whole_cycles(start_s: float, stop_s: float, frequency_hz: float) -> tuple[float, float, int]:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from undulog.analysis.session.analyse import examine_session
+from undulog.analysis.session.analyse import measure_session
 from undulog.capture import Session, SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError, UndulogError
@@ -101,10 +101,6 @@ def find_weak_module(
     return Search(best, p, len(joints)), fitted
 
 
-SPREAD = 0.5
-WITHIN = 0.05
-
-
 @dataclass(frozen=True)
 class Wanted:
     """What is to be fitted.
@@ -122,8 +118,8 @@ class Wanted:
     module: str | None = None
     search: bool = False
     delay: bool = False
-    spread: float = SPREAD
-    within: float = WITHIN
+    spread: float = 0.5
+    within: float = 0.05
     settle_s: float | None = None
 
 
@@ -199,7 +195,7 @@ def calibrate(
         wanted: What is to be fitted.
         kernels: What computes the force laws.
         on_tick: Called at every tick of every run; may raise to end the fit.
-        on_iteration: Told each iteration, the residuals' RMS [rad] and the real-time factor.
+        on_iteration: Called with each iteration, the residuals' RMS [rad] and the real-time factor.
 
     Raises:
         UsageError: If no world is known, or what is wanted isn't there.
@@ -250,7 +246,7 @@ def calibrate(
 def _omega(session: SessionView) -> float | None:
     """Angular frequency of the commands [rad/s], or None where they are no steady gait."""
     try:
-        gait = examine_session(session, with_dead_bands=False).gait
+        gait = measure_session(session, with_dead_bands=False).gait
     except UndulogError:  # a session without a gait can be fitted, too
         return None
     return None if gait is None or not gait.driven else gait.fit.omega

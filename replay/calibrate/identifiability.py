@@ -67,7 +67,7 @@ class CorrelatedParameters:
     """A direction in the parameters that a session doesn't determine.
 
     Attributes:
-        left: Standard deviation along it, as a share of the prior's: 1 where nothing is told.
+        left: Standard deviation along it, as a share of the prior's: 1 where nothing is known.
         factors: Parameter to the factor (of a dead time: the change in seconds) by which it goes
             along, one prior deviation up the ridge; those that hardly move are left out.
     """
@@ -101,11 +101,8 @@ def ridges(unknowns: Sequence[Unknown], covariance: FloatArray) -> tuple[Correla
         way = vectors[:, k] * spread
         way = way * np.sign(way[np.argmax(np.abs(way))])
         order: list[int] = np.argsort(-np.abs(way)).tolist()
-        moved = [i for i in order if abs(way[i]) > _MOVED]
-        factors = {
-            unknowns[i].label: unknowns[i].value(float(way[i])) / (unknowns[i].start or 1.0)
-            for i in moved
-        }
+        moved = [(unknowns[i], float(way[i])) for i in order if abs(way[i]) > _MOVED]
+        factors = {one.label: one.value(size) / (one.start or 1.0) for one, size in moved}
         found.append(CorrelatedParameters(left, factors))
     return tuple(found)
 

@@ -137,10 +137,10 @@ class LackOfFit:
         checks = [len(self.joints) * min(one.p for one in self.joints.values())]
         if self.unfitted is not None:
             checks.append(self.unfitted.p)
-        for laws in (True, False):
-            others = [one.p for one in self.alternatives if one.widens is laws]
-            if others:
-                checks.append(len(others) * min(others))
+        kinds = (
+            [one.p for one in self.alternatives if one.widens is laws] for laws in (True, False)
+        )
+        checks += [len(others) * min(others) for others in kinds if others]
         return min(1.0, len(checks) * min(checks))
 
     @property
@@ -151,9 +151,8 @@ class LackOfFit:
     @property
     def worst(self) -> str:
         """The joint that fits worst."""
-        return min(
-            self.joints, key=lambda j: (self.joints[j].p, -(self.joints[j].periodic_rad or 0.0))
-        )
+        joints = self.joints
+        return min(joints, key=lambda j: (joints[j].p, -(joints[j].periodic_rad or 0.0)))
 
 
 def lack_of_fit(
@@ -173,15 +172,13 @@ def lack_of_fit(
         others: From :func:`.replay.calibrate.identifiability.alternatives`.
     """
     found: dict[str, JointFit] = {}
-    for joint, t, angle, rest in zip(
-        measured.joints, measured.times_s, measured.angles, residuals, strict=True
-    ):
+    rows = zip(measured.joints, measured.times_s, measured.angles, residuals, strict=True)
+    for joint, t, angle, rest in rows:
         if omega is not None and float(t[-1] - t[0]) * omega / (2 * np.pi) >= FEWEST_CYCLES:
             found[joint] = periodic(t, rest, omega, step_of(angle))
         else:
             found[joint] = JointFit(ljung_box(rest), None)
-    hz = None if omega is None else omega / (2 * np.pi)
-    return LackOfFit(found, unfitted, others, hz)
+    return LackOfFit(found, unfitted, others, None if omega is None else omega / (2 * np.pi))
 
 
 def periodic(t: FloatArray, residual: FloatArray, omega: float, step: float = 0.0) -> JointFit:
@@ -208,8 +205,7 @@ def periodic(t: FloatArray, residual: FloatArray, omega: float, step: float = 0.
     reach = min(BETWEEN, int((cycles - 1) / 2))
     statistic, power = 0.0, 0.0
     for k in range(1, most + 1):
-        others = np.hstack([trend, *lines[: k - 1], *lines[k:]])
-        at_line = _power(residual, lines[k - 1], others)
+        at_line = _power(residual, lines[k - 1], np.hstack([trend, *lines[: k - 1], *lines[k:]]))
         near = [
             _power(rest, _waves(t, k * omega + 2 * np.pi * d / duration), whole)
             for d in range(-reach, reach + 1)

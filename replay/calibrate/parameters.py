@@ -111,9 +111,8 @@ def unknowns(
             raise UsageError(f"--only {name}: expected one of {', '.join(found)}")
         if found[name].start == 0.0:
             raise UsageError(f"--only {name}: it is 0 in {scenario.name} and can't be scaled")
-    chosen = tuple(
-        one for name, one in found.items() if one.start > 0.0 and (not only or name in only)
-    )
+    wanted = [one for name, one in found.items() if not only or name in only]
+    chosen = tuple(one for one in wanted if one.start > 0.0)
     return (*chosen, Unknown(DELAY, "s", 0.0, 1.0)) if delay else chosen
 
 
@@ -144,9 +143,7 @@ def with_values(scenario: Scenario, wanted: Sequence[Unknown], x: FloatArray) ->
     Returns:
         The scenario to run; its tables of modules are left as they were.
     """
-    shared: dict[str, float] = {}
-    of_ground: dict[str, float] = {}
-    factor: dict[str, float] = {}
+    shared, of_ground, factor = dict[str, float](), dict[str, float](), dict[str, float]()
     for one, entry in zip(wanted, x.tolist(), strict=True):
         if one.module is not None:
             factor[one.module] = one.value(entry)
@@ -160,8 +157,7 @@ def with_values(scenario: Scenario, wanted: Sequence[Unknown], x: FloatArray) ->
     )
     robot, world = dataclasses.replace(scenario.robot, joints=joints), scenario.world
     if world.ground is not None:
-        ground = dataclasses.replace(world.ground, **of_ground)
-        world = dataclasses.replace(world, ground=ground)
+        world = dataclasses.replace(world, ground=dataclasses.replace(world.ground, **of_ground))
     return dataclasses.replace(scenario, robot=robot, world=world)
 
 
@@ -300,8 +296,7 @@ class Answers:
         # The joints share one table of breaks; a spline of one joint is a column of it.
         found: list[FloatArray] = []
         for joint, times_s in zip(self.measured.joints, self.measured.times_s, strict=True):
-            j = names.index(joint)
-            one = CubicHermiteSpline.construct_fast(track.c[:, :, j], track.x)
+            one = CubicHermiteSpline.construct_fast(track.c[:, :, names.index(joint)], track.x)
             angle = np.asarray(one(np.clip(times_s - late_s, track.x[0], track.x[-1])))
             found.append(angle - angle.mean())
         return tuple(found)

@@ -25,7 +25,7 @@ from undulog.capture.robot.model import Robot
 from undulog.sim.scenario.scenario import Modules
 
 from .fit import Calibration, Fitted
-from .identifiability import Alternative, CorrelatedParameters
+from .identifiability import Alternative
 from .lack_of_fit import LEVEL, LackOfFit, Misfit
 from .parameters import DELAY
 
@@ -78,17 +78,13 @@ def scenario_text(calibration: Calibration, robot_file: Path, scenario_file: Pat
     """
     scenario = calibration.scenario
     modules = {one.module for one in calibration.parameters}
-    own = {
-        joint.name: {"stall_torque": joint.servo.stall_torque}
-        for joint in scenario.robot.joints
-        if joint.name in modules
-    }
-    named = dataclasses.replace(
+    fitted = [joint for joint in scenario.robot.joints if joint.name in modules]
+    own = {joint.name: {"stall_torque": joint.servo.stall_torque} for joint in fitted}
+    return dataclasses.replace(
         scenario,
         robot_name=os.path.relpath(robot_file, scenario_file.parent),
         modules=Modules({}, own, scenario.modules.link_of),
-    )
-    return named.toml()
+    ).toml()
 
 
 def write_calibration(
@@ -145,8 +141,7 @@ def summary_lines(calibration: Calibration) -> Iterator[str]:
     fits = not calibration.lack.found
     yield "Parameters (95 % interval; before):" if fits else "Parameters (no interval; before):"
     width = max(len(one.label) for one in calibration.parameters)
-    for one in calibration.parameters:
-        yield f"  {_parameter(one, width)}"
+    yield from (f"  {_parameter(one, width)}" for one in calibration.parameters)
     if fits:
         yield from _undetermined(calibration)
     yield from _search(calibration)
@@ -213,8 +208,7 @@ def _lack(lack: LackOfFit) -> Iterator[str]:
         best = min(lack.alternatives, key=lambda one: one.p)
         if sum(one.widens is best.widens for one in lack.alternatives) * best.p < LEVEL:
             parts.append(f"{best.label} would fit better ({_size(best)})")
-    off = [j for j, one in lack.joints.items() if len(lack.joints) * one.p < LEVEL]
-    if off:
+    if off := [j for j, one in lack.joints.items() if len(lack.joints) * one.p < LEVEL]:
         periodic = lack.joints[lack.worst].periodic_rad
         size = "" if periodic is None else f" by {periodic:.2g} rad (RMS)"
         how = "is no noise" if periodic is None else "comes back with every cycle"
@@ -250,8 +244,7 @@ def _checked(lack: LackOfFit) -> Iterator[str]:
     if lack.unfitted is not None:
         size = lack.unfitted.unfitted_rad
         off = f"; each half under the parameters of the other is {size:.3g} rad off"
-    open_laws = [one.label for one in lack.alternatives if one.widens and one.could_be]
-    if open_laws:
+    if open_laws := [one.label for one in lack.alternatives if one.widens and one.could_be]:
         yield (
             f"Not determined by this session: {' or '.join(open_laws)} would do as well; "
             "intervals have it in them."
@@ -284,21 +277,16 @@ def _undetermined(calibration: Calibration) -> Iterator[str]:
         return
     yield f"Undetermined by this session: {', '.join(open_ones)}."
     for ridge in calibration.ridges:
-        yield f"  answers alike: {_ridge(ridge)}"
-    for line in calibration.would_tell:
-        yield f"  what would determine {line}"
-
-
-def _ridge(ridge: CorrelatedParameters) -> str:
-    return ", ".join(
-        f"{label} + {1e3 * factor:.2g} ms" if label == DELAY else f"{label} x {factor:.2f}"
-        for label, factor in ridge.factors.items()
-    )
+        parts = (
+            f"{label} + {1e3 * factor:.2g} ms" if label == DELAY else f"{label} x {factor:.2f}"
+            for label, factor in ridge.factors.items()
+        )
+        yield f"  answers alike: {', '.join(parts)}"
+    yield from (f"  what would determine {line}" for line in calibration.would_tell)
 
 
 def _search(calibration: Calibration) -> Iterator[str]:
-    search = calibration.search
-    if search is None:
+    if (search := calibration.search) is None:
         return
     p = _p(search.p)
     if search.named and calibration.lack.found:

@@ -82,8 +82,7 @@ def memory(residuals: Sequence[FloatArray]) -> float:
     for r in residuals:
         spectrum = np.fft.rfft(r, 2 * len(r))
         total += np.fft.irfft(np.abs(spectrum) ** 2)[: longest + 1] / max(float(r @ r), 1e-300)
-    rho = total / len(residuals)
-    tau = 1.0 + 2.0 * np.cumsum(rho[1:])
+    tau = 1.0 + 2.0 * np.cumsum((total / len(residuals))[1:])
     ended = np.flatnonzero(np.arange(1, longest + 1) >= _WINDOW * tau)
     return max(float(tau[ended[0] if ended.size else -1]), 1.0)
 
@@ -106,22 +105,19 @@ def score_covariance(
         Shape (K, K).
     """
     weighted = _Weighted(columns, residuals, sigma, precision)
-    found = minimize_scalar(weighted.criterion, bounds=(0.0, _MOST), method="bounded")
-    phi = float(found.x)
+    phi = float(minimize_scalar(weighted.criterion, bounds=(0.0, _MOST), method="bounded").x)
     innovations = weighted.innovations(phi)
     reach = int(np.ceil(_WINDOW * memory(innovations)))
     total = np.zeros((precision.size, precision.size))
     for column, left, s in zip(columns, innovations, sigma.tolist(), strict=True):
         n = len(left)
         lags = np.arange(min(reach, n - 1) + 1)
-        power = np.abs(np.fft.rfft(left, 2 * n)) ** 2
-        covariance = np.fft.irfft(power)[: lags.size] / n
+        covariance = np.fft.irfft(np.abs(np.fft.rfft(left, 2 * n)) ** 2)[: lags.size] / n
         half = covariance * np.clip(2.0 - 2.0 * lags / reach, 0.0, 1.0)
         color = phi ** np.abs(np.arange(1 - n, n)) / (1.0 - phi**2)
         kernel = fftconvolve(np.concatenate([half[:0:-1], half]), color)[:, None]
         middle = len(kernel) // 2
-        smooth = fftconvolve(column, kernel, axes=0)[middle : middle + n]
-        total += column.T @ smooth / s**2
+        total += column.T @ fftconvolve(column, kernel, axes=0)[middle : middle + n] / s**2
     return (total + total.T) / 2
 
 

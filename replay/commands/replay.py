@@ -123,7 +123,7 @@ def replay(
 
 def _show(comparison: Comparison) -> None:
     """Print a comparison below the output before it."""
-    from undulog.analysis.commands.options import show
+    from undulog.analysis.commands.analyse import show
     from undulog.analysis.present.text_experiment import render_comparison
 
     echo("")
@@ -146,9 +146,7 @@ def _summary(again: ReproducedRun) -> Iterator[str]:
 
 def _same(same: LogDifference) -> Iterator[str]:
     if same.exact:
-        yield (
-            f"The same to the last bit: all {same.messages} messages on {len(same.same)} topics."
-        )
+        yield f"The same to the last bit: all {same.messages} messages on {len(same.same)} topics."
         return
     if same.differs_s:
         first = sorted(same.differs_s.items(), key=lambda item: item[1])

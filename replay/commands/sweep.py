@@ -53,10 +53,9 @@ def sweep(
         raise UsageError(f"--workers {workers}: give 1 or more")
     if workers is not None and cluster is not None:
         raise UsageError("--workers and --cluster: give one of them")
-    from ..sweep.execute import workers_of
     from ..sweep.plan import read_plan
     from ..sweep.rows import RowStore
-    from ..sweep.sweep import cost_of, prepare, processors, run_sweep
+    from ..sweep.sweep import cost_of, prepare, processors, run_sweep, workers_of
 
     prepared = prepare(read_plan(plan), plan.parent, output)
     if dry_run:

@@ -19,8 +19,7 @@ from undulog.capture.common.process import interruptible
 
 from ..samples.content import Layer
 from ..viewer import viewer
-from .view_film import view_clip
-from .view_options import ClipOptions, OverlayOptions, SingleOptions
+from .view_recorded import ClipOptions, OverlayOptions, SingleOptions, view_clip, view_overlay
 
 if TYPE_CHECKING:
     from ..feed.recording import Recording
@@ -94,8 +93,6 @@ def view(
     elif len(files) == 1:
         _view_session(files[0], single or SingleOptions(), web=web)
     else:
-        from .view_overlay import view_overlay
-
         view_overlay(files, beside or OverlayOptions(), save=save, web=web, json=json)
 
 
@@ -203,14 +200,13 @@ def _view_live(
 def _report_live(report: RelayReport, save: Path | None, *, json: bool) -> None:
     lag = report.lag_s
     if json:
-        names = ("p50", "p99", "max")
         facts = {
             "path": None if save is None else str(save),
             "sessions": list(report.sessions),
             "shown": report.shown,
             "dropped": report.dropped,
             "unread": report.unread,
-            "lag_s": None if lag is None else dict(zip(names, lag, strict=True)),
+            "lag_s": None if lag is None else dict(zip(("p50", "p99", "max"), lag, strict=True)),
         }
         emit_json(facts)
         return

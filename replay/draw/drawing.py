@@ -206,12 +206,11 @@ class Drawing:
         Returns:
             What is missing or was assumed by now, a sentence each.
         """
-        notes = [*layer.notes, *self._sources.warnings, *session.warnings]
-        told = list(dict.fromkeys(notes))
+        notes = list(dict.fromkeys([*layer.notes, *self._sources.warnings, *session.warnings]))
         text = facts.markdown(
             session,
             layer.analysis,
-            notes=told,
+            notes=notes,
             colors=body_title(content),
             content=content,
             named=layer.named,
@@ -219,7 +218,7 @@ class Drawing:
             awaited=awaited,
         )
         facts.log_facts(self._rec, text)
-        return told
+        return notes
 
     def _written(self) -> Content:
         """Return the content that every window of samples has."""
@@ -247,8 +246,7 @@ class Drawing:
         session = sources.session.view(stop_ns=span.known_ns)
         head = read_head(session, robot, [times], sources.warnings)
         known = {one.name for one in measured}
-        missing = [name for name in robot.joint_names if name not in known]
-        if missing:
+        if missing := [name for name in robot.joint_names if name not in known]:
             sources.warnings.append(
                 f"no angles of {', '.join(missing)}: the body is drawn up to the first of these"
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from undulog.analysis.results.analysis import Analysis, GaitFacts, GroupFacts
@@ -61,19 +61,22 @@ def markdown(
         has_cycles: Whether there is a timeline of gait cycles.
         awaited: Whether its analysis is still to come.
     """
+    verdict = session.metadata.get("undulog.health", {}).get("verdict")
+    recorded = session.metadata.get("undulog", {}).get("undulog")
     facts = (
         code(session.session_id),
         _robot(session),
         f"{session.duration_s:.1f} s",
         utc(session.start_ns),
         *_gait(analysis),
-        *_health(session.metadata),
-        *_versions(session.metadata),
+        *([f"verdict {escaped(verdict)}"] if verdict else []),
+        *([f"recorded by undulog {escaped(recorded)}"] if recorded else []),
     )
+    awaited_text = "Being analysed: the answer comes in a moment." if awaited else "Not analysed."
     joints = ", ".join(f"{escaped(one.joint)} ({escaped(one.why)})" for one in named)
     return document(
         [
-            f"**{escaped(_first_sentence(analysis, awaited=awaited))}**",
+            f"**{escaped(awaited_text if analysis is None else analysis.answer.sentence)}**",
             f"**Named, pink in the pictures:** {joints}" if named else "",
             " · ".join(facts),
             listed([*notes, *(() if analysis is None else analysis.warnings)]),
@@ -90,12 +93,6 @@ def document(paragraphs: Sequence[str]) -> str:
 def listed(notes: Sequence[str]) -> str:
     """Notes as a list in Markdown, each once."""
     return "\n".join(f"- {escaped(note)}" for note in dict.fromkeys(notes))
-
-
-def _first_sentence(analysis: Analysis | None, *, awaited: bool) -> str:
-    if analysis is not None:
-        return analysis.answer.sentence
-    return "Being analysed: the answer comes in a moment." if awaited else "Not analysed."
 
 
 def _legend(colors: str, content: Content, *, has_cycles: bool) -> str:
@@ -146,16 +143,6 @@ def _wave(gait: GaitFacts | GroupFacts, joints: str = "") -> str:
     parts = [f"{gait.frequency_hz.value:.3f} Hz{joints}"]
     if gait.wave is not None:
         parts.append(f"wave {gait.wave}")
-    for plane, lag in gait.lag_per_joint_rad.items():
-        parts.append(f"{math.degrees(lag):.1f}° a joint ({plane})")
+    lags = gait.lag_per_joint_rad.items()
+    parts += [f"{math.degrees(lag):.1f}° a joint ({plane})" for plane, lag in lags]
     return ", ".join(parts)
-
-
-def _health(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
-    verdict = metadata.get("undulog.health", {}).get("verdict")
-    return [f"verdict {escaped(verdict)}"] if verdict else []
-
-
-def _versions(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
-    recorded = metadata.get("undulog", {}).get("undulog")
-    return [f"recorded by undulog {escaped(recorded)}"] if recorded else []

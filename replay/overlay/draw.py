@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -165,8 +166,7 @@ def _dashed(values: FloatArray, t_ns: IntArray, rank: int) -> FloatArray:
     """
     step_s = max(typical_step_ns(t_ns), 1) * 1e-9
     drawn = max(round(_DASH_S[(rank - 1) % len(_DASH_S)] / step_s), 2)
-    left_out = max(round(_SPACE_S / step_s), 1)
-    is_drawn = np.arange(len(values)) % (drawn + left_out) < drawn
+    is_drawn = np.arange(len(values)) % (drawn + max(round(_SPACE_S / step_s), 1)) < drawn
     return np.where(is_drawn[:, None], values, np.nan)
 
 
@@ -195,8 +195,9 @@ def log_lines(rec: rr.RecordingStream, one: Side, rank: int, places: Places | No
     """
     labels = {} if places is None else places.labelled
     tracks = {track.name: track for track in one.measured if track.name in labels}
-    for name in (name for name in labels if name in tracks):
-        track, label = tracks[name], labels[name]
+    for name, label in labels.items():
+        if (track := tracks.get(name)) is None:
+            continue
         entity = f"{LINES}{one.entity}/{rr.escape_entity_path_part(label)}"
         title = f"{one.name}: {line_title(name, label)}"
         log_look(rec, entity, [name], one.palette, titles={name: title}, width=_WIDTH)
@@ -214,9 +215,8 @@ def log_power_names(rec: rr.RecordingStream, powers: Mapping[int, Side]) -> None
         powers: Sessions whose power was written, by their place, 0 for the first.
     """
     for place, side in powers.items():
-        look = rr.SeriesLines.from_fields(names=side.name)
-        if place:
-            look = rr.SeriesLines.from_fields(names=side.name, colors=tint(place), widths=1.0)
+        own: dict[str, Any] = {"colors": tint(place), "widths": 1.0} if place else {}
+        look = rr.SeriesLines.from_fields(names=side.name, **own)
         rec.log(f"{side.entity}{POWER}", look, static=True)
 
 

@@ -66,8 +66,8 @@ def answer(first: Side, other: Side, found: Found) -> str:
     Returns:
         One sentence without its full stop.
     """
-    told = found.why_not if found.comparison is None else found.comparison.answer
-    return f"{other.name} (B) against {first.name} (A): {told}"
+    result = found.why_not if found.comparison is None else found.comparison.answer
+    return f"{other.name} (B) against {first.name} (A): {result}"
 
 
 def markdown(
@@ -99,10 +99,7 @@ def markdown(
 
 
 def _table(sides: Sequence[Side]) -> str:
-    rows = [
-        "| session | id | robot | lasts | recorded | verdict |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = ["| session | id | robot | lasts | recorded | verdict |", "|---|---|---|---|---|---|"]
     for side in sides:
         robot = "not described" if side.robot is None else side.robot.name
         lasts = f"{(side.end_ns - side.start_ns) * 1e-9:.1f} s"
@@ -116,8 +113,7 @@ def _table(sides: Sequence[Side]) -> str:
 
 def _changes(first: Side, other: Side, changed: Sequence[Change]) -> str:
     if not changed:
-        said = f"{other.name} is described as {first.name}: nothing was changed."
-        return escaped(said)
+        return escaped(f"{other.name} is described as {first.name}: nothing was changed.")
     lines = [escaped(f"What was changed ({first.name}, then {other.name}):"), ""]
     for one in changed[:_CHANGES]:
         before, after = ("not set" if side is None else side for side in (one.a, one.b))
@@ -175,18 +171,18 @@ def build_blueprint(
     differing = [
         rrb.Horizontal(*_bar_differences(one), name=one.side.name) for one in shown[1:] if one.bars
     ]
+    charts = [bar_chart(one.title, f"{BARS}/{one.key}/**") for one in bars]
     groups = (
         (_both(shown), 1.25),
         (_differences(shown), 1.0),
-        ([rrb.Horizontal(*_bars(bars))] if bars else [], 1.0),
+        ([rrb.Horizontal(*charts)] if charts else [], 1.0),
         (differing, 1.0),
     )
     rows = [tabs(group) for group, _ in groups if group]
     heights = [height for group, height in groups if group]
     words = tabs(_words(shown))
-    bodies = [one for one in shown if one.body]
     root: rrb.Container
-    if bodies:
+    if bodies := [one for one in shown if one.body]:
         left = rrb.Vertical(_scene(bodies, title), words, row_shares=[3.0, 1.5])
         right = rrb.Vertical(*rows, row_shares=heights)
         root = rrb.Horizontal(left, right, column_shares=[1.0, 1.0]) if rows else left
@@ -225,8 +221,7 @@ def _both(shown: Sequence[Shown]) -> list[rrb.View]:
     found: list[rrb.View] = []
     if any(one.lines for one in shown):
         found.append(plot("Head, middle, tail [°]", [f"{LINES}/**"]))
-    powers = [f"{one.side.entity}{POWER}" for one in shown if one.content.has_power]
-    if powers:
+    if powers := [f"{one.side.entity}{POWER}" for one in shown if one.content.has_power]:
         found.append(plot("Mechanical power [W]", powers))
     return found
 
@@ -240,14 +235,9 @@ def _differences(shown: Sequence[Shown]) -> list[rrb.View]:
             plane = str(view.name).lower().replace("measured", "").strip()
             view.name = f"{one.side.name} − {first.side.name}, {plane}".replace(", [", " [")
             found.append(view)
-    apart = [f"{one.side.own}{SEPARATE}" for one in others if one.apart]
-    if apart:
+    if apart := [f"{one.side.own}{SEPARATE}" for one in others if one.apart]:
         found.append(plot("Heads apart [m]", apart))
     return found
-
-
-def _bars(quantities: Sequence[Quantity]) -> list[rrb.View]:
-    return [bar_chart(one.title, f"{BARS}/{one.key}/**") for one in quantities]
 
 
 def _bar_differences(one: Shown) -> list[rrb.View]:
@@ -263,7 +253,6 @@ def _words(shown: Sequence[Shown]) -> list[rrb.View]:
         rrb.TextDocumentView(name=one.side.name, contents=[f"{one.side.entity}{SESSION}"])
         for one in shown
     ]
-    events = [f"{one.side.entity}{lines.EVENTS}" for one in shown if one.content.has_events]
-    if events:
+    if events := [f"{one.side.entity}{lines.EVENTS}" for one in shown if one.content.has_events]:
         found.append(rrb.TextLogView(name="Events", contents=events))
     return found

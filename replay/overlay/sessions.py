@@ -23,8 +23,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from undulog.analysis.compare.alignment import facts_of
-from undulog.analysis.compare.side import ComparedSession, see
+from undulog.analysis.compare.side import ComparedSession, facts_of, see
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
@@ -257,8 +256,7 @@ def times_of(rhythm: Rhythm, cycles: FloatArray) -> tuple[IntArray, BoolArray]:
     Returns:
         Times [Unix ns], shape (n,), and whether each is known; 0 where it isn't.
     """
-    reached = np.maximum.accumulate(rhythm.cycles)
-    forward = np.flatnonzero(np.diff(reached, prepend=-np.inf) > 0)
+    forward = np.flatnonzero(np.diff(np.maximum.accumulate(rhythm.cycles), prepend=-np.inf) > 0)
     t_ns, at = rhythm.t_ns[forward], rhythm.cycles[forward]
     left = np.searchsorted(at, cycles, side="right") - 1
     last = at.size - 1
@@ -362,8 +360,7 @@ def placement_text(placed: Placement, name: str, first: str) -> str:
     Returns:
         One sentence without its full stop.
     """
-    step = math.hypot(placed.x, placed.y)
-    if step < _SAME_M and abs(placed.turn) < _SAME_RAD:
+    if math.hypot(placed.x, placed.y) < _SAME_M and abs(placed.turn) < _SAME_RAD:
         return f"{name} starts where {first} does"
     return (
         f"{name} is drawn where {first} starts: turned by {math.degrees(placed.turn):.1f}° about "
@@ -397,8 +394,7 @@ def _heading(one: Side, t_ns: int) -> float | None:
     """Return a body's heading in the cycle after a time [rad]; None if it isn't known."""
     times, rhythm = np.array([t_ns], dtype=np.int64), one.clock.rhythm
     if rhythm is not None:
-        cycle = interpolate(rhythm.t_ns, rhythm.cycles, times)
-        ends, known = times_of(rhythm, cycle + 1.0)
+        ends, known = times_of(rhythm, interpolate(rhythm.t_ns, rhythm.cycles, times) + 1.0)
         if known[0]:
             times = t_ns + np.arange(_INSTANTS) * (int(ends[0]) - t_ns) // _INSTANTS
     forward = _directions(one, times)

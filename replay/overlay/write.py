@@ -21,12 +21,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import rerun as rr
-import rerun.blueprint as rrb
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
-from undulog.analysis.compare.alignment import changes
 from undulog.analysis.compare.compare import Choices, compare_fitted
-from undulog.analysis.compare.side import ComparedSession
+from undulog.analysis.compare.side import ComparedSession, changes
 from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.files import check_stop
@@ -116,8 +114,6 @@ def _moved(chunk: Any, moves: dict[str, int]) -> Chunk:
 ANGLES = "/angles"
 """Differences of the measured angles, below a session's own path."""
 
-Layout = Callable[[Sequence[Shown], Sequence[draw.Quantity], Align, str], rrb.Blueprint]
-
 _APART_RATE_HZ = 25.0
 
 
@@ -172,7 +168,6 @@ def write_overlay(
     *,
     place: Place = Place.START,
     stop: StopRequest | None = None,
-    layout: Layout = build_blueprint,
 ) -> Overlay:
     """Combine converted sessions in one recording.
 
@@ -181,7 +176,6 @@ def write_overlay(
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
         place: Where the bodies are drawn.
         stop: Checked now and then; once a stop is requested, nothing is written.
-        layout: Makes the blueprint from what was written.
 
     Raises:
         LogWriteError: If the file can't be written, or a stop is requested.
@@ -211,7 +205,7 @@ def write_overlay(
             notes=warnings,
         )
         log_facts(rec, text, words.FACTS)
-        rec.send_blueprint(layout(shown, quantities, how, title))
+        rec.send_blueprint(build_blueprint(shown, quantities, how, title))
     return Overlay(path, identity, shown, found, placements, tuple(dict.fromkeys(warnings)))
 
 
@@ -242,13 +236,10 @@ def _placements(
     found: dict[str, Placement] = {}
     for one in bodies[1:] if place is Place.START else ():
         placed, first = placement(bodies[0], one, how), bodies[0].name
-        if placed is None:
-            warnings.append(
-                f"{one.name} and {first} have no body at a shared moment: each in its own world"
-            )
-        else:
-            found[one.name] = placed
-            warnings.append(placement_text(placed, one.name, first))
+        text = f"{one.name} and {first} have no body at a shared moment: each in its own world"
+        if placed is not None:
+            found[one.name], text = placed, placement_text(placed, one.name, first)
+        warnings.append(text)
     if len(bodies) > 1 and place is Place.WORLD:
         warnings.append("every body is drawn at the pose of its own session")
     return found
@@ -268,8 +259,7 @@ def _log(
     for rank, one in enumerate(sessions[1:], start=1):
         b, own = one.side, one.recording.content
         placed = placements.get(b.name, Placement())
-        places = draw.places_in(b, content.places, own.places)
-        lines = draw.log_lines(rec, b, rank, places)
+        lines = draw.log_lines(rec, b, rank, draw.places_in(b, content.places, own.places))
         angles = draw.angle_differences(a, b, how)
         angles = draw.log_differences(rec, a, f"{b.own}{ANGLES}", angles, content.measured)
         apart = _log_apart(rec, (a, b), how, placed, draw.tint(rank))
@@ -297,12 +287,12 @@ def _log_apart(
         return False
     t_ns = one.t_ns[decimate(one.t_ns, _APART_RATE_HZ)]
     apart = head_distance(a, b, how, placed, t_ns)
-    known = bool(np.isfinite(apart).any())
-    if known:
-        name = f"{b.name}, {a.name}"
-        table = Table((name,), t_ns, apart[:, None])
-        log_table(rec, a.clock, f"{b.own}{SEPARATE}", table, {name: color}, degrees=False)
-    return known
+    if not np.isfinite(apart).any():
+        return False
+    table = Table((f"{b.name}, {a.name}",), t_ns, apart[:, None])
+    colors = dict.fromkeys(table.names, color)
+    log_table(rec, a.clock, f"{b.own}{SEPARATE}", table, colors, degrees=False)
+    return True
 
 
 def _log_body(
@@ -353,7 +343,7 @@ def combine_sessions(
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
         names: What they are called, or None for the files' names.
         place: Where the bodies are drawn.
-        on_step: Told before each of :func:`steps` how many are done, and what comes.
+        on_step: Called before each of :func:`steps` with how many are done, and what comes.
         stop: Checked now and then; once a stop is requested, nothing is written.
 
     Raises:

@@ -236,8 +236,7 @@ class Layer:
         Args:
             computed: The session's analysis, or a note why there is none.
         """
-        notes = (*self.notes, *computed.notes)
-        return Layer(computed.analysis, computed.steady, self.named, notes)
+        return Layer(computed.analysis, computed.steady, self.named, (*self.notes, *computed.notes))
 
 
 Tab = Literal["session", "cycles", "mean-cycle"]

@@ -38,9 +38,8 @@ def mechanical_power(columns: Columns) -> tuple[Track, ...]:
     Returns:
         A track [W] for each joint with effort and velocity; positive where the joint drives.
     """
-    return products(
-        columns.get(("/joint_states", "effort"), ()), columns.get(("/joint_states", "velocity"), ())
-    )
+    effort, velocity = (columns.get(("/joint_states", one), ()) for one in ("effort", "velocity"))
+    return products(effort, velocity)
 
 
 def electrical_power(columns: Columns) -> tuple[Track, ...]:
@@ -160,8 +159,7 @@ def quantities(columns: Columns) -> dict[str, tuple[Track, ...]]:
         MECHANICAL: mechanical,
     }
     for kind, tracks in (("electrical", electrical), ("mechanical", mechanical)):
-        whole = total(tracks)
-        if whole is not None:
+        if (whole := total(tracks)) is not None:
             found[f"{TOTAL}/{kind}"] = (whole,)
     found |= {
         topic_entity(SIGNALS, topic): tracks

@@ -15,7 +15,6 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import DataError, MissingChannelError
-from undulog.capture.robot.model import Robot
 
 from .content import MEASURED, MECHANICAL
 from .quantities import power_limit, quantities, segment_power
@@ -113,7 +112,9 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
             if entity == MEASURED:
                 times.append(tracks[0].t_ns[decimate(tracks[0].t_ns, rate_hz)])
             if entity == MECHANICAL and session.robot is not None:
-                powers.append(_segments(session.robot, tracks, thin))
+                at_ns = tracks[0].t_ns[::thin]
+                power = resampled(tracks, names, at_ns, interpolate)
+                powers.append(segment_power(power))
     return Survey(
         wanted={topic: fields for topic, fields in wanted.items() if fields},
         samples={
@@ -164,10 +165,8 @@ def _carried(session: SessionView) -> dict[str, list[str]]:
     try:
         session.joint_columns(wanted, stop_ns=stop_ns)
     except (MissingChannelError, DataError):
-        return {
-            topic: [one for one in fields if comes(session, topic, one)]
-            for topic, fields in wanted.items()
-        }
+        every = wanted.items()
+        return {k: [one for one in fields if comes(session, k, one)] for k, fields in every}
     return wanted
 
 
@@ -178,12 +177,6 @@ def comes(session: SessionView, topic: str, one: str) -> bool:
     except (MissingChannelError, DataError):
         return False
     return True
-
-
-def _segments(robot: Robot, tracks: Sequence[Track], thin: int) -> FloatArray:
-    """Power of the links at some times [W], shape (n, links)."""
-    at_ns = tracks[0].t_ns[::thin]
-    return segment_power(resampled(tracks, robot.joint_names, at_ns, interpolate))
 
 
 def _parts(tracks: Sequence[Track], *, turns: bool) -> list[tuple[str, ...]]:

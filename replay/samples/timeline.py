@@ -81,12 +81,8 @@ def stretches(
         low = start_ns + i * length_ns if i else None
         high = start_ns + (i + 1) * length_ns if i + 1 < count else None
         known_ns = None if high is None else high + context_ns
-        columns = read_columns(
-            session,
-            wanted,
-            start_ns=None if low is None else low - context_ns,
-            stop_ns=known_ns,
-        )
+        begin_ns = None if low is None else low - context_ns
+        columns = read_columns(session, wanted, start_ns=begin_ns, stop_ns=known_ns)
         span = Span(_FIRST_NS if low is None else low, _LAST_NS if high is None else high, known_ns)
         session.forget()
         yield Stretch(span, columns)

@@ -138,10 +138,8 @@ def read_columns(
 
 
 def _tracks(signals: JointSignals) -> tuple[Track, ...]:
-    tracks = [
-        without_filler(Track(name, *ordered(t_ns, values)))
-        for name, t_ns, values in zip(signals.names, signals.t_ns, signals.values, strict=True)
-    ]
+    rows = zip(signals.names, signals.t_ns, signals.values, strict=True)
+    tracks = [without_filler(Track(name, *ordered(t_ns, values))) for name, t_ns, values in rows]
     return tuple(track for track in tracks if np.isfinite(track.values).any())
 
 
@@ -155,9 +153,8 @@ def without_filler(track: Track) -> Track:
         The track without its NaN where they are half or more, else the track itself.
     """
     known = np.isfinite(track.values)
-    if 2 * np.count_nonzero(known) > known.size:
-        return track
-    return Track(track.name, track.t_ns[known], track.values[known])
+    whole = 2 * np.count_nonzero(known) > known.size
+    return track if whole else Track(track.name, track.t_ns[known], track.values[known])
 
 
 def pairs(first: Sequence[Track], second: Sequence[Track]) -> list[tuple[Track, Track]]:
@@ -185,14 +182,12 @@ def tables(tracks: Sequence[Track]) -> tuple[Table, ...]:
     together: dict[bytes, list[Track]] = {}
     for track in tracks:
         together.setdefault(track.t_ns.tobytes(), []).append(track)
-    return tuple(
-        Table(
-            tuple(track.name for track in group),
-            group[0].t_ns,
-            np.stack([track.values for track in group], axis=1),
-        )
-        for group in together.values()
-    )
+
+    def table(group: Sequence[Track]) -> Table:
+        values = np.stack([track.values for track in group], axis=1)
+        return Table(tuple(track.name for track in group), group[0].t_ns, values)
+
+    return tuple(map(table, together.values()))
 
 
 def in_turn(first: IntArray, other: IntArray) -> bool:
@@ -339,10 +334,8 @@ def mark_gaps(
         before = np.append(before, t_ns.size - 1)
     if not before.size:
         return t_ns, values
-    return (
-        np.insert(t_ns, before + 1, t_ns[before] + step),
-        np.insert(values, before + 1, np.nan, axis=0),
-    )
+    after = before + 1
+    return np.insert(t_ns, after, t_ns[before] + step), np.insert(values, after, np.nan, axis=0)
 
 
 def decimate(t_ns: IntArray, rate_hz: float) -> IntArray:
@@ -362,8 +355,7 @@ def decimate(t_ns: IntArray, rate_hz: float) -> IntArray:
         return np.zeros(0, dtype=np.int64)
     period = round(1e9 / rate_hz)
     slot = (t_ns - t_ns[0] + period // 4) // period
-    first = np.flatnonzero(np.diff(slot, prepend=slot[0] - 1))
-    return first.astype(np.int64)
+    return np.flatnonzero(np.diff(slot, prepend=slot[0] - 1)).astype(np.int64)
 
 
 def interpolate(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArray:
@@ -388,8 +380,7 @@ def interpolate(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArr
     exact = inside & (t_ns[np.maximum(left, 0)] == at_ns)
     found[exact] = values[left[exact]]
     if t_ns.size > 1:
-        joined = np.append(~gaps(t_ns), False)
-        between = inside & ~exact & joined[np.maximum(left, 0)]
+        between = inside & ~exact & np.append(~gaps(t_ns), False)[np.maximum(left, 0)]
         i = left[between]
         share = (at_ns[between] - t_ns[i]) / (t_ns[i + 1] - t_ns[i])
         share = share.reshape(-1, *[1] * (values.ndim - 1))

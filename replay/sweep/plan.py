@@ -123,24 +123,11 @@ class SweepPlan:
         """Yield keys that don't fit together, and what would be valid."""
         if (self.points is None) != (self.design is Design.GRID):
             yield "points", "a number for the designs random and sobol, none for grid"
-        keys = {one.key for one in self.parameters}
-        if self.duration_s is not None and "duration_s" in keys:
+        if self.duration_s is not None and "duration_s" in {one.key for one in self.parameters}:
             yield "duration_s", "left out, since it is a parameter"
         ranges = [one.key for one in self.parameters if not one.values]
         if self.design is Design.GRID and ranges:
             yield "design", f"random or sobol, since {ranges[0]} has a range instead of values"
-
-
-@dataclass(frozen=True)
-class PlannedRun:
-    """One run of a sweep.
-
-    Attributes:
-        changes: Key to value of its point in the design.
-    """
-
-    changes: dict[str, Any]
-    seed: int
 
 
 def read_plan(path: Path) -> SweepPlan:
@@ -159,7 +146,8 @@ def read_plan(path: Path) -> SweepPlan:
     top = Table(values, "", faults)
     plan = read_fields(top, SweepPlan, parameters=lambda: _parameters(top))
     top.close()
-    runs = _count(plan)
+    points = plan.points or math.prod(len(one.values) for one in plan.parameters)
+    runs = points * plan.seeds
     if runs > MOST_RUNS:
         top.fault("points", f"at most {MOST_RUNS} runs", str(runs))
     if found := faults.all():
@@ -200,11 +188,6 @@ def _parameter(key: str, table: Table) -> Parameter:
     return one
 
 
-def _count(plan: SweepPlan) -> int:
-    points = plan.points or math.prod(len(one.values) for one in plan.parameters)
-    return points * plan.seeds
-
-
 def points_of(plan: SweepPlan) -> list[dict[str, Any]]:
     """Return the points of a design: key to value of each.
 
@@ -212,10 +195,8 @@ def points_of(plan: SweepPlan) -> list[dict[str, Any]]:
     """
     keys = [one.key for one in plan.parameters]
     if plan.design is Design.GRID:
-        return [
-            dict(zip(keys, values, strict=True))
-            for values in itertools.product(*(one.values for one in plan.parameters))
-        ]
+        every = itertools.product(*(one.values for one in plan.parameters))
+        return [dict(zip(keys, values, strict=True)) for values in every]
     count = plan.points or 0
     if plan.design is Design.SOBOL:
         from scipy.stats.qmc import Sobol
@@ -230,9 +211,7 @@ def points_of(plan: SweepPlan) -> list[dict[str, Any]]:
     ]
 
 
-def runs_of(plan: SweepPlan) -> Iterator[PlannedRun]:
-    """Yield the runs of a plan: each point with each seed."""
+def runs_of(plan: SweepPlan) -> Iterator[tuple[dict[str, Any], int]]:
+    """Yield the runs of a plan: the changes of each point with each seed."""
     seeds = range(plan.first_seed, plan.first_seed + plan.seeds)
-    for changes in points_of(plan):
-        for seed in seeds:
-            yield PlannedRun(changes, seed)
+    yield from itertools.product(points_of(plan), seeds)

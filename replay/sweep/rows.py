@@ -94,15 +94,12 @@ class RowStore:
             InputFileError: If a file of rows can't be read.
         """
         columns = ["key", "status", "session"]
-        self._pending = 0
-        done: dict[str, Row] = {}
-        for row in self._pending_rows():
-            done[row["key"]] = {name: row.get(name, "") for name in columns}
-            self._pending += 1
+        pending = list(self._pending_rows())
+        self._pending = len(pending)
+        rows = [{name: row.get(name, "") for name in columns} for row in pending]
         for path in self._row_files():
-            for row in self._store.read_table(path, columns).to_pylist():
-                done[row["key"]] = row
-        return done
+            rows += self._store.read_table(path, columns).to_pylist()
+        return {row["key"]: row for row in rows}
 
     def settle(self, digest: str, setting: Mapping[str, Any]) -> None:
         """Store what the rows of a setting share.
@@ -184,8 +181,7 @@ class RowStore:
                 shutil.move(path, f"{goal}.part")
                 Path(f"{goal}.part").replace(goal)
             else:
-                filesystem = self._store.filesystem
-                _FS.copy_files(path.as_posix(), goal, _FS.LocalFileSystem(), filesystem)
+                _FS.copy_files(path.as_posix(), goal, _FS.LocalFileSystem(), self._store.filesystem)
         except OSError as error:
             raise LogWriteError(f"{self.where}/{name}", str(error)) from error
         return name

@@ -24,7 +24,7 @@ from typing import Any
 import tomlkit
 
 from undulog.analysis.results.analysis import Analysis
-from undulog.analysis.results.estimate import Estimate, Interval
+from undulog.analysis.results.estimate import Interval
 from undulog.analysis.session.analyse import analyse_session
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session
@@ -40,7 +40,6 @@ from undulog.sim.twin.recording import record
 from .rows import Row, RowStore
 
 _PACKAGES = ("numpy", "scipy", "pandas", "pybullet", "mujoco", "numba", "mcap")
-_ESTIMATES = ("gain", "lag_rad")
 _OF_JOINTS = ("command_amplitude_rad", "energy_net_j", "energy_abs_j", "energy_el_j")
 
 
@@ -215,11 +214,9 @@ def run_job(setting: Setting, job: Job) -> Row:
         UndulogError: If its session can't be kept.
     """
     if (here := software()) != setting.software:
-        other = [
-            f"{name} {here.get(name)} instead of {setting.software.get(name)}"
-            for name in sorted({*here, *setting.software})
-            if here.get(name) != setting.software.get(name)
-        ]
+        there = setting.software
+        names = (name for name in sorted({*here, *there}) if here.get(name) != there.get(name))
+        other = [f"{name} {here.get(name)} instead of {there.get(name)}" for name in names]
         raise UsageError(f"worker {_worker()} has other software: {', '.join(other)}")
     start = time.perf_counter()
     row = row_of(job)
@@ -228,7 +225,7 @@ def run_job(setting: Setting, job: Job) -> Row:
         try:
             row |= _results(setting, job, path)
             row |= {"status": "done", "error": ""}
-        except Exception as error:  # noqa: BLE001 - its row tells of it, and others go on
+        except Exception as error:  # noqa: BLE001 - its row names it, and others go on
             text = f"{type(error).__name__}: {error}"
             if not isinstance(error, UndulogError):
                 last = traceback.extract_tb(error.__traceback__)[-1]
@@ -276,16 +273,15 @@ def result_columns(result: Analysis) -> Row:
         "joint": [one.name for one in joints],
         **{name: [getattr(one, name) for one in joints] for name in _OF_JOINTS},
     }
-    for name in _ESTIMATES:
-        estimates: list[Estimate] = [getattr(one, name) for one in joints]
-        columns |= _columns(name, [(one.value, one.ci95) for one in estimates])
+    columns |= _columns("gain", [(one.gain.value, one.gain.ci95) for one in joints])
+    columns |= _columns("lag_rad", [(one.lag_rad.value, one.lag_rad.ci95) for one in joints])
     single = {"frequency_hz": result.gait.frequency_hz, **result.heterogeneity}
     if result.energy is not None:
         transport = result.energy.transport
         single |= {"distance_m": transport.distance_m, "cost_of_transport": transport.abs}
     for name, one in single.items():
-        for column, (value,) in _columns(name, [(one.value, one.ci95)]).items():
-            columns[column] = value
+        own = _columns(name, [(one.value, one.ci95)])
+        columns |= {column: value for column, (value,) in own.items()}
     return columns
 
 

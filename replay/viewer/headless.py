@@ -97,11 +97,8 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
     def complaints(self) -> list[str]:
         """Return the errors that the views report."""
         self.picture()
-        return [
-            f"{view.name}: {report.summary}"
-            for view in self._client.get_state().views
-            for report in view.reports
-        ]
+        views = self._client.get_state().views
+        return [f"{view.name}: {one.summary}" for view in views for one in view.reports]
 
     def picture(self, view: str | None = None) -> bytes:
         """Return a picture, once two shots in a row agree.

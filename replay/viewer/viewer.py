@@ -1,6 +1,6 @@
 """Rerun's own viewer as a process of ours, reachable from this machine only.
 
-Rerun's ``spawn`` and ``serve`` listen on all interfaces unless told; here every server is bound to
+Rerun's ``spawn`` and ``serve`` listen on all interfaces by default; here every server is bound to
 127.0.0.1.
 """
 
@@ -85,17 +85,13 @@ class Viewer(AbstractContextManager["Viewer"]):
         """Where a recording stream connects to."""
         # The viewer leaves a folder behind when it is terminated; it is removed with ours.
         self._scratch = tempfile.TemporaryDirectory(prefix="undulog-viewer-")
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
-        self._told_to_end = False
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
+        self._closing = False
         self._process = subprocess.Popen(  # noqa: S603  our own arguments
-            [
-                str(binary),
-                *("--bind", LOOPBACK, "--port", str(self._port)),
-                *arguments,
-            ],
+            [str(binary), "--bind", LOOPBACK, "--port", str(self._port), *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            stderr=self._said,
+            stderr=self._errors,
             env={**os.environ, "TMPDIR": self._scratch.name},
             process_group=0,  # a Ctrl-C ends it through us
         )
@@ -148,20 +144,20 @@ class Viewer(AbstractContextManager["Viewer"]):
         Raises:
             UndulogError: If it has ended, and neither by closing its window nor by us.
         """
-        if self._told_to_end or not self._process.poll():
+        if self._closing or not self._process.poll():
             return
         code = self._process.returncode
         if code < 0:
             raise UndulogError(f"the Rerun viewer was ended by signal {-code}")
-        self._said.seek(0)
-        said = self._said.read().decode(errors="replace").splitlines()
-        lines = [line for line in said if "Error" in line] or said[-3:]
+        self._errors.seek(0)
+        text = self._errors.read().decode(errors="replace").splitlines()
+        lines = [line for line in text if "Error" in line] or text[-3:]
         reason = " ".join(line.strip() for line in lines) or f"exit code {code}"
         raise UndulogError(f"the Rerun viewer failed: {reason}")
 
     def close(self) -> None:
         """End it, frozen or not; safe to call twice."""
-        self._told_to_end = self._told_to_end or not self.ended
+        self._closing = self._closing or not self.ended
         if not self.ended:
             self._process.terminate()
             try:
@@ -170,7 +166,7 @@ class Viewer(AbstractContextManager["Viewer"]):
                 self._process.kill()
         self._process.wait()
         self._scratch.cleanup()
-        self._said.close()
+        self._errors.close()
 
 
 def open_window(*options: str) -> Viewer:

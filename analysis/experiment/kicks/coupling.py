@@ -36,7 +36,6 @@ from .local import (
     LocalMatrices,
     MeasuredDerivatives,
     ResponseMatrices,
-    RowSums,
     local_matrices,
     lti_reading,
     nonlinearity,
@@ -192,16 +191,14 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
     m = len(experiment.names)
     plan = f"phase-kicks around this gait ({4 * m} runs and one without a kick)"
     known = np.isfinite(experiment.ratio[used])
-    lost = [name for i, name in enumerate(experiment.names) if not known[:, i].all()]
-    if lost:
+    if lost := [name for i, name in enumerate(experiment.names) if not known[:, i].all()]:
         return Coupling(
             identifiable=False,
             why=f"{', '.join(lost)}: gain and lag are not known in every run, so rows of the "
             "matrices are missing",
             record=plan,
         )
-    lacking = missing_kicks(list(kicks.values()), Kind.PHASE, experiment.names)
-    if lacking:
+    if lacking := missing_kicks(list(kicks.values()), Kind.PHASE, experiment.names):
         return Coupling(
             identifiable=False,
             why="central differences need each joint's phase kicked both up and down by the same "
@@ -211,9 +208,8 @@ def kick_coupling(experiment: KickExperiment, warn: Warn) -> Coupling:
     first = experiment.ratio[experiment.runs.base[0]]
     others = np.log(experiment.ratio[list(experiment.runs.base)] / first)
     base = (first * np.exp(others.mean(axis=0))).astype(np.complex128)
-    deviation = experiment.runs.deviation
     # ln a = ln c + ln H, and both of a run's phases are counted from the same instant.
-    change = deviation + np.log(experiment.ratio / base)
+    change = experiment.runs.deviation + np.log(experiment.ratio / base)
     each = [kicks.get(k) for k in used]
     answers = ResponseMatrices(
         change, experiment.log_gain_variance, experiment.lag_variance, experiment.dof
@@ -316,7 +312,7 @@ def _held_out(
     )
 
 
-def _rows(names: Sequence[str], sums: RowSums, expected: float) -> tuple[RowCheck, ...]:
+def _rows(names: Sequence[str], sums: MeasuredDerivatives, expected: float) -> tuple[RowCheck, ...]:
     """Return sums with their intervals, one by one."""
     half = sums.error * stdtrit(sums.dof, 0.5 + CONFIDENCE / 2)
     return tuple(

@@ -105,21 +105,6 @@ class MeasuredDerivatives:
         return self.error * stdtrit(self.dof, 1 - (1 - CONFIDENCE) / (2 * m * (m - 1)))
 
 
-@dataclass(frozen=True)
-class RowSums:
-    """Sums over the columns.
-
-    Attributes:
-        value: Shape (m,).
-        error: Standard errors, shape (m,).
-        dof: Their degrees of freedom, shape (m,).
-    """
-
-    value: FloatArray
-    error: FloatArray
-    dof: FloatArray
-
-
 def central_differences(
     kicks: Sequence[Kick], answers: ResponseMatrices, kind: Kind
 ) -> tuple[MeasuredDerivatives, MeasuredDerivatives]:
@@ -158,15 +143,13 @@ def central_differences(
         # All runs share the estimate of what is between them: its freedom doesn't add up.
         dof[:, :, j] = within if errors is None else np.where(between > 0, errors.dof, within)
     error = np.sqrt(variance)
-    shared = (None, None)
-    if errors is not None:
-        shared = (errors.correlation[:m, :m], errors.correlation[m:, m:])
-    return MeasuredDerivatives(value[0], error[0], dof[0], shared[0]), MeasuredDerivatives(
-        value[1], error[1], dof[1], shared[1]
-    )
+    both = None if errors is None else errors.correlation
+    shared = (None, None) if both is None else (both[:m, :m], both[m:, m:])
+    phase, log_gain = map(MeasuredDerivatives, value, error, dof, shared)
+    return phase, log_gain
 
 
-def row_sums(matrix: MeasuredDerivatives) -> RowSums:
+def row_sums(matrix: MeasuredDerivatives) -> MeasuredDerivatives:
     """Return sums over the columns: 1 for P, 0 for R, by time shift.
 
     Args:
@@ -179,7 +162,7 @@ def row_sums(matrix: MeasuredDerivatives) -> RowSums:
     parts = matrix.error.T**2
     shared = matrix.correlation is not None
     dof = matrix.dof.min(axis=1) if shared else welch_satterthwaite(parts, matrix.dof.T)
-    return RowSums(matrix.value.sum(axis=1), np.sqrt(parts.sum(axis=0)), dof)
+    return MeasuredDerivatives(matrix.value.sum(axis=1), np.sqrt(parts.sum(axis=0)), dof)
 
 
 def nonlinearity(
@@ -206,11 +189,8 @@ def nonlinearity(
     """
     m = len(P.value)
     noise = noise_draws(stacked(((P, S), (R, G)), correlation), 1)
-    of_p, of_s, of_r, of_g = (
-        noise[:, rows, columns]
-        for rows in (slice(m), slice(m, None))
-        for columns in (slice(m), slice(m, None))
-    )
+    halves = (slice(m), slice(m, None))
+    of_p, of_s, of_r, of_g = (noise[:, rows, columns] for rows in halves for columns in halves)
     return norm_ratio(
         np.stack([G.value - P.value, S.value + R.value]),
         np.stack([of_g - of_p, of_s + of_r], axis=1),
@@ -229,11 +209,9 @@ def stacked(
             the same kicks.
         correlation: Of a column's errors.
     """
-    value, error, dof = (
-        np.block([[getattr(one, part) for one in row] for row in blocks])
-        for part in ("value", "error", "dof")
-    )
-    return MeasuredDerivatives(value, error, dof, correlation)
+    parts = ("value", "error", "dof")
+    stack = (np.block([[getattr(one, part) for one in row] for row in blocks]) for part in parts)
+    return MeasuredDerivatives(*stack, correlation)
 
 
 BANDS = (1, 2, 3)
@@ -273,8 +251,7 @@ def lti_reading(
         X: ComplexArray = np.linalg.inv(H).astype(np.complex128)
         draws = noise_draws(stacked(((P,), (R,)), correlation), 11)
         noise = scale * (draws[:, : len(H)] - 1j * draws[:, len(H) :])
-        error: ComplexArray = np.linalg.inv(H + noise).astype(np.complex128) - X
-        shape = reciprocity(X, error)
+        shape = reciprocity(X, np.linalg.inv(H + noise).astype(np.complex128) - X)
     finite = condition if np.isfinite(condition) else None
     return Lti(LTI_LABEL, rows_of(H.real), rows_of(H.imag), finite, *shape)
 
@@ -315,11 +292,8 @@ def squared(share: Estimate) -> Estimate:
     """
     if share.value is None:
         return share
-    ci95 = share.ci95
-    return Estimate(
-        min(1.0, share.value**2),
-        None if ci95 is None else (min(1.0, ci95[0] ** 2), min(1.0, ci95[1] ** 2)),
-    )
+    value, *ends = (min(1.0, one**2) for one in (share.value, *(share.ci95 or ())))
+    return Estimate(value, (ends[0], ends[1]) if ends else None)
 
 
 ROW_TOLERANCE = 1e-2
@@ -349,8 +323,8 @@ class LocalMatrices:
     S: MeasuredDerivatives | None
     errors: RunErrors
     steady_errors: RunErrors
-    phase_rows: RowSums
-    gain_rows: RowSums
+    phase_rows: MeasuredDerivatives
+    gain_rows: MeasuredDerivatives
     agree: BoolArray
     widened: FloatArray
 
@@ -385,21 +359,19 @@ def local_matrices(
     )
     sums = [row_sums(one) for one in differences(without, Kind.PHASE)]
     agree = np.stack([_agree(one, to) for one, to in zip(sums, (1.0, 0.0), strict=True)])
-    widened = np.stack(
-        [_widening(one, to, good) for one, to, good in zip(sums, (1.0, 0.0), agree, strict=True)]
-    )
+    widened = np.stack(list(map(_widening, sums, (1.0, 0.0), agree)))
     P, R = _widen(differences(errors, Kind.PHASE), widened)
     S, G = _widen(differences(errors, Kind.AMPLITUDE), widened) if amplitude else (None, None)
     return LocalMatrices(P, R, G, S, errors, steady, sums[0], sums[1], agree, widened)
 
 
-def _agree(sums: RowSums, expected: float) -> BoolArray:
+def _agree(sums: MeasuredDerivatives, expected: float) -> BoolArray:
     """Return whether each sum is as expected, all 2 m of P and R together at 95 %."""
     quantile = stdtrit(sums.dof, 1 - (1 - CONFIDENCE) / (4 * len(sums.value)))
     return np.abs(sums.value - expected) <= ROW_TOLERANCE + sums.error * quantile
 
 
-def _widening(sums: RowSums, expected: float, agree: BoolArray) -> FloatArray:
+def _widening(sums: MeasuredDerivatives, expected: float, agree: BoolArray) -> FloatArray:
     """Return the factor on each row's errors; 1 where all sums agree."""
     if agree.all():
         return np.ones(len(agree))

@@ -82,15 +82,13 @@ def closed_loop(
         for k, rate in enumerate(modes_here.rates.tolist())
     )
     omega = 2 * math.pi * base.frequency_hz
-    spread = here - here.mean(axis=0)
-    fastest = eps * float(np.linalg.norm(spread, ord=2))
+    fastest = eps * float(np.linalg.norm(here - here.mean(axis=0), ord=2))
     relaxed = None
     if kick:
         turned = np.array([kick.get(name, 0.0) for name in coupling.joints])
         slowest = eps * max(abs(modes_here.gap), 1e-9)
         end = min(3 / slowest, 100 / base.frequency_hz) if until_s is None else until_s
         relaxed = _relaxed(eps * here, eps * drawn, turned, end)
-    limits = tuple(_limits(coupling, fastest, omega, kick or {}))
     return ClosedLoop(
         answer=_answer(modes, eps),
         joints=coupling.joints,
@@ -104,7 +102,7 @@ def closed_loop(
         relaxation=relaxed,
         valid_to=coupling.valid_to,
         fastest=fastest,
-        limits=limits,
+        limits=tuple(_limits(coupling, fastest, omega, kick or {})),
     )
 
 
@@ -194,11 +192,10 @@ def _answer(modes: tuple[LoopMode, ...], eps: float) -> str:
     slowest = modes[0].rate
     grows = sum(one.rate.ci95 is not None and one.rate.ci95[1] < 0 for one in modes)
     relaxes = sum(one.rate.ci95 is not None and one.rate.ci95[0] > 0 for one in modes)
-    opened = len(modes) - grows - relaxes
     counts = (
         (relaxes, "relaxes", "relax"),
         (grows, "grows", "grow"),
-        (opened, "may do either", "may do either"),
+        (len(modes) - grows - relaxes, "may do either", "may do either"),
     )
     parts = [f"{count} {one if count == 1 else more}" for count, one, more in counts if count]
     return (

@@ -68,8 +68,7 @@ class RunErrors:
         size = np.sqrt(np.sum(np.square(self.draws), axis=0))
         unit = np.divide(self.draws, size, out=np.zeros_like(self.draws), where=size > 0)
         m = unit.shape[1] // 2
-        lacking = len(self.draws) - self.dof
-        more = self.dof / max(self.dof - lacking, 1)
+        more = self.dof / max(self.dof - (len(self.draws) - self.dof), 1)
         same = np.tile(np.eye(m, dtype=bool), (2, 2))
         found = np.clip((unit.T @ unit) * np.where(same, 1.0, more), -1.0, 1.0)
         np.fill_diagonal(found, 1.0)
@@ -110,8 +109,7 @@ def run_errors(
         length = float(np.linalg.norm(alone))
         draws = np.vstack([draws, (left - along @ draws) / length])
         even = np.vstack([even, alone / length])
-    share = np.mean(np.square(even) @ variance, axis=0)
-    return RunErrors(draws, share, len(draws) - left_out)
+    return RunErrors(draws, np.mean(np.square(even) @ variance, axis=0), len(draws) - left_out)
 
 
 def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray:
@@ -125,12 +123,10 @@ def _without_own(kicks: Sequence[Kick | None], values: FloatArray) -> FloatArray
         pairs = sides(kicks, kind)
         if len(pairs) < 2:
             continue
-        middle = np.array(
-            [
-                (values[up].mean(axis=0) + values[down].mean(axis=0)) / 2
-                for up, down in pairs.values()
-            ]
-        )
+        means = [
+            (values[up].mean(axis=0), values[down].mean(axis=0)) for up, down in pairs.values()
+        ]
+        middle = np.array([(high + low) / 2 for high, low in means])
         for k, (joint, (up, down)) in enumerate(pairs.items()):
             own = [joint, m + joint]
             others = np.delete(middle[:, own], k, axis=0).mean(axis=0)
@@ -215,8 +211,7 @@ def sides(kicks: Sequence[Kick | None], kind: Kind) -> dict[int, tuple[list[int]
 
 
 def _mean_size(kicks: Sequence[Kick | None], chosen: Sequence[int]) -> float:
-    sizes = [one.size for k in chosen if (one := kicks[k]) is not None]
-    return float(np.mean(sizes))
+    return float(np.mean([one.size for k in chosen if (one := kicks[k]) is not None]))
 
 
 def _orthonormal(rows: Sequence[FloatArray], count: int) -> FloatArray:

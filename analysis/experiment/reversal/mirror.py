@@ -114,8 +114,6 @@ def mirror_test(
     forward: ComplexArray,
     reverse: ComplexArray,
     strata: tuple[IntArray, IntArray] | None = None,
-    *,
-    seed: int = 1,
 ) -> MirrorTest:
     """Test identical modules by reversal.
 
@@ -124,7 +122,6 @@ def mirror_test(
         reverse: y of the runs the other way, shape (r2, m), joints from head to tail.
         strata: Stratum of each run of either way, shapes (r1,) and (r2,); runs of one stratum are
             mirror images of each other whatever the floor. All runs are in one where it is None.
-        seed: Of the random labellings, where there are too many to try all.
 
     Raises:
         UsageError: If a way has fewer than ``MIN_RUNS`` runs in a stratum, or the joints are not
@@ -144,13 +141,12 @@ def mirror_test(
     if strata is None:
         strata = np.zeros(r1, dtype=np.int64), np.zeros(r2, dtype=np.int64)
     design = Strata.of(*strata)
-    mirrored = reverse[:, ::-1]
-    both = np.concatenate([forward, mirrored])
+    both = np.concatenate([forward, reverse[:, ::-1]])
     half = m // 2
     # Contrast and common are taken run by run: both joints of a pair share what a run does to all.
     odd, even = (both - both[:, ::-1]) / 2, (both + both[:, ::-1]) / 2
     columns = np.concatenate([parts(odd[:, :half]), parts(even[:, : m - half])], axis=1)
-    labels = design.labellings(seed)
+    labels = design.labellings()
     scores = np.abs(design.scores(columns, labels))
     p = family_wise_p(scores)
     noise_only = np.abs(design.scores(design.residuals(parts(both)), labels))
@@ -239,7 +235,7 @@ class Strata:
         precision = self.plus * self.minus / (self.plus + self.minus)
         return precision / precision.sum()
 
-    def labellings(self, seed: int = 1) -> BoolArray:
+    def labellings(self) -> BoolArray:
         """Return ways to choose which runs of each stratum are called '+'.
 
         Returns:
@@ -252,7 +248,7 @@ class Strata:
         observed = np.arange(len(self.index)) < int(self.plus.sum())
         own: list[IntArray] = [np.flatnonzero(self.index == s) for s in range(self.strata)]
         if self.count > MOST_LABELLINGS:
-            random = np.random.default_rng(seed)
+            random = np.random.default_rng(1)
             drawn = np.zeros((RANDOM_LABELLINGS, len(self.index)), dtype=np.bool_)
             for runs, plus in zip(own, self.plus.tolist(), strict=True):
                 order = random.random((RANDOM_LABELLINGS, len(runs))).argsort(axis=1)
@@ -317,8 +313,7 @@ class Strata:
             - runs[(self.index == s) & ~plus].mean(axis=0)
             for s in range(self.strata)
         ]
-        mean: ComplexArray = (self.weights[:, None] * np.stack(each)).sum(axis=0)
-        return mean
+        return (self.weights[:, None] * np.stack(each)).sum(axis=0)
 
     def residuals(self, runs: FloatArray) -> FloatArray:
         """Subtract the mean of each run's way in its stratum.
@@ -375,5 +370,4 @@ def family_wise_p(scores: FloatArray) -> FloatArray:
     Returns:
         Share of the labellings whose largest abs(t) reaches each observed abs(t), shape (..., c).
     """
-    largest = scores.max(axis=-1)[..., :, None]
-    return np.mean(largest >= scores[..., :1, :] * (1 - _TIE), axis=-2)
+    return np.mean(scores.max(axis=-1)[..., :, None] >= scores[..., :1, :] * (1 - _TIE), axis=-2)

@@ -149,8 +149,7 @@ def common_ratio(forward: ComplexArray, reverse: ComplexArray) -> Estimate:
     # The bootstrap adds the noise once more, which is subtracted once more.
     powers = np.sum(np.abs(drawn[0] - drawn[1]) ** 2, axis=-1) - 2 * noise[:, None]
     ratios = np.sqrt(np.maximum(powers[0], 0.0) / np.maximum(powers[1], np.finfo(np.float64).tiny))
-    value = float(np.sqrt(max(power[0], 0.0) / power[1]))
-    return Estimate(value, _percentiles(ratios))
+    return Estimate(float(np.sqrt(max(power[0], 0.0) / power[1])), _percentiles(ratios))
 
 
 def heading_strata(forward: FloatArray, reverse: FloatArray) -> tuple[IntArray, IntArray] | None:
@@ -227,8 +226,7 @@ def variance_shares(forward: ComplexArray, reverse: ComplexArray) -> Shares:
     mirrored = reverse[:, ::-1]
     random = np.random.default_rng(1)
     noise = np.stack([_noise(forward), _noise(mirrored)])
-    means = np.stack([forward.mean(axis=0), mirrored.mean(axis=0)])
-    module, boundary = _variances(means, noise)
+    module, boundary = _variances(np.stack([forward.mean(axis=0), mirrored.mean(axis=0)]), noise)
     drawn = np.stack([_resampled(one, random) for one in (forward, mirrored)])
     modules, boundaries = _variances(drawn, 2 * noise)
     whole, wholes = module + boundary, modules + boundaries
@@ -316,8 +314,7 @@ def reversal_of(
     shares = variance_shares(forward, reverse)
     half = test.critical * test.error
     bounds = (np.abs([test.difference.real, test.difference.imag]) + half).max(axis=1)
-    every = all(np.isfinite(one).all() for one in known)
-    kind = Headings.UNBALANCED if every else Headings.UNKNOWN
+    kind = Headings.UNBALANCED if all(np.isfinite(one).all() for one in known) else Headings.UNKNOWN
     if strata is not None:
         kind = Headings.BALANCED
     return Reversal(

@@ -117,11 +117,10 @@ def impedance(response: Phasors, torque: Phasors) -> MeasuredMatrix:
     parts = np.stack([torque.variance, through])
     # A joint's torque with its own few bins, the responses together with no fewer than the least.
     least = np.broadcast_to(response.dof.min(axis=0), torque.dof.shape)
-    dof = welch_satterthwaite(parts, np.stack([torque.dof, least]))
     return MeasuredMatrix(
         Z,
         np.sqrt(variance @ power),
-        _dof(variance, dof, power),
+        _dof(variance, welch_satterthwaite(parts, np.stack([torque.dof, least])), power),
         float(np.linalg.cond(response.value)),
         (torque.draws(22) - Z @ response.draws(23)) @ weights,
     )
@@ -133,8 +132,7 @@ def inverse(H: MeasuredMatrix) -> ComplexArray:
     Returns:
         Shape (DRAWS, m, m).
     """
-    X = np.linalg.inv(H.value)
-    return (np.linalg.inv(H.value + H.draws) - X).astype(np.complex128)
+    return (np.linalg.inv(H.value + H.draws) - np.linalg.inv(H.value)).astype(np.complex128)
 
 
 def impedance_behind_servos(
@@ -153,8 +151,7 @@ def impedance_behind_servos(
     """
     X: ComplexArray = np.linalg.inv(H.value).astype(np.complex128)
     size = np.abs(X) ** 2
-    scale = np.abs(D_r)[:, None]
-    error = scale * np.sqrt(size @ H.error**2 @ size)
+    error = np.abs(D_r)[:, None] * np.sqrt(size @ H.error**2 @ size)
     return MeasuredMatrix(
         (D_r[:, None] * X - np.diag(D_q)).astype(np.complex128),
         error,
@@ -242,15 +239,12 @@ def sweep_coupling(
     hold_s = (data.period_s - step_s) / 2
     servos, servo_why = _servos(data, sweep.names)
     tones = tuple(_tone(data, k, hold_s, servos) for k in range(len(sweep.tones)))
-    beside = Estimate()
-    if data.beside is not None:
-        beside = sideband_energy(data.response, data.beside)
+    beside = Estimate() if data.beside is None else sideband_energy(data.response, data.beside)
     _warn(data, beside, tones, warn)
-    first = np.array(tones[0].H.real) + 1j * np.array(tones[0].H.imag)
     return LinearCoupling(
         identifiable=True,
         why=f"{len(sweep.index)} runs of a {plan}: H = Y C^-1",
-        matrix=rows_of(np.abs(first)),
+        matrix=rows_of(np.abs(np.array(tones[0].H.real) + 1j * np.array(tones[0].H.imag))),
         condition_number=tones[0].condition_number,
         plan=plan,
         joints=sweep.names,
@@ -268,8 +262,7 @@ def sweep_coupling(
 def _tone(data: SweepData, k: int, hold_s: float, servos: Sequence[Servo] | None) -> ToneCoupling:
     omega = float(data.omega[k])
     # A command held over its period acts half of it late; the twin's steps look ahead by half one.
-    command: ComplexArray = data.command[k] * np.exp(-1j * omega * hold_s)
-    H = transfer(command, data.response[k])
+    H = transfer(data.command[k] * np.exp(-1j * omega * hold_s), data.response[k])
     condition = float(np.linalg.cond(H.value))
     regular = condition < SINGULAR
     side = None if servos is None else servo_side(servos, omega)
@@ -347,11 +340,8 @@ def _warn(data: SweepData, beside: Estimate, tones: Sequence[ToneCoupling], warn
         )
     if beside.value is None:
         warn("too short to measure energy beside the tones; record two periods of the multisine")
-    bent = [one for one in tones if (one.distortion or 0.0) > NONLINEAR]
-    if bent:
-        at = ", ".join(
-            f"{one.frequency_hz:.4g} Hz ({100 * (one.distortion or 0):.2g} %)" for one in bent
-        )
+    bent = [(one.frequency_hz, one.distortion or 0.0) for one in tones]
+    if at := ", ".join(f"{hz:.4g} Hz ({100 * by:.2g} %)" for hz, by in bent if by > NONLINEAR):
         warn(
             "not linear: where nothing is commanded, lines reach more than 1 % of the tone beside "
             f"them, at {at}; H and Z hold for these motions only, take a smaller amplitude"
@@ -364,9 +354,5 @@ def _warn(data: SweepData, beside: Estimate, tones: Sequence[ToneCoupling], warn
 
 
 def _matrix(matrix: MeasuredMatrix) -> ComplexMatrix:
-    return ComplexMatrix(
-        rows_of(matrix.value.real),
-        rows_of(matrix.value.imag),
-        rows_of(matrix.error),
-        rows_of(matrix.half),
-    )
+    value = matrix.value
+    return ComplexMatrix(*map(rows_of, (value.real, value.imag, matrix.error, matrix.half)))

@@ -7,7 +7,7 @@ neither repeats of a gait nor kicks around one have it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,14 +17,15 @@ from scipy.special import fdtrc
 from undulog.capture import Session, SessionView
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import DataError
+from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 from undulog.capture.robot.run import Run
 
 from ...estimators.cycle_sums import DRIFT_PER_CYCLE, SIGNIFICANT
 from ...estimators.series import Series, clean
+from ...response.fitting import GaitFit
 from ...response.rhythm import DRIVEN_SHARE, NYQUIST_SHARE
 from ...results.answer import Remarks
-from ...session.analyse import FittedSession
 from ...session.runs import SAME_FREQUENCY
 from ...signals.columns import read_columns
 from ...signals.stretch import Options, choose_stretch
@@ -93,32 +94,30 @@ def read_signals(session: SessionView, options: Options) -> Signals:
     stretch = choose_stretch(session, columns, options, unused)
     origin_ns = stretch.start_ns + (stretch.stop_ns - stretch.start_ns) // 2
     half_s = stretch.duration_s / 2
-    command, position, effort = (
-        {
-            name: clean(name, signals[name].t_ns, signals[name].values, origin_ns).between(
-                -half_s, half_s
-            )
-            for name in columns.names
-            if name in signals
-        }
-        for signals in (columns.command, columns.position, columns.effort)
-    )
-    return command, position, effort
+
+    def part(signals: Mapping[str, Signal]) -> dict[str, Series]:
+        known = [(name, signals[name]) for name in columns.names if name in signals]
+        cleaned = {name: clean(name, one.t_ns, one.values, origin_ns) for name, one in known}
+        return {name: one.between(-half_s, half_s) for name, one in cleaned.items()}
+
+    return part(columns.command), part(columns.position), part(columns.effort)
 
 
 def command_tones(
-    session: SessionView, options: Options, examined: FittedSession
+    session: SessionView, options: Options, gait: GaitFit | None, robot: str | None
 ) -> CommandTones | None:
     """Find the tones of a session's commands.
+
+    Args:
+        gait: The fitted gait, or None.
+        robot: Name of the robot, or None.
 
     Returns:
         The gait's frequency alone, or the tones of a multisine; None of anything else.
     """
-    gait, robot = examined.gait, examined.analysis.session.robot
     if gait is not None and gait.driven and not gait.others:
         m = len(gait.driven)
-        left = float(gait.fit.rss[:m].sum() / gait.fit.total[:m].sum())
-        if left < _PURE:
+        if float(gait.fit.rss[:m].sum() / gait.fit.total[:m].sum()) < _PURE:
             omega = np.array([gait.fit.omega])
             return CommandTones(gait.driven, robot, omega, gait.fit.fundamental[:m, None])
     commands = [one for one in read_signals(session, options)[0].values() if one.count > 64]
@@ -167,11 +166,8 @@ def _sweep(index: Sequence[int], runs: Sequence[CommandTones]) -> Sweep | None:
         return Sweep(tuple(index), runs[0].names, tones, lines) if tones else None
     # Fewer runs than joints: part of a sweep if they are all at right angles to each other.
     unit = C / np.linalg.norm(C, axis=0)
-    apart = [
-        k
-        for k in range(lines)
-        if np.abs(unit[:, :, k].conj().T @ unit[:, :, k] - np.eye(r)).max() < _ORTHOGONAL
-    ]
+    gram = [np.abs(unit[:, :, k].conj().T @ unit[:, :, k] - np.eye(r)) for k in range(lines)]
+    apart = [k for k, one in enumerate(gram) if one.max() < _ORTHOGONAL]
     if not apart or r < max(3, m / 2):
         return None
     return Sweep(tuple(index), runs[0].names, tuple(apart), lines, lacking=m - r)
@@ -242,8 +238,7 @@ def sweep_data(
             robot = robot or session.robot_as_run
             twins.append(session.run)
             command, position, effort = read_signals(session, options)
-        lost = [name for name in sweep.names if name not in position]
-        if lost:
+        if lost := [name for name in sweep.names if name not in position]:
             raise DataError(f"{paths[k]}: no responses of {', '.join(lost)}")
         commanded_series, series = (
             [kind[name] for name in sweep.names] for kind in (command, position)
@@ -254,8 +249,7 @@ def sweep_data(
         commands.append(fit_tones(commanded_series, tones.omega, np.zeros(0)).amplitude)
         responses.append(fit_tones(series, tones.omega, own))
         if all(name in effort for name in sweep.names):
-            efforts = [effort[name] for name in sweep.names]
-            torques.append(fit_tones(efforts, tones.omega, own))
+            torques.append(fit_tones([effort[name] for name in sweep.names], tones.omega, own))
         periods_s.append(max(one.period_s for one in commanded_series))
         drifts.append(_drift(series, tones.omega, responses[-1], len(sweep.index)))
     touched = [None if one is None else one.contact for one in twins]
@@ -316,21 +310,17 @@ def _drift(series: Sequence[Series], omega: FloatArray, fit: ToneFit, runs: int)
     the noise rejects that they are noise, the chance of a false alarm shared among the runs.
     """
     middle = float(series[0].t_s[0] + series[0].t_s[-1]) / 2
-    halves = [
-        [one.between(start, stop) for one in series]
-        for start, stop in ((-np.inf, middle), (middle, np.inf))
-    ]
+    ends = ((-np.inf, middle), (middle, np.inf))
+    halves = [[one.between(start, stop) for one in series] for start, stop in ends]
     lines = omega[0] * np.array([2.0, 3.0]) if omega.size == 1 else np.zeros(0)
     tones = omega.size
     first, second = (fit_tones(half, omega, lines).amplitude[:, :tones] for half in halves)
     change: ComplexArray = second - first
-    span = middle - float(series[0].t_s[0])
-    cycles = omega * span / (2 * np.pi)
+    cycles = omega * (middle - float(series[0].t_s[0])) / (2 * np.pi)
     size: FloatArray = np.linalg.norm(change, axis=0)
     size = size / np.linalg.norm(fit.amplitude[:, :tones], axis=0)
     # Two halves, each with twice the variance of the whole, in two parts.
-    scatter: FloatArray = np.sum(8 * fit.variance[:, :tones], axis=0)
-    ratio = np.sum(np.abs(change) ** 2, axis=0) / scatter
+    ratio = np.sum(np.abs(change) ** 2, axis=0) / np.sum(8 * fit.variance[:, :tones], axis=0)
     worst = 0.0
     for tone, per_cycle in enumerate((size / cycles).tolist()):
         dof = float(fit.dof[:, tone].sum())

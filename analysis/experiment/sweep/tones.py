@@ -98,19 +98,15 @@ def distortion(omega: float, tone: Phasors, beside: Beside) -> float:
         Root mean square of a free line, of the nearest ones, over that of the tone; noise taken
         off.
     """
-    apart: FloatArray = np.abs(beside.omega - omega)
-    nearest: list[int] = np.argsort(apart)[:_NEAREST].tolist()
+    nearest: list[int] = np.argsort(np.abs(beside.omega - omega))[:_NEAREST].tolist()
     near = _joined(tuple(beside.lines[k] for k in nearest))
     energy = float(np.sum(np.abs(near.value) ** 2 - 2 * near.variance)) / len(nearest)
     return float(np.sqrt(max(0.0, energy)) / np.linalg.norm(tone.value))
 
 
 def _joined(parts: tuple[Phasors, ...]) -> Phasors:
-    return Phasors(
-        np.concatenate([one.value for one in parts], axis=1),
-        np.concatenate([one.variance for one in parts], axis=1),
-        np.concatenate([one.dof for one in parts], axis=1),
-    )
+    columns = zip(*((one.value, one.variance, one.dof) for one in parts), strict=True)
+    return Phasors(*(np.concatenate(one, axis=1) for one in columns))
 
 
 MOST_TONES = 12
@@ -119,6 +115,9 @@ EXPLAINED = 0.98
 
 FAINT = 0.005
 """A line below this share of the strongest is no tone."""
+
+MOST_MULTIPLE = 24
+"""Largest multiple of the tones' common step that the lowest of them may be."""
 
 MULTIPLE = 1e-3
 """How near to a whole number a ratio of frequencies must be to count as one."""
@@ -166,17 +165,16 @@ def find_tones(commands: Sequence[Series]) -> FloatArray | None:
     return None if np.all(np.abs(multiples - np.round(multiples)) < MULTIPLE) else omega
 
 
-def common_step(omega: FloatArray, most: int = 24) -> float | None:
+def common_step(omega: FloatArray) -> float | None:
     """Find the largest frequency of which all tones are multiples.
 
     Args:
         omega: Rising [rad/s].
-        most: Largest multiple that the lowest tone may be.
 
     Returns:
         It [rad/s], or None where there is none.
     """
-    for multiple in range(1, most + 1):
+    for multiple in range(1, MOST_MULTIPLE + 1):
         place: FloatArray = omega * multiple / omega[0]
         if np.all(np.abs(place - np.round(place)) < MULTIPLE * multiple):
             return float(np.mean(omega / np.round(place)))
@@ -305,8 +303,7 @@ def fit_tones(series: Sequence[Series], omega: FloatArray, beside: FloatArray) -
         for tone in range(tones):
             level, bins = _level(t_s, residual, float(omega[tone]), rows, inverse)
             own = [tone, *(tones + np.flatnonzero(nearest == tone)).tolist()]
-            noise = np.maximum(level, floor)[:, None] * of_part[None, own]
-            variance[np.ix_(members, own)] = noise
+            variance[np.ix_(members, own)] = np.maximum(level, floor)[:, None] * of_part[None, own]
             dof[members, tone] = 2.0 * bins
     dof[:, tones:] = dof[:, :tones].min(axis=1, keepdims=True)
     return ToneFit(amplitude, variance, dof)

@@ -1,4 +1,4 @@
-"""Results to files and back."""
+"""Results to files and back, and as a notebook shows them."""
 
 from __future__ import annotations
 
@@ -6,23 +6,30 @@ import dataclasses
 import json
 import math
 import types
+from collections.abc import Iterable
 from enum import Enum
+from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, Union, cast, get_args, get_origin, get_type_hints
 
-from undulog.capture.common.console import refuse_existing
+from undulog.capture.common.console import plain, refuse_existing
 from undulog.capture.common.errors import DataError, MissingExtraError
 from undulog.capture.common.files import check_output, part_file, read_input, write_text
 
-from ...results import analysis, oscillators
+from ...experiment.answer import kick_answer, kick_detail, pair_order, sweep_answer, sweep_detail
+from ...results import analysis, formats, oscillators
 from ...results.analysis import Analysis, interval_key
 from ...results.comparison import Comparison
 from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
 from ...results.estimate import Estimate
 from ...results.experiment import Experiment, Reversal
+from ...results.shown import PresentedResult
+from ..text import render, unidentified
+from ..text_experiment import render_comparison, render_experiment, reversal_detail
+from .frames import frames_of as frames
+from .pictures import picture_of as picture
 
-if TYPE_CHECKING:
-    from ...results.shown import PresentedResult
+__all__ = ["frames", "headline", "html", "load", "picture", "save", "save_tables", "text"]
 
 
 _NAMES = {**vars(oscillators), **vars(analysis)}
@@ -142,3 +149,80 @@ def _dataclass(kind: Any, data: dict[str, Any]) -> Any:
         else:
             built[name] = _build(hints[name], data[name])
     return chosen(**built)
+
+
+MOST_ROWS = 40
+"""Rows of a table that a notebook shows."""
+
+
+def headline(result: object) -> str:  # noqa: PLR0911 - one kind of result a case
+    """Return the answer in one line, the first of :func:`text_of`.
+
+    Raises:
+        TypeError: If it is no result of this package.
+    """
+    match result:
+        case Analysis():
+            return f"{Path(result.session.path).name}: {result.answer.sentence}"
+        case Experiment():
+            count = len(result.sessions)
+            return f"{count} session{'s' if count > 1 else ''}: {result.answer}."
+        case Comparison():
+            return f"{result.answer}."
+        case Reversal():
+            return _reversal_headline(result)
+        case LocalCoupling():
+            return kick_answer(result)
+        case LinearCoupling():
+            return sweep_answer(result)
+        case Coupling():
+            return f"Coupling: {result.why}" if result.identifiable else unidentified(result)
+        case _:
+            raise TypeError(f"{type(result).__name__} is no result of analysis")
+
+
+def _reversal_headline(result: Reversal) -> str:
+    runs = f"{result.forward_runs} + {result.reverse_runs} runs"
+    differ = pair_order(result.pairs[0]) if result.pairs else "no pair is ordered"
+    floor = "" if result.tilt.excluded or not result.pairs else ", or the floor is tilted"
+    return f"Reversal, {runs}: {differ}{floor} ({formats.p_value_text(result.p)})"
+
+
+def text(result: object) -> str:
+    """Return a result as text, the answer first.
+
+    Raises:
+        TypeError: If it is no result of this package.
+    """
+    detail: Iterable[str] = ()
+    match result:
+        case Analysis():
+            return render(result)
+        case Experiment():
+            return render_experiment(result)
+        case Comparison():
+            return render_comparison(result)
+        case Reversal():
+            detail = reversal_detail(result)
+        case LocalCoupling():
+            detail = kick_detail(result)
+        case LinearCoupling():
+            detail = sweep_detail(result)
+        case _:
+            pass
+    return "\n".join(map(plain, [headline(result), *detail]))
+
+
+def html(result: Any) -> str:
+    """Return the answer, the first table, and the warnings, for a notebook; all text escaped."""
+    answer = escape(plain(headline(result)))
+    name, frame = next(iter(result.frames().items()))
+    clean = frame.head(MOST_ROWS).map(lambda cell: plain(cell) if isinstance(cell, str) else cell)
+    shown = clean.to_html(float_format="{:.4g}".format, index=False, na_rep="–")
+    left = len(frame) - MOST_ROWS
+    more = f", {left} more rows in frames()[{name!r}]" if left > 0 else ""
+    remarks = ""
+    for kind in ("warnings", "notes"):
+        items = "".join(f"<li>{escape(plain(text))}</li>" for text in getattr(result, kind, ()))
+        remarks += f"<details><summary>{kind}</summary><ul>{items}</ul></details>" if items else ""
+    return f"<p><strong>{answer}</strong></p><p>{escape(name)}{escape(more)}</p>{shown}{remarks}"

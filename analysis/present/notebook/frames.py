@@ -74,12 +74,10 @@ def named(kind: type[Any], indices: Mapping[str, Any]) -> pd.DataFrame:
 
 def _cells(name: str, value: Any) -> dict[str, Any]:
     if isinstance(value, Estimate):
-        low, high = ends(name)
-        interval = value.ci95 or (None, None)
-        return {name: _number(value.value), low: _number(interval[0]), high: _number(interval[1])}
+        numbers = value.value, *(value.ci95 or (None, None))
+        return dict(zip((name, *ends(name)), map(_number, numbers), strict=True))
     if name == "ci95":
-        interval = value or (None, None)
-        return {"low": _number(interval[0]), "high": _number(interval[1])}
+        return dict(zip(("low", "high"), map(_number, value or (None, None)), strict=True))
     if isinstance(value, tuple):
         words = cast("tuple[Any, ...]", value)
         return {name: " ".join(words)} if all(isinstance(one, str) for one in words) else {}
@@ -89,13 +87,11 @@ def _cells(name: str, value: Any) -> dict[str, Any]:
 
 
 def _columns(kind: type[Any]) -> list[str]:
-    plain = [
-        field.name
-        for field in fields(kind)
-        if not str(field.type).startswith(("tuple", "dict", "Estimate"))
-    ]
-    estimates = [field.name for field in fields(kind) if field.type == "Estimate"]
-    return [*plain, *(column for name in estimates for column in (name, *ends(name)))]
+    types = {field.name: str(field.type) for field in fields(kind)}
+    nested = ("tuple", "dict", "Estimate")
+    estimates = [(name, *ends(name)) for name, word in types.items() if word == "Estimate"]
+    plain = [name for name, word in types.items() if not word.startswith(nested)]
+    return [*plain, *chain.from_iterable(estimates)]
 
 
 def _number(value: float | None) -> float:
@@ -257,10 +253,7 @@ def _with_unit(column: str) -> str:
 
 def _pairs(names: Sequence[str]) -> dict[str, list[str]]:
     """Return responding and commanded joints, row by row of a matrix."""
-    return {
-        "joint": [name for name in names for _ in names],
-        "commanded": [other for _ in names for other in names],
-    }
+    return {"joint": [name for name in names for _ in names], "commanded": [*names] * len(names)}
 
 
 def _entries(name: str, rows: Sequence[Sequence[float]]) -> dict[str, list[float]]:

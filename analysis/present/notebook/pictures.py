@@ -161,15 +161,14 @@ def pictures_of(result: object) -> Pictures:
 
 
 def _of_analysis(result: Analysis) -> Pictures:
-    from ..page.motion import body_motion
-    from ..page.segments import segments
+    from ..page.segments import body_motion, segments
 
     body = {} if result.body is None else {"body": partial(body_motion, result.body)}
     return {"segments": partial(segments, result.joints), **body}
 
 
 def _of_experiment(result: Experiment) -> Pictures:
-    from ..page.mirror import mirror_profile, profiles
+    from ..page.experiment_view import mirror_profile, profiles
 
     reversal = result.reversal
     known: Pictures = {}
@@ -183,8 +182,7 @@ def _of_experiment(result: Experiment) -> Pictures:
 
 
 def _of_comparison(result: Comparison) -> Pictures:
-    from ..page.comparison_view import differences_of
-    from ..page.motion import waveforms_drawing
+    from ..page.comparison_view import differences_of, waveforms_drawing
 
     waves = {"waveforms": partial(waveforms_drawing, result)} if result.waveforms else {}
     return {"differences": partial(differences_of, result), **waves}

@@ -19,7 +19,7 @@ from ...results.analysis import Analysis, JointResult
 from ...results.artefact import KINDS, Artefact, Span
 from ...results.formats import degrees, estimate, short
 from ...signals.columns import COMMAND_TOPIC, RESPONSE_TOPIC
-from .svg import REFERENCE, WIDTH_IN, Drawing, drawing, inline_svg, key, legend, new_figure
+from .svg import REFERENCE, Drawing, drawing, inline_svg, key, legend
 from .tables import element, is_driven
 
 CYCLES = 2.5
@@ -58,13 +58,10 @@ def chosen_joints(joints: Sequence[JointResult]) -> list[int]:
     Returns:
         Up to three indices, ascending; of all joints if none is driven.
     """
-    members = [i for i, joint in enumerate(joints) if is_driven(joint)]
-    planes = [joints[i].plane for i in members]
-    if members:
-        most = max(dict.fromkeys(planes), key=planes.count)
-        members = [i for i in members if joints[i].plane == most]
-    else:
-        members = list(range(len(joints)))
+    planes = [joint.plane for joint in joints if is_driven(joint)]
+    most = max(dict.fromkeys(planes), key=planes.count, default=None)
+    members = [i for i, j in enumerate(joints) if is_driven(j) and j.plane == most]
+    members = members or list(range(len(joints)))
     return sorted({members[k] for k in (0, len(members) // 2, -1)}) if members else []
 
 
@@ -72,9 +69,8 @@ def stretch_s(analysis: Analysis) -> tuple[float, float]:
     """Return start and stop of the last cycles of the last analysed window [s]."""
     frequency = analysis.gait.frequency_hz.value
     length = CYCLES / frequency if frequency else SECONDS_WITHOUT_GAIT
-    first, stop = 0.0, analysis.session.duration_s
-    for window in analysis.gait.windows[-1:]:
-        first, stop = window.start_s, window.stop_s
+    spans = [(window.start_s, window.stop_s) for window in analysis.gait.windows]
+    first, stop = spans[-1] if spans else (0.0, analysis.session.duration_s)
     return max(first, stop - length), stop
 
 
@@ -109,7 +105,7 @@ def read_traces(session: SessionView, analysis: Analysis) -> tuple[Trace, ...]:
                 t_s: FloatArray = np.asarray((signal.t_ns - start_ns) * 1e-9, np.float64)
                 columns += _thinned(t_s, signal.values)
             else:
-                columns += [np.empty(0), np.empty(0)]
+                columns += [np.empty(0)] * 2
         if columns[3].size:
             traces.append(Trace(joint, place, *columns))
     return tuple(traces)
@@ -123,16 +119,14 @@ def _thinned(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArra
     return frozen(t_s[::step]), frozen(values[::step])
 
 
-def command_response(traces: Sequence[Trace], joint_count: int, prefix: str) -> Drawing:
+def command_response(traces: Sequence[Trace], joint_count: int) -> Drawing:
     """Draw command (grey) and response (coloured) of a few joints, one panel each.
 
     Args:
         joint_count: Joints in the chain, for their colours.
-        prefix: For identifiers, unique in the page.
     """
     colors = joint_hex(joint_count)
-    with drawing():
-        figure = new_figure(WIDTH_IN, 0.7 + 1.35 * len(traces))
+    with drawing(0.7 + 1.35 * len(traces)) as figure:
         grid = figure.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)
         for (axes,), trace in zip(grid, traces, strict=True):
             command, response = np.degrees(trace.command_rad), np.degrees(trace.response_rad)
@@ -148,17 +142,15 @@ def command_response(traces: Sequence[Trace], joint_count: int, prefix: str) -> 
         title = "Command and response of " + ", ".join(t.joint.name for t in traces)
         about = "Joint angle over time, command in grey, response in the joint's colour. "
         about += "; ".join(_panel_title(t.joint) for t in traces) + "."
-        svg = inline_svg(figure, prefix, title, about)
-    caption = "The last analysed cycles: command in grey, response in the joint's colour."
-    return Drawing(svg, caption)
+        svg = inline_svg(figure, "signals-figure", title, about)
+    return Drawing(
+        svg, "The last analysed cycles: command in grey, response in the joint's colour."
+    )
 
 
 def _panel_title(joint: JointResult) -> str:
-    name = short(joint.name)
-    if joint.gain.value is None:
-        return name
-    lag = estimate(degrees(joint.lag_rad), "°")
-    return f"{name}: gain {estimate(joint.gain)}, lag {lag}"
+    values = f": gain {estimate(joint.gain)}, lag {estimate(degrees(joint.lag_rad), '°')}"
+    return short(joint.name) + ("" if joint.gain.value is None else values)
 
 
 MOST_SPANS = 4
@@ -246,9 +238,8 @@ def times_text(spans: tuple[Span, ...]) -> str:
 def _row(same: Sequence[Artefact], analysis: Analysis) -> ArtefactRow:
     one = same[0]
     about, text = KINDS[one.flag]
-    names = [plain(each.joint) for each in same]
     return ArtefactRow(
-        joints=_named(names, len(analysis.joints)),
+        joints=_named([plain(each.joint) for each in same], len(analysis.joints)),
         where=f"{one.quantity} on {one.topic}" if one.topic else one.quantity,
         flag=one.flag,
         meaning=f"values {text}" + (f"; {one.note}" if one.note else ""),

@@ -6,18 +6,18 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from undulog.capture.common.palette import joint_hex
 
 from ...compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, in_people_units, signed
 from ...results.comparison import BODY, Comparison
 from ...results.estimate import Estimate
-from ...results.formats import scaled
+from ...results.formats import scaled, short
 from ..text_experiment import comparison_method, margin_text
-from .motion import waveforms_drawing
 from .svg import (
     DASHED,
     REFERENCE,
-    WIDTH_IN,
     Axes,
     Drawing,
     drawing,
@@ -25,7 +25,6 @@ from .svg import (
     joint_ticks,
     key,
     legend,
-    new_figure,
     plot_estimate,
 )
 from .tables import Fact, joint_mark
@@ -49,8 +48,7 @@ def differences_drawing(
         prefix: For identifiers, unique in the page.
     """
     colors = joint_hex(len(names))
-    with drawing():
-        figure = new_figure(WIDTH_IN, 0.8 + 1.6 * len(panels))
+    with drawing(0.8 + 1.6 * len(panels)) as figure:
         grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False)
         for row, panel in enumerate(panels):
             _panel(grid[row, 0], panel, colors)
@@ -74,6 +72,54 @@ def _panel(axes: Axes, panel: Panel, colors: Sequence[str]) -> None:
             plot_estimate(axes, place, value, color)
     axes.set_ylabel(panel.label)
     axes.margins(y=0.15)
+
+
+_MOST_WAVES = 4
+"""Joints drawn: those whose cycles differ most."""
+
+
+def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
+    """Draw the mean cycles that differ most: both sides on the left, B minus A on the right.
+
+    Args:
+        comparison: With at least one waveform.
+        prefix: For identifiers, unique in the page.
+    """
+    every = joint_hex(len(comparison.waveforms))
+    worst = sorted(comparison.waveforms, key=lambda one: -one.rms_rad)[:_MOST_WAVES]
+    pairs = zip(comparison.waveforms, every, strict=True)
+    shown = [(one, color) for one, color in pairs if one in worst]
+    phase = np.degrees(comparison.phase_rad)
+    with drawing(0.8 + 1.4 * len(shown)) as figure:
+        grid = figure.subplots(len(shown), 2, sharex=True, squeeze=False)
+        for (both, right), (one, color) in zip(grid, shown, strict=True):
+            both.plot(phase, np.degrees(one.a_rad), color=REFERENCE, linewidth=2.4)
+            both.plot(phase, np.degrees(one.b_rad), color=color)
+            both.set_title(short(one.name))
+            middle, half = np.degrees(one.difference_rad), np.degrees(one.half_rad)
+            right.axhline(0.0, color=REFERENCE, linestyle=DASHED, linewidth=0.8)
+            band = {"color": color, "alpha": 0.25, "linewidth": 0}
+            right.fill_between(phase, middle - half, middle + half, **band)
+            right.plot(phase, middle, color=color)
+            right.set_title("B − A")
+        grid[-1, 0].set_xticks(range(0, 361, 90))
+        for axes in grid[-1]:
+            axes.set_xlabel("gait phase [°]")
+        figure.supylabel("joint angle [°]", fontsize=8.0)
+        color = shown[0][1]
+        legend(
+            figure,
+            key(color=REFERENCE, linewidth=2.4, label="A"),
+            key(color=color, label="B"),
+            key(color=color, linewidth=6, alpha=0.25, label="95 %, each phase"),
+        )
+        description = "Joints: " + ", ".join(short(one.name) for one, _ in shown) + "."
+        svg = inline_svg(figure, prefix, "Mean cycles by gait phase", description)
+    return Drawing(
+        svg,
+        "Mean cycle of the joints that differ most, by the phase of the commands: A in grey, B in "
+        "the joint's colour, and their difference with its 95 % interval at each phase.",
+    )
 
 
 _VERDICTS = {

@@ -4,19 +4,39 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from undulog.capture.common.arrays import FloatArray, frozen
+from undulog.capture.common.palette import joint_hex
 
 from ...experiment.answer import kick_checks, sweep_checks
 from ...experiment.sweep.coupling import NONLINEAR
 from ...results import formats
 from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
-from ...results.estimate import Estimate
+from ...results.estimate import Estimate, leaves_out_zero
 from ...results.experiment import Experiment, Reversal
+from ...results.formats import degrees, estimate, relative, short
+from ...results.oscillators import BodyOscillators
 from ..text_experiment import by_sentence, method, reversal_detail
-from .matrix import entries_of, matrix_picture
-from .mirror import mirror_profile, profiles
-from .oscillators import body_facts, entrainment_entries, modes_drawing
+from .matrix import Entries, entries_of, matrix_picture
+from .svg import (
+    DASHED,
+    INK,
+    MUTED,
+    REFERENCE,
+    Axes,
+    Drawing,
+    drawing,
+    inline_svg,
+    joint_ticks,
+    key,
+    legend,
+    plot_estimate,
+)
 from .tables import Fact, digits
 from .trials import Trial, experiment_trials
 
@@ -90,9 +110,6 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
     names = tuple(name for name in dict.fromkeys(j.name for j in joints) if name in known)
     entries = entries_of(coupling, names)
     trials = experiment_trials(experiment)
-    mirror = None
-    if reversal is not None:
-        mirror = mirror_profile(profiles(experiment, reversal), reversal, "mirror-figure")
     if isinstance(coupling, LinearCoupling):
         trials += _sweep_trials(coupling)
     return {
@@ -103,13 +120,15 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
         "detail": [] if reversal is None else list(reversal_detail(reversal)),
         "facts": _facts(experiment),
         "answers": [one.answer.sentence for one in experiment.sessions],
-        "mirror": mirror,
+        "mirror": None
+        if reversal is None
+        else mirror_profile(profiles(experiment, reversal), reversal, "mirror-figure"),
         "entries": entries,
         "matrices": [
             matrix_picture(one, f"matrix-{k + 1}", small=k > 0) for k, one in enumerate(entries)
         ],
-        "told": _checks(coupling),
-        "modes": None if body is None else modes_drawing(body, "modes-figure"),
+        "checks": _checks(coupling),
+        "modes": None if body is None else modes_drawing(body),
         "body_facts": [] if body is None else body_facts(body),
         "entrainment": None if body is None else entrainment_entries(body),
         "trials": trials,
@@ -174,10 +193,7 @@ def _flagged(experiment: Experiment) -> list[tuple[str, str]]:
 
 def _facts(experiment: Experiment) -> list[Fact]:
     runs = experiment.runs
-    roles: dict[str, int] = {}
-    for run in runs:
-        word = run.role or "left out"
-        roles[word] = roles.get(word, 0) + 1
+    roles = Counter(run.role or "left out" for run in runs)
     counts = ", ".join(f"{count} {word}" for word, count in roles.items())
     facts = [Fact("Sessions", str(len(runs)), counts)]
     frequencies = [v for s in experiment.sessions if (v := s.gait.frequency_hz.value) is not None]
@@ -216,3 +232,216 @@ def _kick_facts(coupling: LocalCoupling) -> list[Fact]:
         Fact("Within one joint", formats.percent(lti.within_1), "of X's off-diagonal energy"),
         Fact("Valid to", valid, f"{len(coupling.held_out)} held-out runs"),
     ]
+
+
+_ASIDE = 0.16
+"""Distance of the dots of single runs from their joint's position."""
+
+_SOLID: dict[str, Any] = {"markersize": 4.6, "markeredgecolor": INK, "markeredgewidth": 0.5}
+_HOLLOW = _SOLID | {"markersize": 6.6, "markerfacecolor": "none", "markeredgewidth": 1.0}
+_MIRRORED: dict[str, Any] = {"color": INK, "linestyle": (0, (2, 2))}
+
+
+class Profiles(NamedTuple):
+    """Gain and lag of the runs of a reversal, all read at the joints of the forward wave.
+
+    Attributes:
+        gain: Of the r1 runs from head to tail, shape (r1, m).
+        lag_deg: Their lag [deg], within 180 of the joint's mean, shape (r1, m).
+        mirrored_gain: Of the r2 runs from tail to head, read from tail to head, shape (r2, m).
+        mirrored_lag_deg: Their lag [deg], shape (r2, m).
+    """
+
+    gain: FloatArray
+    lag_deg: FloatArray
+    mirrored_gain: FloatArray
+    mirrored_lag_deg: FloatArray
+
+
+def profiles(experiment: Experiment, reversal: Reversal) -> Profiles:
+    """Return gain and lag of the joints that take part in a reversal test, run by run."""
+    names = [one.name for one in reversal.joints]
+
+    def of(role: str) -> tuple[FloatArray, FloatArray]:
+        chosen = [
+            {joint.name: joint for joint in session.joints}
+            for run, session in zip(experiment.runs, experiment.sessions, strict=True)
+            if run.role == role
+        ]
+        gain = [[joints[name].gain.value for name in names] for joints in chosen]
+        lag = [[joints[name].lag_rad.value for name in names] for joints in chosen]
+        return np.array(gain, dtype=np.float64), np.array(lag, dtype=np.float64)
+
+    (gain, lag), (back_gain, back_lag) = of("forward"), of("reverse")
+    middle = np.angle(np.nanmean(np.exp(1j * lag)))
+    lag, back_lag = (middle + np.angle(np.exp(1j * (one - middle))) for one in (lag, back_lag))
+    parts = (gain, np.degrees(lag), back_gain[:, ::-1], np.degrees(back_lag)[:, ::-1])
+    return Profiles(*map(frozen, parts))
+
+
+def mirror_profile(seen: Profiles, reversal: Reversal, prefix: str) -> Drawing:
+    """Draw gain and lag of both directions, each with its differences below.
+
+    Args:
+        prefix: For identifiers, unique in the page.
+    """
+    joints = reversal.joints
+    colors = joint_hex(len(joints))
+    tooltips: dict[str, str] = {}
+    gains = [relative(one.log_gain_difference) for one in joints]
+    lags = [degrees(one.lag_difference_rad) for one in joints]
+    labels = ("gain [1]", "difference [%]", "lag [°]", "difference [°]")
+    with drawing(6.6) as figure:
+        rows = figure.subplots(4, 1, sharex=True, height_ratios=[1.35, 1, 1.35, 1])
+        _profile(rows[0], seen.gain, seen.mirrored_gain, colors)
+        _differences(rows[1], reversal, gains, colors, tooltips, what="gain")
+        _profile(rows[2], seen.lag_deg, seen.mirrored_lag_deg, colors)
+        _differences(rows[3], reversal, lags, colors, tooltips, what="lag")
+        for axes, label in zip(rows, labels, strict=True):
+            axes.set_ylabel(label)
+        joint_ticks(rows[3], [one.name for one in joints])
+        rows[3].set_xlabel("joint with the wave from head to tail, head on the left")
+        figure.align_ylabels()
+        middle = colors[len(colors) // 2]
+        legend(
+            figure,
+            key(color=middle, marker="o", label="wave from head to tail", **_SOLID),
+            key(marker="D", label="from tail to head, mirrored", **_MIRRORED, **_HOLLOW),
+            key(color=MUTED, marker=".", linestyle="none", label="one run"),
+            key(color=middle, linewidth=2.2, label="difference, 95 % together"),
+        )
+        title = "Gain and lag of both directions, and their differences"
+        svg = inline_svg(figure, prefix, title, _mirror_in_words(reversal), tooltips)
+    return Drawing(
+        svg,
+        "Identical modules mirror: the profile with the wave from tail to head, read from tail to "
+        "head, lies on the other one, whatever the free ends do to both. The intervals of the "
+        "differences hold all together at 95 %: a pair differs where its interval leaves out zero. "
+        "The name of a weak module stands at its difference.",
+    )
+
+
+def _profile(axes: Axes, one: FloatArray, other: FloatArray, colors: Sequence[str]) -> None:
+    place: FloatArray = np.arange(1.0, one.shape[1] + 1.0)
+    for runs, aside in ((one, -_ASIDE), (other, _ASIDE)):
+        for run in runs:
+            axes.plot(place + aside, run, ".", color=MUTED, markersize=2.2, zorder=2)
+    axes.plot(place, other.mean(0), linewidth=1.0, **_MIRRORED)
+    axes.plot(place, one.mean(0), color=MUTED, linewidth=1.0, zorder=1)
+    for x, y, color in zip(place, one.mean(0), colors, strict=True):
+        axes.plot([x], [y], "o", markerfacecolor=color, **_SOLID, zorder=3)
+    # Hollow and larger, so that a diamond on a dot shows both.
+    axes.plot(place, other.mean(0), "D", **_HOLLOW, zorder=4)
+
+
+def _differences(
+    axes: Axes,
+    reversal: Reversal,
+    values: Sequence[Estimate],
+    colors: Sequence[str],
+    tooltips: dict[str, str],
+    *,
+    what: str,
+) -> None:
+    named = {pair.name for pair in reversal.pairs}
+    axes.axhline(0.0, color=REFERENCE, linestyle=DASHED, zorder=1)
+    unit = " %" if what == "gain" else "°"
+    for k, (joint, value, color) in enumerate(zip(reversal.joints, values, colors, strict=True)):
+        if value.value is None or value.ci95 is None:
+            continue
+        size, edge = (5.2, 0.9) if leaves_out_zero(value.ci95) else (3.6, 0.4)
+        style: dict[str, Any] = {"markersize": size, "markeredgewidth": edge}
+        plot_estimate(axes, k + 1, value, color, bar=2.2, gid=f"{what}-{k}", **style)
+        tooltips[f"{what}-{k}"] = (
+            f"{joint.name} against {joint.mirror}: {what} {estimate(value, unit)}"
+        )
+        if joint.name in named:
+            above = value.value > 0
+            axes.annotate(
+                short(joint.name, 14),
+                (k + 1, value.ci95[1] if above else value.ci95[0]),
+                xytext=(0, 5 if above else -5),
+                textcoords="offset points",
+                ha="center",
+                va="bottom" if above else "top",
+                fontweight="bold",
+            )
+    axes.margins(y=0.3)
+
+
+def _mirror_in_words(reversal: Reversal) -> str:
+    less = ", ".join(f"{pair.name} less than {pair.mirror}" for pair in reversal.pairs) or "none"
+    return (
+        f"{len(reversal.joints)} joints, {reversal.forward_runs} and {reversal.reverse_runs} runs. "
+        f"Pairs that differ beyond doubt: {less}. The table of mirror pairs holds every number."
+    )
+
+
+def body_facts(body: BodyOscillators) -> list[Fact]:
+    """Return the key figures of oscillators with feedback from their servos."""
+    bound = f"{body.strong_above:g} eps"
+    slowest = formats.estimate(body.slowest, " eps", most=4)
+    strong = f"{formats.number(body.strong.value, 0)} of {len(body.modes)}"
+    growth = formats.estimate(body.growth, " eps")
+    lifts = body.explicit_coupling
+    explicit = "none is enough" if lifts.value is None else formats.estimate(lifts, " eps")
+    return [
+        Fact("Slowest pattern", slowest, "negative: grows"),
+        Fact("Strong patterns", strong, f"relax faster than {bound}"),
+        Fact("Growth for a while", growth, "the fastest of a deviation; negative: none"),
+        Fact("Explicit coupling", explicit, f"between neighbours, lifts all to {bound}"),
+    ]
+
+
+def modes_drawing(body: BodyOscillators) -> Drawing:
+    """Draw the rates at which patterns of phases relax, and those of a homogeneous chain.
+
+    Args:
+        body: With at least one mode.
+    """
+    count = len(body.modes)
+    tooltips: dict[str, str] = {}
+    hollow = {"markerfacecolor": "none", "linestyle": "none"}
+    with drawing(2.9) as figure:
+        axes = figure.subplots()
+        axes.axhline(0.0, color=REFERENCE, linewidth=0.8, zorder=1)
+        axes.axhline(body.strong_above, color=REFERENCE, linestyle=DASHED, zorder=1)
+        others = body.comparator.real
+        style = {"markersize": 6.0, "markeredgecolor": REFERENCE, **hollow}
+        axes.plot(range(1, len(others) + 1), others, marker="D", zorder=2, **style)
+        for k, mode in enumerate(body.modes, start=1):
+            style = {"markersize": 4.6, "markeredgewidth": 1.0, "gid": f"mode-{k}"}
+            plot_estimate(axes, k, mode.real, INK, bar=1.8, zorder=3, **style)
+            tooltips[f"mode-{k}"] = f"pattern {k}: {formats.estimate(mode.real, ' eps', most=4)}"
+        axes.set_xlim(0.4, count + 0.6)
+        axes.set_xticks(range(1, count + 1))
+        axes.set_xlabel("pattern of phases, the slowest first")
+        axes.set_ylabel("rate of relaxing [eps]")
+        legend(
+            figure,
+            key(color=INK, marker="o", markersize=4.6, label="this body, 95 %"),
+            key(color=REFERENCE, marker="D", label="a homogeneous chain as strong", **hollow),
+            key(color=REFERENCE, linestyle=DASHED, label=f"{body.strong_above:g} eps: strong"),
+        )
+        title = "Rates at which patterns of phases relax through the body"
+        description = f"{count} patterns; the table below holds every number."
+        svg = inline_svg(figure, "modes-figure", title, description, tooltips)
+    return Drawing(
+        svg,
+        "What oscillators that feel their own servos would do without any other coupling, eps the "
+        "strength of that feeling: a pattern above zero relaxes, below zero it grows. All phases "
+        "together are left out: they neither relax nor grow.",
+    )
+
+
+def entrainment_entries(body: BodyOscillators) -> Entries | None:
+    """Return P^-1 - I, the coupling relative to entrainment; None if P is singular."""
+    relative = body.entrainment
+    if relative.value is None:
+        return None
+    value = np.array(relative.value, dtype=np.float64)
+    half = None if relative.ci95_half is None else np.array(relative.ci95_half, dtype=np.float64)
+    symbol = "P\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT ONE} \N{MINUS SIGN} I"
+    meaning = "P read as entrainment by the commands: coupling relative to it [1]"
+    words = ("the joint that follows", "the joint that it follows")
+    return Entries(symbol, meaning, body.joints, body.joints, value, half, *words)

@@ -61,12 +61,8 @@ class Map:
         return low - short_by, high + short_by
 
 
-def cycle_drawings(cycles: CycleMaps, prefix: str) -> tuple[Drawing, ...]:
-    """Draw gain, lag and power, as far as any cycle has them.
-
-    Args:
-        prefix: For identifiers, unique in the page.
-    """
+def cycle_drawings(cycles: CycleMaps) -> tuple[Drawing, ...]:
+    """Draw gain, lag and power, as far as any cycle has them."""
     shown = (
         ("Gain", cycles.driven, cycles.gain, False, 0.02),
         ("Lag [°]", cycles.driven, np.degrees(cycles.lag_rad), False, 1.0),
@@ -76,15 +72,14 @@ def cycle_drawings(cycles: CycleMaps, prefix: str) -> tuple[Drawing, ...]:
     for title, names, value, signed, least in shown:
         if np.isfinite(value).any():
             one = Map(title, names, *_thinned(cycles, value), signed, least)
-            drawings.append(_draw(one, f"{prefix}-{len(drawings)}", _caption(cycles, one)))
+            drawings.append(_draw(one, f"map-{len(drawings)}", _caption(cycles, one)))
     return tuple(drawings)
 
 
 def _thinned(cycles: CycleMaps, value: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
     """Return means over as few cycles as fit into the map's columns."""
     count = cycles.start_s.size
-    step = -(-count // MOST_COLUMNS)
-    first = np.arange(0, count, step)
+    first = np.arange(0, count, -(-count // MOST_COLUMNS))
     known = np.isfinite(value)
     total = np.add.reduceat(np.where(known, value, 0.0), first, axis=1)
     seen = np.add.reduceat(known.astype(np.float64), first, axis=1)
@@ -141,8 +136,7 @@ def _draw(shown: Map, prefix: str, caption: str) -> Drawing:
 
 def _cells(chosen: BoolArray, edges: FloatArray, top: float, side: float) -> str:
     """Path around the chosen cells, those beside one another in a row as one."""
-    padded = np.pad(chosen.astype(np.int8), ((0, 0), (1, 1)))
-    turns = np.diff(padded, axis=1)
+    turns = np.diff(np.pad(chosen.astype(np.int8), ((0, 0), (1, 1))), axis=1)
     rows, starts = np.nonzero(turns == 1)
     _, stops = np.nonzero(turns == -1)
     return "".join(
@@ -171,8 +165,7 @@ def _times(edges_s: FloatArray, left: float, width: float, foot: float) -> list[
     for tick in ticks:
         x = left + width * (tick - start) / (stop - start)
         parts.append(element("path", d=f"M{x:.1f} {foot:g}v4", class_="tick"))
-        text = number(tick, digits)
-        parts.append(element("text", text, x=x, y=foot + 13, text_anchor="middle"))
+        parts.append(element("text", number(tick, digits), x=x, y=foot + 13, text_anchor="middle"))
     label = "time from the session's start [s]"
     parts.append(element("text", label, x=left + width, y=foot + 30, text_anchor="end"))
     return parts
@@ -208,8 +201,8 @@ def _caption(cycles: CycleMaps, shown: Map) -> str:
     name = shown.title.partition(" [")[0].capitalize()
     text = f"{name}: each column is one of {count} cycles."
     if step > 1:
-        text = f"{name}: {count} cycles are too many to show one by one; "
-        text += f"each column is the mean of {step}."
+        many = f"{count} cycles are too many to show one by one"
+        text = f"{name}: {many}; each column is the mean of {step}."
     if shown.signed:
         text += " Negative: driven by the rest of the body."
     if shown.holed.any():

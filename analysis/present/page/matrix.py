@@ -56,8 +56,7 @@ class Entries:
             return self.ends
         size = np.nan_to_num(np.abs(self.value))
         beside = size[~np.eye(*size.shape, dtype=np.bool_)]
-        largest = float(beside.max()) if beside.size else 0.0
-        return largest or float(size.max()) or 1.0
+        return (float(beside.max()) if beside.size else 0.0) or float(size.max()) or 1.0
 
     def entry_text(self, i: int, j: int, decimals: int) -> str:
         """Return an entry as text, e.g. ``-0.21 ± 0.01``."""
@@ -99,12 +98,6 @@ def entries_of(coupling: Coupling, names: tuple[str, ...]) -> tuple[Entries, ...
     """
     if isinstance(coupling, LocalCoupling):
         amplitude = "log amplitude"
-        known = (
-            ("P", "phase", "phase", coupling.P),
-            ("R", amplitude, "phase", coupling.R),
-            ("G", amplitude, amplitude, coupling.G),
-            ("S", "phase", amplitude, coupling.S),
-        )
         return tuple(
             _entries(
                 symbol,
@@ -113,7 +106,12 @@ def entries_of(coupling: Coupling, names: tuple[str, ...]) -> tuple[Entries, ...
                 matrix.value,
                 matrix.ci95_half,
             )
-            for symbol, what, of, matrix in known
+            for symbol, what, of, matrix in (
+                ("P", "phase", "phase", coupling.P),
+                ("R", amplitude, "phase", coupling.R),
+                ("G", amplitude, amplitude, coupling.G),
+                ("S", "phase", amplitude, coupling.S),
+            )
             if matrix is not None
         )
     if isinstance(coupling, LinearCoupling):
@@ -308,21 +306,19 @@ def _column_names(entries: Entries, left: float, top: float, cell: float, *, sma
 
 def _tail(name: str) -> str:
     """Return the number at a name's end, or else a short form of the name."""
-    digits = name[len(name.rstrip("0123456789")) :]
-    return digits or short(name, 5)
+    return name[len(name.rstrip("0123456789")) :] or short(name, 5)
 
 
 def _color_bar(limit: float, box: _Box, unit: float) -> Markup:
     left, top, width = box
     digits = decimals_for_values([limit], 2)
-    ends = (
-        (number(-limit, digits), left, "start"),
-        ("0", left + width / 2, "middle"),
-        (number(limit, digits), left + width, "end"),
-    )
     ticks = [
         element("text", text, x=x, y=top + 20 * unit, text_anchor=anchor, class_="name")
-        for text, x, anchor in ends
+        for text, x, anchor in (
+            (number(-limit, digits), left, "start"),
+            ("0", left + width / 2, "middle"),
+            (number(limit, digits), left + width, "end"),
+        )
     ]
     return element("g", *color_bar(left, top, width, 9 * unit, signed=True), *ticks)
 

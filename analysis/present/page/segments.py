@@ -1,4 +1,4 @@
-"""Draw gain, lag and energy of every joint, head to tail."""
+"""Draw a session along its body: gain, lag and energy of joints, motion of head, middle, tail."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_hex
 
-from ...results.analysis import JointResult
+from ...results.analysis import BodyPoint, BodyResult, JointResult
 from ...results.estimate import Estimate
-from ...results.formats import degrees, estimate, number
+from ...results.formats import degrees, estimate, number, scaled, short
 from .svg import (
     DASHED,
     INK,
     MUTED,
     PAPER,
     REFERENCE,
-    WIDTH_IN,
     Axes,
     Drawing,
     Figure,
@@ -29,7 +29,6 @@ from .svg import (
     key,
     legend,
     marker,
-    new_figure,
     plot_estimate,
 )
 from .tables import is_driven
@@ -50,8 +49,7 @@ def segments(joints: Sequence[JointResult], prefix: str) -> Drawing:
     """
     colors = joint_hex(len(joints))
     tooltips: dict[str, str] = {}
-    with drawing():
-        figure = new_figure(WIDTH_IN, 5.8)
+    with drawing(5.8) as figure:
         gain_axes, lag_axes, energy_axes = figure.subplots(3, 1, sharex=True)
         _estimates(gain_axes, joints, colors, tooltips, what="gain", of=lambda j: j.gain)
         _estimates(lag_axes, joints, colors, tooltips, what="lag", of=lambda j: degrees(j.lag_rad))
@@ -87,30 +85,29 @@ def _estimates(
             gid = f"{what}-{i}"
             plot_estimate(axes, i + 1, quantity, colors[i], marker=marker(joint.plane), gid=gid)
             tooltips[gid] = _tooltip(joint, f"{what} {estimate(quantity, '°' if lag else '')}")
-    _mean_lines(axes, joints, of, _circular_mean_deg if lag else fmean)
+    _mean_lines(axes, joints, of, circular=lag)
     if drawn:
         _keep_span(axes, least=1.0 if lag else 0.02)
     else:
         _empty(axes, f"no {what}: see the warnings")
 
 
-def _circular_mean_deg(values: Sequence[float]) -> float:
-    """Return the mean direction [°] (Fisher, Statistical Analysis of Circular Data, Eq. 2.9)."""
-    return float(np.degrees(np.angle(np.mean(np.exp(1j * np.radians(values))))))
-
-
 def _mean_lines(
     axes: Axes,
     joints: Sequence[JointResult],
     of: Callable[[JointResult], Estimate],
-    average: Callable[[Sequence[float]], float],
+    *,
+    circular: bool,
 ) -> None:
     """Draw the mean over the joints of each plane: the position of all if they moved alike."""
     for plane in _PLANES:
         members = [(i + 1, of(j).value) for i, j in enumerate(joints) if j.plane == plane]
         known = [(place, value) for place, value in members if value is not None]
         if len(known) > 1:
-            mean = average([value for _, value in known])
+            values = [value for _, value in known]
+            # Mean direction (Fisher, Statistical Analysis of Circular Data, Eq. 2.9).
+            turn = np.angle(np.mean(np.exp(1j * np.radians(values))))
+            mean = float(np.degrees(turn)) if circular else fmean(values)
             ends = [known[0][0] - 0.4, known[-1][0] + 0.4]
             axes.plot(ends, [mean, mean], color=REFERENCE, linestyle=DASHED, zorder=1)
 
@@ -218,3 +215,70 @@ def _segments_caption(joints: Sequence[JointResult]) -> str:
             "body."
         )
     return text
+
+
+_NULL_STYLES = (DASHED, (0, (1.5, 2)), (0, (7, 2, 1.5, 2)))
+
+
+def body_motion(body: BodyResult, prefix: str) -> Drawing:
+    """Draw head, middle and tail over one gait cycle, with the perfect-tracking nulls dashed.
+
+    The curve of a place is A cos(Phi + phase), A and phase with respect to the head link; the
+    band is what amplitude and phase may do within their intervals.
+
+    Args:
+        body: With one or more observed points.
+        prefix: For identifiers, unique in the page.
+    """
+    points = body.observed
+    colors = joint_hex(len(points))
+    cycle = np.linspace(0.0, 2.0 * np.pi, 121)
+    with drawing(2.7) as figure:
+        grid = figure.subplots(1, len(points), sharex=True, sharey=True, squeeze=False)
+        for axes, point, color in zip(grid[0], points, colors, strict=True):
+            for style, points_of_null in zip(_NULL_STYLES, body.null.values(), strict=False):
+                for null in points_of_null:
+                    if null.place == point.place:
+                        _harmonic(axes, null, cycle, REFERENCE, style)
+            _harmonic(axes, point, cycle, color, "-")
+            axes.set_title(short(f"{point.place} ({point.link})", 28))
+            axes.set_xticks([0.0, 90.0, 180.0, 270.0, 360.0])
+        grid[0, 0].set_ylabel("left of the heading [mm]" if body.plane != "vertical" else "up [mm]")
+        figure.supxlabel("phase of the gait [°], zero at the head link's peak", fontsize=8.0)
+        nulls = [
+            key(color=REFERENCE, linestyle=style, label=short(f"perfect tracking, {name}"))
+            for style, name in zip(_NULL_STYLES, body.null, strict=False)
+        ]
+        legend(figure, key(color=colors[len(colors) // 2], label="measured, 95 %"), *nulls)
+        title = f"Motion of {', '.join(p.place for p in points)} over one gait cycle"
+        dashed = ". Dashed grey: the same body with every joint exactly on its command."
+        svg = inline_svg(figure, prefix, title, "; ".join(map(_point_in_words, points)) + dashed)
+    return Drawing(
+        svg,
+        "Motion of the links at the gait frequency, across the mean heading. Dashed grey is a "
+        "perfect-tracking null: the same body with every joint exactly on its command. Head, "
+        "middle and tail differ there already, by kinematics alone, so only what departs from the "
+        "dashed line speaks of the joints.",
+    )
+
+
+def _harmonic(axes: Axes, point: BodyPoint, cycle: FloatArray, color: str, style: object) -> None:
+    amplitude, phase = scaled(point.amplitude_m, 1000.0), point.phase_rad
+    if amplitude.value is None or phase.value is None:
+        return
+    x = np.degrees(cycle)
+    width, zorder = 1.4, 2
+    if style == "-":
+        width, zorder = 2.0, 3
+        low, high = phase.ci95 or (phase.value, phase.value)
+        sizes = amplitude.ci95 or (amplitude.value, amplitude.value)
+        family = np.stack([a * np.cos(cycle + p) for a in sizes for p in np.linspace(low, high, 9)])
+        axes.fill_between(x, family.min(0), family.max(0), color=color, alpha=0.3, linewidth=0)
+    y = amplitude.value * np.cos(cycle + phase.value)
+    axes.plot(x, y, color=color, linestyle=style, linewidth=width, zorder=zorder)
+
+
+def _point_in_words(point: BodyPoint) -> str:
+    amplitude = estimate(scaled(point.amplitude_m, 1000.0), " mm")
+    phase = estimate(degrees(point.phase_rad), "°")
+    return f"{point.place}: amplitude {amplitude}, phase {phase}"

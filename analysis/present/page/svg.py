@@ -96,6 +96,9 @@ STYLE: dict[str, Any] = {
 }
 """What a figure is drawn with; see :func:`drawing`."""
 
+WIDTH_IN = 8.0
+"""Width of every figure [inch]; the page scales it."""
+
 _SVG = "http://www.w3.org/2000/svg"
 _XLINK = "{http://www.w3.org/1999/xlink}href"
 _NUMBER = re.compile(r"-?\d+\.\d+")
@@ -107,21 +110,15 @@ _FILL = re.compile(r"(?:^|; ?)fill: ([^;]+)")
 
 
 @contextmanager
-def drawing() -> Generator[None]:
-    """Set the style of the report's figures, which are built and written inside the block.
+def drawing(height_in: float, width_in: float = WIDTH_IN) -> Generator[Figure]:
+    """Open an empty figure in the page's own style, whatever the caller's matplotlib is set to.
 
-    Yields:
-        Nothing. The user's own matplotlib settings are restored at the end.
+    Panels and legend share its space. It belongs to no window, so that nothing must close it.
     """
     with _mpl.rc_context():
         _mpl.rcdefaults()
         _mpl.rcParams.update(STYLE)
-        yield
-
-
-def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure [inch] without a window, whose panels make room for their labels."""
-    return _Figure(figsize=(width_in, height_in), layout="constrained")
+        yield _Figure(figsize=(width_in, height_in), layout="constrained")
 
 
 def inline_svg(
@@ -230,13 +227,9 @@ def _plain_text_style(text: ET.Element) -> None:
             text.set(attribute, found[1])
     fill = _FILL.search(style)
     text.set("style", f"fill: {fill[1] if fill is not None else INK}")
-    transform = text.get("transform", "")
-    if transform.startswith("rotate(-0 "):
+    if text.get("transform", "").startswith("rotate(-0 "):
         del text.attrib["transform"]
 
-
-WIDTH_IN = 8.0
-"""Width of every figure [inch]; the page scales it."""
 
 DASHED = (0, (5, 3))
 """Line style of margins, means and nulls."""

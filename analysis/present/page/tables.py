@@ -90,8 +90,7 @@ def color_bar(
     left: float, top: float, width: float, height: float, *, signed: bool
 ) -> list[Markup]:
     """Return the rectangles of a colour scale."""
-    step = width / (LEVELS + 1)
-    sizes = {"y": top, "width": step + 0.4, "height": height}
+    sizes = {"y": top, "width": width / (LEVELS + 1) + 0.4, "height": height}
     return [
         element("rect", x=left + width * n / (LEVELS + 1), **sizes, **hue(n, signed=signed))
         for n in range(LEVELS + 1)
@@ -251,9 +250,13 @@ def key_figures(analysis: Analysis) -> list[Fact]:
         sum_j = math.fsum(energies)
         total = f"{formats.number(sum_j, formats.decimals_for_values([sum_j]))} J"
         energy_note = f"{len(energies)} of {len(joints)} joints"
+    steps = [
+        f"{formats.number(math.degrees(lag), 1)}° a joint, {plain(plane)}"
+        for plane, lag in gait.lag_per_joint_rad.items()
+    ]
     facts = [
         Fact("Gait frequency", formats.gait_frequency(gait), _analysed(analysis)),
-        Fact("Wave", (gait.wave or formats.MISSING).replace("-", " "), _lag_per_joint(analysis)),
+        Fact("Wave", (gait.wave or formats.MISSING).replace("-", " "), ", ".join(steps)),
         Fact("Joints in the gait", count),
         _range("Gain", gains, formats.decimals_for((j.gain for j in joints), most=3), ""),
         _range("Lag", lags, 1, "°"),
@@ -266,8 +269,7 @@ def key_figures(analysis: Analysis) -> list[Fact]:
     points = analysis.body.observed if analysis.body is not None else ()
     sizes = [formats.number(formats.scaled(p.amplitude_m, 1000.0).value, 0) for p in points]
     amplitude = " / ".join(sizes) + " mm" if sizes else formats.MISSING
-    places = plain(" / ".join(p.place for p in points))
-    return [*facts, Fact("Body amplitude", amplitude, places)]
+    return [*facts, Fact("Body amplitude", amplitude, plain(" / ".join(p.place for p in points)))]
 
 
 def _range(name: str, values: Sequence[tuple[float, str]], decimals: int, unit: str) -> Fact:
@@ -288,10 +290,3 @@ def _analysed(analysis: Analysis) -> str:
     spans = ", ".join(f"{w.start_s:.2f} to {w.stop_s:.2f} s" for w in windows[:3])
     more = f" and {len(windows) - 3} more" if len(windows) > 3 else ""
     return f"{cycles:.0f} cycles, {spans}{more}" if cycles else f"{spans}{more}"
-
-
-def _lag_per_joint(analysis: Analysis) -> str:
-    return ", ".join(
-        f"{formats.number(math.degrees(lag), 1)}° a joint, {plain(plane)}"
-        for plane, lag in analysis.gait.lag_per_joint_rad.items()
-    )

@@ -74,13 +74,12 @@ class Pace:
             return self
         stop_ns = start_ns + round(stop_s * _NS)
         j = int(np.searchsorted(self.t_ns, stop_ns)) + 1
-        end = float(np.interp(stop_ns, self.t_ns, self.phase_rad))
         return replace(
             self,
             t_ns=self.t_ns[:j],
             phase_rad=self.phase_rad[:j],
             stop_s=stop_s,
-            ends_rad=(self.ends_rad[0], end),
+            ends_rad=(self.ends_rad[0], float(np.interp(stop_ns, self.t_ns, self.phase_rad))),
         )
 
 
@@ -180,10 +179,8 @@ def falsified(analysis: Analysis | None, start_s: float, stop_s: float) -> tuple
         Their names, each once.
     """
     artefacts = () if analysis is None else analysis.artefacts
-    found = (
-        one.joint for one in artefacts if one.falsifies("position") and one.within(start_s, stop_s)
-    )
-    return tuple(dict.fromkeys(found))
+    false = (one for one in artefacts if one.falsifies("position"))
+    return tuple(dict.fromkeys(one.joint for one in false if one.within(start_s, stop_s)))
 
 
 def mean_cycles(tracks: Sequence[Track], pace: Pace) -> MeanCycles | None:
@@ -226,8 +223,7 @@ def body_frame(robot: Robot, angles: FloatArray) -> tuple[FloatArray, FloatArray
     known = np.isfinite(centre[..., 0])
     many = np.count_nonzero(known, axis=1)[:, None]
     middle = np.where(known[..., None], centre, 0.0).sum(axis=1) / many
-    whole = np.where(known[..., None, None], rotation, 0.0).sum(axis=1)
-    u, _, vt = np.linalg.svd(whole)
+    u, _, vt = np.linalg.svd(np.where(known[..., None, None], rotation, 0.0).sum(axis=1))
     # Det of U V^T is +1 or -1: only the former is a rotation.
     sign = np.ones((len(angles), 3))
     sign[:, 2] = np.linalg.det(u @ vt)
@@ -261,8 +257,7 @@ def _fitted(
     if model is None or series.count <= model.size + 1:
         return None
     crest = float(np.angle(fit_at([series], omega, model).fundamental[0]))
-    steps = 2 + int(cycles * PHASES)
-    at_s = np.linspace(*window, steps)
+    at_s = np.linspace(*window, 2 + int(cycles * PHASES))
     ends = omega * window[0] + crest, omega * window[1] + crest
     at_ns = start_ns + np.round(at_s * _NS).astype(np.int64)
     return Pace(at_ns, omega * at_s + crest, *window, ends, logged=False)
@@ -281,14 +276,8 @@ def _cut(track: Track, pace: Pace) -> FloatArray:
     model = allowed_model([one], 1.0)
     if one.count <= model.size + 1 or 4 * one.period_s > np.pi:
         return nothing
-    return cycles_by_phase(
-        one,
-        fit_at([one], 1.0, model),
-        0,
-        zero_rad=0.0,
-        start_s=pace.ends_rad[0],
-        stop_s=pace.ends_rad[1],
-    )
+    fit, (start, stop) = fit_at([one], 1.0, model), pace.ends_rad
+    return cycles_by_phase(one, fit, 0, zero_rad=0.0, start_s=start, stop_s=stop)
 
 
 def _half(cut: FloatArray) -> FloatArray:

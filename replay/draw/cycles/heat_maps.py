@@ -179,9 +179,7 @@ def _log_bar(rec: rr.RecordingStream, shown: HeatMap) -> None:
     """Draw the colour bar with the values at its ends."""
     low, high = shown.low, shown.high
     ramp = np.linspace(low, high, 128)
-    whole = CycleTable(
-        shown.table.quantity, ("",), ramp, ramp, np.stack([ramp, ramp]).reshape(2, -1)
-    )
+    whole = CycleTable(shown.table.quantity, ("",), ramp, ramp, np.stack([ramp, ramp]))
     colors = cell_colors(HeatMap(whole, (1,), low, high, shown.signed)).transpose(1, 0, 2)
     left = (SIZE[0] - _BAR[0]) / 2
     place = rr.Transform3D(
@@ -189,10 +187,9 @@ def _log_bar(rec: rr.RecordingStream, shown: HeatMap) -> None:
     )
     rec.log(f"{shown.entity}/colors", rr.Image(np.ascontiguousarray(colors)), place, static=True)
     unit = shown.table.quantity.unit
-    told = [f"{end}{'' if unit == '°' else ' '}{unit}" for end in shown.ends]
+    ends = [f"{end}{'' if unit == '°' else ' '}{unit}" for end in shown.ends]
     y = _BAR_TOP - 8.0
-    points = [(left - 32.0, y), (left + _BAR[0] + 32.0, y)]
-    _log_text(rec, f"{shown.entity}/ends", points, told)
+    _log_text(rec, f"{shown.entity}/ends", [(left - 32.0, y), (left + _BAR[0] + 32.0, y)], ends)
 
 
 def _log_text(

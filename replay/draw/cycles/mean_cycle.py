@@ -109,8 +109,7 @@ def log_mean_cycle(
     if pace is None:
         return None
     pace = pace.shortened(pace.start_s + MOST_S, clock.start_ns)
-    false = falsified(analysis, pace.start_s, pace.stop_s)
-    if false:
+    if false := falsified(analysis, pace.start_s, pace.stop_s):
         warnings.append(
             f"the mean cycle leaves out {', '.join(false)}: a sensor falsifies the angles"
         )

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any, cast
 
 import numpy as np
@@ -86,14 +87,14 @@ def together(tables: Sequence[CycleTable]) -> CycleTable:
     """
     main = max(tables, key=lambda table: table.start_s.size)
     middle = 0.5 * (main.start_s + main.stop_s)
-    rows: list[FloatArray] = []
-    for table in tables:
+
+    def rows(table: CycleTable) -> FloatArray:
         at = np.searchsorted(table.start_s, middle, side="right") - 1
         own = np.maximum(at, 0)
-        inside = (at >= 0) & (middle < table.stop_s[own])
-        rows.append(np.where(inside, table.value[:, own], np.nan))
+        return np.where((at >= 0) & (middle < table.stop_s[own]), table.value[:, own], np.nan)
+
     names = tuple(name for table in tables for name in table.names)
-    return replace(main, names=names, value=np.concatenate(rows))
+    return replace(main, names=names, value=np.concatenate([rows(table) for table in tables]))
 
 
 def log_cycles(
@@ -112,13 +113,8 @@ def log_cycles(
     """
     found: list[tuple[Quantity, tuple[Series, ...]]] = []
     for quantity in dict.fromkeys(table.quantity for table in tables):
-        tracks = [
-            track
-            for table in tables
-            if table.quantity == quantity
-            for track in _steps(table, clock.start_ns)
-        ]
-        parts = tables_of(tracks)
+        own = [_steps(table, clock.start_ns) for table in tables if table.quantity == quantity]
+        parts = tables_of(list(chain.from_iterable(own)))
         paths = part_entities(f"{CYCLES}/{quantity.key}", [part.names for part in parts])
         series: list[Series] = []
         for entity, part in zip(paths, parts, strict=True):
@@ -140,10 +136,8 @@ def cycle_times_ns(table: CycleTable, start_ns: int) -> tuple[IntArray, IntArray
         Unix times [ns], each of shape (c,).
     """
     far_s = 4e9  # keeps the times of a damaged result within int64
-    start, stop = (
-        np.round(np.clip(t_s, -far_s, far_s) * 1e9).astype(np.int64)
-        for t_s in (table.start_s, table.stop_s)
-    )
+    start_s, stop_s = (np.clip(t_s, -far_s, far_s) for t_s in (table.start_s, table.stop_s))
+    start, stop = (np.round(t_s * 1e9).astype(np.int64) for t_s in (start_s, stop_s))
     return start_ns + start, start_ns + stop
 
 
@@ -179,13 +173,8 @@ def _over_time(joints: Sequence[JointOverTime]) -> list[CycleTable]:
     for start_s, group in together.items():
         gain = np.array([joint.gain for joint in group], dtype=np.float64)
         lag = np.array([joint.lag_rad for joint in group], dtype=np.float64)
-        table = CycleTable(
-            GAIN,
-            tuple(joint.name for joint in group),
-            np.array(start_s),
-            np.array(group[0].stop_s),
-            100.0 * (gain - 1.0),
-        )
+        names, stop_s = tuple(joint.name for joint in group), np.array(group[0].stop_s)
+        table = CycleTable(GAIN, names, np.array(start_s), stop_s, 100.0 * (gain - 1.0))
         gains.append(table)
         lags.append(replace(table, quantity=LAG, value=np.degrees(_about_its_mean(lag))))
     return [*gains, *lags]
@@ -194,8 +183,7 @@ def _over_time(joints: Sequence[JointOverTime]) -> list[CycleTable]:
 def _about_its_mean(lag_rad: FloatArray) -> FloatArray:
     """Lags within pi of each joint's mean direction, so that no step is a mere turn, (m, c)."""
     mean = np.angle(np.nansum(np.exp(1j * lag_rad), axis=1, keepdims=True))
-    turned: FloatArray = mean + np.angle(np.exp(1j * (lag_rad - mean)))
-    return turned
+    return mean + np.angle(np.exp(1j * (lag_rad - mean)))
 
 
 def _energy(analysis: Analysis) -> list[CycleTable]:
@@ -208,15 +196,9 @@ def _energy(analysis: Analysis) -> list[CycleTable]:
         return []
     value = np.array([joint.net_j for joint in known], dtype=np.float64)
     covered = np.array([joint.coverage for joint in known], dtype=np.float64)
-    return [
-        CycleTable(
-            ENERGY,
-            tuple(joint.name for joint in known),
-            np.array(energy.start_s),
-            np.array(energy.stop_s),
-            np.where(covered >= LEAST_COVERED, value, np.nan),
-        )
-    ]
+    value = np.where(covered >= LEAST_COVERED, value, np.nan)
+    names, start_s = tuple(joint.name for joint in known), np.array(energy.start_s)
+    return [CycleTable(ENERGY, names, start_s, np.array(energy.stop_s), value)]
 
 
 SEGMENTS = "/segments"
@@ -266,16 +248,13 @@ def log_charts(
         tallest = max((bar.value for bar in chart.bars), key=abs, default=0.0)
         marked = [bar.place + _MARK_LEFT for bar in chart.bars if bar.joint in named]
         entity = f"{SEGMENTS}/{chart.key}"
-        if marked:
-            many = len(marked)
-            drawn = rr.BarChart(
-                [tallest] * many, abscissa=marked, widths=[_MARK_WIDTH] * many, color=NAMED
-            )
+        if many := len(marked):
+            tall, wide = [tallest] * many, [_MARK_WIDTH] * many
+            drawn = rr.BarChart(tall, abscissa=marked, widths=wide, color=NAMED)
             rec.log(f"{entity}/named", drawn, static=True)
         for bar in chart.bars:
-            color = palette.get(bar.joint, GREY)
-            left = bar.place + _LEFT
-            log_bar(rec, entity, bar, left=left, width=_WIDTH, whisker=_WHISKER, color=color)
+            look: dict[str, Any] = {"whisker": _WHISKER, "color": palette.get(bar.joint, GREY)}
+            log_bar(rec, entity, bar, left=bar.place + _LEFT, width=_WIDTH, **look)
 
 
 def log_bar(
@@ -326,15 +305,14 @@ def _log_rows(rec: rr.RecordingStream, clock: Clock, chart: Chart, table: CycleT
     # After the last cycle there is none.
     heights = np.append(table.value[row], np.full((len(row), 1), np.nan), axis=1).T
     for rows, times in clock.rows(t_ns):
-        known = [np.isfinite(height) for height in heights[rows]]
         bars = [
             rr.BarChart(
-                height[sure],
+                height[sure := np.isfinite(height)],
                 abscissa=left[sure],
                 widths=np.full(np.count_nonzero(sure), _CURRENT_WIDTH),
                 color=CURRENT,
             )
-            for height, sure in zip(heights[rows], known, strict=True)
+            for height in heights[rows]
         ]
         rec.send_columns(f"{SEGMENTS}/{chart.key}/current", times, _columns(bars))
 
@@ -388,6 +366,5 @@ def bar_of(
     """
     if estimate.value is None:
         return None
-    ends = [scale * (end - baseline) for end in estimate.ci95 or ()]
-    far = max(ends, key=abs, default=None)
+    far = max([scale * (end - baseline) for end in estimate.ci95 or ()], key=abs, default=None)
     return Bar(joint, place, scale * (estimate.value - baseline), far)

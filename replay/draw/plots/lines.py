@@ -65,13 +65,10 @@ def head_middle_tail(robot: Robot | None, moving: Sequence[Track]) -> Places | N
     if robot is None:
         names, plane = tuple(swing), None
     else:
-        planes = {
-            plane: [joint.name for joint in robot.joints if joint.plane is plane] for plane in Plane
-        }
+        planes = {one: [j.name for j in robot.joints if j.plane is one] for one in Plane}
         plane = max(Plane, key=lambda p: max((swing.get(n, -1.0) for n in planes[p]), default=-1.0))
         names = tuple(name for name in planes[plane] if name in swing) or tuple(swing)
-    chosen = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
-    return Places(tuple(chosen), plane)
+    return Places(tuple(dict.fromkeys((names[0], names[len(names) // 2], names[-1]))), plane)
 
 
 def places_look(places: Places, kind: str) -> dict[str, Any]:
@@ -80,11 +77,10 @@ def places_look(places: Places, kind: str) -> dict[str, Any]:
     Args:
         kind: ``measured`` or ``commanded``.
     """
-    titles = {
-        name: line_title(name, label if kind == "measured" else "command")
-        for name, label in places.labelled.items()
-    }
-    return {"titles": titles, "width": 2.0 if kind == "measured" else 1.0}
+    own = kind == "measured"
+    labels = places.labelled.items()
+    titles = {name: line_title(name, label if own else "command") for name, label in labels}
+    return {"titles": titles, "width": 2.0 if own else 1.0}
 
 
 def part_entities(entity: str, parts: Sequence[Sequence[str]]) -> list[str]:
@@ -177,8 +173,7 @@ def log_rows(
         shown = rounded(shown, steps)
     packed = shown.astype(np.float32)
     for rows, times in clock.rows(t_ns):
-        batch = Float32Batch(packed[rows].ravel())
-        column = rr.ComponentColumn(_DESCRIPTORS[component], batch)
+        column = rr.ComponentColumn(_DESCRIPTORS[component], Float32Batch(packed[rows].ravel()))
         size = np.full(rows.stop - rows.start, values.shape[1])
         rec.send_columns(entity, times, [column.partition(size)])
 
@@ -303,8 +298,7 @@ def log_lines(rec: rr.RecordingStream, clock: Clock, events: Sequence[tuple[int,
         events: When each happened [ns], and its ``rcl_interfaces/msg/Log``.
     """
     lines = [(t_ns, f"{one.name}: {one.msg}" if one.name else one.msg) for t_ns, one in events]
-    levels = [_LEVELS.get(event.level, INFO) for _, event in events]
-    log_texts(rec, clock, EVENTS, lines, levels)
+    log_texts(rec, clock, EVENTS, lines, [_LEVELS.get(event.level, INFO) for _, event in events])
 
 
 def log_texts(

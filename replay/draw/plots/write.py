@@ -16,7 +16,6 @@ import numpy as np
 import rerun as rr
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.columns.topics import Channel
 
@@ -106,7 +105,7 @@ def log_others(
 
 def log_words(rec: rr.RecordingStream, clock: Clock, session: SessionView) -> bool:
     """Write String topics of a foreign bag as events, each time that their value changes."""
-    said: list[tuple[int, str]] = []
+    words: list[tuple[int, str]] = []
     for topic, channel in _others(session):
         if channel.type_name == _WORDS and channel.is_ros2:
             messages = [
@@ -115,10 +114,10 @@ def log_words(rec: rr.RecordingStream, clock: Clock, session: SessionView) -> bo
                 if hasattr(message, "data")  # a log's own definition of the type may lack it
             ]
             turns = changes([word for _, word in messages])
-            said += [(messages[i][0], f"{topic}: {messages[i][1]}") for i in turns]
-    said.sort()
-    log_texts(rec, clock, f"{EVENTS}/said", said, [INFO] * len(said))
-    return bool(said)
+            words += [(messages[i][0], f"{topic}: {messages[i][1]}") for i in turns]
+    words.sort()
+    log_texts(rec, clock, f"{EVENTS}/said", words, [INFO] * len(words))
+    return bool(words)
 
 
 def _others(session: SessionView) -> Iterator[tuple[str, Channel]]:
@@ -149,9 +148,7 @@ def _count(value: Any) -> int:
         return len(cast("bytes", value))
     if isinstance(value, (list, tuple)):
         many = cast("list[Any]", value)
-        if len(many) > MOST_NUMBERS:
-            return len(many)
-        return sum(_count(one) for one in many)
+        return len(many) if len(many) > MOST_NUMBERS else sum(map(_count, many))
     return sum(_count(getattr(value, name)) for name in getattr(value, "__slots__", ()))
 
 
@@ -230,7 +227,6 @@ class Plot:
             values[:, [one.names.index(name) for name in table.names]] = table.values
             t_ns, values = mark_gaps(table.t_ns, values, span.known_ns)
             rows = span.rows(t_ns)
-            steps: FloatArray = np.array([self._steps.get(name, 0.0) for name in one.names])
             log_rows(
                 rec,
                 clock,
@@ -239,7 +235,7 @@ class Plot:
                 values[rows],
                 degrees=self._degrees,
                 component=one.component,
-                steps=steps,
+                steps=np.array([self._steps.get(name, 0.0) for name in one.names]),
             )
 
 
@@ -297,11 +293,8 @@ class Plots:
     @property
     def signals(self) -> dict[str, tuple[Series, ...]]:
         """Series of the topics without views of their own, by entity."""
-        return {
-            entity: plot.series
-            for entity, plot in self._plots.items()
-            if entity.startswith(f"{SIGNALS}/")
-        }
+        own = f"{SIGNALS}/"
+        return {name: one.series for name, one in self._plots.items() if name.startswith(own)}
 
     def write(self, stretch: Stretch) -> None:
         """Write a stretch."""

@@ -322,9 +322,7 @@ def log_markers(
         named: At which of the motion's times the names are moved, shape (n,).
     """
     robot = motion.robot
-    if places is None:
-        return
-    labels = places.labelled
+    labels = {} if places is None else places.labelled
     names = tuple(name for name in labels if name in robot.joint_names)
     if not names:
         return
@@ -373,8 +371,7 @@ def log_marks(
         names: The joints; those that the robot doesn't have are left out.
         chosen: Which of its drawing times, shape (n,).
     """
-    robot = motion.robot
-    known = tuple(name for name in names if name in robot.joint_names)
+    known = tuple(name for name in names if name in motion.robot.joint_names)
     if not known:
         return
     look = rr.Points3D.from_fields(colors=NAMED, radii=rr.Radius.ui_points(5.0), show_labels=True)

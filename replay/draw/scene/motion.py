@@ -187,11 +187,7 @@ def tracked_head(t_ns: IntArray, pose: FloatArray) -> HeadPath:
     return HeadPath(t_ns, pose[:, :3], quaternion, tracked=True)
 
 
-def assemble(
-    robot: Robot,
-    head: HeadPath,
-    columns: Columns,
-) -> Motion:
+def assemble(robot: Robot, head: HeadPath, columns: Columns) -> Motion:
     """Bring joints and power to the times at which the body is drawn.
 
     Args:

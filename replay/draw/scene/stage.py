@@ -282,11 +282,9 @@ class Scene:
         self._head, sparse = frames_of(head, session.end_ns)
         self._sparse = np.flatnonzero(sparse)
         self._sensors = range_sensors(robot, session.channels)
-        at_ns = self._head.t_ns[self._sparse]
-        self._distance = read_ranges(session, self._sensors, at_ns)
+        self._distance = read_ranges(session, self._sensors, self._head.t_ns[self._sparse])
         rec.log("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        world = world_of(session, warnings)
-        if world is not None:
+        if (world := world_of(session, warnings)) is not None:
             log_surroundings(rec, world)
         if head.tracked:
             log_trail(rec, clock, head, span)

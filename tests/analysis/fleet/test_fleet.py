@@ -10,7 +10,7 @@ import pytest
 from support.linear_chain import CHAIN, WAVE, M, write_run
 from support.processes import undulog
 from undulog.analysis.fleet.change_points import find_change_points, relative_to_others
-from undulog.analysis.fleet.fleet import analyse_fleet
+from undulog.analysis.fleet.fleet import Components, analyse_fleet
 
 DAY_NS = 86_400_000_000_000
 FIRST = pd.Timestamp("2026-09-01")
@@ -172,23 +172,31 @@ def test_one_joint_does_not_move_the_others():
     assert np.abs(after - before)[:, [0, 1, 3, 4]].max() < 0.03
 
 
+@pytest.fixture
+def without_models(monkeypatch):
+    """Leave out the mixed-effects models, which take most of the time."""
+    monkeypatch.setattr(
+        "undulog.analysis.fleet.fleet._components", lambda name, *_: Components(name)
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("gaits", [1, 3])
-def test_without_wear_hardly_a_joint_is_named(gaits):
+def test_without_wear_hardly_a_joint_is_named(without_models, gaits):
     named = 0
     for seed in range(50):
         sessions, rows, _, _ = frames(seed, gaits=gaits)
-        named += bool(analyse_fleet(sessions, rows, components=False).robots[0].changes)
+        named += bool(analyse_fleet(sessions, rows).robots[0].changes)
     assert named <= 2  # binomial, 1 %: 2 or fewer in 99 %
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["step", "ramp", "saturating"])
-def test_wear_is_named_with_a_date_whose_interval_holds(kind):
+def test_wear_is_named_with_a_date_whose_interval_holds(without_models, kind):
     good = 0
     for seed in range(50):
         sessions, rows, name, begun = frames(seed, kind, size=0.06)
-        changes = analyse_fleet(sessions, rows, components=False).robots[0].changes
+        changes = analyse_fleet(sessions, rows).robots[0].changes
         mine = [change for change in changes if (change.joint, change.quantity) == (name, "gain")]
         good += any(one.earliest <= begun.isoformat() <= one.latest for one in mine)
     assert good >= {"step": 45, "ramp": 36, "saturating": 42}[kind]

@@ -9,8 +9,8 @@ from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.spectrum import residual_noise
 from undulog.analysis.response.fitting import fit_gait
-from undulog.analysis.response.groups import find_groups
-from undulog.analysis.response.mixing import (
+from undulog.analysis.response.groups import (
+    find_groups,
     further_lines,
     group_model,
     mixed_tones,

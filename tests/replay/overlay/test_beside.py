@@ -501,8 +501,9 @@ def in_a_grid(*shown):
 
 
 @pytest.mark.slow
-def test_no_view_complains_and_each_shows_something(show, converted, rgb, tmp_path):
-    write_overlay(converted, tmp_path / "all.rrd", Align.TIME, layout=in_a_grid)
+def test_no_view_complains_and_each_shows_something(show, converted, rgb, tmp_path, monkeypatch):
+    monkeypatch.setattr("undulog.replay.overlay.write.build_blueprint", in_a_grid)
+    write_overlay(converted, tmp_path / "all.rrd", Align.TIME)
     grid = show(tmp_path / "all.rrd", 3.0)
     assert grid.complaints() == []
     # Bodies, three texts, places, power, differences, heads; three bars and three differences.

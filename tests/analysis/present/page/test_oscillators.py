@@ -7,8 +7,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from undulog.analysis.present.page.oscillators import chain_view, entrainment_entries
-from undulog.analysis.present.page.page import render
+from undulog.analysis.present.page.experiment_view import entrainment_entries
+from undulog.analysis.present.page.page import chain_view, render
 from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 

@@ -10,8 +10,7 @@ from undulog.analysis.present.page import svg
 
 
 def draw(prefix="p", text="lag [°]", **options):
-    with svg.drawing():
-        figure = svg.new_figure(4, 3)
+    with svg.drawing(3, 4) as figure:
         axes = figure.subplots()
         axes.plot([1, 2, 3], [1, 5, 2], "o-", color=svg.INK, gid="curve")
         axes.set_xlabel(text)

@@ -1,0 +1,306 @@
+"""Command ``view`` of recorded sessions: its options, a clip, several sessions side by side."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from undulog.capture import Session, SessionView
+from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
+from undulog.capture.common.errors import MissingExtraError, UsageError
+from undulog.capture.common.process import interruptible
+
+from ..samples.content import Tab
+from ..viewer import viewer
+
+if TYPE_CHECKING:
+    from ..feed.film import Shot
+    from ..feed.recording import Recording
+    from ..overlay.sessions import Align
+    from ..overlay.write import Overlay, Place
+
+_COMMANDS = "/joint_commands"
+_STATES = "/joint_states"
+_TYPED = {"start": "from", "end": "to"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Options:
+    """Options of the command line that belong together."""
+
+    @property
+    def given(self) -> list[str]:
+        """Options that were given, as they are typed."""
+        names = [one.name for one in fields(self) if getattr(self, one.name) is not None]
+        return [f"--{_TYPED.get(name, name.replace('_', '-'))}" for name in names]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class SingleOptions(_Options):
+    """How one session is shown; None where an option is not given.
+
+    Attributes:
+        result: With one session: show what was found before instead of analysing now, `.json` of
+            `undulog analyse`. Results of an experiment or a comparison that it is part of mark the
+            modules they name. May be given several times.
+        tab: With one session: the tab in front, `session` by default; the mean cycle's
+            plays at once.
+        command_topic: With one session: JointState topic of the commands, in a bag of another make.
+        response_topic: With one session: JointState topic of the responses.
+    """
+
+    result: Annotated[list[Path] | None, Parameter(negative=())] = None
+    tab: Tab | None = None
+    command_topic: str | None = None
+    response_topic: str | None = None
+
+    @property
+    def topics(self) -> tuple[str, str]:
+        """JointState topics of commands and responses."""
+        return self.command_topic or _COMMANDS, self.response_topic or _STATES
+
+    def view(self, session: SessionView) -> SessionView:
+        """View a session with commands and responses on the topics of the log contract.
+
+        Args:
+            session: The session.
+
+        Returns:
+            The view; the session itself where they are there already.
+
+        Raises:
+            MissingChannelError: If it has no topic of a name that was given.
+        """
+        names = dict(zip((_COMMANDS, _STATES), self.topics, strict=True))
+        if all(usual == topic for usual, topic in names.items()):
+            return session
+        known = session.channels
+        return session.view(rename={a: b for a, b in names.items() if a != b or b in known})
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipOptions(_Options):
+    """The command line's options of a clip; None for those not given.
+
+    Attributes:
+        start: With `--clip`: where it begins, in seconds of the session.
+        end: With `--clip`: where it ends.
+        fps: With `--clip`: frames a second; 25 by default.
+        speed: With `--clip`: seconds of the session in a second of the clip, e.g. 0.25.
+        size: With `--clip`: WIDTHxHEIGHT in pixels; 960x540 by default.
+    """
+
+    start: Annotated[float | None, Parameter(name="--from")] = None
+    end: Annotated[float | None, Parameter(name="--to")] = None
+    fps: Annotated[int | None, Parameter(name="--fps")] = None
+    speed: Annotated[float | None, Parameter(name="--speed")] = None
+    size: Annotated[str | None, Parameter(name="--size")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class OverlayOptions(_Options):
+    """The command line's options of sessions side by side; None for those not given.
+
+    Attributes:
+        align: With several sessions, what happens at once: the same `time` since each one's first
+            sample (the default), the same time since the start of its `gait`, or the
+            same `phase` of the gait.
+        names: With several sessions: what they are called, with commas, e.g. `robot,twin`; the
+            files' names by default.
+        place: With several sessions: whether bodies are laid on the first one at the `start`
+            (the default) or stay where each session's `world` has them.
+    """
+
+    align: Annotated[Literal["time", "gait", "phase"] | None, Parameter(name="--align")] = None
+    names: Annotated[str | None, Parameter(name="--names")] = None
+    place: Annotated[Literal["start", "world"] | None, Parameter(name="--place")] = None
+
+
+def view_clip(file: Path, clip: Path, options: ClipOptions, *, force: bool, json: bool) -> None:
+    """Write a moving picture of a session's body.
+
+    Args:
+        file: The session.
+        clip: The clip, ``.gif`` or ``.mp4``.
+        options: How it is filmed.
+        force: Replace the clip if it is there.
+        json: Print the report as one JSON object.
+
+    Raises:
+        UsageError: If the options are wrong.
+        UndulogError: If the work fails.
+    """
+    try:
+        from ..feed.film import check_film, film, scene_only
+    except ModuleNotFoundError as error:
+        raise MissingExtraError("'undulog view --clip'", "replay", error.name or "av") from error
+    from ..draw.scene.body import body_title
+    from ..feed.recording import write_recording
+
+    refuse_existing(clip, force=force)
+    with (
+        interruptible() as stop,
+        tempfile.TemporaryDirectory(prefix="undulog-clip-") as folder,
+        Session.open(file) as session,
+    ):
+        shot = _shot(options, session.duration_s, file)
+        check_film(clip.suffix.lower(), shot.size, shot.fps)
+        with progress(f"clip of {file.name}", total=len(shot.times_s)) as bar:
+            bar.update(0, note="recording")
+            recording = write_recording(session, Path(folder) / "clip.rrd", layout=scene_only)
+            frames = film(
+                recording.path,
+                shot,
+                clip,
+                legend=body_title(recording.content),
+                on_frame=bar.update,
+                stop=stop,
+            )
+    _report_clip(clip, shot, frames, recording, json=json)
+
+
+def _shot(options: ClipOptions, duration_s: float, file: Path) -> Shot:
+    from ..feed.film import Shot
+
+    end_s = duration_s if options.end is None else options.end
+    if end_s > duration_s:
+        raise UsageError(f"--to {end_s:g}: {file.name} ends at {duration_s:.3f} s")
+    given: dict[str, Any] = {"fps": options.fps, "speed": options.speed}
+    chosen = {name: value for name, value in given.items() if value is not None}
+    if options.size is not None:
+        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", options.size)
+        if match is None:
+            text = "expected WIDTHxHEIGHT in pixels, e.g. 960x540"
+            raise UsageError(f"--size {options.size}: {text}")
+        chosen["size"] = int(match[1]), int(match[2])
+    return Shot(options.start or 0.0, end_s, **chosen)
+
+
+def _report_clip(clip: Path, shot: Shot, frames: int, recording: Recording, *, json: bool) -> None:
+    facts: dict[str, Any] = {
+        "path": str(clip),
+        "bytes": clip.stat().st_size,
+        "frames": frames,
+        "fps": shot.fps,
+        "duration_s": frames / shot.fps,
+        "from_s": shot.start_s,
+        "to_s": shot.end_s,
+        "speed": shot.speed,
+        "size": list(shot.size),
+        "warnings": list(recording.warnings),
+    }
+    if json:
+        emit_json(facts)
+        return
+    echo(
+        f"{clip}: {facts['duration_s']:.2f} s, {frames} frames of {shot.size[0]}x{shot.size[1]}, "
+        f"{facts['bytes'] / 1e6:.2f} MB"
+    )
+    echo(*(f"note: {warning}" for warning in recording.warnings))
+
+
+def view_overlay(
+    files: Sequence[Path],
+    options: OverlayOptions,
+    *,
+    save: Path | None,
+    web: bool,
+    json: bool,
+) -> None:
+    """Show or save sessions side by side.
+
+    Args:
+        files: Two or more sessions.
+        options: How they are aligned, placed and called.
+        save: Write the recording there instead of opening the viewer.
+        web: Serve it to a browser on this machine.
+        json: Print one JSON object.
+
+    Raises:
+        UsageError: If the names don't fit, or a session has no gait to be aligned by.
+    """
+    from ..overlay.sessions import Align, names_of
+    from ..overlay.write import Place, combine_sessions, steps
+
+    names = names_of(files, None if options.names is None else options.names.split(","))
+    how, place = Align(options.align or Align.TIME), Place(options.place or Place.START)
+    if save is None and not web:
+        viewer.require_display()
+    with ExitStack() as stack:
+        path = save
+        if path is None:  # it is only looked at
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="undulog-view-"))
+            path = Path(folder) / "beside.rrd"
+        with interruptible() as stop, progress("view", total=steps(len(files))) as bar:
+            beside = combine_sessions(
+                files,
+                path,
+                names=names,
+                how=how,
+                place=place,
+                on_step=bar.update,
+                stop=stop,
+            )
+        _report_overlay(beside, how, place, saved=save is not None, json=json)
+        if web:
+            viewer.serve(path, echo)
+        elif save is None:
+            viewer.show(path)
+
+
+def _report_overlay(beside: Overlay, how: Align, place: Place, *, saved: bool, json: bool) -> None:
+    size = beside.path.stat().st_size
+    if json:
+        facts = {
+            "path": str(beside.path),
+            "bytes": size,
+            "recording_id": beside.recording_id,
+            "align": str(how),
+            "place": str(place),
+            "sessions": [_session(beside, k) for k in range(len(beside.shown))],
+            "warnings": list(beside.warnings),
+        }
+        emit_json(facts)
+        return
+    from ..overlay import layout as words
+
+    first, *others = [one.side for one in beside.shown]
+    for other in others:
+        echo(f"{words.answer(first, other, beside.found[other.name])}.")
+    if saved:
+        echo(f"{beside.path}: {size / 1e6:.1f} MB; open it with: rerun {beside.path}")
+    echo(*(f"note: {warning}" for warning in beside.warnings))
+
+
+def _session(beside: Overlay, place: int) -> dict[str, Any]:
+    from ..overlay import layout as words
+
+    one, first = beside.shown[place], beside.shown[0].side
+    side = one.side
+    facts: dict[str, Any] = {
+        "name": side.name,
+        "path": str(side.path),
+        "session_id": side.session_id,
+        "duration_s": (side.end_ns - side.start_ns) * 1e-9,
+        "body": one.body,
+    }
+    if not place:
+        return facts
+    found, placed = beside.found[side.name], beside.placements.get(side.name)
+    return facts | {
+        "answer": words.answer(first, side, found),
+        "verdict": None if found.comparison is None else found.comparison.verdict,
+        "changed": [{"name": c.name, "a": c.a, "b": c.b} for c in found.changed],
+        "joints_compared": [name for series in one.differences for name in series.names],
+        "placed": None
+        if placed is None
+        else {"turn_rad": placed.turn, "x_m": placed.x, "y_m": placed.y},
+    }
