@@ -3,12 +3,8 @@
 CAN traces are written by python-can, foreign logs by the ``mcap`` packages.
 """
 
-from __future__ import annotations
-
 import shutil
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import can
 import numpy as np
@@ -126,7 +122,7 @@ class Base:
     mutable: tuple[str, ...]
 
 
-def gait_session(path: Path, ticks: int = 200, sink: DurableSink | None = None) -> None:
+def gait_session(path, ticks=200, sink=None):
     """Write four joints that follow sines, with frames, events and a reading of every kind."""
     robot = load_robot(str(path.parent / "snake4.toml"))
     with SessionWriter(
@@ -158,7 +154,7 @@ def gait_session(path: Path, ticks: int = 200, sink: DurableSink | None = None) 
         writer.set_verdict("good", ["no fault"])
 
 
-def foreign_session(path: Path, ticks: int = 240) -> None:
+def foreign_session(path, ticks=240):
     """Write a bag by mcap-ros2-support: one message a servo, without a robot."""
     with path.open("wb") as stream:
         writer = RosWriter(stream, chunk_size=4000)
@@ -176,7 +172,7 @@ def foreign_session(path: Path, ticks: int = 240) -> None:
         writer.finish()
 
 
-def rewrite(source: Path, path: Path, **options: object) -> None:
+def rewrite(source, path, **options):
     """Write the same records as another make does."""
     with source.open("rb") as stream, path.open("wb") as out:
         reader = make_reader(stream)
@@ -196,7 +192,7 @@ def rewrite(source: Path, path: Path, **options: object) -> None:
         writer.finish()
 
 
-def write_logs(folder: Path, ticks: int = 200) -> dict[str, bytes]:
+def write_logs(folder, ticks=200):
     """Write the session, a foreign one, and those of other makes beside the robot's files.
 
     Returns:
@@ -211,7 +207,7 @@ def write_logs(folder: Path, ticks: int = 200) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in names}
 
 
-def can_messages(count: int = 160) -> Iterator[can.Message]:
+def can_messages(count=160):
     """Yield commands and states of the small robot, a servo at a time."""
     for number in range(count):
         joint, state = number // 2 % 4, number % 2
@@ -226,7 +222,7 @@ def can_messages(count: int = 160) -> Iterator[can.Message]:
         )
 
 
-def _trace(path: Path) -> Path:
+def _trace(path):
     writer = can.Logger(str(path))
     for message in can_messages():
         writer.on_message_received(message)
@@ -234,7 +230,7 @@ def _trace(path: Path) -> Path:
     return path
 
 
-def write_texts(folder: Path) -> dict[str, bytes]:
+def write_texts(folder):
     """Write robot, scenario, plan, settings and table; return name to content."""
     rows = "".join(f"{k / 100},{k % 360},{0.1 * k}\n" for k in range(80))
     texts = {
@@ -251,12 +247,12 @@ def write_texts(folder: Path) -> dict[str, bytes]:
     return {name: text.encode() for name, text in texts.items()}
 
 
-def _files_below(folder: Path) -> dict[str, bytes]:
+def _files_below(folder):
     found = sorted(path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in found}
 
 
-def make_bases(folder: Path, result_of: Callable[[Path], bytes]) -> list[Base]:
+def make_bases(folder, result_of):
     """Write all base files to an empty folder; ``result_of`` analyses a session, as JSON."""
     texts = write_texts(folder)
     logs = write_logs(folder)
@@ -281,7 +277,7 @@ def make_bases(folder: Path, result_of: Callable[[Path], bytes]) -> list[Base]:
     return bases
 
 
-def of_recorder(folder: Path) -> list[Base]:
+def of_recorder(folder):
     """Return the files that a killed recorder leaves, and a session in parts."""
     work, split = folder / "recorded", folder / "split"
     for path in (work, split):
@@ -289,9 +285,7 @@ def of_recorder(folder: Path) -> list[Base]:
     texts = write_texts(work)
     robot = load_robot(str(work / "snake4.toml"))
 
-    def record(
-        path: Path, size: int, topics: tuple[str, ...], at: Callable[[int, DurableSink], object]
-    ) -> None:
+    def record(path, size, topics, at):
         sink = DurableSink(path, segment_size=size, ballast=0)
         with SessionWriter(
             path, session_id="s", epoch_ns=EPOCH_NS, robot=robot, sink=sink
@@ -303,11 +297,11 @@ def of_recorder(folder: Path) -> list[Base]:
                     channel.write(EPOCH_NS + tick * PERIOD_NS, angles)
                 at(tick, sink)
 
-    def copy(tick: int, _sink: DurableSink) -> None:
+    def copy(tick, _sink):
         if tick == 100:
             shutil.copytree(work, folder / "unfinished")
 
-    def divide(tick: int, sink: DurableSink) -> None:
+    def divide(tick, sink):
         if tick in {50, 100}:
             sink.split()
 

@@ -7,8 +7,6 @@ beside that: one where replies answer requests; where feedback comes unasked, on
 tick until the hold begins, and one more.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import random
@@ -19,13 +17,11 @@ import time
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from undulog.capture import load_robot
 
 from .base import DBC, ROBOT, SCENARIO
 from .case import Result, run_command
-from .stage import Stage
 
 PERIOD_S = 0.01
 MAX_RATE = 4.0
@@ -70,15 +66,15 @@ class FarEnd:
     commands: dict[int, list[tuple[float, float]]] = field(default_factory=dict)
     first_s: float | None = None
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         """Listen."""
         self.server = socket.create_server(("127.0.0.1", 0))
         self.port = self.server.getsockname()[1]
         self._angles = dict.fromkeys(range(1 if self.polled else 4), self.pose)
-        self._inbox: deque[bytes] = deque()
-        self._outbox: deque[tuple[float, bytes]] = deque()
+        self._inbox = deque()
+        self._outbox = deque()
 
-    def serve(self, child: int) -> None:
+    def serve(self, child):
         """Serve one client after the other until a process ends."""
         deadline = time.monotonic() + DRIVE_S
         self.server.settimeout(0.05)
@@ -94,7 +90,7 @@ class FarEnd:
                 link.sendall(b"< hi >")
                 self._connected(link, deadline)
 
-    def _connected(self, link: socket.socket, deadline: float) -> None:
+    def _connected(self, link, deadline):
         """Serve one client until it leaves."""
         text, opened, next_state = b"", False, time.monotonic()
         while time.monotonic() < deadline:
@@ -127,17 +123,17 @@ class FarEnd:
             while self._outbox and self._outbox[0][0] <= now:
                 link.sendall(self._outbox.popleft()[1])
 
-    def _stalled(self, now: float) -> bool:
+    def _stalled(self, now):
         if self.first_s is None:
             return False
         return any(begin <= now - self.first_s < begin + length for begin, length in self.stalls)
 
-    def _reply(self, identifier: int, data: bytes) -> None:
+    def _reply(self, identifier, data):
         now = time.time()
         words = f"< frame {identifier:X} {now:.6f} {data.hex().upper()} >"
         self._outbox.append((time.monotonic() + self.latency_s, words.encode()))
 
-    def _frame(self, identifier: int, data: bytes) -> None:
+    def _frame(self, identifier, data):
         now = time.monotonic()
         if self.polled and identifier == POLLED and data[0] == 0x92:
             raw = round(math.degrees(self._angles[0]) * 100)
@@ -157,12 +153,12 @@ class FarEnd:
         self.commands.setdefault(joint, []).append((now, angle))
 
     @property
-    def steps_allowed(self) -> int:
+    def steps_allowed(self):
         """Return the number of steps that may be on their way, by the rule above."""
         ticks = max(3, math.ceil(3 * self.interval_s / PERIOD_S - 1e-9))
         return 1 if self.polled else ticks + 1
 
-    def check(self, limit: float) -> tuple[list[str], float]:
+    def check(self, limit):
         """Return the failures, and the largest number of steps beyond the rate."""
         found, worst = [], 0.0
         for joint, rows in self.commands.items():
@@ -183,7 +179,7 @@ class FarEnd:
         return found, worst / STEP
 
 
-def run(seed: int, stage: Stage) -> Result:
+def run(seed, stage):
     """Run one armed drive; every fifth is over a healthy bus and must finish."""
     rng = random.Random(seed)
     polled, healthy = rng.random() < 0.5, seed % 5 == 0
@@ -225,7 +221,7 @@ def run(seed: int, stage: Stage) -> Result:
     return result
 
 
-def _lay_out(folder: Path, polled: bool) -> None:
+def _lay_out(folder, polled):
     if polled:
         robot = load_robot("arcsnake-joint")
         for name, text in dict(robot.databases).items():
@@ -245,6 +241,6 @@ def _lay_out(folder: Path, polled: bool) -> None:
     (folder / "scenario.toml").write_text(scenario)
 
 
-def _alive(child: int) -> bool:
+def _alive(child):
     """Return whether a child process still runs; it stays to be awaited."""
     return os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None

@@ -1,13 +1,10 @@
 """Text that acts on a terminal, a page, a spreadsheet or a path, in every name of a file."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import random
 import re
 import shlex
-from pathlib import Path
 
 import numpy as np
 from mcap_ros2.writer import Writer as RosWriter
@@ -19,7 +16,6 @@ from .case import Result, run_command
 from .commands import COMMANDS
 from .fuzz import check_output
 from .mutate import remake_log
-from .stage import Stage
 
 EVIL = [
     "\x1b]0;owned\x07", "\x1b[2J\x1b[H", "\x1b]52;c;b3duZWQ=\x07", "fine\rerror: forged",
@@ -34,12 +30,12 @@ HTML = re.compile(rb"<script>alert\(1\)|<img src=x onerror|href=\"javascript:", 
 TEXTS = ("toml", "dbc", "scenario", "plan", "trace", "columns")
 
 
-def _evil_session(path: Path, rng: random.Random) -> None:
+def _evil_session(path, rng):
     """Write a foreign bag with such names of joints and topics, texts of events, and metadata."""
 
     favourite = rng.choice(EVIL)
 
-    def evil(name: str) -> str:
+    def evil(name):
         evil_text = rng.choice([favourite, rng.choice(EVIL)])
         return rng.choice([name, name + evil_text, evil_text + name])
 
@@ -75,10 +71,10 @@ def _evil_session(path: Path, rng: random.Random) -> None:
         writer.finish()
 
 
-def _spoil(text: str, rng: random.Random) -> str:
+def _spoil(text, rng):
     """Return a TOML or DBC text in which some strings are evil."""
 
-    def worse(found: re.Match[str]) -> str:
+    def worse(found):
         if rng.random() > 0.15:
             return found.group()
         evil_text = found.group(1) + rng.choice(EVIL)
@@ -91,7 +87,7 @@ def _spoil(text: str, rng: random.Random) -> str:
     return re.sub(r'"([^"\n]*)"', worse, text)
 
 
-def run(seed: int, stage: Stage) -> Result:
+def run(seed, stage):
     """Run one command on evil names in one of the files that it reads."""
     rng = random.Random(seed)
     with stage.fresh() as folder:
@@ -111,7 +107,7 @@ def run(seed: int, stage: Stage) -> Result:
     return result
 
 
-def _lay_out(kind: str, folder: Path, rng: random.Random, stage: Stage) -> str:
+def _lay_out(kind, folder, rng, stage):
     """Write the spoilt file; return the command line to run on it."""
     trace = folder / "trace.log"
     with trace.open("w") as stream:
@@ -157,7 +153,7 @@ def _lay_out(kind: str, folder: Path, rng: random.Random, stage: Stage) -> str:
     return rng.choice([imports, "sim run scenario.toml -o new.mcap", imports + " --json"])
 
 
-def _check_pages(folder: Path) -> list[str]:
+def _check_pages(folder):
     """Return markup from names in pages, and cells of tables that a spreadsheet computes."""
     found = [
         f"page: {hit.group()!r} in {path.name}"
@@ -175,7 +171,7 @@ def _check_pages(folder: Path) -> list[str]:
     return found
 
 
-def _is_number(cell: str) -> bool:
+def _is_number(cell):
     with contextlib.suppress(ValueError):
         float(cell)
         return True

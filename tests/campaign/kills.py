@@ -1,19 +1,15 @@
 """Kills at random moments: of every command that writes, and of the recorder under load."""
 
-from __future__ import annotations
-
 import os
 import random
 import shlex
 import signal
 import time
-from pathlib import Path
 
 from .base import gait_session
 from .case import Result, judge, run_command
 from .fuzz import check_output
 from .recording import check_kept, numbers_in, recorder, senders
-from .stage import Stage
 
 LINES = [
     "sim run scenario.toml -o new.mcap --duration 3",
@@ -41,7 +37,7 @@ LINES = [
 END = {".html": b"</html>", ".rrd": b""}
 
 
-def lay_out(folder: Path, stage: Stage) -> None:
+def lay_out(folder, stage):
     """Write the inputs of all command lines."""
     path = stage.folder / "bases" / "long.mcap"
     if not path.exists():
@@ -59,7 +55,7 @@ def lay_out(folder: Path, stage: Stage) -> None:
         (folder / name).write_bytes(data)
 
 
-def whole_outputs(folder: Path) -> list[str]:
+def whole_outputs(folder):
     """Return faults of the files under their final names."""
     found = check_output(folder)
     for suffix, end in END.items():
@@ -70,7 +66,7 @@ def whole_outputs(folder: Path) -> list[str]:
     return found
 
 
-def run(seed: int, stage: Stage) -> Result:
+def run(seed, stage):
     """End one command at a random moment, then run it again to its end."""
     rng = random.Random(seed)
     line = rng.choice(LINES)
@@ -103,7 +99,7 @@ def run(seed: int, stage: Stage) -> Result:
     return result
 
 
-def run_recorder(seed: int, stage: Stage) -> Result:
+def run_recorder(seed, stage):
     """Kill the recorder under the load of two senders; accepted frames are kept.
 
     What may be missing is what the kernel had accepted in the last 50 ms.

@@ -1,17 +1,12 @@
 """Faults of files: in bytes, in words of a text, in messages of a log, in rows of a database."""
 
-from __future__ import annotations
-
 import contextlib
-import random
 import re
 import sqlite3
 import struct
-from pathlib import Path
 
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, IndexType, Writer
 
 HUGE = [
@@ -38,7 +33,7 @@ JUMPS = [-(10**9), 10**9, 3600 * 10**9, DAY_NS, 365 * DAY_NS, 10**18]
 # -- bytes ---------------------------------------------------------------------------------
 
 
-def mutate_bytes(data: bytes, rng: random.Random) -> bytes:
+def mutate_bytes(data, rng):
     """Return bytes with one to four faults."""
     changed = bytearray(data)
     for _ in range(rng.choice([1, 1, 1, 2, 4])):
@@ -113,7 +108,7 @@ FAULTS = [
 # -- text ----------------------------------------------------------------------------------
 
 
-def mutate_text(data: bytes, rng: random.Random) -> bytes:
+def mutate_text(data, rng):
     """Return text with one to four faults: in bytes, in words, in numbers, in whole lines."""
     text = data.decode("utf-8", "surrogateescape")
     for _ in range(rng.choice([1, 1, 2, 4])):
@@ -145,7 +140,7 @@ def mutate_text(data: bytes, rng: random.Random) -> bytes:
 # -- logs, from the inside -----------------------------------------------------------------
 
 
-def _payload(data: bytes, rng: random.Random) -> bytes:
+def _payload(data, rng):
     kind = rng.randrange(5)
     if kind == 0:
         return b""
@@ -172,15 +167,13 @@ def _payload(data: bytes, rng: random.Random) -> bytes:
 class _Remake:
     """Writes the messages of a log again, some of them with faults."""
 
-    def __init__(self, writer: Writer, rng: random.Random, faults: set[str]) -> None:
+    def __init__(self, writer, rng, faults):
         self.writer, self.rng, self.faults = writer, rng, faults
-        self.schemas: dict[int, int] = {}
-        self.channels: dict[int, int] = {}
+        self.schemas = {}
+        self.channels = {}
         self.jump = rng.choice(JUMPS)
 
-    def add(
-        self, number: int, schema: Schema, channel: Channel, message: Message, *, hit: bool
-    ) -> None:
+    def add(self, number, schema, channel, message, *, hit):
         """Add one message; ``hit`` is whether it gets the faults of single messages."""
         rng, own = self.rng, self.faults if hit else self.faults & {"time"}
         if schema.id not in self.schemas:
@@ -201,7 +194,7 @@ class _Remake:
             self.channels[channel.id], log_ns % 2**64, payload, publish_ns, message.sequence
         )
 
-    def _add_schema(self, schema: Schema) -> None:
+    def _add_schema(self, schema):
         name, text = schema.name, schema.data
         if "schema" in self.faults:
             text = mutate_text(text, self.rng)
@@ -209,7 +202,7 @@ class _Remake:
                 name = mutate_text(name.encode(), self.rng).decode("utf-8", "replace")[:200]
         self.schemas[schema.id] = self.writer.register_schema(name, schema.encoding, text)
 
-    def _add_channel(self, channel: Channel, schema_id: int, *, astray: bool) -> None:
+    def _add_channel(self, channel, schema_id, *, astray):
         topic, facts = channel.topic, dict(channel.metadata)
         if "names" in self.faults:
             topic = mutate_text(topic.encode(), self.rng).decode("utf-8", "replace")[:300]
@@ -220,7 +213,7 @@ class _Remake:
         )
 
 
-def remake_log(data: bytes, rng: random.Random, scratch: Path) -> bytes:
+def remake_log(data, rng, scratch):
     """A log with faults inside its messages and right checksums around them.
 
     Args:
@@ -271,7 +264,7 @@ def remake_log(data: bytes, rng: random.Random, scratch: Path) -> bytes:
 # -- databases -----------------------------------------------------------------------------
 
 
-def remake_database(data: bytes, rng: random.Random, scratch: Path) -> bytes:
+def remake_database(data, rng, scratch):
     """Return an SQLite file with faults in rows, columns or the layout."""
     path = scratch.with_suffix(".db")
     path.write_bytes(data)

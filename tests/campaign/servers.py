@@ -1,7 +1,5 @@
 """Clients that send garbage, stay silent or leave half-way; then a good client is served."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -9,14 +7,12 @@ import re
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
 from .base import DBC, ROBOT, SCENARIO
-from .case import Outcome, Result, run_command
-from .stage import Stage
+from .case import Result, run_command
 
 PATIENCE_S = 30.0
 MORE = 4
@@ -30,7 +26,7 @@ WORDS = (
 )  # fmt: skip
 
 
-def _connect(address: tuple[str, int] | str) -> socket.socket:
+def _connect(address):
     kind = socket.AF_UNIX if isinstance(address, str) else socket.AF_INET
     link = socket.socket(kind, socket.SOCK_STREAM)
     link.settimeout(PATIENCE_S)
@@ -49,8 +45,8 @@ def _connect(address: tuple[str, int] | str) -> socket.socket:
 
 
 @contextmanager
-def _closing() -> Iterator[list[socket.socket]]:
-    links: list[socket.socket] = []
+def _closing():
+    links = []
     try:
         yield links
     finally:
@@ -59,7 +55,7 @@ def _closing() -> Iterator[list[socket.socket]]:
                 link.close()
 
 
-def attack(address: tuple[str, int] | str, rng: random.Random, links: list[socket.socket]) -> None:
+def attack(address, rng, links):
     """Connect forty clients: some send garbage, some nothing, some leave half-way or at once."""
     for _ in range(40):
         kind = rng.choice(["garbage", "silent", "half", "gone", "deaf"])
@@ -80,7 +76,7 @@ def attack(address: tuple[str, int] | str, rng: random.Random, links: list[socke
                 link.sendall(b"< open can0 >< rawmode >")
 
 
-def _heard(link: socket.socket, until: Callable[[bytes], bool]) -> bytes:
+def _heard(link, until):
     data = b""
     deadline = time.monotonic() + PATIENCE_S
     while not until(data) and time.monotonic() < deadline:
@@ -92,7 +88,7 @@ def _heard(link: socket.socket, until: Callable[[bytes], bool]) -> bytes:
     return data
 
 
-def _wait(condition: Callable[[], object]) -> object:
+def _wait(condition):
     deadline = time.monotonic() + PATIENCE_S
     while not (found := condition()):
         if time.monotonic() > deadline:
@@ -101,7 +97,7 @@ def _wait(condition: Callable[[], object]) -> object:
     return found
 
 
-def _answer(address: tuple[str, int] | str, words: bytes, is_good: Callable[[bytes], bool]) -> str:
+def _answer(address, words, is_good):
     """Return the fault of the answer that a client gets; empty where it is good."""
     with suppress(OSError), _connect(address) as link:
         link.settimeout(0.5)
@@ -111,11 +107,11 @@ def _answer(address: tuple[str, int] | str, words: bytes, is_good: Callable[[byt
     return "the connection was refused or closed"
 
 
-def _descriptors(pid: int) -> int:
+def _descriptors(pid):
     return len(os.listdir(f"/proc/{pid}/fd"))  # noqa: PTH208
 
 
-def _check_descriptors(result: Result, pid: int, before: int, of: str = "") -> None:
+def _check_descriptors(result, pid, before, of=""):
     """Check that after the clients no more descriptors are open than before."""
     with suppress(TimeoutError):
         _wait(lambda: _descriptors(pid) <= before + MORE)
@@ -123,15 +119,7 @@ def _check_descriptors(result: Result, pid: int, before: int, of: str = "") -> N
         result.failures.append(f"descriptors: {before} before, {left} after{of}")
 
 
-def _watched(
-    result: Result,
-    pid: int,
-    address: tuple[str, int] | str,
-    rng: random.Random,
-    good: Callable[[], str],
-    *,
-    foreign: bool = False,
-) -> None:
+def _watched(result, pid, address, rng, good, *, foreign=False):
     """Attack a server; a good client comes while the bad ones stay and after they left.
 
     A foreign server's answer beside the bad ones is only counted, and so is a connection that it
@@ -157,17 +145,8 @@ def _watched(
 
 
 def _attacked(
-    result: Result,
-    folder: Path,
-    words: list[str],
-    *,
-    rng: random.Random,
-    ready: Callable[[], tuple[str, int] | str | None],
-    request: tuple[bytes, Callable[[bytes], bool]],
-    foreign: bool = False,
-    end_by: int = signal.SIGTERM,
-    more: Callable[[int, Callable[[], str]], None] | None = None,
-) -> Outcome:
+    result, folder, words, *, rng, ready, request, foreign=False, end_by=signal.SIGTERM, more=None
+):
     """Run a server under attack.
 
     Args:
@@ -182,7 +161,7 @@ def _attacked(
         more: A further attack on the process; it gets the good client.
     """
 
-    def meanwhile(pid: int) -> None:
+    def meanwhile(pid):
         try:
             good = partial(_answer, _wait(ready), *request)
             _watched(result, pid, good.args[0], rng, good, foreign=foreign)
@@ -197,12 +176,12 @@ def _attacked(
     return outcome
 
 
-def serve(result: Result, folder: Path, rng: random.Random) -> None:
+def serve(result, folder, rng):
     """``sim serve``: the good client gets the robot's frames."""
     (folder / "long.toml").write_text(SCENARIO.replace("duration_s = 0.1", "duration_s = 600.0"))
     out = folder.parent / f"{folder.name}.out"
 
-    def ready() -> tuple[str, int] | None:
+    def ready():
         line = out.read_bytes().split(b"\n")[0] if out.exists() else b""
         return ("127.0.0.1", json.loads(line)["port"]) if line else None
 
@@ -211,11 +190,11 @@ def serve(result: Result, folder: Path, rng: random.Random) -> None:
     _attacked(result, folder, words, rng=rng, ready=ready, request=request)
 
 
-def control(result: Result, folder: Path, rng: random.Random) -> None:
+def control(result, folder, rng):
     """A recorder's control socket, and its source: status is answered, senders are received."""
     path, source = str(folder / "c.sock"), str(folder / "s.sock")
 
-    def silent_senders(pid: int, good: Callable[[], str]) -> None:
+    def silent_senders(pid, good):
         before = _descriptors(pid)
         with _closing() as silent:
             for _ in range(100):
@@ -234,7 +213,7 @@ def control(result: Result, folder: Path, rng: random.Random) -> None:
     words += ["--socket", path, "-o", "new.mcap"]
     request = b'{"do": "status"}\n', lambda data: b'"ok":true' in data.replace(b" ", b"")
 
-    def ready() -> str | None:
+    def ready():
         return path if Path(path).exists() and Path(source).exists() else None
 
     how = {"rng": rng, "ready": ready, "request": request}
@@ -243,12 +222,12 @@ def control(result: Result, folder: Path, rng: random.Random) -> None:
         result.failures.append(f"recorder: exit code {outcome.code}: {outcome.err[-200:]!r}")
 
 
-def viewer(result: Result, folder: Path, rng: random.Random, stage: Stage) -> None:
+def viewer(result, folder, rng, stage):
     """The page of ``view --web``, by Rerun's own server: it is served again afterwards."""
     (folder / "gait.mcap").write_bytes(stage.files_of("gait.mcap")["gait.mcap"])
     out = folder.parent / f"{folder.name}.out"
 
-    def ready() -> tuple[str, int] | None:
+    def ready():
         found = out.exists() and re.search(rb"127\.0\.0\.1:(\d+)", out.read_bytes())
         return ("127.0.0.1", int(found.group(1))) if found else None
 
@@ -261,7 +240,7 @@ def viewer(result: Result, folder: Path, rng: random.Random, stage: Stage) -> No
 ATTACKS = ("sim serve", "record", "view --web")
 
 
-def run(seed: int, stage: Stage) -> Result:
+def run(seed, stage):
     """Attack one server."""
     rng = random.Random(seed)
     name = ATTACKS[seed % len(ATTACKS)]

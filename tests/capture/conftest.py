@@ -2,9 +2,7 @@
 
 import socket
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,13 +30,13 @@ class Heard:
     events: list[SourceEvent] = field(default_factory=list)
     fd_arrays: list[FrameArray] = field(default_factory=list)
 
-    def poll(self) -> None:
+    def poll(self):
         polled = self.source.poll()
         self.arrays += polled.frames
         self.fd_arrays += polled.fd_frames
         self.events += polled.events
 
-    def until(self, condition: Callable[[], bool]) -> None:
+    def until(self, condition):
         """Poll until something is so; fails after a long time."""
         deadline = time.monotonic() + PATIENCE_S
         while not condition():
@@ -46,30 +44,30 @@ class Heard:
             self.poll()
             time.sleep(0.002)
 
-    def until_frames(self, count: int) -> FrameArray:
+    def until_frames(self, count):
         self.until(lambda: sum(map(len, self.arrays)) >= count)
         self.poll()
         return self.frames
 
-    def until_event(self, part: str) -> SourceEvent:
+    def until_event(self, part):
         self.until(lambda: any(part in event.text for event in self.events))
         return next(event for event in self.events if part in event.text)
 
     @property
-    def frames(self) -> FrameArray:
+    def frames(self):
         return np.concatenate([empty_frames(0), *self.arrays])
 
     @property
-    def fd_frames(self) -> FrameArray:
+    def fd_frames(self):
         return np.concatenate([empty_fd_frames(0), *self.fd_arrays])
 
     @property
-    def texts(self) -> list[str]:
+    def texts(self):
         return [event.text for event in self.events]
 
 
 @pytest.fixture
-def context(tmp_path: Path) -> Iterator[SourceContext]:
+def context(tmp_path):
     """A recording that has begun."""
     epoch_ns, start_ns = time.time_ns(), time.monotonic_ns()
     path = tmp_path / "session.mcap"
@@ -78,11 +76,11 @@ def context(tmp_path: Path) -> Iterator[SourceContext]:
 
 
 @pytest.fixture
-def listen(context: SourceContext) -> Iterator[Callable[[Source], Heard]]:
+def listen(context):
     """Start a source; it is stopped at the end, whatever happens."""
-    started: list[Source] = []
+    started = []
 
-    def start(source: Source) -> Heard:
+    def start(source):
         started.append(source)
         source.start(context)
         return Heard(source)
@@ -94,7 +92,7 @@ def listen(context: SourceContext) -> Iterator[Callable[[Source], Heard]]:
 
 
 @pytest.fixture
-def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
+def sockets():
     """A bound datagram socket and one connected to it."""
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours,
@@ -106,10 +104,10 @@ def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
 
 
 @pytest.fixture
-def traffic() -> Callable[[int], FrameArray]:
+def traffic():
     """Random frames of both identifier widths and all lengths, a remote request now and then."""
 
-    def make(count: int) -> FrameArray:
+    def make(count):
         rng = np.random.default_rng(count)
         frames = empty_frames(count)
         extended = rng.random(count) < 0.3
@@ -133,10 +131,10 @@ def traffic() -> Callable[[int], FrameArray]:
 
 
 @pytest.fixture
-def fd_traffic() -> Callable[[int], FrameArray]:
+def fd_traffic():
     """Random CAN FD frames of both identifier widths, all lengths, and some with the fast rate."""
 
-    def make(count: int) -> FrameArray:
+    def make(count):
         rng = np.random.default_rng(count)
         frames = empty_fd_frames(count)
         frames["id_flags"] = np.where(
@@ -156,10 +154,10 @@ def fd_traffic() -> Callable[[int], FrameArray]:
 
 
 @pytest.fixture
-def same() -> Callable[[FrameArray, FrameArray], bool]:
+def same():
     """Whether two lots of frames agree in everything but times."""
 
-    def compare(found: FrameArray, truth: FrameArray) -> bool:
+    def compare(found, truth):
         names = ("id_flags", "len", "fd_flags", "data")
         if truth.dtype == empty_frames(0).dtype:
             names = ("id_flags", "dlc", "data")

@@ -216,7 +216,7 @@ def test_entities_and_documents_of_rerun_are_as_meant(folder):
 class _Tags(HTMLParser):
     def __init__(self):
         super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.found = []
 
     def handle_starttag(self, tag, attrs):
         self.found.append((tag, dict(attrs)))

@@ -1,17 +1,12 @@
 """A bucket of an S3 server on loopback."""
 
-from __future__ import annotations
-
 import os
 import socket
 import sys
 import time
-from collections.abc import Generator
 from contextlib import contextmanager
-from typing import Any
 
 import boto3
-import pytest
 
 from .processes import process
 
@@ -19,13 +14,13 @@ BUCKET = "robots"
 _KEYS = {"AWS_ACCESS_KEY_ID": "any", "AWS_SECRET_ACCESS_KEY": "any", "AWS_REGION": "us-east-1"}
 
 
-def _free_port() -> int:
+def _free_port():
     with socket.create_server(("127.0.0.1", 0)) as server:
         return server.getsockname()[1]
 
 
 @contextmanager
-def s3_bucket(monkeypatch: pytest.MonkeyPatch) -> Generator[Any]:
+def s3_bucket(monkeypatch):
     """A boto3 client and an empty bucket, for this process and those that it starts."""
     port = _free_port()
     for name, value in {**_KEYS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}.items():

@@ -1,16 +1,11 @@
 """A clean session, and faults planted in it, for the tests of `undulog log check`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
 from support.foreign_logs import foreign_log
 from undulog.capture import SessionWriter, load_robot
-from undulog.capture.log.health.session_check import SessionHealth
-from undulog.capture.log.health.tallies import Timing
 from undulog.capture.log.messages.cdr import encode
 from undulog.capture.log.messages.definitions import message_type
 
@@ -24,11 +19,11 @@ Edit = Callable[[int, np.ndarray, np.ndarray], int | None]
 """Tick, command and measured angles (edited in place) to stamp; None leaves the state out."""
 
 
-def gait(tick: int) -> np.ndarray:
+def gait(tick):
     return 0.4 * np.sin(np.pi * tick / 100 - 0.5 * np.arange(len(NAMES)))
 
 
-def write(path: Path, edit: Edit | None = None, verdict: str | None = None) -> Path:
+def write(path, edit=None, verdict=None):
     """Write 20 s of 25 joints at 100 Hz, with a fault planted by ``edit``."""
     noise = np.random.default_rng(3).normal(0.0, 1e-3, (TICKS, len(NAMES)))
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
@@ -37,7 +32,7 @@ def write(path: Path, edit: Edit | None = None, verdict: str | None = None) -> P
         for tick in range(TICKS):
             command, angles = gait(tick), gait(tick - 5) + noise[tick]
             log_ns = EPOCH_NS + tick * STEP_NS
-            t_ns: int | None = log_ns
+            t_ns = log_ns
             if edit is not None:
                 t_ns = edit(tick, command, angles)
             commands.write(log_ns, command)
@@ -48,21 +43,21 @@ def write(path: Path, edit: Edit | None = None, verdict: str | None = None) -> P
     return path
 
 
-def at(tick: int) -> int:
+def at(tick):
     return EPOCH_NS + tick * STEP_NS
 
 
-def without(is_lost: Callable[[int], bool]) -> Edit:
+def without(is_lost):
     """Leave out the states of some ticks."""
     return lambda tick, command, angles: None if is_lost(tick) else at(tick)
 
 
-def timing_of(health: SessionHealth, topic: str = "/joint_states") -> Timing:
+def timing_of(health, topic="/joint_states"):
     (found,) = [each.timing for each in health.series if each.topic == topic]
     return found
 
 
-def write_raw(path: Path, sequences: list[int], **options: object) -> Path:
+def write_raw(path, sequences, **options):
     """Write JointState messages of three joints with given sequence numbers."""
     with foreign_log(path, JOINT_STATE, **options) as (writer, schema):
         for topic in ("/joint_commands", "/joint_states"):

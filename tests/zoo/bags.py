@@ -4,14 +4,10 @@ The messages are laid out in NumPy, all of one topic at once: a hundred seeds of
 some hundred million numbers. A test reads them back with ``mcap_ros2``.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from .robot import SECOND_TOPIC, Log
+from .robot import SECOND_TOPIC
 
 EPOCH_NS = 1_700_000_000_000_000_000
 
@@ -31,7 +27,7 @@ uint32 nanosec
 """
 
 
-def write_bag(log: Log, path: Path) -> Path:
+def write_bag(log, path):
     """Write a log to a file, replaced if it exists; return the file."""
     robot = log.robot
     topics = ["/joint_commands", "/joint_states"] + [SECOND_TOPIC] * (log.second is not None)
@@ -94,6 +90,6 @@ def _messages(number, names, times_s, columns):
     return [(int(t), number, row.tobytes()) for t, row in zip(t_ns, rows, strict=True)]
 
 
-def _text(name: str) -> bytes:
+def _text(name):
     data = name.encode() + b"\0"
     return len(data).to_bytes(4, "little") + data + b"\0" * (-len(data) % 4)

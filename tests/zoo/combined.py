@@ -65,7 +65,7 @@ def _(robot, rng, j):
     return single(change, kinds, kinds | {"slipped_sensor"}, stands_out=OFFSET, checked=False)
 
 
-def _both(first: str, second: str):
+def _both(first, second):
     def plant(robot, rng, j):
         other = int((j + rng.integers(1, robot.m)) % robot.m)
         one = FAULTS[first].plant(robot, rng, j)

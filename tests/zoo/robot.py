@@ -4,8 +4,6 @@ Nothing here imports undulog: the truth comes from closed forms. Three things th
 are kept apart: what reached the servo, where the joint is, and what each sensor reports of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -24,7 +22,7 @@ MARGIN_GAIN = 0.02
 MARGIN_RAD = np.radians(1.0)
 """Below these a deviation is nothing to name, however sure it is."""
 
-NAMINGS: tuple[Callable[[int, int], str], ...] = (
+NAMINGS = (
     lambda i, m: f"joint{i + 1}",
     lambda i, m: f"j_{i + 1:02d}",
     lambda i, m: f"{'yaw' if i % 2 == 0 else 'pitch'}_{i}",
@@ -48,7 +46,7 @@ class Channels:
     effort: bool = False
     second: bool = False
 
-    def __str__(self) -> str:
+    def __str__(self):
         """Return the names, joined."""
         names = [f"{self.velocity} velocity"] if self.velocity else []
         names += [name for name in ("effort", "second") if getattr(self, name)]
@@ -113,24 +111,22 @@ class Robot:
     channels: Channels
 
     @property
-    def m(self) -> int:
+    def m(self):
         """Number of joints."""
         return len(self.names)
 
-    def sent(self) -> np.ndarray:
+    def sent(self):
         """Return the commands as the controller sends them [rad], shape (k, m)."""
         t = self.sent_s[:, None]
         return self.bias + self.amplitude * self._wave(t, self.omega * t + self.phase)
 
-    def wanted(self, joint: int, at: int | None = None) -> np.ndarray:
+    def wanted(self, joint, at=None):
         """Command of a joint at the sampling times of ``at`` (itself if None) [rad], shape (n,)."""
         t = self.t_s[:, joint if at is None else at]
         wave = self._wave(t, self.omega * t + self.phase[joint])
         return self.bias[joint] + self.amplitude[joint] * wave
 
-    def moved(
-        self, joint: int, gain: float | np.ndarray = 1.0, more_lag: float = 0.0, of: int = -1
-    ) -> np.ndarray:
+    def moved(self, joint, gain=1.0, more_lag=0.0, of=-1):
         """Return the true position of a joint [rad], shape (n,).
 
         Args:
@@ -145,16 +141,16 @@ class Robot:
         size = gain * self.gain[joint] * self.amplitude[k]
         return self.bias[k] + self.zero[joint] + size * wave
 
-    def _wave(self, t: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    def _wave(self, t, angle):
         """A delay shifts the second harmonic by twice the angle."""
         grows = np.clip(t / self.start_s, 0.0, 1.0) if self.start_s > 0 else 1.0
         return grows * (np.sin(angle) + self.second * np.sin(2 * angle + 0.7))
 
-    def swing(self, joint: int) -> float:
+    def swing(self, joint):
         """Return the amplitude of the motion of a joint [rad]."""
         return float(self.gain[joint] * self.amplitude[joint])
 
-    def half(self, joint: int, count: float | None = None) -> tuple[float, float]:
+    def half(self, joint, count=None):
         """Return half widths of simultaneous 95 % intervals of a joint's deviation from the others.
 
         Bonferroni over 3 m deviations; each from what a common value, a trend and a parabola
@@ -178,14 +174,14 @@ class Robot:
             float(np.hypot(factor * slow / n**0.5, zero)),
         )
 
-    def _near(self, omega: float) -> float:
+    def _near(self, omega):
         """Amplitude density of the noise at a frequency, that of white noise being 1."""
         step_s = self.duration_s / len(self.t_s)
         power = (1 - self.color**2) / abs(1 - self.color * np.exp(-1j * omega * step_s)) ** 2
         return float(power**0.5)
 
 
-def leverage(m: int, joint: int) -> float:
+def leverage(m, joint):
     """Return the variance of the others' prediction for a joint, in variances of one joint.
 
     Args:
@@ -199,14 +195,7 @@ def leverage(m: int, joint: int) -> float:
     return float(basis[joint] @ np.linalg.solve(others.T @ others, basis[joint]))
 
 
-def draw(
-    seed: int,
-    *,
-    small: bool = False,
-    channels: Channels | None = None,
-    joints: tuple[int, int] | None = None,
-    least_s: float = 15.0,
-) -> Robot:
+def draw(seed, *, small=False, channels=None, joints=None, least_s=15.0):
     """Draw a healthy robot.
 
     Args:
@@ -316,7 +305,7 @@ class Log:
     second: np.ndarray | None
 
 
-def record(robot: Robot, changes: tuple[Change, ...] = (), seed: int = 0) -> Log:
+def record(robot, changes=(), seed=0):
     """Return the log of a robot with some faults; the seed is that of the sensor noise."""
     rng = np.random.default_rng([seed, 2])
     n, m = robot.t_s.shape
@@ -355,7 +344,7 @@ def record(robot: Robot, changes: tuple[Change, ...] = (), seed: int = 0) -> Log
     return Log(robot, position, *(values if is_logged else None for values, is_logged in pairs))
 
 
-def _noise(robot: Robot, rng: np.random.Generator) -> np.ndarray:
+def _noise(robot, rng):
     """Noise of the joints' sensors [rad], shape (n, m)."""
     n, m = robot.t_s.shape
     drawn = (1 - robot.shared) ** 0.5 * rng.normal(size=(n + 100, m))

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +16,7 @@ LOG = "".join(f"(100.{i:06d}) can0 {0x101 + i % 2:03X}#{i:02X}00 T\n" for i in r
 
 
 @pytest.fixture
-def trace(tmp_path: Path):
+def trace(tmp_path):
     path = tmp_path / "trace.log"
     path.write_text(LOG)
     return path
@@ -35,7 +34,7 @@ def cli(trace, capsys):
     return run
 
 
-def test_there_and_back(cli, tmp_path: Path):
+def test_there_and_back(cli, tmp_path):
     run, back = tmp_path / "run.mcap", tmp_path / "back.log"
     code, out, _ = cli("import {log} -o {dir}/run.mcap --robot snake25")
     lines = out.splitlines()
@@ -53,7 +52,7 @@ def test_there_and_back(cli, tmp_path: Path):
     assert json.loads(out) == {**paths, "frames": 10, "buses": {"can0": 10}, "warnings": []}
 
 
-def test_a_csv_by_options_and_by_file(cli, tmp_path: Path):
+def test_a_csv_by_options_and_by_file(cli, tmp_path):
     (tmp_path / "joint.csv").write_text("time,angle\n0,170\n1,-170\n")
     common = "import {dir}/joint.csv --robot snake13"
     options = "--map time=time:s --map angle=joint01.position:deg,wrap=360"
@@ -77,7 +76,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("code", "line", "message"), WRONG)
-def test_what_is_wrong_is_reported(code, line, message, cli, tmp_path: Path):
+def test_what_is_wrong_is_reported(code, line, message, cli, tmp_path):
     (tmp_path / "a.csv").write_text("t,a\n0,1\n")
     (tmp_path / "bad.log").write_text("no log\n")
     found, out, err = cli(f"import {line}")
@@ -103,7 +102,7 @@ def test_an_output_is_kept_without_force(cli):
         (1, "{dir}/csv.mcap -o x.log", "has no raw CAN frames; it has /joint_states"),
     ],
 )
-def test_what_export_cannot_do_is_reported(code, line, message, cli, tmp_path: Path):
+def test_what_export_cannot_do_is_reported(code, line, message, cli, tmp_path):
     (tmp_path / "a.csv").write_text("t,a\n0,1\n")
     columns = "--map t=time:s --map a=joint01.position:rad"
     cli("import {log} -o {dir}/run.mcap --robot snake25")
@@ -121,7 +120,7 @@ def test_help_shows_an_example(capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_leaves_a_whole_file(number, tmp_path: Path):
+def test_a_signal_leaves_a_whole_file(number, tmp_path):
     trace, run = tmp_path / "trace.log", tmp_path / "run.mcap"
     with trace.open("w") as stream:
         for i in range(1_500_000):

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-from pathlib import Path
 
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
@@ -100,7 +99,7 @@ MAKES = {
 
 
 @pytest.mark.parametrize("options", MAKES.values(), ids=MAKES)
-def test_files_of_other_makes(options, tmp_path: Path, capsys):
+def test_files_of_other_makes(options, tmp_path, capsys):
     facts, text = described(make(tmp_path / "x.mcap", **options), capsys)
     topics = {topic["topic"]: topic for topic in facts["topics"]}
     # A channel without messages stands in no chunk's index; only a summary or a look inside has it.
@@ -128,14 +127,14 @@ def test_files_of_other_makes(options, tmp_path: Path, capsys):
     assert any("(json, no schema)" in line for line in lines)
 
 
-def test_a_file_without_messages_has_no_start(tmp_path: Path, capsys):
+def test_a_file_without_messages_has_no_start(tmp_path, capsys):
     facts, text = described(make(tmp_path / "x.mcap", count=0), capsys)
     assert (facts["session"]["start_ns"], facts["session"]["start_utc"]) == (None, None)
     assert text.startswith("x: no robot, no messages, ")
     assert "1970" not in text
 
 
-def test_a_file_of_one_message_and_an_unnamed_writer(tmp_path: Path, capsys):
+def test_a_file_of_one_message_and_an_unnamed_writer(tmp_path, capsys):
     channels = {"/schemaless": CHANNELS["/schemaless"]}
     facts, text = described(make(tmp_path / "x.mcap", channels, count=1, library=""), capsys)
     assert facts["topics"][0]["rate_hz"] is None
@@ -144,7 +143,7 @@ def test_a_file_of_one_message_and_an_unnamed_writer(tmp_path: Path, capsys):
 
 
 @pytest.mark.parametrize("options", [{}, {"use_chunking": False}, NO_SUMMARY])
-def test_a_cut_file_says_so(options, tmp_path: Path, capsys):
+def test_a_cut_file_says_so(options, tmp_path, capsys):
     path = make(tmp_path / "x.mcap", chunk_size=500, **options)
     whole = path.read_bytes()
     for cut in (len(whole) - 20, len(whole) * 3 // 4, len(whole) // 2):
@@ -154,7 +153,7 @@ def test_a_cut_file_says_so(options, tmp_path: Path, capsys):
         assert "warning: the file is cut short" in text
 
 
-def test_two_channels_of_one_topic(tmp_path: Path, capsys):
+def test_two_channels_of_one_topic(tmp_path, capsys):
     """Several publishers, and two types: the first is counted, the other reported."""
     path = tmp_path / "x.mcap"
     with path.open("wb") as stream:

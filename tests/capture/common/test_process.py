@@ -1,11 +1,8 @@
 """Real signals to a real process: the file is whole, the second signal kills."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -35,9 +32,7 @@ def started(code, *arguments):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_a_signal_ends_between_samples_and_leaves_a_whole_file(
-    tmp_path: Path, number: signal.Signals
-) -> None:
+def test_a_signal_ends_between_samples_and_leaves_a_whole_file(tmp_path, number):
     path = tmp_path / "s.mcap"
     process = started(RECORDER, path)
     assert process.stdout.readline() == "recording\n"
@@ -49,7 +44,7 @@ def test_a_signal_ends_between_samples_and_leaves_a_whole_file(
         assert session.joints("/joint_states").values[0].tolist() == list(range(ticks))
 
 
-def test_the_second_signal_acts_as_usual() -> None:
+def test_the_second_signal_acts_as_usual():
     code = (
         "import time; from undulog.capture.common.process import interruptible\n"
         "with interruptible() as stop:\n"

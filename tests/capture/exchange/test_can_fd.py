@@ -2,7 +2,6 @@
 
 import threading
 import time
-from pathlib import Path
 
 import can
 import cantools
@@ -79,7 +78,7 @@ def test_what_is_written_is_read_the_same(data, tmp_path_factory):
         assert window.tobytes() == frames[ends[0] : ends[0] + [*sizes, 0][1]].tobytes()
 
 
-def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path: Path):
+def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path):
     frames = every_kind(fd=True)[:5]
     path = write_frames(tmp_path / "x.mcap", {"/can_fd/can0": frames})
     with path.open("rb") as stream:
@@ -104,7 +103,7 @@ def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path: Path):
         assert row[offsets["data"] :] == expected["data"].tobytes()
 
 
-def test_the_kinds_are_not_mixed_up(tmp_path: Path):
+def test_the_kinds_are_not_mixed_up(tmp_path):
     # 4 CAN FD frames have as many bytes as 11 classic ones: the label tells them apart.
     topics = {"/can_fd/can0": every_kind(fd=True)[:4], "/can/can0_fd": classic_frames(11, T0, 1000)}
     path = write_frames(tmp_path / "x.mcap", topics)
@@ -121,7 +120,7 @@ def test_the_kinds_are_not_mixed_up(tmp_path: Path):
             writer.frames("/can/can0").write(T0, empty_fd_frames(1))
 
 
-def test_the_check_counts_them(tmp_path: Path, capsys):
+def test_the_check_counts_them(tmp_path, capsys):
     # The classic frames pause for 3 s in which CAN FD frames come: the bus isn't silent.
     classic = classic_frames(200, T0, 10_000_000)
     classic["t_host_ns"][100:] += 3 * S
@@ -157,7 +156,7 @@ def session_of_every_kind(tmp_path_factory):
 
 
 @pytest.mark.parametrize("suffix", [".log", ".blf", ".asc"])
-def test_frames_of_every_kind_come_back(suffix, session_of_every_kind, tmp_path: Path):
+def test_frames_of_every_kind_come_back(suffix, session_of_every_kind, tmp_path):
     source, frames = session_of_every_kind
     report = export_log(source, tmp_path / f"x{suffix}")
     assert (report.buses, report.warnings) == ({"can0": len(frames)}, [])
@@ -188,7 +187,7 @@ def some_messages(channel=0):
 
 
 @pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".asc.gz"])
-def test_logs_of_python_can(suffix, tmp_path: Path):
+def test_logs_of_python_can(suffix, tmp_path):
     messages = some_messages()
     source = tmp_path / f"log{suffix}"
     with can.Logger(str(source)) as writer:
@@ -221,7 +220,7 @@ def records_of(messages):
     return frames
 
 
-def test_an_mf4_of_python_can(tmp_path: Path):
+def test_an_mf4_of_python_can(tmp_path):
     pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
     messages = some_messages()
     with can.MF4Writer(tmp_path / "x.mf4") as writer:
@@ -251,7 +250,7 @@ TRC = """;$FILEVERSION=2.1
 """
 
 
-def test_a_trc_of_version_2(tmp_path: Path):
+def test_a_trc_of_version_2(tmp_path):
     data = " ".join(f"{k:02X}" for k in range(64))
     (tmp_path / "x.trc").write_text(TRC.format(data))
     report, frames = imported(tmp_path / "x.trc", tmp_path, "/can_fd/can1")
@@ -264,7 +263,7 @@ def test_a_trc_of_version_2(tmp_path: Path):
     assert frames["data"][1].tolist() == [0] * 11 + [12] + [0] * 52
 
 
-def test_a_csv_shows_can_fd_by_the_length_alone(tmp_path: Path):
+def test_a_csv_shows_can_fd_by_the_length_alone(tmp_path):
     with can.Logger(str(tmp_path / "x.csv")) as writer:
         for message in some_messages():
             writer(message)
@@ -278,7 +277,7 @@ def test_a_csv_shows_can_fd_by_the_length_alone(tmp_path: Path):
     assert found == [bytes(message.data) for message in long]
 
 
-def test_a_candump_log_of_both_kinds_comes_back_bit_for_bit(tmp_path: Path):
+def test_a_candump_log_of_both_kinds_comes_back_bit_for_bit(tmp_path):
     rng = np.random.default_rng(9)
     text = "".join(
         f"(1717639553.{i:06d}) {'vcan1' if i % 7 == 0 else 'can0'} {i % 0x800:03X}"
@@ -296,7 +295,7 @@ def test_a_candump_log_of_both_kinds_comes_back_bit_for_bit(tmp_path: Path):
     assert (tmp_path / "one.log").read_text().splitlines() == expected
 
 
-def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path: Path):
+def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path):
     frames = every_kind(fd=True)
     topics = {"/can_fd/can0": frames, "/can/can0": classic_frames(50, T0, 1000)}
     source = write_frames(tmp_path / "run.mcap", topics)
@@ -308,7 +307,7 @@ def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path: Path):
     assert (report.buses, report.warnings) == ({"can0": 0}, [left_out])
 
 
-def test_what_a_format_loses_is_counted(tmp_path: Path):
+def test_what_a_format_loses_is_counted(tmp_path):
     frames = every_kind(fd=True, start_ns=T0 + 7)[:10]
     frames["id_flags"][:3] |= REMOTE_FLAG  # there is no such thing in CAN FD
     frames["t_device_ns"] = frames["t_host_ns"] + 5
@@ -341,7 +340,7 @@ SIGNALS = [
 ]
 
 
-def test_import_decodes_both_kinds(tmp_path: Path):
+def test_import_decodes_both_kinds(tmp_path):
     database = cantools.database.load_string(BIG, "dbc")
     lines, angles, targets = [], [], []
     for i in range(200):
@@ -366,7 +365,7 @@ def test_import_decodes_both_kinds(tmp_path: Path):
     assert (state.t_ns - command.t_ns).tolist() == [500_000] * 200
 
 
-def test_a_frame_too_short_for_its_signal_is_reported(tmp_path: Path):
+def test_a_frame_too_short_for_its_signal_is_reported(tmp_path):
     (tmp_path / "x.log").write_text(
         "(1.000000) can0 100##1" + "00" * 48 + " R\n(1.000100) can0 100#" + "00" * 8 + " R\n"
     )
@@ -380,7 +379,7 @@ def test_a_frame_too_short_for_its_signal_is_reported(tmp_path: Path):
 # -- recording -----------------------------------------------------------------------------
 
 
-def test_a_recording_keeps_and_decodes_both_kinds(tmp_path: Path):
+def test_a_recording_keeps_and_decodes_both_kinds(tmp_path):
     database = cantools.database.load_string(BIG, "dbc")
     robot = bus_robot(BIG, SIGNALS)
     output, clock, count = tmp_path / "run.mcap", SessionClock(), 300

@@ -1,7 +1,6 @@
 """CAN logs into sessions: a real one, and foreign formats as python-can writes them."""
 
 import math
-from pathlib import Path
 
 import can
 import cantools
@@ -40,7 +39,7 @@ def arcsnake(tmp_path_factory):
 
 
 @needs_recording
-def test_the_arcsnake_log_comes_back_bit_for_bit(arcsnake, tmp_path: Path):
+def test_the_arcsnake_log_comes_back_bit_for_bit(arcsnake, tmp_path):
     path, report = arcsnake
     assert (report.frames, report.verdict, report.problems) == (19_297, "good", [])
     exported = export_log(path, tmp_path / "back.log")
@@ -103,7 +102,7 @@ def test_arcsnake_quantities_keep_their_own_times(arcsnake):
 
 
 @needs_recording
-def test_the_same_log_gives_the_same_bytes(arcsnake, tmp_path: Path):
+def test_the_same_log_gives_the_same_bytes(arcsnake, tmp_path):
     import_can(RECORDING, tmp_path / "again.mcap", load_robot("arcsnake-joint"))
     assert (tmp_path / "again.mcap").read_bytes() == arcsnake[0].read_bytes()
 
@@ -111,7 +110,7 @@ def test_the_same_log_gives_the_same_bytes(arcsnake, tmp_path: Path):
 # -- foreign formats -----------------------------------------------------------------------
 
 
-def test_error_and_fd_frames_of_a_blf(tmp_path: Path):
+def test_error_and_fd_frames_of_a_blf(tmp_path):
     source, output = tmp_path / "log.blf", tmp_path / "run.mcap"
     with can.BLFWriter(source) as writer:
         writer(can.Message(timestamp=T0, arbitration_id=1, is_extended_id=False, data=b"\1"))
@@ -128,7 +127,7 @@ def test_error_and_fd_frames_of_a_blf(tmp_path: Path):
         assert session.verdict == "degraded"
 
 
-def test_a_cut_blf_is_reported(tmp_path: Path):
+def test_a_cut_blf_is_reported(tmp_path):
     whole, cut = tmp_path / "whole.blf", tmp_path / "cut.blf"
     with can.BLFWriter(whole, max_container_size=1000) as writer:
         for i in range(300):
@@ -155,7 +154,7 @@ def test_a_cut_blf_is_reported(tmp_path: Path):
         ("x.xyz", b"", "is no CAN log by its suffix; valid: .log, .asc, .blf, .trc, .csv"),
     ],
 )
-def test_logs_that_are_none(name, data, message, tmp_path: Path):
+def test_logs_that_are_none(name, data, message, tmp_path):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(ImportFormatError) as caught:
         import_can(tmp_path / name, tmp_path / "run.mcap", load_robot("snake25"))
@@ -306,7 +305,7 @@ def exported(report, **options):
     return back.read_text()
 
 
-def test_the_bus_to_decode_can_be_chosen(import_text, tmp_path: Path):
+def test_the_bus_to_decode_can_be_chosen(import_text, tmp_path):
     first = import_text(TWO_BUSES)
     assert "/joint_commands" not in first.samples
     assert first.notes[-1] == "5 frames of bus can1 kept raw, not decoded"
@@ -370,7 +369,7 @@ def test_a_robot_without_a_bus_keeps_the_frames(import_text):
     assert set(report.samples) == {"/can/can0", "/can/can1"}
 
 
-def test_nothing_is_overwritten(import_text, tmp_path: Path):
+def test_nothing_is_overwritten(import_text, tmp_path):
     output = tmp_path / "a.mcap"
     output.write_text("precious")
     with pytest.raises(OutputExistsError):
@@ -391,7 +390,7 @@ def test_a_stopped_import_leaves_a_whole_file(import_text, monkeypatch):
         assert session.verdict == "degraded"
 
 
-def test_blocks_make_no_difference(tmp_path: Path, polled, monkeypatch):
+def test_blocks_make_no_difference(tmp_path, polled, monkeypatch):
     source = polled[0].parent / "poll.asc"
     monkeypatch.setattr("undulog.capture.exchange.frame_log.FRAMES_PER_BLOCK", 37)
     import_can(source, tmp_path / "a.mcap", load_robot("snake25"))

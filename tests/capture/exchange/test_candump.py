@@ -1,7 +1,5 @@
 """The candump format, against its definition in can-utils and against python-can."""
 
-from pathlib import Path
-
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -59,7 +57,7 @@ def test_what_is_read_is_written_the_same(lines, ways, tmp_path):
     assert written(text, tmp_path / "x.log") == text
 
 
-def test_frames_of_every_kind(tmp_path: Path):
+def test_frames_of_every_kind(tmp_path):
     log, block = read(
         tmp_path / "x.log",
         "(1717639553.000022) can0 14B#9B01 T\n"
@@ -89,7 +87,7 @@ def test_frames_of_every_kind(tmp_path: Path):
     assert log.problems == ["1 frames without a direction, unlike the first one"]
 
 
-def test_can_fd_frames(tmp_path: Path):
+def test_can_fd_frames(tmp_path):
     text = f"(1.0) can1 001#00\n(1.000001) can0 001##3{'AB' * 64}\n(1.000002) can1 00000002##5\n"
     log, block = read(tmp_path / "x.log", text)
     assert (len(block), log.problems) == (3, [])
@@ -102,7 +100,7 @@ def test_can_fd_frames(tmp_path: Path):
     assert block.frames["data"].tolist() == [[0] * 64, [0xAB] * 64, [0] * 64]
 
 
-def test_a_cut_last_line_is_reported(tmp_path: Path):
+def test_a_cut_last_line_is_reported(tmp_path):
     log, block = read(tmp_path / "x.log", "(1.000000) can0 001#00 R\n(1.000001) can0 001#0")
     assert len(block) == 1
     assert log.problems == ["the last line is cut short and left out: '(1.000001) can0 001#0'"]
@@ -119,12 +117,12 @@ def test_a_cut_last_line_is_reported(tmp_path: Path):
         "(x) c 1#",
     ],
 )
-def test_a_wrong_line_is_named(line, tmp_path: Path):
+def test_a_wrong_line_is_named(line, tmp_path):
     text = f"(1.000000) can0 001#00\n\n{line}\n(1.000000) can0 001#00\n"
     with pytest.raises(ImportFormatError, match=r"x\.log: line 3 is no candump line: "):
         read(tmp_path / "x.log", text)
 
 
-def test_another_format_is_refused(tmp_path: Path):
+def test_another_format_is_refused(tmp_path):
     with pytest.raises(ImportFormatError, match="is not a candump log; its first line is 'Jan 1"):
         read(tmp_path / "x.log", "Jan 1 kernel: hello\n")

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -63,7 +62,7 @@ def assert_same_samples(table, session, topic, field, column):
 @pytest.mark.parametrize("rows_per_block", [100_000, 10])
 @pytest.mark.parametrize("suffix", TABLE_FORMATS)
 def test_each_sample_has_a_row_at_its_own_time(
-    suffix, rows_per_block, polled, tmp_path: Path, monkeypatch
+    suffix, rows_per_block, polled, tmp_path, monkeypatch
 ):
     monkeypatch.setattr("undulog.capture.exchange.export._ROWS_PER_BLOCK", rows_per_block)
     output = tmp_path / f"x{suffix}"
@@ -93,7 +92,7 @@ def test_each_sample_has_a_row_at_its_own_time(
     assert (first["t_ns"] - T0).tolist() == [0, 2_000_000, 4_000_000]
 
 
-def test_topics_can_be_chosen(polled, tmp_path: Path):
+def test_topics_can_be_chosen(polled, tmp_path):
     report = export_columns(polled, tmp_path / "x.csv", topics=["/gait", "/joint_current", "/gait"])
     assert report.rows == {"/gait": 200, "/joint_current": 600}
     table = pd.read_csv(tmp_path / "x.csv")
@@ -110,7 +109,7 @@ def test_topics_can_be_chosen(polled, tmp_path: Path):
 
 
 @pytest.mark.parametrize("suffix", TABLE_FORMATS)
-def test_a_foreign_log_with_fields_that_come_and_go(suffix, tmp_path: Path):
+def test_a_foreign_log_with_fields_that_come_and_go(suffix, tmp_path):
     # One message a servo, some without velocity: the fields don't share times.
     from mcap.writer import Writer
 
@@ -145,7 +144,7 @@ def test_a_foreign_log_with_fields_that_come_and_go(suffix, tmp_path: Path):
     assert velocity["servo/states.velocity [rad/s]"].tolist() == expected
 
 
-def test_parquet_keeps_nan_as_null_and_text_as_categories(polled, tmp_path: Path):
+def test_parquet_keeps_nan_as_null_and_text_as_categories(polled, tmp_path):
     import pyarrow.parquet as pq
 
     export_columns(polled, tmp_path / "x.parquet")
@@ -158,7 +157,7 @@ def test_parquet_keeps_nan_as_null_and_text_as_categories(polled, tmp_path: Path
     assert table["joint_states.position [rad]"].null_count == 600 + 4
 
 
-def test_a_csv_of_one_joint_can_be_imported_again(tmp_path: Path):
+def test_a_csv_of_one_joint_can_be_imported_again(tmp_path):
     if not RECORDING.exists():
         pytest.skip(f"the ArcSnake recording is not at {RECORDING}")
     robot = load_robot("arcsnake-joint")
@@ -181,7 +180,7 @@ def test_a_csv_of_one_joint_can_be_imported_again(tmp_path: Path):
     np.testing.assert_array_equal(back.values, states.values)
 
 
-def test_the_verb(polled, tmp_path: Path, capsys):
+def test_the_verb(polled, tmp_path, capsys):
     output = tmp_path / "x.csv"
     arguments = ["log", "export", str(polled), "-o", str(output)]
     assert undulog.run(arguments) == 0
@@ -195,7 +194,7 @@ def test_the_verb(polled, tmp_path: Path, capsys):
     assert "--bus is for CAN frames; a .csv file has joint columns" in capsys.readouterr().err
 
 
-def test_a_missing_package_is_named(polled, tmp_path: Path, monkeypatch, capsys):
+def test_a_missing_package_is_named(polled, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtraError):
         export_columns(polled, tmp_path / "x.parquet")

@@ -1,7 +1,6 @@
 """CSV logs by a column map: real joint recordings, and every kind of fault."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -57,7 +56,7 @@ def load(path, name, tmp_path, toml=JOINT7):
         ("joint7_load_fullsegment_amp0.2pi.csv", 16.35, 0.2 * math.pi),
     ],
 )
-def test_the_arcsnake_joint_becomes_a_smooth_slow_sine(name, period, amplitude, tmp_path: Path):
+def test_the_arcsnake_joint_becomes_a_smooth_slow_sine(name, period, amplitude, tmp_path):
     raw = np.genfromtxt(ARCSNAKE / name, delimiter=",", names=True)
     assert np.abs(np.diff(raw["s_pos"])).max() > 12  # it does wrap around
     report, output = load(ARCSNAKE, name, tmp_path)
@@ -95,7 +94,7 @@ def run(tmp_path, text, *options, robot="snake13"):
     return import_csv(source, tmp_path / "run.mcap", described, column_map)
 
 
-def test_columns_of_several_joints_and_quantities(tmp_path: Path):
+def test_columns_of_several_joints_and_quantities(tmp_path):
     report = run(
         tmp_path,
         "t,a2,a1,v2,cmd,T\n0.00,20,10,1,5,293.15\n0.01,,11,,6,\n0.02,,,,7,294.15\n",
@@ -126,19 +125,19 @@ def test_columns_of_several_joints_and_quantities(tmp_path: Path):
         assert session.joints("/joint_commands").names == ("joint03",)
 
 
-def test_velocity_without_position_has_its_own_topic(tmp_path: Path):
+def test_velocity_without_position_has_its_own_topic(tmp_path):
     report = run(tmp_path, "t,v\n0,1\n", "v=joint01.velocity:rad/s")
     assert report.samples == {"/joint_velocity": 1}
 
 
-def test_unix_times_are_kept_to_the_nanosecond(tmp_path: Path):
+def test_unix_times_are_kept_to_the_nanosecond(tmp_path):
     run(tmp_path, "t,a\n1717639553.000000123,1\n1717639553.000000124,1\n", "a=joint01.position:rad")
     with Session.open(tmp_path / "run.mcap") as session:
         t_ns = session.joints("/joint_states").t_ns[0].tolist()
     assert t_ns == [1717639553_000000123, 1717639553_000000124]
 
 
-def test_unwrapping_passes_over_gaps(tmp_path: Path):
+def test_unwrapping_passes_over_gaps(tmp_path):
     run(
         tmp_path,
         "t,a\n0,170\n1,\n2,-170\n3,-150\n",
@@ -164,14 +163,14 @@ def test_unwrapping_passes_over_gaps(tmp_path: Path):
         ("", "log.csv: has no column 't'; it has none"),
     ],
 )
-def test_faults_of_a_log_name_file_row_and_column(text, message, tmp_path: Path):
+def test_faults_of_a_log_name_file_row_and_column(text, message, tmp_path):
     with pytest.raises(ImportFormatError) as caught:
         run(tmp_path, text, "a=joint01.position:rad")
     assert str(caught.value).endswith(message) or message in str(caught.value)
     assert not (tmp_path / "run.mcap").exists()
 
 
-def test_all_faults_of_a_map_are_listed(tmp_path: Path):
+def test_all_faults_of_a_map_are_listed(tmp_path):
     path = tmp_path / "map.toml"
     path.write_text(
         """
@@ -234,7 +233,7 @@ def test_faults_of_options(option, message):
     assert message in str(caught.value)
 
 
-def test_options_and_file_say_the_same(tmp_path: Path):
+def test_options_and_file_say_the_same(tmp_path):
     robot = load_robot("snake13")
     options = column_map_from_options(
         ("t [s]=time:ms", "a=b=joint01.position:deg,wrap=360,scale=0.5,offset=-1"), robot
@@ -244,13 +243,13 @@ def test_options_and_file_say_the_same(tmp_path: Path):
     assert read_column_map(tmp_path / "map.toml", robot) == options
 
 
-def test_a_csv_of_can_frames_is_reported_from_others(tmp_path: Path):
+def test_a_csv_of_can_frames_is_reported_from_others(tmp_path):
     header = "timestamp,arbitration_id,extended,remote,error,dlc,data\n"
     assert is_frame_csv(csv_file(tmp_path, header))
     assert not is_frame_csv(csv_file(tmp_path, "time,a\n"))
 
 
-def test_a_stopped_import_leaves_a_whole_file(tmp_path: Path):
+def test_a_stopped_import_leaves_a_whole_file(tmp_path):
     robot = load_robot("snake13")
     source = csv_file(tmp_path, "t,a\n" + "".join(f"{i},1\n" for i in range(10_000)))
     stop = StopRequest()

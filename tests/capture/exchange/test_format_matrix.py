@@ -337,7 +337,7 @@ def test_python_cans_writer_and_import(suffix, frames):
     assert abs(late).max() <= error_ns
 
 
-def test_lines_that_a_reader_passes_over_are_counted(tmp_path: Path):
+def test_lines_that_a_reader_passes_over_are_counted(tmp_path):
     """Status and error lines of PEAK's format, which python-can has no frames for."""
     lines = [
         ";$FILEVERSION=2.1",

@@ -3,7 +3,6 @@
 import json
 import struct
 import zlib
-from pathlib import Path
 
 import can
 import numpy as np
@@ -62,7 +61,7 @@ READERS = {
 
 @pytest.mark.parametrize("suffix", READERS)
 @pytest.mark.parametrize("fd", [False, True])
-def test_python_can_reads_them(suffix, fd, tmp_path: Path):
+def test_python_can_reads_them(suffix, fd, tmp_path):
     frames = every_kind(fd=fd)
     source = write_frames(tmp_path / "run.mcap", {"/can_fd/can0" if fd else "/can/can0": frames})
     export_log(source, tmp_path / f"x{suffix}")
@@ -108,7 +107,7 @@ def blf_times(path):
     return times
 
 
-def test_a_blf_has_each_nanosecond(tmp_path: Path):
+def test_a_blf_has_each_nanosecond(tmp_path):
     frames = every_kind(step_ns=12_345_679, start_ns=T0 + 7)
     frames["t_host_ns"][5] = frames["t_host_ns"][0] - 3 * S  # a time may go back
     frames["t_host_ns"][-1] += 3600 * S
@@ -120,7 +119,7 @@ def test_a_blf_has_each_nanosecond(tmp_path: Path):
     assert header == (2023, 11, 2, 14, 22, 13, 20, 0)  # UTC, as python-can and Vector's library
 
 
-def test_asc_has_no_clock_of_this_machine(tmp_path: Path):
+def test_asc_has_no_clock_of_this_machine(tmp_path):
     source = write_session(tmp_path / "run.mcap", {"can0": every_kind()})
     export_log(source, tmp_path / "x.asc")
     text = (tmp_path / "x.asc").read_text()
@@ -131,7 +130,7 @@ def test_asc_has_no_clock_of_this_machine(tmp_path: Path):
     assert (tmp_path / "x.asc").read_text() == text
 
 
-def test_what_no_format_but_candump_has_is_counted(tmp_path: Path):
+def test_what_no_format_but_candump_has_is_counted(tmp_path):
     frames = empty_frames(3)
     frames["t_host_ns"], frames["id_flags"] = T0, [5, 6, 7]
     frames["dlc"], frames["t_device_ns"] = [11, 8, 8], [0, T0, 5]
@@ -149,7 +148,7 @@ def test_what_no_format_but_candump_has_is_counted(tmp_path: Path):
 # -- ROS 2 ---------------------------------------------------------------------------------
 
 
-def test_ros_messages_hold_everything(session_of_every_kind, tmp_path: Path):
+def test_ros_messages_hold_everything(session_of_every_kind, tmp_path):
     source, frames = session_of_every_kind
     report = export_log(source, tmp_path / "x.mcap")
     assert report.warnings == []
@@ -176,7 +175,7 @@ def test_ros_messages_hold_everything(session_of_every_kind, tmp_path: Path):
     ]
 
 
-def test_rosbags_reads_them(session_of_every_kind, tmp_path: Path):
+def test_rosbags_reads_them(session_of_every_kind, tmp_path):
     source, frames = session_of_every_kind
     export_log(source, tmp_path / "x.mcap")
     store = get_typestore(Stores.EMPTY)
@@ -192,7 +191,7 @@ def test_rosbags_reads_them(session_of_every_kind, tmp_path: Path):
     assert [bytes(m.data) for _, m in messages] == [bytes(row) for row in frames["data"]]
 
 
-def test_names_that_a_format_has_not_are_reported(tmp_path: Path):
+def test_names_that_a_format_has_not_are_reported(tmp_path):
     frames = every_kind()[:20]
     buses = {"can3": frames, "left-arm": frames, "0": frames}
     source = write_session(tmp_path / "run.mcap", buses)
@@ -209,14 +208,14 @@ def test_names_that_a_format_has_not_are_reported(tmp_path: Path):
 @pytest.mark.parametrize(
     ("suffix", "words"), [(".blf", "written as received"), (".mcap", "on from_can_bus")]
 )
-def test_directions_that_are_none_are_reported(suffix, words, tmp_path: Path):
+def test_directions_that_are_none_are_reported(suffix, words, tmp_path):
     facts = {"import.directions": "none"}
     source = write_session(tmp_path / "run.mcap", {"can0": every_kind()[:20]}, **facts)
     report = export_log(source, tmp_path / f"x{suffix}")
     assert f"no directions were recorded: all frames are {words}" in report.warnings
 
 
-def test_a_trace_without_a_date(tmp_path: Path):
+def test_a_trace_without_a_date(tmp_path):
     frames = every_kind(start_ns=100 * S)
     source = write_session(tmp_path / "run.mcap", {"can0": frames})
     report = export_log(source, tmp_path / "x.blf")
@@ -231,7 +230,7 @@ def test_a_trace_without_a_date(tmp_path: Path):
 
 
 @pytest.mark.parametrize("suffix", FRAME_FORMATS)
-def test_stretches_make_no_difference(suffix, tmp_path: Path, monkeypatch):
+def test_stretches_make_no_difference(suffix, tmp_path, monkeypatch):
     rng = np.random.default_rng(1)
     buses = {}
     for bus in ("can0", "can1", "can2"):
@@ -269,7 +268,7 @@ def arcsnake(tmp_path_factory):
 
 
 @pytest.mark.parametrize("suffix", [".blf", ".asc"])
-def test_a_real_trace_comes_back(suffix, arcsnake, tmp_path: Path):
+def test_a_real_trace_comes_back(suffix, arcsnake, tmp_path):
     path, frames = arcsnake
     report = export_log(path, tmp_path / f"x{suffix}")
     assert (report.buses, report.warnings) == ({"can0": 19_297}, [])
@@ -280,7 +279,7 @@ def test_a_real_trace_comes_back(suffix, arcsnake, tmp_path: Path):
     np.testing.assert_array_equal(back["t_host_ns"] + start_ns, frames["t_host_ns"])
 
 
-def test_a_real_trace_as_ros_messages(arcsnake, tmp_path: Path):
+def test_a_real_trace_as_ros_messages(arcsnake, tmp_path):
     path, frames = arcsnake
     export_log(path, tmp_path / "x.mcap")
     with Session.open(tmp_path / "x.mcap") as session:
@@ -297,7 +296,7 @@ def test_a_real_trace_as_ros_messages(arcsnake, tmp_path: Path):
 # -- the command ------------------------------------------------------------------------------
 
 
-def test_the_verb_says_what_is_lost(session_of_every_kind, tmp_path: Path, capsys):
+def test_the_verb_says_what_is_lost(session_of_every_kind, tmp_path, capsys):
     source, frames = session_of_every_kind
     output = tmp_path / "x.blf"
     assert undulog.run(["log", "export", str(source), "-o", str(output)]) == 0
@@ -322,7 +321,7 @@ EXPORTS = [
 
 
 @pytest.mark.parametrize("case", EXPORTS, ids=lambda case: case[1])
-def test_what_fails_leaves_nothing_behind(case, tmp_path: Path, monkeypatch):
+def test_what_fails_leaves_nothing_behind(case, tmp_path, monkeypatch):
     exporter, suffix, owner, step = case
     source, output = tmp_path / "run.mcap", tmp_path / f"x{suffix}"
     with SessionWriter(source, session_id="s", epoch_ns=T0) as writer:
@@ -342,7 +341,7 @@ def test_what_fails_leaves_nothing_behind(case, tmp_path: Path, monkeypatch):
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_session_is_not_replaced_by_its_export(tmp_path: Path):
+def test_a_session_is_not_replaced_by_its_export(tmp_path):
     source = write_session(tmp_path / "run.mcap", {"can0": every_kind()[:1]})
     with pytest.raises(UsageError, match="is the session itself"):
         export_log(source, source, force=True)

@@ -1,11 +1,7 @@
 """Damaged foreign logs: an import ends in a session or in an error of ours that names the file."""
 
-from __future__ import annotations
-
 import random
 import sqlite3
-from collections.abc import Callable
-from pathlib import Path
 
 import can
 import pytest
@@ -34,7 +30,7 @@ NUMBERS = (
 CASES = 40
 
 
-def write_trace(path: Path) -> None:
+def write_trace(path):
     with can.Logger(str(path)) as logger:
         for k in range(60):
             logger.on_message_received(
@@ -55,14 +51,14 @@ def robot():
 
 
 @pytest.fixture(scope="module")
-def traces(tmp_path_factory) -> dict[str, bytes]:
+def traces(tmp_path_factory):
     folder = tmp_path_factory.mktemp("traces")
     for suffix in SUFFIXES:
         write_trace(folder / f"run{suffix}")
     return {suffix: (folder / f"run{suffix}").read_bytes() for suffix in SUFFIXES}
 
 
-def mutated(data: bytes, rng: random.Random, *, text: bool) -> bytes:
+def mutated(data, rng, *, text):
     """One to three changes: bytes, a cut, a piece twice, a number that is none or too large."""
     for _ in range(rng.randint(1, 3)):
         at = rng.randrange(len(data) + 1)
@@ -84,7 +80,7 @@ def mutated(data: bytes, rng: random.Random, *, text: bool) -> bytes:
     return data
 
 
-def refusal(work: Callable[[], object]) -> str | None:
+def refusal(work):
     """The error of ours that some work ends in; None if it is done."""
     try:
         work()
@@ -93,7 +89,7 @@ def refusal(work: Callable[[], object]) -> str | None:
     return None
 
 
-def imported(path: Path, robot) -> None:
+def imported(path, robot):
     """Import; a session that came of it can be read."""
     output = path.with_suffix(".mcap")
     why = refusal(lambda: import_can(path, output, robot, force=True))

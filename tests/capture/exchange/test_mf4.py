@@ -6,7 +6,6 @@ import random
 import struct
 import sys
 from datetime import UTC, datetime, timedelta, timezone
-from pathlib import Path
 
 import can
 import numpy as np
@@ -32,7 +31,7 @@ START = datetime(2024, 2, 29, 12, 0, 0, 125_000, tzinfo=UTC)
 START_NS = 1_709_208_000_125_000_000
 
 
-def read(path: Path):
+def read(path):
     """Everything in a file: frames, name of each one's bus, the log."""
     with open_frame_log(path) as log:
         blocks = list(log.blocks)
@@ -68,7 +67,7 @@ def data_group(times, ids, data, *, way=None, bus=None, wide=None, dlc=None, wid
     return group("CAN_DataFrame", times, columns)
 
 
-def written(path: Path, *groups, start=START, compression=0, ways=None):
+def written(path, *groups, start=START, compression=0, ways=None):
     """``ways``: conversion of the directions, as loggers have it: numbers that stand for texts."""
     mdf = asammdf.MDF(version="4.10")
     mdf.header.start_time = start
@@ -82,7 +81,7 @@ def written(path: Path, *groups, start=START, compression=0, ways=None):
     return path
 
 
-def test_a_compressed_file_is_read_the_same(tmp_path: Path):
+def test_a_compressed_file_is_read_the_same(tmp_path):
     plain, packed = tmp_path / "log.mf4", tmp_path / "log.mf4.gz"
     with can.MF4Writer(plain) as writer:
         for i in range(500):
@@ -94,7 +93,7 @@ def test_a_compressed_file_is_read_the_same(tmp_path: Path):
 
 
 @pytest.mark.parametrize("compression", [0, 1, 2])
-def test_groups_of_a_logger_merge_by_time_to_the_nanosecond(compression, tmp_path: Path):
+def test_groups_of_a_logger_merge_by_time_to_the_nanosecond(compression, tmp_path):
     """One group for each bus, with texts for directions, the extended bit in the identifier."""
     steps = np.arange(200_000) * 12_345  # more than one block of either
     times = steps / 1e9
@@ -128,7 +127,7 @@ def test_groups_of_a_logger_merge_by_time_to_the_nanosecond(compression, tmp_pat
     assert log.problems == []
 
 
-def test_fields_that_a_group_may_lack(tmp_path: Path):
+def test_fields_that_a_group_may_lack(tmp_path):
     path = written(
         tmp_path / "log.mf4",
         data_group([0.5, 1.5], [0x123, 0x456], [b"\1\2", b""]),
@@ -144,7 +143,7 @@ def test_fields_that_a_group_may_lack(tmp_path: Path):
     assert log.directions is False
 
 
-def test_what_is_left_out_is_reported(tmp_path: Path):
+def test_what_is_left_out_is_reported(tmp_path):
     long_columns = {
         "ID": (("<u4",), 2),
         "DLC": (("u1",), 15),
@@ -183,14 +182,14 @@ def test_what_is_left_out_is_reported(tmp_path: Path):
         (START.astimezone().replace(tzinfo=None), START_NS),
     ],
 )
-def test_the_start_of_the_measurement(start, truth_ns, tmp_path: Path):
+def test_the_start_of_the_measurement(start, truth_ns, tmp_path):
     path = written(tmp_path / "log.mf4", data_group([0.0, 0.25], [1, 2], [b"", b""]), start=start)
     frames, _, log = read(path)
     assert (frames["t_host_ns"].astype(np.int64) - truth_ns).tolist() == [0, 250_000_000]
     assert ("this machine's" in log.time) == (start.tzinfo is None)
 
 
-def test_times_that_go_back_stay_in_their_order(tmp_path: Path):
+def test_times_that_go_back_stay_in_their_order(tmp_path):
     times = [0.0, 2.0, 1.0, 3.0]
     ids = [1, 2, 3, 4]
     other = data_group([1.5, 2.5], [5, 6], [b"", b""])
@@ -198,7 +197,7 @@ def test_times_that_go_back_stay_in_their_order(tmp_path: Path):
     assert frames["id_flags"].tolist() == [1, 5, 2, 3, 6, 4]
 
 
-def test_files_that_hold_no_frames(tmp_path: Path):
+def test_files_that_hold_no_frames(tmp_path):
     temperature = asammdf.Signal(np.arange(4.0), np.arange(4.0), name="temperature")
     path = written(tmp_path / "log.mf4", temperature)
     with pytest.raises(ImportFormatError, match=r"log\.mf4: holds no CAN frames"):
@@ -212,7 +211,7 @@ def test_files_that_hold_no_frames(tmp_path: Path):
         read(path)
 
 
-def test_a_damaged_file_is_one_error_and_nothing_else(tmp_path: Path, capfd, monkeypatch):
+def test_a_damaged_file_is_one_error_and_nothing_else(tmp_path, capfd, monkeypatch):
     """Read or refused, whatever is damaged; neither asammdf nor the interpreter says a word."""
     messages = []
     monkeypatch.setattr(sys, "unraisablehook", messages.append)
@@ -236,7 +235,7 @@ def test_a_damaged_file_is_one_error_and_nothing_else(tmp_path: Path, capfd, mon
     assert capfd.readouterr() == ("", "")
 
 
-def test_without_asammdf_the_command_names_the_extra(tmp_path: Path, capsys, monkeypatch):
+def test_without_asammdf_the_command_names_the_extra(tmp_path, capsys, monkeypatch):
     (tmp_path / "x.mf4").write_bytes(b"MDF     4.10    ".ljust(64, b"\0"))
     monkeypatch.setitem(sys.modules, "asammdf", None)
     arguments = ["import", str(tmp_path / "x.mf4"), "-o", str(tmp_path / "run.mcap")]
@@ -248,7 +247,7 @@ def test_without_asammdf_the_command_names_the_extra(tmp_path: Path, capsys, mon
     assert not (tmp_path / "run.mcap").exists()
 
 
-def test_the_times_are_rounded_not_cut(tmp_path: Path):
+def test_the_times_are_rounded_not_cut(tmp_path):
     """A time as a floating-point number of seconds lies beside its nanosecond."""
     steps = [1, 3, 999_999_999, 1_000_000_001, 3_600_000_000_007]
     times = [math.nextafter(step / 1e9, 0) for step in steps]
@@ -256,7 +255,7 @@ def test_the_times_are_rounded_not_cut(tmp_path: Path):
     assert (read(path)[0]["t_host_ns"].astype(np.int64) - START_NS).tolist() == steps
 
 
-def test_a_file_that_its_logger_did_not_finish(tmp_path: Path):
+def test_a_file_that_its_logger_did_not_finish(tmp_path):
     """No counts, no lengths, as a logger leaves it that lost its power."""
     times = np.arange(500) * 1e-3
     frames = data_group(times, np.arange(500), [bytes([i % 256]) for i in range(500)])
@@ -278,7 +277,7 @@ def test_a_file_that_its_logger_did_not_finish(tmp_path: Path):
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_data_of_varying_length(text, tmp_path: Path):
+def test_data_of_varying_length(text, tmp_path):
     """Data bytes in a list of their own, each as long as it is; as text they would lose zeros."""
     lengths = np.arange(300) % 9
     data = [bytes((i + k) % 256 for k in range(length)) for i, length in enumerate(lengths)]

@@ -3,16 +3,12 @@
 The senders here know what they sent; joint states are counted with mcap's own reader.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal
 import socket
 import threading
 import time
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +18,7 @@ from support.processes import wait_for
 from support.recorders import counts, ended, events, greet, recording, send
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.bus.decoding import BusDecoder
-from undulog.capture.log.messages.frames import DIR_TX, FrameArray, empty_frames
+from undulog.capture.log.messages.frames import DIR_TX, empty_frames
 from undulog.capture.log.write.channels import JointStateChannel
 from undulog.capture.recorder.bus_recorder import BusRecorder
 from undulog.capture.recorder.source_clock import SourceClock
@@ -31,7 +27,7 @@ NS = 1_000_000_000
 CYCLES, JOINTS = 300, 25
 
 
-def polling() -> FrameArray:
+def polling():
     """300 polling cycles of 10 ms: each servo's command, then its answer."""
     assert len(load_robot("snake25").joints) == JOINTS
     frames = empty_frames(2 * JOINTS * CYCLES)
@@ -50,7 +46,7 @@ ODD_NS = (1 << 63, (1 << 63) + 18 * 10**17 - 1, 1 << 62, (1 << 63) - 1, 2**64 - 
 
 
 @pytest.mark.parametrize("first", [0, 199], ids=["the first", "later"])
-def test_an_impossible_device_time_ends_no_decoding(first: int, tmp_path: Path) -> None:
+def test_an_impossible_device_time_ends_no_decoding(first, tmp_path):
     bus, frames = tmp_path / "bus.sock", polling()
     odd = frames[first::200]
     odd["t_device_ns"] = np.resize(np.array(ODD_NS, dtype=np.uint64), len(odd))
@@ -74,10 +70,10 @@ TIMES = ("9300000000.0", "99999999999.0", "-1.5", "nan", "inf", "1e300", "9" * 3
 
 
 @pytest.mark.parametrize("first", [0, 199], ids=["the first", "later"])
-def test_an_impossible_time_of_socketcand_ends_no_decoding(first: int, tmp_path: Path) -> None:
+def test_an_impossible_time_of_socketcand_ends_no_decoding(first, tmp_path):
     frames = polling()[1::2]  # a server marks no directions: answers only
     odd = range(first, len(frames), 200)
-    lines: list[bytes] = []
+    lines = []
     for k, frame in enumerate(frames):
         t_ns = int(frame["t_device_ns"])
         stamp = f"{t_ns // NS}.{t_ns % NS // 1000:06d}"
@@ -86,7 +82,7 @@ def test_an_impossible_time_of_socketcand_ends_no_decoding(first: int, tmp_path:
         lines.append(f"< frame {int(frame['id_flags']):03X} {stamp} {'00' * 8} >".encode())
     listener = socket.create_server(("127.0.0.1", 0))
 
-    def serve() -> None:
+    def serve():
         client, _ = listener.accept()
         with client:
             greet(client)
@@ -111,9 +107,7 @@ def test_an_impossible_time_of_socketcand_ends_no_decoding(first: int, tmp_path:
 
 
 @pytest.mark.parametrize("stage", ["decode", "map", "write"])
-def test_a_failure_of_decoding_costs_the_frames_that_cause_it(
-    stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failure_of_decoding_costs_the_frames_that_cause_it(stage, tmp_path, monkeypatch):
     """Every 200th frame makes one stage raise, as a fault of the program would."""
     owner, method, fails = {
         "decode": (BusDecoder, "decode", lambda _, args: (args[0]["t_device_ns"] % 200 == 1).any()),
@@ -122,7 +116,7 @@ def test_a_failure_of_decoding_costs_the_frames_that_cause_it(
     }[stage]
     original, calls = getattr(owner, method), itertools.count(1)
 
-    def failing(self: Any, *args: Any, **options: Any) -> Any:
+    def failing(self, *args, **options):
         if fails(next(calls), args):
             raise ZeroDivisionError(stage)
         return original(self, *args, **options)
@@ -158,12 +152,10 @@ def test_a_failure_of_decoding_costs_the_frames_that_cause_it(
         assert samples > 0.8 * CYCLES * JOINTS
 
 
-def test_a_decoder_that_always_fails_ends_in_bounded_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tries: list[int] = []
+def test_a_decoder_that_always_fails_ends_in_bounded_time(tmp_path, monkeypatch):
+    tries = []
 
-    def fail(self: BusDecoder, frames: FrameArray) -> Any:
+    def fail(self, frames):
         tries.append(len(frames))
         raise ZeroDivisionError
 
@@ -184,7 +176,7 @@ def test_a_decoder_that_always_fails_ends_in_bounded_time(
 # -- simulated time and plug-ins ------------------------------------------------------------------
 
 
-def test_a_duration_ends_sources_of_simulated_time(tmp_path: Path) -> None:
+def test_a_duration_ends_sources_of_simulated_time(tmp_path):
     bus = tmp_path / "bus.sock"
     with recording(
         tmp_path / "run.mcap", f"can0=unix:{bus}?clock=simulated", "--duration", "1.5"
@@ -227,7 +219,7 @@ class Source:
 
 
 @pytest.fixture
-def plugged(tmp_path: Path) -> dict[str, str]:
+def plugged(tmp_path):
     """The environment of a command that finds a plug-in with the scheme ``faulty``."""
     folder = tmp_path / "plug-in"
     info = folder / "faulty-1.0.dist-info"
@@ -240,9 +232,7 @@ def plugged(tmp_path: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("where", ["open", "start,stop"])
-def test_a_plug_in_that_fails_to_start_is_an_error_with_its_name(
-    where: str, plugged: dict[str, str], tmp_path: Path
-) -> None:
+def test_a_plug_in_that_fails_to_start_is_an_error_with_its_name(where, plugged, tmp_path):
     good = f"can0=unix:{tmp_path / 'bus.sock'}"
     with recording(tmp_path / "run.mcap", good, f"bad=faulty:{where}", env=plugged) as process:
         said, trouble = process.communicate(timeout=60)
@@ -254,9 +244,7 @@ def test_a_plug_in_that_fails_to_start_is_an_error_with_its_name(
 
 
 @pytest.mark.parametrize("where", ["poll,stop", "rubbish", "dtype"])
-def test_a_plug_in_that_fails_later_is_given_up_alone(
-    where: str, plugged: dict[str, str], tmp_path: Path
-) -> None:
+def test_a_plug_in_that_fails_later_is_given_up_alone(where, plugged, tmp_path):
     bus, frames = tmp_path / "bus.sock", polling()[: 50 * 2 * JOINTS]
     sources = [f"can0=unix:{bus}", f"bad=faulty:{where}"]
     with recording(tmp_path / "run.mcap", *sources, env=plugged) as process:

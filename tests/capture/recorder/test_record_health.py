@@ -1,11 +1,8 @@
 """The stored verdict and clock of a real recording, against what was done to its source."""
 
-from __future__ import annotations
-
 import signal
 import socket
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +17,7 @@ from undulog.capture.sources.contract import HEAD
 NS = 1_000_000_000
 
 
-def send(path: Path, seconds: float, lost: int) -> int:
+def send(path, seconds, lost):
     """Frames at about 1 kHz on a clock that runs 80 ppm fast; some numbers are never sent."""
     sequence = sent = 0
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
@@ -39,7 +36,7 @@ def send(path: Path, seconds: float, lost: int) -> int:
 
 
 @pytest.mark.slow
-def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path: Path) -> None:
+def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path):
     output, source = tmp_path / "run.mcap", tmp_path / "snake.sock"
     with recording(output, f"bus=unix:{source}") as recorder:
         wait_for(source.exists, "the source", alive=[recorder])

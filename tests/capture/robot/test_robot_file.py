@@ -1,7 +1,6 @@
 """Robot descriptions: the shipped ones, and every kind of fault in others."""
 
 import math
-from pathlib import Path
 
 import cantools
 import pytest
@@ -366,7 +365,7 @@ def test_unequal_numbers_of_links_and_joints():
     assert "  links: found 1; valid: 3, one more than joints" in faults_of(text)
 
 
-def test_a_robot_file_finds_its_databases_beside_it(tmp_path: Path):
+def test_a_robot_file_finds_its_databases_beside_it(tmp_path):
     (tmp_path / "worm.toml").write_text(MINIMAL + BUS)
     (tmp_path / "worm.dbc").write_bytes(DBC.replace('"deg"', '"°"').encode("cp1252"))
     robot = load_robot(tmp_path / "worm.toml")
@@ -378,7 +377,7 @@ def test_an_unknown_robot_is_wrong_usage():
         load_robot("snak25")
 
 
-def test_a_file_that_is_not_text(tmp_path: Path):
+def test_a_file_that_is_not_text(tmp_path):
     path = tmp_path / "worm.toml"
     path.write_bytes(b"name = '\xff'")
     with pytest.raises(RobotFileError, match="not UTF-8"):

@@ -39,7 +39,7 @@ from undulog.capture.sources.address import open_source, open_sources, parse_add
         ("can:socketcan:can0?note=", "can0", "can", "socketcan:can0", {"note": ""}),
     ],
 )
-def test_an_address_is_taken_apart(text, name, scheme, rest, options) -> None:
+def test_an_address_is_taken_apart(text, name, scheme, rest, options):
     address = parse_address(text)
     assert (address.name, address.scheme, address.rest) == (name, scheme, rest)
     assert dict(address.options) == options
@@ -62,18 +62,18 @@ def test_an_address_is_taken_apart(text, name, scheme, rest, options) -> None:
         ("can:socketcan:can0?a=1&&b=2", "'' is no option"),
     ],
 )
-def test_what_is_wrong_is_said(text, match) -> None:
+def test_what_is_wrong_is_said(text, match):
     with pytest.raises(UsageError, match=match):
         parse_address(text)
 
 
-def test_schemes_are_those_installed() -> None:
+def test_schemes_are_those_installed():
     assert {"can", "twin", "unix"} <= set(schemes())
     with pytest.raises(UsageError, match=r"no kind of source 'cam'; valid: can.*did you mean can"):
         open_source(parse_address("cam:socketcan:can0"))
 
 
-def test_two_sources_need_two_names(tmp_path) -> None:
+def test_two_sources_need_two_names(tmp_path):
     with pytest.raises(UsageError, match=r"are both called can0.*can0_2="):
         open_sources(["can:virtual:can0", f"unix:{tmp_path}/can0.sock"])
     sources = open_sources(["can:virtual:can0", f"other=unix:{tmp_path}/can0.sock"])
@@ -84,7 +84,7 @@ def test_two_sources_need_two_names(tmp_path) -> None:
         open_sources([])
 
 
-def test_a_source_without_its_extra_says_which() -> None:
+def test_a_source_without_its_extra_says_which():
     code = (
         "import sys; sys.modules['pybullet'] = None\n"
         "from undulog.capture.common.errors import MissingExtraError\n"

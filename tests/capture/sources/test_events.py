@@ -12,14 +12,14 @@ S = 1_000_000_000
 class Clock:
     """A session's clock that stands still until told."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.t_ns = 10**18
 
-    def __call__(self) -> int:
+    def __call__(self):
         return self.t_ns
 
 
-def test_one_text_is_told_once_a_second_with_its_count() -> None:
+def test_one_text_is_told_once_a_second_with_its_count():
     clock = Clock()
     events = EventLog(clock)
     told = []
@@ -39,7 +39,7 @@ def test_one_text_is_told_once_a_second_with_its_count() -> None:
     assert events.flush() == ()
 
 
-def test_different_texts_do_not_hide_each_other() -> None:
+def test_different_texts_do_not_hide_each_other():
     events = EventLog(Clock())
     for text in ("a", "b", "a"):
         events.log_event("info", text)
@@ -47,7 +47,7 @@ def test_different_texts_do_not_hide_each_other() -> None:
     assert [event.text for event in events.flush()] == ["a"]
 
 
-def test_after_a_quiet_second_the_next_is_told_at_once() -> None:
+def test_after_a_quiet_second_the_next_is_told_at_once():
     clock = Clock()
     events = EventLog(clock)
     events.log_event("info", "a")
@@ -58,7 +58,7 @@ def test_after_a_quiet_second_the_next_is_told_at_once() -> None:
     assert [event.text for event in events.take()] == ["a (3 times)"]
 
 
-def test_pauses_double_up_to_five_seconds_and_begin_anew_after_a_steady_connection() -> None:
+def test_pauses_double_up_to_five_seconds_and_begin_anew_after_a_steady_connection():
     backoff, now = Backoff(), 10**18
     assert backoff.due(now)
     pauses = []
@@ -78,13 +78,13 @@ def test_pauses_double_up_to_five_seconds_and_begin_anew_after_a_steady_connecti
     assert backoff.due(now + S + S // 10)
 
 
-def errors(*classes: int):
+def errors(*classes):
     frames = empty_frames(len(classes))
     frames["id_flags"] = np.array(classes) | ERROR_FLAG
     return frames
 
 
-def test_bus_off_and_back_are_events() -> None:
+def test_bus_off_and_back_are_events():
     watch, tally = BusWatch(), Tally(Clock())
     watch.look(errors(BUS_OFF, BUS_OFF), tally)
     watch.look(errors(RESTARTED), tally)
@@ -100,7 +100,7 @@ def test_bus_off_and_back_are_events() -> None:
     assert tally.counts.error_frames == 4
 
 
-def test_error_classes_are_spelt_out() -> None:
+def test_error_classes_are_spelt_out():
     watch, tally = BusWatch(), Tally(Clock())
     frames = errors(0x4 | 0x8, 0)
     frames["data"][0, 1] = 0x01 | 0x08

@@ -19,12 +19,12 @@ from undulog.capture.sources.socketcan import SocketcanLink
 FRAME = bytes.fromhex("23010000020000001122000000000000")
 
 
-def source_of(open_link) -> LinkedSource:
+def source_of(open_link):
     address = parse_address("can:test:can0")
     return LinkedSource(address, open_link, place="can0", clock=ClockDomain.HOST, facts={})
 
 
-def test_a_fault_of_an_opener_is_told_and_tried_again(sockets, listen) -> None:
+def test_a_fault_of_an_opener_is_told_and_tried_again(sockets, listen):
     ours, theirs = sockets
     faults = [RuntimeError("a bug"), RuntimeError("a bug"), OSError(5, "Input/output error")]
 
@@ -46,7 +46,7 @@ def test_a_fault_of_an_opener_is_told_and_tried_again(sockets, listen) -> None:
     assert frame.dtype == FRAME_DTYPE
 
 
-def test_a_fault_of_a_link_is_a_lost_connection(sockets, listen) -> None:
+def test_a_fault_of_a_link_is_a_lost_connection(sockets, listen):
     ours, theirs = sockets
 
     class Faulty(SocketcanLink):
@@ -55,7 +55,7 @@ def test_a_fault_of_a_link_is_a_lost_connection(sockets, listen) -> None:
                 raise ZeroDivisionError("a bug") from None
             return found
 
-        def close(self) -> None:
+        def close(self):
             pass  # the test's socket lives on
 
     links = [Faulty, SocketcanLink]
@@ -69,7 +69,7 @@ def test_a_fault_of_a_link_is_a_lost_connection(sockets, listen) -> None:
     assert heard.source.counts.reconnects == 1
 
 
-def test_what_the_thread_took_and_what_the_kernel_dropped_is_all(sockets, listen) -> None:
+def test_what_the_thread_took_and_what_the_kernel_dropped_is_all(sockets, listen):
     ours, theirs = sockets
     for option in (SO_TIMESTAMPNS, SO_RXQ_OVFL):
         ours.setsockopt(socket.SOL_SOCKET, option, 1)
@@ -94,7 +94,7 @@ def test_what_the_thread_took_and_what_the_kernel_dropped_is_all(sockets, listen
     assert heard.source.counts.frames == len(heard.frames)
 
 
-def test_what_is_found_impossible_late_ends_the_source_only(listen) -> None:
+def test_what_is_found_impossible_late_ends_the_source_only(listen):
     go = threading.Event()
 
     def open_link(tally):
@@ -109,7 +109,7 @@ def test_what_is_found_impossible_late_ends_the_source_only(listen) -> None:
     assert heard.source.finished
 
 
-def test_what_is_found_impossible_at_once_is_raised(context) -> None:
+def test_what_is_found_impossible_at_once_is_raised(context):
     def open_link(tally):
         raise SourceError("can:test:can0", "there is no such driver")
 
@@ -119,7 +119,7 @@ def test_what_is_found_impossible_at_once_is_raised(context) -> None:
     source.stop()
 
 
-def test_a_connection_that_opens_after_the_end_is_closed(sockets, context) -> None:
+def test_a_connection_that_opens_after_the_end_is_closed(sockets, context):
     ours, _ = sockets
     go = threading.Event()
 

@@ -29,7 +29,7 @@ def bus():
         yield bus
 
 
-def source_at(query: str = "", interface: str = "virtual:snake"):
+def source_at(query="", interface="virtual:snake"):
     return open_source(parse_address(f"can:{interface}{query}"))
 
 
@@ -37,7 +37,7 @@ def source_at(query: str = "", interface: str = "virtual:snake"):
 def connect(listen):
     """Starts the source, and waits until it is connected."""
 
-    def start(query: str = ""):
+    def start(query=""):
         heard = listen(source_at(query))
         heard.until_event("connected to virtual snake (never transmits)")
         return heard
@@ -45,7 +45,7 @@ def connect(listen):
     return start
 
 
-def test_twenty_thousand_frames_arrive_as_sent(bus, connect, traffic, same) -> None:
+def test_twenty_thousand_frames_arrive_as_sent(bus, connect, traffic, same):
     truth = traffic(20_000)
     heard = connect()
     for start in range(0, len(truth), 500):
@@ -63,7 +63,7 @@ def test_twenty_thousand_frames_arrive_as_sent(bus, connect, traffic, same) -> N
     assert bus.recv(0) is None  # it sent nothing
 
 
-def test_the_devices_times_to_the_microsecond(bus, connect, traffic) -> None:
+def test_the_devices_times_to_the_microsecond(bus, connect, traffic):
     truth = traffic(2000)
     heard = connect("?device_time=1&preserve_timestamps=1")
     assert heard.source.clock is ClockDomain.DEVICE
@@ -73,13 +73,13 @@ def test_the_devices_times_to_the_microsecond(bus, connect, traffic) -> None:
     assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
 
 
-def test_a_driver_without_times_gets_those_of_arrival() -> None:
+def test_a_driver_without_times_gets_those_of_arrival():
     messages = [(123, can.Message(timestamp=0.0)), (456, can.Message(timestamp=1.5))]
     frames = frames_of(messages, device_time=True)
     assert frames["t_device_ns"].tolist() == [123, 1_500_000_000]
 
 
-def test_impossible_times_are_replaced_by_the_arrivals_and_counted(bus, connect) -> None:
+def test_impossible_times_are_replaced_by_the_arrivals_and_counted(bus, connect):
     heard = connect("?device_time=1&preserve_timestamps=1")
     times = (float("nan"), float("inf"), -1.5, 1e300, 9.3e9, 4611686018.5)
     for k, time_s in enumerate((*times, 5.25)):
@@ -91,7 +91,7 @@ def test_impossible_times_are_replaced_by_the_arrivals_and_counted(bus, connect)
     assert heard.source.counts.reconnects == 0
 
 
-def test_error_frames(bus, connect) -> None:
+def test_error_frames(bus, connect):
     heard = connect()
     bus.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=[0] * 8))
     bus.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=[7]))
@@ -103,7 +103,7 @@ def test_error_frames(bus, connect) -> None:
     heard.until_event("back on the bus")
 
 
-def test_can_fd_frames(bus, connect, traffic, fd_traffic, same) -> None:
+def test_can_fd_frames(bus, connect, traffic, fd_traffic, same):
     truth, fd_truth = traffic(500), fd_traffic(500)
     fd_truth["fd_flags"][::3] |= FD_ESI
     heard = connect()
@@ -116,7 +116,7 @@ def test_can_fd_frames(bus, connect, traffic, fd_traffic, same) -> None:
     assert heard.source.counts.frames == 1000
 
 
-def test_a_driver_that_does_not_say_can_fd(same) -> None:
+def test_a_driver_that_does_not_say_can_fd(same):
     """Eight bytes fit a classic frame, more don't, whatever the driver calls it."""
     link_frames = frames_of([(7, can.Message(data=range(12)))], device_time=False, fd=True)
     assert (link_frames["len"][0], link_frames["data"][0].tolist()) == (
@@ -125,7 +125,7 @@ def test_a_driver_that_does_not_say_can_fd(same) -> None:
     )
 
 
-def test_a_bus_that_fails_is_opened_again(connect) -> None:
+def test_a_bus_that_fails_is_opened_again(connect):
     """The driver is closed under the reading thread: what an unplugged adapter looks like."""
     heard = connect()
     heard.source._link._bus.shutdown()
@@ -149,19 +149,19 @@ def test_a_bus_that_fails_is_opened_again(connect) -> None:
         ("socketcan:can0?bitrate=500000", "ip link set can0 up type can bitrate 500000"),
     ],
 )
-def test_wrong_interfaces_and_options_are_refused(address, match) -> None:
+def test_wrong_interfaces_and_options_are_refused(address, match):
     with pytest.raises(UsageError, match=match):
         source_at(interface=address)
 
 
-def test_options_are_converted(context) -> None:
+def test_options_are_converted(context):
     source = source_at("?receive_own_messages=1", "udp_multicast:239.74.163.2")
     with pytest.raises(SourceError, match=r"can:udp_multicast.*receive"):
         source.start(context)
     assert source.finished
 
 
-def test_an_interface_that_can_not_be_loaded_says_why(context) -> None:
+def test_an_interface_that_can_not_be_loaded_says_why(context):
     with pytest.raises(SourceError, match="python-can can't load canalystii: No module named"):
         source_at(interface="canalystii:0")
     source = source_at(interface="kvaser:0")
@@ -170,7 +170,7 @@ def test_an_interface_that_can_not_be_loaded_says_why(context) -> None:
 
 
 @pytest.mark.parametrize("interface", sorted(LISTEN_ONLY))
-def test_listen_only_options_are_ones_that_the_interface_knows(interface) -> None:
+def test_listen_only_options_are_ones_that_the_interface_knows(interface):
     try:
         bus = bus_class("x", interface)
     except SourceError as error:
@@ -180,11 +180,11 @@ def test_listen_only_options_are_ones_that_the_interface_knows(interface) -> Non
     assert set(LISTEN_ONLY[interface]) <= known_options(bus) | {"listen_only"}
 
 
-def test_the_tables_name_interfaces_that_exist() -> None:
+def test_the_tables_name_interfaces_that_exist():
     assert set(LISTEN_ONLY) | NO_CONTROLLER | DEVICE_TIME <= set(can.VALID_INTERFACES)
 
 
-def test_a_drivers_error_is_a_lost_connection() -> None:
+def test_a_drivers_error_is_a_lost_connection():
     error = failure(can.CanOperationError("the cable", 19))
     assert isinstance(error, OSError)
     assert "the cable" in str(error)

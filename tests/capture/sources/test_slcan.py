@@ -7,7 +7,6 @@ import select
 import threading
 import time
 import tty
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from undulog.capture.sources.events import Tally
 from undulog.capture.sources.slcan import STAMP_PERIOD_MS, SlcanText
 
 
-def lines(frames, stamps_ms=None) -> list[bytes]:
+def lines(frames, stamps_ms=None):
     """Frames as the protocol's description has them, and CAN FD frames as its extension does."""
     out = []
     fd = "len" in frames.dtype.names
@@ -40,21 +39,21 @@ def lines(frames, stamps_ms=None) -> list[bytes]:
     return out
 
 
-def stream(frames, stamps_ms=None) -> bytes:
+def stream(frames, stamps_ms=None):
     return b"".join(lines(frames, stamps_ms))
 
 
 class Adapter:
     """An adapter on a pseudo-terminal: takes commands, sends when its channel is open."""
 
-    def __init__(self, link: Path, *, refuses: bytes = b"", answers: bool = True) -> None:
+    def __init__(self, link, *, refuses=b"", answers=True):
         self.master, self.slave = os.openpty()
         tty.setraw(self.slave)
         link.unlink(missing_ok=True)
         link.symlink_to(os.ttyname(self.slave))
         self.link = link
         self.refuses, self.answers = refuses, answers
-        self.commands: list[bytes] = []
+        self.commands = []
         self.opened = threading.Event()
         self.queue = b""
         self.lock = threading.Lock()
@@ -62,11 +61,11 @@ class Adapter:
         self.thread = threading.Thread(target=self.run)
         self.thread.start()
 
-    def send(self, data: bytes) -> None:
+    def send(self, data):
         with self.lock:
             self.queue += data
 
-    def run(self) -> None:
+    def run(self):
         text = b""
         os.set_blocking(self.master, False)
         while self.plugged:
@@ -90,7 +89,7 @@ class Adapter:
                     with contextlib.suppress(BlockingIOError):
                         self.queue = self.queue[os.write(self.master, self.queue[:3000]) :]
 
-    def unplug(self) -> None:
+    def unplug(self):
         if self.plugged:
             self.plugged = False
             self.thread.join()
@@ -103,7 +102,7 @@ class Adapter:
 def plug(tmp_path):
     adapters = []
 
-    def make(**kwargs) -> Adapter:
+    def make(**kwargs):
         adapters.append(Adapter(tmp_path / "ttyACM0", **kwargs))
         return adapters[-1]
 
@@ -112,7 +111,7 @@ def plug(tmp_path):
         adapter.unplug()
 
 
-def source_at(tmp_path: Path, query: str = "bitrate=1000000"):
+def source_at(tmp_path, query="bitrate=1000000"):
     return open_source(parse_address(f"can:slcan:{tmp_path}/ttyACM0?{query}"))
 
 
@@ -129,12 +128,12 @@ def connect(plug, listen, tmp_path):
     return start
 
 
-def commands(adapter) -> list[bytes]:
+def commands(adapter):
     """What the adapter was told, apart from closing."""
     return [command for command in adapter.commands if command != b"C"]
 
 
-def test_twenty_thousand_frames_arrive_as_sent(connect, traffic, same) -> None:
+def test_twenty_thousand_frames_arrive_as_sent(connect, traffic, same):
     adapter, heard = connect()
     truth = traffic(20_000)
     assert heard.source.connected
@@ -148,7 +147,7 @@ def test_twenty_thousand_frames_arrive_as_sent(connect, traffic, same) -> None:
     assert (counts.frames, counts.malformed, counts.dropped) == (20_000, 0, None)
 
 
-def test_it_listens_only_and_never_transmits(connect, traffic) -> None:
+def test_it_listens_only_and_never_transmits(connect, traffic):
     adapter, heard = connect()
     assert "listen-only, 1000000 bit/s" in heard.texts[-1]
     adapter.send(stream(traffic(100)))
@@ -160,7 +159,7 @@ def test_it_listens_only_and_never_transmits(connect, traffic) -> None:
     assert not heard.source.connected
 
 
-def test_the_adapters_clock_runs_on_over_the_minute(connect, traffic, same) -> None:
+def test_the_adapters_clock_runs_on_over_the_minute(connect, traffic, same):
     adapter, heard = connect("bitrate=500000&timestamps=1")
     truth = traffic(20_000)
     stamps_ms = 51_234 + 7 * np.arange(len(truth))
@@ -172,7 +171,7 @@ def test_the_adapters_clock_runs_on_over_the_minute(connect, traffic, same) -> N
     assert commands(adapter) == [b"S6", b"Z1", b"L"]
 
 
-def test_minutes_of_silence_are_counted_by_the_hosts_clock() -> None:
+def test_minutes_of_silence_are_counted_by_the_hosts_clock():
     text, tally = SlcanText(stamps=True), Tally(lambda: 0)
     true_s = np.array([3.0, 59.9, 60.1, 700.0, 3599.999, 3600.002, 90_000.0])
     found = [
@@ -187,14 +186,14 @@ def test_minutes_of_silence_are_counted_by_the_hosts_clock() -> None:
 @pytest.mark.parametrize(("asked", "given"), [(True, None), (False, np.arange(50))])
 def test_stamps_that_are_missing_or_not_asked_for_are_no_times_and_no_data(
     asked, given, traffic, same
-) -> None:
+):
     truth = traffic(50)
     frames, _ = SlcanText(stamps=asked).feed(stream(truth, given), 77, Tally(lambda: 0))
     assert same(frames, truth)
     assert set(frames["t_device_ns"].tolist()) == {77}
 
 
-def test_a_recorder_that_is_held_up_loses_nothing(connect, traffic, same) -> None:
+def test_a_recorder_that_is_held_up_loses_nothing(connect, traffic, same):
     adapter, heard = connect()
     truth = traffic(20_000)  # half a megabyte: several times what the terminal holds
     adapter.send(stream(truth))
@@ -204,7 +203,7 @@ def test_a_recorder_that_is_held_up_loses_nothing(connect, traffic, same) -> Non
     assert len(np.unique(found["t_host_ns"])) > 5  # each stamped when it was read
 
 
-def test_noise_costs_its_own_line_only(connect, traffic, same) -> None:
+def test_noise_costs_its_own_line_only(connect, traffic, same):
     adapter, heard = connect()
     truth = traffic(1000)
     noise = [
@@ -233,7 +232,7 @@ def test_noise_costs_its_own_line_only(connect, traffic, same) -> None:
     heard.until_event("malformed line")
 
 
-def test_any_way_of_cutting_the_stream_gives_the_same(traffic) -> None:
+def test_any_way_of_cutting_the_stream_gives_the_same(traffic):
     whole_stream = stream(traffic(300)) + b"\xff\r" + stream(traffic(300))
     whole, _ = SlcanText(stamps=False).feed(whole_stream, 5, Tally(lambda: 0))
     for seed in range(20):
@@ -243,7 +242,7 @@ def test_any_way_of_cutting_the_stream_gives_the_same(traffic) -> None:
         assert tally.counts.malformed == 1
 
 
-def test_can_fd_frames_among_the_others(connect, traffic, fd_traffic, same) -> None:
+def test_can_fd_frames_among_the_others(connect, traffic, fd_traffic, same):
     adapter, heard = connect()
     truth, fd_truth = traffic(2000), fd_traffic(2000)
     mixed = itertools.chain.from_iterable(zip(lines(truth), lines(fd_truth), strict=True))
@@ -254,7 +253,7 @@ def test_can_fd_frames_among_the_others(connect, traffic, fd_traffic, same) -> N
     assert heard.source.counts.frames == 4000
 
 
-def test_an_adapter_stamps_can_fd_frames_too(fd_traffic, same) -> None:
+def test_an_adapter_stamps_can_fd_frames_too(fd_traffic, same):
     truth = fd_traffic(100)
     tally = Tally(lambda: 0)
     stamped = stream(truth, 10 * np.arange(100))
@@ -265,7 +264,7 @@ def test_an_adapter_stamps_can_fd_frames_too(fd_traffic, same) -> None:
     assert set(frames["t_host_ns"].tolist()) == {10**18}
 
 
-def test_unplugged_and_plugged_in_again(connect, plug, traffic, same) -> None:
+def test_unplugged_and_plugged_in_again(connect, plug, traffic, same):
     first, second = traffic(500), traffic(700)
     adapter, heard = connect()
     adapter.send(stream(first))
@@ -284,9 +283,7 @@ def test_unplugged_and_plugged_in_again(connect, plug, traffic, same) -> None:
     assert not heard.source.finished
 
 
-def test_an_adapter_that_is_not_there_yet_is_waited_for(
-    plug, tmp_path, listen, traffic, same
-) -> None:
+def test_an_adapter_that_is_not_there_yet_is_waited_for(plug, tmp_path, listen, traffic, same):
     heard = listen(source_at(tmp_path))
     assert "No such file" in heard.until_event("waits for").text
     assert not heard.source.connected
@@ -296,14 +293,14 @@ def test_an_adapter_that_is_not_there_yet_is_waited_for(
     assert heard.source.counts.reconnects == 0
 
 
-def test_an_adapter_without_listen_only_is_not_opened_otherwise(plug, tmp_path, listen) -> None:
+def test_an_adapter_without_listen_only_is_not_opened_otherwise(plug, tmp_path, listen):
     adapter = plug(refuses=b"L")
     heard = listen(source_at(tmp_path))
     assert "listen_only=0" in heard.until_event("refuses").text
     assert b"O" not in adapter.commands
 
 
-def test_listen_only_can_be_given_up(connect, traffic, same) -> None:
+def test_listen_only_can_be_given_up(connect, traffic, same):
     adapter, heard = connect("listen_only=0", refuses=b"L")
     truth = traffic(100)
     assert "acknowledges" in heard.texts[-1]
@@ -312,14 +309,14 @@ def test_listen_only_can_be_given_up(connect, traffic, same) -> None:
     assert commands(adapter) == [b"O"]
 
 
-def test_an_adapter_that_never_answers(connect, traffic, same) -> None:
+def test_an_adapter_that_never_answers(connect, traffic, same):
     adapter, heard = connect(answers=False)
     truth = traffic(100)
     adapter.send(stream(truth))
     assert same(heard.until_frames(100), truth)
 
 
-def test_what_can_never_work_is_said_at_once(tmp_path, context) -> None:
+def test_what_can_never_work_is_said_at_once(tmp_path, context):
     (tmp_path / "ttyACM0").write_text("a file")
     with pytest.raises(SourceError, match="is no serial device"):
         source_at(tmp_path)
@@ -333,7 +330,7 @@ def test_what_can_never_work_is_said_at_once(tmp_path, context) -> None:
         source_at(tmp_path, "bitrat=1000000")
 
 
-def test_python_cans_own_client_reads_the_same(plug, tmp_path, listen, traffic, same) -> None:
+def test_python_cans_own_client_reads_the_same(plug, tmp_path, listen, traffic, same):
     pytest.importorskip("serial")
     from can.interfaces.slcan import slcanBus
 
@@ -351,9 +348,7 @@ def test_python_cans_own_client_reads_the_same(plug, tmp_path, listen, traffic, 
     assert same(heard.until_frames(1000), frames)
 
 
-def test_can_fd_frames_as_python_cans_own_client_writes_them(
-    plug, tmp_path, fd_traffic, same
-) -> None:
+def test_can_fd_frames_as_python_cans_own_client_writes_them(plug, tmp_path, fd_traffic, same):
     pytest.importorskip("serial")
     from can.interfaces.slcan import slcanBus
 

@@ -28,7 +28,7 @@ from undulog.capture.sources.receive_many import (
 from undulog.capture.sources.socketcan import SocketcanLink, frames_of
 
 
-def packed(frame) -> bytes:
+def packed(frame):
     return build_can_frame(can_message(frame))
 
 
@@ -40,7 +40,7 @@ def pair(sockets):
     return sockets
 
 
-def test_twenty_thousand_frames_as_packed_by_python_can(pair, traffic, same) -> None:
+def test_twenty_thousand_frames_as_packed_by_python_can(pair, traffic, same):
     ours, theirs = pair
     truth = traffic(20_000)
     tally = Tally(time.time_ns)
@@ -60,7 +60,7 @@ def test_twenty_thousand_frames_as_packed_by_python_can(pair, traffic, same) -> 
     link.close()
 
 
-def test_drops_are_those_that_the_kernel_counts(pair, traffic) -> None:
+def test_drops_are_those_that_the_kernel_counts(pair, traffic):
     ours, theirs = pair
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
     frame = packed(traffic(1)[0])
@@ -79,7 +79,7 @@ def test_drops_are_those_that_the_kernel_counts(pair, traffic) -> None:
     link.close()
 
 
-def test_arrival_is_the_kernels(pair, traffic) -> None:
+def test_arrival_is_the_kernels(pair, traffic):
     ours, theirs = pair
     link = SocketcanLink(ours, Tally(time.time_ns))
     before_ns = time.time_ns()
@@ -92,7 +92,7 @@ def test_arrival_is_the_kernels(pair, traffic) -> None:
     link.close()
 
 
-def test_can_fd_frames_and_what_is_no_frame(pair, traffic, fd_traffic, same) -> None:
+def test_can_fd_frames_and_what_is_no_frame(pair, traffic, fd_traffic, same):
     ours, theirs = pair
     truth, fd_truth = traffic(2), fd_traffic(40)
     fd_truth["fd_flags"][::3] |= FD_ESI
@@ -117,14 +117,14 @@ def test_can_fd_frames_and_what_is_no_frame(pair, traffic, fd_traffic, same) -> 
     link.close()
 
 
-def test_frames_of_this_computer_are_told_apart(traffic) -> None:
+def test_frames_of_this_computer_are_told_apart(traffic):
     raw = np.frombuffer(b"".join(packed(f) for f in traffic(2)), dtype=np.uint8).reshape(2, 16)
     batch = Batch(raw, [16, 16], [0, socket.MSG_DONTROUTE], [5, 6], None)
     frames = frames_of(batch, [5, 6])
     assert frames["dir"].tolist() == [DIR_RX, DIR_TX]
 
 
-def test_a_socket_that_fails_is_a_lost_connection(pair) -> None:
+def test_a_socket_that_fails_is_a_lost_connection(pair):
     ours, _ = pair
     link = SocketcanLink(ours, Tally(time.time_ns))
     link.close()
@@ -132,7 +132,7 @@ def test_a_socket_that_fails_is_a_lost_connection(pair) -> None:
         link.read(0)
 
 
-def test_more_packets_than_fit_one_call(pair) -> None:
+def test_more_packets_than_fit_one_call(pair):
     ours, theirs = pair
     receive = ReceiveMany(8, 16)
     for number in range(20):
@@ -145,7 +145,7 @@ def test_more_packets_than_fit_one_call(pair) -> None:
     assert firsts == [8, 8, 4]
 
 
-def test_a_wall_clock_that_is_set_can_not_move_arrivals_beyond_what_is_known() -> None:
+def test_a_wall_clock_that_is_set_can_not_move_arrivals_beyond_what_is_known():
     start_ns, wall_ns = time.monotonic_ns(), time.time_ns()
     clock = ArrivalClock(lambda: 10**18 + time.monotonic_ns() - start_ns)
     now = 10**18 + time.monotonic_ns() - start_ns
@@ -159,7 +159,7 @@ def test_a_wall_clock_that_is_set_can_not_move_arrivals_beyond_what_is_known() -
     assert mixed == sorted(mixed)
 
 
-def test_a_kernel_without_can_says_so(context) -> None:
+def test_a_kernel_without_can_says_so(context):
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError:

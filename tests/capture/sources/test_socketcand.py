@@ -19,7 +19,7 @@ from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcand import SocketcandText
 
 
-def messages(frames, blank: str = "") -> bytes:
+def messages(frames, blank=""):
     """Frames as socketcand writes them, remote requests among them."""
     out = []
     for frame in frames:
@@ -37,18 +37,18 @@ def messages(frames, blank: str = "") -> bytes:
 class Server:
     """Serves a stream to each client that asks for can0 in raw mode."""
 
-    def __init__(self, port: int = 0, hello: bytes = b"< hi >", pause_s: float = 0.0) -> None:
+    def __init__(self, port=0, hello=b"< hi >", pause_s=0.0):
         self.listener = socket.create_server(("127.0.0.1", port))
         self.port = self.listener.getsockname()[1]
         self.hello, self.pause_s = hello, pause_s
         self.stream = b""
-        self.pieces: list[int] = []
-        self.heard: list[bytes] = []
-        self.clients: list[socket.socket] = []
+        self.pieces = []
+        self.heard = []
+        self.clients = []
         self.thread = threading.Thread(target=self.run)
         self.thread.start()
 
-    def run(self) -> None:
+    def run(self):
         while True:
             try:
                 client, _ = self.listener.accept()
@@ -62,7 +62,7 @@ class Server:
             except OSError:
                 continue
 
-    def serve(self, client: socket.socket) -> None:
+    def serve(self, client):
         client.sendall(self.hello)
         for expected in (b"< open can0 >", b"< rawmode >"):
             asked = client.recv(1000)
@@ -77,7 +77,7 @@ class Server:
             client.sendall(self.stream[at : at + size])
             at += size
 
-    def close(self) -> None:
+    def close(self):
         self.listener.shutdown(socket.SHUT_RDWR)
         self.listener.close()
         for client in self.clients:
@@ -89,7 +89,7 @@ class Server:
 def serve():
     servers = []
 
-    def make(*args, **kwargs) -> Server:
+    def make(*args, **kwargs):
         servers.append(Server(*args, **kwargs))
         return servers[-1]
 
@@ -99,14 +99,14 @@ def serve():
             server.close()
 
 
-def source_at(port: int, channel: str = "can0"):
+def source_at(port, channel="can0"):
     return open_source(parse_address(f"can:socketcand:{channel}?host=127.0.0.1&port={port}"))
 
 
 @pytest.mark.parametrize("blank", ["", " "])
 def test_twenty_thousand_frames_and_their_times_to_the_microsecond(
     serve, listen, traffic, same, blank
-) -> None:
+):
     truth = traffic(20_000)
     server = serve()
     server.stream = messages(truth, blank)
@@ -120,7 +120,7 @@ def test_twenty_thousand_frames_and_their_times_to_the_microsecond(
     assert server.heard == [b"< open can0 >", b"< rawmode >"]
 
 
-def test_python_cans_own_client_reads_the_same(serve, listen, traffic, same) -> None:
+def test_python_cans_own_client_reads_the_same(serve, listen, traffic, same):
     truth = traffic(20_000)
     truth = truth[(truth["id_flags"] & REMOTE_FLAG) == 0]  # it knows no remote requests
     server = serve(pause_s=0.3)  # it can't bear frames right behind the last answer
@@ -134,7 +134,7 @@ def test_python_cans_own_client_reads_the_same(serve, listen, traffic, same) -> 
     assert np.abs(found["t_device_ns"] / 1e9 - times_s).max() < 1e-6
 
 
-def test_error_frames_are_frames_and_events(serve, listen, traffic, same) -> None:
+def test_error_frames_are_frames_and_events(serve, listen, traffic, same):
     truth = traffic(10)
     server = serve()
     server.stream = (
@@ -161,7 +161,7 @@ def test_error_frames_are_frames_and_events(serve, listen, traffic, same) -> Non
     assert theirs.arbitration_id == int(errors["id_flags"][0]) & ID_MASK
 
 
-def test_any_way_of_cutting_the_stream_gives_the_same(traffic) -> None:
+def test_any_way_of_cutting_the_stream_gives_the_same(traffic):
     truth = traffic(200)
     stream = messages(truth) + b"< frame 12Z 1.0 00 >" + messages(truth, " ") + b"< ok >"
     whole = SocketcandText().feed(stream, 5, Tally(lambda: 0))
@@ -173,7 +173,7 @@ def test_any_way_of_cutting_the_stream_gives_the_same(traffic) -> None:
         assert tally.counts.malformed == 1
 
 
-def test_noise_costs_its_own_message_only(traffic, same) -> None:
+def test_noise_costs_its_own_message_only(traffic, same):
     truth = traffic(1000)
     noise = [
         b"< frame 123 1.000000 11",  # cut short: the next one begins
@@ -196,7 +196,7 @@ def test_noise_costs_its_own_message_only(traffic, same) -> None:
     assert tally.counts.malformed == len(noise)
 
 
-def test_other_decimals_and_other_widths() -> None:
+def test_other_decimals_and_other_widths():
     text, tally = SocketcandText(), Tally(lambda: 0)
     found = text.feed(
         b"< frame 7 23.4 11 >< frame 123 23.424242 >< frame 00000123 5.123456789 1122 >", 5, tally
@@ -207,7 +207,7 @@ def test_other_decimals_and_other_widths() -> None:
     assert tally.counts.malformed == 0
 
 
-def test_a_time_out_of_range_is_replaced_by_the_arrivals_and_counted() -> None:
+def test_a_time_out_of_range_is_replaced_by_the_arrivals_and_counted():
     tally = Tally(lambda: 0)
     times = ("-1.5", "nan", "-inf", "1e300", "99999999999.0", "9" * 300, "5.5")
     stream = "".join(f"< frame 123 {time_s} 11 >< rtr 123 {time_s} 3 >" for time_s in times)
@@ -216,7 +216,7 @@ def test_a_time_out_of_range_is_replaced_by_the_arrivals_and_counted() -> None:
     assert tally.counts.malformed == 12
 
 
-def test_can_fd_frames_are_left_out_and_told(traffic, same) -> None:
+def test_can_fd_frames_are_left_out_and_told(traffic, same):
     truth = traffic(3)
     tally = Tally(lambda: 0)
     stream = messages(truth) + b"< frame 123 1.000000 " + b"AB" * 12 + b" >"
@@ -239,7 +239,7 @@ time.sleep(600)
 """
 
 
-def test_the_server_is_killed_and_comes_back(listen, traffic, same) -> None:
+def test_the_server_is_killed_and_comes_back(listen, traffic, same):
     first, second = traffic(100), traffic(200)
     with start(sys.executable, "-c", KILLED, 0, messages(first).decode()) as process:
         port = int(process.stdout.readline())
@@ -259,7 +259,7 @@ def test_the_server_is_killed_and_comes_back(listen, traffic, same) -> None:
     heard.until_event("is back after")
 
 
-def test_a_server_that_comes_later(listen, serve, traffic, same) -> None:
+def test_a_server_that_comes_later(listen, serve, traffic, same):
     with socket.create_server(("127.0.0.1", 0)) as reserved:
         port = reserved.getsockname()[1]
     heard = listen(source_at(port))
@@ -270,7 +270,7 @@ def test_a_server_that_comes_later(listen, serve, traffic, same) -> None:
     assert same(heard.until_frames(50), truth)
 
 
-def test_something_else_at_the_port_or_another_bus_is_told(listen, serve) -> None:
+def test_something_else_at_the_port_or_another_bus_is_told(listen, serve):
     heard = listen(source_at(serve(hello=b"HTTP/1.1 400 >").port))
     assert "HTTP" in heard.until_event("waits for").text
     heard = listen(source_at(serve().port, "can7"))
@@ -285,6 +285,6 @@ def test_something_else_at_the_port_or_another_bus_is_told(listen, serve) -> Non
         ("hots=x", "no option 'hots'; valid: host, port"),
     ],
 )
-def test_options_are_checked(options, match) -> None:
+def test_options_are_checked(options, match):
     with pytest.raises(UsageError, match=match):
         open_source(parse_address(f"can:socketcand:can0?{options}"))

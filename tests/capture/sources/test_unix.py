@@ -51,7 +51,7 @@ with FrameSender(sys.argv[2]) as sender:
 """
 
 
-def foreign_truth(first: int, count: int):
+def foreign_truth(first, count):
     frames = empty_frames(count)
     for row, n in enumerate(range(first, first + count)):
         frames["t_device_ns"][row] = 10**18 + n * 1000
@@ -61,7 +61,7 @@ def foreign_truth(first: int, count: int):
     return frames
 
 
-def source_at(path: Path, query: str = ""):
+def source_at(path, query=""):
     return open_source(parse_address(f"unix:{path}{query}"))
 
 
@@ -81,7 +81,7 @@ def peer(path):
     """Connects sockets of this process."""
     with ExitStack() as opened:
 
-        def connect() -> socket.socket:
+        def connect():
             sock = opened.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
             sock.connect(str(path))
             return sock
@@ -90,7 +90,7 @@ def peer(path):
 
 
 @pytest.mark.parametrize(("per_packet", "head"), [(256, 1), (1, 0), (7, 1)])
-def test_twenty_thousand_frames_of_a_foreign_process(path, heard, same, per_packet, head) -> None:
+def test_twenty_thousand_frames_of_a_foreign_process(path, heard, same, per_packet, head):
     truth = foreign_truth(0, 20_000)
     with start(sys.executable, "-c", FOREIGN, path, 0, 20_000, per_packet, head) as process:
         found = heard.until_frames(20_000)
@@ -105,7 +105,7 @@ def test_twenty_thousand_frames_of_a_foreign_process(path, heard, same, per_pack
     assert heard.source.clock is ClockDomain.DEVICE
 
 
-def test_what_our_sender_offers_arrives(tmp_path, path, heard, traffic, same) -> None:
+def test_what_our_sender_offers_arrives(tmp_path, path, heard, traffic, same):
     truth = traffic(20_000)
     np.save(tmp_path / "frames.npy", truth)
     with start(sys.executable, "-c", OURS, tmp_path / "frames.npy", path) as process:
@@ -119,7 +119,7 @@ def test_what_our_sender_offers_arrives(tmp_path, path, heard, traffic, same) ->
     assert heard.source.counts.dropped == refused - before  # refused before it was connected
 
 
-def test_frames_that_found_no_room_are_proved_lost(path, heard, traffic, same) -> None:
+def test_frames_that_found_no_room_are_proved_lost(path, heard, traffic, same):
     truth = traffic(200)
     sender = FrameSender(path)
     sent = []
@@ -135,7 +135,7 @@ def test_frames_that_found_no_room_are_proved_lost(path, heard, traffic, same) -
     sender.close()
 
 
-def test_the_last_losses_are_told_on_leaving(path, heard, traffic) -> None:
+def test_the_last_losses_are_told_on_leaving(path, heard, traffic):
     truth = traffic(200)
     sender = FrameSender(path)
     while sender.refused == 0:
@@ -146,7 +146,7 @@ def test_the_last_losses_are_told_on_leaving(path, heard, traffic) -> None:
     assert heard.source.counts.dropped == sender.refused > 0
 
 
-def test_a_gap_in_the_numbers_is_a_loss(heard, peer) -> None:
+def test_a_gap_in_the_numbers_is_a_loss(heard, peer):
     sock, record = peer(), bytes(empty_frames(1).tobytes())
     for sequence, dropped in ((1000, 5), (1001, 5), (1012, 5), (1013, 8), (1014, 8), (0, 0)):
         sock.send(struct.pack("<QQ", sequence, dropped) + record)
@@ -154,7 +154,7 @@ def test_a_gap_in_the_numbers_is_a_loss(heard, peer) -> None:
     assert heard.source.counts.dropped == 10 + 3
 
 
-def test_malformed_packets_are_counted_and_told(heard, peer, traffic, same) -> None:
+def test_malformed_packets_are_counted_and_told(heard, peer, traffic, same):
     truth = traffic(3)
     sock = peer()
     sock.send(truth[:1].tobytes())
@@ -168,7 +168,7 @@ def test_malformed_packets_are_counted_and_told(heard, peer, traffic, same) -> N
     assert heard.source.connected
 
 
-def test_arrival_is_when_it_came_not_when_it_was_fetched(heard, peer, context) -> None:
+def test_arrival_is_when_it_came_not_when_it_was_fetched(heard, peer, context):
     sock = peer()
     heard.until_event("connected")
     record = empty_frames(1).tobytes()
@@ -185,7 +185,7 @@ def test_arrival_is_when_it_came_not_when_it_was_fetched(heard, peer, context) -
         assert low_ns - slack_ns <= t_ns <= high_ns + slack_ns
 
 
-def test_two_senders_are_put_in_the_order_of_arrival(heard, peer) -> None:
+def test_two_senders_are_put_in_the_order_of_arrival(heard, peer):
     one, two = peer(), peer()
     heard.until(lambda: len(heard.source._senders) == 2)
     frames = empty_frames(40)
@@ -198,7 +198,7 @@ def test_two_senders_are_put_in_the_order_of_arrival(heard, peer) -> None:
     assert found["id_flags"].tolist() == list(range(40))
 
 
-def test_a_sender_may_leave_and_come_back(path, heard, same) -> None:
+def test_a_sender_may_leave_and_come_back(path, heard, same):
     for first in (0, 100):
         with start(sys.executable, "-c", FOREIGN, path, first, 100, 10, 1) as process:
             heard.until_frames(first + 100)
@@ -211,7 +211,7 @@ def test_a_sender_may_leave_and_come_back(path, heard, same) -> None:
     assert not heard.source.finished
 
 
-def test_a_killed_sender_loses_nothing_that_it_sent(path, heard, same) -> None:
+def test_a_killed_sender_loses_nothing_that_it_sent(path, heard, same):
     code = FOREIGN.replace("peer.close()", "import os; os.kill(os.getpid(), 9)")
     assert python(code, path, 0, 200, 1, 1).returncode == -9
     assert same(heard.until_frames(200), foreign_truth(0, 200))
@@ -219,7 +219,7 @@ def test_a_killed_sender_loses_nothing_that_it_sent(path, heard, same) -> None:
     assert heard.source.counts.malformed == 0
 
 
-def test_our_sender_waits_for_a_recorder_and_for_the_next_one(path, listen, traffic) -> None:
+def test_our_sender_waits_for_a_recorder_and_for_the_next_one(path, listen, traffic):
     truth, sender = traffic(10), FrameSender(path)
     assert sender.send(truth) == 0
     assert not sender.connected
@@ -237,7 +237,7 @@ def test_our_sender_waits_for_a_recorder_and_for_the_next_one(path, listen, traf
         sender.send(np.zeros(3))
 
 
-def test_senders_that_never_leave_hold_a_bounded_number_of_descriptors(heard, peer) -> None:
+def test_senders_that_never_leave_hold_a_bounded_number_of_descriptors(heard, peer):
     worker = peer()
     worker.send(foreign_truth(0, 3).tobytes())
     heard.until_frames(3)
@@ -259,7 +259,7 @@ def test_senders_that_never_leave_hold_a_bounded_number_of_descriptors(heard, pe
     heard.until_frames(8)
 
 
-def test_no_frame_of_a_sender_that_gives_its_place_is_lost(heard, peer) -> None:
+def test_no_frame_of_a_sender_that_gives_its_place_is_lost(heard, peer):
     """Every sender's packets are counted by itself; none that was accepted is missing."""
     accepted = 0
     senders = []
@@ -273,7 +273,7 @@ def test_no_frame_of_a_sender_that_gives_its_place_is_lost(heard, peer) -> None:
     assert len(heard.until_frames(accepted)) == accepted > 3 * MOST_SENDERS
 
 
-def test_error_frames_are_counted(heard, peer) -> None:
+def test_error_frames_are_counted(heard, peer):
     frames = empty_frames(2)
     frames["id_flags"] = [ERROR_FLAG | 0x4, 5]
     frames["dlc"] = 8
@@ -284,7 +284,7 @@ def test_error_frames_are_counted(heard, peer) -> None:
     heard.until_event("controller problem, reception error passive")
 
 
-def test_only_we_may_send_and_the_socket_goes_with_the_source(path, context) -> None:
+def test_only_we_may_send_and_the_socket_goes_with_the_source(path, context):
     source = source_at(path)
     source.start(context)
     mode = path.lstat().st_mode
@@ -298,7 +298,7 @@ def test_only_we_may_send_and_the_socket_goes_with_the_source(path, context) -> 
     assert source.finished
 
 
-def test_a_socket_left_behind_is_replaced_and_nothing_else(path, context) -> None:
+def test_a_socket_left_behind_is_replaced_and_nothing_else(path, context):
     code = (
         "import os, socket, sys\n"
         "s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)\n"
@@ -325,7 +325,7 @@ def test_a_socket_left_behind_is_replaced_and_nothing_else(path, context) -> Non
             source_at(path).start(context)
 
 
-def test_the_successors_socket_is_not_removed(path, context) -> None:
+def test_the_successors_socket_is_not_removed(path, context):
     first, second = source_at(path), source_at(path)
     first.start(context)
     path.unlink()
@@ -335,7 +335,7 @@ def test_the_successors_socket_is_not_removed(path, context) -> None:
     second.stop()
 
 
-def test_a_place_that_can_not_be_used(tmp_path, context) -> None:
+def test_a_place_that_can_not_be_used(tmp_path, context):
     for path in (tmp_path / "no" / "folder.sock", tmp_path / ("x" * 120)):
         with pytest.raises(SourceError, match=r"can't listen at|No such file"):
             source_at(path).start(context)

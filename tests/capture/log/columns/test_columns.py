@@ -130,10 +130,10 @@ def test_stores_grow_and_keep_far_log_times():
 @pytest.mark.parametrize("seed", range(20))
 def test_echoes_keep_their_own_rows_whatever_the_others_get(seed):
     rng = np.random.default_rng(seed)
-    columns: list[EchoColumn] = []
+    columns = []
     for _ in range(4):
         columns.append(EchoColumn("<i8", 3, tuple(columns)))
-    truth: list[list[int]] = [[] for _ in columns]
+    truth = [[] for _ in columns]
     for _ in range(30):
         rows = rng.integers(0, 9, rng.integers(0, 5))
         for column, kept in zip(columns, truth, strict=True):

@@ -1,10 +1,7 @@
 """Cuts of logs against other readers: each message of the window, and what explains it."""
 
-from __future__ import annotations
-
 import hashlib
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,7 +33,7 @@ from undulog.capture.log.messages.definitions import schema_text
 
 
 @pytest.mark.parametrize("make", MAKES)
-def test_a_cut_holds_exactly_the_messages_of_its_window(tmp_path: Path, make: str):
+def test_a_cut_holds_exactly_the_messages_of_its_window(tmp_path, make):
     whole = write_log(tmp_path / "whole.mcap", ticks(), **MAKES[make])
     same = write_log(tmp_path / "same.mcap", ticks())  # mcap reads it whatever the make
     report = cut_log(whole, tmp_path / "cut.mcap", start_s=0.5, stop_s=1.21)
@@ -47,7 +44,7 @@ def test_a_cut_holds_exactly_the_messages_of_its_window(tmp_path: Path, make: st
     assert report.start_ns == EPOCH_NS + 500 * MS
 
 
-def test_the_window_is_half_open_and_its_ends_are_exact(tmp_path: Path):
+def test_the_window_is_half_open_and_its_ends_are_exact(tmp_path):
     moments = [("/a", 0, "first"), ("/a", 1, "1 ns"), ("/a", 2, "2 ns"), ("/a", 300 * MS, "last")]
     whole = write_log(tmp_path / "whole.mcap", moments)
     cut_log(whole, tmp_path / "cut.mcap", start_s=1e-9, stop_s=0.3)
@@ -56,13 +53,13 @@ def test_the_window_is_half_open_and_its_ends_are_exact(tmp_path: Path):
     assert [m[0] - EPOCH_NS for m in read(tmp_path / "rest.mcap")] == [2, 300 * MS]
 
 
-def test_a_cut_keeps_topics_by_pattern(tmp_path: Path):
+def test_a_cut_keeps_topics_by_pattern(tmp_path):
     whole = write_log(tmp_path / "whole.mcap", ticks(topics=("/ir/01", "/ir/02", "/imu")))
     cut_log(whole, tmp_path / "cut.mcap", topics=["/ir/*"])
     assert read(tmp_path / "cut.mcap") == [m for m in read(whole) if m[1] != "/imu"]
 
 
-def test_a_cut_keeps_what_explains_the_log_and_says_what_it_is(tmp_path: Path):
+def test_a_cut_keeps_what_explains_the_log_and_says_what_it_is(tmp_path):
     attachments = [("robot.urdf", b"<robot/>"), ("notes", b"one"), ("notes", b"two")]
     metadata = [
         ("undulog", {"session_id": "s7"}),
@@ -91,7 +88,7 @@ def test_a_cut_keeps_what_explains_the_log_and_says_what_it_is(tmp_path: Path):
     assert stored["undulog.edit"]["source"] == "two.mcap"
 
 
-def test_a_session_that_was_cut_reads_as_one(tmp_path: Path):
+def test_a_session_that_was_cut_reads_as_one(tmp_path):
     robot = load_robot("snake13")
     with SessionWriter(
         tmp_path / "run.mcap", session_id="s1", epoch_ns=EPOCH_NS, robot=robot
@@ -117,7 +114,7 @@ def test_a_session_that_was_cut_reads_as_one(tmp_path: Path):
         assert message.position == pytest.approx([0.1] * len(robot.joint_names))
 
 
-def test_the_last_words_before_a_cut_are_told_and_carried_on_request(tmp_path: Path):
+def test_the_last_words_before_a_cut_are_told_and_carried_on_request(tmp_path):
     said = [("/robot_description", 0, "<robot/>"), ("/gait/mode", 10 * MS, "walk")]
     said += [("/gait/mode", 500 * MS, "avoid"), ("/gait/mode", 900 * MS, "walk")]
     whole = write_log(tmp_path / "whole.mcap", said)
@@ -138,7 +135,7 @@ def test_the_last_words_before_a_cut_are_told_and_carried_on_request(tmp_path: P
     assert json.loads(edit["carried"])["/gait/mode"] == EPOCH_NS + 500 * MS
 
 
-def test_latched_topics_of_ros_are_known(tmp_path: Path):
+def test_latched_topics_of_ros_are_known(tmp_path):
     path = tmp_path / "bag.mcap"
     kind = "sensor_msgs/msg/Range"
     latched = "- history: 3\n  depth: 0\n  reliability: 1\n  durability: 1\n"
@@ -160,7 +157,7 @@ def test_latched_topics_of_ros_are_known(tmp_path: Path):
     assert found == [("/tf_static", 4), ("/map", 6), ("/tf_static", 7), ("/scan", 9)]
 
 
-def test_a_truncated_log_is_cut_as_far_as_it_goes(tmp_path: Path, capsys):
+def test_a_truncated_log_is_cut_as_far_as_it_goes(tmp_path, capsys):
     whole = write_log(tmp_path / "whole.mcap", ticks(), attachments=[("a.txt", b"a")])
     data = whole.read_bytes()
     (tmp_path / "torn.mcap").write_bytes(data[: len(data) // 2])
@@ -176,7 +173,7 @@ def test_a_truncated_log_is_cut_as_far_as_it_goes(tmp_path: Path, capsys):
 
 
 @pytest.mark.parametrize("make", ["zstd", "uncompressed"])
-def test_a_corrupt_chunk_is_not_passed_on(tmp_path: Path, make: str):
+def test_a_corrupt_chunk_is_not_passed_on(tmp_path, make):
     whole = write_log(tmp_path / "whole.mcap", ticks(), **MAKES[make])
     data = bytearray(whole.read_bytes())
     index = summary_of(whole).chunk_indexes[3]
@@ -192,7 +189,7 @@ def test_a_corrupt_chunk_is_not_passed_on(tmp_path: Path, make: str):
     assert read(tmp_path / "cut.mcap") == [m for m in read(whole) if m not in lost]
 
 
-def test_a_torn_uncompressed_log_keeps_each_attachment_once(tmp_path: Path):
+def test_a_torn_uncompressed_log_keeps_each_attachment_once(tmp_path):
     path = tmp_path / "torn.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=256, compression=CompressionType.NONE)
@@ -220,7 +217,7 @@ WRONG_CUTS = [
 
 
 @pytest.mark.parametrize(("code", "options", "said"), WRONG_CUTS)
-def test_a_cut_refuses_and_leaves_nothing(tmp_path: Path, capsys, code, options, said):
+def test_a_cut_refuses_and_leaves_nothing(tmp_path, capsys, code, options, said):
     whole = write_log(tmp_path / "whole.mcap", ticks())
     run = ["log", "cut", str(whole), "-o", str(tmp_path / "cut.mcap"), *options]
     assert undulog.run(run) == code
@@ -228,7 +225,7 @@ def test_a_cut_refuses_and_leaves_nothing(tmp_path: Path, capsys, code, options,
     assert list(tmp_path.iterdir()) == [whole]
 
 
-def test_the_output_is_a_new_file(tmp_path: Path, capsys):
+def test_the_output_is_a_new_file(tmp_path, capsys):
     whole = write_log(tmp_path / "whole.mcap", ticks())
     before = whole.read_bytes()
     link = tmp_path / "link.mcap"

@@ -1,11 +1,8 @@
 """Edits of logs, cut or merged: the same bytes each time, bounded memory, whole or not at all."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,7 +26,7 @@ from undulog.capture.log.edit.merge import merge_logs
 # -- both ------------------------------------------------------------------------------------
 
 
-def test_the_same_edit_gives_the_same_bytes(tmp_path: Path):
+def test_the_same_edit_gives_the_same_bytes(tmp_path):
     logs = [write_log(tmp_path / f"{k}.mcap", ticks(50, topics=(f"/{k}",))) for k in range(2)]
     for k in range(2):
         cut_log(logs[0], tmp_path / f"cut{k}.mcap", stop_s=0.3)
@@ -39,7 +36,7 @@ def test_the_same_edit_gives_the_same_bytes(tmp_path: Path):
         assert first == second
 
 
-def test_a_topic_by_topic_log_is_edited_in_its_own_order(tmp_path: Path):
+def test_a_topic_by_topic_log_is_edited_in_its_own_order(tmp_path):
     said = [(topic, t * 10 * MS, f"{topic} {t}" + "y" * 40) for topic in "abc" for t in range(100)]
     whole = write_log(tmp_path / "whole.mcap", [(f"/{topic}", t, word) for topic, t, word in said])
     cut_log(whole, tmp_path / "cut.mcap", start_s=0.2, stop_s=0.8)
@@ -49,7 +46,7 @@ def test_a_topic_by_topic_log_is_edited_in_its_own_order(tmp_path: Path):
     assert sorted(read(tmp_path / "both.mcap")) == sorted(read(whole) + read(other))
 
 
-def test_memory_holds_a_few_chunks_however_long_the_log(tmp_path: Path):
+def test_memory_holds_a_few_chunks_however_long_the_log(tmp_path):
     logs = []
     for k in range(3):
         logs.append(tmp_path / f"{k}.mcap")
@@ -68,7 +65,7 @@ def test_memory_holds_a_few_chunks_however_long_the_log(tmp_path: Path):
     assert merge_peak < 16 << 20  # of 94 MiB
 
 
-def test_a_stop_leaves_nothing(tmp_path: Path):
+def test_a_stop_leaves_nothing(tmp_path):
     logs = [write_log(tmp_path / f"{k}.mcap", ticks(20, topics=(f"/{k}",))) for k in range(2)]
     stop = StopRequest()
     stop.signal = signal.SIGTERM
@@ -92,7 +89,7 @@ sys.exit(undulog.run(sys.argv[1:]))
 """
 
 
-def test_sigterm_leaves_no_half_file_and_the_former_one_whole(tmp_path: Path):
+def test_sigterm_leaves_no_half_file_and_the_former_one_whole(tmp_path):
     whole = write_log(tmp_path / "whole.mcap", ticks(5000))
     former = tmp_path / "cut.mcap"
     former.write_bytes(b"former")
@@ -108,7 +105,7 @@ def test_sigterm_leaves_no_half_file_and_the_former_one_whole(tmp_path: Path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
 
 
-def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path):
+def test_a_full_disk_is_told_and_leaves_nothing(tmp_path):
     messages = [("/a", k * MS, np.random.default_rng(k).bytes(200).hex()) for k in range(200)]
     whole = write_log(tmp_path / "whole.mcap", messages)
     code = (

@@ -1,10 +1,7 @@
 """Merged logs against other readers: each message once, in order, and what differs is told."""
 
-from __future__ import annotations
-
 import hashlib
 import json
-from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -66,7 +63,7 @@ def test_cuts_side_by_side_make_the_whole_again(tmp_path_factory, times, bounds,
     assert report.warnings == [w for w in report.warnings if "overlap" not in w]
 
 
-def test_a_merge_interleaves_by_log_time_and_is_stable(tmp_path: Path):
+def test_a_merge_interleaves_by_log_time_and_is_stable(tmp_path):
     one = write_log(tmp_path / "one.mcap", [("/a", t * MS, f"one {t}") for t in (0, 2, 2, 4, 9)])
     two = write_log(
         tmp_path / "two.mcap",
@@ -84,7 +81,7 @@ def test_a_merge_interleaves_by_log_time_and_is_stable(tmp_path: Path):
     assert sorted(found) == sorted(everything)
 
 
-def test_a_topic_of_several_logs_becomes_one_channel(tmp_path: Path):
+def test_a_topic_of_several_logs_becomes_one_channel(tmp_path):
     one = write_log(tmp_path / "one.mcap", ticks(50))
     two = write_log(tmp_path / "two.mcap", ticks(50, start_ms=5000))
     report = merge_logs([one, two], tmp_path / "both.mcap")
@@ -96,14 +93,14 @@ def test_a_topic_of_several_logs_becomes_one_channel(tmp_path: Path):
     assert read(tmp_path / "both.mcap") == read(one) + read(two)
 
 
-def test_a_merge_warns_when_the_same_topics_overlap(tmp_path: Path):
+def test_a_merge_warns_when_the_same_topics_overlap(tmp_path):
     one = write_log(tmp_path / "one.mcap", ticks(50))
     two = write_log(tmp_path / "two.mcap", ticks(50, start_ms=405))
     warnings = merge_logs([one, two], tmp_path / "both.mcap").warnings
     assert ["overlap by 0.09 s" in text for text in warnings] == [True]
 
 
-def test_a_merge_keeps_ids_hashes_and_what_differs(tmp_path: Path):
+def test_a_merge_keeps_ids_hashes_and_what_differs(tmp_path):
     health = [{"verdict": "good", "reasons": "[]"}, {"verdict": "bad", "reasons": '["hot"]'}]
     logs = [
         write_log(
@@ -143,7 +140,7 @@ def test_a_merge_keeps_ids_hashes_and_what_differs(tmp_path: Path):
     ]
 
 
-def test_a_merge_refuses_topics_of_other_type_or_unit(tmp_path: Path, capsys):
+def test_a_merge_refuses_topics_of_other_type_or_unit(tmp_path, capsys):
     one = write_log(tmp_path / "one.mcap", ticks(20), units={"/b": "rad"})
     two = write_log(tmp_path / "two.mcap", ticks(20), units={"/b": "deg"})
     with pytest.raises(DataError, match=r"^/b is in rad in .*one.mcap and in deg in .*two"):
@@ -165,7 +162,7 @@ def test_a_merge_refuses_topics_of_other_type_or_unit(tmp_path: Path, capsys):
     ]
 
 
-def test_a_definition_with_other_comments_is_the_same_type(tmp_path: Path):
+def test_a_definition_with_other_comments_is_the_same_type(tmp_path):
     definitions = ["string data", "# what is said\nstring   data  # a word\n", "float64 data"]
     *logs, other = [tmp_path / f"{k}.mcap" for k in range(3)]
     for k, definition in enumerate(definitions):
@@ -180,7 +177,7 @@ def test_a_definition_with_other_comments_is_the_same_type(tmp_path: Path):
         merge_logs([logs[0], other], tmp_path / "never.mcap")
 
 
-def test_a_merge_of_different_robots_must_be_told_which(tmp_path: Path, capsys):
+def test_a_merge_of_different_robots_must_be_told_which(tmp_path, capsys):
     for k, name in enumerate(["snake13", "snake25"]):
         with SessionWriter(
             tmp_path / f"{name}.mcap", session_id=name, epoch_ns=EPOCH_NS, robot=load_robot(name)
@@ -204,7 +201,7 @@ def test_a_merge_of_different_robots_must_be_told_which(tmp_path: Path, capsys):
         assert reader.message_count == 2
 
 
-def test_a_merge_refuses_one_log_and_the_same_log(tmp_path: Path):
+def test_a_merge_refuses_one_log_and_the_same_log(tmp_path):
     one = write_log(tmp_path / "one.mcap", ticks(20))
     (tmp_path / "copy.mcap").write_bytes(one.read_bytes())
     with pytest.raises(UsageError, match="two logs or more"):

@@ -1,9 +1,6 @@
 """`undulog log check` against faults planted in the rhythm and the values of a clean session."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,11 +21,11 @@ from support.checked_sessions import (
     write_raw,
 )
 from undulog.capture import SessionWriter
-from undulog.capture.log.health.session_check import SessionHealth, check_session
+from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.health.tallies import SequenceTally, TimingTally
 
 
-def joint_of(health: SessionHealth, name: str, topic: str = "/joint_states"):
+def joint_of(health, name, topic="/joint_states"):
     (found,) = [each for each in health.joints if (each.topic, each.name) == (topic, name)]
     return found
 
@@ -36,9 +33,7 @@ def joint_of(health: SessionHealth, name: str, topic: str = "/joint_states"):
 # -- the clean twin ----------------------------------------------------------------------------
 
 
-def test_a_clean_session_is_good_without_a_word(
-    clean: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_clean_session_is_good_without_a_word(clean, capsys):
     health = check_session(clean)
     assert health.verdict == "good"
     assert health.findings == ()
@@ -58,9 +53,7 @@ def test_a_clean_session_is_good_without_a_word(
     assert "0 messages dropped in 2 channels" in said
 
 
-def test_json_is_one_object_and_says_whether_the_stored_verdict_differs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_is_one_object_and_says_whether_the_stored_verdict_differs(tmp_path, capsys):
     write(tmp_path / "s.mcap", verdict="bad")
     assert undulog.run(["log", "check", str(tmp_path / "s.mcap"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -74,7 +67,7 @@ def test_json_is_one_object_and_says_whether_the_stored_verdict_differs(
 # -- planted in the rhythm ---------------------------------------------------------------------
 
 
-def test_gaps_are_counted_measured_and_placed(tmp_path: Path) -> None:
+def test_gaps_are_counted_measured_and_placed(tmp_path):
     lost = {*range(300, 303), 900, *range(1500, 1530)}
 
     health = check_session(write(tmp_path / "s.mcap", without(lambda tick: tick in lost)))
@@ -89,19 +82,19 @@ def test_gaps_are_counted_measured_and_placed(tmp_path: Path) -> None:
     )
 
 
-def test_one_short_gap_is_told_and_no_fault(tmp_path: Path) -> None:
+def test_one_short_gap_is_told_and_no_fault(tmp_path):
     health = check_session(write(tmp_path / "s.mcap", without(lambda tick: tick == 700)))
     assert health.verdict == "good"
     assert "1 gaps, 1 samples missing" in health.notes[0]
 
 
-def test_a_tenth_lost_is_bad_and_exits_1(tmp_path: Path) -> None:
+def test_a_tenth_lost_is_bad_and_exits_1(tmp_path):
     path = write(tmp_path / "s.mcap", without(lambda tick: tick % 8 == 1))
     assert check_session(path).verdict == "bad"
     assert undulog.run(["log", "check", str(path)]) == 1
 
 
-def test_a_pause_can_be_cut_out_unless_it_is_most_of_the_session(tmp_path: Path) -> None:
+def test_a_pause_can_be_cut_out_unless_it_is_most_of_the_session(tmp_path):
     once = check_session(write(tmp_path / "once.mcap", without(lambda tick: 400 <= tick < 900)))
     assert once.verdict == "degraded"
     assert timing_of(once).paused_s == pytest.approx(5.01)
@@ -110,13 +103,13 @@ def test_a_pause_can_be_cut_out_unless_it_is_most_of_the_session(tmp_path: Path)
     assert check_session(most).verdict == "bad"
 
 
-def test_a_series_that_ends_early_is_told(tmp_path: Path) -> None:
+def test_a_series_that_ends_early_is_told(tmp_path):
     health = check_session(write(tmp_path / "s.mcap", without(lambda tick: tick >= 1500)))
     assert health.reasons == ("/joint_states: ends 5 s before the session",)
 
 
-def test_repeated_and_backward_stamps_are_counted(tmp_path: Path) -> None:
-    def edit(tick: int, command: np.ndarray, angles: np.ndarray) -> int | None:
+def test_repeated_and_backward_stamps_are_counted(tmp_path):
+    def edit(tick, command, angles):
         shift = -1 if tick % 200 == 100 else -3 if tick in {450, 850} else 0
         return at(tick + shift)
 
@@ -125,11 +118,11 @@ def test_repeated_and_backward_stamps_are_counted(tmp_path: Path) -> None:
     assert health.verdict == "degraded"
 
 
-def test_jitter_has_the_standard_deviation_that_was_planted(tmp_path: Path) -> None:
+def test_jitter_has_the_standard_deviation_that_was_planted(tmp_path):
     rng = np.random.default_rng(11)
     late = rng.normal(0.0, 3e5, TICKS).astype(int)
 
-    def edit(tick: int, command: np.ndarray, angles: np.ndarray) -> int | None:
+    def edit(tick, command, angles):
         return at(tick) + int(late[tick])
 
     steps = np.diff(at(0) + np.arange(TICKS) * STEP_NS + late) / 1e9
@@ -143,7 +136,7 @@ def test_jitter_has_the_standard_deviation_that_was_planted(tmp_path: Path) -> N
     st.lists(st.integers(1, 10**10), min_size=1, max_size=300),
     st.lists(st.integers(0, 300), max_size=4),
 )
-def test_blocks_don_t_change_a_timing(steps: list[int], cuts: list[int]) -> None:
+def test_blocks_don_t_change_a_timing(steps, cuts):
     t_ns = np.concatenate([[EPOCH_NS], EPOCH_NS + np.cumsum(steps)])
     whole, pieces = TimingTally(), TimingTally()
     whole.add(t_ns)
@@ -161,7 +154,7 @@ def test_blocks_don_t_change_a_timing(steps: list[int], cuts: list[int]) -> None
 # -- sequence numbers ------------------------------------------------------------------------------
 
 
-def test_dropped_sequence_numbers_are_proved(tmp_path: Path) -> None:
+def test_dropped_sequence_numbers_are_proved(tmp_path):
     kept = [k for k in range(1, 500) if k not in {100, 101, 350}]
     health = check_session(write_raw(tmp_path / "s.mcap", kept))
     assert {each.sequence.dropped for each in health.channels} == {3}
@@ -170,7 +163,7 @@ def test_dropped_sequence_numbers_are_proved(tmp_path: Path) -> None:
     assert f"/joint_commands and /joint_states, each: {dropped}" in health.reasons
 
 
-def test_zeros_are_no_sequence_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_zeros_are_no_sequence_numbers(tmp_path, capsys):
     path = write_raw(tmp_path / "s.mcap", [0] * 300)
     health = check_session(path)
     assert {each.sequence.kind for each in health.channels} == {"none"}
@@ -190,7 +183,7 @@ def test_zeros_are_no_sequence_numbers(tmp_path: Path, capsys: pytest.CaptureFix
         ([4], "too few", None),
     ],
 )
-def test_what_sequence_numbers_prove(numbers: list[int], kind: str, dropped: int | None) -> None:
+def test_what_sequence_numbers_prove(numbers, kind, dropped):
     tally = SequenceTally()
     for part in np.split(np.array(numbers), [1, 3]):
         tally.add(part)
@@ -200,8 +193,8 @@ def test_what_sequence_numbers_prove(numbers: list[int], kind: str, dropped: int
 # -- planted in the values ---------------------------------------------------------------------
 
 
-def test_nan_is_counted_by_joint(tmp_path: Path) -> None:
-    def edit(tick: int, command: np.ndarray, angles: np.ndarray) -> int | None:
+def test_nan_is_counted_by_joint(tmp_path):
+    def edit(tick, command, angles):
         angles[4] = np.nan if 100 <= tick < 150 else angles[4]
         return at(tick)
 
@@ -219,7 +212,7 @@ def test_nan_is_counted_by_joint(tmp_path: Path) -> None:
         ("xyz", 3 * 200),  # then nothing is left of the sensor
     ],
 )
-def test_an_axis_that_is_never_measured_is_no_fault(tmp_path: Path, axes: str, told: int) -> None:
+def test_an_axis_that_is_never_measured_is_no_fault(tmp_path, axes, told):
     path = tmp_path / "s.mcap"
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
         compass = writer.magnetic_field("/compass", frame="head")
@@ -236,8 +229,8 @@ def test_an_axis_that_is_never_measured_is_no_fault(tmp_path: Path, axes: str, t
     assert [reason.split(" of ")[0] for reason in of_compass] == [f"/compass: {told}"] * (told > 0)
 
 
-def test_a_frozen_joint_is_named_and_timed_and_a_resting_one_is_not(tmp_path: Path) -> None:
-    def edit(tick: int, command: np.ndarray, angles: np.ndarray) -> int | None:
+def test_a_frozen_joint_is_named_and_timed_and_a_resting_one_is_not(tmp_path):
+    def edit(tick, command, angles):
         command[1], angles[1] = 0.0, 0.0  # told to rest
         angles[6] = 0.123 if 480 <= tick < 1230 else angles[6]
         return at(tick)
@@ -252,18 +245,18 @@ def test_a_frozen_joint_is_named_and_timed_and_a_resting_one_is_not(tmp_path: Pa
     assert following.endswith("the velocity shows that it moves: frozen_sensor or stale_sensor")
 
 
-def test_half_of_the_joints_frozen_is_bad(tmp_path: Path) -> None:
-    def edit(tick: int, command: np.ndarray, angles: np.ndarray) -> int | None:
+def test_half_of_the_joints_frozen_is_bad(tmp_path):
+    def edit(tick, command, angles):
         angles[:13] = 0.1
         return at(tick)
 
     assert check_session(write(tmp_path / "s.mcap", edit)).verdict == "bad"
 
 
-def test_a_joint_held_at_its_limit_is_named_and_a_full_stroke_is_not(tmp_path: Path) -> None:
+def test_a_joint_held_at_its_limit_is_named_and_a_full_stroke_is_not(tmp_path):
     limit = ROBOT.joints[0].upper
 
-    def edit(tick: int, command: np.ndarray, angles: np.ndarray) -> int | None:
+    def edit(tick, command, angles):
         angles[2] = command[2] = np.clip(2 * command[2], -limit, limit)
         angles[3] = command[3] = limit * np.sin(np.pi * tick / 100)
         return at(tick)

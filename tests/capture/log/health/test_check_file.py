@@ -1,11 +1,7 @@
 """`undulog log check` against faults planted in the file, and logs of other makes."""
 
-from __future__ import annotations
-
 import re
 import struct
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,15 +21,15 @@ from support.checked_sessions import (
 from support.read_back import chunks_of
 from support.written_sessions import joint_state, write_foreign
 from undulog.capture import SessionWriter
-from undulog.capture.log.health.session_check import SessionHealth, check_session
+from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.mcap.chunk import walk_records
 
 
-def flip(data: bytearray, at_byte: int) -> None:
+def flip(data, at_byte):
     data[at_byte] ^= 0x10
 
 
-def changed(path: Path, source: Path, change: Callable[[bytearray], object]) -> SessionHealth:
+def changed(path, source, change):
     """The health of a copy of a file with changed bytes."""
     data = bytearray(source.read_bytes())
     change(data)
@@ -42,7 +38,7 @@ def changed(path: Path, source: Path, change: Callable[[bytearray], object]) -> 
 
 
 @pytest.mark.parametrize("part", [0.02, 0.5, 0.9])
-def test_a_flipped_bit_is_found_and_bad(clean: Path, tmp_path: Path, part: float) -> None:
+def test_a_flipped_bit_is_found_and_bad(clean, tmp_path, part):
     chunk = chunks_of(clean, "/joint_states")[0]
     at_byte = chunk.chunk_start_offset + 60 + int(part * (chunk.chunk_length - 60))
     health = changed(tmp_path / "s.mcap", clean, lambda data: flip(data, at_byte))
@@ -60,9 +56,7 @@ def test_a_flipped_bit_is_found_and_bad(clean: Path, tmp_path: Path, part: float
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4])
 @pytest.mark.parametrize("indexed", [True, False])
-def test_a_flipped_bit_is_found_however_the_chunk_is_stored(
-    tmp_path: Path, compression: CompressionType, indexed: bool
-) -> None:
+def test_a_flipped_bit_is_found_however_the_chunk_is_stored(tmp_path, compression, indexed):
     kinds = IndexType.ALL if indexed else IndexType.NONE
     options = {"compression": compression, "chunk_size": 20_000, "index_types": kinds}
     path = write_raw(tmp_path / "s.mcap", list(range(500)), **options)
@@ -76,7 +70,7 @@ def test_a_flipped_bit_is_found_however_the_chunk_is_stored(
     assert health.file.indexed is indexed
 
 
-def test_an_index_that_lists_a_message_twice_is_found(tmp_path: Path) -> None:
+def test_an_index_that_lists_a_message_twice_is_found(tmp_path):
     path = write_raw(tmp_path / "s.mcap", list(range(100)))
     data = bytearray(path.read_bytes())
     _, start, _ = next(span for span in walk_records(bytes(data), 8, len(data)) if span[0] == 7)
@@ -87,7 +81,7 @@ def test_an_index_that_lists_a_message_twice_is_found(tmp_path: Path) -> None:
     assert "does not list its messages" in health.file.damage[0]
 
 
-def test_a_summary_that_counts_more_than_there_is_is_found(tmp_path: Path) -> None:
+def test_a_summary_that_counts_more_than_there_is_is_found(tmp_path):
     path = write_raw(tmp_path / "s.mcap", list(range(100)), enable_crcs=False)
     data = bytearray(path.read_bytes())
     counts = struct.pack("<HQHQ", 1, 100, 2, 100)
@@ -100,14 +94,14 @@ def test_a_summary_that_counts_more_than_there_is_is_found(tmp_path: Path) -> No
     )
 
 
-def test_a_flipped_bit_in_an_attachment_is_found(clean: Path, tmp_path: Path) -> None:
+def test_a_flipped_bit_in_an_attachment_is_found(clean, tmp_path):
     at_byte = clean.read_bytes().index(b"+-30 degrees")
     health = changed(tmp_path / "s.mcap", clean, lambda data: flip(data, at_byte))
     assert health.verdict == "bad"
     assert "the attachment" in health.file.damage[0]
 
 
-def test_a_cut_file_is_degraded_and_says_what_is_left(clean: Path, tmp_path: Path) -> None:
+def test_a_cut_file_is_degraded_and_says_what_is_left(clean, tmp_path):
     chunk = chunks_of(clean, "/joint_states")[0]
     (tmp_path / "s.mcap").write_bytes(
         clean.read_bytes()[: chunk.chunk_start_offset + chunk.chunk_length // 2]
@@ -119,7 +113,7 @@ def test_a_cut_file_is_degraded_and_says_what_is_left(clean: Path, tmp_path: Pat
     assert 0 < timing_of(health).count < TICKS
 
 
-def test_a_file_without_index_is_degraded(tmp_path: Path) -> None:
+def test_a_file_without_index_is_degraded(tmp_path):
     path = write_raw(tmp_path / "s.mcap", list(range(300)), use_chunking=False)
     health = check_session(path)
     assert not health.file.truncated
@@ -128,7 +122,7 @@ def test_a_file_without_index_is_degraded(tmp_path: Path) -> None:
     assert timing_of(health).count == 300
 
 
-def test_an_uncovered_chunk_is_told(tmp_path: Path) -> None:
+def test_an_uncovered_chunk_is_told(tmp_path):
     health = check_session(write_raw(tmp_path / "s.mcap", list(range(300)), enable_crcs=False))
     assert health.verdict == "good"
     assert "carry no CRC" in health.notes[0]
@@ -137,7 +131,7 @@ def test_an_uncovered_chunk_is_told(tmp_path: Path) -> None:
 # -- foreign bags ----------------------------------------------------------------------------------
 
 
-def foreign(path: Path, topic: str, names: list[list[str]]) -> Path:
+def foreign(path, topic, names):
     """Each tick one message a list of names, as mcap-ros2-support writes them."""
     messages = [
         (topic, t_ns, joint_state(t_ns, group, [float(np.sin(tick / 20 + k))] * len(group)))
@@ -148,7 +142,7 @@ def foreign(path: Path, topic: str, names: list[list[str]]) -> Path:
     return write_foreign(path, messages)
 
 
-def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path: Path) -> None:
+def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path):
     path = foreign(tmp_path / "s.mcap", "/joint_states", [["a"], ["b"], ["c"]])
     health = check_session(path)
     assert {each.label: each.timing.gaps for each in health.series} == {
@@ -160,7 +154,7 @@ def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path: Path) -> None:
     assert health.reasons == ("/joint_commands is missing; JointStates are on /joint_states",)
 
 
-def test_missing_contract_topics_are_named(tmp_path: Path) -> None:
+def test_missing_contract_topics_are_named(tmp_path):
     health = check_session(foreign(tmp_path / "s.mcap", "/arm/state", [["a", "b"]]))
     assert health.verdict == "degraded"
     assert "/joint_states is missing; JointStates are on /arm/state" in health.reasons
@@ -169,7 +163,7 @@ def test_missing_contract_topics_are_named(tmp_path: Path) -> None:
     assert check_session(tmp_path / "t.mcap").verdict == "bad"
 
 
-def test_a_joint_that_never_speaks_is_named(tmp_path: Path) -> None:
+def test_a_joint_that_never_speaks_is_named(tmp_path):
     path = tmp_path / "s.mcap"
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
         commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
@@ -180,7 +174,7 @@ def test_a_joint_that_never_speaks_is_named(tmp_path: Path) -> None:
     assert check_session(path).reasons == ("/joint_states never carries joint25",)
 
 
-def test_what_is_no_log_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_log_is_an_error(tmp_path, capsys):
     (tmp_path / "x.mcap").write_bytes(b"no log at all")
     assert undulog.run(["log", "check", str(tmp_path / "x.mcap")]) == 1
     assert "not an MCAP file" in capsys.readouterr().err

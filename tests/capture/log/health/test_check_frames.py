@@ -1,9 +1,5 @@
 """`undulog log check` of raw frames: their lengths on the wire, load and silence of a bus."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -18,7 +14,7 @@ from undulog.capture.log.messages.frames import ERROR_FLAG, EXTENDED_FLAG, empty
 # -- raw frames --------------------------------------------------------------------------------
 
 
-def test_frame_lengths_are_those_of_the_paper() -> None:
+def test_frame_lengths_are_those_of_the_paper():
     frames = empty_frames(4)
     frames["dlc"] = [8, 8, 0, 8]
     frames["id_flags"] = [0x123, 0x123 | EXTENDED_FLAG, 0x123, 0x123 | ERROR_FLAG]
@@ -28,7 +24,7 @@ def test_frame_lengths_are_those_of_the_paper() -> None:
     assert fewest.tolist() == [111, 131, 47, 0]
 
 
-def test_load_rate_silence_and_errors_of_a_bus() -> None:
+def test_load_rate_silence_and_errors_of_a_bus():
     tally = BusTally()
     frames = empty_frames(4001)
     t_ns = EPOCH_NS + np.arange(4001) * 1_000_000
@@ -45,7 +41,7 @@ def test_load_rate_silence_and_errors_of_a_bus() -> None:
     assert bus.peak_load == pytest.approx((990 * 111 / 250_000, 990 * 135 / 250_000))
 
 
-def test_frames_in_a_session_are_checked_as_they_were_logged(tmp_path: Path) -> None:
+def test_frames_in_a_session_are_checked_as_they_were_logged(tmp_path):
     path = tmp_path / "s.mcap"
     sizes = np.random.default_rng(5).integers(0, 40, 300)
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
@@ -63,7 +59,7 @@ def test_frames_in_a_session_are_checked_as_they_were_logged(tmp_path: Path) -> 
     assert any(sentence.startswith(none) for sentence in health.reasons)
 
 
-def test_a_real_trace_has_its_own_frame_count(tmp_path: Path) -> None:
+def test_a_real_trace_has_its_own_frame_count(tmp_path):
     trace = ARCSNAKE / "linear_trajectory.candump.log"
     if not trace.is_file():
         pytest.skip("the recording of ArcSnake is not there")

@@ -1,11 +1,8 @@
 """Chunks that hold more than they declare, or declare much: bounded memory, the rest is read."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource
-from pathlib import Path
 
 import pytest
 from hostile_logs import EPOCH_NS, NS, HostileLog, joint_state, lz4_zeros, zeros
@@ -20,7 +17,7 @@ ROOM = 600 * MIB
 """Largest memory of a process that reads such a file, its own 120 MiB included [byte]."""
 
 
-def ticks(start_s: int, count: int = 50) -> list:
+def ticks(start_s, count=50):
     return [
         (channel, t_ns, joint_state(t_ns, ["a", "b"], [tick / 100, 0.5]))
         for tick in range(count)
@@ -29,7 +26,7 @@ def ticks(start_s: int, count: int = 50) -> list:
     ]
 
 
-def with_bomb(path: Path, packed: bytes, size: int, *, whole: bool = True, **options) -> int:
+def with_bomb(path, packed, size, *, whole=True, **options):
     """A good chunk, one that is not what it says, and a good one where the file is whole.
 
     Returns where the bytes of the second begin.
@@ -48,7 +45,7 @@ def with_bomb(path: Path, packed: bytes, size: int, *, whole: bool = True, **opt
     return at
 
 
-def run(*commands: list[object], most: int = ROOM) -> list[str]:
+def run(*commands, most=ROOM):
     """Run commands in a process of its own and give what each prints; none may fail.
 
     Its memory is held against a limit.
@@ -67,7 +64,7 @@ def run(*commands: list[object], most: int = ROOM) -> list[str]:
         "print(json.dumps([used, found]))\n"
     )
 
-    def limited() -> None:
+    def limited():
         resource.setrlimit(resource.RLIMIT_AS, (3 * GIB, 3 * GIB))
 
     listed = json.dumps([[str(word) for word in command] for command in commands])
@@ -92,10 +89,8 @@ BOMBS = {
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_chunks_that_expand_beyond_their_size_are_refused_and_the_rest_is_kept(
-    tmp_path: Path, whole: bool
-) -> None:
-    places: dict[Path, int] = {}
+def test_chunks_that_expand_beyond_their_size_are_refused_and_the_rest_is_kept(tmp_path, whole):
+    places = {}
     for kind, make in BOMBS.items():
         packed, size, options = make()
         path = tmp_path / f"{kind}.mcap"
@@ -120,7 +115,7 @@ def test_chunks_that_expand_beyond_their_size_are_refused_and_the_rest_is_kept(
         assert any("chunk" in text for text in json.loads(said[2 * count + k])["warnings"]), path
 
 
-def test_the_error_names_the_option_that_reads_a_larger_chunk(tmp_path: Path) -> None:
+def test_the_error_names_the_option_that_reads_a_larger_chunk(tmp_path):
     path = tmp_path / "big.mcap"
     with_bomb(path, zeros(300 * MIB), 300 * MIB)
     command = ["log", "check", path, "--json"]
@@ -131,9 +126,7 @@ def test_the_error_names_the_option_that_reads_a_larger_chunk(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("wrong", ["", "0", "-1", "many", "1e9", "99999999999999999999"])
-def test_a_chunk_limit_is_a_positive_whole_number(
-    wrong: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_chunk_limit_is_a_positive_whole_number(wrong, capsys):
     assert undulog.run(["log", "info", "x.mcap", f"--max-chunk-mib={wrong}"]) == 2
     assert "--max-chunk-mib" in capsys.readouterr().err
 
@@ -145,7 +138,7 @@ IMAGE = (
 )
 
 
-def test_constant_images_open_however_well_they_compress(tmp_path: Path) -> None:
+def test_constant_images_open_however_well_they_compress(tmp_path):
     """Black pictures, zero depth and an empty map compress 10,000 times and more."""
     log = HostileLog()
     kind = log.schema("sensor_msgs/msg/Image", IMAGE)

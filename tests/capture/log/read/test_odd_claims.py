@@ -1,10 +1,7 @@
 """Logs whose numbers and types no recorder writes: an answer or an error in words, soon."""
 
-from __future__ import annotations
-
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +18,7 @@ from undulog.replay.samples.tracks import drawn_topics
 RULE = "=" * 80
 
 
-def ticks(count: int = 100, start_ns: int = EPOCH_NS) -> list:
+def ticks(count=100, start_ns=EPOCH_NS):
     return [
         (channel, t_ns, joint_state(EPOCH_NS + tick * 10_000_000, ["a"], [tick / 100]))
         for tick in range(count)
@@ -30,7 +27,7 @@ def ticks(count: int = 100, start_ns: int = EPOCH_NS) -> list:
     ]
 
 
-def joints() -> object:
+def joints():
     log = HostileLog()
     kind = log.schema()
     for topic in ("/joint_commands", "/joint_states"):
@@ -39,9 +36,7 @@ def joints() -> object:
 
 
 @pytest.mark.parametrize("kind", ["sensor_msgs/msg/JointState", "std_msgs/msg/String"])
-def test_an_empty_message_at_the_end_of_a_chunk_is_counted_as_unreadable(
-    tmp_path: Path, kind: str
-) -> None:
+def test_an_empty_message_at_the_end_of_a_chunk_is_counted_as_unreadable(tmp_path, kind):
     log = joints()
     channel = log.channel("/other", log.schema(kind))
     log.chunk([*ticks(), (channel, EPOCH_NS, b"")])
@@ -50,9 +45,7 @@ def test_an_empty_message_at_the_end_of_a_chunk_is_counted_as_unreadable(
     assert (other.count, other.unread) == (1, 1)
 
 
-def test_a_topic_whose_joints_change_from_message_to_message_is_refused_soon(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_topic_whose_joints_change_from_message_to_message_is_refused_soon(tmp_path, capsys):
     log = joints()
     times = [EPOCH_NS + NS + k * 10_000 for k in range(5_000)]
     log.chunk([*ticks(), *((2, t, joint_state(t, [f"joint{t}"], [0.5])) for t in times)])
@@ -64,7 +57,7 @@ def test_a_topic_whose_joints_change_from_message_to_message_is_refused_soon(
     assert f"error: {path}: {why}" in capsys.readouterr().err
 
 
-def test_more_joints_than_are_judged_are_a_finding(tmp_path: Path) -> None:
+def test_more_joints_than_are_judged_are_a_finding(tmp_path):
     log = joints()
     names = [f"j{k}" for k in range(2001)]
     message = joint_state(EPOCH_NS, names, np.zeros(2001))
@@ -75,9 +68,7 @@ def test_more_joints_than_are_judged_are_a_finding(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("start_ns", [2**63 - NS // 2, 2**63, 2**64 - 10 * NS])
 @pytest.mark.parametrize("whole", [True, False])
-def test_log_times_that_no_signed_number_holds(
-    tmp_path: Path, start_ns: int, whole: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_log_times_that_no_signed_number_holds(tmp_path, start_ns, whole, capsys):
     log = joints()
     if not whole:
         log.chunk(ticks())
@@ -95,7 +86,7 @@ def test_log_times_that_no_signed_number_holds(
     assert "Traceback" not in capsys.readouterr().err
 
 
-def nested(depth: int, fields: str) -> str:
+def nested(depth, fields):
     """A schema of types in types; each has the fields, with the next type for ``T``."""
     bodies = [fields.replace("T", f"T{k + 1}") for k in range(depth)]
     sections = [f"{RULE}\nMSG: p/T{k}\n{body}" for k, body in enumerate([*bodies, "int32 x\n"])]
@@ -110,7 +101,7 @@ SCHEMAS = {
 
 
 @pytest.mark.parametrize("kind", SCHEMAS)
-def test_types_that_no_reader_could_hold_are_refused(tmp_path: Path, kind: str) -> None:
+def test_types_that_no_reader_could_hold_are_refused(tmp_path, kind):
     text, complaint = SCHEMAS[kind]
     with pytest.raises(DataError, match=complaint):
         parse_message_type("p/msg/Top", text)
@@ -128,7 +119,7 @@ def test_types_that_no_reader_could_hold_are_refused(tmp_path: Path, kind: str) 
     assert report.messages["/odd"] == 2
 
 
-def test_a_million_million_elements_without_a_byte_are_no_message(tmp_path: Path) -> None:
+def test_a_million_million_elements_without_a_byte_are_no_message(tmp_path):
     text = f"E[1000000] a\n{RULE}\nMSG: p/E\nF[1000000] f\n{RULE}\nMSG: p/F\n"
     log = joints()
     channel = log.channel("/odd", log.schema("p/msg/Top", text))
@@ -137,7 +128,7 @@ def test_a_million_million_elements_without_a_byte_are_no_message(tmp_path: Path
     assert [each.unread for each in health.channels if each.topic == "/odd"] == [1]
 
 
-def test_a_merge_of_more_channels_than_can_be_numbered_is_refused(tmp_path: Path) -> None:
+def test_a_merge_of_more_channels_than_can_be_numbered_is_refused(tmp_path):
     paths = []
     for name in ("one", "two"):
         log = joints()
@@ -150,7 +141,7 @@ def test_a_merge_of_more_channels_than_can_be_numbered_is_refused(tmp_path: Path
     assert not (tmp_path / "both.mcap").exists()
 
 
-def test_a_summary_that_lists_a_chunk_again_and_again_is_not_believed(tmp_path: Path) -> None:
+def test_a_summary_that_lists_a_chunk_again_and_again_is_not_believed(tmp_path):
     log = joints()
     log.attachment("notes.txt", bytes(1 << 20), listed=1000)
     log.chunk(ticks(), listed=1000)
@@ -163,9 +154,7 @@ def test_a_summary_that_lists_a_chunk_again_and_again_is_not_believed(tmp_path: 
 
 
 @pytest.mark.parametrize("verb", ["analyse", "report", "compare", "view"])
-def test_more_joints_than_a_robot_has_are_an_error(
-    tmp_path: Path, verb: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_more_joints_than_a_robot_has_are_an_error(tmp_path, verb, capsys):
     path = gait(tmp_path / "many.mcap", ticks=5, joints=6000)
     more = {"view": ["--save", "x.rrd"], "report": ["-o", "x.html"], "compare": [path]}
     words = [verb, path, *more.get(verb, [])]
@@ -175,9 +164,7 @@ def test_more_joints_than_a_robot_has_are_an_error(
     assert not list(tmp_path.glob("x.*"))
 
 
-def test_of_many_joint_topics_some_are_drawn_and_a_table_asks_which(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_of_many_joint_topics_some_are_drawn_and_a_table_asks_which(tmp_path, capsys):
     log = HostileLog()
     kind = log.schema()
     for number in range(600):

@@ -1,7 +1,5 @@
 """Sessions that we write, read by others and by ourselves."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +17,7 @@ from undulog.capture.log.messages.frames import DIR_TX, EXTENDED_FLAG, empty_fra
 # -- writing -----------------------------------------------------------------------------------
 
 
-def test_foreign_readers_find_every_number_and_the_description(tmp_path: Path) -> None:
+def test_foreign_readers_find_every_number_and_the_description(tmp_path):
     path, robot = tmp_path / "s.mcap", load_robot("snake13")
     facts = {"operator": "a person"}
     data = write_session(path, robot=robot, clock={"twin": "simulated"}, metadata=facts)
@@ -52,7 +50,7 @@ def test_foreign_readers_find_every_number_and_the_description(tmp_path: Path) -
     assert units["/joint_states"] == "rad"
 
 
-def test_the_other_channels_read_back_elsewhere(tmp_path: Path) -> None:
+def test_the_other_channels_read_back_elsewhere(tmp_path):
     path = tmp_path / "s.mcap"
     pose = np.array([[1.0, 2.0, 3.00001], [4.0, 5.0, 6.0]])
     turn = np.array([[0.0, 0.0, 0.0, 1.0], [0.5, 0.5, 0.5, 0.5]])
@@ -75,7 +73,7 @@ def test_the_other_channels_read_back_elsewhere(tmp_path: Path) -> None:
     assert found["/compass"].magnetic_field.z == -4e-5
 
 
-def test_an_existing_file_stays_unless_forced(tmp_path: Path) -> None:
+def test_an_existing_file_stays_unless_forced(tmp_path):
     path = tmp_path / "s.mcap"
     path.write_bytes(b"precious")
     with pytest.raises(OutputExistsError, match="--force"):
@@ -85,10 +83,10 @@ def test_an_existing_file_stays_unless_forced(tmp_path: Path) -> None:
     assert Session.open(path).channels["/joint_states"].count == 3
 
 
-def test_a_block_left_by_an_exception_leaves_a_whole_file(tmp_path: Path) -> None:
+def test_a_block_left_by_an_exception_leaves_a_whole_file(tmp_path):
     path = tmp_path / "s.mcap"
 
-    def record_and_fail() -> None:
+    def record_and_fail():
         with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
             writer.joint_state("/joint_commands", NAMES, unit="rad").write(EPOCH_NS, [1, 2, 3])
             raise RuntimeError("robot fell")
@@ -100,12 +98,12 @@ def test_a_block_left_by_an_exception_leaves_a_whole_file(tmp_path: Path) -> Non
         assert session.warnings == []
 
 
-def test_a_full_disk_is_an_error_that_names_the_file() -> None:
+def test_a_full_disk_is_an_error_that_names_the_file():
     with pytest.raises(LogWriteError, match="/dev/full: can't be written: No space left"):
         write_session(Path("/dev/full"), 3000, force=True)
 
 
-def test_a_topic_has_one_channel_and_a_shape(tmp_path: Path) -> None:
+def test_a_topic_has_one_channel_and_a_shape(tmp_path):
     with SessionWriter(tmp_path / "s.mcap", session_id="s", epoch_ns=EPOCH_NS) as writer:
         channel = writer.joint_state("/joint_commands", NAMES, unit="rad")
         with pytest.raises(DataError, match="open already"):
@@ -119,7 +117,7 @@ def test_a_topic_has_one_channel_and_a_shape(tmp_path: Path) -> None:
 # -- reading our own ---------------------------------------------------------------------------
 
 
-def test_columns_come_back_bit_for_bit(tmp_path: Path) -> None:
+def test_columns_come_back_bit_for_bit(tmp_path):
     data = write_session(tmp_path / "s.mcap", 3000)  # several chunks
     with Session.open(tmp_path / "s.mcap") as session:
         for k, field in enumerate(("position", "velocity", "effort")):
@@ -137,7 +135,7 @@ def test_columns_come_back_bit_for_bit(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.array(signals.values).T, data[1000:1500, 0])
 
 
-def test_tables_events_messages_and_a_long_frame(tmp_path: Path) -> None:
+def test_tables_events_messages_and_a_long_frame(tmp_path):
     data = write_session(tmp_path / "s.mcap")
     with Session.open(tmp_path / "s.mcap") as session:
         odometry = session.table("/odom")
@@ -151,7 +149,7 @@ def test_tables_events_messages_and_a_long_frame(tmp_path: Path) -> None:
     np.testing.assert_array_equal(second["velocity [rad/s]"], data[:, 1, 1])
 
 
-def test_frames_come_back_bit_for_bit(tmp_path: Path) -> None:
+def test_frames_come_back_bit_for_bit(tmp_path):
     rng = np.random.default_rng(3)
     frames = empty_frames(1000)
     frames["t_host_ns"] = EPOCH_NS + np.arange(1000)
@@ -166,7 +164,7 @@ def test_frames_come_back_bit_for_bit(tmp_path: Path) -> None:
         assert session.frames("/can/can0").tobytes() == frames.tobytes()
 
 
-def test_each_joint_gets_its_own_sampling_time(tmp_path: Path) -> None:
+def test_each_joint_gets_its_own_sampling_time(tmp_path):
     path = tmp_path / "s.mcap"
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
         states = writer.joint_state("/joint_states", NAMES, unit="rad")
@@ -186,7 +184,7 @@ def test_each_joint_gets_its_own_sampling_time(tmp_path: Path) -> None:
         np.testing.assert_array_equal(session.joints("/joint_commands").t_ns[1], base)
 
 
-def test_joints_come_in_chain_order(tmp_path: Path) -> None:
+def test_joints_come_in_chain_order(tmp_path):
     robot = load_robot("snake13")
     names = robot.joint_names[::-1]
     path = tmp_path / "s.mcap"

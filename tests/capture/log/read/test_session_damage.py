@@ -1,9 +1,5 @@
 """What is no session, or only part of one: an error or a warning in words."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -23,20 +19,20 @@ from undulog.capture.common.errors import LogError, MissingChannelError, NotALog
         (b"\x89MCAP0\r\n", "without any channel"),
     ],
 )
-def test_what_is_no_log_is_refused_in_words(tmp_path: Path, content: bytes, complaint: str) -> None:
+def test_what_is_no_log_is_refused_in_words(tmp_path, content, complaint):
     (tmp_path / "x.mcap").write_bytes(content)
     with pytest.raises(NotALogError, match=complaint):
         Session.open(tmp_path / "x.mcap")
 
 
-def test_a_missing_file_and_a_folder_are_log_errors(tmp_path: Path) -> None:
+def test_a_missing_file_and_a_folder_are_log_errors(tmp_path):
     with pytest.raises(LogError, match="no such file"):
         Session.open(tmp_path / "none.mcap")
     with pytest.raises(LogError, match=r"no session .* is in this folder"):
         Session.open(tmp_path)
 
 
-def test_a_missing_topic_lists_those_there(tmp_path: Path) -> None:
+def test_a_missing_topic_lists_those_there(tmp_path):
     write_session(tmp_path / "s.mcap", 3)
     with (
         Session.open(tmp_path / "s.mcap") as session,
@@ -45,7 +41,7 @@ def test_a_missing_topic_lists_those_there(tmp_path: Path) -> None:
         session.joints("/joint_torque")
 
 
-def test_a_cut_file_keeps_every_whole_message_before_the_cut(tmp_path: Path) -> None:
+def test_a_cut_file_keeps_every_whole_message_before_the_cut(tmp_path):
     data = write_session(tmp_path / "s.mcap", 6000)
     whole = (tmp_path / "s.mcap").read_bytes()
     previous = 0
@@ -60,7 +56,7 @@ def test_a_cut_file_keeps_every_whole_message_before_the_cut(tmp_path: Path) -> 
     assert previous > 5900
 
 
-def test_a_flipped_bit_in_a_chunk_is_told_and_only_that_chunk_is_missing(tmp_path: Path) -> None:
+def test_a_flipped_bit_in_a_chunk_is_told_and_only_that_chunk_is_missing(tmp_path):
     write_session(tmp_path / "s.mcap", 6000)
     chunks = chunks_of(tmp_path / "s.mcap", "/joint_states")
     middle = chunks[len(chunks) // 2]
@@ -73,7 +69,7 @@ def test_a_flipped_bit_in_a_chunk_is_told_and_only_that_chunk_is_missing(tmp_pat
     assert 3000 < count < 6000
 
 
-def test_chunks_that_claim_to_have_no_bytes_are_told_as_missing(tmp_path: Path) -> None:
+def test_chunks_that_claim_to_have_no_bytes_are_told_as_missing(tmp_path):
     write_session(tmp_path / "s.mcap", 6000)
     damaged = bytearray((tmp_path / "s.mcap").read_bytes())
     for chunk in summary_of(tmp_path / "s.mcap").chunk_indexes:

@@ -1,9 +1,5 @@
 """Logs of other makes as sessions: any number of joints a message, any clock, any container."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from mcap.records import Schema
@@ -26,11 +22,11 @@ from undulog.capture.log.messages.cdr import encode
 from undulog.capture.log.messages.definitions import message_type, schema_text
 
 
-def states(t_ns: int, names: list, position: list, *, log_ns: int = 0, **more: object) -> tuple:
+def states(t_ns, names, position, *, log_ns=0, **more):
     return "/joint_states", log_ns or t_ns, joint_state(t_ns, names, position, **more)
 
 
-def test_one_message_per_servo_is_read_right(tmp_path: Path) -> None:
+def test_one_message_per_servo_is_read_right(tmp_path):
     data = samples(200)
     messages = [
         states(EPOCH_NS + tick * STEP_NS + j * 1_000_000, [name], [float(data[tick, 0, j])])
@@ -47,7 +43,7 @@ def test_one_message_per_servo_is_read_right(tmp_path: Path) -> None:
         assert session.warnings == []
 
 
-def test_a_changed_joint_set_is_told_and_read(tmp_path: Path) -> None:
+def test_a_changed_joint_set_is_told_and_read(tmp_path):
     messages = [
         states(EPOCH_NS + tick * STEP_NS, ["a", "b" if tick < 50 else "c"], [float(tick), 1.0])
         for tick in range(100)
@@ -59,7 +55,7 @@ def test_a_changed_joint_set_is_told_and_read(tmp_path: Path) -> None:
         assert any("set of joints changes" in w and "b, c" in w for w in session.warnings)
 
 
-def test_a_later_window_is_not_read_with_the_names_of_an_earlier_one(tmp_path: Path) -> None:
+def test_a_later_window_is_not_read_with_the_names_of_an_earlier_one(tmp_path):
     step_ns = 100_000_000
     messages = [  # of one length
         states(EPOCH_NS + tick * step_ns, list("ab" if tick < 300 else "bc"), [tick, -tick])
@@ -81,7 +77,7 @@ def test_a_later_window_is_not_read_with_the_names_of_an_earlier_one(tmp_path: P
             assert read == {name: truth[name] for name in truth if truth[name] or name in read}
 
 
-def test_duplicate_and_backward_stamps_are_told(tmp_path: Path) -> None:
+def test_duplicate_and_backward_stamps_are_told(tmp_path):
     messages = [
         states(EPOCH_NS + tick * STEP_NS, ["a"], [float(tick)], log_ns=EPOCH_NS + k * STEP_NS)
         for k, tick in enumerate([0, 1, 2, 2, 4, 3, 5])
@@ -94,7 +90,7 @@ def test_duplicate_and_backward_stamps_are_told(tmp_path: Path) -> None:
     assert "1 samples repeat the stamp" in text
 
 
-def test_a_field_that_is_never_filled_is_missing_not_zero(tmp_path: Path) -> None:
+def test_a_field_that_is_never_filled_is_missing_not_zero(tmp_path):
     messages = [states(EPOCH_NS, ["a"], [1.0], velocity=[])]
     with (
         Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session,
@@ -105,7 +101,7 @@ def test_a_field_that_is_never_filled_is_missing_not_zero(tmp_path: Path) -> Non
         session.joints("/joint_states", "effort")
 
 
-def test_values_that_do_not_match_the_names_are_left_out_with_a_warning(tmp_path: Path) -> None:
+def test_values_that_do_not_match_the_names_are_left_out_with_a_warning(tmp_path):
     messages = [
         states(EPOCH_NS, ["a", "b"], [1.0]),
         states(EPOCH_NS + 1, ["a", "b"], [1.0, 2.0]),
@@ -115,20 +111,20 @@ def test_values_that_do_not_match_the_names_are_left_out_with_a_warning(tmp_path
         assert "2 names but 1 values of position" in session.warnings[0]
 
 
-def test_nan_samples_are_kept(tmp_path: Path) -> None:
+def test_nan_samples_are_kept(tmp_path):
     messages = [states(EPOCH_NS, ["a"], [float("nan")])]
     with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         assert np.isnan(session.joints("/joint_states").values[0]).all()
 
 
-def test_zero_stamps_fall_back_to_log_times(tmp_path: Path) -> None:
+def test_zero_stamps_fall_back_to_log_times(tmp_path):
     messages = [states(0, ["a"], [float(k)], log_ns=EPOCH_NS + k) for k in range(3)]
     with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         assert session.joints("/joint_states").t_ns[0].tolist() == [EPOCH_NS + k for k in range(3)]
         assert "header stamps are zero" in session.warnings[0]
 
 
-def test_simulated_time_is_shifted_to_the_log_clock(tmp_path: Path) -> None:
+def test_simulated_time_is_shifted_to_the_log_clock(tmp_path):
     messages = [
         (
             topic,
@@ -159,7 +155,7 @@ def test_simulated_time_is_shifted_to_the_log_clock(tmp_path: Path) -> None:
         ({"use_statistics": False}, True),
     ],
 )
-def test_any_kind_of_mcap_reads_the_same(tmp_path: Path, options: dict, warned: bool) -> None:
+def test_any_kind_of_mcap_reads_the_same(tmp_path, options, warned):
     kind = message_type(JOINT_STATE)
     data = samples(500)
     path = tmp_path / "f.mcap"
@@ -176,7 +172,7 @@ def test_any_kind_of_mcap_reads_the_same(tmp_path: Path, options: dict, warned: 
         assert bool(session.warnings) == warned
 
 
-def test_undefined_padding_of_a_foreign_writer_does_no_harm(tmp_path: Path) -> None:
+def test_undefined_padding_of_a_foreign_writer_does_no_harm(tmp_path):
     kind = message_type(JOINT_STATE)
     plain = encode(kind, joint_state(EPOCH_NS, ["ab"], [1.5]))
     padding_at = 4 + 8 + 4 + 1  # header, stamp, length of frame_id, its terminating zero
