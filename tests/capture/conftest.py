@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 
 from undulog.capture import SessionWriter
-from undulog.capture.log.messages.frames import (
-    EXTENDED_FLAG,
-    FD_BRS,
-    REMOTE_FLAG,
-    FrameArray,
-    empty_fd_frames,
-    empty_frames,
-)
+from undulog.capture.log.messages import frames as fr
 from undulog.capture.sources.contract import Source, SourceContext, SourceEvent
 
 PATIENCE_S = 90.0
@@ -26,9 +19,9 @@ class Heard:
     """What a source gave: frames in order, events in order."""
 
     source: Source
-    arrays: list[FrameArray] = field(default_factory=list)
+    arrays: list[fr.FrameArray] = field(default_factory=list)
     events: list[SourceEvent] = field(default_factory=list)
-    fd_arrays: list[FrameArray] = field(default_factory=list)
+    fd_arrays: list[fr.FrameArray] = field(default_factory=list)
 
     def poll(self):
         polled = self.source.poll()
@@ -55,11 +48,11 @@ class Heard:
 
     @property
     def frames(self):
-        return np.concatenate([empty_frames(0), *self.arrays])
+        return np.concatenate([fr.empty_frames(0), *self.arrays])
 
     @property
     def fd_frames(self):
-        return np.concatenate([empty_fd_frames(0), *self.fd_arrays])
+        return np.concatenate([fr.empty_fd_frames(0), *self.fd_arrays])
 
     @property
     def texts(self):
@@ -109,14 +102,14 @@ def traffic():
 
     def make(count):
         rng = np.random.default_rng(count)
-        frames = empty_frames(count)
+        frames = fr.empty_frames(count)
         extended = rng.random(count) < 0.3
         remote = rng.random(count) < 0.02
         frames["id_flags"] = np.where(
             extended,
-            rng.integers(0, 2**29, count) | EXTENDED_FLAG,
+            rng.integers(0, 2**29, count) | fr.EXTENDED_FLAG,
             rng.integers(0, 2**11, count),
-        ) | (remote * REMOTE_FLAG)
+        ) | (remote * fr.REMOTE_FLAG)
         frames["dlc"] = rng.integers(0, 9, count)
         data = rng.integers(0, 256, (count, 8))
         data[np.arange(8) >= frames["dlc"][:, None]] = 0
@@ -136,13 +129,13 @@ def fd_traffic():
 
     def make(count):
         rng = np.random.default_rng(count)
-        frames = empty_fd_frames(count)
+        frames = fr.empty_fd_frames(count)
         frames["id_flags"] = np.where(
             rng.random(count) < 0.3,
-            rng.integers(0, 2**29, count) | EXTENDED_FLAG,
+            rng.integers(0, 2**29, count) | fr.EXTENDED_FLAG,
             rng.integers(0, 2**11, count),
         )
-        frames["fd_flags"] = np.where(rng.random(count) < 0.5, FD_BRS, 0)
+        frames["fd_flags"] = np.where(rng.random(count) < 0.5, fr.FD_BRS, 0)
         lengths = [*range(9), 12, 16, 20, 24, 32, 48, 64]
         frames["len"] = np.array(lengths)[rng.integers(0, 16, count)]
         data = rng.integers(0, 256, (count, 64))
@@ -159,7 +152,7 @@ def same():
 
     def compare(found, truth):
         names = ("id_flags", "len", "fd_flags", "data")
-        if truth.dtype == empty_frames(0).dtype:
+        if truth.dtype == fr.empty_frames(0).dtype:
             names = ("id_flags", "dlc", "data")
         return len(found) == len(truth) and all(
             np.array_equal(found[name], truth[name]) for name in names

@@ -16,14 +16,7 @@ from undulog.capture import load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.bus.map_entry import BitField
 from undulog.capture.common.errors import DataError
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    REMOTE_FLAG,
-    empty_frames,
-)
+from undulog.capture.log.messages import frames as fr
 from undulog.capture.robot.bus_map import UNITS
 
 
@@ -148,8 +141,8 @@ def muxed():
     return bus_robot(MULTIPLEXED, SIGNALS)
 
 
-def some_frames(count, id_flags, dlc=8, way=DIR_RX):
-    frames = empty_frames(count)
+def some_frames(count, id_flags, dlc=8, way=fr.DIR_RX):
+    frames = fr.empty_frames(count)
     frames["t_host_ns"] = np.arange(count) * 1000 + 7
     frames["id_flags"], frames["dlc"], frames["dir"] = id_flags, dlc, way
     return frames
@@ -159,7 +152,7 @@ def some_frames(count, id_flags, dlc=8, way=DIR_RX):
 @given(seed=st.integers(0, 2**32 - 1))
 def test_nested_multiplexing(muxed, seed):
     rng = np.random.default_rng(seed)
-    frames = some_frames(200, 1024 | EXTENDED_FLAG)
+    frames = some_frames(200, 1024 | fr.EXTENDED_FLAG)
     frames["data"] = rng.integers(0, 256, (200, 8))
     frames["data"][:, 1] %= 11
     samples, tally = BusDecoder(muxed).decode(frames)
@@ -192,7 +185,7 @@ def test_frames_of_many_joints_and_sensors_at_once(seed):
     chosen = rng.choice(database.messages, 300)
     frames = some_frames(300, [message.frame_id for message in chosen])
     frames["dlc"] = [message.length for message in chosen]
-    frames["dir"] = [DIR_TX if way[message.name] == "tx" else DIR_RX for message in chosen]
+    frames["dir"] = [fr.DIR_TX if way[message.name] == "tx" else fr.DIR_RX for message in chosen]
     frames["data"] = rng.integers(0, 256, (300, 8))
     expected = {}
     for row, (message, frame) in enumerate(zip(chosen, frames, strict=True)):
@@ -228,11 +221,11 @@ def test_no_frame_goes_unaccounted_for(muxed):
         [
             some_frames(2, 5, dlc=4),  # decoded
             some_frames(3, 5, dlc=3),  # too short for its signal
-            some_frames(4, 5, way=DIR_TX),  # known, but nothing is mapped in that direction
-            some_frames(5, 5 | EXTENDED_FLAG),  # another identifier
+            some_frames(4, 5, way=fr.DIR_TX),  # known, but nothing is mapped in that direction
+            some_frames(5, 5 | fr.EXTENDED_FLAG),  # another identifier
             some_frames(6, 0x7FF),
-            some_frames(7, 5 | REMOTE_FLAG),
-            some_frames(8, 0x80 | ERROR_FLAG),
+            some_frames(7, 5 | fr.REMOTE_FLAG),
+            some_frames(8, 0x80 | fr.ERROR_FLAG),
         ]
     )
     samples, tally = BusDecoder(muxed).decode(frames)
@@ -252,7 +245,7 @@ def test_no_frame_goes_unaccounted_for(muxed):
 
 
 def test_a_frame_too_short_for_its_multiplexer_is_counted(muxed):
-    samples, tally = BusDecoder(muxed).decode(some_frames(1, 1024 | EXTENDED_FLAG, dlc=0))
+    samples, tally = BusDecoder(muxed).decode(some_frames(1, 1024 | fr.EXTENDED_FLAG, dlc=0))
     assert samples == ()
     assert set(tally.short) == {"mux.one", "mux.two", "mux.three", "mux.always"}
 
@@ -270,7 +263,7 @@ def test_the_direction_tells_a_request_from_its_reply():
             "9C1721007E00F355",  # motor state: 126 deg/s
         )
     ]
-    frames["dir"] = [DIR_TX, DIR_RX, DIR_TX, DIR_RX, DIR_RX]
+    frames["dir"] = [fr.DIR_TX, fr.DIR_RX, fr.DIR_TX, fr.DIR_RX, fr.DIR_RX]
     samples, tally = decoder.decode(frames)
     found = {
         sample.signals[0].quantity: (sample.rows.tolist(), sample.values) for sample in samples

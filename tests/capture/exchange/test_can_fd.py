@@ -23,17 +23,7 @@ from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.export import export_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 from undulog.capture.log.health.session_check import check_session
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    FD_FRAME_LAYOUT,
-    REMOTE_FLAG,
-    empty_fd_frames,
-    empty_frames,
-)
+from undulog.capture.log.messages import frames as fr
 from undulog.capture.recorder.loop import Ending, Recorder
 from undulog.capture.recorder.status import SessionClock
 from undulog.capture.sources.address import open_source, parse_address
@@ -45,7 +35,7 @@ FIELDS = ("t_host_ns", "id_flags", "len", "dir", "fd_flags", "data")
 
 
 def classic_frames(count, start_ns, step_ns):
-    frames = empty_frames(count)
+    frames = fr.empty_frames(count)
     frames["t_host_ns"] = start_ns + step_ns * np.arange(count)
     frames["id_flags"], frames["dlc"] = np.arange(count) % 0x800, 8
     frames["data"] = np.random.default_rng(1).integers(0, 256, (count, 8))
@@ -65,7 +55,7 @@ def same(found, expected, fields=FIELDS):
 def test_what_is_written_is_read_the_same(data, tmp_path_factory):
     sizes = data.draw(st.lists(st.integers(1, 9), min_size=1, max_size=6))
     raw = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
-    frames = np.frombuffer(raw.bytes(sum(sizes) * 88), empty_fd_frames(0).dtype)
+    frames = np.frombuffer(raw.bytes(sum(sizes) * 88), fr.empty_fd_frames(0).dtype)
     path = tmp_path_factory.mktemp("fd") / "x.mcap"
     with SessionWriter(path, session_id="s", epoch_ns=T0) as writer:
         channel = writer.fd_frames("/can_fd/can0")
@@ -86,7 +76,7 @@ def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path):
         ((_, channel, _, message),) = reader.iter_decoded_messages()
     frame, record = message.layout.dim
     assert (channel.topic, frame.label, frame.size) == ("/can_fd/can0", "frame", 5)
-    assert (record.label, record.size) == (FD_FRAME_LAYOUT, 88)
+    assert (record.label, record.size) == (fr.FD_FRAME_LAYOUT, 88)
     # The label, taken by its word, is the layout.
     at, offsets = 0, {}
     for part in record.label.split(","):
@@ -115,9 +105,9 @@ def test_the_kinds_are_not_mixed_up(tmp_path):
         assert len(session.frames("/can/can0_fd")) == 11
     with SessionWriter(tmp_path / "y.mcap", session_id="s", epoch_ns=T0) as writer:
         with pytest.raises(DataError, match="frames have the layout"):
-            writer.fd_frames("/can_fd/can0").write(T0, empty_frames(1))
+            writer.fd_frames("/can_fd/can0").write(T0, fr.empty_frames(1))
         with pytest.raises(DataError, match="frames have the layout"):
-            writer.frames("/can/can0").write(T0, empty_fd_frames(1))
+            writer.frames("/can/can0").write(T0, fr.empty_fd_frames(1))
 
 
 def test_the_check_counts_them(tmp_path, capsys):
@@ -208,14 +198,14 @@ def test_logs_of_python_can(suffix, tmp_path):
 
 
 def records_of(messages):
-    frames = empty_fd_frames(len(messages))
+    frames = fr.empty_fd_frames(len(messages))
     for frame, message in zip(frames, messages, strict=True):
         frame["t_host_ns"] = round(message.timestamp * 1e6) * 1000
         frame["id_flags"] = message.arbitration_id
-        frame["id_flags"] |= EXTENDED_FLAG if message.is_extended_id else 0
-        frame["len"], frame["dir"] = len(message.data), DIR_RX if message.is_rx else DIR_TX
-        frame["fd_flags"] |= FD_BRS if message.bitrate_switch else 0
-        frame["fd_flags"] |= FD_ESI if message.error_state_indicator else 0
+        frame["id_flags"] |= fr.EXTENDED_FLAG if message.is_extended_id else 0
+        frame["len"], frame["dir"] = len(message.data), fr.DIR_RX if message.is_rx else fr.DIR_TX
+        frame["fd_flags"] |= fr.FD_BRS if message.bitrate_switch else 0
+        frame["fd_flags"] |= fr.FD_ESI if message.error_state_indicator else 0
         frame["data"][: len(message.data)] = list(message.data)
     return frames
 
@@ -255,10 +245,10 @@ def test_a_trc_of_version_2(tmp_path):
     (tmp_path / "x.trc").write_text(TRC.format(data))
     report, frames = imported(tmp_path / "x.trc", tmp_path, "/can_fd/can1")
     assert report.frames == 5
-    assert frames["id_flags"].tolist() == [0x300, 0x400, 0x18FEF100 | EXTENDED_FLAG, 0x500]
+    assert frames["id_flags"].tolist() == [0x300, 0x400, 0x18FEF100 | fr.EXTENDED_FLAG, 0x500]
     assert frames["len"].tolist() == [8, 12, 64, 0]
-    assert frames["fd_flags"].tolist() == [0, FD_BRS, FD_BRS | FD_ESI, FD_ESI]
-    assert frames["dir"].tolist() == [DIR_RX, DIR_TX, DIR_RX, DIR_RX]
+    assert frames["fd_flags"].tolist() == [0, fr.FD_BRS, fr.FD_BRS | fr.FD_ESI, fr.FD_ESI]
+    assert frames["dir"].tolist() == [fr.DIR_RX, fr.DIR_TX, fr.DIR_RX, fr.DIR_RX]
     assert frames["data"][2].tolist() == list(range(64))
     assert frames["data"][1].tolist() == [0] * 11 + [12] + [0] * 52
 
@@ -309,7 +299,7 @@ def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path):
 
 def test_what_a_format_loses_is_counted(tmp_path):
     frames = every_kind(fd=True, start_ns=T0 + 7)[:10]
-    frames["id_flags"][:3] |= REMOTE_FLAG  # there is no such thing in CAN FD
+    frames["id_flags"][:3] |= fr.REMOTE_FLAG  # there is no such thing in CAN FD
     frames["t_device_ns"] = frames["t_host_ns"] + 5
     source = write_frames(tmp_path / "run.mcap", {"/can_fd/can0": frames})
     assert export_log(source, tmp_path / "x.asc").warnings == [

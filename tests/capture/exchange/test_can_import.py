@@ -16,12 +16,7 @@ from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.export import export_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 from undulog.capture.log.health.session_check import check_session
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-)
+from undulog.capture.log.messages import frames as fr
 
 RECORDING = ARCSNAKE / "linear_trajectory.candump.log"
 T0 = 1_700_000_000.25
@@ -52,7 +47,7 @@ def test_the_arcsnake_frames_are_those_of_the_text(arcsnake):
     lines = [line.split() for line in RECORDING.read_text().splitlines()]
     with Session.open(arcsnake[0]) as session:
         frames = session.frames("/can/can0")
-    assert frames["dir"].tolist() == [DIR_TX if line[3] == "T" else DIR_RX for line in lines]
+    assert frames["dir"].tolist() == [fr.DIR_TX if line[3] == "T" else fr.DIR_RX for line in lines]
     data = [bytes(row) for row in frames["data"]]
     assert data == [bytes.fromhex(line[2].removeprefix("14B#")) for line in lines]
     assert (np.bincount(frames["dir"]) == [9617, 9680]).all()
@@ -87,7 +82,7 @@ def test_arcsnake_follows_its_command_with_slope_one_and_the_known_lag(arcsnake)
 def test_arcsnake_quantities_keep_their_own_times(arcsnake):
     with Session.open(arcsnake[0]) as session:
         frames = session.frames("/can/can0")
-        is_state = np.isin(frames["data"][:, 0], [0x9C, 0xA4]) & (frames["dir"] == DIR_RX)
+        is_state = np.isin(frames["data"][:, 0], [0x9C, 0xA4]) & (frames["dir"] == fr.DIR_RX)
         for topic, unit in (
             ("/joint_velocity", "rad/s"),
             ("/joint_current", "A"),
@@ -121,9 +116,9 @@ def test_error_and_fd_frames_of_a_blf(tmp_path):
     assert report.problems[1].startswith("none of 2 CAN frames can be decoded")
     assert report.verdict == "degraded"
     with Session.open(output) as session:
-        assert session.frames("/can/can0")["id_flags"].tolist() == [1, 0x80 | ERROR_FLAG]
+        assert session.frames("/can/can0")["id_flags"].tolist() == [1, 0x80 | fr.ERROR_FLAG]
         (frame,) = session.fd_frames("/can_fd/can0")
-        assert (frame["id_flags"], frame["len"]) == (2 | EXTENDED_FLAG, 64)
+        assert (frame["id_flags"], frame["len"]) == (2 | fr.EXTENDED_FLAG, 64)
         assert session.verdict == "degraded"
 
 

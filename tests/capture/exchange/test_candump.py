@@ -7,15 +7,7 @@ from hypothesis import strategies as st
 from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.candump import candump_lines, read_candump
 from undulog.capture.exchange.frame_log import joined
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    REMOTE_FLAG,
-)
+from undulog.capture.log.messages import frames as fr
 
 
 def read(path, text):
@@ -76,13 +68,13 @@ def test_frames_of_every_kind(tmp_path):
     assert not frames["t_device_ns"].any()
     assert frames["id_flags"].tolist() == [
         0x14B,
-        0x18FEF100 | EXTENDED_FLAG,
-        0x7FF | REMOTE_FLAG,
-        0x80 | ERROR_FLAG,
+        0x18FEF100 | fr.EXTENDED_FLAG,
+        0x7FF | fr.REMOTE_FLAG,
+        0x80 | fr.ERROR_FLAG,
         1,
     ]
     assert frames["dlc"].tolist() == [2, 8, 4, 8, 0]
-    assert frames["dir"].tolist() == [DIR_TX, DIR_RX, DIR_RX, DIR_RX, DIR_RX]
+    assert frames["dir"].tolist() == [fr.DIR_TX, fr.DIR_RX, fr.DIR_RX, fr.DIR_RX, fr.DIR_RX]
     assert frames["data"][0].tolist() == [0x9B, 1, 0, 0, 0, 0, 0, 0]
     assert log.problems == ["1 frames without a direction, unlike the first one"]
 
@@ -94,9 +86,9 @@ def test_can_fd_frames(tmp_path):
     assert block.is_fd.tolist() == [False, True, True]
     assert block.times_ns().tolist() == [1_000_000_000, 1_000_001_000, 1_000_002_000]
     assert block.bus.tolist() == [0, 1, 0]
-    assert block.frames["id_flags"].tolist() == [1, 1, 2 | EXTENDED_FLAG]
+    assert block.frames["id_flags"].tolist() == [1, 1, 2 | fr.EXTENDED_FLAG]
     assert block.frames["len"].tolist() == [1, 64, 0]
-    assert block.frames["fd_flags"].tolist() == [0, FD_BRS | FD_ESI, FD_BRS | 4]
+    assert block.frames["fd_flags"].tolist() == [0, fr.FD_BRS | fr.FD_ESI, fr.FD_BRS | 4]
     assert block.frames["data"].tolist() == [[0] * 64, [0xAB] * 64, [0] * 64]
 
 

@@ -19,14 +19,7 @@ from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.export import export_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    REMOTE_FLAG,
-    empty_frames,
-)
+from undulog.capture.log.messages import frames as fr
 
 T0 = 1_700_000_003_250_000_000
 S = 1_000_000_000
@@ -90,19 +83,19 @@ many = settings(
 
 
 def record_of(frames):
-    array = empty_frames(len(frames))
+    array = fr.empty_frames(len(frames))
     for row, each in zip(array, frames, strict=True):
-        flags = {"data": 0, "remote": REMOTE_FLAG, "error": ERROR_FLAG}[each.kind]
+        flags = {"data": 0, "remote": fr.REMOTE_FLAG, "error": fr.ERROR_FLAG}[each.kind]
         row["t_host_ns"] = each.t_ns
-        row["id_flags"] = each.identifier | flags | (EXTENDED_FLAG if each.extended else 0)
-        row["dlc"], row["dir"] = each.dlc, DIR_TX if each.sent else DIR_RX
+        row["id_flags"] = each.identifier | flags | (fr.EXTENDED_FLAG if each.extended else 0)
+        row["dlc"], row["dir"] = each.dlc, fr.DIR_TX if each.sent else fr.DIR_RX
         row["data"][: len(each.data)] = list(each.data)
     return array
 
 
 def frame_of(row, bus):
     flags = int(row["id_flags"])
-    kind = "error" if flags & ERROR_FLAG else "remote" if flags & REMOTE_FLAG else "data"
+    kind = "error" if flags & fr.ERROR_FLAG else "remote" if flags & fr.REMOTE_FLAG else "data"
     dlc = int(row["dlc"])
     data = bytes(row["data"])
     size = 0 if kind == "remote" else min(dlc, 8)
@@ -112,10 +105,10 @@ def frame_of(row, bus):
         bus=bus,
         kind=kind,
         identifier=flags & 0x1FFF_FFFF,
-        extended=bool(flags & EXTENDED_FLAG),
+        extended=bool(flags & fr.EXTENDED_FLAG),
         dlc=dlc,
         data=data[:size],
-        sent=int(row["dir"]) == DIR_TX,
+        sent=int(row["dir"]) == fr.DIR_TX,
     )
 
 

@@ -23,16 +23,7 @@ from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.export import TABLE_FORMATS, export_columns, export_log
 from undulog.capture.exchange.frame_formats import FRAME_FORMATS, channel_numbers
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    REMOTE_FLAG,
-    empty_frames,
-)
+from undulog.capture.log.messages import frames as fr
 
 S = 1_000_000_000
 CAN_MSGS_FRAME = (
@@ -72,19 +63,19 @@ def test_python_can_reads_them(suffix, fd, tmp_path):
     for message, frame in zip(messages, frames, strict=True):
         id_flags = int(frame["id_flags"])
         assert message.is_fd == fd
-        assert message.is_error_frame == bool(id_flags & ERROR_FLAG)
+        assert message.is_error_frame == bool(id_flags & fr.ERROR_FLAG)
         if message.is_error_frame:
             continue
-        assert message.is_rx == (frame["dir"] == DIR_RX)
+        assert message.is_rx == (frame["dir"] == fr.DIR_RX)
         assert message.arbitration_id == id_flags & 0x1FFF_FFFF
-        assert message.is_extended_id == bool(id_flags & EXTENDED_FLAG)
+        assert message.is_extended_id == bool(id_flags & fr.EXTENDED_FLAG)
         if fd:
-            assert message.bitrate_switch == bool(frame["fd_flags"] & FD_BRS)
-            assert message.error_state_indicator == bool(frame["fd_flags"] & FD_ESI)
+            assert message.bitrate_switch == bool(frame["fd_flags"] & fr.FD_BRS)
+            assert message.error_state_indicator == bool(frame["fd_flags"] & fr.FD_ESI)
         else:
-            assert message.is_remote_frame == bool(id_flags & REMOTE_FLAG)
+            assert message.is_remote_frame == bool(id_flags & fr.REMOTE_FLAG)
             assert message.dlc == frame["dlc"]
-        if not id_flags & REMOTE_FLAG:
+        if not id_flags & fr.REMOTE_FLAG:
             assert bytes(message.data) == bytes(frame["data"][: frame["len" if fd else "dlc"]])
 
 
@@ -131,7 +122,7 @@ def test_asc_has_no_clock_of_this_machine(tmp_path):
 
 
 def test_what_no_format_but_candump_has_is_counted(tmp_path):
-    frames = empty_frames(3)
+    frames = fr.empty_frames(3)
     frames["t_host_ns"], frames["id_flags"] = T0, [5, 6, 7]
     frames["dlc"], frames["t_device_ns"] = [11, 8, 8], [0, T0, 5]
     source = write_session(tmp_path / "run.mcap", {"can0": frames})
@@ -162,11 +153,11 @@ def test_ros_messages_hold_everything(session_of_every_kind, tmp_path):
             stamp_ns = decoded.header.stamp.sec * S + decoded.header.stamp.nanosec
             assert message.log_time == message.publish_time == stamp_ns
             flags = (
-                decoded.is_extended * EXTENDED_FLAG
-                | decoded.is_rtr * REMOTE_FLAG
-                | decoded.is_error * ERROR_FLAG
+                decoded.is_extended * fr.EXTENDED_FLAG
+                | decoded.is_rtr * fr.REMOTE_FLAG
+                | decoded.is_error * fr.ERROR_FLAG
             )
-            way = {"/can0/from_can_bus": DIR_RX, "/can0/to_can_bus": DIR_TX}[channel.topic]
+            way = {"/can0/from_can_bus": fr.DIR_RX, "/can0/to_can_bus": fr.DIR_TX}[channel.topic]
             data = bytes(decoded.data)
             found[message.sequence] = (stamp_ns, decoded.id | flags, decoded.dlc, way, data)
     assert [found[k] for k in range(len(frames))] == [
@@ -249,7 +240,7 @@ def test_stretches_make_no_difference(suffix, tmp_path, monkeypatch):
         assert times == sorted(times)
     for bus, frames in buses.items() if suffix != ".mcap" else ():
         back = imported(tmp_path / f"parts{suffix}", tmp_path, f"/can/{bus}")[1]
-        keep = (frames["id_flags"] & ERROR_FLAG) == 0
+        keep = (frames["id_flags"] & fr.ERROR_FLAG) == 0
         for name in ("id_flags", "dlc", "data", "dir"):
             assert back[name][keep].tolist() == frames[name][keep].tolist()
 
@@ -284,7 +275,7 @@ def test_a_real_trace_as_ros_messages(arcsnake, tmp_path):
     export_log(path, tmp_path / "x.mcap")
     with Session.open(tmp_path / "x.mcap") as session:
         assert session.warnings == []
-        for topic, way in (("/can0/from_can_bus", DIR_RX), ("/can0/to_can_bus", DIR_TX)):
+        for topic, way in (("/can0/from_can_bus", fr.DIR_RX), ("/can0/to_can_bus", fr.DIR_TX)):
             table, own = session.table(topic), frames[frames["dir"] == way]
             assert table.index.tolist() == own["t_host_ns"].tolist()
             assert table["id"].tolist() == own["id_flags"].tolist()

@@ -14,20 +14,8 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 
 from support.processes import process, wait_for
 from undulog.capture.common.errors import DataError
-from undulog.capture.recorder import live_feed
+from undulog.capture.recorder import live_feed, live_wire
 from undulog.capture.recorder.live_feed import LiveCounts, LiveFeed
-from undulog.capture.recorder.live_wire import (
-    MAX_DATAGRAM,
-    MAX_MESSAGE,
-    DatagramHead,
-    Kind,
-    LiveMessage,
-    pack_datagram,
-    pack_description,
-    pack_message,
-    read_head,
-    read_records,
-)
 
 EPOCH_NS = 1_735_689_600_000_000_000
 STEP_NS = 10_000_000
@@ -83,11 +71,11 @@ def received(link):
     heads, records = [], []
     while True:
         try:
-            data = link.recv(MAX_DATAGRAM)
+            data = link.recv(live_wire.MAX_DATAGRAM)
         except BlockingIOError:
             return heads, records
-        heads.append(read_head(data))
-        records += read_records(data)
+        heads.append(live_wire.read_head(data))
+        records += live_wire.read_records(data)
 
 
 def pump_until(feed, condition):
@@ -125,7 +113,7 @@ def offer(feed, number, channel=1, payload=b"data", step_ns=STEP_NS):
 
 
 def messages(records):
-    return [record for record in records if isinstance(record, LiveMessage)]
+    return [record for record in records if isinstance(record, live_wire.LiveMessage)]
 
 
 @given(
@@ -138,36 +126,38 @@ def messages(records):
     st.integers(0, 2**64 - 1),
 )
 def test_datagram_comes_back_as_it_was(fields, dropped):
-    head = DatagramHead(Kind.MESSAGES, len(fields), 7, dropped)
-    data = pack_datagram(head, map(pack_message, fields))
-    assert read_head(data) == head
-    assert read_records(data) == [LiveMessage(*one) for one in fields]
+    head = live_wire.DatagramHead(live_wire.Kind.MESSAGES, len(fields), 7, dropped)
+    data = live_wire.pack_datagram(head, map(live_wire.pack_message, fields))
+    assert live_wire.read_head(data) == head
+    assert live_wire.read_records(data) == [live_wire.LiveMessage(*one) for one in fields]
 
 
 @pytest.mark.parametrize("record", DEFINITIONS)
 def test_definition_comes_back_as_it_was(record):
-    head = DatagramHead(Kind.DEFINITIONS, 0, 7, 0)
-    data = pack_datagram(head, [pack_description(record)])
-    assert read_records(data) == [record]
+    head = live_wire.DatagramHead(live_wire.Kind.DEFINITIONS, 0, 7, 0)
+    data = live_wire.pack_datagram(head, [live_wire.pack_description(record)])
+    assert live_wire.read_records(data) == [record]
 
 
 @given(st.binary(max_size=200))
 def test_noise_is_refused_not_believed(noise):
     with pytest.raises(DataError):
-        read_head(noise)
+        live_wire.read_head(noise)
 
 
 @given(st.data())
 def test_any_cut_or_flipped_datagram_is_read_or_refused(data):
-    head = DatagramHead(Kind.DEFINITIONS, 0, 7, 0)
-    whole = pack_datagram(head, [pack_description(one) for one in DEFINITIONS[:4]])
+    head = live_wire.DatagramHead(live_wire.Kind.DEFINITIONS, 0, 7, 0)
+    whole = live_wire.pack_datagram(
+        head, [live_wire.pack_description(one) for one in DEFINITIONS[:4]]
+    )
     at = data.draw(st.integers(24, len(whole) - 1))
     if data.draw(st.booleans()):
         damaged = whole[:at]
     else:
         damaged = whole[:at] + bytes([whole[at] ^ data.draw(st.integers(1, 255))]) + whole[at + 1 :]
     with contextlib.suppress(DataError):
-        read_records(damaged)
+        live_wire.read_records(damaged)
 
 
 def test_nothing_is_kept_while_nobody_watches(make):
@@ -189,7 +179,7 @@ def test_relay_that_comes_late_gets_definitions_first_and_then_every_message(mak
     pump_until(feed, lambda: feed.connected)
     heads, records = received(link)
     assert records == DEFINITIONS
-    assert {head.kind for head in heads} == {Kind.DEFINITIONS}
+    assert {head.kind for head in heads} == {live_wire.Kind.DEFINITIONS}
     for number in range(100, 300):
         offer(feed, number)
     records = all_sent(feed, link)
@@ -277,8 +267,8 @@ def test_a_jittering_channel_at_the_highest_rate_is_not_thinned(watched):
 
 def test_a_message_beyond_a_datagram_is_left_out_and_counted(watched):
     feed, link = watched()
-    offer(feed, 0, payload=bytes(MAX_MESSAGE + 1))
-    offer(feed, 1, payload=bytes(MAX_MESSAGE))
+    offer(feed, 0, payload=bytes(live_wire.MAX_MESSAGE + 1))
+    offer(feed, 1, payload=bytes(live_wire.MAX_MESSAGE))
     offer(feed, 2)
     assert [one.sequence for one in messages(all_sent(feed, link))] == [1, 2]
     assert feed.counts.too_big == 1
@@ -320,7 +310,7 @@ def test_a_full_socket_drops_the_oldest_and_every_tick_completes(watched):
     assert numbers == sorted(numbers)
     assert numbers[-1] == 19_999
     assert len(numbers) + feed.counts.dropped == 20_000
-    assert read_head(feed._pack(Kind.END).data).dropped == feed.counts.dropped
+    assert live_wire.read_head(feed._pack(live_wire.Kind.END).data).dropped == feed.counts.dropped
 
 
 def test_a_relay_that_is_replaced_is_found_and_told_everything(watched, listen, monkeypatch):
@@ -364,7 +354,7 @@ def test_the_end_is_told(watched):
     assert not feed.connected
     heads, records = received(link)
     assert [one.sequence for one in messages(records)] == [0]
-    assert heads[-1].kind is Kind.END
+    assert heads[-1].kind is live_wire.Kind.END
     offer(feed, 1)
     feed.pump()
     assert not feed.connected

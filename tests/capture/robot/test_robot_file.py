@@ -9,19 +9,8 @@ import pytest
 from support.bus_robots import LINK
 from undulog.capture import load_robot, robot_names
 from undulog.capture.common.errors import RobotFileError, UsageError
+from undulog.capture.robot import model
 from undulog.capture.robot.description import parse_robot
-from undulog.capture.robot.model import (
-    BusPoll,
-    ClockDomain,
-    Direction,
-    OnFault,
-    Plane,
-    Quantity,
-    Safety,
-    Sensor,
-    SensorKind,
-    Servo,
-)
 from undulog.sim.gate.limits import missing_limits, safety_example
 
 MINIMAL = f"""
@@ -55,16 +44,16 @@ def test_snake25_is_the_robot_of_the_paper():
     assert len(robot.links) == 26
     assert robot.joint_names == tuple(f"joint{i:02d}" for i in range(1, 26))
     planes = [joint.plane for joint in robot.joints]
-    assert planes == [Plane.HORIZONTAL, Plane.VERTICAL] * 12 + [Plane.HORIZONTAL]
+    assert planes == [model.Plane.HORIZONTAL, model.Plane.VERTICAL] * 12 + [model.Plane.HORIZONTAL]
     lower, upper = robot.limits()
     assert set(-lower) == set(upper) == {math.pi / 6}
     (link,) = {(k.length, k.radius, k.mass, k.inertia) for k in robot.links}
     assert link == (0.06, 0.025, 0.1, (4e-5, 5e-5, 5e-5))
-    assert {joint.servo for joint in robot.joints} == {Servo()}
+    assert {joint.servo for joint in robot.joints} == {model.Servo()}
     assert robot.joints[0].servo.resistance_ohm == 4.0
     kinds = [sensor.kind for sensor in robot.sensors]
-    assert [kinds.count(kind) for kind in SensorKind] == [15, 1, 1, 1]
-    assert {s.range_max for s in robot.sensors if s.kind is SensorKind.IR} == {1.5}
+    assert [kinds.count(kind) for kind in model.SensorKind] == [15, 1, 1, 1]
+    assert {s.range_max for s in robot.sensors if s.kind is model.SensorKind.IR} == {1.5}
     axes = {s.name: "".join(s.axes) for s in robot.sensors if s.axes}
     assert axes == {"accelerometer": "xyz", "compass": "xy"}
     assert all({"link", "position"} <= set(sensor.assumed) for sensor in robot.sensors)
@@ -75,18 +64,18 @@ def test_snake25_is_the_robot_of_the_paper():
 
 def test_topics_are_those_of_the_log_contract():
     place = {"link": "link01", "position": (0, 0, 0), "rpy": (0, 0, 0)}
-    assert Sensor("ir07", SensorKind.IR, **place).topic == "/ir/07"
-    assert Sensor("sonar", SensorKind.SONAR, **place).topic == "/sonar"
-    assert Sensor("rear", SensorKind.SONAR, **place).topic == "/sonar/rear"
+    assert model.Sensor("ir07", model.SensorKind.IR, **place).topic == "/ir/07"
+    assert model.Sensor("sonar", model.SensorKind.SONAR, **place).topic == "/sonar"
+    assert model.Sensor("rear", model.SensorKind.SONAR, **place).topic == "/sonar/rear"
 
 
 def test_snake25_has_one_command_and_one_state_frame_a_servo():
     robot = load_robot("snake25")
     for name in robot.joint_names:
         own = [signal for signal in robot.bus.signals if signal.target == name]
-        kinds = {(f"{name}_command", Direction.TX), (f"{name}_state", Direction.RX)}
+        kinds = {(f"{name}_command", model.Direction.TX), (f"{name}_state", model.Direction.RX)}
         assert {(s.message, s.direction) for s in own} == kinds
-        assert {s.quantity for s in own} >= {Quantity.COMMAND, Quantity.POSITION}
+        assert {s.quantity for s in own} >= {model.Quantity.COMMAND, model.Quantity.POSITION}
     sensed = {(s.target, s.axis) for s in robot.bus.signals if not s.target.startswith("joint")}
     assert len(sensed) == 15 + 1 + 3 + 2
     database = cantools.database.load_string(robot.databases[0][1], "dbc", strict=True)
@@ -97,8 +86,8 @@ def test_snake25_has_one_command_and_one_state_frame_a_servo():
 def test_snake13_has_six_joints_a_plane():
     robot = load_robot("snake13")
     assert (len(robot.links), len(robot.joints)) == (13, 12)
-    assert [len(robot.joint_indices(plane)) for plane in Plane] == [6, 6]
-    assert robot.clock is ClockDomain.SIMULATED
+    assert [len(robot.joint_indices(plane)) for plane in model.Plane] == [6, 6]
+    assert robot.clock is model.ClockDomain.SIMULATED
 
 
 def test_arcsnake_databases_load_strictly_and_share_one_identifier():
@@ -117,7 +106,7 @@ def test_a_robot_is_whole_again_from_what_a_session_carries(name):
 def test_a_description_may_leave_out_what_has_a_default():
     robot = parse_robot(MINIMAL, "worm.toml", {})
     assert [link.name for link in robot.links] == ["link01", "link02", "link03"]
-    assert robot.joints[0].servo == Servo()
+    assert robot.joints[0].servo == model.Servo()
     assert (robot.description, robot.sensors, robot.bus, robot.assumed) == ("", (), None, ())
 
 
@@ -126,7 +115,7 @@ def test_entries_override_the_defaults():
     text = MINIMAL.replace('plane = "vertical"', f'plane = "vertical", {more}')
     robot = parse_robot(text + "[defaults.servo]\nsupply_v = 12\n", "worm.toml", {})
     assert (robot.joints[0].upper, robot.joints[1].upper) == (math.pi / 6, 1.0)
-    assert robot.joints[1].servo == Servo(supply_v=12.0, stall_torque=0.25)
+    assert robot.joints[1].servo == model.Servo(supply_v=12.0, stall_torque=0.25)
 
 
 def test_all_faults_are_listed_at_once():
@@ -201,7 +190,7 @@ def test_a_bus_map_is_read():
     robot = parse_robot(MINIMAL + BUS, "worm.toml", {"worm.dbc": DBC, "other.dbc": "?"})
     (signal,) = robot.bus.signals
     assert (signal.message, signal.signal, signal.target) == ("state", "angle", "joint01")
-    assert (signal.direction, signal.quantity) == (Direction.RX, Quantity.POSITION)
+    assert (signal.direction, signal.quantity) == (model.Direction.RX, model.Quantity.POSITION)
     assert robot.databases == (("worm.dbc", DBC),)
 
 
@@ -304,7 +293,7 @@ def test_further_fields_of_a_bus_signal(text, name, value):
 def test_shipped_snakes_can_be_armed(name):
     robot = load_robot(name)
     assert missing_limits(robot) == ()
-    assert robot.safety.on_fault is OnFault.RAMP_DOWN
+    assert robot.safety.on_fault is model.OnFault.RAMP_DOWN
     rate = robot.safety.values("max_rate", robot.joint_names)
     assert rate.tolist() == [4.0] * len(robot.joints)
 
@@ -322,7 +311,9 @@ max_current = 0.5
 """
     safety = parse_robot(MINIMAL + text, "worm.toml", {}).safety
     of = (("joint02", "max_rate", 1.0), ("joint02", "max_current", 0.5))
-    assert safety == Safety(max_rate=2.0, fault_after_s=0.1, on_fault=OnFault.HOLD, of=of)
+    assert safety == model.Safety(
+        max_rate=2.0, fault_after_s=0.1, on_fault=model.OnFault.HOLD, of=of
+    )
     names = ("joint01", "joint02")
     assert safety.values("max_rate", names).tolist() == [2.0, 1.0]
     np.testing.assert_array_equal(safety.values("max_current", names), [math.nan, 0.5])
@@ -368,7 +359,7 @@ def test_requests_stand_in_the_bus_map():
     bus = BUS.partition("signals")[0]
     good = bus + 'polls = [{ message = "ask", signals = { what = 0x92 } }]\n'
     robot = parse_robot(MINIMAL + good, "worm.toml", {"worm.dbc": dbc})
-    assert robot.bus.polls == (BusPoll("ask", (("what", 0x92),)),)
+    assert robot.bus.polls == (model.BusPoll("ask", (("what", 0x92),)),)
     valid = "valid: joint01, joint02, {joint} (did you mean joint02?)"
     bad = """
 [[bus.polls]]
