@@ -1,15 +1,12 @@
 """The commands import and log export, as the command line calls them."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
-import time
 
 import pytest
 
 import undulog
+from support.processes import UNDULOG, start, wait_for
 from undulog.capture import Session
 
 LOG = "".join(f"(100.{i:06d}) can0 {0x101 + i % 2:03X}#{i:02X}00 T\n" for i in range(10))
@@ -17,9 +14,8 @@ LOG = "".join(f"(100.{i:06d}) can0 {0x101 + i % 2:03X}#{i:02X}00 T\n" for i in r
 
 @pytest.fixture
 def trace(tmp_path):
-    path = tmp_path / "trace.log"
-    path.write_text(LOG)
-    return path
+    (tmp_path / "trace.log").write_text(LOG)
+    return tmp_path / "trace.log"
 
 
 @pytest.fixture
@@ -27,8 +23,7 @@ def cli(trace, capsys):
     """Runs a line with {log} and {dir}; returns exit code, output and errors."""
 
     def run(line):
-        words = [word.format(log=trace, dir=trace.parent) for word in line.split()]
-        code = undulog.run(words)
+        code = undulog.run([word.format(log=trace, dir=trace.parent) for word in line.split()])
         return code, *capsys.readouterr()
 
     return run
@@ -122,17 +117,14 @@ def test_help_shows_an_example(capsys):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_leaves_a_whole_file(number, tmp_path):
     trace, run = tmp_path / "trace.log", tmp_path / "run.mcap"
-    with trace.open("w") as stream:
-        for i in range(1_500_000):
-            stream.write(f"({100 + i // 1000}.{i % 1000 * 1000:06d}) can0 101#0000 T\n")
-    arguments = ["import", str(trace), "-o", str(run), "--robot", "snake25"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "undulog", *arguments], stdout=subprocess.PIPE, text=True
+    lines = (
+        f"({100 + i // 1000}.{i % 1000 * 1000:06d}) can0 101#0000 T\n" for i in range(1_500_000)
     )
+    trace.write_text("".join(lines))
+    process = start(*UNDULOG, "import", trace, "-o", run, "--robot", "snake25")
     part = tmp_path / "run.mcap.part"
-    while process.poll() is None and not (part.exists() and part.stat().st_size > 1_000_000):
-        time.sleep(0.05)
-    os.kill(process.pid, number)
+    wait_for(lambda: part.exists() and part.stat().st_size > 1_000_000, alive=[process])
+    process.send_signal(number)
     out, _ = process.communicate()
     assert process.returncode == 1
     assert "stopped on request; the file is complete up to there" in out
