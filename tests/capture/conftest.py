@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+import undulog
 from undulog.capture import SessionWriter
 from undulog.capture.log.messages import frames as fr
 from undulog.capture.sources.contract import Source, SourceContext, SourceEvent
@@ -57,6 +58,17 @@ class Heard:
     @property
     def texts(self):
         return [event.text for event in self.events]
+
+
+@pytest.fixture
+def command(capsys):
+    """Runs a command in this process to its exit code; returns output and errors."""
+
+    def run(*words, code=0):
+        assert undulog.run([str(word) for word in words]) == code
+        return capsys.readouterr()
+
+    return run
 
 
 @pytest.fixture
@@ -151,11 +163,8 @@ def same():
     """Whether two lots of frames agree in everything but times."""
 
     def compare(found, truth):
-        names = ("id_flags", "len", "fd_flags", "data")
-        if truth.dtype == fr.empty_frames(0).dtype:
-            names = ("id_flags", "dlc", "data")
-        return len(found) == len(truth) and all(
-            np.array_equal(found[name], truth[name]) for name in names
-        )
+        classic = truth.dtype == fr.empty_frames(0).dtype
+        names = ("id_flags", "dlc", "data") if classic else ("id_flags", "len", "fd_flags", "data")
+        return len(found) == len(truth) and all(np.array_equal(found[n], truth[n]) for n in names)
 
     return compare

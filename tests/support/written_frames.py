@@ -2,6 +2,7 @@
 
 from itertools import product
 
+import can
 import numpy as np
 from can.util import CAN_FD_DLC
 
@@ -51,10 +52,20 @@ def write_frames(path, topics, batch=37, **metadata):
     return path
 
 
+def frames_of(path, topic="/can/can0"):
+    with Session.open(path) as session:
+        return (session.fd_frames if "_fd/" in topic else session.frames)(topic)
+
+
 def imported(trace, folder, topic="/can/can0"):
     """Import a trace; return the report, and the frames of a topic of the session."""
-    run = folder / "back.mcap"
-    report = import_can(trace, run, load_robot("snake13"), force=True)
-    with Session.open(run) as session:
-        read = session.fd_frames if "_fd/" in topic else session.frames
-        return report, read(topic)
+    report = import_can(trace, folder / "back.mcap", load_robot("snake13"), force=True)
+    return report, frames_of(report.output, topic)
+
+
+def log_messages(path, messages, **options):
+    """Write a log by python-can's writer for its suffix."""
+    with can.Logger(str(path), **options) as writer:
+        for message in messages:
+            writer(message)
+    return path

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-import undulog
 from support.bus_robots import bus_robot
-from support.written_frames import T0, every_kind, imported, write_frames
+from support.written_frames import T0, every_kind, frames_of, imported, log_messages, write_frames
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError
 from undulog.capture.common.process import StopRequest
@@ -70,7 +69,7 @@ def test_what_is_written_is_read_the_same(data, tmp_path_factory):
 
 def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path):
     frames = every_kind(fd=True)[:5]
-    path = write_frames(tmp_path / "x.mcap", {"/can_fd/can0": frames})
+    path = write_frames(tmp_path / "x.mcap", {FD: frames})
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         ((_, channel, _, message),) = reader.iter_decoded_messages()
@@ -110,29 +109,26 @@ def test_the_kinds_are_not_mixed_up(tmp_path):
             writer.frames("/can/can0").write(T0, fr.empty_fd_frames(1))
 
 
-def test_the_check_counts_them(tmp_path, capsys):
+def test_the_check_counts_them(tmp_path, command):
     # The classic frames pause for 3 s in which CAN FD frames come: the bus isn't silent.
     classic = classic_frames(200, T0, 10_000_000)
     classic["t_host_ns"][100:] += 3 * S
     fd = every_kind(fd=True, step_ns=10_000_000)
     path = write_frames(tmp_path / "x.mcap", {"/can/can0": classic, "/can_fd/can0": fd})
     health = check_session(path)
-    assert {bus.topic: bus.frames for bus in health.buses} == {
-        "/can/can0": 200,
-        "/can_fd/can0": len(fd),
-    }
-    rate = {bus.topic: bus.rate_hz for bus in health.buses}
-    assert rate["/can_fd/can0"] == pytest.approx(100)
-    assert not [finding for finding in health.findings if "silent" in finding.sentence]
-    assert not [finding for finding in health.findings if "can't be read" in finding.sentence]
+    found = {bus.topic: (bus.frames, bus.rate_hz) for bus in health.buses}
+    assert found.keys() == {"/can/can0", FD}
+    assert (found["/can/can0"][0], found[FD]) == (200, (len(fd), pytest.approx(100)))
+    text = " ".join(finding.sentence for finding in health.findings)
+    assert "silent" not in text
+    assert "can't be read" not in text
     alone = write_frames(tmp_path / "y.mcap", {"/can/can0": classic, "/can_fd/can1": fd})
     sentences = [finding.sentence for finding in check_session(alone).findings]
     (silence,) = (sentence for sentence in sentences if "silent" in sentence)
     assert silence.startswith("/can/can0: silent for 3.01 s, at ")
-    undulog.run(["log", "info", str(path)])
-    assert f"  {len(fd)} frames\n" in capsys.readouterr().out
-    undulog.run(["log", "check", str(path)])
-    assert f"/can_fd/can0: {len(fd)} frames, 100.0 Hz, 0 error frames" in capsys.readouterr().out
+    assert f"  {len(fd)} frames\n" in command("log", "info", path).out
+    checked = command("log", "check", path).out
+    assert f"/can_fd/can0: {len(fd)} frames, 100.0 Hz, 0 error frames" in checked
 
 
 # -- other tools ---------------------------------------------------------------------------
@@ -179,18 +175,12 @@ def some_messages(channel=0):
 @pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".asc.gz"])
 def test_logs_of_python_can(suffix, tmp_path):
     messages = some_messages()
-    source = tmp_path / f"log{suffix}"
-    with can.Logger(str(source)) as writer:
-        for message in messages:
-            writer(message)
+    source = log_messages(tmp_path / f"log{suffix}", messages)
     report, frames = imported(source, tmp_path, FD)
     fd = [message for message in messages if message.is_fd]
-    assert (report.frames, report.problems) == (
-        len(messages),
-        ["nothing decoded: the robot snake13 has no bus map"],
-    )
-    with Session.open(tmp_path / "back.mcap") as session:
-        assert len(session.frames("/can/can0")) == len(messages) - len(fd)
+    assert report.frames == len(messages)
+    assert report.problems == ["nothing decoded: the robot snake13 has no bus map"]
+    assert len(frames_of(report.output)) == len(messages) - len(fd)
     start_ns = T0 - RELATIVE_EPOCH_NS if ".asc" in suffix else 0
     expected = records_of(fd)
     expected["t_host_ns"] -= np.uint64(start_ns)
@@ -213,17 +203,14 @@ def records_of(messages):
 def test_an_mf4_of_python_can(tmp_path):
     pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
     messages = some_messages()
-    with can.MF4Writer(tmp_path / "x.mf4") as writer:
-        for message in messages:
-            writer(message)
+    log_messages(tmp_path / "x.mf4", messages)
     report, frames = imported(tmp_path / "x.mf4", tmp_path, FD)
     fd = [message for message in messages if message.is_fd]
     assert report.frames == len(messages)
     same(frames, records_of(fd), [name for name in FIELDS if name != "t_host_ns"])
     truth_ns = [round(message.timestamp * 1e6) * 1000 for message in fd]
     assert np.abs(frames["t_host_ns"].astype(np.int64) - truth_ns).max() <= 1000
-    with Session.open(tmp_path / "back.mcap") as session:
-        classic = session.frames("/can/can0")
+    classic = frames_of(report.output)
     others = [message for message in messages if not message.is_fd]
     assert classic["dlc"].tolist() == [message.dlc for message in others]
     assert [bytes(f["data"][: f["dlc"]]) for f in classic] == [bytes(m.data) for m in others]
@@ -254,11 +241,10 @@ def test_a_trc_of_version_2(tmp_path):
 
 
 def test_a_csv_shows_can_fd_by_the_length_alone(tmp_path):
-    with can.Logger(str(tmp_path / "x.csv")) as writer:
-        for message in some_messages():
-            writer(message)
+    messages = some_messages()
+    log_messages(tmp_path / "x.csv", messages)
     report, frames = imported(tmp_path / "x.csv", tmp_path, FD)
-    long = [message for message in some_messages() if len(message.data) > 8]
+    long = [message for message in messages if len(message.data) > 8]
     assert report.problems[0] == (
         f"{len(long)} frames of more than 8 bytes are CAN FD frames; the log does not mark them, "
         "and shorter ones count as classic"
@@ -356,14 +342,12 @@ def test_import_decodes_both_kinds(tmp_path):
 
 
 def test_a_frame_too_short_for_its_signal_is_reported(tmp_path):
-    (tmp_path / "x.log").write_text(
-        "(1.000000) can0 100##1" + "00" * 48 + " R\n(1.000100) can0 100#" + "00" * 8 + " R\n"
-    )
+    lines = ("(1.000000) can0 100##1" + "00" * 48, "(1.000100) can0 100#" + "00" * 8)
+    (tmp_path / "x.log").write_text("".join(f"{line} R\n" for line in lines))
     robot = bus_robot(BIG, SIGNALS)
     report = import_can(tmp_path / "x.log", tmp_path / "run.mcap", robot)
-    assert report.problems == [
-        "3 values missing from frames too short for them: big.angle (2), big.torque (1)"
-    ]
+    short = "3 values missing from frames too short for them: big.angle (2), big.torque (1)"
+    assert report.problems == [short]
 
 
 # -- recording -----------------------------------------------------------------------------
@@ -374,24 +358,13 @@ def test_a_recording_keeps_and_decodes_both_kinds(tmp_path):
     robot = bus_robot(BIG, SIGNALS)
     output, clock, count = tmp_path / "run.mcap", SessionClock(), 300
     bus = can.Bus(interface="virtual", channel="fd", ignore_config=True, preserve_timestamps=True)
-    messages = []
+    messages, plain = [], {"is_extended_id": False}
     for i in range(count):
-        angle = {"angle": i * 0.5, "torque": i * 0.01}
-        messages += [
-            can.Message(
-                arbitration_id=257,
-                is_extended_id=False,
-                is_rx=False,
-                data=database.encode_message("small", {"target": -i * 0.25}),
-            ),
-            can.Message(
-                arbitration_id=256,
-                is_extended_id=False,
-                is_fd=True,
-                bitrate_switch=True,
-                data=database.encode_message("big", angle),
-            ),
-        ]
+        target = database.encode_message("small", {"target": -i * 0.25})
+        state = database.encode_message("big", {"angle": i * 0.5, "torque": i * 0.01})
+        fast = {"is_fd": True, "bitrate_switch": True}
+        messages.append(can.Message(arbitration_id=257, is_rx=False, data=target, **plain))
+        messages.append(can.Message(arbitration_id=256, data=state, **fast, **plain))
 
     def send():
         begun = time.monotonic()
@@ -399,6 +372,10 @@ def test_a_recording_keeps_and_decodes_both_kinds(tmp_path):
             message.timestamp = 1000 + round(time.monotonic() - begun, 6)
             bus.send(message)
             time.sleep(0.0005)
+
+    def end():
+        if source.counts.frames >= 2 * count:
+            recorder.ending = Ending("all came")
 
     source = open_source(parse_address("front=can:virtual:fd?device_time=1&preserve_timestamps=1"))
     with SessionWriter(output, session_id="s", epoch_ns=clock.epoch_ns, robot=robot) as writer:
@@ -409,13 +386,7 @@ def test_a_recording_keeps_and_decodes_both_kinds(tmp_path):
             context=SourceContext(clock.now_ns, writer),
             robot=robot,
             decoded="front",
-            each_tick=[
-                lambda: setattr(
-                    recorder,
-                    "ending",
-                    Ending("all came") if source.counts.frames >= 2 * count else None,
-                )
-            ],
+            each_tick=[end],
         )
         sender = threading.Thread(target=send)
         recorder.on_event(lambda *event: "connected" in event[3] and sender.start())

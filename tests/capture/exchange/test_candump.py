@@ -61,20 +61,13 @@ def test_frames_of_every_kind(tmp_path):
     frames = block.classic()
     assert log.buses == ["can0", "can1"]
     assert block.bus.tolist() == [0, 1, 0, 0, 0]
-    assert frames["t_host_ns"].tolist() == [
-        *(1717639553_000022000 + 1000 * i for i in range(4)),
-        1717639553_000026123,
-    ]
+    times_ns = [1717639553_000022000 + 1000 * i for i in range(4)]
+    assert frames["t_host_ns"].tolist() == [*times_ns, 1717639553_000026123]
     assert not frames["t_device_ns"].any()
-    assert frames["id_flags"].tolist() == [
-        0x14B,
-        0x18FEF100 | fr.EXTENDED_FLAG,
-        0x7FF | fr.REMOTE_FLAG,
-        0x80 | fr.ERROR_FLAG,
-        1,
-    ]
+    extended, remote = 0x18FEF100 | fr.EXTENDED_FLAG, 0x7FF | fr.REMOTE_FLAG
+    assert frames["id_flags"].tolist() == [0x14B, extended, remote, 0x80 | fr.ERROR_FLAG, 1]
     assert frames["dlc"].tolist() == [2, 8, 4, 8, 0]
-    assert frames["dir"].tolist() == [fr.DIR_TX, fr.DIR_RX, fr.DIR_RX, fr.DIR_RX, fr.DIR_RX]
+    assert frames["dir"].tolist() == [fr.DIR_TX, *[fr.DIR_RX] * 4]
     assert frames["data"][0].tolist() == [0x9B, 1, 0, 0, 0, 0, 0, 0]
     assert log.problems == ["1 frames without a direction, unlike the first one"]
 
@@ -98,17 +91,11 @@ def test_a_cut_last_line_is_reported(tmp_path):
     assert log.problems == ["the last line is cut short and left out: '(1.000001) can0 001#0'"]
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "(1.0) can0 1##1000",
-        "(1.0) can0 001##",
-        "(1.0) can0 1234#00",
-        "nonsense",
-        "(1.0) can0 123#0G",
-        "(x) c 1#",
-    ],
-)
+LINES = ("1##1000", "001##", "1234#00", "123#0G")
+WRONG = [*(f"(1.0) can0 {line}" for line in LINES), "nonsense", "(x) c 1#"]
+
+
+@pytest.mark.parametrize("line", WRONG)
 def test_a_wrong_line_is_named(line, tmp_path):
     text = f"(1.000000) can0 001#00\n\n{line}\n(1.000000) can0 001#00\n"
     with pytest.raises(ImportFormatError, match=r"x\.log: line 3 is no candump line: "):
