@@ -12,9 +12,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-import undulog
 from support.paths import TRACE as RECORDING
-from support.written_frames import T0, every_kind, imported, write_frames
+from support.written_frames import T0, every_kind, frames_of, imported, write_frames
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.common.process import StopRequest
@@ -129,11 +128,10 @@ def test_what_no_format_but_candump_has_is_counted(tmp_path):
     device = "1 frame loses its device time"
     assert export_log(source, tmp_path / "x.log").warnings == [device]
     assert " can0 005#0000000000000000_B R\n" in (tmp_path / "x.log").read_text()
-    report = export_log(source, tmp_path / "x.blf")
-    assert report.warnings == [device]
+    assert export_log(source, tmp_path / "x.blf").warnings == [device]
     assert imported(tmp_path / "x.blf", tmp_path)[1]["dlc"].tolist() == [11, 8, 8]
-    report = export_log(source, tmp_path / "x.asc")
-    assert report.warnings == ["1 data frame loses its length code", device]
+    code = "1 data frame loses its length code"
+    assert export_log(source, tmp_path / "x.asc").warnings == [code, device]
 
 
 # -- ROS 2 ---------------------------------------------------------------------------------
@@ -152,18 +150,13 @@ def test_ros_messages_hold_everything(session_of_every_kind, tmp_path):
             assert decoded.header.frame_id == "can0"
             stamp_ns = decoded.header.stamp.sec * S + decoded.header.stamp.nanosec
             assert message.log_time == message.publish_time == stamp_ns
-            flags = (
-                decoded.is_extended * fr.EXTENDED_FLAG
-                | decoded.is_rtr * fr.REMOTE_FLAG
-                | decoded.is_error * fr.ERROR_FLAG
-            )
             way = {"/can0/from_can_bus": fr.DIR_RX, "/can0/to_can_bus": fr.DIR_TX}[channel.topic]
-            data = bytes(decoded.data)
-            found[message.sequence] = (stamp_ns, decoded.id | flags, decoded.dlc, way, data)
-    assert [found[k] for k in range(len(frames))] == [
-        (int(f["t_host_ns"]), int(f["id_flags"]), int(f["dlc"]), int(f["dir"]), bytes(f["data"]))
-        for f in frames
-    ]
+            flags = decoded.is_extended * fr.EXTENDED_FLAG | decoded.is_rtr * fr.REMOTE_FLAG
+            flags |= decoded.id | decoded.is_error * fr.ERROR_FLAG
+            found[message.sequence] = (stamp_ns, flags, decoded.dlc, way, bytes(decoded.data))
+    columns = [frames[name].tolist() for name in ("t_host_ns", "id_flags", "dlc", "dir")]
+    truth = zip(*columns, map(bytes, frames["data"]), strict=True)
+    assert found == dict(enumerate(truth))
 
 
 def test_rosbags_reads_them(session_of_every_kind, tmp_path):
@@ -173,13 +166,10 @@ def test_rosbags_reads_them(session_of_every_kind, tmp_path):
     full = get_typestore(Stores.ROS2_HUMBLE)
     full.register(get_types_from_msg(CAN_MSGS_FRAME, "can_msgs/msg/Frame"))
     with AnyReader([tmp_path / "x.mcap"], default_typestore=store) as reader:
-        messages = [
-            (t, full.deserialize_cdr(data, connection.msgtype))
-            for connection, t, data in reader.messages()
-        ]
-    assert [t for t, _ in messages] == frames["t_host_ns"].tolist()
-    assert [m.id for _, m in messages] == (frames["id_flags"] & 0x1FFF_FFFF).tolist()
-    assert [bytes(m.data) for _, m in messages] == [bytes(row) for row in frames["data"]]
+        read = [(t, full.deserialize_cdr(data, c.msgtype)) for c, t, data in reader.messages()]
+    found = [(t, message.id, bytes(message.data)) for t, message in read]
+    columns = (frames["t_host_ns"], frames["id_flags"] & 0x1FFF_FFFF, map(bytes, frames["data"]))
+    assert found == list(zip(*columns, strict=True))
 
 
 def test_names_that_a_format_has_not_are_reported(tmp_path):
@@ -187,12 +177,11 @@ def test_names_that_a_format_has_not_are_reported(tmp_path):
     buses = {"can3": frames, "left-arm": frames, "0": frames}
     source = write_session(tmp_path / "run.mcap", buses)
     report = export_log(source, tmp_path / "x.mcap")
-    assert report.warnings == [
-        "topics can't be named after bus 0: its are in /can_0",
-        "topics can't be named after bus left-arm: its are in /left_arm",
-    ]
-    report = export_log(source, tmp_path / "x.asc", bus="left-arm")
-    assert "it has no names: bus left-arm is channel 1" in report.warnings
+    names = {"0": "/can_0", "left-arm": "/left_arm"}
+    lost = [f"topics can't be named after bus {b}: its are in {name}" for b, name in names.items()]
+    assert report.warnings == lost
+    warnings = export_log(source, tmp_path / "x.asc", bus="left-arm").warnings
+    assert "it has no names: bus left-arm is channel 1" in warnings
     assert channel_numbers(["can3", "left-arm", "0", "can0", "can01"]) == [3, 1, 2, 0, 4]
 
 
@@ -202,17 +191,16 @@ def test_names_that_a_format_has_not_are_reported(tmp_path):
 def test_directions_that_are_none_are_reported(suffix, words, tmp_path):
     facts = {"import.directions": "none"}
     source = write_session(tmp_path / "run.mcap", {"can0": every_kind()[:20]}, **facts)
-    report = export_log(source, tmp_path / f"x{suffix}")
-    assert f"no directions were recorded: all frames are {words}" in report.warnings
+    warnings = export_log(source, tmp_path / f"x{suffix}").warnings
+    assert f"no directions were recorded: all frames are {words}" in warnings
 
 
 def test_a_trace_without_a_date(tmp_path):
     frames = every_kind(start_ns=100 * S)
     source = write_session(tmp_path / "run.mcap", {"can0": frames})
     report = export_log(source, tmp_path / "x.blf")
-    assert report.warnings[0] == (
-        "its dates begin in 1990: the times are those since 1970, without a date"
-    )
+    note = "its dates begin in 1990: the times are those since 1970, without a date"
+    assert report.warnings[0] == note
     back = imported(tmp_path / "x.blf", tmp_path)[1]["t_host_ns"] - RELATIVE_EPOCH_NS
     assert back.tolist() == frames["t_host_ns"].tolist()
 
@@ -254,8 +242,7 @@ def arcsnake(tmp_path_factory):
         pytest.skip(f"the ArcSnake recording is not at {RECORDING}")
     path = tmp_path_factory.mktemp("arcsnake") / "run.mcap"
     import_can(RECORDING, path, load_robot("arcsnake-joint"))
-    with Session.open(path) as session:
-        return path, session.frames("/can/can0")
+    return path, frames_of(path)
 
 
 @pytest.mark.parametrize("suffix", [".blf", ".asc"])
@@ -287,22 +274,16 @@ def test_a_real_trace_as_ros_messages(arcsnake, tmp_path):
 # -- the command ------------------------------------------------------------------------------
 
 
-def test_the_verb_says_what_is_lost(session_of_every_kind, tmp_path, capsys):
-    source, frames = session_of_every_kind
-    output = tmp_path / "x.blf"
-    assert undulog.run(["log", "export", str(source), "-o", str(output)]) == 0
-    assert capsys.readouterr().out.splitlines() == [
-        f"{output}: {len(frames)} frames of can0, in the format of Vector BLF",
-        "  warning: 18 error frames lose their direction",
-    ]
-    arguments = ["log", "export", str(source), "-o", str(output), "--force", "--json"]
-    assert undulog.run(arguments) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert report["warnings"] == ["18 error frames lose their direction"]
-    assert report["buses"] == {"can0": len(frames)}
-    arguments = ["log", "export", str(source), "-o", str(output), "--force", "--topics", "/x"]
-    assert undulog.run(arguments) == 2
-    assert "--topics is for tables; a .blf file has CAN frames" in capsys.readouterr().err
+def test_the_verb_lists_what_is_lost(session_of_every_kind, tmp_path, command):
+    (source, frames), output = session_of_every_kind, tmp_path / "x.blf"
+    export = ("log", "export", source, "-o", output)
+    loss = "18 error frames lose their direction"
+    done = f"{output}: {len(frames)} frames of can0, in the format of Vector BLF"
+    assert command(*export).out == f"{done}\n  warning: {loss}\n"
+    report = json.loads(command(*export, "--force", "--json").out)
+    assert (report["warnings"], report["buses"]) == ([loss], {"can0": len(frames)})
+    refused = command(*export, "--force", "--topics", "/x", code=2).err
+    assert "--topics is for tables; a .blf file has CAN frames" in refused
 
 
 EXPORTS = [
