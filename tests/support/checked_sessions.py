@@ -1,7 +1,5 @@
 """A clean session, and faults planted in it, for the tests of `undulog log check`."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from support.foreign_logs import foreign_log
@@ -15,41 +13,35 @@ ROBOT = load_robot("snake25")
 NAMES = ROBOT.joint_names
 TICKS = 2000
 JOINT_STATE = "sensor_msgs/msg/JointState"
-Edit = Callable[[int, np.ndarray, np.ndarray], int | None]
-"""Tick, command and measured angles (edited in place) to stamp; None leaves the state out."""
 
 
 def gait(tick):
     return 0.4 * np.sin(np.pi * tick / 100 - 0.5 * np.arange(len(NAMES)))
 
 
-def write(path, edit=None, verdict=None):
-    """Write 20 s of 25 joints at 100 Hz, with a fault planted by ``edit``."""
+def write(path, edit=None, verdict=None, *, lost=lambda tick: False):
+    """Write 20 s of 25 joints at 100 Hz; some states are lost.
+
+    ``edit`` plants faults: it gets tick, command and measured angles [rad], changes them in place,
+    and may return another stamp [ns].
+    """
     noise = np.random.default_rng(3).normal(0.0, 1e-3, (TICKS, len(NAMES)))
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
         commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
         states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True)
         for tick in range(TICKS):
             command, angles = gait(tick), gait(tick - 5) + noise[tick]
-            log_ns = EPOCH_NS + tick * STEP_NS
-            t_ns = log_ns
-            if edit is not None:
-                t_ns = edit(tick, command, angles)
-            commands.write(log_ns, command)
-            if t_ns is not None:
-                states.write(t_ns, angles, command, log_time_ns=log_ns)
+            stamp_ns = edit and edit(tick, command, angles)
+            commands.write(at(tick), command)
+            if not lost(tick):
+                states.write(stamp_ns or at(tick), angles, command, log_time_ns=at(tick))
         if verdict is not None:
-            writer.set_verdict(verdict, ["so said the recorder"])
+            writer.set_verdict(verdict, ["as the recorder had it"])
     return path
 
 
 def at(tick):
     return EPOCH_NS + tick * STEP_NS
-
-
-def without(is_lost):
-    """Leave out the states of some ticks."""
-    return lambda tick, command, angles: None if is_lost(tick) else at(tick)
 
 
 def timing_of(health, topic="/joint_states"):

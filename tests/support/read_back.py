@@ -24,6 +24,14 @@ def messages_of(path, **options):
         return list(make_reader(stream, validate_crcs=True).iter_messages(**options))
 
 
+def rows_of(path):
+    """All messages of one file as :func:`read` has them, by mcap's reader."""
+    return [
+        (channel.topic, m.sequence, m.log_time, m.publish_time, m.data)
+        for _, channel, m in messages_of(path)
+    ]
+
+
 def summary_of(path):
     with path.open("rb") as stream:
         return make_reader(stream).get_summary()

@@ -70,31 +70,33 @@ def test_of_many_recorders_that_find_a_stale_socket_one_gets_it(tmp_path):
             for racer in racers:
                 racer.stdin.write("go\n")
                 racer.stdin.flush()
-            said = [racer.stdout.readline() for racer in racers]
-            assert said.count("ready\n") == 1
-            assert sum("another recorder listens" in line for line in said) == 5
+            lines = [racer.stdout.readline() for racer in racers]
+            assert lines.count("ready\n") == 1
+            assert sum("another recorder listens" in line for line in lines) == 5
             with control_client.ControlClient(path) as client:
                 assert client.ask({"do": "x"}) == {}
         path.unlink()
 
 
-@pytest.mark.parametrize("kind", ["file", "folder", "link"])
+MAKERS = {
+    "file": lambda path: path.write_text("data"),
+    "folder": Path.mkdir,
+    "link": lambda path: path.symlink_to(path.with_name("precious")),
+}
+
+
+@pytest.mark.parametrize("kind", MAKERS)
 def test_what_is_no_socket_is_left_alone(tmp_path, kind):
     path = tmp_path / "c.sock"
     (tmp_path / "precious").write_text("data")
-    if kind == "file":
-        path.write_text("data")
-    elif kind == "folder":
-        path.mkdir()
-    else:
-        path.symlink_to(tmp_path / "precious")
+    MAKERS[kind](path)
     with pytest.raises(ControlError, match="no socket"):
         ControlServer(path, echo)
     assert os.path.lexists(path)
     assert (tmp_path / "precious").read_text() == "data"
 
 
-def test_an_impossible_path_is_told(tmp_path):
+def test_an_impossible_path_is_reported(tmp_path):
     with pytest.raises(ControlError, match="at most 107 bytes"):
         ControlServer(tmp_path / ("x" * 120), echo)
     with pytest.raises(ControlError, match="No such file"):

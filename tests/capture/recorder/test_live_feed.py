@@ -69,13 +69,12 @@ def make(path):
 def received(link):
     """What lies in the socket: heads, and records in order."""
     heads, records = [], []
-    while True:
-        try:
+    with contextlib.suppress(BlockingIOError):
+        while True:
             data = link.recv(live_wire.MAX_DATAGRAM)
-        except BlockingIOError:
-            return heads, records
-        heads.append(live_wire.read_head(data))
-        records += live_wire.read_records(data)
+            heads.append(live_wire.read_head(data))
+            records += live_wire.read_records(data)
+    return heads, records
 
 
 def pump_until(feed, condition):
@@ -116,15 +115,11 @@ def messages(records):
     return [record for record in records if isinstance(record, live_wire.LiveMessage)]
 
 
-@given(
-    st.lists(
-        st.tuples(
-            *(st.integers(0, 2**n - 1) for n in (16, 32, 64, 64, 64)), st.binary(max_size=300)
-        ),
-        max_size=20,
-    ),
-    st.integers(0, 2**64 - 1),
-)
+NUMBERS = (st.integers(0, 2**n - 1) for n in (16, 32, 64, 64, 64))
+FIELDS = st.lists(st.tuples(*NUMBERS, st.binary(max_size=300)), max_size=20)
+
+
+@given(FIELDS, st.integers(0, 2**64 - 1))
 def test_datagram_comes_back_as_it_was(fields, dropped):
     head = live_wire.DatagramHead(live_wire.Kind.MESSAGES, len(fields), 7, dropped)
     data = live_wire.pack_datagram(head, map(live_wire.pack_message, fields))
@@ -148,14 +143,11 @@ def test_noise_is_refused_not_believed(noise):
 @given(st.data())
 def test_any_cut_or_flipped_datagram_is_read_or_refused(data):
     head = live_wire.DatagramHead(live_wire.Kind.DEFINITIONS, 0, 7, 0)
-    whole = live_wire.pack_datagram(
-        head, [live_wire.pack_description(one) for one in DEFINITIONS[:4]]
-    )
+    whole = live_wire.pack_datagram(head, map(live_wire.pack_description, DEFINITIONS[:4]))
     at = data.draw(st.integers(24, len(whole) - 1))
+    damaged = whole[:at]
     if data.draw(st.booleans()):
-        damaged = whole[:at]
-    else:
-        damaged = whole[:at] + bytes([whole[at] ^ data.draw(st.integers(1, 255))]) + whole[at + 1 :]
+        damaged += bytes([whole[at] ^ data.draw(st.integers(1, 255))]) + whole[at + 1 :]
     with contextlib.suppress(DataError):
         live_wire.read_records(damaged)
 
@@ -213,15 +205,15 @@ def test_definitions_are_repeated(make, listen, monkeypatch):
     feed, link = make(), listen()
     seen = []
 
-    def told_thrice():
+    def defined_thrice():
         seen.extend(received(link)[1])
         return seen.count(STATES) >= 3
 
-    pump_until(feed, told_thrice)
+    pump_until(feed, defined_thrice)
     assert feed.counts.connections == 1
 
 
-def test_a_state_that_holds_is_told_to_a_relay_that_comes_later(make, listen):
+def test_a_state_that_holds_is_sent_to_a_relay_that_comes_later(make, listen):
     feed = make()
     schema = Schema(id=7, name="std_msgs/msg/String", encoding="ros2msg", data=b"string data")
     mode = Channel(id=7, topic="/gait/mode", message_encoding="cdr", metadata={}, schema_id=7)
@@ -234,7 +226,7 @@ def test_a_state_that_holds_is_told_to_a_relay_that_comes_later(make, listen):
     _, records = received(link)
     assert records[:-1] == [*DEFINITIONS, schema, mode]
     assert records[-1].payload == b"mode 2"
-    assert feed.counts.sent == 0  # as a message: it was told, like the definitions
+    assert feed.counts.sent == 0  # as a message: it was sent like the definitions
 
 
 def test_raw_frames_are_not_sent(watched):
@@ -313,18 +305,18 @@ def test_a_full_socket_drops_the_oldest_and_every_tick_completes(watched):
     assert live_wire.read_head(feed._pack(live_wire.Kind.END).data).dropped == feed.counts.dropped
 
 
-def test_a_relay_that_is_replaced_is_found_and_told_everything(watched, listen, monkeypatch):
+def test_a_relay_that_is_replaced_is_found_and_gets_everything(watched, listen, monkeypatch):
     monkeypatch.setattr(live_feed, "RENEW_NS", 50_000_000)
     feed, first = watched()
     second = listen()  # the first is still there, bound to nothing any more
     seen = []
 
-    def told():
+    def known():
         offer(feed, feed.counts.sent)
         seen.extend(received(second)[1])
         return ROBOT in seen and bool(messages(seen))
 
-    pump_until(feed, told)
+    pump_until(feed, known)
     first.close()
 
 
@@ -345,7 +337,7 @@ def test_a_relay_that_goes_and_comes_again_is_found(watched, listen, monkeypatch
     assert feed.counts.connections == 2
 
 
-def test_the_end_is_told(watched):
+def test_the_end_is_sent(watched):
     feed, link = watched()
     offer(feed, 0)
     feed.close()

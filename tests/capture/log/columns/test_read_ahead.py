@@ -1,7 +1,6 @@
 """Reading with several threads: the same as with one, in order, bounded, and nothing left."""
 
 import json
-import subprocess
 import sys
 import threading
 
@@ -11,6 +10,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
+from support.processes import python
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import UsageError
 from undulog.capture.log.columns import blocks as arenas
@@ -33,9 +33,8 @@ def values_of(ticks):
 def write_session(path, ticks, sink=None):
     """Joints and the frames of a bus; the writer is left open where it has a sink."""
     writer = SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, sink=sink)
-    channels = [
-        writer.joint_state(topic, NAMES, unit="1", velocity=True, effort=True) for topic in TOPICS
-    ]
+    options = {"unit": "1", "velocity": True, "effort": True}
+    channels = [writer.joint_state(topic, NAMES, **options) for topic in TOPICS]
     note = writer.string("/gait/mode")
     for tick, values in enumerate(values_of(ticks)):
         t_ns = EPOCH_NS + tick * STEP_NS
@@ -118,8 +117,8 @@ def test_damaged_chunks_cost_their_own_messages_with_any_number_of_threads(tmp_p
         data[(block.start + block.stop) // 2] ^= 0x55
     path.write_bytes(data)
     found, warnings = signals(path, 1)
-    told = [f"the chunk at byte {block.start} can't be decompressed" for block in harmed]
-    assert all(any(text in warning for warning in warnings) for text in told)
+    texts = [f"the chunk at byte {block.start} can't be decompressed" for block in harmed]
+    assert all(any(text in warning for warning in warnings) for text in texts)
     assert len(warnings) == len(harmed)
     expected = dict(zip(found, truth(10_000)[1], strict=True))
     for key, each in found.items():
@@ -164,11 +163,11 @@ def test_what_only_the_write_ahead_log_has_comes_last(tmp_path, threads):
     try:
         with Session(path, threads=threads) as session:
             assert any("write-ahead log" in text for text in session.warnings)
-            told = session.table("/gait/mode")  # all have the same stamp: as they lie in the file
+            modes = session.table("/gait/mode")  # all have the same stamp: as they lie in the file
         check(path, threads, 1500)
     finally:
         writer.close()
-    assert told["data"].tolist() == [f"{tick:06d}" for tick in range(1500)]
+    assert modes["data"].tolist() == [f"{tick:06d}" for tick in range(1500)]
 
 
 @pytest.mark.usefixtures("small_arenas")
@@ -265,10 +264,5 @@ def test_beyond_the_arrays_and_the_file_a_reader_needs_little(tmp_path, threads)
     path = tmp_path / "s.mcap"
     write_session(path, 150_000)  # some 200 MB of arrays
     wanted = json.dumps(dict.fromkeys(TOPICS, FIELDS))
-    told = subprocess.run(
-        [sys.executable, "-c", MEASURE, path, str(threads), wanted, str(EPOCH_NS + 10**9)],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    assert int(told.stdout) <= 64 * MIB
+    done = python(MEASURE, path, threads, wanted, EPOCH_NS + 10**9)
+    assert int(done.stdout) <= 64 * MIB, done.stderr

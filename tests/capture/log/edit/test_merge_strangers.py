@@ -3,7 +3,6 @@
 import pytest
 from hostile_logs import EPOCH_NS, NS, HostileLog, joint_state
 
-import undulog
 from support.read_back import messages_of
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.common.errors import UsageError
@@ -27,19 +26,18 @@ def session(path, robot):
     return path
 
 
-def test_logs_two_months_apart_are_merged_on_request(tmp_path, capsys):
+def test_logs_two_months_apart_are_merged_on_request(tmp_path, command):
     early = bag(tmp_path / "early.mcap", ["a", "b"])
     late = bag(tmp_path / "late.mcap", ["a", "b"], EPOCH_NS + 62 * DAY)
     out = tmp_path / "out.mcap"
-    command = ["log", "merge", str(late), str(early), "-o", str(out)]
-    assert undulog.run(command) == 2
-    said = capsys.readouterr().err
-    assert "late.mcap begins 62.0 days after" in said
-    assert "--apart" in said
+    merge = ("log", "merge", late, early, "-o", out)
+    refused = command(*merge, code=2).err
+    assert "late.mcap begins 62.0 days after" in refused
+    assert "--apart" in refused
     assert not out.exists()
-    assert undulog.run([*command, "--apart"]) == 0
-    assert "warning: " in (said := capsys.readouterr().out)
-    assert "62.0 days" in said
+    report = command(*merge, "--apart").out
+    assert "warning: " in report
+    assert "62.0 days" in report
     assert len(messages_of(out)) == 22
 
 
@@ -47,8 +45,8 @@ def test_an_hour_between_logs_is_warned_of_and_a_second_is_not(tmp_path):
     one = bag(tmp_path / "one.mcap", ["a"])
     hour = bag(tmp_path / "hour.mcap", ["a"], EPOCH_NS + 2 * 3600 * NS)
     near = bag(tmp_path / "near.mcap", ["a"], EPOCH_NS + 2 * NS)
-    (said,) = merge_logs([one, hour], tmp_path / "far.mcap").warnings
-    assert "hour.mcap begins 2.0 h after" in said
+    (warning,) = merge_logs([one, hour], tmp_path / "far.mcap").warnings
+    assert "hour.mcap begins 2.0 h after" in warning
     assert merge_logs([one, near], tmp_path / "both.mcap").warnings == []
     late = bag(tmp_path / "late.mcap", ["a"], EPOCH_NS + 3 * DAY)
     log = HostileLog()  # that bridges the time between the two

@@ -7,17 +7,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType
 
-import undulog
-from support.checked_sessions import (
-    EPOCH_NS,
-    NAMES,
-    ROBOT,
-    TICKS,
-    at,
-    gait,
-    timing_of,
-    write_raw,
-)
+from support.checked_sessions import EPOCH_NS, NAMES, ROBOT, TICKS, at, gait, timing_of, write_raw
 from support.read_back import chunks_of
 from support.written_sessions import joint_state, write_foreign
 from undulog.capture import SessionWriter
@@ -44,12 +34,12 @@ def test_a_flipped_bit_is_found_and_bad(clean, tmp_path, part):
     health = changed(tmp_path / "s.mcap", clean, lambda data: flip(data, at_byte))
     assert health.verdict == "bad"
     assert health.file.checked == health.file.chunks - 1
-    assert len(health.file.damage) == 1
-    assert "the chunk at byte" in health.file.damage[0]
+    (fault,) = health.file.damage
+    assert "the chunk at byte" in fault
     left = timing_of(health).count
     assert 0 < left < TICKS
-    held = re.search(r"; it held (\d+) messages: (\d+) of /joint_states$", health.file.damage[0])
-    assert held is not None  # the index tells it, whatever is around it in the file
+    held = re.search(r"; it held (\d+) messages: (\d+) of /joint_states$", fault)
+    assert held is not None  # the index has it, whatever is around it in the file
     assert int(held[1]) == int(held[2]) == TICKS - left
     assert timing_of(health, "/joint_commands").count == TICKS
 
@@ -89,9 +79,8 @@ def test_a_summary_that_counts_more_than_there_is_is_found(tmp_path):
     at_count = data.index(counts) + 2
     data[at_count : at_count + 8] = struct.pack("<Q", 107)
     path.write_bytes(data)
-    assert check_session(path).file.damage == (
-        "the summary counts 107 messages of /joint_commands, 100 are in the file",
-    )
+    fault = "the summary counts 107 messages of /joint_commands, 100 are in the file"
+    assert check_session(path).file.damage == (fault,)
 
 
 def test_a_flipped_bit_in_an_attachment_is_found(clean, tmp_path):
@@ -101,11 +90,10 @@ def test_a_flipped_bit_in_an_attachment_is_found(clean, tmp_path):
     assert "the attachment" in health.file.damage[0]
 
 
-def test_a_cut_file_is_degraded_and_says_what_is_left(clean, tmp_path):
+def test_a_cut_file_is_degraded_with_what_is_left(clean, tmp_path):
     chunk = chunks_of(clean, "/joint_states")[0]
-    (tmp_path / "s.mcap").write_bytes(
-        clean.read_bytes()[: chunk.chunk_start_offset + chunk.chunk_length // 2]
-    )
+    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
+    (tmp_path / "s.mcap").write_bytes(clean.read_bytes()[:middle])
     health = check_session(tmp_path / "s.mcap")
     assert health.file.truncated
     assert health.verdict == "degraded"
@@ -116,13 +104,12 @@ def test_a_cut_file_is_degraded_and_says_what_is_left(clean, tmp_path):
 def test_a_file_without_index_is_degraded(tmp_path):
     path = write_raw(tmp_path / "s.mcap", list(range(300)), use_chunking=False)
     health = check_session(path)
-    assert not health.file.truncated
-    assert not health.file.indexed
+    assert (health.file.truncated, health.file.indexed) == (False, False)
     assert health.verdict == "degraded"
     assert timing_of(health).count == 300
 
 
-def test_an_uncovered_chunk_is_told(tmp_path):
+def test_an_uncovered_chunk_is_noted(tmp_path):
     health = check_session(write_raw(tmp_path / "s.mcap", list(range(300)), enable_crcs=False))
     assert health.verdict == "good"
     assert "carry no CRC" in health.notes[0]
@@ -145,11 +132,8 @@ def foreign(path, topic, names):
 def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path):
     path = foreign(tmp_path / "s.mcap", "/joint_states", [["a"], ["b"], ["c"]])
     health = check_session(path)
-    assert {each.label: each.timing.gaps for each in health.series} == {
-        "/joint_states (a)": 0,
-        "/joint_states (b)": 0,
-        "/joint_states (c)": 0,
-    }
+    gaps = {each.label: each.timing.gaps for each in health.series}
+    assert gaps == {f"/joint_states ({name})": 0 for name in "abc"}
     assert [each.sequence.kind for each in health.channels] == ["none"]
     assert health.reasons == ("/joint_commands is missing; JointStates are on /joint_states",)
 
@@ -163,7 +147,7 @@ def test_missing_contract_topics_are_named(tmp_path):
     assert check_session(tmp_path / "t.mcap").verdict == "bad"
 
 
-def test_a_joint_that_never_speaks_is_named(tmp_path):
+def test_a_joint_without_samples_is_named(tmp_path):
     path = tmp_path / "s.mcap"
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
         commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
@@ -174,7 +158,6 @@ def test_a_joint_that_never_speaks_is_named(tmp_path):
     assert check_session(path).reasons == ("/joint_states never carries joint25",)
 
 
-def test_what_is_no_log_is_an_error(tmp_path, capsys):
+def test_what_is_no_log_is_an_error(tmp_path, command):
     (tmp_path / "x.mcap").write_bytes(b"no log at all")
-    assert undulog.run(["log", "check", str(tmp_path / "x.mcap")]) == 1
-    assert "not an MCAP file" in capsys.readouterr().err
+    assert "not an MCAP file" in command("log", "check", tmp_path / "x.mcap", code=1).err

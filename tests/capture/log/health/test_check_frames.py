@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-import undulog
 from support.checked_sessions import EPOCH_NS, ROBOT, at
-from support.paths import ARCSNAKE
+from support.paths import TRACE
 from undulog.capture import SessionWriter
 from undulog.capture.log.health.bus_tally import BusTally, frame_bits
 from undulog.capture.log.health.session_check import check_session
@@ -59,20 +58,17 @@ def test_frames_in_a_session_are_checked_as_they_were_logged(tmp_path):
     assert any(sentence.startswith(none) for sentence in health.reasons)
 
 
-def test_a_real_trace_has_its_own_frame_count(tmp_path):
-    trace = ARCSNAKE / "linear_trajectory.candump.log"
-    if not trace.is_file():
+def test_a_real_trace_has_its_own_frame_count(tmp_path, command):
+    if not TRACE.is_file():
         pytest.skip("the recording of ArcSnake is not there")
-    output = tmp_path / "s.mcap"
-    done = undulog.run(["import", str(trace), "-o", str(output), "--robot", "arcsnake-joint"])
-    assert done == 0
-    health = check_session(output)
+    command("import", TRACE, "-o", tmp_path / "s.mcap", "--robot", "arcsnake-joint")
+    health = check_session(tmp_path / "s.mcap")
     (bus,) = health.buses
-    assert bus.frames == len(trace.read_text().splitlines()) == 19_297
-    assert bus.error_frames == 0
+    lines = TRACE.read_text().splitlines()
+    assert (bus.frames, bus.error_frames) == (len(lines), 0) == (19_297, 0)
     # 1,787 frames a second of 111 to 135 bits on 1 Mbit/s.
     assert bus.load == pytest.approx((0.198, 0.241), abs=0.003)
     # The trace pauses before the motion and its log stamps have holes; it is fit for use.
     assert health.verdict == "degraded"
-    stamps = [float(line.split(")")[0][1:]) for line in trace.read_text().splitlines()]
+    stamps = [float(line.split(")")[0][1:]) for line in lines]
     assert bus.longest_s == pytest.approx(np.diff(stamps).max(), abs=1e-6)

@@ -7,7 +7,6 @@ import resource
 import pytest
 from hostile_logs import EPOCH_NS, NS, HostileLog, joint_state, lz4_zeros, zeros
 
-import undulog
 from support.processes import python
 from support.read_back import messages_of
 
@@ -55,9 +54,9 @@ def run(*commands, most=ROOM):
         "from pathlib import Path\n"
         "found = []\n"
         "for command in json.loads(sys.argv[1]):\n"
-        "    with contextlib.redirect_stdout(io.StringIO()) as said:\n"
+        "    with contextlib.redirect_stdout(io.StringIO()) as printed:\n"
         "        code = undulog.run(command)\n"
-        "    found.append([code, said.getvalue()])\n"
+        "    found.append([code, printed.getvalue()])\n"
         # ru_maxrss would count what the process had before it became this program.
         "status = Path('/proc/self/status').read_text()\n"
         "used = 1024 * int(re.search(r'VmHWM:\\s+(\\d+)', status)[1])\n"
@@ -68,15 +67,14 @@ def run(*commands, most=ROOM):
         resource.setrlimit(resource.RLIMIT_AS, (3 * GIB, 3 * GIB))
 
     listed = json.dumps([[str(word) for word in command] for command in commands])
-    done = python(
-        script, listed, preexec_fn=limited, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    )
+    env = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    done = python(script, listed, preexec_fn=limited, env=env)
     assert not done.returncode, done.stderr
     used, found = json.loads(done.stdout)
     assert used < most, f"{used / MIB:.0f} MiB"
     for command, (code, _) in zip(commands, found, strict=True):
         assert code == 0 or "check" in command, command
-    return [said for _, said in found]
+    return [printed for _, printed in found]
 
 
 BOMBS = {
@@ -95,8 +93,7 @@ def test_chunks_that_expand_beyond_their_size_are_refused_and_the_rest_is_kept(t
         packed, size, options = make()
         path = tmp_path / f"{kind}.mcap"
         places[path] = with_bomb(path, packed, size, whole=whole, **options)
-    recovered = [path.with_suffix(".recovered.mcap") for path in places]
-    said = run(
+    printed = run(
         *(["log", "recover", path] for path in places),
         *(["log", "check", path, "--json"] for path in places),
         *(["analyse", path, "--json"] for path in places),
@@ -105,14 +102,15 @@ def test_chunks_that_expand_beyond_their_size_are_refused_and_the_rest_is_kept(t
     starts = [0, 3] if whole else [0]
     wanted = [t_ns for start in starts for _, t_ns, _ in ticks(start)]
     for k, (path, at) in enumerate(places.items()):
-        assert "chunk" in said[k], path
-        kept = [message.log_time for _, _, message in messages_of(recovered[k])]
+        assert "chunk" in printed[k], path
+        recovered = messages_of(path.with_suffix(".recovered.mcap"))
+        kept = [message.log_time for _, _, message in recovered]
         assert kept == wanted, path
-        health = json.loads(said[count + k])
+        health = json.loads(printed[count + k])
         if whole:
             assert health["verdict"] == "bad", path
             assert any(f"the chunk at byte {at} " in text for text in health["reasons"]), path
-        assert any("chunk" in text for text in json.loads(said[2 * count + k])["warnings"]), path
+        assert any("chunk" in text for text in json.loads(printed[2 * count + k])["warnings"]), path
 
 
 def test_the_error_names_the_option_that_reads_a_larger_chunk(tmp_path):
@@ -126,9 +124,9 @@ def test_the_error_names_the_option_that_reads_a_larger_chunk(tmp_path):
 
 
 @pytest.mark.parametrize("wrong", ["", "0", "-1", "many", "1e9", "99999999999999999999"])
-def test_a_chunk_limit_is_a_positive_whole_number(wrong, capsys):
-    assert undulog.run(["log", "info", "x.mcap", f"--max-chunk-mib={wrong}"]) == 2
-    assert "--max-chunk-mib" in capsys.readouterr().err
+def test_a_chunk_limit_is_a_positive_whole_number(wrong, command):
+    option = f"--max-chunk-mib={wrong}"
+    assert "--max-chunk-mib" in command("log", "info", "x.mcap", option, code=2).err
 
 
 IMAGE = (

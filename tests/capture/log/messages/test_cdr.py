@@ -72,7 +72,7 @@ def test_our_definitions_have_the_fields_of_ros_2(name):
     assert parse_message_type(name, theirs) == parse_message_type(name, schema_text(name))
 
 
-def test_a_message_that_is_too_short_says_so():
+def test_a_message_that_is_too_short_is_refused():
     name = "sensor_msgs/msg/JointState"
     data = encode(message_type(name), MESSAGES[name])
     for size in range(4, len(data)):
@@ -99,18 +99,11 @@ def test_an_unknown_field_lists_those_that_exist():
 
 
 def test_constants_defaults_bounds_and_nested_packages_parse():
-    text = (
-        "uint8 A=1\nstring<=8 s 'x'\nfloat64[3] v\nint32[<=4] w\nOther o  # a comment\n"
-        + "=" * 80
-        + "\nMSG: mine/Other\nfloat32 x 1.5\n"
-    )
+    text = "uint8 A=1\nstring<=8 s 'x'\nfloat64[3] v\nint32[<=4] w\nOther o  # a comment\n"
+    text += "=" * 80 + "\nMSG: mine/Other\nfloat32 x 1.5\n"
     kind = parse_message_type("mine/msg/Main", text)
-    assert [(f.name, f.length, f.is_array) for f in kind.fields] == [
-        ("s", 1, False),
-        ("v", 3, True),
-        ("w", None, True),
-        ("o", 1, False),
-    ]
+    found = [(f.name, f.length, f.is_array) for f in kind.fields]
+    assert found == [("s", 1, False), ("v", 3, True), ("w", None, True), ("o", 1, False)]
 
 
 @pytest.mark.parametrize(
@@ -121,6 +114,6 @@ def test_constants_defaults_bounds_and_nested_packages_parse():
         ("Main m", "mine/Main contains itself"),
     ],
 )
-def test_a_bad_schema_says_what_is_wrong(text, complaint):
+def test_a_bad_schema_is_refused_with_what_is_wrong(text, complaint):
     with pytest.raises(DataError, match=complaint):
         parse_message_type("mine/msg/Main", text)

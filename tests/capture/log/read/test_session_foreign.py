@@ -43,7 +43,7 @@ def test_one_message_per_servo_is_read_right(tmp_path):
         assert session.warnings == []
 
 
-def test_a_changed_joint_set_is_told_and_read(tmp_path):
+def test_a_changed_joint_set_is_reported_and_read(tmp_path):
     messages = [
         states(EPOCH_NS + tick * STEP_NS, ["a", "b" if tick < 50 else "c"], [float(tick), 1.0])
         for tick in range(100)
@@ -64,9 +64,8 @@ def test_a_later_window_is_not_read_with_the_names_of_an_earlier_one(tmp_path):
     with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         for first in (100, 450, 100, 295, 450, 295):
             start_ns = EPOCH_NS + first * step_ns
-            found = session.joints(
-                "/joint_states", start_ns=start_ns, stop_ns=start_ns + 10 * step_ns
-            )
+            window = {"start_ns": start_ns, "stop_ns": start_ns + 10 * step_ns}
+            found = session.joints("/joint_states", **window)
             inside = range(first, first + 10)
             truth = {
                 "a": [tick for tick in inside if tick < 300],
@@ -77,7 +76,7 @@ def test_a_later_window_is_not_read_with_the_names_of_an_earlier_one(tmp_path):
             assert read == {name: truth[name] for name in truth if truth[name] or name in read}
 
 
-def test_duplicate_and_backward_stamps_are_told(tmp_path):
+def test_duplicate_and_backward_stamps_are_reported(tmp_path):
     messages = [
         states(EPOCH_NS + tick * STEP_NS, ["a"], [float(tick)], log_ns=EPOCH_NS + k * STEP_NS)
         for k, tick in enumerate([0, 1, 2, 2, 4, 3, 5])
@@ -91,21 +90,15 @@ def test_duplicate_and_backward_stamps_are_told(tmp_path):
 
 
 def test_a_field_that_is_never_filled_is_missing_not_zero(tmp_path):
-    messages = [states(EPOCH_NS, ["a"], [1.0], velocity=[])]
-    with (
-        Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session,
-        pytest.raises(
-            MissingChannelError, match=r"has no effort in /joint_states; it has position"
-        ),
-    ):
+    path = write_foreign(tmp_path / "f.mcap", [states(EPOCH_NS, ["a"], [1.0], velocity=[])])
+    missing = "has no effort in /joint_states; it has position"
+    with Session.open(path) as session, pytest.raises(MissingChannelError, match=missing):
         session.joints("/joint_states", "effort")
 
 
 def test_values_that_do_not_match_the_names_are_left_out_with_a_warning(tmp_path):
-    messages = [
-        states(EPOCH_NS, ["a", "b"], [1.0]),
-        states(EPOCH_NS + 1, ["a", "b"], [1.0, 2.0]),
-    ]
+    rows = ([1.0], [1.0, 2.0])
+    messages = [states(EPOCH_NS + k, ["a", "b"], row) for k, row in enumerate(rows)]
     with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         assert session.joints("/joint_states").values[1].tolist() == [2.0]
         assert "2 names but 1 values of position" in session.warnings[0]
@@ -125,13 +118,10 @@ def test_zero_stamps_fall_back_to_log_times(tmp_path):
 
 
 def test_simulated_time_is_shifted_to_the_log_clock(tmp_path):
+    steps = [(k, k * STEP_NS) for k in range(50)]
     messages = [
-        (
-            topic,
-            EPOCH_NS + k * STEP_NS,
-            joint_state(5_000_000_000 + k * STEP_NS, ["a"], [float(k)]),
-        )
-        for k in range(50)
+        (topic, EPOCH_NS + t_ns, joint_state(5_000_000_000 + t_ns, ["a"], [float(k)]))
+        for k, t_ns in steps
         for topic in ("/joint_states", "/joint_commands")
     ]
     with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
