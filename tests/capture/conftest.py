@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 import undulog
+from support.processes import wait_for
 from undulog.capture import SessionWriter
 from undulog.capture.log.messages import frames as fr
 from undulog.capture.sources.contract import Source, SourceContext, SourceEvent
 
-PATIENCE_S = 90.0
-
 
 @dataclass
-class Heard:
+class Reader:
     """What a source gave: frames in order, events in order."""
 
     source: Source
@@ -32,11 +31,7 @@ class Heard:
 
     def until(self, condition):
         """Poll until something is so; fails after a long time."""
-        deadline = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert time.monotonic() < deadline, (len(self.frames), self.texts, self.source.counts)
-            self.poll()
-            time.sleep(0.002)
+        wait_for(condition, f"{self.counts}, {self.texts}", each=self.poll)
 
     def until_frames(self, count):
         self.until(lambda: sum(map(len, self.arrays)) >= count)
@@ -54,6 +49,10 @@ class Heard:
     @property
     def fd_frames(self):
         return np.concatenate([fr.empty_fd_frames(0), *self.fd_arrays])
+
+    @property
+    def counts(self):
+        return self.source.counts
 
     @property
     def texts(self):
@@ -88,7 +87,7 @@ def listen(context):
     def start(source):
         started.append(source)
         source.start(context)
-        return Heard(source)
+        return Reader(source)
 
     yield start
     for source in started:
@@ -108,6 +107,12 @@ def sockets():
         yield ours, theirs
 
 
+def identifiers(rng, count):
+    """Random identifiers, three in ten of them of 29 bits."""
+    wide, narrow = rng.integers(0, 2**29, count) | fr.EXTENDED_FLAG, rng.integers(0, 2**11, count)
+    return np.where(rng.random(count) < 0.3, wide, narrow)
+
+
 @pytest.fixture
 def traffic():
     """Random frames of both identifier widths and all lengths, a remote request now and then."""
@@ -115,21 +120,13 @@ def traffic():
     def make(count):
         rng = np.random.default_rng(count)
         frames = fr.empty_frames(count)
-        extended = rng.random(count) < 0.3
         remote = rng.random(count) < 0.02
-        frames["id_flags"] = np.where(
-            extended,
-            rng.integers(0, 2**29, count) | fr.EXTENDED_FLAG,
-            rng.integers(0, 2**11, count),
-        ) | (remote * fr.REMOTE_FLAG)
+        frames["id_flags"] = identifiers(rng, count) | (remote * fr.REMOTE_FLAG)
         frames["dlc"] = rng.integers(0, 9, count)
-        data = rng.integers(0, 256, (count, 8))
-        data[np.arange(8) >= frames["dlc"][:, None]] = 0
-        data[remote] = 0
-        frames["data"] = data
-        frames["t_device_ns"] = 1_700_000_000_123_456_000 + np.cumsum(
-            rng.integers(1, 9000, count) * 1000
-        )
+        frames["data"] = rng.integers(0, 256, (count, 8))
+        frames["data"][(np.arange(8) >= frames["dlc"][:, None]) | remote[:, None]] = 0
+        steps_ns = rng.integers(1, 9000, count) * 1000
+        frames["t_device_ns"] = 1_700_000_000_123_456_000 + np.cumsum(steps_ns)
         return frames
 
     return make
@@ -142,17 +139,12 @@ def fd_traffic():
     def make(count):
         rng = np.random.default_rng(count)
         frames = fr.empty_fd_frames(count)
-        frames["id_flags"] = np.where(
-            rng.random(count) < 0.3,
-            rng.integers(0, 2**29, count) | fr.EXTENDED_FLAG,
-            rng.integers(0, 2**11, count),
-        )
+        frames["id_flags"] = identifiers(rng, count)
         frames["fd_flags"] = np.where(rng.random(count) < 0.5, fr.FD_BRS, 0)
         lengths = [*range(9), 12, 16, 20, 24, 32, 48, 64]
         frames["len"] = np.array(lengths)[rng.integers(0, 16, count)]
-        data = rng.integers(0, 256, (count, 64))
-        data[np.arange(64) >= frames["len"][:, None]] = 0
-        frames["data"] = data
+        frames["data"] = rng.integers(0, 256, (count, 64))
+        frames["data"][np.arange(64) >= frames["len"][:, None]] = 0
         return frames
 
     return make
