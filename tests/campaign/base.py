@@ -13,6 +13,8 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2.writer import Writer as RosWriter
 
 from support.twin_chains import snake4
+from support.written_frames import log_messages
+from support.written_sessions import joint_state
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.log.messages.definitions import schema_text
 from undulog.capture.log.messages.frames import empty_frames
@@ -124,10 +126,8 @@ class Base:
 
 def gait_session(path, ticks=200, sink=None):
     """Write four joints that follow sines, with frames, events and a reading of every kind."""
-    robot = load_robot(str(path.parent / "snake4.toml"))
-    with SessionWriter(
-        path, session_id="s", epoch_ns=EPOCH_NS, robot=robot, metadata={"operator": "x"}, sink=sink
-    ) as writer:
+    facts = {"robot": load_robot(path.parent / "snake4.toml"), "metadata": {"operator": "x"}}
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, sink=sink, **facts) as writer:
         commands = writer.joint_state("/joint_commands", JOINTS, unit="rad")
         states = writer.joint_state("/joint_states", JOINTS, unit="rad", velocity=True, effort=True)
         offsets = writer.joint_state("/joint_sample_offset", JOINTS, unit="s")
@@ -164,10 +164,8 @@ def foreign_session(path, ticks=240):
             t_ns = EPOCH_NS + tick * PERIOD_NS
             for topic, lag in (("/joint_commands", 0.0), ("/joint_states", 0.2)):
                 for k, name in enumerate(JOINTS[:2]):
-                    seconds, rest = divmod(t_ns + k * 1000, 10**9)
                     angle = 0.3 * np.sin(0.25 * tick + k - lag)
-                    stamp = {"sec": seconds, "nanosec": rest}
-                    message = {"header": {"stamp": stamp}, "name": [name], "position": [angle]}
+                    message = joint_state(t_ns + k * 1000, [name], [angle])
                     writer.write_message(topic, schema, message, log_time=t_ns)
         writer.finish()
 
@@ -222,12 +220,12 @@ def can_messages(count=160):
         )
 
 
-def _trace(path):
-    writer = can.Logger(str(path))
-    for message in can_messages():
-        writer.on_message_received(message)
-    writer.stop()
-    return path
+def write_files(folder, files):
+    """Write texts or bytes by their relative paths."""
+    for name, data in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
 def write_texts(folder):
@@ -242,8 +240,7 @@ def write_texts(folder):
         "columns.toml": COLUMNS,
         "table.csv": "time,angle,torque\n" + rows,
     }
-    for name, text in texts.items():
-        (folder / name).write_text(text)
+    write_files(folder, texts)
     return {name: text.encode() for name, text in texts.items()}
 
 
@@ -259,7 +256,7 @@ def make_bases(folder, result_of):
     bases = [Base("log", name, {name: data, **texts}, (name,)) for name, data in logs.items()]
     bases += of_recorder(folder)
     for kind in ("log", "blf", "asc", "trc", "csv", "db"):
-        path = _trace(folder / f"trace.{kind}")
+        path = log_messages(folder / f"trace.{kind}", can_messages())
         files = {path.name: path.read_bytes(), **texts}
         bases.append(Base("trace", path.name, files, (path.name,)))
     trace = {"trace.log": (folder / "trace.log").read_bytes(), **texts}
@@ -283,13 +280,12 @@ def of_recorder(folder):
     for path in (work, split):
         path.mkdir()
     texts = write_texts(work)
-    robot = load_robot(str(work / "snake4.toml"))
+    robot = load_robot(work / "snake4.toml")
 
     def record(path, size, topics, at):
         sink = DurableSink(path, segment_size=size, ballast=0)
-        with SessionWriter(
-            path, session_id="s", epoch_ns=EPOCH_NS, robot=robot, sink=sink
-        ) as writer:
+        facts = {"session_id": "s", "epoch_ns": EPOCH_NS, "robot": robot}
+        with SessionWriter(path, sink=sink, **facts) as writer:
             channels = [writer.joint_state(topic, JOINTS, unit="rad") for topic in topics]
             for tick in range(150):
                 for channel in channels:

@@ -61,6 +61,11 @@ class Outcome:
     out: bytes
     err: bytes
 
+    @property
+    def errors(self):
+        """Return the last characters on standard error."""
+        return self.err.decode(errors="replace")[-200:]
+
 
 @dataclass
 class Result:

@@ -2,6 +2,7 @@
 
 import base64
 import contextlib
+import itertools
 import json
 import random
 import re
@@ -13,17 +14,13 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mcap.reader import make_reader
 
-from .base import EPOCH_NS
+from .base import EPOCH_NS, write_files
 from .case import Result, front_door, judge, run_forked
 from .commands import COMMANDS, WEIGHTS
 from .mutate import mutate_bytes, mutate_text, remake_database, remake_log
-
-if TYPE_CHECKING:
-    pass
 
 RECORDS_FOR_S = 12.0
 """A recorder with mutated settings may have been given an hour: it is ended then [s]."""
@@ -57,10 +54,7 @@ class Case:
 
         The names of the imported modules go to the file ``modules``.
         """
-        for name, data in self.files.items():
-            path = folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+        write_files(folder, self.files)
         work = front_door(self.words)
         if self.words[0] == "api":
             work = partial(try_session, folder / self.words[1])
@@ -149,9 +143,8 @@ def session_parts(session):
 def check_output(folder):
     """Return faults of the outputs under their final names, by mcap's own reader."""
     found = []
-    for path in [
-        one for name in ("new*", "new/*", "frames") for one in folder.glob(f"{name}.mcap")
-    ]:
+    names = ("new*.mcap", "new/*.mcap", "frames.mcap")
+    for path in itertools.chain.from_iterable(map(folder.glob, names)):
         try:
             with path.open("rb") as stream:
                 for _ in make_reader(stream, validate_crcs=True).iter_messages():
@@ -244,8 +237,7 @@ def warm(cases, fresh):
             if listing.exists():
                 wanted |= dict.fromkeys(listing.read_text().split("\n"))
         if outcome.code:
-            errors = outcome.err.decode(errors="replace")[-300:]
-            failures.append(f"exit code {outcome.code}: {errors}")
+            failures.append(f"exit code {outcome.code}: {outcome.errors}")
         found += [f"{' '.join(case.words)}: {fault}" for fault in failures]
     for name in wanted:
         if name not in sys.modules and not name.startswith("__"):

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 from undulog.capture import load_robot
 
-from .base import DBC, ROBOT, SCENARIO
+from .base import DBC, ROBOT, SCENARIO, write_files
 from .case import Result, run_command
 
 PERIOD_S = 0.01
@@ -48,7 +48,7 @@ class FarEnd:
     """Servos at a socketcand server; the connection stalls at given times.
 
     Attributes:
-        polled: Whether a servo speaks only when it is asked.
+        polled: Whether a servo only replies to requests.
         interval_s: How often unasked states are sent [s].
         latency_s: Of what is sent back [s].
         stalls: (Begin after the first command [s], length [s], whether only the way to the bus).
@@ -163,9 +163,7 @@ class FarEnd:
         found, worst = [], 0.0
         for joint, rows in self.commands.items():
             if (most := max(abs(angle) for _, angle in rows)) > limit + ROUNDING:
-                found.append(
-                    f"position: joint {joint} commanded to {most:.4f} rad, limit {limit:.4f}"
-                )
+                found.append(f"position: joint {joint} at {most:.4f} rad, limit {limit:.4f}")
             low = high = None
             for t_s, angle in [(rows[0][0] - PERIOD_S, self.pose), *rows]:
                 up, down = angle - MAX_RATE * t_s, angle + MAX_RATE * t_s
@@ -173,9 +171,8 @@ class FarEnd:
                 high = down if high is None else max(high, down)
                 worst = max(worst, up - low, high - down)
         if worst > self.steps_allowed * STEP + 2 * ROUNDING:
-            found.append(
-                f"step: {worst:.4f} rad beyond the rate, {self.steps_allowed} x {STEP:.2f} allowed"
-            )
+            allowed = f"{self.steps_allowed} x {STEP:.2f} allowed"
+            found.append(f"step: {worst:.4f} rad beyond the rate, {allowed}")
         return found, worst / STEP
 
 
@@ -188,14 +185,9 @@ def run(seed, stage):
         (rng.uniform(0.3, 2.0), math.exp(rng.uniform(math.log(0.02), math.log(5.0))))
         for _ in range(0 if healthy else rng.choice([1, 1, 2, 4]))
     ]
-    far = FarEnd(
-        polled,
-        interval_s,
-        rng.choice([0.0, 0.0, 0.004, 0.016]),
-        stalls,
-        rng.random() < 0.5,
-        rng.choice([0.0, 0.1]),
-    )
+    latency_s = rng.choice([0.0, 0.0, 0.004, 0.016])
+    bursts, pose = rng.random() < 0.5, rng.choice([0.0, 0.1])
+    far = FarEnd(polled, interval_s, latency_s, stalls, bursts, pose)
     how = "polled" if polled else f"states each {1000 * interval_s:.0f} ms"
     gaps = ", ".join(f"{1000 * length:.0f} ms" for _, length in stalls) or "none"
     result = Result(f"drive, {how}, stalls: {gaps}{', in bursts' if far.bursts else ''}")
@@ -211,34 +203,29 @@ def run(seed, stage):
         result.failures += failures
         result.at_most("steps_beyond_rate_polled" if polled else "steps_beyond_rate_unasked", worst)
         result.figures["n_commands"] = sum(map(len, far.commands.values()))
-        errors = outcome.err.decode(errors="replace")[-200:]
+        ended = f"exit code {outcome.code}: {outcome.errors}"
         if not far.commands:
-            result.failures.append(f"drive: nothing was sent: {errors}")
+            result.failures.append(f"drive: nothing was sent: {ended}")
         elif healthy and outcome.code != 0:
-            result.failures.append(f"drive: a healthy bus, and exit code {outcome.code}: {errors}")
+            result.failures.append(f"drive: a healthy bus, and {ended}")
         elif any(length > 1.5 and begin < 1.5 for begin, length in stalls) and outcome.code == 0:
             result.failures.append("drive: exit code 0 though the bus stood still")
     return result
 
 
 def _lay_out(folder, polled):
-    if polled:
-        robot = load_robot("arcsnake-joint")
-        for name, text in dict(robot.databases).items():
-            (folder / name).write_text(text)
-        (folder / "snake4.toml").write_text(robot.toml + SAFETY)
-    else:
-        (folder / "snake4.dbc").write_text(DBC)
-        (folder / "snake4.toml").write_text(ROBOT + SAFETY)
-    scenario = SCENARIO.replace("duration_s = 0.1", "duration_s = 60.0").replace(
-        "ramp_s = 0.02", "ramp_s = 0.5"
-    )
-    scenario = scenario.replace("frequency_hz = 2.0", "frequency_hz = 1.5").replace(
-        "amplitude = 0.1", "amplitude = 0.38"
-    )
-    if polled:
-        scenario = scenario[: scenario.index("[gait.vertical]")]
-    (folder / "scenario.toml").write_text(scenario)
+    servo = load_robot("arcsnake-joint")
+    robot, databases = (servo.toml, servo.databases) if polled else (ROBOT, {"snake4.dbc": DBC})
+    scenario = SCENARIO.partition("[gait.vertical]")[0] if polled else SCENARIO
+    for key, old, new in (
+        ("duration_s", 0.1, 60.0),
+        ("ramp_s", 0.02, 0.5),
+        ("frequency_hz", 2.0, 1.5),
+        ("amplitude", 0.1, 0.38),
+    ):
+        scenario = scenario.replace(f"{key} = {old}", f"{key} = {new}")
+    texts = {"snake4.toml": robot + SAFETY, "scenario.toml": scenario}
+    write_files(folder, dict(databases) | texts)
 
 
 def _alive(child):

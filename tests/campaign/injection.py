@@ -11,7 +11,7 @@ from mcap_ros2.writer import Writer as RosWriter
 
 from undulog.capture.log.messages.definitions import schema_text
 
-from .base import DBC, EPOCH_NS, JOINTS, PERIOD_NS, PLAN, ROBOT, SCENARIO, can_messages
+from .base import DBC, EPOCH_NS, JOINTS, PERIOD_NS, PLAN, ROBOT, SCENARIO, can_messages, write_files
 from .case import Result, run_command
 from .commands import COMMANDS
 from .fuzz import check_output
@@ -91,17 +91,14 @@ def run(seed, stage):
     """Run one command on evil names in one of the files that it reads."""
     rng = random.Random(seed)
     with stage.fresh() as folder:
-        (folder / "snake4.toml").write_text(ROBOT)
-        (folder / "snake4.dbc").write_text(DBC)
-        (folder / "scenario.toml").write_text(SCENARIO)
-        (folder / "gait0.mcap").write_bytes(stage.files_of("gait.mcap")["gait.mcap"])
+        texts = {"snake4.toml": ROBOT, "snake4.dbc": DBC, "scenario.toml": SCENARIO}
+        write_files(folder, texts | {"gait0.mcap": stage.files_of("gait.mcap")["gait.mcap"]})
         kind = rng.choice(["log", "log", "log", "foreign", *TEXTS])
         line = _lay_out(kind, folder, rng, stage)
         result = Result(f"{line!r}: {kind}")
         outcome = run_command(shlex.split(line), folder)
         result.add(outcome)
-        result.failures += check_output(folder)
-        result.failures += _check_pages(folder)
+        result.failures += check_output(folder) + _check_pages(folder)
         outside = [str(path) for path in folder.parent.iterdir() if path.name.startswith("up")]
         result.failures += [f"path: wrote {path}" for path in outside]
     return result

@@ -6,7 +6,7 @@ import shlex
 import signal
 import time
 
-from .base import gait_session
+from .base import gait_session, write_files
 from .case import Result, judge, run_command
 from .fuzz import check_output
 from .recording import check_kept, numbers_in, recorder, senders
@@ -45,14 +45,12 @@ def lay_out(folder, stage):
         gait_session(part, 2000)
         part.rename(path)
     long = path.read_bytes()
+    places = {"unfinished": folder / "unfinished", "trace": folder}
     for base in stage.bases:
-        inside = {"unfinished": folder / "unfinished", "trace": folder}.get(base.kind)
-        if inside is not None:
-            for name, data in base.files.items():
-                (inside / name).parent.mkdir(parents=True, exist_ok=True)
-                (inside / name).write_bytes(data)
-    for name, data in (("run.mcap", long), ("other.mcap", stage.files_of("lz4.mcap")["lz4.mcap"])):
-        (folder / name).write_bytes(data)
+        if base.kind in places:
+            write_files(places[base.kind], base.files)
+    other = stage.files_of("lz4.mcap")["lz4.mcap"]
+    write_files(folder, {"run.mcap": long, "other.mcap": other})
 
 
 def whole_outputs(folder):
@@ -94,8 +92,7 @@ def run(seed, stage):
         again = run_command(words, folder)
         result.failures += [f"again: {fault}" for fault in judge(again)]
         if again.code and not leaves_a_log:
-            errors = again.err.decode(errors="replace")[-200:]
-            result.failures.append(f"again: exit code {again.code}: {errors}")
+            result.failures.append(f"again: exit code {again.code}: {again.errors}")
     return result
 
 
@@ -125,7 +122,7 @@ def run_recorder(seed, stage):
         outcome = run_command(words, folder)
         result.add(outcome)
         if outcome.code:
-            result.failures.append(f"recover: {outcome.err.decode(errors='replace')[-200:]}")
+            result.failures.append(f"recover: {outcome.errors}")
         for one, least in zip(sending, accepted, strict=True):
             result.failures += check_kept(folder / "recovered", one, least)
             result.figures["n_accepted"] = result.figures.get("n_accepted", 0) + least

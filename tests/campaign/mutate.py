@@ -152,13 +152,8 @@ def _payload(data, rng):
         value = rng.choice([float("nan"), float("inf"), 1e308, -1e308, 1e-320, 0.0])
         struct.pack_into("<d", changed, at, value)
     elif kind == 3 and len(changed) >= 12:  # its stamp
-        struct.pack_into(
-            "<iI",
-            changed,
-            4,
-            rng.choice([-(2**31), -1, 0, 2**31 - 1, 10**9 * 2]),
-            rng.choice([0, 999_999_999, 2**32 - 1]),
-        )
+        seconds = rng.choice([-(2**31), -1, 0, 2**31 - 1, 10**9 * 2])
+        struct.pack_into("<iI", changed, 4, seconds, rng.choice([0, 999_999_999, 2**32 - 1]))
     elif changed:
         _flip_bits(changed, rng)
     return bytes(changed)
@@ -189,10 +184,9 @@ class _Remake:
             log_ns += self.jump if number > 40 else 0
         if "order" in own:
             log_ns = max(0, log_ns - rng.choice([1, 10**8, 10**10]))
-        publish_ns = message.publish_time % 2**64
-        self.writer.add_message(
-            self.channels[channel.id], log_ns % 2**64, payload, publish_ns, message.sequence
-        )
+        times = log_ns % 2**64, message.publish_time % 2**64
+        of = self.channels[channel.id]
+        self.writer.add_message(of, times[0], payload, times[1], message.sequence)
 
     def _add_schema(self, schema):
         name, text = schema.name, schema.data
@@ -208,9 +202,8 @@ class _Remake:
             topic = mutate_text(topic.encode(), self.rng).decode("utf-8", "replace")[:300]
             facts = {k: self.rng.choice([v, *WORDS[:25]]) for k, v in facts.items()}
         used = self.rng.choice([*self.schemas.values(), 0]) if astray else self.schemas[schema_id]
-        self.channels[channel.id] = self.writer.register_channel(
-            topic, channel.message_encoding, used, facts
-        )
+        description = (topic, channel.message_encoding, used, facts)
+        self.channels[channel.id] = self.writer.register_channel(*description)
 
 
 def remake_log(data, rng, scratch):
@@ -227,12 +220,8 @@ def remake_log(data, rng, scratch):
     source, target = scratch.with_suffix(".old"), scratch.with_suffix(".new")
     source.write_bytes(data)
     every = rng.choice([1, 3, 20, 100, 1000])
-    faults = set(
-        rng.sample(
-            ["time", "payload", "schema", "names", "channel", "few", "order"],
-            rng.choice([1, 1, 2, 3]),
-        )
-    )
+    kinds = ["time", "payload", "schema", "names", "channel", "few", "order"]
+    faults = set(rng.sample(kinds, rng.choice([1, 1, 2, 3])))
     options = {
         "compression": rng.choice(list(CompressionType)),
         "chunk_size": rng.choice([200, 2000, 1 << 20]),
@@ -277,10 +266,8 @@ def remake_database(data, rng, scratch):
             with contextlib.suppress(sqlite3.DatabaseError):
                 kind = rng.random()
                 if kind < 0.8:
-                    base.execute(
-                        f'update "{table}" set "{column}"=? where rowid=?',
-                        (rng.choice(values), row),
-                    )
+                    change = f'update "{table}" set "{column}"=? where rowid=?'
+                    base.execute(change, (rng.choice(values), row))
                 elif kind < 0.9:
                     base.execute(f'alter table "{table}" drop column "{column}"')
                 else:

@@ -11,7 +11,9 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-from .base import DBC, ROBOT, SCENARIO
+from support.processes import wait_for
+
+from .base import DBC, ROBOT, SCENARIO, write_files
 from .case import Result, run_command
 
 PATIENCE_S = 30.0
@@ -40,7 +42,6 @@ def _connect(address):
                 raise
             time.sleep(0.01)
             continue
-        link.settimeout(PATIENCE_S)
         return link
 
 
@@ -76,7 +77,7 @@ def attack(address, rng, links):
                 link.sendall(b"< open can0 >< rawmode >")
 
 
-def _heard(link, until):
+def _received(link, until):
     data = b""
     deadline = time.monotonic() + PATIENCE_S
     while not until(data) and time.monotonic() < deadline:
@@ -89,12 +90,7 @@ def _heard(link, until):
 
 
 def _wait(condition):
-    deadline = time.monotonic() + PATIENCE_S
-    while not (found := condition()):
-        if time.monotonic() > deadline:
-            raise TimeoutError("the server did not start")
-        time.sleep(0.02)
-    return found
+    return wait_for(condition, "the server", PATIENCE_S)
 
 
 def _answer(address, words, is_good):
@@ -102,7 +98,7 @@ def _answer(address, words, is_good):
     with suppress(OSError), _connect(address) as link:
         link.settimeout(0.5)
         link.sendall(words)
-        data = _heard(link, is_good)
+        data = _received(link, is_good)
         return "" if is_good(data) else f"only {data[:80]!r}"
     return "the connection was refused or closed"
 
@@ -113,7 +109,7 @@ def _descriptors(pid):
 
 def _check_descriptors(result, pid, before, of=""):
     """Check that after the clients no more descriptors are open than before."""
-    with suppress(TimeoutError):
+    with suppress(AssertionError):
         _wait(lambda: _descriptors(pid) <= before + MORE)
     if (left := _descriptors(pid)) > before + MORE:
         result.failures.append(f"descriptors: {before} before, {left} after{of}")
@@ -136,7 +132,7 @@ def _watched(result, pid, address, rng, good, *, foreign=False):
     if fault and foreign:
         # It may close one connection more while it drops the bad ones: a browser asks again.
         result.at_most("n_closed_after", 1.0)
-        with suppress(TimeoutError):
+        with suppress(AssertionError):
             _wait(lambda: not good())
         fault = good()
     if fault:
@@ -144,9 +140,7 @@ def _watched(result, pid, address, rng, good, *, foreign=False):
     _check_descriptors(result, pid, before)
 
 
-def _attacked(
-    result, folder, words, *, rng, ready, request, foreign=False, end_by=signal.SIGTERM, more=None
-):
+def _attacked(result, folder, words, *, rng, ready, request, end_by=signal.SIGTERM, **how):
     """Run a server under attack.
 
     Args:
@@ -156,18 +150,17 @@ def _attacked(
         rng: Generator of the attack.
         ready: Returns the address as soon as the server listens.
         request: Bytes that a good client sends, and whether an answer is right.
-        foreign: See :func:`_watched`.
         end_by: Signal that ends the server.
-        more: A further attack on the process; it gets the good client.
+        how: ``foreign``, see :func:`_watched`; ``more``, a further attack on the process, which
+            gets the good client.
     """
 
     def meanwhile(pid):
         try:
             good = partial(_answer, _wait(ready), *request)
-            _watched(result, pid, good.args[0], rng, good, foreign=foreign)
-            if more is not None:
-                more(pid, good)
-        except (TimeoutError, ValueError) as error:
+            _watched(result, pid, good.args[0], rng, good, foreign=how.get("foreign", False))
+            how.get("more", lambda *_: None)(pid, good)
+        except (AssertionError, ValueError) as error:
             result.failures.append(f"server: {error}")
         os.kill(pid, end_by)
 
@@ -176,7 +169,7 @@ def _attacked(
     return outcome
 
 
-def serve(result, folder, rng):
+def serve(result, folder, rng, _stage):
     """``sim serve``: the good client gets the robot's frames."""
     (folder / "long.toml").write_text(SCENARIO.replace("duration_s = 0.1", "duration_s = 600.0"))
     out = folder.parent / f"{folder.name}.out"
@@ -190,7 +183,7 @@ def serve(result, folder, rng):
     _attacked(result, folder, words, rng=rng, ready=ready, request=request)
 
 
-def control(result, folder, rng):
+def control(result, folder, rng, _stage):
     """A recorder's control socket, and its source: status is answered, senders are received."""
     path, source = str(folder / "c.sock"), str(folder / "s.sock")
 
@@ -237,21 +230,15 @@ def viewer(result, folder, rng, stage):
     _attacked(result, folder, words, **how, foreign=True, end_by=signal.SIGINT)
 
 
-ATTACKS = ("sim serve", "record", "view --web")
+ATTACKS = {"sim serve": serve, "record": control, "view --web": viewer}
 
 
 def run(seed, stage):
     """Attack one server."""
     rng = random.Random(seed)
-    name = ATTACKS[seed % len(ATTACKS)]
+    name = list(ATTACKS)[seed % len(ATTACKS)]
     result = Result(f"{name}: forty bad clients")
     with stage.fresh() as folder:
-        for path, text in (("snake4.toml", ROBOT), ("snake4.dbc", DBC)):
-            (folder / path).write_text(text)
-        if name == "sim serve":
-            serve(result, folder, rng)
-        elif name == "record":
-            control(result, folder, rng)
-        else:
-            viewer(result, folder, rng, stage)
+        write_files(folder, {"snake4.toml": ROBOT, "snake4.dbc": DBC})
+        ATTACKS[name](result, folder, rng, stage)
     return result
