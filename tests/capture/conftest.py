@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-import undulog
 from support.processes import wait_for
 from undulog.capture import SessionWriter
 from undulog.capture.log.messages import frames as fr
@@ -57,17 +56,6 @@ class Reader:
     @property
     def texts(self):
         return [event.text for event in self.events]
-
-
-@pytest.fixture
-def command(capsys):
-    """Runs a command in this process to its exit code; returns output and errors."""
-
-    def run(*words, code=0):
-        assert undulog.run([str(word) for word in words]) == code
-        return capsys.readouterr()
-
-    return run
 
 
 @pytest.fixture

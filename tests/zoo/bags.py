@@ -32,10 +32,8 @@ def write_bag(log, path):
     robot = log.robot
     topics = ["/joint_commands", "/joint_states"] + [SECOND_TOPIC] * (log.second is not None)
     rows = _messages(0, robot.names, robot.sent_s, [robot.sent(), None, None])
-    for number, position, others in (
-        (1, log.position, (log.velocity, log.effort)),
-        (2, log.second, (None, None)),
-    ):
+    topics_of = ((log.position, log.velocity, log.effort), (log.second, None, None))
+    for number, (position, *others) in enumerate(topics_of, 1):
         if position is None:
             continue
         groups = [[j] for j in range(robot.m)] if robot.per_servo else [list(range(robot.m))]
@@ -62,8 +60,7 @@ def write_bag(log, path):
 
 def _messages(number, names, times_s, columns):
     """Time, topic's number and CDR of each message, in order of time."""
-    count = len(names)
-    text = b"".join(_text(name) for name in names)
+    count, text = len(names), b"".join(map(_text, names))
     # Offsets count from after the encapsulation: stamp 8, empty frame id 4 + 1 and 3 to align.
     at = 8 + 8 + 4 + len(text)
     fields = [("head", "V4"), ("sec", "<i4"), ("ns", "<u4"), ("frame", "V8"), ("names", "<u4")]

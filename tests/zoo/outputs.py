@@ -103,13 +103,8 @@ def structured(answer):
     quantities = {}
     for one in answer.stand_out:
         quantities[one.joint] = quantities.get(one.joint, frozenset()) | {one.quantity}
-    return Statement(
-        answer.sentence,
-        {one.joint: Named(frozenset(one.kinds), one.since_s) for one in answer.not_following},
-        quantities,
-        answer.undecided is not None,
-        bool(answer.alike),
-    )
+    undecided, alike = answer.undecided is not None, bool(answer.alike)
+    return Statement(answer.sentence, _named(answer.not_following), quantities, undecided, alike)
 
 
 def detected(log):
@@ -123,21 +118,22 @@ def detected(log):
         kept = np.isfinite(columns[:, j])
         return Samples(robot.t_s[kept, j], columns[kept, j])
 
+    logged = {"velocity": log.velocity, "effort": log.effort, "reference": log.second}
     motions = [
         JointMotion(
             name,
             Samples(robot.sent_s, sent[:, j]),
             samples(log.position, j),
-            velocity=samples(log.velocity, j),
-            effort=samples(log.effort, j),
-            reference=samples(log.second, j),
+            **{key: samples(columns, j) for key, columns in logged.items()},
         )
         for j, name in enumerate(robot.names)
     ]
-    found = {
-        one.joint: Named(frozenset(one.kinds), one.since_s) for one in joints_not_following(motions)
-    }
+    found = _named(joints_not_following(motions))
     return Statement(" ".join(found), found)
+
+
+def _named(faults):
+    return {one.joint: Named(frozenset(one.kinds), one.since_s) for one in faults}
 
 
 def _compared(healthy, path, options):

@@ -90,6 +90,21 @@ def onset(robot, j, rng, low=0.25, high=0.7):
     return start, robot.t_s[:, j] >= start
 
 
+def spell(robot, j, rng, begin, long):
+    """Draw an interval; return its start [s] and when a fault acts in it, shape (n,).
+
+    Args:
+        robot: The robot.
+        j: The joint.
+        rng: Generator.
+        begin: Least and largest start, in shares of the session.
+        long: Least and largest length, likewise.
+    """
+    start = float(rng.uniform(*begin)) * robot.duration_s
+    t = robot.t_s[:, j]
+    return start, (t >= start) & (t < start + rng.uniform(*long) * robot.duration_s)
+
+
 def hold(values, acts):
     """Return values that stay constant while a fault acts, as they were when it began."""
     index = np.arange(len(values))

@@ -62,8 +62,7 @@ def _(robot, rng, j):
 
 def clipped(robot):
     """Return the sensor's kinds of a flat top; none if another sensor shows it, too."""
-    kinds = () if robot.channels.second else ("clipped_sensor", "frozen_sensor")
-    return frozenset(kinds)
+    return robot.channels.unless_second("clipped_sensor", "frozen_sensor")
 
 
 def _at_limit(robot, j, position, more, quantities):

@@ -46,6 +46,10 @@ class Channels:
     effort: bool = False
     second: bool = False
 
+    def unless_second(self, *kinds):
+        """Return kinds that a second sensor would exclude; none if there is one."""
+        return frozenset() if self.second else frozenset(kinds)
+
     def __str__(self):
         """Return the names, joined."""
         names = [f"{self.velocity} velocity"] if self.velocity else []
@@ -263,12 +267,12 @@ def draw(seed, *, small=False, channels=None, joints=None, least_s=15.0):
 
 @dataclass(frozen=True)
 class Change:
-    """Changes of one joint by a fault; None: no change.
+    """Changes of one joint by a fault.
 
     Attributes:
         joint: The joint.
-        position: Where it really is [rad], shape (n,).
-        wanted: Command that reached its servo [rad], shape (n,).
+        position: Where it really is [rad], shape (n,); None: as usual.
+        wanted: Command that reached its servo [rad], shape (n,); None: as usual.
         power: Share of the effort that the motor gives, shape (n,).
         exact: Where its sensors add no noise, shape (n,).
         reading: From the position that its sensor would report to the one that it does.
@@ -279,11 +283,11 @@ class Change:
     joint: int
     position: np.ndarray | None = None
     wanted: np.ndarray | None = None
-    power: np.ndarray | None = None
-    exact: np.ndarray | None = None
-    reading: Callable[[np.ndarray], np.ndarray] | None = None
-    telemetry: Callable[[np.ndarray], np.ndarray] | None = None
-    lost: np.ndarray | None = None
+    power: np.ndarray | float = 1.0
+    exact: np.ndarray | bool = False
+    reading: Callable[[np.ndarray], np.ndarray] = np.asarray
+    telemetry: Callable[[np.ndarray], np.ndarray] = np.asarray
+    lost: np.ndarray | bool = False
 
 
 @dataclass(frozen=True)
@@ -317,26 +321,19 @@ def record(robot, changes=(), seed=0):
         t, swing = robot.t_s[:, j], robot.swing(j)
         where = robot.moved(j) if change.position is None else change.position
         wanted = robot.wanted(j) if change.wanted is None else change.wanted
-        noisy = np.ones(n) if change.exact is None else np.where(change.exact, 0.0, 1.0)
+        noisy = np.where(change.exact, 0.0, 1.0)
         read = where + noisy * noise[:, j]
         other = where + noisy * other_noise[:, j]
         if robot.step > 0:
             read, other = (np.round(one / robot.step) * robot.step for one in (read, other))
         rate = np.gradient(where, t) + 0.01 * robot.omega * swing * noisy * rng.normal(size=n)
         scale = STIFFNESS * robot.amplitude[j] * abs(1 - robot.gain[j] * np.exp(-1j * robot.lag[j]))
-        pull = STIFFNESS * (wanted - where)
-        if change.power is not None:
-            pull = pull * change.power
+        pull = STIFFNESS * (wanted - where) * change.power
         pull = pull + EFFORT_NOISE * scale * rng.normal(size=n)
-        if change.reading is not None:
-            read = change.reading(read)
+        read = change.reading(read)
         if robot.channels.velocity == "derived":
             rate = np.diff(read, prepend=read[0]) / np.diff(t, prepend=2 * t[0] - t[1])
-        channels = [read, rate, pull]
-        if change.telemetry is not None:
-            channels = [change.telemetry(one) for one in channels]
-        if change.lost is not None:
-            channels = [np.where(change.lost, np.nan, one) for one in channels]
+        channels = [np.where(change.lost, np.nan, change.telemetry(x)) for x in (read, rate, pull)]
         position[:, j], velocity[:, j], effort[:, j] = channels
         second[:, j] = other
     logged = robot.channels

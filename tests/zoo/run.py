@@ -105,11 +105,9 @@ def line(cases, width, outputs=OUTPUTS):
     sound = np.mean([any(one.sound for one in case.judged.values()) for case in cases])
     narrow = np.mean([any(one.narrow for one in case.judged.values()) for case in cases])
     fine = min(shares) >= RIGHT and sound <= SOUND
-    return (
-        f"{cases[0].fault:<{width}}  "
-        + "  ".join(f"{share:>9.0%}" for share in shares)
-        + f"  {sound:>7.0%} {narrow:>7.0%}  {'' if fine else 'FAILS'}"
-    )
+    row = "  ".join(f"{share:>9.0%}" for share in shares)
+    verdict = "" if fine else "FAILS"
+    return f"{cases[0].fault:<{width}}  {row}  {sound:>7.0%} {narrow:>7.0%}  {verdict}"
 
 
 def failures(cases):
@@ -118,11 +116,9 @@ def failures(cases):
         for output, one in case.judged.items():
             if one.missing or one.sound:
                 why = [*one.missing, *(f"names {name}, which is sound" for name in one.sound)]
-                robot = case.robot
-                yield (
-                    f"{case.fault!r} seed {case.seed} ({robot.m} joints, {robot.channels}), "
-                    f"{output}: {'; '.join(why)}\n    said: {case.statements[output].text[:300]!r}"
-                )
+                robot, text = case.robot, case.statements[output].text[:300]
+                drawn = f"seed {case.seed} ({robot.m} joints, {robot.channels})"
+                yield f"{case.fault!r} {drawn}, {output}: {'; '.join(why)}\n    text: {text!r}"
 
 
 def main(arguments=None):
