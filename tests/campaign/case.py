@@ -99,8 +99,7 @@ class Result:
 
 
 def _limit(room):
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    size = pages * resource.getpagesize() + room
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() + room
     resource.setrlimit(resource.RLIMIT_AS, (size, size))
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S + 2))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

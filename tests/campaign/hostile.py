@@ -57,8 +57,7 @@ def sines(ticks, jump_ns=0):
         t_ns = EPOCH_NS + tick * PERIOD_NS + (jump_ns if tick >= ticks // 2 else 0)
         for number in (1, 2):
             values = [0.3 * ((tick * 7 + 3 * k) % 50 / 25 - 1) + rng.gauss(0, 1e-3) for k in (0, 1)]
-            state = joint_state(t_ns % 2**62, ["a", "b"], values)
-            yield message(number, t_ns % 2**64, state, tick)
+            yield message(number, t_ns % 2**64, joint_state(t_ns % 2**62, ["a", "b"], values), tick)
 
 
 def zeros(size, *, stated=True):
@@ -81,8 +80,7 @@ def bomb(*, size, declared, stated=True, cut=0):
 def lz4_bomb():
     stream = lz4.frame.LZ4FrameCompressor()
     parts = [stream.begin(), *(stream.compress(bytes(1 << 24)) for _ in range(96)), stream.flush()]
-    packed = b"".join(parts)
-    return HEADER + PAIR + chunk(b"", size=1000, packed=packed, kind="lz4") + END
+    return HEADER + PAIR + chunk(b"", size=1000, packed=b"".join(parts), kind="lz4") + END
 
 
 def many_chunks(count):

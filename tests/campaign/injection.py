@@ -96,8 +96,7 @@ def run(seed, stage):
         kind = rng.choice(["log", "log", "log", "foreign", *TEXTS])
         line = _lay_out(kind, folder, rng, stage)
         result = Result(f"{line!r}: {kind}")
-        outcome = run_command(shlex.split(line), folder)
-        result.add(outcome)
+        result.add(run_command(shlex.split(line), folder))
         result.failures += check_output(folder) + _check_pages(folder)
         outside = [str(path) for path in folder.parent.iterdir() if path.name.startswith("up")]
         result.failures += [f"path: wrote {path}" for path in outside]
@@ -118,8 +117,7 @@ def _lay_out(kind, folder, rng, stage):
         _evil_session(folder / name, rng)
         if kind == "foreign":  # with faults besides, so that errors and warnings name things
             scratch = stage.folder / f"scratch{folder.parent.name}"
-            data = remake_log((folder / name).read_bytes(), rng, scratch)
-            (folder / name).write_bytes(data)
+            (folder / name).write_bytes(remake_log((folder / name).read_bytes(), rng, scratch))
         lines = [line for _, line in COMMANDS["log"] if line != "api"]
         return rng.choice(lines).format(file=shlex.quote(name))
     imports = "import trace.log -o new.mcap -r snake4.toml"

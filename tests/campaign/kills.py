@@ -49,8 +49,7 @@ def lay_out(folder, stage):
     for base in stage.bases:
         if base.kind in places:
             write_files(places[base.kind], base.files)
-    other = stage.files_of("lz4.mcap")["lz4.mcap"]
-    write_files(folder, {"run.mcap": long, "other.mcap": other})
+    write_files(folder, {"run.mcap": long, "other.mcap": stage.files_of("lz4.mcap")["lz4.mcap"]})
 
 
 def whole_outputs(folder):

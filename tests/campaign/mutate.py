@@ -95,8 +95,7 @@ def _set_length(data, rng):
     at = rng.choice(places or [0]) + rng.choice([1, 1, 9, 13, 17, 21, 25, 29, 33, 37, 41, 49])
     if at + 8 <= len(data):
         size = rng.choice([4, 8])
-        value = rng.choice(HUGE) & ((1 << 8 * size) - 1)
-        data[at : at + size] = value.to_bytes(size, "little")
+        data[at : at + size] = (rng.choice(HUGE) & ((1 << 8 * size) - 1)).to_bytes(size, "little")
 
 
 FAULTS = [

@@ -86,8 +86,7 @@ def test_a_folder_that_is_no_session_is_named_with_the_fix(line, kind, there, tm
         (folder / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
     suffix = suffix_of(line)
     words = line.replace("{no}" + suffix, str(folder))
-    given = {"out": tmp_path / "out", **there}
-    assert undulog.run(shlex.split(words.format_map(given))) in (1, 2)
+    assert undulog.run(shlex.split(words.format_map({"out": tmp_path / "out", **there}))) in (1, 2)
     err = capsys.readouterr().err
     assert str(folder) in err
     if suffix == ".mcap" and not line.startswith("drive"):

@@ -37,8 +37,7 @@ def run(*words, cwd=ROOT, fails=False, **environment):
 def record(wheel):
     with zipfile.ZipFile(wheel) as archive:
         (name,) = [n for n in archive.namelist() if n.endswith(".dist-info/RECORD")]
-        rows = csv.reader(archive.read(name).decode().splitlines())
-        return {row[0]: row[1] for row in rows}
+        return {row[0]: row[1] for row in csv.reader(archive.read(name).decode().splitlines())}
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +67,7 @@ def test_the_source_archive_holds_each_file_once_and_builds_the_same_wheel(tree,
     assert len(set(names)) == len(names)
     assert not [name for name in names if name.startswith(tuple(f"{one}/" for one in FOLDERS))]
     run(*BUILD, "-t", "wheel", "-d", tree.parent / "again", cwd=unpacked)
-    again = record(next((tree.parent / "again").glob("*.whl")))
-    assert again == record(wheel)
+    assert record(next((tree.parent / "again").glob("*.whl"))) == record(wheel)
 
 
 def test_the_wheel_holds_every_file_of_the_packages(wheel):

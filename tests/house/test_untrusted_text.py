@@ -88,8 +88,7 @@ def write_hostile(path, *, seconds=12.0, session_id=f"s{CLEAR}"):
         other = writer.register_schema(f"x/msg/Y{TITLE}\n{FORGED}", f"e{CLEAR}", b"?")
         topics = ("/joint_commands", "/joint_states", *TOPICS[:2])
         unit = {"unit": f"rad{TITLE}\n{FORGED}"}
-        units = ({}, {}, unit, unit)
-        pairs = zip(topics, units, strict=True)
+        pairs = zip(topics, ({}, {}, unit, unit), strict=True)
         channels = [writer.register_channel(t, "cdr", states, facts) for t, facts in pairs]
         odd = writer.register_channel(TOPICS[2], f"c{CLEAR}", other, unit)
         layout = message_type(JOINT_STATE)
@@ -190,11 +189,9 @@ def test_spreadsheets_find_no_formula_and_names_come_back(folder):
 
 def test_entities_and_documents_of_rerun_are_as_meant(folder):
     run(folder, "view A --save c.rrd")
-    chunks = RrdReader(folder / "c.rrd").stream().to_chunks()
-    paths = {chunk.entity_path for chunk in chunks}
+    paths = {chunk.entity_path for chunk in RrdReader(folder / "c.rrd").stream().to_chunks()}
     assert not [path for path in paths if raw(path)]
-    roots = {path.split("/")[1] for path in paths}
-    assert not roots & {"j10", "t1", ".."}
+    assert not {path.split("/")[1] for path in paths} & {"j10", "t1", ".."}
 
 
 class _Tags(HTMLParser):

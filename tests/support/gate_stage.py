@@ -247,8 +247,7 @@ class Written:
         """Return commands from an event on: joint to angles [rad]."""
         since_s = self.time_of(words)
         rows = [row for at_s, row in self.commands if at_s >= since_s - 1e-9]
-        names = self.commands[0][1]
-        return {name: np.array([row[name] for row in rows]) for name in names}
+        return {name: np.array([row[name] for row in rows]) for name in self.commands[0][1]}
 
 
 def check_session(path, lines, *, max_rate=MAX_RATE, lockstep=False):
@@ -284,8 +283,7 @@ def check_true_rates(written, lines, *, max_rate=MAX_RATE):
     shortest_s = math.inf
     for name, (_, angle) in commands_of(lines).items():
         apart_s = np.diff(sent_ns[name]) * 1e-9
-        step = np.abs(np.diff(angle))
-        beyond = step - max_rate * apart_s - STEP * (1 + 1e-6)
+        beyond = np.abs(np.diff(angle)) - max_rate * apart_s - STEP * (1 + 1e-6)
         assert beyond.max(initial=0.0) <= 0.0, (name, beyond.max(), apart_s[np.argmax(beyond)])
         shortest_s = min(shortest_s, apart_s.min(initial=math.inf))
     return shortest_s
@@ -294,8 +292,7 @@ def check_true_rates(written, lines, *, max_rate=MAX_RATE):
 def check_pace(times_s, late_s=0.02):
     """Never more commands than deadlines have passed: what was late is not made up in a burst."""
     ahead = np.arange(len(times_s)) / RATE_HZ - times_s
-    least = np.minimum.accumulate(ahead)
-    assert (ahead - least).max(initial=0.0) <= 1 / RATE_HZ + late_s
+    assert (ahead - np.minimum.accumulate(ahead)).max(initial=0.0) <= 1 / RATE_HZ + late_s
 
 
 def check_ramp_down(written, since, *, ramp_rate=RAMP_RATE, yields=()):

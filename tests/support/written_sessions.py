@@ -25,8 +25,7 @@ def write_session(path, count=300, **options):
         states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True, effort=True)
         odometry = writer.odometry("/odom", frame="world", child="link01")
         events = writer.log("/rosout")
-        mode = writer.string("/gait/mode")
-        mode.write(EPOCH_NS, "walk")
+        writer.string("/gait/mode").write(EPOCH_NS, "walk")
         events.write(EPOCH_NS, "warn", "twin", "clamped")
         for tick, (position, velocity, effort) in enumerate(data):
             t_ns = EPOCH_NS + tick * STEP_NS

@@ -47,8 +47,7 @@ def _(robot, rng, j):
     apart = np.angle(np.exp(1j * (robot.phase[other] - robot.phase[j])))
     if abs(apart) > np.radians(120):  # as good as inverted
         kinds |= either(robot.channels, "inverted", "inverted_sensor", cause="inverted")
-    change = misled(robot, j, other)
-    return single(change, kinds, stands_out=RESPONSE | OFFSET, checked=False)
+    return single(misled(robot, j, other), kinds, stands_out=RESPONSE | OFFSET, checked=False)
 
 
 @fault("off by a whole turn from the beginning")

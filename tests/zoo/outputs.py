@@ -152,5 +152,4 @@ def _heading(page):
 
 def _plain(markup):
     """Text without tags, soft hyphens and zero-width spaces."""
-    text = unescape(re.sub(r"<wbr[^>]*>|<[^>]*>", "", markup))
-    return re.sub("[\u00ad\u200b\u2060]", "", text)
+    return re.sub("[\u00ad\u200b\u2060]", "", unescape(re.sub(r"<wbr[^>]*>|<[^>]*>", "", markup)))

@@ -30,8 +30,7 @@ def lines():
 def _cell(fault, channels):
     if fault.channels is not None and channels not in fault.channels:
         return "-"
-    robot = draw(1, small=True, channels=channels, joints=fault.joints)
-    _, truth = plant(fault, robot, 1)
+    _, truth = plant(fault, draw(1, small=True, channels=channels, joints=fault.joints), 1)
     if truth.undecided:
         return "joints differ; which one can't be decided"
     return _kinds(truth.joints[0]) if truth.joints else "nothing"

@@ -109,14 +109,12 @@ def hold(values, acts):
     """Return values that stay constant while a fault acts, as they were when it began."""
     index = np.arange(len(values))
     begins = acts & ~np.concatenate(([False], acts[:-1]))
-    last = np.maximum.accumulate(np.where(begins | ~acts, index, 0))
-    return values[np.where(acts, last, index)]
+    return values[np.where(acts, np.maximum.accumulate(np.where(begins | ~acts, index, 0)), index)]
 
 
 def bouts(robot, j, rng, share):
     """Return when a fault acts for a share of the time, in bouts of about a cycle, shape (n,)."""
-    period = 2 * np.pi / robot.omega
-    count = max(2, round(share * robot.duration_s / period))
+    count = max(2, round(share * robot.duration_s / (2 * np.pi / robot.omega)))
     long = share * robot.duration_s / count
     slots = robot.duration_s / count
     starts = np.arange(count) * slots + rng.uniform(0.1, 0.9 - share, count) * slots

@@ -10,8 +10,7 @@ from .truth import PAUSED, Truth, either
 @fault("inverted")
 def _(robot, rng, j):
     """The position is the mirror image of what it should be."""
-    about = robot.bias[j]
-    position = 2 * about - robot.moved(j)
+    position = 2 * robot.bias[j] - robot.moved(j)
     # Turned as a whole: its servo sees what it always saw, and so does its effort.
     wanted = robot.wanted(j) - robot.moved(j) + position
     kinds = either(robot.channels, "inverted", "inverted_sensor", cause="inverted")
@@ -88,8 +87,7 @@ def _(robot, rng, j):
 def _slip(robot, rng, j):
     since, acts = onset(robot, j, rng)
     side, least = np.sign(rng.uniform(-1, 1)), 0.35 * robot.amplitude[j]
-    size = max(abs(offset(robot, j, rng, 0.5, 0.3)), least)
-    return since, np.where(acts, side * size, 0.0)
+    return since, np.where(acts, side * max(abs(offset(robot, j, rng, 0.5, 0.3)), least), 0.0)
 
 
 def _slipped(change, name, kinds, since):
@@ -116,8 +114,7 @@ def _(robot, rng, j):
 @fault("sensor drifts")
 def _(robot, rng, j):
     """The mean of the position wanders."""
-    size = 2 * offset(robot, j, rng, 0.4)
-    drift = size * robot.t_s[:, j] / robot.duration_s
+    drift = (2 * offset(robot, j, rng, 0.4)) * robot.t_s[:, j] / robot.duration_s
     kinds = robot.channels.unless_second("slipped", "slipped_sensor") | {"drifting_sensor"}
     change = Change(j, reading=lambda read: read + drift)
     return single(change, {"drifting_sensor"}, kinds, stands_out=OFFSET, checked=False)

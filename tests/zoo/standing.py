@@ -93,8 +93,7 @@ def _(robot, rng, j):
     """The position repeats one value to the bit; all else goes on."""
     since, acts = onset(robot, j, rng)
     change = Change(j, reading=lambda read: hold(read, acts))
-    kinds = standing(robot.channels, "sensor")
-    return single(change, {"frozen_sensor"}, kinds, since_s=since)
+    return single(change, {"frozen_sensor"}, standing(robot.channels, "sensor"), since_s=since)
 
 
 @fault("sensor frozen from the beginning")
@@ -125,8 +124,7 @@ def _(robot, rng, j):
     """The position stands still for a part of a cycle, again and again; the effort is zero then."""
     acts = bouts(robot, j, rng, 0.2)
     change = Change(j, position=hold(robot.moved(j), acts), power=np.where(acts, 0.0, 1.0))
-    kinds = again(standing(robot.channels, "dead"))
-    return single(change, {"intermittent", "dead"}, kinds)
+    return single(change, {"intermittent", "dead"}, again(standing(robot.channels, "dead")))
 
 
 @fault("sensor frozen at times, a fifth of the time")

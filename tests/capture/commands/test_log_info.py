@@ -16,8 +16,7 @@ HUMBLE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def std_string(store, serialize):
-    kind = store.types["std_msgs/msg/String"]
-    return bytes(serialize(kind(data="walk"), "std_msgs/msg/String"))
+    return bytes(serialize(store.types["std_msgs/msg/String"](data="walk"), "std_msgs/msg/String"))
 
 
 ROS1_TEXT, ROS1_SUM = NOETIC.generate_msgdef("std_msgs/msg/String")

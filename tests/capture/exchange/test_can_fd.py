@@ -175,8 +175,7 @@ def some_messages(channel=0):
 @pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".asc.gz"])
 def test_logs_of_python_can(suffix, tmp_path):
     messages = some_messages()
-    source = log_messages(tmp_path / f"log{suffix}", messages)
-    report, frames = imported(source, tmp_path, FD)
+    report, frames = imported(log_messages(tmp_path / f"log{suffix}", messages), tmp_path, FD)
     fd = [message for message in messages if message.is_fd]
     assert report.frames == len(messages)
     assert report.problems == ["nothing decoded: the robot snake13 has no bus map"]
@@ -228,8 +227,7 @@ TRC = """;$FILEVERSION=2.1
 
 
 def test_a_trc_of_version_2(tmp_path):
-    data = " ".join(f"{k:02X}" for k in range(64))
-    (tmp_path / "x.trc").write_text(TRC.format(data))
+    (tmp_path / "x.trc").write_text(TRC.format(" ".join(f"{k:02X}" for k in range(64))))
     report, frames = imported(tmp_path / "x.trc", tmp_path, "/can_fd/can1")
     assert report.frames == 5
     assert frames["id_flags"].tolist() == [0x300, 0x400, 0x18FEF100 | fr.EXTENDED_FLAG, 0x500]
@@ -274,8 +272,7 @@ def test_a_candump_log_of_both_kinds_comes_back_bit_for_bit(tmp_path):
 def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path):
     frames = every_kind(fd=True)
     topics = {"/can_fd/can0": frames, "/can/can0": classic_frames(50, T0, 1000)}
-    source = write_frames(tmp_path / "run.mcap", topics)
-    report = export_log(source, tmp_path / "x.mcap")
+    report = export_log(write_frames(tmp_path / "run.mcap", topics), tmp_path / "x.mcap")
     assert report.buses == {"can0": 50}
     left_out = f"{len(frames)} CAN FD frames left out: the format has 8 bytes a frame"
     assert report.warnings == [left_out]
@@ -329,8 +326,7 @@ def test_import_decodes_both_kinds(tmp_path):
         targets.append(target)
     (tmp_path / "x.log").write_text("".join(lines))
     robot = bus_robot(BIG, SIGNALS)
-    report = import_can(tmp_path / "x.log", tmp_path / "run.mcap", robot)
-    assert report.problems == []
+    assert import_can(tmp_path / "x.log", tmp_path / "run.mcap", robot).problems == []
     with Session.open(tmp_path / "run.mcap") as session:
         state = session.joints("/joint_states").signal("joint01")
         effort = session.joints("/joint_states", "effort").signal("joint01")
@@ -344,8 +340,7 @@ def test_import_decodes_both_kinds(tmp_path):
 def test_a_frame_too_short_for_its_signal_is_reported(tmp_path):
     lines = ("(1.000000) can0 100##1" + "00" * 48, "(1.000100) can0 100#" + "00" * 8)
     (tmp_path / "x.log").write_text("".join(f"{line} R\n" for line in lines))
-    robot = bus_robot(BIG, SIGNALS)
-    report = import_can(tmp_path / "x.log", tmp_path / "run.mcap", robot)
+    report = import_can(tmp_path / "x.log", tmp_path / "run.mcap", bus_robot(BIG, SIGNALS))
     short = "3 values missing from frames too short for them: big.angle (2), big.torque (1)"
     assert report.problems == [short]
 

@@ -37,8 +37,7 @@ def arcsnake(tmp_path_factory):
 def test_the_arcsnake_log_comes_back_bit_for_bit(arcsnake, tmp_path):
     path, report = arcsnake
     assert (report.frames, report.verdict, report.problems) == (19_297, "good", [])
-    exported = export_log(path, tmp_path / "back.log")
-    assert exported.buses == {"can0": 19_297}
+    assert export_log(path, tmp_path / "back.log").buses == {"can0": 19_297}
     assert (tmp_path / "back.log").read_bytes() == RECORDING.read_bytes()
 
 
@@ -194,8 +193,7 @@ def polled(tmp_path_factory):
                 ("magnetic_field", {"x": 20.5, "y": -30.25}),
             ):
                 writer(sent(name, values, t))
-    report = import_can(folder / "poll.asc", folder / "run.mcap", robot)
-    return folder / "run.mcap", report, truth
+    return folder / "run.mcap", import_can(folder / "poll.asc", folder / "run.mcap", robot), truth
 
 
 # The writer counts from its first message, which is one frame after the first round's start.
@@ -366,8 +364,7 @@ def test_a_stopped_import_leaves_a_whole_file(import_text, monkeypatch):
     report = import_text(TWO_BUSES, stop=stop)
     assert (report.complete, report.verdict, report.frames) == (False, "degraded", 4)
     with Session.open(report.output) as session:
-        assert session.warnings == []
-        assert session.verdict == "degraded"
+        assert (session.warnings, session.verdict) == ([], "degraded")
 
 
 def test_blocks_make_no_difference(tmp_path, polled, monkeypatch):

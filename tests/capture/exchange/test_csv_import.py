@@ -84,8 +84,7 @@ def csv_file(tmp_path, text):
 def run(tmp_path, text, *options, time="s", **more):
     robot = load_robot("snake13")
     columns = csv.column_map_from_options((f"t=time:{time}", *options), robot)
-    source = csv_file(tmp_path, text)
-    return csv.import_csv(source, tmp_path / "run.mcap", robot, columns, **more)
+    return csv.import_csv(csv_file(tmp_path, text), tmp_path / "run.mcap", robot, columns, **more)
 
 
 def test_columns_of_several_joints_and_quantities(tmp_path):
@@ -116,8 +115,7 @@ def test_columns_of_several_joints_and_quantities(tmp_path):
 
 
 def test_velocity_without_position_has_its_own_topic(tmp_path):
-    report = run(tmp_path, "t,v\n0,1\n", "v=joint01.velocity:rad/s")
-    assert report.samples == {"/joint_velocity": 1}
+    assert run(tmp_path, "t,v\n0,1\n", "v=joint01.velocity:rad/s").samples == {"/joint_velocity": 1}
 
 
 def test_unix_times_are_kept_to_the_nanosecond(tmp_path):
@@ -128,8 +126,7 @@ def test_unix_times_are_kept_to_the_nanosecond(tmp_path):
 
 
 def test_unwrapping_passes_over_gaps(tmp_path):
-    text = "t,a\n0,170\n1,\n2,-170\n3,-150\n"
-    run(tmp_path, text, "a=joint01.position:deg,wrap=360,scale=0.5")
+    run(tmp_path, "t,a\n0,170\n1,\n2,-170\n3,-150\n", "a=joint01.position:deg,wrap=360,scale=0.5")
     with Session.open(tmp_path / "run.mcap") as session:
         values = session.joints("/joint_states").values[0]
     np.testing.assert_allclose(np.degrees(values[~np.isnan(values)]), [85, 95, 105])

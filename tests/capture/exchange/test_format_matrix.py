@@ -235,8 +235,7 @@ def message_of(each):
 
 def held_by_python_cans_candump(each):
     if each.kind == "error":  # its writer has one identifier for all of them, and no direction
-        size = len(each.data)
-        return replace(each, identifier=0x80, dlc=size, sent=False)
+        return replace(each, identifier=0x80, dlc=len(each.data), sent=False)
     if each.kind == "remote":
         return replace(each, dlc=0)
     return replace(each, dlc=len(each.data))

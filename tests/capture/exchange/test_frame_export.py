@@ -139,8 +139,7 @@ def test_what_no_format_but_candump_has_is_counted(tmp_path):
 
 def test_ros_messages_hold_everything(session_of_every_kind, tmp_path):
     source, frames = session_of_every_kind
-    report = export_log(source, tmp_path / "x.mcap")
-    assert report.warnings == []
+    assert export_log(source, tmp_path / "x.mcap").warnings == []
     found = {}
     with (tmp_path / "x.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -155,8 +154,7 @@ def test_ros_messages_hold_everything(session_of_every_kind, tmp_path):
             flags |= decoded.id | decoded.is_error * fr.ERROR_FLAG
             found[message.sequence] = (stamp_ns, flags, decoded.dlc, way, bytes(decoded.data))
     columns = [frames[name].tolist() for name in ("t_host_ns", "id_flags", "dlc", "dir")]
-    truth = zip(*columns, map(bytes, frames["data"]), strict=True)
-    assert found == dict(enumerate(truth))
+    assert found == dict(enumerate(zip(*columns, map(bytes, frames["data"]), strict=True)))
 
 
 def test_rosbags_reads_them(session_of_every_kind, tmp_path):
@@ -174,8 +172,7 @@ def test_rosbags_reads_them(session_of_every_kind, tmp_path):
 
 def test_names_that_a_format_has_not_are_reported(tmp_path):
     frames = every_kind()[:20]
-    buses = {"can3": frames, "left-arm": frames, "0": frames}
-    source = write_session(tmp_path / "run.mcap", buses)
+    source = write_session(tmp_path / "run.mcap", {"can3": frames, "left-arm": frames, "0": frames})
     report = export_log(source, tmp_path / "x.mcap")
     names = {"0": "/can_0", "left-arm": "/left_arm"}
     lost = [f"topics can't be named after bus {b}: its are in {name}" for b, name in names.items()]
@@ -197,8 +194,7 @@ def test_directions_that_are_none_are_reported(suffix, words, tmp_path):
 
 def test_a_trace_without_a_date(tmp_path):
     frames = every_kind(start_ns=100 * S)
-    source = write_session(tmp_path / "run.mcap", {"can0": frames})
-    report = export_log(source, tmp_path / "x.blf")
+    report = export_log(write_session(tmp_path / "run.mcap", {"can0": frames}), tmp_path / "x.blf")
     note = "its dates begin in 1990: the times are those since 1970, without a date"
     assert report.warnings[0] == note
     back = imported(tmp_path / "x.blf", tmp_path)[1]["t_host_ns"] - RELATIVE_EPOCH_NS

@@ -121,8 +121,7 @@ def test_groups_of_a_logger_merge_by_time_to_the_nanosecond(compression, tmp_pat
     np.testing.assert_array_equal(frames["dir"], truth[2])
     np.testing.assert_array_equal(frames["data"].view("<u8")[:, 0], truth[0])
     assert buses == [f"can{number}" for number in truth[3]]
-    assert log.time == "to 1 ns from a start to 1 us, in UTC"
-    assert log.problems == []
+    assert (log.time, log.problems) == ("to 1 ns from a start to 1 us, in UTC", [])
 
 
 def test_fields_that_a_group_may_lack(tmp_path):

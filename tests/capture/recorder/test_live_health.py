@@ -173,8 +173,7 @@ def test_a_clean_recording_is_good(tmp_path):
 
 def test_pieces_keep_the_order(tmp_path, monkeypatch):
     monkeypatch.setattr(live_health, "PIECE", 2000)
-    wrong = Faults(back=0.01, nan=0.002, lost=0.01, updates=1.0)
-    live = record(tmp_path / "s.mcap", wrong)
+    live = record(tmp_path / "s.mcap", Faults(back=0.01, nan=0.002, lost=0.01, updates=1.0))
     assert without_rounding(live) == without_rounding(check_session(tmp_path / "s.mcap"))
 
 

@@ -123,8 +123,7 @@ def test_a_manager_that_hears_nothing_or_is_gone_never_holds_us_up(tmp_path, not
         full = notifier.failed
         assert full > 0
         deaf.setblocking(False)
-        taken = len(heard(deaf))
-        assert taken + full == 5000
+        assert len(heard(deaf)) + full == 5000
         notifier.status("goes on")
         assert heard(deaf) == [["STATUS=goes on"]]
     notifier.status("to nobody")

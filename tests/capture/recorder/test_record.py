@@ -100,10 +100,8 @@ def test_unknown_identifiers_and_losses_are_reported_and_the_verdict_is_that_of_
 def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
     output = tmp_path / "twin.mcap"
     options = ("--fast", "--duration", "4s", "--json", "--floor", "0")
-    done = run(*command(output, "twin:flat"), *options, cwd=ROOT)
-    report = json.loads(done.stdout)
-    assert report["robot"] == "snake25"
-    assert report["ended"] == "all sources have ended"
+    report = json.loads(run(*command(output, "twin:flat"), *options, cwd=ROOT).stdout)
+    assert (report["robot"], report["ended"]) == ("snake25", "all sources have ended")
     with Session.open(output) as session:
         states = session.joints("/joint_states")
         np.testing.assert_array_equal(np.diff(states.t_ns[0]), 10_000_000)

@@ -154,8 +154,7 @@ def test_the_command_line_beats_the_environment_beats_the_file(tmp_path, name, p
     cli = NEEDED | {name: in_command if present[2] else None}
     settings = resolve(cli, {"PATH": "/bin", **environ}, file)
     winner = max((i for i in range(3) if present[i]), default=3)
-    origins = (str(file), "environment", "command line", "default")
-    assert settings.origin[name] == origins[winner]
+    assert settings.origin[name] == ((str(file), "environment", "command line", "default"))[winner]
     if any(present):
         attribute = f"{name}_s" if name in {"duration", "split_time", "ring"} else name
         assert getattr(settings, attribute) == PARSERS[name](GOOD[name][winner])
@@ -180,10 +179,8 @@ def test_every_setting_is_tested_and_the_docstring_s_example_holds_all(tmp_path)
 @pytest.mark.skipif(not MANUAL.is_file(), reason="the manual is not here")
 def test_the_manual_s_example_works_and_its_table_has_every_setting(tmp_path):
     text = MANUAL.read_text().split("## Control", 1)[0]
-    example = text.split("```toml\n", 1)[1].split("```", 1)[0]
-    (tmp_path / "snake.toml").write_text(example)
-    settings = resolve({"operator": "ann"}, {}, tmp_path / "snake.toml")
-    assert settings.split_time_s == 600.0
+    (tmp_path / "snake.toml").write_text(text.split("```toml\n", 1)[1].split("```", 1)[0])
+    assert resolve({"operator": "ann"}, {}, tmp_path / "snake.toml").split_time_s == 600.0
     rows = "".join(line.split("|")[1] for line in text.splitlines() if line.startswith("| `"))
     assert set(re.findall(r"`(\w+)`", rows)) == set(PARSERS)
 
@@ -199,8 +196,7 @@ def test_defaults():
 
 def test_the_environment_may_name_the_file(tmp_path):
     (tmp_path / "x.toml").write_text(toml({"operator": "ann"}))
-    environ = {"UNDULOG_RECORD_SETTINGS": str(tmp_path / "x.toml")}
-    assert resolve(NEEDED, environ).operator == "ann"
+    assert resolve(NEEDED, {"UNDULOG_RECORD_SETTINGS": str(tmp_path / "x.toml")}).operator == "ann"
 
 
 def test_a_robot_beside_the_settings_file_is_found_there(tmp_path):

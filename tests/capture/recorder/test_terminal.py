@@ -187,8 +187,7 @@ def test_a_terminal_gets_a_screen_that_is_cleared_at_the_end(monkeypatch):
     with terminal() as (ours, stream):
         shown = Terminal(stream)
         shown.show(SNAPSHOT)
-        said = read_until(ours, "the connection is lost")
-        assert "DEGRADED" in said
+        assert "DEGRADED" in read_until(ours, "the connection is lost")
         shown.show(replace(SNAPSHOT, elapsed_s=755.3))
         assert "0:12:35" in read_until(ours, "the connection is lost")
         assert shown.close()
@@ -283,8 +282,7 @@ def test_the_statuses_say_what_the_screen_says():
     found = {status.name: status for status in statuses(SNAPSHOT)}
     names = "recorder, session, source can0, source imu, topics ir, topics joints"
     assert list(found) == names.split(", ")
-    assert found["recorder"].level == OK
-    assert found["session"].level == WARN
+    assert (found["recorder"].level, found["session"].level) == (OK, WARN)
     assert found["session"].values["reason.2"] == "reason 1"
     assert (found["source can0"].level, found["source imu"].level) == (WARN, ERROR)
     assert found["source can0"].values["clock_drift_ppm"] == "-23.420"
@@ -293,8 +291,7 @@ def test_the_statuses_say_what_the_screen_says():
 
 
 def test_a_silent_source_is_stale_and_a_full_disk_an_error():
-    silent = replace(CAN, age_s=3.0, dropped=0)
-    snapshot = replace(SNAPSHOT, sources=(silent,), free=1_000_000)
+    snapshot = replace(SNAPSHOT, sources=(replace(CAN, age_s=3.0, dropped=0),), free=1_000_000)
     found = {status.name: status for status in statuses(snapshot)}
     assert (found["source can0"].level, found["source can0"].message) == (STALE, "silent for 3 s")
     recorder = found["recorder"]

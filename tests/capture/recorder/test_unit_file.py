@@ -62,8 +62,7 @@ def test_systemd_finds_it_well_hardened(systemd_analyze, unit):
     if "unrecognized option" in done.stderr:
         pytest.skip("this systemd-analyze can't judge a file")
     assert done.returncode == 0, done.stdout
-    exposure = float(re.search(r"exposure level for \S+: ([0-9.]+)", done.stdout)[1])
-    assert exposure <= EXPOSURE
+    assert float(re.search(r"exposure level for \S+: ([0-9.]+)", done.stdout)[1]) <= EXPOSURE
 
 
 def test_a_weaker_unit_would_not_pass(systemd_analyze, unit):
@@ -76,14 +75,12 @@ def test_a_weaker_unit_would_not_pass(systemd_analyze, unit):
 
 def test_what_the_recorder_relies_on_is_there(unit):
     found = settings_of(unit.read_text())
-    assert found["Type"] == ["notify"]
-    assert found["KillSignal"] == ["SIGTERM"]
+    assert (found["Type"], found["KillSignal"]) == (["notify"], ["SIGTERM"])
     assert found["Restart"] == ["on-failure"]
     assert found["AssertPathExists"] == ["/etc/undulog/%i.toml"]
     assert found["RestartPreventExitStatus"] == ["2"]
     assert found["RuntimeDirectory"] == found["StateDirectory"] == ["undulog/%i"]
-    families = found["RestrictAddressFamilies"][0].split()
-    assert {"AF_UNIX", "AF_CAN", "AF_INET"} <= set(families)
+    assert {"AF_UNIX", "AF_CAN", "AF_INET"} <= set(found["RestrictAddressFamilies"][0].split())
     assert {"char-ttyACM rw", "char-ttyUSB rw"} <= set(found["DeviceAllow"])
 
 
@@ -126,8 +123,7 @@ def heard(manager, wanted):
 
 def start_command(unit, name):
     """What the unit would run, with its specifiers filled in."""
-    command = settings_of(unit.read_text())["ExecStart"][0]
-    return command.replace("%i", name).split()
+    return settings_of(unit.read_text())["ExecStart"][0].replace("%i", name).split()
 
 
 def without_capabilities():
@@ -169,8 +165,7 @@ def service(unit, tmp_path):
 
 def control(runtime, *words):
     """Run a command of the control socket as the operator would."""
-    environ = {**os.environ, "RUNTIME_DIRECTORY": str(runtime)}
-    return undulog("record", *words, env=environ)
+    return undulog("record", *words, env={**os.environ, "RUNTIME_DIRECTORY": str(runtime)})
 
 
 def test_a_service_says_ready_feeds_its_watchdog_and_ends_whole_on_sigterm(service, tmp_path):
@@ -187,8 +182,7 @@ def test_a_service_says_ready_feeds_its_watchdog_and_ends_whole_on_sigterm(servi
     output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
     assert output == "", "--quiet"
-    raw = (tmp_path / "state" / "run.mcap").read_bytes()
-    assert raw.endswith(b"\x89MCAP0\r\n")
+    assert (tmp_path / "state" / "run.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
     assert not (tmp_path / "runtime" / "run.sock").exists()
 
 

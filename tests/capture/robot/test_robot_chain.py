@@ -41,8 +41,7 @@ def test_a_chain_has_as_many_joints_as_it_says(count):
 
 
 def test_a_chain_may_bend_in_one_plane_alone():
-    robot = eel(chain(12, YAW))
-    assert {joint.plane for joint in robot.joints} == {Plane.HORIZONTAL}
+    assert {joint.plane for joint in eel(chain(12, YAW)).joints} == {Plane.HORIZONTAL}
 
 
 @pytest.mark.parametrize(

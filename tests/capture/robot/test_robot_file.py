@@ -261,8 +261,7 @@ def test_unequal_numbers_of_links_and_joints():
 def test_a_robot_file_finds_its_databases_beside_it(tmp_path):
     (tmp_path / "worm.toml").write_text(MINIMAL + BUS)
     (tmp_path / "worm.dbc").write_bytes(DBC.replace('"deg"', '"°"').encode("cp1252"))
-    robot = load_robot(tmp_path / "worm.toml")
-    assert "°" in robot.databases[0][1]
+    assert "°" in load_robot(tmp_path / "worm.toml").databases[0][1]
 
 
 def test_an_unknown_robot_is_wrong_usage():
@@ -294,8 +293,7 @@ def test_shipped_snakes_can_be_armed(name):
     robot = load_robot(name)
     assert missing_limits(robot) == ()
     assert robot.safety.on_fault is model.OnFault.RAMP_DOWN
-    rate = robot.safety.values("max_rate", robot.joint_names)
-    assert rate.tolist() == [4.0] * len(robot.joints)
+    assert robot.safety.values("max_rate", robot.joint_names).tolist() == [4.0] * len(robot.joints)
 
 
 def test_safety_of_one_joint_may_be_otherwise():

@@ -104,8 +104,7 @@ def test_what_is_found_impossible_late_ends_the_source_only(listen):
     reader = listen(source_of(open_link))
     assert not reader.source.finished
     go.set()
-    event = reader.until_event("there is no such driver")
-    assert event.level == "error"
+    assert reader.until_event("there is no such driver").level == "error"
     assert reader.source.finished
 
 

@@ -59,8 +59,7 @@ def test_the_devices_times_to_the_microsecond(bus, connect, traffic):
     assert reader.source.clock is ClockDomain.DEVICE
     for frame in truth:
         bus.send(can_message(frame))
-    found = reader.until_frames(2000)
-    assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
+    assert np.array_equal(reader.until_frames(2000)["t_device_ns"], truth["t_device_ns"])
 
 
 def test_a_driver_without_times_gets_those_of_arrival():
@@ -84,8 +83,7 @@ def test_error_frames(bus, connect):
     reader = connect()
     bus.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=[0] * 8))
     bus.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=[7]))
-    found = reader.until_frames(2)
-    assert found["id_flags"].tolist() == [ERROR_FLAG | 0x40, 0x123]
+    assert reader.until_frames(2)["id_flags"].tolist() == [ERROR_FLAG | 0x40, 0x123]
     assert (reader.counts.error_frames, reader.counts.malformed) == (1, 0)
     reader.until_event("bus-off")
     reader.until_event("back on the bus")
@@ -162,8 +160,7 @@ def test_listen_only_options_are_ones_that_the_interface_has(interface):
         bus = can_source.bus_class("x", interface)
     except SourceError as error:
         pytest.skip(str(error))
-    source = can_source.open_can(parse_address(f"can:{interface}:0"))
-    assert source.facts["listen_only"] == "yes"
+    assert can_source.open_can(parse_address(f"can:{interface}:0")).facts["listen_only"] == "yes"
     assert set(can_source.LISTEN_ONLY[interface]) <= can_source.known_options(bus) | {"listen_only"}
 
 

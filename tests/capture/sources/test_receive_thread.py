@@ -126,8 +126,7 @@ def test_what_was_accepted_before_the_end_is_in_the_session(seed, tmp_path):
         report, err = ended(recorder, signal.SIGINT)
         accepted, _, _ = sender.result()  # its send() failed: nobody records
     assert recorder.returncode == 0, err
-    numbers = frames_of(output, "/can/bus")["t_device_ns"]
-    np.testing.assert_array_equal(numbers, np.arange(accepted))
+    np.testing.assert_array_equal(frames_of(output, "/can/bus")["t_device_ns"], np.arange(accepted))
     assert report["sources"]["bus"]["frames"] == accepted
 
 

@@ -211,8 +211,7 @@ def test_noise_costs_its_own_line_only(connect, traffic, same):
         b"q\r",
         b"X" * 5000 + b"\r",
     ]
-    rng = np.random.default_rng(0)
-    places = rng.choice(1000, len(noise), replace=False).tolist()
+    places = np.random.default_rng(0).choice(1000, len(noise), replace=False).tolist()
     mixed = b""
     for number, line in enumerate(lines(truth)):
         mixed += noise[places.index(number)] if number in places else b""
@@ -288,8 +287,7 @@ def test_an_adapter_that_is_not_there_yet_is_waited_for(plug, tmp_path, listen, 
 
 def test_an_adapter_without_listen_only_is_not_opened_otherwise(plug, tmp_path, listen):
     adapter = plug(refuses=b"L")
-    reader = listen(source_at(tmp_path))
-    assert "listen_only=0" in reader.until_event("refuses").text
+    assert "listen_only=0" in listen(source_at(tmp_path)).until_event("refuses").text
     assert b"O" not in adapter.commands
 
 

@@ -113,8 +113,7 @@ def test_can_fd_frames_and_what_is_no_frame(pair, traffic, fd_traffic, same):
 def test_frames_of_this_computer_are_marked(traffic):
     raw = np.frombuffer(b"".join(packed(f) for f in traffic(2)), dtype=np.uint8).reshape(2, 16)
     batch = receive_many.Batch(raw, [16, 16], [0, socket.MSG_DONTROUTE], [5, 6], None)
-    frames = frames_of(batch, [5, 6])
-    assert frames["dir"].tolist() == [DIR_RX, DIR_TX]
+    assert frames_of(batch, [5, 6])["dir"].tolist() == [DIR_RX, DIR_TX]
 
 
 def test_a_socket_that_fails_is_a_lost_connection(pair):

@@ -124,11 +124,9 @@ def test_python_cans_own_client_reads_the_same(serve, listen, traffic, same):
     server.stream = messages(truth)
     bus = can.Bus(interface="socketcand", host="127.0.0.1", port=server.port, channel="can0")
     theirs, frames = received(bus, len(truth))
-    reader = listen(source_at(server.port))
-    found = reader.until_frames(len(truth))
+    found = listen(source_at(server.port)).until_frames(len(truth))
     assert same(found, frames)
-    times_s = np.array([m.timestamp for m in theirs])
-    assert np.abs(found["t_device_ns"] / 1e9 - times_s).max() < 1e-6
+    assert np.abs(found["t_device_ns"] / 1e9 - np.array([m.timestamp for m in theirs])).max() < 1e-6
 
 
 def test_error_frames_are_frames_and_events(serve, listen, traffic, same):
@@ -245,8 +243,7 @@ def test_the_server_is_killed_and_comes_back(listen, traffic, same):
         assert same(reader.until_frames(300), np.concatenate([first, second]))
         process.kill()
     assert reader.counts.reconnects == 1
-    levels = [event.level for event in reader.events]
-    assert levels[:3] == ["info", "warn", "info"]
+    assert [event.level for event in reader.events][:3] == ["info", "warn", "info"]
     reader.until_event("is back after")
 
 
@@ -256,8 +253,7 @@ def test_a_server_that_comes_later(listen, serve, traffic, same):
     reader = listen(source_at(port))
     assert "Connection refused" in reader.until_event("waits for").text
     truth = traffic(50)
-    server = serve(port)
-    server.stream = messages(truth)
+    serve(port).stream = messages(truth)
     assert same(reader.until_frames(50), truth)
 
 

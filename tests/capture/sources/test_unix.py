@@ -124,8 +124,7 @@ def test_frames_that_found_no_room_are_proved_lost(path, reader, traffic, same):
     sent = []
     while sender.refused == 0:  # faster than it is read: the buffer fills
         sent.append(truth[: sender.send(truth)])
-    found = reader.until_frames(sender.accepted)
-    assert same(found, np.concatenate(sent))
+    assert same(reader.until_frames(sender.accepted), np.concatenate(sent))
     assert reader.counts.dropped == 0  # not known yet
     sent.append(truth[: sender.send(truth)])
     assert same(reader.until_frames(sender.accepted), np.concatenate(sent))
@@ -193,8 +192,7 @@ def test_two_senders_are_put_in_the_order_of_arrival(reader, peer):
         (one, two)[number % 3 == 0].send(frames[number : number + 1].tobytes())
     while any(sender.receiver.pending for sender in reader.source._senders):
         time.sleep(0.001)
-    found = reader.until_frames(40)
-    assert found["id_flags"].tolist() == list(range(40))
+    assert reader.until_frames(40)["id_flags"].tolist() == list(range(40))
 
 
 def test_a_sender_may_leave_and_come_back(path, reader, same):

@@ -161,8 +161,7 @@ def test_sensors_of_shared_and_own_stamps_are_what_a_foreign_reader_finds(tmp_pa
     path = tmp_path / "s.mcap"
     topics = [f"/ir/{k:02d}" for k in range(1, 5)]
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
-        limits = {"min_range": 0.0, "max_range": 4.0, "field_of_view": 0.1}
-        options = {"infrared": True, **limits}
+        options = {"infrared": True, "min_range": 0.0, "max_range": 4.0, "field_of_view": 0.1}
         channels = [writer.range(topic, frame=topic[1:], **options) for topic in topics]
         field = writer.magnetic_field("/compass", frame="compass")
         for tick in range(400):

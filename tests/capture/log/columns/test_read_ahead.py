@@ -174,8 +174,7 @@ def test_what_only_the_write_ahead_log_has_comes_last(tmp_path, threads):
 def test_no_thread_outlives_a_reader_that_gives_up(tmp_path):
     write_session(tmp_path / "s.mcap", 10_000)
     log_file = LogFile(tmp_path / "s.mcap")
-    ids = list(log_file.channels)
-    batches = arenas.filled_arenas(log_file, ids, log_file.blocks, print, 4)
+    batches = arenas.filled_arenas(log_file, list(log_file.channels), log_file.blocks, print, 4)
     next(batches)
     assert helpers_alive()
     batches.close()

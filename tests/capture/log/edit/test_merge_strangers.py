@@ -52,8 +52,7 @@ def test_an_hour_between_logs_is_warned_of_and_a_second_is_not(tmp_path):
     log = HostileLog()  # that bridges the time between the two
     log.channel("/temperature", log.schema())
     log.chunk([(1, EPOCH_NS + k * DAY, joint_state(EPOCH_NS, ["a"], [20.0])) for k in range(5)])
-    long = log.write(tmp_path / "long.mcap")
-    report = merge_logs([one, late, long], tmp_path / "out.mcap")
+    report = merge_logs([one, late, log.write(tmp_path / "long.mcap")], tmp_path / "out.mcap")
     assert not any("begins" in text for text in report.warnings)
 
 

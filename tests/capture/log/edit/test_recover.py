@@ -105,8 +105,7 @@ def test_thirty_kills_lose_no_accepted_message(tmp_path):
         warnings = check_killed(path, accepted)
         assert any("none is missing" in text for text in warnings)
         output = path.with_name("whole.mcap")
-        report = recover_log(path, output)
-        assert report.missing == 0
+        assert recover_log(path, output).missing == 0
         found, warnings = read(output)
         assert found == recorder.truth(len(found))
         assert warnings == []
@@ -380,8 +379,7 @@ def test_a_recovery_gives_no_advice_to_recover_but_names_what_a_copy_lacks(path,
     shutil.copy(path, copy)
     with Session(copy) as session:
         assert len(session.warnings) == 1
-    missing = "note: there is no run.mcap.wal beside run.mcap"
-    assert missing in command("log", "recover", copy).out
+    assert "note: there is no run.mcap.wal beside run.mcap" in command("log", "recover", copy).out
     shutil.copytree(path.with_name("run.mcap.wal"), copy.with_name("run.mcap.wal"))
     assert "; none is missing" in command("log", "recover", copy, "--force").out
     assert read(copy.with_name("run.recovered.mcap")) == (recorder.truth(6000), [])
@@ -448,8 +446,7 @@ def damage(rng, folder):
     """Damage up to three files of a session in one of several ways each."""
     files = [path for path in sorted(folder.rglob("*")) if path.suffix in (".mcap", ".seg")]
     for path in rng.sample(files, rng.randint(1, 3)):
-        raw = path.read_bytes()
-        damaged = damaged_bytes(rng, raw, rng.choice([1, 8, 64, 4096]))
+        damaged = damaged_bytes(rng, path.read_bytes(), rng.choice([1, 8, 64, 4096]))
         path.unlink() if damaged is None else path.write_bytes(damaged)
 
 

@@ -98,8 +98,7 @@ def test_a_pause_can_be_cut_out_unless_it_is_most_of_the_session(write):
     assert once.verdict == "degraded"
     assert timing_of(once).paused_s == pytest.approx(5.01)
     assert (timing_of(once).missing, timing_of(once).scattered) == (500, 0)
-    most = check_session(write(lost=lambda tick: 400 <= tick < 1500))
-    assert most.verdict == "bad"
+    assert check_session(write(lost=lambda tick: 400 <= tick < 1500)).verdict == "bad"
 
 
 def test_a_series_that_ends_early_is_reported(write):
@@ -117,8 +116,7 @@ def test_repeated_and_backward_stamps_are_counted(write):
 
 
 def test_jitter_has_the_standard_deviation_that_was_planted(write):
-    rng = np.random.default_rng(11)
-    late = rng.normal(0.0, 3e5, TICKS).astype(int)
+    late = np.random.default_rng(11).normal(0.0, 3e5, TICKS).astype(int)
 
     steps = np.diff(at(0) + np.arange(TICKS) * STEP_NS + late) / 1e9
     timing = timing_of(check_session(write(lambda tick, *_: at(tick) + int(late[tick]))))
@@ -162,8 +160,7 @@ def test_zeros_are_no_sequence_numbers(tmp_path, command):
     health = check_session(path)
     assert {each.sequence.kind for each in health.channels} == {"none"}
     assert {each.sequence.dropped for each in health.channels} == {None}
-    report = command("log", "check", path).out
-    assert "no sequence numbers, so drops can't be proved" in report
+    assert "no sequence numbers, so drops can't be proved" in command("log", "check", path).out
 
 
 @pytest.mark.parametrize(

@@ -102,8 +102,7 @@ def test_a_cut_file_is_degraded_with_what_is_left(clean, tmp_path):
 
 
 def test_a_file_without_index_is_degraded(tmp_path):
-    path = write_raw(tmp_path / "s.mcap", list(range(300)), use_chunking=False)
-    health = check_session(path)
+    health = check_session(write_raw(tmp_path / "s.mcap", list(range(300)), use_chunking=False))
     assert (health.file.truncated, health.file.indexed) == (False, False)
     assert health.verdict == "degraded"
     assert timing_of(health).count == 300
@@ -130,8 +129,7 @@ def foreign(path, topic, names):
 
 
 def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path):
-    path = foreign(tmp_path / "s.mcap", "/joint_states", [["a"], ["b"], ["c"]])
-    health = check_session(path)
+    health = check_session(foreign(tmp_path / "s.mcap", "/joint_states", [["a"], ["b"], ["c"]]))
     gaps = {each.label: each.timing.gaps for each in health.series}
     assert gaps == {f"/joint_states ({name})": 0 for name in "abc"}
     assert [each.sequence.kind for each in health.channels] == ["none"]

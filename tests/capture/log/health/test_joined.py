@@ -49,8 +49,7 @@ def test_one_lost_bus_cycle_is_one_reason(tmp_path, whole, servos):
 
 
 def test_losses_at_two_times_are_two_reasons(tmp_path):
-    health = lost(tmp_path / "s.mcap", of_topic={"/joint_current": 300})
-    apart, together = sorted(health.reasons)
+    apart, together = sorted(lost(tmp_path / "s.mcap", of_topic={"/joint_current": 300}).reasons)
     gap = "1 gaps, 1 samples missing (0.25%); the longest is 0.1 s"
     assert apart.startswith(f"/joint_current: {gap}")
     both = "/joint_states and /joint_temperature, lost together"

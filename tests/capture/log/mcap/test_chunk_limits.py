@@ -104,8 +104,7 @@ def test_chunks_that_expand_beyond_their_size_are_refused_and_the_rest_is_kept(t
     for k, (path, at) in enumerate(places.items()):
         assert "chunk" in printed[k], path
         recovered = messages_of(path.with_suffix(".recovered.mcap"))
-        kept = [message.log_time for _, _, message in recovered]
-        assert kept == wanted, path
+        assert [message.log_time for _, _, message in recovered] == wanted, path
         health = json.loads(printed[count + k])
         if whole:
             assert health["verdict"] == "bad", path

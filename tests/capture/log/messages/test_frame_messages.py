@@ -35,13 +35,11 @@ def test_the_bytes_are_those_of_the_general_encoder(data):
 @given(RECORDS, st.integers(0, 400), st.integers(0, 7))
 def test_a_damaged_head_is_never_taken_for_a_whole_one(data, place, bit):
     message = bytearray(fr.frame_message(fr.frames_from_bytes(data)))
-    head = len(message) - len(data)
-    place %= head
+    place %= len(message) - len(data)
     message[place] ^= 1 << bit
     assert fr.records_at(bytes(message)) is None
 
 
 @pytest.mark.parametrize("cut", [1, 31, 32, 33])
 def test_a_message_cut_short_is_none(cut):
-    message = fr.frame_message(np.zeros(3, fr.FRAME_DTYPE))
-    assert fr.records_at(message[:-cut]) is None
+    assert fr.records_at(fr.frame_message(np.zeros(3, fr.FRAME_DTYPE))[:-cut]) is None

@@ -58,8 +58,7 @@ def test_a_topic_whose_joints_change_from_message_to_message_is_refused_soon(tmp
 
 def test_more_joints_than_are_judged_are_a_finding(tmp_path):
     log = joints()
-    names = [f"j{k}" for k in range(2001)]
-    message = joint_state(EPOCH_NS, names, np.zeros(2001))
+    message = joint_state(EPOCH_NS, [f"j{k}" for k in range(2001)], np.zeros(2001))
     log.chunk([(channel, EPOCH_NS, message) for channel in (1, 2)])
     health = check_session(log.write(tmp_path / "run.mcap"))
     assert any("/joint_commands has 2001 joints; at most 2000" in one for one in health.reasons)
@@ -75,8 +74,7 @@ def test_log_times_that_no_signed_number_holds(tmp_path, start_ns, whole, capsys
     path = log.write(tmp_path / "run.mcap")
     with Session.open(path) as session:
         assert any("beyond the year 2262" in text for text in session.warnings)
-        found = session.joints("/joint_states")
-        assert len(found.t_ns[0]) == (300 if whole else 400)
+        assert len(session.joints("/joint_states").t_ns[0]) == (300 if whole else 400)
         assert 0 <= session.start_ns <= session.end_ns < 2**63
     for verb in (["log", "check"], ["log", "info"], ["analyse"]):
         assert undulog.run([*verb, str(path)]) in (0, 1)
@@ -113,8 +111,7 @@ def test_types_that_no_reader_could_hold_are_refused(tmp_path, kind):
     health = check_session(paths[0])
     assert [each.count for each in health.channels if each.topic == "/odd"] == [1]
     assert any(complaint in note for note in health.notes)
-    report = merge_logs(paths, tmp_path / "both.mcap")
-    assert report.messages["/odd"] == 2
+    assert merge_logs(paths, tmp_path / "both.mcap").messages["/odd"] == 2
 
 
 def test_a_million_million_elements_without_a_byte_are_no_message(tmp_path):

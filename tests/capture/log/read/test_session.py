@@ -64,8 +64,7 @@ def test_the_other_channels_read_back_elsewhere(tmp_path):
     assert [t.child_frame_id for t in found["/tf"].transforms] == ["a", "b"]
     assert abs(found["/tf"].transforms[0].transform.translation.z - 3.00001) <= 2**-15
     assert found["/tf"].transforms[1].transform.rotation.w == 0.5
-    assert found["/ir/01"].range == 0.75
-    assert found["/imu"].linear_acceleration.z == 9.8
+    assert (found["/ir/01"].range, found["/imu"].linear_acceleration.z) == (0.75, 9.8)
     assert found["/imu"].orientation_covariance[0] == -1.0
     assert found["/imu"].angular_velocity_covariance[0] == -1.0
     assert found["/compass"].magnetic_field.z == -4e-5
@@ -124,8 +123,7 @@ def test_columns_come_back_bit_for_bit(tmp_path):
             assert signals.names == NAMES
         assert session.joints("/joint_states", "effort").unit == "N m"
         assert session.duration_s == pytest.approx(29.99)
-        assert session.verdict == "good"
-        assert session.warnings == []
+        assert (session.verdict, session.warnings) == ("good", [])
         start, stop = EPOCH_NS + 1000 * STEP_NS, EPOCH_NS + 1500 * STEP_NS  # half-open
         signals = session.joints("/joint_states", start_ns=start, stop_ns=stop)
     assert signals.t_ns[0][0] == start

@@ -82,8 +82,7 @@ def test_chunks_that_claim_to_have_no_bytes_are_reported_as_missing(long):
     path, data = long
     for chunk in summary_of(path).chunk_indexes:
         # Its compressed length is the last field before its bytes.
-        compression = len(chunk.compression.encode())
-        at = chunk.chunk_start_offset + 9 + 8 + 8 + 8 + 4 + 4 + compression
+        at = chunk.chunk_start_offset + 9 + 8 + 8 + 8 + 4 + 4 + len(chunk.compression.encode())
         assert int.from_bytes(data[at : at + 8], "little") == chunk.compressed_size
         data[at : at + 8] = bytes(8)
     path.write_bytes(data)

@@ -82,8 +82,7 @@ def test_duplicate_and_backward_stamps_are_reported(tmp_path):
         for k, tick in enumerate([0, 1, 2, 2, 4, 3, 5])
     ]
     with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
-        signals = session.joints("/joint_states")
-        assert signals.values[0].tolist() == [0, 1, 2, 2, 3, 4, 5]
+        assert session.joints("/joint_states").values[0].tolist() == [0, 1, 2, 2, 3, 4, 5]
         text = " ".join(session.warnings)
     assert "1 samples go back in time" in text
     assert "1 samples repeat the stamp" in text
@@ -97,8 +96,7 @@ def test_a_field_that_is_never_filled_is_missing_not_zero(tmp_path):
 
 
 def test_values_that_do_not_match_the_names_are_left_out_with_a_warning(tmp_path):
-    rows = ([1.0], [1.0, 2.0])
-    messages = [states(EPOCH_NS + k, ["a", "b"], row) for k, row in enumerate(rows)]
+    messages = [states(EPOCH_NS + k, ["a", "b"], row) for k, row in enumerate(([1.0], [1.0, 2.0]))]
     with Session.open(write_foreign(tmp_path / "f.mcap", messages)) as session:
         assert session.joints("/joint_states").values[1].tolist() == [2.0]
         assert "2 names but 1 values of position" in session.warnings[0]
@@ -163,8 +161,7 @@ def test_any_kind_of_mcap_reads_the_same(tmp_path, options, warned):
 
 
 def test_undefined_padding_of_a_foreign_writer_does_no_harm(tmp_path):
-    kind = message_type(JOINT_STATE)
-    plain = encode(kind, joint_state(EPOCH_NS, ["ab"], [1.5]))
+    plain = encode(message_type(JOINT_STATE), joint_state(EPOCH_NS, ["ab"], [1.5]))
     padding_at = 4 + 8 + 4 + 1  # header, stamp, length of frame_id, its terminating zero
     assert plain[padding_at : padding_at + 3] == bytes(3)
     with foreign_log(tmp_path / "f.mcap", JOINT_STATE) as (writer, schema):
@@ -174,7 +171,6 @@ def test_undefined_padding_of_a_foreign_writer_does_no_harm(tmp_path):
             message[padding_at] = k
             writer.add_message(channel, EPOCH_NS + k, bytes(message), EPOCH_NS + k)
     record = Schema(1, schema_text(JOINT_STATE).encode(), "ros2msg", JOINT_STATE)
-    decoded = DecoderFactory().decoder_for("cdr", record)
-    assert list(decoded(bytes(message)).position) == [1.5]
+    assert list(DecoderFactory().decoder_for("cdr", record)(bytes(message)).position) == [1.5]
     with Session.open(tmp_path / "f.mcap") as session:
         assert session.joints("/joint_states").values[0].tolist() == [1.5] * 20

@@ -75,8 +75,7 @@ def test_renamed_topics_are_read_by_their_new_names(session):
     signals, tables = view.columns({"/joint_commands": ["position"]}, {"/pose": [POSE_X]})
     same_signals(signals["/joint_commands", "position"], session.joints("/joint_states"))
     assert tables["/pose"].columns.tolist() == [POSE_X]
-    narrow = view.view(stop_ns=session.start_ns + 10**9)
-    assert narrow.channels == view.channels
+    assert view.view(stop_ns=session.start_ns + 10**9).channels == view.channels
     with pytest.raises(MissingChannelError):
         session.view(rename={"/joint_commands": "/none"})
 

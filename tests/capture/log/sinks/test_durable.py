@@ -75,8 +75,7 @@ def test_listeners_get_what_was_accepted_and_nothing_else(tmp_path):
     with pytest.raises(DataError, match="out of range"):
         sink.write(1, -1, 0, 0, b"")
     sink.close(())
-    expected = [(c, t, p, s, data) for c, s, t, p, data in map(recorder.message, range(100))]
-    assert offered == expected
+    assert offered == [(c, t, p, s, data) for c, s, t, p, data in map(recorder.message, range(100))]
     assert (kept.messages, kept.part) == (100, 1)
     assert kept.bytes_written == (tmp_path / "run.mcap").stat().st_size
 

@@ -126,8 +126,7 @@ def test_what_was_in_force_before_the_window_is_carried_to_its_start(ring):
     facts = metadata_of(path)[MARK_RECORD]
     assert (facts["number"], facts["text"], facts["ring_s"]) == ("1", "slipped", "1.0")
     assert facts["stop_ns"] == str(now_ns + 9)
-    carried = {"/gait/mode": EPOCH_NS + 5, "/tf_static": EPOCH_NS + 4}
-    assert json.loads(facts["carried"]) == carried
+    assert json.loads(facts["carried"]) == {"/gait/mode": EPOCH_NS + 5, "/tf_static": EPOCH_NS + 4}
 
 
 def test_every_mark_explains_itself_and_opens_as_a_session(tmp_path):
@@ -137,11 +136,9 @@ def test_every_mark_explains_itself_and_opens_as_a_session(tmp_path):
     writer = SessionWriter(tmp_path / "run.mcap", sink=ring, **facts)
     writer.attach("scenario.toml", "application/toml", b"a = 1")
     states = writer.joint_state("/joint_states", ["j1", "j2"], unit="rad")
-    mode = writer.string("/gait/mode")
-    mode.write(EPOCH_NS, "walk")
+    writer.string("/gait/mode").write(EPOCH_NS, "walk")
     for k in range(1000):
-        t_ns = EPOCH_NS + k * 10 * MS
-        states.write(t_ns, [k, -k])
+        states.write(EPOCH_NS + k * 10 * MS, [k, -k])
         if k in (300, 600):
             ring.mark()
     writer.log().write(EPOCH_NS + 9990 * MS, "info", "test", "late channel")

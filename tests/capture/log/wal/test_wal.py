@@ -95,8 +95,7 @@ def test_a_number_out_of_range_is_refused_and_leaves_no_trace(tmp_path, values):
 
 
 def test_bytes_of_another_log_in_a_payload_are_not_taken_for_messages(tmp_path):
-    inner = filled(tmp_path / "inner", 3)
-    raw = (inner / "000001.seg").read_bytes()
+    raw = (filled(tmp_path / "inner", 3) / "000001.seg").read_bytes()
     with WriteAheadLog(tmp_path / "w") as wal:
         wal.define(CHANNEL)
         wal.append(1, 0, 0, 0, raw)

@@ -58,8 +58,7 @@ def test_a_dead_background_thread_is_reported_by_the_next_append(tmp_path, monke
 
 
 def test_room_is_asked_for_beforehand(tmp_path):
-    free = free_bytes(tmp_path / "not" / "yet.mcap")
-    assert free > 0
+    assert free_bytes(tmp_path / "not" / "yet.mcap") > 0
     require_space(tmp_path, 1)
     with pytest.raises(LogWriteError, match=r"needs \d+ bytes .* bytes are missing"):
         require_space(tmp_path / "x.mcap", 1 << 60)
