@@ -83,9 +83,7 @@ def make_snake(path="weak.mcap", rename=None, session_id="weak-servo-pi3-7f3a"):
     body = BodyResult(
         plane="horizontal",
         observed=points(((52, 0), (35, -128), (30, 97)), name),
-        null={
-            "viscous": tuple(map(exact, points(((55, 0), (41, -117), (38, 110)), name))),
-        },
+        null={"viscous": tuple(map(exact, points(((55, 0), (41, -117), (38, 110)), name)))},
     )
     contrast = (-0.1082, (-0.1134, -0.1030))
     indices = {

@@ -47,11 +47,7 @@ def kicked(folder):
     off.append(1j * np.array([0.1, -0.12, 0.05, 0.08, -0.11]))
     return [
         write_run(
-            folder / f"run{k:02d}.mcap",
-            WAVE * np.exp(one),
-            CHAIN @ (WAVE * np.exp(one)),
-            k,
-            0.002,
+            folder / f"run{k:02d}.mcap", WAVE * np.exp(one), CHAIN @ (WAVE * np.exp(one)), k, 0.002
         )
         for k, one in enumerate(off)
     ]

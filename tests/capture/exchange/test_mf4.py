@@ -17,10 +17,7 @@ from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.can_logs import open_frame_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS, joined
-from undulog.capture.log.messages.frames import (
-    ERROR_FLAG,
-    REMOTE_FLAG,
-)
+from undulog.capture.log.messages.frames import ERROR_FLAG, REMOTE_FLAG
 
 asammdf = pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
 from asammdf.blocks.v4_blocks import SourceInformation  # noqa: E402
