@@ -9,9 +9,8 @@ import struct
 from functools import partial
 from pathlib import Path
 
-import lz4.frame
 import zstandard
-from hostile_logs import MAGIC, joint_state, record, text
+from hostile_logs import MAGIC, joint_state, lz4_zeros, record, text, zeros
 
 from undulog.capture.log.messages.definitions import schema_text
 
@@ -60,14 +59,6 @@ def sines(ticks, jump_ns=0):
             yield message(number, t_ns % 2**64, joint_state(t_ns % 2**62, ["a", "b"], values), tick)
 
 
-def zeros(size, *, stated=True):
-    """Return a number of zero bytes in one zstd frame."""
-    packer = zstandard.ZstdCompressor(level=1, write_content_size=stated)
-    stream = packer.compressobj(size=size if stated else -1)
-    block = bytes(1 << 24)
-    return b"".join(stream.compress(block) for _ in range(size >> 24)) + stream.flush()
-
-
 # -- the logs ------------------------------------------------------------------------------
 
 
@@ -78,9 +69,8 @@ def bomb(*, size, declared, stated=True, cut=0):
 
 
 def lz4_bomb():
-    stream = lz4.frame.LZ4FrameCompressor()
-    parts = [stream.begin(), *(stream.compress(bytes(1 << 24)) for _ in range(96)), stream.flush()]
-    return HEADER + PAIR + chunk(b"", size=1000, packed=b"".join(parts), kind="lz4") + END
+    packed = lz4_zeros(3 * GIB // 2)
+    return HEADER + PAIR + chunk(b"", size=1000, packed=packed, kind="lz4") + END
 
 
 def many_chunks(count):

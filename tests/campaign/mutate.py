@@ -52,30 +52,21 @@ def _cut(data, rng):
     del data[rng.randrange(len(data)) :]
 
 
-def _stretch(data, rng):
-    a, b = sorted(rng.choices(range(len(data)), k=2))
-    return a, min(b, a + rng.choice([4, 64, 1024, 1 << 20]))
+def _stretch(change):
+    """Return a fault that changes some bytes in a row."""
+
+    def fault(data, rng):
+        a, b = sorted(rng.choices(range(len(data)), k=2))
+        b = min(b, a + rng.choice([4, 64, 1024, 1 << 20]))
+        data[a:b] = change(data[a:b])
+
+    return fault
 
 
-def _zero(data, rng):
-    a, b = _stretch(data, rng)
-    data[a:b] = bytes(b - a)
-
-
-def _take_out(data, rng):
-    a, b = _stretch(data, rng)
-    del data[a:b]
-
-
-def _double(data, rng):
-    a, b = _stretch(data, rng)
-    data[b:b] = data[a:b]
-
-
-def _swap(data, rng):
-    a, b = _stretch(data, rng)
-    middle = (a + b) // 2
-    data[a:b] = data[middle:b] + data[a:middle]
+_zero = _stretch(lambda part: bytes(len(part)))
+_take_out = _stretch(lambda part: b"")
+_double = _stretch(lambda part: 2 * part)
+_swap = _stretch(lambda part: part[len(part) // 2 :] + part[: len(part) // 2])
 
 
 def _set_number(data, rng):

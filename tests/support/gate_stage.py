@@ -128,11 +128,8 @@ class Stage:
 
     def wait_for_commands(self, controller, count=150):
         """Wait until a number of ticks was commanded."""
-        wait_for(
-            lambda: len(self.command_lines) >= count * len(JOINTS),
-            "no commands on the bus",
-            alive=[controller],
-        )
+        most = count * len(JOINTS)
+        wait_for(lambda: len(self.command_lines) >= most, "commands", alive=[controller])
 
     def settle(self, quiet_s=0.3):
         """Wait while frames may still be sent, and until all of them are received.
@@ -148,9 +145,7 @@ class Stage:
             place = {"host": "127.0.0.1", "port": self.port, "channel": self.bus}
             with can.Bus(interface="socketcand", **place) as bus:
                 bus.send(can.Message(arbitration_id=MARK, is_extended_id=False))
-                wait_for(
-                    lambda: any(one["id"] == MARK for one in self.lines), "the mark is not heard"
-                )
+                wait_for(lambda: any(one["id"] == MARK for one in self.lines), "the mark")
         self._listener.send_signal(signal.SIGTERM)
         _, complained = self._listener.communicate(timeout=20)
         assert self._listener.returncode == 0, complained

@@ -119,7 +119,7 @@ def test_damaged_chunks_cost_their_own_messages_with_any_number_of_threads(tmp_p
     found, warnings = signals(path, 1)
     texts = [f"the chunk at byte {block.start} can't be decompressed" for block in harmed]
     assert all(any(text in warning for warning in warnings) for text in texts)
-    assert len(warnings) == len(harmed)
+    assert ["; its messages are missing" in text for text in warnings] == [True] * len(harmed)
     expected = dict(zip(found, truth(10_000)[1], strict=True))
     for key, each in found.items():
         ticks = (each.t_ns[0] - EPOCH_NS) // STEP_NS
