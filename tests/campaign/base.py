@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 import can
 import numpy as np
-from mcap.reader import make_reader
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
 from mcap_ros2.writer import Writer as RosWriter
 
+from support.foreign_logs import rewrite
 from support.twin_chains import snake4
 from support.written_frames import log_messages
 from support.written_sessions import joint_state
@@ -167,26 +167,6 @@ def foreign_session(path, ticks=240):
                     angle = 0.3 * np.sin(0.25 * tick + k - lag)
                     message = joint_state(t_ns + k * 1000, [name], [angle])
                     writer.write_message(topic, schema, message, log_time=t_ns)
-        writer.finish()
-
-
-def rewrite(source, path, **options):
-    """Write the same records as another make does."""
-    with source.open("rb") as stream, path.open("wb") as out:
-        reader = make_reader(stream)
-        writer = Writer(out, **options)
-        writer.start("ros2", "another make")
-        schemas, channels = {}, {}
-        for kind, channel, one in reader.iter_messages():
-            if kind.id not in schemas:
-                schemas[kind.id] = writer.register_schema(kind.name, kind.encoding, kind.data)
-            if channel.id not in channels:
-                facts = (channel.message_encoding, schemas[kind.id], channel.metadata)
-                channels[channel.id] = writer.register_channel(channel.topic, *facts)
-            times = (one.log_time, one.data, one.publish_time, one.sequence)
-            writer.add_message(channels[channel.id], *times)
-        for one in reader.iter_attachments():
-            writer.add_attachment(0, EPOCH_NS, one.name, one.media_type, one.data)
         writer.finish()
 
 

@@ -1,13 +1,11 @@
 """A clean session, and faults planted in it, for the tests of `undulog log check`."""
 
 import numpy as np
+from hostile_logs import EPOCH_NS, joint_state
 
 from support.foreign_logs import foreign_log
 from undulog.capture import SessionWriter, load_robot
-from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.definitions import message_type
 
-EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
 ROBOT = load_robot("snake25")
 NAMES = ROBOT.joint_names
@@ -55,8 +53,6 @@ def write_raw(path, sequences, **options):
         for topic in ("/joint_commands", "/joint_states"):
             channel = writer.register_channel(topic, "cdr", schema)
             for k, sequence in enumerate(sequences):
-                stamp = {"sec": at(k) // 10**9, "nanosec": at(k) % 10**9}
-                values = {"header": {"stamp": stamp}, "name": list("abc"), "position": gait(k)[:3]}
-                message = encode(message_type(JOINT_STATE), values)
+                message = joint_state(at(k), "abc", gait(k)[:3])
                 writer.add_message(channel, at(k), message, at(k), sequence)
     return path

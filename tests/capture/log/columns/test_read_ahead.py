@@ -6,10 +6,9 @@ import threading
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
 
+from support.foreign_logs import rewrite
 from support.processes import python
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import UsageError
@@ -133,26 +132,12 @@ def test_damaged_chunks_cost_their_own_messages_with_any_number_of_threads(tmp_p
             np.testing.assert_array_equal(np.array(again[key].values), np.array(each.values))
 
 
-def transcribed(source, target, kind):
-    """The messages of a file in another file, compressed otherwise."""
-    with source.open("rb") as stream, target.open("wb") as output:
-        writer = McapWriter(output, compression=kind, chunk_size=1 << 18)
-        writer.start(profile="ros2", library="test")
-        ids = {}
-        for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
-            if channel.id not in ids:
-                known = writer.register_schema(schema.name, schema.encoding, schema.data)
-                ids[channel.id] = writer.register_channel(channel.topic, "cdr", known)
-            times = message.log_time, message.publish_time
-            writer.add_message(ids[channel.id], times[0], message.data, times[1])
-        writer.finish()
-
-
 @pytest.mark.parametrize("threads", [1, 4])
 @pytest.mark.parametrize("kind", [CompressionType.LZ4, CompressionType.NONE])
 def test_chunks_that_are_not_zstd_are_read_as_well(tmp_path, kind, threads):
     write_session(tmp_path / "ours.mcap", 2000)
-    transcribed(tmp_path / "ours.mcap", tmp_path / "s.mcap", kind)
+    options = {"compression": kind, "chunk_size": 1 << 18}
+    rewrite(tmp_path / "ours.mcap", tmp_path / "s.mcap", **options)
     check(tmp_path / "s.mcap", threads, 2000)
 
 

@@ -4,16 +4,13 @@ from itertools import product
 
 import numpy as np
 import pytest
+from hostile_logs import EPOCH_NS, joint_state
 
 from support.foreign_logs import foreign_log
-from support.written_sessions import joint_state
 from undulog.capture.log.health.rules import Fault, joined, listed
 from undulog.capture.log.health.session_check import check_session
-from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.definitions import message_type
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
-EPOCH_NS = 1_700_000_000_000_000_000
 JOINTS = tuple(f"j{k}" for k in range(1, 13))
 TOPICS = ("/joint_states", "/joint_current", "/joint_temperature")
 TICKS = 400
@@ -21,7 +18,6 @@ TICKS = 400
 
 def lost(path, *, of_topic=None, whole=True, servos=False):
     """20 s at 20 Hz; in each topic a cycle is lost, or its numbers: 200, or ``of_topic``'s."""
-    kind = message_type(JOINT_STATE)
     with foreign_log(path, JOINT_STATE) as (writer, schema):
         topics = (*TOPICS, "/joint_commands")
         channels = {topic: writer.register_channel(topic, "cdr", schema) for topic in topics}
@@ -32,8 +28,8 @@ def lost(path, *, of_topic=None, whole=True, servos=False):
                 continue
             t_ns = EPOCH_NS + tick * 50_000_000
             values = 0.4 * np.sin(0.1 * tick - np.arange(len(names)))
-            fields = joint_state(t_ns, names, np.full(len(names), np.nan) if gone else values)
-            writer.add_message(channels[topic], t_ns, encode(kind, fields), t_ns, 0)
+            message = joint_state(t_ns, names, values * (np.nan if gone else 1.0))
+            writer.add_message(channels[topic], t_ns, message, t_ns, 0)
     return check_session(path)
 
 

@@ -1,5 +1,6 @@
 """Logs of other makes as sessions: any number of joints a message, any clock, any container."""
 
+import hostile_logs
 import numpy as np
 import pytest
 from mcap.records import Schema
@@ -18,8 +19,7 @@ from support.written_sessions import (
 )
 from undulog.capture import Session
 from undulog.capture.common.errors import MissingChannelError
-from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.definitions import message_type, schema_text
+from undulog.capture.log.messages.definitions import schema_text
 
 
 def states(t_ns, names, position, *, log_ns=0, **more):
@@ -144,14 +144,13 @@ def test_simulated_time_is_shifted_to_the_log_clock(tmp_path):
     ],
 )
 def test_any_kind_of_mcap_reads_the_same(tmp_path, options, warned):
-    kind = message_type(JOINT_STATE)
     data = samples(500)
     path = tmp_path / "f.mcap"
     with foreign_log(path, JOINT_STATE, chunk_size=20_000, **options) as (writer, schema):
         channel = writer.register_channel("/joint_states", "cdr", schema)
         for tick, row in enumerate(data):
             t_ns = EPOCH_NS + tick * STEP_NS
-            message = encode(kind, joint_state(t_ns, list(NAMES), row[0].tolist()))
+            message = hostile_logs.joint_state(t_ns, NAMES, row[0])
             writer.add_message(channel, t_ns, message, t_ns)
     with Session.open(tmp_path / "f.mcap") as session:
         signals = session.joints("/joint_states")
@@ -161,7 +160,7 @@ def test_any_kind_of_mcap_reads_the_same(tmp_path, options, warned):
 
 
 def test_undefined_padding_of_a_foreign_writer_does_no_harm(tmp_path):
-    plain = encode(message_type(JOINT_STATE), joint_state(EPOCH_NS, ["ab"], [1.5]))
+    plain = hostile_logs.joint_state(EPOCH_NS, ["ab"], [1.5])
     padding_at = 4 + 8 + 4 + 1  # header, stamp, length of frame_id, its terminating zero
     assert plain[padding_at : padding_at + 3] == bytes(3)
     with foreign_log(tmp_path / "f.mcap", JOINT_STATE) as (writer, schema):
