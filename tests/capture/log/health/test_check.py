@@ -1,6 +1,6 @@
 """`undulog log check` against faults planted in the rhythm and the values of a clean session."""
 
-import functools
+import itertools
 import json
 
 import numpy as np
@@ -26,8 +26,9 @@ from undulog.capture.log.health.tallies import SequenceTally, TimingTally
 
 @pytest.fixture
 def write(tmp_path):
-    """Writes a session with faults."""
-    return functools.partial(checked_sessions.write, tmp_path / "s.mcap")
+    """Writes sessions with faults, each to a file of its own."""
+    paths = (tmp_path / f"{number}.mcap" for number in itertools.count())
+    return lambda *how, **more: checked_sessions.write(next(paths), *how, **more)
 
 
 def joint_of(health, name, topic="/joint_states"):
