@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 from support.paths import DOCS
+from support.read_back import decoded_of
 from zoo.bags import write_bag
 from zoo.faults import FAULTS, plant
 from zoo.page import lines
@@ -23,16 +22,14 @@ def test_bags_are_read_back_by_another_reader(tmp_path, per_servo):
     robot = next(robot for robot in robots if robot.per_servo is per_servo)
     log = record(robot, (), 7)
     seen = {}
-    with write_bag(log, tmp_path / "bag.mcap").open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for _, channel, message, state in reader.iter_decoded_messages():
-            stamp = state.header.stamp
-            assert stamp.sec * 10**9 + stamp.nanosec == message.log_time
-            for k, name in enumerate(state.name):
-                columns = seen.setdefault((channel.topic, name), ([], [], []))
-                columns[0].append(state.position[k])
-                columns[1].extend(state.velocity[k : k + 1])
-                columns[2].extend(state.effort[k : k + 1])
+    for topic, log_ns, state in decoded_of(write_bag(log, tmp_path / "bag.mcap")):
+        stamp = state.header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == log_ns
+        for k, name in enumerate(state.name):
+            columns = seen.setdefault((topic, name), ([], [], []))
+            columns[0].append(state.position[k])
+            columns[1].extend(state.velocity[k : k + 1])
+            columns[2].extend(state.effort[k : k + 1])
     for j, name in enumerate(robot.names):
         np.testing.assert_array_equal(seen["/joint_commands", name][0], robot.sent()[:, j])
         states = seen["/joint_states", name]

@@ -10,10 +10,9 @@ import pytest
 from can.util import CAN_FD_DLC
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 from support.bus_robots import bus_robot
+from support.read_back import decoded_of
 from support.written_frames import T0, every_kind, frames_of, imported, log_messages, write_frames
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError
@@ -70,11 +69,9 @@ def test_what_is_written_is_read_the_same(data, tmp_path_factory):
 def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path):
     frames = every_kind(fd=True)[:5]
     path = write_frames(tmp_path / "x.mcap", {FD: frames})
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        ((_, channel, _, message),) = reader.iter_decoded_messages()
+    ((topic, _, message),) = decoded_of(path)
     frame, record = message.layout.dim
-    assert (channel.topic, frame.label, frame.size) == ("/can_fd/can0", "frame", 5)
+    assert (topic, frame.label, frame.size) == ("/can_fd/can0", "frame", 5)
     assert (record.label, record.size) == (fr.FD_FRAME_LAYOUT, 88)
     # The label, taken by its word, is the layout.
     at, offsets = 0, {}

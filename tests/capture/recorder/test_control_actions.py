@@ -4,10 +4,9 @@ import math
 import re
 
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 from support.control_clients import connected, drain, polled
+from support.read_back import decoded_of
 from undulog.capture.common.errors import ControlError, DataError
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.recorder.control import ControlServer
@@ -51,10 +50,7 @@ class Stage:
     def read(self, topic):
         """Log time and decoded message of each, by a foreign reader."""
         self.writer.close()
-        with self.path.open("rb") as stream:
-            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-            found = reader.iter_decoded_messages([topic])
-            return [(message.log_time, decoded) for _, _, message, decoded in found]
+        return [(log_ns, content) for _, log_ns, content in decoded_of(self.path, [topic])]
 
 
 @pytest.fixture

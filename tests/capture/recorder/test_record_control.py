@@ -9,12 +9,11 @@ import subprocess
 import sys
 
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 from support import processes
 from support.processes import UNDULOG, python, wait_for
 from support.processes import undulog as undulog_command
+from support.read_back import decoded_of
 from undulog.capture import Session
 from undulog.capture.recorder.control_client import ControlClient, find_sockets
 
@@ -55,9 +54,7 @@ def ask(place, command):
 
 def decoded(path, topic):
     """Messages by a foreign reader."""
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        return [message for *_, message in reader.iter_decoded_messages([topic])]
+    return [content for *_, content in decoded_of(path, [topic])]
 
 
 def events(path):

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 import zstandard
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
-from support.read_back import chunks_of
+from support.read_back import chunks_of, decoded_of
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.columns.buffers import ColumnStore, EchoColumn, Times, TimeStore
@@ -173,13 +171,10 @@ def test_sensors_of_shared_and_own_stamps_are_what_a_foreign_reader_finds(tmp_pa
                     channel.write(own, rng.random(), log_time_ns=t_ns + 5 * (chance < 0.06))
             if tick % 2:
                 field.write(t_ns, rng.normal(size=3))
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        found = [(channel.topic, m) for _, channel, _, m in reader.iter_decoded_messages()]
     with Session(path) as session:
         _, tables = session.columns({}, {topic: ["range"] for topic in topics})
     for topic in topics:
-        theirs = [message for name, message in found if name == topic]
+        theirs = [content for *_, content in decoded_of(path, [topic])]
         stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in theirs]
         order = np.argsort(stamps, kind="stable")
         assert tables[topic].index.tolist() == np.array(stamps)[order].tolist()

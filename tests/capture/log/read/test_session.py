@@ -5,10 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from support.read_back import metadata_of
+from support.read_back import decoded_of, metadata_of
 from support.written_frames import frames_of
 from support.written_sessions import EPOCH_NS, NAMES, STEP_NS, write_session
 from undulog.capture import Session, SessionWriter, load_robot
@@ -58,9 +57,7 @@ def test_the_other_channels_read_back_elsewhere(tmp_path):
         ir.write(EPOCH_NS, 0.75)
         writer.imu("/imu", frame="a").write(EPOCH_NS, np.array([0.1, 0.2, 9.8]))
         writer.magnetic_field("/compass", frame="a").write(EPOCH_NS, np.array([2e-5, 0, -4e-5]))
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        found = {channel.topic: data for _, channel, _, data in reader.iter_decoded_messages()}
+    found = {topic: content for topic, _, content in decoded_of(path)}
     assert [t.child_frame_id for t in found["/tf"].transforms] == ["a", "b"]
     assert abs(found["/tf"].transforms[0].transform.translation.z - 3.00001) <= 2**-15
     assert found["/tf"].transforms[1].transform.rotation.w == 0.5
