@@ -15,7 +15,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
-from mcap.reader import make_reader
+from support.read_back import messages_of
 
 from .base import EPOCH_NS, write_files
 from .case import Result, front_door, judge, run_forked
@@ -146,9 +146,7 @@ def check_output(folder):
     names = ("new*.mcap", "new/*.mcap", "frames.mcap")
     for path in itertools.chain.from_iterable(map(folder.glob, names)):
         try:
-            with path.open("rb") as stream:
-                for _ in make_reader(stream, validate_crcs=True).iter_messages():
-                    pass
+            messages_of(path)
         except Exception as error:  # noqa: BLE001 - whatever the foreign reader raises
             found.append(f"output: {path.name} is no whole file: {type(error).__name__}: {error}")
     for path in folder.glob("new*.json"):

@@ -11,10 +11,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from mcap.reader import make_reader
-
 from support.paths import ROOT
 from support.processes import UNDULOG
+from support.read_back import messages_of
 
 SENDER = Path(__file__).with_name("sender.py")
 RECORD = 32
@@ -95,18 +94,14 @@ def numbers_in(paths, bus):
     """Return the sequence numbers of a bus in the order of the files, by mcap's own reader."""
     found = []
     for path in paths:
-        with path.open("rb") as stream:
-            reader = make_reader(stream)
-            for _, _, message in reader.iter_messages([f"/can/{bus}"], log_time_order=False):
-                data = message.data
-                # The array is the last field: a length before it, then whole records.
-                size = len(data)
-                at = size - RECORD
-                while at >= RECORD and struct.unpack_from("<I", data, at - 4)[0] != size - at:
-                    at -= RECORD
-                rows = data[at:]
-                ends = range(AT_DATA, len(rows), RECORD)
-                found += [struct.unpack_from("<Q", rows, end)[0] for end in ends]
+        for *_, message in messages_of(path, topics=[f"/can/{bus}"], log_time_order=False):
+            data, size = message.data, len(message.data)
+            # The array is the last field: a length before it, then whole records.
+            at = size - RECORD
+            while at >= RECORD and struct.unpack_from("<I", data, at - 4)[0] != size - at:
+                at -= RECORD
+            ends = range(at + AT_DATA, size, RECORD)
+            found += [struct.unpack_from("<Q", data, end)[0] for end in ends]
     return found
 
 

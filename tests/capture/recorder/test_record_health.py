@@ -6,9 +6,9 @@ import time
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 from support.processes import wait_for
+from support.read_back import metadata_of
 from support.recorders import ended, recording
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.frames import empty_frames
@@ -49,9 +49,7 @@ def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path):
     (found,) = health.sources
     assert (found.name, found.frames, found.dropped) == ("bus", sent, 12)
     assert any(f"source bus lost 12 of {sent + 12} frames" in text for text in health.reasons)
-    with output.open("rb") as stream:
-        facts = {m.name: m.metadata for m in make_reader(stream).iter_metadata()}
-    clock = facts["undulog.clock"]
+    clock = metadata_of(output)["undulog.clock"]
     unsure = float(clock["bus.drift_uncertainty_ppm"])
     assert float(clock["bus.drift_ppm"]) == pytest.approx(80.0, abs=10.0 + 4 * unsure)
     assert int(clock["bus.samples"]) == sent

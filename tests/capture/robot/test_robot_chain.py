@@ -78,7 +78,6 @@ def test_a_mesh_travels_with_the_session(tmp_path):
     assert stored["shell.stl"].data == STL
     assert stored["shell.stl"].media_type == "model/stl"
     with Session.open(path) as session:
-        assert session.robot is not None
         assert session.robot.meshes == robot.meshes
         assert {link.mesh_scale for link in session.robot.links} == {0.001}
 
