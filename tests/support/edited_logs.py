@@ -91,6 +91,6 @@ def records(path):
     return stored, attached
 
 
-def in_window(messages, start_ms, stop_ms):
+def between(messages, start_ms, stop_ms):
     low, high = EPOCH_NS + round(start_ms * MS), EPOCH_NS + round(stop_ms * MS)
     return [message for message in messages if low <= message[0] < high]

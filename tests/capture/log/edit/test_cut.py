@@ -9,19 +9,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
-from support.edited_logs import (
-    EPOCH_NS,
-    MAKES,
-    MS,
-    STRING,
-    in_file_order,
-    in_window,
-    read,
-    records,
-    text,
-    ticks,
-    write_log,
-)
+from support.edited_logs import EPOCH_NS, MAKES, MS, between, read, records, text, ticks, write_log
 from support.foreign_logs import foreign_log
 from support.read_back import summary_of
 from undulog.capture import Session, SessionWriter, load_robot
@@ -36,7 +24,7 @@ def test_a_cut_holds_exactly_the_messages_of_its_window(tmp_path, make):
     whole = write_log(tmp_path / "whole.mcap", ticks(), **MAKES[make])
     same = write_log(tmp_path / "same.mcap", ticks())  # mcap reads it whatever the make
     report = cut_log(whole, tmp_path / "cut.mcap", start_s=0.5, stop_s=1.21)
-    wanted = in_window(read(same), 500, 1210)
+    wanted = between(read(same), 500, 1210)
     assert len(wanted) == 71
     assert read(tmp_path / "cut.mcap") == wanted
     assert sum(report.messages.values()) == 71
@@ -139,7 +127,7 @@ def test_latched_topics_of_ros_are_known(tmp_path):
         writer.add_message(ids[2], EPOCH_NS + 100 * MS, b"z", 0, 9)
     cut_log(path, tmp_path / "cut.mcap", start_s=0.05, carry_state=True)
     # /map: the last one; /tf_static: each different one; /scan is volatile.
-    found = [(m[1], m[3]) for m in in_file_order(tmp_path / "cut.mcap")]
+    found = [(m[1], m[3]) for m in read(tmp_path / "cut.mcap", log_time_order=False)]
     assert found == [("/tf_static", 4), ("/map", 6), ("/tf_static", 7), ("/scan", 9)]
 
 
@@ -151,7 +139,7 @@ def test_a_truncated_log_is_cut_as_far_as_it_goes(tmp_path, command):
     assert "warning: the file is cut short (no footer)" in command(*cut).out
     found = read(tmp_path / "cut.mcap")
     assert 10 < len(found) < 150
-    assert found == in_window(read(whole), 200, 1e6)[: len(found)]
+    assert found == between(read(whole), 200, 1e6)[: len(found)]
     stored, attached = records(tmp_path / "cut.mcap")
     assert "cut short" in stored["undulog.edit"]["warnings"]
     assert [a[:2] for a in attached] == [("a.txt", b"a")]
@@ -176,7 +164,8 @@ def test_a_torn_uncompressed_log_keeps_each_attachment_once(tmp_path):
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=256, compression=CompressionType.NONE)
         writer.start(profile="ros2")
-        schema = writer.register_schema(STRING, "ros2msg", schema_text(STRING).encode())
+        kind = "std_msgs/msg/String"
+        schema = writer.register_schema(kind, "ros2msg", schema_text(kind).encode())
         channel = writer.register_channel("/a", "cdr", schema)
         for k in range(40):
             writer.add_message(channel, EPOCH_NS + k, text(f"{k}"), 0)

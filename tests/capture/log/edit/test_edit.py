@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from support.edited_logs import EPOCH_NS, MS, in_file_order, in_window, read, ticks, write_log
+from support.edited_logs import EPOCH_NS, MS, between, in_file_order, read, ticks, write_log
 from support.foreign_logs import foreign_log
 from support.processes import python, start
 from undulog.capture.common.errors import UndulogError
@@ -32,7 +32,7 @@ def test_a_topic_by_topic_log_is_edited_in_its_own_order(tmp_path):
     moments = [(f"/{x}", t * 10 * MS, f"{x} {t}" + "y" * 40) for x in "abc" for t in range(100)]
     whole = write_log(tmp_path / "whole.mcap", moments)
     cut_log(whole, tmp_path / "cut.mcap", start_s=0.2, stop_s=0.8)
-    assert in_file_order(tmp_path / "cut.mcap") == in_window(in_file_order(whole), 200, 800)
+    assert in_file_order(tmp_path / "cut.mcap") == between(in_file_order(whole), 200, 800)
     other = write_log(tmp_path / "other.mcap", ticks(50, topics=("/d",)))
     merge_logs([whole, other], tmp_path / "both.mcap")
     assert sorted(read(tmp_path / "both.mcap")) == sorted(read(whole) + read(other))

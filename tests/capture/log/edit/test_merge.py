@@ -8,18 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
-from support.edited_logs import (
-    EPOCH_NS,
-    MAKES,
-    MS,
-    STRING,
-    in_file_order,
-    read,
-    records,
-    text,
-    ticks,
-    write_log,
-)
+from support.edited_logs import EPOCH_NS, MAKES, MS, STRING, read, records, text, ticks, write_log
 from support.foreign_logs import foreign_log
 from support.read_back import summary_of
 from undulog.capture import Session, SessionWriter, load_robot
@@ -63,7 +52,7 @@ def test_a_merge_interleaves_by_log_time_and_is_stable(tmp_path):
     two = write_log(tmp_path / "two.mcap", texts, use_chunking=False)
     three = write_log(tmp_path / "three.mcap", [("/c", 2 * MS, "three")], **MAKES["lz4"])
     merge_logs([one, two, three], tmp_path / "all.mcap")
-    found = in_file_order(tmp_path / "all.mcap")
+    found = read(tmp_path / "all.mcap", log_time_order=False)
     assert [(m[1], (m[0] - EPOCH_NS) // MS) for m in found] == [
         *[("/a", 0), ("/b", 1), ("/a", 2), ("/a", 2), ("/b", 2), ("/c", 2)],
         *[("/a", 4), ("/b", 4), ("/b", 5), ("/a", 9)],
