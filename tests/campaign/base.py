@@ -3,20 +3,18 @@
 CAN traces are written by python-can, foreign logs by the ``mcap`` packages.
 """
 
-from __future__ import annotations
-
 import shutil
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import can
 import numpy as np
-from mcap.reader import make_reader
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
 from mcap_ros2.writer import Writer as RosWriter
 
+from support.foreign_logs import rewrite
 from support.twin_chains import snake4
+from support.written_frames import log_messages
+from support.written_sessions import joint_state
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.log.messages.definitions import schema_text
 from undulog.capture.log.messages.frames import empty_frames
@@ -126,12 +124,10 @@ class Base:
     mutable: tuple[str, ...]
 
 
-def gait_session(path: Path, ticks: int = 200, sink: DurableSink | None = None) -> None:
+def gait_session(path, ticks=200, sink=None):
     """Write four joints that follow sines, with frames, events and a reading of every kind."""
-    robot = load_robot(str(path.parent / "snake4.toml"))
-    with SessionWriter(
-        path, session_id="s", epoch_ns=EPOCH_NS, robot=robot, metadata={"operator": "x"}, sink=sink
-    ) as writer:
+    facts = {"robot": load_robot(path.parent / "snake4.toml"), "metadata": {"operator": "x"}}
+    with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, sink=sink, **facts) as writer:
         commands = writer.joint_state("/joint_commands", JOINTS, unit="rad")
         states = writer.joint_state("/joint_states", JOINTS, unit="rad", velocity=True, effort=True)
         offsets = writer.joint_state("/joint_sample_offset", JOINTS, unit="s")
@@ -158,7 +154,7 @@ def gait_session(path: Path, ticks: int = 200, sink: DurableSink | None = None) 
         writer.set_verdict("good", ["no fault"])
 
 
-def foreign_session(path: Path, ticks: int = 240) -> None:
+def foreign_session(path, ticks=240):
     """Write a bag by mcap-ros2-support: one message a servo, without a robot."""
     with path.open("wb") as stream:
         writer = RosWriter(stream, chunk_size=4000)
@@ -168,35 +164,13 @@ def foreign_session(path: Path, ticks: int = 240) -> None:
             t_ns = EPOCH_NS + tick * PERIOD_NS
             for topic, lag in (("/joint_commands", 0.0), ("/joint_states", 0.2)):
                 for k, name in enumerate(JOINTS[:2]):
-                    seconds, rest = divmod(t_ns + k * 1000, 10**9)
                     angle = 0.3 * np.sin(0.25 * tick + k - lag)
-                    stamp = {"sec": seconds, "nanosec": rest}
-                    message = {"header": {"stamp": stamp}, "name": [name], "position": [angle]}
+                    message = joint_state(t_ns + k * 1000, [name], [angle])
                     writer.write_message(topic, schema, message, log_time=t_ns)
         writer.finish()
 
 
-def rewrite(source: Path, path: Path, **options: object) -> None:
-    """Write the same records as another make does."""
-    with source.open("rb") as stream, path.open("wb") as out:
-        reader = make_reader(stream)
-        writer = Writer(out, **options)
-        writer.start("ros2", "another make")
-        schemas, channels = {}, {}
-        for kind, channel, one in reader.iter_messages():
-            if kind.id not in schemas:
-                schemas[kind.id] = writer.register_schema(kind.name, kind.encoding, kind.data)
-            if channel.id not in channels:
-                facts = (channel.message_encoding, schemas[kind.id], channel.metadata)
-                channels[channel.id] = writer.register_channel(channel.topic, *facts)
-            times = (one.log_time, one.data, one.publish_time, one.sequence)
-            writer.add_message(channels[channel.id], *times)
-        for one in reader.iter_attachments():
-            writer.add_attachment(0, EPOCH_NS, one.name, one.media_type, one.data)
-        writer.finish()
-
-
-def write_logs(folder: Path, ticks: int = 200) -> dict[str, bytes]:
+def write_logs(folder, ticks=200):
     """Write the session, a foreign one, and those of other makes beside the robot's files.
 
     Returns:
@@ -211,7 +185,7 @@ def write_logs(folder: Path, ticks: int = 200) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in names}
 
 
-def can_messages(count: int = 160) -> Iterator[can.Message]:
+def can_messages(count=160):
     """Yield commands and states of the small robot, a servo at a time."""
     for number in range(count):
         joint, state = number // 2 % 4, number % 2
@@ -226,15 +200,15 @@ def can_messages(count: int = 160) -> Iterator[can.Message]:
         )
 
 
-def _trace(path: Path) -> Path:
-    writer = can.Logger(str(path))
-    for message in can_messages():
-        writer.on_message_received(message)
-    writer.stop()
-    return path
+def write_files(folder, files):
+    """Write texts or bytes by their relative paths."""
+    for name, data in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
-def write_texts(folder: Path) -> dict[str, bytes]:
+def write_texts(folder):
     """Write robot, scenario, plan, settings and table; return name to content."""
     rows = "".join(f"{k / 100},{k % 360},{0.1 * k}\n" for k in range(80))
     texts = {
@@ -246,24 +220,23 @@ def write_texts(folder: Path) -> dict[str, bytes]:
         "columns.toml": COLUMNS,
         "table.csv": "time,angle,torque\n" + rows,
     }
-    for name, text in texts.items():
-        (folder / name).write_text(text)
+    write_files(folder, texts)
     return {name: text.encode() for name, text in texts.items()}
 
 
-def _files_below(folder: Path) -> dict[str, bytes]:
+def _files_below(folder):
     found = sorted(path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in found}
 
 
-def make_bases(folder: Path, result_of: Callable[[Path], bytes]) -> list[Base]:
+def make_bases(folder, result_of):
     """Write all base files to an empty folder; ``result_of`` analyses a session, as JSON."""
     texts = write_texts(folder)
     logs = write_logs(folder)
     bases = [Base("log", name, {name: data, **texts}, (name,)) for name, data in logs.items()]
     bases += of_recorder(folder)
     for kind in ("log", "blf", "asc", "trc", "csv", "db"):
-        path = _trace(folder / f"trace.{kind}")
+        path = log_messages(folder / f"trace.{kind}", can_messages())
         files = {path.name: path.read_bytes(), **texts}
         bases.append(Base("trace", path.name, files, (path.name,)))
     trace = {"trace.log": (folder / "trace.log").read_bytes(), **texts}
@@ -281,21 +254,18 @@ def make_bases(folder: Path, result_of: Callable[[Path], bytes]) -> list[Base]:
     return bases
 
 
-def of_recorder(folder: Path) -> list[Base]:
+def of_recorder(folder):
     """Return the files that a killed recorder leaves, and a session in parts."""
     work, split = folder / "recorded", folder / "split"
     for path in (work, split):
         path.mkdir()
     texts = write_texts(work)
-    robot = load_robot(str(work / "snake4.toml"))
+    robot = load_robot(work / "snake4.toml")
 
-    def record(
-        path: Path, size: int, topics: tuple[str, ...], at: Callable[[int, DurableSink], object]
-    ) -> None:
+    def record(path, size, topics, at):
         sink = DurableSink(path, segment_size=size, ballast=0)
-        with SessionWriter(
-            path, session_id="s", epoch_ns=EPOCH_NS, robot=robot, sink=sink
-        ) as writer:
+        facts = {"session_id": "s", "epoch_ns": EPOCH_NS, "robot": robot}
+        with SessionWriter(path, sink=sink, **facts) as writer:
             channels = [writer.joint_state(topic, JOINTS, unit="rad") for topic in topics]
             for tick in range(150):
                 for channel in channels:
@@ -303,11 +273,11 @@ def of_recorder(folder: Path) -> list[Base]:
                     channel.write(EPOCH_NS + tick * PERIOD_NS, angles)
                 at(tick, sink)
 
-    def copy(tick: int, _sink: DurableSink) -> None:
+    def copy(tick, _sink):
         if tick == 100:
             shutil.copytree(work, folder / "unfinished")
 
-    def divide(tick: int, sink: DurableSink) -> None:
+    def divide(tick, sink):
         if tick in {50, 100}:
             sink.split()
 

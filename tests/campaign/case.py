@@ -5,8 +5,6 @@ is judged by what the kernel reports of it (exit, signal, processor time, peak m
 bytes that it wrote.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re
@@ -15,7 +13,6 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -64,6 +61,11 @@ class Outcome:
     out: bytes
     err: bytes
 
+    @property
+    def errors(self):
+        """Return the last characters on standard error."""
+        return self.err.decode(errors="replace")[-200:]
+
 
 @dataclass
 class Result:
@@ -81,31 +83,30 @@ class Result:
     figures: dict[str, float] = field(default_factory=dict)
     skipped: str = ""
 
-    def add(self, outcome: Outcome) -> None:
+    def add(self, outcome):
         """Add the failures of a command's run, and keep the largest figures."""
         self.failures += judge(outcome)
         self.measure(outcome)
 
-    def measure(self, outcome: Outcome) -> None:
+    def measure(self, outcome):
         """Keep the largest processor time and memory."""
         self.at_most("cpu_s", outcome.cpu_s)
         self.at_most("peak_mib", outcome.peak / MIB)
 
-    def at_most(self, name: str, value: float) -> None:
+    def at_most(self, name, value):
         """Keep the larger value of a figure."""
         self.figures[name] = max(self.figures.get(name, 0.0), round(value, 3))
 
 
-def _limit(room: int) -> None:
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    size = pages * resource.getpagesize() + room
+def _limit(room):
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() + room
     resource.setrlimit(resource.RLIMIT_AS, (size, size))
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S + 2))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST_FILE, LARGEST_FILE))
 
 
-def _be_child(work: Callable[[], int | None], folder: Path, streams: tuple[Path, Path]) -> None:
+def _be_child(work, folder, streams):
     """The forked process: never returns."""
     code = STRAY
     try:
@@ -137,8 +138,8 @@ def _be_child(work: Callable[[], int | None], folder: Path, streams: tuple[Path,
         os._exit(code)
 
 
-def front_door(words: Sequence[str]) -> Callable[[], int | None]:
-    def work() -> None:
+def front_door(words):
+    def work():
         import undulog
 
         sys.argv = ["undulog", *words]
@@ -148,14 +149,8 @@ def front_door(words: Sequence[str]) -> Callable[[], int | None]:
 
 
 def run_forked(
-    work: Callable[[], int | None],
-    folder: Path,
-    *,
-    end_after_s: float | None = None,
-    end_by: int = signal.SIGKILL,
-    stdout: Path | None = None,
-    meanwhile: Callable[[int], None] | None = None,
-) -> Outcome:
+    work, folder, *, end_after_s=None, end_by=signal.SIGKILL, stdout=None, meanwhile=None
+):
     """Run a function in a forked process under limits.
 
     Args:
@@ -202,12 +197,12 @@ def run_forked(
     return Outcome(code, by, killed, hung, cpu_s, used.ru_maxrss * 1024, *texts)
 
 
-def run_command(words: Sequence[str], folder: Path, **options: object) -> Outcome:
+def run_command(words, folder, **options):
     """Run ``undulog WORDS...`` by its entry function; options as :func:`run_forked` has them."""
     return run_forked(front_door([str(word) for word in words]), folder, **options)
 
 
-def last_line(err: bytes) -> str:
+def last_line(err):
     """Return the last line of a traceback, with its last line of code in the product."""
     text = err.decode("utf-8", "replace")
     places = re.findall(r'File "[^"]*/((?:capture|sim|analysis|replay)/[^"]+)", line (\d+)', text)
@@ -218,12 +213,12 @@ def last_line(err: bytes) -> str:
     return f"{str(last)[:160]} [{at}]"
 
 
-def control_characters(data: bytes) -> list[str]:
+def control_characters(data):
     """Return the characters of an output that act on a terminal."""
     return sorted(set(CONTROL.findall(data.decode("utf-8", "replace"))))
 
 
-def judge(outcome: Outcome) -> list[str]:
+def judge(outcome):
     """Return the failures of a command's run; each begins with its kind."""
     found = []
     if outcome.hung:

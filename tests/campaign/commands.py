@@ -17,7 +17,7 @@ READS = [
     (0.5, "log export {file} -o new.blf"),
     (0.5, "log export {file} -o new.parquet"),
 ]
-COMMANDS: dict[str, list[tuple[float, str]]] = {
+COMMANDS = {
     "log": [
         *EDITS,
         *READS,

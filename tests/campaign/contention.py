@@ -1,25 +1,21 @@
 """The recorder beside busy loops and a disk that syncs all the time."""
 
-from __future__ import annotations
-
 import os
 import random
 import subprocess
 import sys
 import time
 from contextlib import ExitStack
-from pathlib import Path
 
 from .case import Result
 from .recording import check_kept, end, recorder, senders, start
-from .stage import Stage
 
 RATE = 9000
 SECONDS = 20.0
 BUSY = "while True: pass"
 
 
-def run(seed: int, stage: Stage) -> Result:
+def run(seed, stage):
     """Record two buses of 9,000 frames/s, all cores and the disk busy: no accepted frame is lost.
 
     Frames that the kernel refused are a figure, not a failure: the sender gets the refusal.
@@ -52,7 +48,7 @@ def run(seed: int, stage: Stage) -> Result:
     return result
 
 
-def _syncing(folder: Path) -> list[str]:
+def _syncing(folder):
     """Return a command that writes 1 MB blocks and syncs, over and over."""
     dd = f"dd if=/dev/zero of={folder / 'dd'} bs=1M count=64 conv=fsync"
     return ["bash", "-c", f"while kill -0 {os.getpid()}; do {dd}; done"]

@@ -1,7 +1,5 @@
 """Disks that fill up, vanish, or are read-only, under every command that writes."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random
@@ -10,14 +8,12 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from .case import Result, judge, run_command
 from .kills import LINES, lay_out, whole_outputs
 from .recording import check_kept, recorder, senders
-from .stage import Stage
 
 TEXTS = (
     *("log info run.mcap", "log check run.mcap --json", "analyse run.mcap", "info", "sim list"),
@@ -26,7 +22,7 @@ TEXTS = (
 
 
 @contextmanager
-def disk(place: Path, size: str, *, read_only: bool = False) -> Iterator[bool]:
+def disk(place, size, *, read_only=False):
     """Mount a file system of a size at a folder; yield whether mounting is permitted here."""
     place.mkdir(exist_ok=True)
     command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
@@ -40,7 +36,7 @@ def disk(place: Path, size: str, *, read_only: bool = False) -> Iterator[bool]:
             subprocess.run(["umount", "-l", str(place)], capture_output=True, check=False)
 
 
-def run(seed: int, stage: Stage) -> Result:
+def run(seed, stage):
     """Run one command, or the recorder, on a bad disk."""
     rng = random.Random(seed)
     kinds = {"small": 8, "text": 4, "read-only": 2, "vanish": 4}
@@ -54,7 +50,7 @@ def run(seed: int, stage: Stage) -> Result:
         return _command(kind, folder, rng, stage)
 
 
-def _full_terminal(line: str, folder: Path, stage: Stage) -> Result:
+def _full_terminal(line, folder, stage):
     lay_out(folder, stage)
     result = Result(f"{line!r} to a full device")
     outcome = run_command(shlex.split(line), folder, stdout=Path("/dev/full"))
@@ -64,7 +60,7 @@ def _full_terminal(line: str, folder: Path, stage: Stage) -> Result:
     return result
 
 
-def _command(kind: str, folder: Path, rng: random.Random, stage: Stage) -> Result:
+def _command(kind, folder, rng, stage):
     line = rng.choice(LINES)
     size = f"{rng.choice([4, 16, 64, 256])}k"
     result = Result(f"{line!r}: {kind} disk of {size}")
@@ -78,7 +74,7 @@ def _command(kind: str, folder: Path, rng: random.Random, stage: Stage) -> Resul
             result.skipped = "mounting is not permitted here"
             return result
 
-        def vanish(_child: int) -> None:
+        def vanish(_child):
             time.sleep(rng.random() * 0.5)
             if rng.random() < 0.5:
                 subprocess.run(["umount", "-l", str(folder / "disk")], check=False)
@@ -99,7 +95,7 @@ def _command(kind: str, folder: Path, rng: random.Random, stage: Stage) -> Resul
     return result
 
 
-def _fill(place: Path, spare: int) -> None:
+def _fill(place, spare):
     """Fill a disk, but for a number of bytes."""
     state = os.statvfs(place)
     with contextlib.suppress(OSError), (place / "other").open("wb", buffering=0) as stream:
@@ -107,7 +103,7 @@ def _fill(place: Path, spare: int) -> None:
             stream.write(bytes(4096))
 
 
-def _recorder(kind: str, folder: Path, rng: random.Random) -> Result:
+def _recorder(kind, folder, rng):
     result = Result(f"record, {kind}")
     with disk(folder / "disk", "96m") as can:
         if not can:

@@ -1,9 +1,8 @@
 """Mutated files through the commands: a seed is a base file, its faults and a command line."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
+import itertools
 import json
 import random
 import re
@@ -11,23 +10,17 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from mcap.reader import make_reader
+from support.read_back import messages_of
 
-from .base import EPOCH_NS, Base
-from .case import Outcome, Result, front_door, judge, run_forked
+from .base import EPOCH_NS, write_files
+from .case import Result, front_door, judge, run_forked
 from .commands import COMMANDS, WEIGHTS
 from .mutate import mutate_bytes, mutate_text, remake_database, remake_log
-
-if TYPE_CHECKING:
-    from undulog.capture import Session
 
 RECORDS_FOR_S = 12.0
 """A recorder with mutated settings may have been given an hour: it is ended then [s]."""
@@ -43,33 +36,30 @@ class Case:
     files: dict[str, bytes]
     ended_after_s: float | None = None
 
-    def as_json(self) -> str:
+    def as_json(self):
         """Return the case as one text, for a file."""
         files = {name: base64.b64encode(data).decode() for name, data in self.files.items()}
         fields = {"words": self.words, "ended_after_s": self.ended_after_s, "files": files}
         return json.dumps(fields, indent=1) + "\n"
 
     @classmethod
-    def from_json(cls, text: str) -> Case:
+    def from_json(cls, text):
         """Return a case from such a text."""
         fields = json.loads(text)
         files = {name: base64.b64decode(data) for name, data in fields["files"].items()}
         return cls(tuple(fields["words"]), files, fields["ended_after_s"])
 
-    def run(self, folder: Path, modules: Path | None = None) -> Outcome:
+    def run(self, folder, modules=None):
         """Write the files to an empty folder and run the command there.
 
         The names of the imported modules go to the file ``modules``.
         """
-        for name, data in self.files.items():
-            path = folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+        write_files(folder, self.files)
         work = front_door(self.words)
         if self.words[0] == "api":
             work = partial(try_session, folder / self.words[1])
 
-        def listed() -> None:
+        def listed():
             try:
                 work()
             finally:
@@ -79,7 +69,7 @@ class Case:
         return run_forked(listed, folder, end_after_s=self.ended_after_s, end_by=signal.SIGTERM)
 
 
-def make_case(seed: int, bases: list[Base], scratch: Path) -> Case:
+def make_case(seed, bases, scratch):
     """Return the case of a seed."""
     rng = random.Random(seed)
     kind = rng.choices(list(WEIGHTS), list(WEIGHTS.values()))[0]
@@ -101,7 +91,7 @@ def make_case(seed: int, bases: list[Base], scratch: Path) -> Case:
     return Case(tuple(words), files, RECORDS_FOR_S if words[0] == "record" else None)
 
 
-def _mutated(data: bytes, suffix: str, rng: random.Random, scratch: Path) -> bytes:
+def _mutated(data, suffix, rng, scratch):
     if suffix in TEXTS:
         return mutate_text(data, rng)
     if suffix == ".db" and rng.random() < 0.7:
@@ -112,7 +102,7 @@ def _mutated(data: bytes, suffix: str, rng: random.Random, scratch: Path) -> byt
     return mutate_bytes(data, rng)
 
 
-def read_session(path: Path) -> None:
+def read_session(path):
     """Read all parts of a session; errors of the error tree are answers, too."""
     from undulog.capture import Session
     from undulog.capture.common.errors import UndulogError
@@ -125,7 +115,7 @@ def read_session(path: Path) -> None:
                 str(error)
 
 
-def try_session(path: Path) -> None:
+def try_session(path):
     """Read a session if it can be opened."""
     from undulog.capture.common.errors import UndulogError
 
@@ -133,7 +123,7 @@ def try_session(path: Path) -> None:
         read_session(path)
 
 
-def session_parts(session: Session) -> Iterator[Callable[[], object]]:
+def session_parts(session):
     """Yield functions that read one part of a session each."""
     window = {"start_ns": EPOCH_NS + 20_000_000, "stop_ns": EPOCH_NS + 50_000_000}
     yield lambda: session.robot
@@ -150,16 +140,13 @@ def session_parts(session: Session) -> Iterator[Callable[[], object]]:
         yield partial(session.joints, topic, **window)
 
 
-def check_output(folder: Path) -> list[str]:
+def check_output(folder):
     """Return faults of the outputs under their final names, by mcap's own reader."""
     found = []
-    for path in [
-        one for name in ("new*", "new/*", "frames") for one in folder.glob(f"{name}.mcap")
-    ]:
+    names = ("new*.mcap", "new/*.mcap", "frames.mcap")
+    for path in itertools.chain.from_iterable(map(folder.glob, names)):
         try:
-            with path.open("rb") as stream:
-                for _ in make_reader(stream, validate_crcs=True).iter_messages():
-                    pass
+            messages_of(path)
         except Exception as error:  # noqa: BLE001 - whatever the foreign reader raises
             found.append(f"output: {path.name} is no whole file: {type(error).__name__}: {error}")
     for path in folder.glob("new*.json"):
@@ -170,13 +157,13 @@ def check_output(folder: Path) -> list[str]:
     return found
 
 
-def run_case(case: Case, folder: Path, modules: Path | None = None) -> tuple[list[str], Outcome]:
+def run_case(case, folder, modules=None):
     """Run a case in an empty folder; return failures and outcome."""
     outcome = case.run(folder, modules)
     return [*judge(outcome), *check_output(folder)], outcome
 
 
-def run_seed(seed: int, bases: list[Base], folder: Path) -> tuple[Result, Case]:
+def run_seed(seed, bases, folder):
     """Make and run the case of a seed, in an empty folder."""
     case = make_case(seed, bases, folder.parent / "scratch")
     failures, outcome = run_case(case, folder)
@@ -185,7 +172,7 @@ def run_seed(seed: int, bases: list[Base], folder: Path) -> tuple[Result, Case]:
     return result, case
 
 
-def kind_of(failure: str) -> str:
+def kind_of(failure):
     """Return the kind of a failure; for a traceback its error and its line of code, too."""
     if failure.startswith("traceback: "):
         error, _, place = failure.removeprefix("traceback: ").rpartition(" [")
@@ -193,13 +180,7 @@ def kind_of(failure: str) -> str:
     return re.sub(r"[\d.]+", "N", failure.split(":", maxsplit=1)[0])
 
 
-def minimise(
-    case: Case,
-    kind: str,
-    bases: list[Base],
-    fresh: Callable[[], AbstractContextManager[Path]],
-    seconds: float = 40.0,
-) -> Case:
+def minimise(case, kind, bases, fresh, seconds=40.0):
     """Return a smaller case with the same kind of failure, as far as the time allows.
 
     Unneeded files are left out, unneeded faults are undone, then parts are cut out by halves.
@@ -207,7 +188,7 @@ def minimise(
     deadline = time.monotonic() + seconds
     originals = {(one.name, path): data for one in bases for path, data in one.files.items()}
 
-    def fails(files: dict[str, bytes]) -> bool:
+    def fails(files):
         tried = Case(case.words, files, case.ended_after_s)
         with fresh() as folder:
             return any(kind_of(one) == kind for one in run_case(tried, folder)[0])
@@ -239,13 +220,13 @@ def minimise(
     return Case(case.words, files, case.ended_after_s)
 
 
-def warm(cases: Sequence[Case], fresh: Callable[[], AbstractContextManager[Path]]) -> list[str]:
+def warm(cases, fresh):
     """Import here all modules that some cases import, so that forked processes needn't.
 
     Returns:
         Failures of the cases.
     """
-    wanted: dict[str, None] = {}
+    wanted = {}
     found = []
     for case in cases:
         with fresh() as folder:
@@ -254,8 +235,7 @@ def warm(cases: Sequence[Case], fresh: Callable[[], AbstractContextManager[Path]
             if listing.exists():
                 wanted |= dict.fromkeys(listing.read_text().split("\n"))
         if outcome.code:
-            errors = outcome.err.decode(errors="replace")[-300:]
-            failures.append(f"exit code {outcome.code}: {errors}")
+            failures.append(f"exit code {outcome.code}: {outcome.errors}")
         found += [f"{' '.join(case.words)}: {fault}" for fault in failures]
     for name in wanted:
         if name not in sys.modules and not name.startswith("__"):

@@ -9,8 +9,6 @@ hold begins, and one more. Those ticks follow from the reply interval that the d
 arming and wrote to its session; it may exceed that of the far end by :data:`SPREAD_S`.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import random
@@ -21,15 +19,13 @@ import time
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from mcap.reader import make_reader
 
 from undulog.capture import load_robot
 
-from .base import DBC, ROBOT, SCENARIO
+from .base import DBC, ROBOT, SCENARIO, write_files
 from .case import Result, run_command
-from .stage import Stage
 
 PERIOD_S = 0.01
 MAX_RATE = 4.0
@@ -59,7 +55,7 @@ class FarEnd:
     """Servos at a socketcand server; the connection stalls at given times.
 
     Attributes:
-        polled: Whether a servo speaks only when it is asked.
+        polled: Whether a servo only replies to requests.
         interval_s: How often unasked states are sent [s].
         latency_s: Of what is sent back [s].
         stalls: (Begin after the first command [s], length [s], whether only the way to the bus).
@@ -77,15 +73,15 @@ class FarEnd:
     commands: dict[int, list[tuple[float, float, float]]] = field(default_factory=dict)
     first_s: float | None = None
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         """Listen."""
         self.server = socket.create_server(("127.0.0.1", 0))
         self.port = self.server.getsockname()[1]
         self._angles = dict.fromkeys(range(1 if self.polled else 4), self.pose)
-        self._inbox: deque[bytes] = deque()
-        self._outbox: deque[tuple[float, bytes]] = deque()
+        self._inbox = deque()
+        self._outbox = deque()
 
-    def serve(self, child: int) -> None:
+    def serve(self, child):
         """Serve one client after the other until a process ends."""
         deadline = time.monotonic() + DRIVE_S
         self.server.settimeout(0.05)
@@ -101,7 +97,7 @@ class FarEnd:
                 link.sendall(b"< hi >")
                 self._connected(link, deadline)
 
-    def _connected(self, link: socket.socket, deadline: float) -> None:
+    def _connected(self, link, deadline):
         """Serve one client until it leaves."""
         text, opened, next_state = b"", False, time.monotonic()
         self._looked_s = time.monotonic()
@@ -136,17 +132,17 @@ class FarEnd:
             while self._outbox and self._outbox[0][0] <= now:
                 link.sendall(self._outbox.popleft()[1])
 
-    def _stalled(self, now: float) -> bool:
+    def _stalled(self, now):
         if self.first_s is None:
             return False
         return any(begin <= now - self.first_s < begin + length for begin, length in self.stalls)
 
-    def _reply(self, identifier: int, data: bytes) -> None:
+    def _reply(self, identifier, data):
         now = time.time()
         words = f"< frame {identifier:X} {now:.6f} {data.hex().upper()} >"
         self._outbox.append((time.monotonic() + self.latency_s, words.encode()))
 
-    def _frame(self, identifier: int, data: bytes) -> None:
+    def _frame(self, identifier, data):
         now = time.monotonic()
         if self.polled and identifier == POLLED and data[0] == 0x92:
             raw = round(math.degrees(self._angles[0]) * 100)
@@ -165,7 +161,7 @@ class FarEnd:
         self._angles[joint] = angle
         self.commands.setdefault(joint, []).append((self._looked_s, now, angle))
 
-    def check(self, limit: float, measured_s: float) -> tuple[list[str], float]:
+    def check(self, limit, measured_s):
         """Return the failures, and the largest number of steps beyond the rate.
 
         Args:
@@ -194,7 +190,7 @@ class FarEnd:
         return found, worst / STEP
 
 
-def run(seed: int, stage: Stage) -> Result:
+def run(seed, stage):
     """Run one armed drive; every fifth is over a healthy bus and must finish."""
     rng = random.Random(seed)
     polled, healthy = rng.random() < 0.5, seed % 5 == 0
@@ -203,14 +199,9 @@ def run(seed: int, stage: Stage) -> Result:
         (rng.uniform(0.3, 2.0), math.exp(rng.uniform(math.log(0.02), math.log(5.0))))
         for _ in range(0 if healthy else rng.choice([1, 1, 2, 4]))
     ]
-    far = FarEnd(
-        polled,
-        interval_s,
-        rng.choice([0.0, 0.0, 0.004, 0.016]),
-        stalls,
-        rng.random() < 0.5,
-        rng.choice([0.0, 0.1]),
-    )
+    latency_s = rng.choice([0.0, 0.0, 0.004, 0.016])
+    bursts, pose = rng.random() < 0.5, rng.choice([0.0, 0.1])
+    far = FarEnd(polled, interval_s, latency_s, stalls, bursts, pose)
     how = "polled" if polled else f"states each {1000 * interval_s:.0f} ms"
     gaps = ", ".join(f"{1000 * length:.0f} ms" for _, length in stalls) or "none"
     result = Result(f"drive, {how}, stalls: {gaps}{', in bursts' if far.bursts else ''}")
@@ -226,17 +217,17 @@ def run(seed: int, stage: Stage) -> Result:
         result.failures += failures
         result.at_most("steps_beyond_rate_polled" if polled else "steps_beyond_rate_unasked", worst)
         result.figures["n_commands"] = sum(map(len, far.commands.values()))
-        errors = outcome.err.decode(errors="replace")[-200:]
+        ended = f"exit code {outcome.code}: {outcome.errors}"
         if not far.commands:
-            result.failures.append(f"drive: nothing was sent: {errors}")
+            result.failures.append(f"drive: nothing was sent: {ended}")
         elif healthy and outcome.code != 0:
-            result.failures.append(f"drive: a healthy bus, and exit code {outcome.code}: {errors}")
+            result.failures.append(f"drive: a healthy bus, and {ended}")
         elif any(length > 1.5 and begin < 1.5 for begin, length in stalls) and outcome.code == 0:
             result.failures.append("drive: exit code 0 though the bus stood still")
     return result
 
 
-def _measured_s(path: Path) -> float:
+def _measured_s(path):
     """Return the reply interval of a drive's session [s]; 0 where none was armed."""
     if not path.exists():
         return 0.0
@@ -245,26 +236,21 @@ def _measured_s(path: Path) -> float:
     return float(records.get("undulog.gate.feedback", {}).get("reply_interval_s", 0.0))
 
 
-def _lay_out(folder: Path, polled: bool) -> None:
-    if polled:
-        robot = load_robot("arcsnake-joint")
-        for name, text in dict(robot.databases).items():
-            (folder / name).write_text(text)
-        (folder / "snake4.toml").write_text(robot.toml + SAFETY)
-    else:
-        (folder / "snake4.dbc").write_text(DBC)
-        (folder / "snake4.toml").write_text(ROBOT + SAFETY)
-    scenario = SCENARIO.replace("duration_s = 0.1", "duration_s = 60.0").replace(
-        "ramp_s = 0.02", "ramp_s = 0.5"
-    )
-    scenario = scenario.replace("frequency_hz = 2.0", "frequency_hz = 1.5").replace(
-        "amplitude = 0.1", "amplitude = 0.38"
-    )
-    if polled:
-        scenario = scenario[: scenario.index("[gait.vertical]")]
-    (folder / "scenario.toml").write_text(scenario)
+def _lay_out(folder, polled):
+    servo = load_robot("arcsnake-joint")
+    robot, databases = (servo.toml, servo.databases) if polled else (ROBOT, {"snake4.dbc": DBC})
+    scenario = SCENARIO.partition("[gait.vertical]")[0] if polled else SCENARIO
+    for key, old, new in (
+        ("duration_s", 0.1, 60.0),
+        ("ramp_s", 0.02, 0.5),
+        ("frequency_hz", 2.0, 1.5),
+        ("amplitude", 0.1, 0.38),
+    ):
+        scenario = scenario.replace(f"{key} = {old}", f"{key} = {new}")
+    texts = {"snake4.toml": robot + SAFETY, "scenario.toml": scenario}
+    write_files(folder, dict(databases) | texts)
 
 
-def _alive(child: int) -> bool:
+def _alive(child):
     """Return whether a child process still runs; it stays to be awaited."""
     return os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None

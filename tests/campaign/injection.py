@@ -1,25 +1,21 @@
 """Text that acts on a terminal, a page, a spreadsheet or a path, in every name of a file."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import random
 import re
 import shlex
-from pathlib import Path
 
 import numpy as np
 from mcap_ros2.writer import Writer as RosWriter
 
 from undulog.capture.log.messages.definitions import schema_text
 
-from .base import DBC, EPOCH_NS, JOINTS, PERIOD_NS, PLAN, ROBOT, SCENARIO, can_messages
+from .base import DBC, EPOCH_NS, JOINTS, PERIOD_NS, PLAN, ROBOT, SCENARIO, can_messages, write_files
 from .case import Result, run_command
 from .commands import COMMANDS
 from .fuzz import check_output
 from .mutate import remake_log
-from .stage import Stage
 
 EVIL = [
     "\x1b]0;owned\x07", "\x1b[2J\x1b[H", "\x1b]52;c;b3duZWQ=\x07", "fine\rerror: forged",
@@ -34,12 +30,12 @@ HTML = re.compile(rb"<script>alert\(1\)|<img src=x onerror|href=\"javascript:", 
 TEXTS = ("toml", "dbc", "scenario", "plan", "trace", "columns")
 
 
-def _evil_session(path: Path, rng: random.Random) -> None:
+def _evil_session(path, rng):
     """Write a foreign bag with such names of joints and topics, texts of events, and metadata."""
 
     favourite = rng.choice(EVIL)
 
-    def evil(name: str) -> str:
+    def evil(name):
         evil_text = rng.choice([favourite, rng.choice(EVIL)])
         return rng.choice([name, name + evil_text, evil_text + name])
 
@@ -75,10 +71,10 @@ def _evil_session(path: Path, rng: random.Random) -> None:
         writer.finish()
 
 
-def _spoil(text: str, rng: random.Random) -> str:
+def _spoil(text, rng):
     """Return a TOML or DBC text in which some strings are evil."""
 
-    def worse(found: re.Match[str]) -> str:
+    def worse(found):
         if rng.random() > 0.15:
             return found.group()
         evil_text = found.group(1) + rng.choice(EVIL)
@@ -91,27 +87,23 @@ def _spoil(text: str, rng: random.Random) -> str:
     return re.sub(r'"([^"\n]*)"', worse, text)
 
 
-def run(seed: int, stage: Stage) -> Result:
+def run(seed, stage):
     """Run one command on evil names in one of the files that it reads."""
     rng = random.Random(seed)
     with stage.fresh() as folder:
-        (folder / "snake4.toml").write_text(ROBOT)
-        (folder / "snake4.dbc").write_text(DBC)
-        (folder / "scenario.toml").write_text(SCENARIO)
-        (folder / "gait0.mcap").write_bytes(stage.files_of("gait.mcap")["gait.mcap"])
+        texts = {"snake4.toml": ROBOT, "snake4.dbc": DBC, "scenario.toml": SCENARIO}
+        write_files(folder, texts | {"gait0.mcap": stage.files_of("gait.mcap")["gait.mcap"]})
         kind = rng.choice(["log", "log", "log", "foreign", *TEXTS])
         line = _lay_out(kind, folder, rng, stage)
         result = Result(f"{line!r}: {kind}")
-        outcome = run_command(shlex.split(line), folder)
-        result.add(outcome)
-        result.failures += check_output(folder)
-        result.failures += _check_pages(folder)
+        result.add(run_command(shlex.split(line), folder))
+        result.failures += check_output(folder) + _check_pages(folder)
         outside = [str(path) for path in folder.parent.iterdir() if path.name.startswith("up")]
         result.failures += [f"path: wrote {path}" for path in outside]
     return result
 
 
-def _lay_out(kind: str, folder: Path, rng: random.Random, stage: Stage) -> str:
+def _lay_out(kind, folder, rng, stage):
     """Write the spoilt file; return the command line to run on it."""
     trace = folder / "trace.log"
     with trace.open("w") as stream:
@@ -125,8 +117,7 @@ def _lay_out(kind: str, folder: Path, rng: random.Random, stage: Stage) -> str:
         _evil_session(folder / name, rng)
         if kind == "foreign":  # with faults besides, so that errors and warnings name things
             scratch = stage.folder / f"scratch{folder.parent.name}"
-            data = remake_log((folder / name).read_bytes(), rng, scratch)
-            (folder / name).write_bytes(data)
+            (folder / name).write_bytes(remake_log((folder / name).read_bytes(), rng, scratch))
         lines = [line for _, line in COMMANDS["log"] if line != "api"]
         return rng.choice(lines).format(file=shlex.quote(name))
     imports = "import trace.log -o new.mcap -r snake4.toml"
@@ -157,7 +148,7 @@ def _lay_out(kind: str, folder: Path, rng: random.Random, stage: Stage) -> str:
     return rng.choice([imports, "sim run scenario.toml -o new.mcap", imports + " --json"])
 
 
-def _check_pages(folder: Path) -> list[str]:
+def _check_pages(folder):
     """Return markup from names in pages, and cells of tables that a spreadsheet computes."""
     found = [
         f"page: {hit.group()!r} in {path.name}"
@@ -175,7 +166,7 @@ def _check_pages(folder: Path) -> list[str]:
     return found
 
 
-def _is_number(cell: str) -> bool:
+def _is_number(cell):
     with contextlib.suppress(ValueError):
         float(cell)
         return True

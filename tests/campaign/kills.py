@@ -1,19 +1,15 @@
 """Kills at random moments: of every command that writes, and of the recorder under load."""
 
-from __future__ import annotations
-
 import os
 import random
 import shlex
 import signal
 import time
-from pathlib import Path
 
-from .base import gait_session
+from .base import gait_session, write_files
 from .case import Result, judge, run_command
 from .fuzz import check_output
 from .recording import check_kept, numbers_in, recorder, senders
-from .stage import Stage
 
 LINES = [
     "sim run scenario.toml -o new.mcap --duration 3",
@@ -41,7 +37,7 @@ LINES = [
 END = {".html": b"</html>", ".rrd": b""}
 
 
-def lay_out(folder: Path, stage: Stage) -> None:
+def lay_out(folder, stage):
     """Write the inputs of all command lines."""
     path = stage.folder / "bases" / "long.mcap"
     if not path.exists():
@@ -49,17 +45,14 @@ def lay_out(folder: Path, stage: Stage) -> None:
         gait_session(part, 2000)
         part.rename(path)
     long = path.read_bytes()
+    places = {"unfinished": folder / "unfinished", "trace": folder}
     for base in stage.bases:
-        inside = {"unfinished": folder / "unfinished", "trace": folder}.get(base.kind)
-        if inside is not None:
-            for name, data in base.files.items():
-                (inside / name).parent.mkdir(parents=True, exist_ok=True)
-                (inside / name).write_bytes(data)
-    for name, data in (("run.mcap", long), ("other.mcap", stage.files_of("lz4.mcap")["lz4.mcap"])):
-        (folder / name).write_bytes(data)
+        if base.kind in places:
+            write_files(places[base.kind], base.files)
+    write_files(folder, {"run.mcap": long, "other.mcap": stage.files_of("lz4.mcap")["lz4.mcap"]})
 
 
-def whole_outputs(folder: Path) -> list[str]:
+def whole_outputs(folder):
     """Return faults of the files under their final names."""
     found = check_output(folder)
     for suffix, end in END.items():
@@ -70,7 +63,7 @@ def whole_outputs(folder: Path) -> list[str]:
     return found
 
 
-def run(seed: int, stage: Stage) -> Result:
+def run(seed, stage):
     """End one command at a random moment, then run it again to its end."""
     rng = random.Random(seed)
     line = rng.choice(LINES)
@@ -98,12 +91,11 @@ def run(seed: int, stage: Stage) -> Result:
         again = run_command(words, folder)
         result.failures += [f"again: {fault}" for fault in judge(again)]
         if again.code and not leaves_a_log:
-            errors = again.err.decode(errors="replace")[-200:]
-            result.failures.append(f"again: exit code {again.code}: {errors}")
+            result.failures.append(f"again: exit code {again.code}: {again.errors}")
     return result
 
 
-def run_recorder(seed: int, stage: Stage) -> Result:
+def run_recorder(seed, stage):
     """Kill the recorder under the load of two senders; accepted frames are kept.
 
     What may be missing is what the kernel had accepted in the last 50 ms.
@@ -129,7 +121,7 @@ def run_recorder(seed: int, stage: Stage) -> Result:
         outcome = run_command(words, folder)
         result.add(outcome)
         if outcome.code:
-            result.failures.append(f"recover: {outcome.err.decode(errors='replace')[-200:]}")
+            result.failures.append(f"recover: {outcome.errors}")
         for one, least in zip(sending, accepted, strict=True):
             result.failures += check_kept(folder / "recovered", one, least)
             result.figures["n_accepted"] = result.figures.get("n_accepted", 0) + least

@@ -1,17 +1,12 @@
 """Faults of files: in bytes, in words of a text, in messages of a log, in rows of a database."""
 
-from __future__ import annotations
-
 import contextlib
-import random
 import re
 import sqlite3
 import struct
-from pathlib import Path
 
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, IndexType, Writer
 
 HUGE = [
@@ -38,7 +33,7 @@ JUMPS = [-(10**9), 10**9, 3600 * 10**9, DAY_NS, 365 * DAY_NS, 10**18]
 # -- bytes ---------------------------------------------------------------------------------
 
 
-def mutate_bytes(data: bytes, rng: random.Random) -> bytes:
+def mutate_bytes(data, rng):
     """Return bytes with one to four faults."""
     changed = bytearray(data)
     for _ in range(rng.choice([1, 1, 1, 2, 4])):
@@ -57,30 +52,21 @@ def _cut(data, rng):
     del data[rng.randrange(len(data)) :]
 
 
-def _stretch(data, rng):
-    a, b = sorted(rng.choices(range(len(data)), k=2))
-    return a, min(b, a + rng.choice([4, 64, 1024, 1 << 20]))
+def _stretch(change):
+    """Return a fault that changes some bytes in a row."""
+
+    def fault(data, rng):
+        a, b = sorted(rng.choices(range(len(data)), k=2))
+        b = min(b, a + rng.choice([4, 64, 1024, 1 << 20]))
+        data[a:b] = change(data[a:b])
+
+    return fault
 
 
-def _zero(data, rng):
-    a, b = _stretch(data, rng)
-    data[a:b] = bytes(b - a)
-
-
-def _take_out(data, rng):
-    a, b = _stretch(data, rng)
-    del data[a:b]
-
-
-def _double(data, rng):
-    a, b = _stretch(data, rng)
-    data[b:b] = data[a:b]
-
-
-def _swap(data, rng):
-    a, b = _stretch(data, rng)
-    middle = (a + b) // 2
-    data[a:b] = data[middle:b] + data[a:middle]
+_zero = _stretch(lambda part: bytes(len(part)))
+_take_out = _stretch(lambda part: b"")
+_double = _stretch(lambda part: 2 * part)
+_swap = _stretch(lambda part: part[len(part) // 2 :] + part[: len(part) // 2])
 
 
 def _set_number(data, rng):
@@ -100,8 +86,7 @@ def _set_length(data, rng):
     at = rng.choice(places or [0]) + rng.choice([1, 1, 9, 13, 17, 21, 25, 29, 33, 37, 41, 49])
     if at + 8 <= len(data):
         size = rng.choice([4, 8])
-        value = rng.choice(HUGE) & ((1 << 8 * size) - 1)
-        data[at : at + size] = value.to_bytes(size, "little")
+        data[at : at + size] = (rng.choice(HUGE) & ((1 << 8 * size) - 1)).to_bytes(size, "little")
 
 
 FAULTS = [
@@ -113,7 +98,7 @@ FAULTS = [
 # -- text ----------------------------------------------------------------------------------
 
 
-def mutate_text(data: bytes, rng: random.Random) -> bytes:
+def mutate_text(data, rng):
     """Return text with one to four faults: in bytes, in words, in numbers, in whole lines."""
     text = data.decode("utf-8", "surrogateescape")
     for _ in range(rng.choice([1, 1, 2, 4])):
@@ -145,7 +130,7 @@ def mutate_text(data: bytes, rng: random.Random) -> bytes:
 # -- logs, from the inside -----------------------------------------------------------------
 
 
-def _payload(data: bytes, rng: random.Random) -> bytes:
+def _payload(data, rng):
     kind = rng.randrange(5)
     if kind == 0:
         return b""
@@ -157,13 +142,8 @@ def _payload(data: bytes, rng: random.Random) -> bytes:
         value = rng.choice([float("nan"), float("inf"), 1e308, -1e308, 1e-320, 0.0])
         struct.pack_into("<d", changed, at, value)
     elif kind == 3 and len(changed) >= 12:  # its stamp
-        struct.pack_into(
-            "<iI",
-            changed,
-            4,
-            rng.choice([-(2**31), -1, 0, 2**31 - 1, 10**9 * 2]),
-            rng.choice([0, 999_999_999, 2**32 - 1]),
-        )
+        seconds = rng.choice([-(2**31), -1, 0, 2**31 - 1, 10**9 * 2])
+        struct.pack_into("<iI", changed, 4, seconds, rng.choice([0, 999_999_999, 2**32 - 1]))
     elif changed:
         _flip_bits(changed, rng)
     return bytes(changed)
@@ -172,15 +152,13 @@ def _payload(data: bytes, rng: random.Random) -> bytes:
 class _Remake:
     """Writes the messages of a log again, some of them with faults."""
 
-    def __init__(self, writer: Writer, rng: random.Random, faults: set[str]) -> None:
+    def __init__(self, writer, rng, faults):
         self.writer, self.rng, self.faults = writer, rng, faults
-        self.schemas: dict[int, int] = {}
-        self.channels: dict[int, int] = {}
+        self.schemas = {}
+        self.channels = {}
         self.jump = rng.choice(JUMPS)
 
-    def add(
-        self, number: int, schema: Schema, channel: Channel, message: Message, *, hit: bool
-    ) -> None:
+    def add(self, number, schema, channel, message, *, hit):
         """Add one message; ``hit`` is whether it gets the faults of single messages."""
         rng, own = self.rng, self.faults if hit else self.faults & {"time"}
         if schema.id not in self.schemas:
@@ -196,12 +174,11 @@ class _Remake:
             log_ns += self.jump if number > 40 else 0
         if "order" in own:
             log_ns = max(0, log_ns - rng.choice([1, 10**8, 10**10]))
-        publish_ns = message.publish_time % 2**64
-        self.writer.add_message(
-            self.channels[channel.id], log_ns % 2**64, payload, publish_ns, message.sequence
-        )
+        times = log_ns % 2**64, message.publish_time % 2**64
+        of = self.channels[channel.id]
+        self.writer.add_message(of, times[0], payload, times[1], message.sequence)
 
-    def _add_schema(self, schema: Schema) -> None:
+    def _add_schema(self, schema):
         name, text = schema.name, schema.data
         if "schema" in self.faults:
             text = mutate_text(text, self.rng)
@@ -209,18 +186,17 @@ class _Remake:
                 name = mutate_text(name.encode(), self.rng).decode("utf-8", "replace")[:200]
         self.schemas[schema.id] = self.writer.register_schema(name, schema.encoding, text)
 
-    def _add_channel(self, channel: Channel, schema_id: int, *, astray: bool) -> None:
+    def _add_channel(self, channel, schema_id, *, astray):
         topic, facts = channel.topic, dict(channel.metadata)
         if "names" in self.faults:
             topic = mutate_text(topic.encode(), self.rng).decode("utf-8", "replace")[:300]
             facts = {k: self.rng.choice([v, *WORDS[:25]]) for k, v in facts.items()}
         used = self.rng.choice([*self.schemas.values(), 0]) if astray else self.schemas[schema_id]
-        self.channels[channel.id] = self.writer.register_channel(
-            topic, channel.message_encoding, used, facts
-        )
+        description = (topic, channel.message_encoding, used, facts)
+        self.channels[channel.id] = self.writer.register_channel(*description)
 
 
-def remake_log(data: bytes, rng: random.Random, scratch: Path) -> bytes:
+def remake_log(data, rng, scratch):
     """A log with faults inside its messages and right checksums around them.
 
     Args:
@@ -234,12 +210,8 @@ def remake_log(data: bytes, rng: random.Random, scratch: Path) -> bytes:
     source, target = scratch.with_suffix(".old"), scratch.with_suffix(".new")
     source.write_bytes(data)
     every = rng.choice([1, 3, 20, 100, 1000])
-    faults = set(
-        rng.sample(
-            ["time", "payload", "schema", "names", "channel", "few", "order"],
-            rng.choice([1, 1, 2, 3]),
-        )
-    )
+    kinds = ["time", "payload", "schema", "names", "channel", "few", "order"]
+    faults = set(rng.sample(kinds, rng.choice([1, 1, 2, 3])))
     options = {
         "compression": rng.choice(list(CompressionType)),
         "chunk_size": rng.choice([200, 2000, 1 << 20]),
@@ -271,7 +243,7 @@ def remake_log(data: bytes, rng: random.Random, scratch: Path) -> bytes:
 # -- databases -----------------------------------------------------------------------------
 
 
-def remake_database(data: bytes, rng: random.Random, scratch: Path) -> bytes:
+def remake_database(data, rng, scratch):
     """Return an SQLite file with faults in rows, columns or the layout."""
     path = scratch.with_suffix(".db")
     path.write_bytes(data)
@@ -284,10 +256,8 @@ def remake_database(data: bytes, rng: random.Random, scratch: Path) -> bytes:
             with contextlib.suppress(sqlite3.DatabaseError):
                 kind = rng.random()
                 if kind < 0.8:
-                    base.execute(
-                        f'update "{table}" set "{column}"=? where rowid=?',
-                        (rng.choice(values), row),
-                    )
+                    change = f'update "{table}" set "{column}"=? where rowid=?'
+                    base.execute(change, (rng.choice(values), row))
                 elif kind < 0.9:
                     base.execute(f'alter table "{table}" drop column "{column}"')
                 else:

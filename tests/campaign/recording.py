@@ -1,7 +1,5 @@
 """A recorder, and senders with sequence numbers of their own, held against mcap's own reader."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -9,15 +7,13 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from mcap.reader import make_reader
-
 from support.paths import ROOT
 from support.processes import UNDULOG
+from support.read_back import messages_of
 
 SENDER = Path(__file__).with_name("sender.py")
 RECORD = 32
@@ -27,12 +23,7 @@ PATIENCE_S = 90.0
 
 
 @contextmanager
-def recorder(
-    folder: Path,
-    buses: Sequence[str],
-    options: Sequence[str] = (),
-    output: Path | None = None,
-) -> Iterator[subprocess.Popen[bytes]]:
+def recorder(folder, buses, options=(), output=None):
     """Record frames of other processes; errors of the recorder go to ``recorder.err``."""
     sources = [f"{name}=unix:{folder / name}.sock" for name in buses]
     command = [*UNDULOG, "record", *sources, *options, "--quiet", "--floor", "0"]
@@ -42,7 +33,7 @@ def recorder(
         yield start(stack, *command, stderr=errors, cwd=ROOT)
 
 
-def start(stack: ExitStack, *command: object, **options: object) -> subprocess.Popen[bytes]:
+def start(stack, *command, **options):
     """Start a process that is killed when the stack is closed."""
     process = subprocess.Popen([str(word) for word in command], **options)
     stack.callback(process.wait, 30)
@@ -58,21 +49,21 @@ class Sending:
     process: subprocess.Popen[bytes]
     log: Path
 
-    def rows(self) -> list[tuple[int, int]]:
+    def rows(self):
         """Return pairs of monotonic time [ns] and frames accepted by then."""
         data = self.log.read_bytes() if self.log.exists() else b""
         return list(struct.iter_unpack("<QQ", data[: len(data) // 16 * 16]))
 
-    def accepted_before(self, t_ns: int) -> int:
+    def accepted_before(self, t_ns):
         """Return the number of frames accepted before a time."""
         return max((count for at_ns, count in self.rows() if at_ns < t_ns), default=0)
 
-    def lost_tail_ms(self, kept: int, killed_ns: int) -> float:
+    def lost_tail_ms(self, kept, killed_ns):
         """Return the age of the first accepted frame that is not kept at a kill [ms]; 0 if none."""
         first = next((at_ns for at_ns, count in self.rows() if count > kept), killed_ns)
         return max(0, killed_ns - first) / 1e6
 
-    def wait_for(self, packets: int) -> None:
+    def wait_for(self, packets):
         """Wait until a number of packets was accepted."""
         until = time.monotonic() + PATIENCE_S
         while len(self.rows()) < packets:
@@ -80,16 +71,14 @@ class Sending:
                 raise TimeoutError(f"the sender of {self.bus} found no recorder")
             time.sleep(0.02)
 
-    def result(self) -> dict[str, int]:
+    def result(self):
         """Return the report of the sender at its end."""
         out, _ = self.process.communicate(timeout=PATIENCE_S)
         return json.loads(out)
 
 
 @contextmanager
-def senders(
-    folder: Path, buses: Sequence[str], *, rate: float, per_packet: int, seconds: float
-) -> Iterator[list[Sending]]:
+def senders(folder, buses, *, rate, per_packet, seconds):
     """Start senders to a recorder, one a bus."""
     with ExitStack() as stack:
         found = []
@@ -101,26 +90,22 @@ def senders(
         yield found
 
 
-def numbers_in(paths: Sequence[Path], bus: str) -> list[int]:
+def numbers_in(paths, bus):
     """Return the sequence numbers of a bus in the order of the files, by mcap's own reader."""
     found = []
     for path in paths:
-        with path.open("rb") as stream:
-            reader = make_reader(stream)
-            for _, _, message in reader.iter_messages([f"/can/{bus}"], log_time_order=False):
-                data = message.data
-                # The array is the last field: a length before it, then whole records.
-                size = len(data)
-                at = size - RECORD
-                while at >= RECORD and struct.unpack_from("<I", data, at - 4)[0] != size - at:
-                    at -= RECORD
-                rows = data[at:]
-                ends = range(AT_DATA, len(rows), RECORD)
-                found += [struct.unpack_from("<Q", rows, end)[0] for end in ends]
+        for *_, message in messages_of(path, topics=[f"/can/{bus}"], log_time_order=False):
+            data, size = message.data, len(message.data)
+            # The array is the last field: a length before it, then whole records.
+            at = size - RECORD
+            while at >= RECORD and struct.unpack_from("<I", data, at - 4)[0] != size - at:
+                at -= RECORD
+            ends = range(at + AT_DATA, size, RECORD)
+            found += [struct.unpack_from("<Q", data, end)[0] for end in ends]
     return found
 
 
-def check_kept(folder: Path, sending: Sending, least: int) -> list[str]:
+def check_kept(folder, sending, least):
     """Return failures unless each accepted frame is there once, in order, and no other."""
     paths = sorted(folder.glob("*.mcap"))
     if not paths:
@@ -138,7 +123,7 @@ def check_kept(folder: Path, sending: Sending, least: int) -> list[str]:
     return found
 
 
-def end(running: subprocess.Popen[bytes], by: int = signal.SIGTERM) -> int:
+def end(running, by=signal.SIGTERM):
     """End a process by a signal; return its exit code."""
     os.kill(running.pid, by)
     return running.wait(PATIENCE_S)

@@ -6,8 +6,6 @@ own sequence numbers and by a listener on the bus. Prints a line for each case, 
 that was interrupted goes on where it was.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing
@@ -17,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -48,7 +46,7 @@ class Part:
     alone: bool = False
 
 
-def mutated(seed: int, stage: Stage) -> Result:
+def mutated(seed, stage):
     """Run a command on a mutated file; minimise and store one failure of each kind."""
     with stage.fresh() as folder:
         result, case = run_seed(seed, stage.bases, folder)
@@ -73,10 +71,10 @@ PARTS = {
 }
 LONG = 50_000
 
-_stage: Stage | None = None
+_stage = None
 
 
-def _work(part: str, seed: int) -> tuple[str, int, Result, float]:
+def _work(part, seed):
     assert _stage is not None
     began = time.monotonic()
     try:
@@ -86,11 +84,9 @@ def _work(part: str, seed: int) -> tuple[str, int, Result, float]:
     return part, seed, result, time.monotonic() - began
 
 
-def plan(
-    names: Sequence[str], seed: int, cases: int | None, *, short: bool
-) -> list[tuple[str, int]]:
+def plan(names, seed, cases, *, short):
     """Return every case as (part, seed), those that need the machine alone first."""
-    jobs: list[tuple[str, int]] = []
+    jobs = []
     for name in sorted(names, key=lambda one: not PARTS[one].alone):
         part = PARTS[name]
         count = part.short if short else part.long
@@ -100,9 +96,7 @@ def plan(
     return jobs
 
 
-def run_all(
-    jobs: Sequence[tuple[str, int]], workers: int
-) -> Iterator[tuple[str, int, Result, float]]:
+def run_all(jobs, workers):
     """Run cases: parts that need the machine alone one by one, then the others side by side."""
     for job in jobs:
         if PARTS[job[0]].alone:
@@ -119,7 +113,7 @@ def run_all(
 class Records:
     """The results of a campaign, a line of JSON each, in a file that a later run continues."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         """Read what is there."""
         self.path, self.rows = path, []
         if path.exists():
@@ -129,19 +123,19 @@ class Records:
             if whole != text:
                 path.write_text(whole)
 
-    def add(self, row: dict[str, object]) -> None:
+    def add(self, row):
         """Append a line."""
         self.rows.append(row)
         with self.path.open("a") as stream:
             stream.write(json.dumps(row) + "\n")
 
     @property
-    def cases(self) -> list[dict]:
+    def cases(self):
         """All but the first line, which has the seed."""
         return self.rows[1:]
 
 
-def summary(records: Records) -> list[str]:
+def summary(records):
     """Return a table by part, then the failures by kind with a seed each."""
     lines = [
         "| part | cases | failed | skipped | most processor time [s] | most memory [MiB] | other |",
@@ -165,7 +159,7 @@ def summary(records: Records) -> list[str]:
             f"| {part} | {len(own)} | {failed} | {skipped} | {most.get('cpu_s', 0):.1f} "
             f"| {most.get('peak_mib', 0):.0f} | {other} |"
         )
-    kinds: dict[tuple[str, str], list[tuple[int, str, str]]] = defaultdict(list)
+    kinds = defaultdict(list)
     for row in records.cases:
         for failure in row["failures"]:
             kind = f"{' '.join(row['case'].split()[:2])}: {kind_of(failure)}"
@@ -179,7 +173,7 @@ def summary(records: Records) -> list[str]:
     return lines
 
 
-def main() -> int:
+def main():
     """Run the command line; return 1 where a case failed."""
     parser = argparse.ArgumentParser(prog="campaign", description=__doc__)
     parser.add_argument("--seed", type=int, help="of the campaign; a new one by default")
@@ -197,7 +191,7 @@ def main() -> int:
         return _run(options, Path(name))
 
 
-def _run(options: argparse.Namespace, folder: Path) -> int:
+def _run(options, folder):
     global _stage  # noqa: PLW0603 - the workers are forked with it
     os.environ["XDG_RUNTIME_DIR"] = str(folder)
     os.environ.setdefault("NO_COLOR", "1")  # as the front door does before anything is imported

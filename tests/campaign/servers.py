@@ -1,7 +1,5 @@
 """Clients that send garbage, stay silent or leave half-way; then a good client is served."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -10,14 +8,14 @@ import signal
 import socket
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-from .base import DBC, ROBOT, SCENARIO
-from .case import Outcome, Result, run_command
-from .stage import Stage
+from support.processes import wait_for
+
+from .base import DBC, ROBOT, SCENARIO, write_files
+from .case import Result, run_command
 
 PATIENCE_S = 30.0
 MORE = 4
@@ -31,7 +29,7 @@ WORDS = (
 )  # fmt: skip
 
 
-def _connect(address: tuple[str, int] | str) -> socket.socket:
+def _connect(address):
     kind = socket.AF_UNIX if isinstance(address, str) else socket.AF_INET
     link = socket.socket(kind, socket.SOCK_STREAM)
     link.settimeout(PATIENCE_S)
@@ -45,13 +43,12 @@ def _connect(address: tuple[str, int] | str) -> socket.socket:
                 raise
             time.sleep(0.01)
             continue
-        link.settimeout(PATIENCE_S)
         return link
 
 
 @contextmanager
-def _closing() -> Iterator[list[socket.socket]]:
-    links: list[socket.socket] = []
+def _closing():
+    links = []
     try:
         yield links
     finally:
@@ -60,7 +57,7 @@ def _closing() -> Iterator[list[socket.socket]]:
                 link.close()
 
 
-def attack(address: tuple[str, int] | str, rng: random.Random, links: list[socket.socket]) -> None:
+def attack(address, rng, links):
     """Connect forty clients: some send garbage, some nothing, some leave half-way or at once."""
     for _ in range(40):
         kind = rng.choice(["garbage", "silent", "half", "gone", "deaf"])
@@ -81,7 +78,7 @@ def attack(address: tuple[str, int] | str, rng: random.Random, links: list[socke
                 link.sendall(b"< open can0 >< rawmode >")
 
 
-def _heard(link: socket.socket, until: Callable[[bytes], bool]) -> bytes:
+def _received(link, until):
     data = b""
     deadline = time.monotonic() + PATIENCE_S
     while not until(data) and time.monotonic() < deadline:
@@ -93,30 +90,25 @@ def _heard(link: socket.socket, until: Callable[[bytes], bool]) -> bytes:
     return data
 
 
-def _wait(condition: Callable[[], object]) -> object:
-    deadline = time.monotonic() + PATIENCE_S
-    while not (found := condition()):
-        if time.monotonic() > deadline:
-            raise TimeoutError("the server did not start")
-        time.sleep(0.02)
-    return found
+def _wait(condition):
+    return wait_for(condition, "the server", PATIENCE_S)
 
 
-def _answer(address: tuple[str, int] | str, words: bytes, is_good: Callable[[bytes], bool]) -> str:
+def _answer(address, words, is_good):
     """Return the fault of the answer that a client gets; empty where it is good."""
     with suppress(OSError), _connect(address) as link:
         link.settimeout(0.5)
         link.sendall(words)
-        data = _heard(link, is_good)
+        data = _received(link, is_good)
         return "" if is_good(data) else f"only {data[:80]!r}"
     return "the connection was refused or closed"
 
 
-def _descriptors(pid: int) -> int:
+def _descriptors(pid):
     return len(os.listdir(f"/proc/{pid}/fd"))  # noqa: PTH208
 
 
-def _targets(pid: int) -> str:
+def _targets(pid):
     found = Counter[str]()
     for link in Path(f"/proc/{pid}/fd").iterdir():
         with suppress(OSError):  # closed meanwhile
@@ -124,24 +116,16 @@ def _targets(pid: int) -> str:
     return ", ".join(f"{count} x {target}" for target, count in found.items())
 
 
-def _check_descriptors(result: Result, pid: int, before: int, of: str = "") -> None:
+def _check_descriptors(result, pid, before, of=""):
     """Check that after the clients no more descriptors are open than before."""
-    with suppress(TimeoutError):
+    with suppress(AssertionError):
         _wait(lambda: _descriptors(pid) <= before + MORE)
     if (left := _descriptors(pid)) > before + MORE:
         text = f"descriptors: {before} before, {left} after{of}: {_targets(pid)}"
         result.failures.append(text)
 
 
-def _watched(
-    result: Result,
-    pid: int,
-    address: tuple[str, int] | str,
-    rng: random.Random,
-    good: Callable[[], str],
-    *,
-    foreign: bool = False,
-) -> None:
+def _watched(result, pid, address, rng, good, *, foreign=False):
     """Attack a server; a good client comes while the bad ones stay and after they left.
 
     A foreign server's answer beside the bad ones is only counted, and so is a connection that it
@@ -158,7 +142,7 @@ def _watched(
     if fault and foreign:
         # It may close one connection more while it drops the bad ones: a browser asks again.
         result.at_most("n_closed_after", 1.0)
-        with suppress(TimeoutError):
+        with suppress(AssertionError):
             _wait(lambda: not good())
         fault = good()
     if fault:
@@ -166,18 +150,7 @@ def _watched(
     _check_descriptors(result, pid, before)
 
 
-def _attacked(
-    result: Result,
-    folder: Path,
-    words: list[str],
-    *,
-    rng: random.Random,
-    ready: Callable[[], tuple[str, int] | str | None],
-    request: tuple[bytes, Callable[[bytes], bool]],
-    foreign: bool = False,
-    end_by: int = signal.SIGTERM,
-    more: Callable[[int, Callable[[], str]], None] | None = None,
-) -> Outcome:
+def _attacked(result, folder, words, *, rng, ready, request, end_by=signal.SIGTERM, **how):
     """Run a server under attack.
 
     Args:
@@ -187,18 +160,17 @@ def _attacked(
         rng: Generator of the attack.
         ready: Returns the address as soon as the server listens.
         request: Bytes that a good client sends, and whether an answer is right.
-        foreign: See :func:`_watched`.
         end_by: Signal that ends the server.
-        more: A further attack on the process; it gets the good client.
+        how: ``foreign``, see :func:`_watched`; ``more``, a further attack on the process, which
+            gets the good client.
     """
 
-    def meanwhile(pid: int) -> None:
+    def meanwhile(pid):
         try:
             good = partial(_answer, _wait(ready), *request)
-            _watched(result, pid, good.args[0], rng, good, foreign=foreign)
-            if more is not None:
-                more(pid, good)
-        except (TimeoutError, ValueError) as error:
+            _watched(result, pid, good.args[0], rng, good, foreign=how.get("foreign", False))
+            how.get("more", lambda *_: None)(pid, good)
+        except (AssertionError, ValueError) as error:
             result.failures.append(f"server: {error}")
         os.kill(pid, end_by)
 
@@ -207,12 +179,12 @@ def _attacked(
     return outcome
 
 
-def serve(result: Result, folder: Path, rng: random.Random) -> None:
+def serve(result, folder, rng, _stage):
     """``sim serve``: the good client gets the robot's frames."""
     (folder / "long.toml").write_text(SCENARIO.replace("duration_s = 0.1", "duration_s = 600.0"))
     out = folder.parent / f"{folder.name}.out"
 
-    def ready() -> tuple[str, int] | None:
+    def ready():
         line = out.read_bytes().split(b"\n")[0] if out.exists() else b""
         return ("127.0.0.1", json.loads(line)["port"]) if line else None
 
@@ -221,11 +193,11 @@ def serve(result: Result, folder: Path, rng: random.Random) -> None:
     _attacked(result, folder, words, rng=rng, ready=ready, request=request)
 
 
-def control(result: Result, folder: Path, rng: random.Random) -> None:
+def control(result, folder, rng, _stage):
     """A recorder's control socket, and its source: status is answered, senders are received."""
     path, source = str(folder / "c.sock"), str(folder / "s.sock")
 
-    def silent_senders(pid: int, good: Callable[[], str]) -> None:
+    def silent_senders(pid, good):
         before = _descriptors(pid)
         with _closing() as silent:
             for _ in range(100):
@@ -244,7 +216,7 @@ def control(result: Result, folder: Path, rng: random.Random) -> None:
     words += ["--socket", path, "-o", "new.mcap"]
     request = b'{"do": "status"}\n', lambda data: b'"ok":true' in data.replace(b" ", b"")
 
-    def ready() -> str | None:
+    def ready():
         return path if Path(path).exists() and Path(source).exists() else None
 
     how = {"rng": rng, "ready": ready, "request": request}
@@ -253,12 +225,12 @@ def control(result: Result, folder: Path, rng: random.Random) -> None:
         result.failures.append(f"recorder: exit code {outcome.code}: {outcome.err[-200:]!r}")
 
 
-def viewer(result: Result, folder: Path, rng: random.Random, stage: Stage) -> None:
+def viewer(result, folder, rng, stage):
     """The page of ``view --web``, by Rerun's own server: it is served again afterwards."""
     (folder / "gait.mcap").write_bytes(stage.files_of("gait.mcap")["gait.mcap"])
     out = folder.parent / f"{folder.name}.out"
 
-    def ready() -> tuple[str, int] | None:
+    def ready():
         found = out.exists() and re.search(rb"127\.0\.0\.1:(\d+)", out.read_bytes())
         return ("127.0.0.1", int(found.group(1))) if found else None
 
@@ -268,21 +240,15 @@ def viewer(result: Result, folder: Path, rng: random.Random, stage: Stage) -> No
     _attacked(result, folder, words, **how, foreign=True, end_by=signal.SIGINT)
 
 
-ATTACKS = ("sim serve", "record", "view --web")
+ATTACKS = {"sim serve": serve, "record": control, "view --web": viewer}
 
 
-def run(seed: int, stage: Stage) -> Result:
+def run(seed, stage):
     """Attack one server."""
     rng = random.Random(seed)
-    name = ATTACKS[seed % len(ATTACKS)]
+    name = list(ATTACKS)[seed % len(ATTACKS)]
     result = Result(f"{name}: forty bad clients")
     with stage.fresh() as folder:
-        for path, text in (("snake4.toml", ROBOT), ("snake4.dbc", DBC)):
-            (folder / path).write_text(text)
-        if name == "sim serve":
-            serve(result, folder, rng)
-        elif name == "record":
-            control(result, folder, rng)
-        else:
-            viewer(result, folder, rng, stage)
+        write_files(folder, {"snake4.toml": ROBOT, "snake4.dbc": DBC})
+        ATTACKS[name](result, folder, rng, stage)
     return result

@@ -1,12 +1,9 @@
 """Where the cases of all parts run: whole files, empty folders, a place for failing cases."""
 
-from __future__ import annotations
-
 import gc
 import shlex
 import shutil
 import tempfile
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -27,7 +24,7 @@ class Stage:
         failing: Where minimised failing cases go; None to keep none.
     """
 
-    def __init__(self, folder: Path, failing: Path | None = None) -> None:
+    def __init__(self, folder, failing=None):
         """Write the whole files; import what the commands need."""
         self.folder, self.failing = folder, failing
         self._number = 0
@@ -35,14 +32,14 @@ class Stage:
         self.bases = make_bases(folder / "bases", self._result_of)
         self.warm_failures = self._warm()
 
-    def _result_of(self, gait: Path) -> bytes:
+    def _result_of(self, gait):
         """The JSON of ``undulog analyse`` for a session."""
         output = gait.with_suffix(".json")
         with self.fresh() as folder:
             run_command(["analyse", gait, "--json", "-o", output], folder)
         return output.read_bytes()
 
-    def _warm(self) -> list[str]:
+    def _warm(self):
         """Run every command line once on whole files, and import here what it imported."""
         cases, seen = [], set()
         for kind, lines in COMMANDS.items():
@@ -50,12 +47,8 @@ class Stage:
             files = base.files | {"gait0.mcap": self.files_of("lz4.mcap")["lz4.mcap"]}
             for _, line in lines:
                 verb = tuple(line.split()[:2])
-                if (
-                    kind in WHOLE
-                    and verb not in seen
-                    and "--null" not in line
-                    and verb[0] not in {"predict", "api"}
-                ):
+                left_out = "--null" in line or verb[0] in {"predict", "api"} or verb in seen
+                if kind in WHOLE and not left_out:
                     seen.add(verb)
                     cases.append(Case(tuple(shlex.split(line.format(file=base.name))), files))
         found = warm(cases, self.fresh)
@@ -64,23 +57,23 @@ class Stage:
         return found
 
     @contextmanager
-    def fresh(self) -> Iterator[Path]:
+    def fresh(self):
         """Yield an empty folder that is removed afterwards."""
         with tempfile.TemporaryDirectory(prefix="c", dir=self.folder) as name:
             folder = Path(name) / "w"
             folder.mkdir()
             yield folder
 
-    def keep(self, name: str, case: Case) -> None:
+    def keep(self, name, case):
         """Store a failing case."""
         if self.failing is not None:
             self.failing.mkdir(parents=True, exist_ok=True)
             (self.failing / f"{name}.json").write_text(case.as_json())
 
-    def files_of(self, name: str) -> dict[str, bytes]:
+    def files_of(self, name):
         """Return the files of a base."""
         return next(one for one in self.bases if one.name == name and one.kind == "log").files
 
-    def close(self) -> None:
+    def close(self):
         """Remove the folder."""
         shutil.rmtree(self.folder, ignore_errors=True)

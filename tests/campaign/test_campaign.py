@@ -1,7 +1,6 @@
 """The fault campaign with a fixed seed; every case that once failed, again."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import pytest
 
 from campaign.fuzz import Case, run_case
 from support.paths import ROOT
+from support.processes import run
 
 KEPT = sorted((Path(__file__).parent / "kept").glob("*.json"))
 
@@ -16,16 +16,9 @@ KEPT = sorted((Path(__file__).parent / "kept").glob("*.json"))
 @pytest.mark.slow
 def test_the_short_campaign_finds_nothing(tmp_path):
     paths = os.pathsep.join(str(ROOT / folder) for folder in (".", "tests", "bench"))
-    words = ["--short", "--seed", "1", "-o", tmp_path / "campaign"]
-    done = subprocess.run(
-        [sys.executable, "-m", "campaign.run", *words],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=1200,
-    )
+    env = os.environ | {"PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"}
+    words = (sys.executable, "-m", "campaign.run", "--short", "--seed", 1, "-o", tmp_path / "out")
+    done = run(*words, cwd=ROOT, env=env, timeout=1200)
     bad = [line for line in done.stdout.splitlines() if not line.endswith(" ok")]
     assert done.returncode == 0, "\n".join(bad)[-6000:] + done.stderr[-2000:]
 

@@ -2,74 +2,64 @@
 
 import socket
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from support.processes import wait_for
 from undulog.capture import SessionWriter
-from undulog.capture.log.messages.frames import (
-    EXTENDED_FLAG,
-    FD_BRS,
-    REMOTE_FLAG,
-    FrameArray,
-    empty_fd_frames,
-    empty_frames,
-)
+from undulog.capture.log.messages import frames as fr
 from undulog.capture.sources.contract import Source, SourceContext, SourceEvent
-
-PATIENCE_S = 90.0
 
 
 @dataclass
-class Heard:
+class Reader:
     """What a source gave: frames in order, events in order."""
 
     source: Source
-    arrays: list[FrameArray] = field(default_factory=list)
+    arrays: list[fr.FrameArray] = field(default_factory=list)
     events: list[SourceEvent] = field(default_factory=list)
-    fd_arrays: list[FrameArray] = field(default_factory=list)
+    fd_arrays: list[fr.FrameArray] = field(default_factory=list)
 
-    def poll(self) -> None:
+    def poll(self):
         polled = self.source.poll()
         self.arrays += polled.frames
         self.fd_arrays += polled.fd_frames
         self.events += polled.events
 
-    def until(self, condition: Callable[[], bool]) -> None:
+    def until(self, condition):
         """Poll until something is so; fails after a long time."""
-        deadline = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert time.monotonic() < deadline, (len(self.frames), self.texts, self.source.counts)
-            self.poll()
-            time.sleep(0.002)
+        wait_for(condition, f"{self.counts}, {self.texts}", each=self.poll)
 
-    def until_frames(self, count: int) -> FrameArray:
+    def until_frames(self, count):
         self.until(lambda: sum(map(len, self.arrays)) >= count)
         self.poll()
         return self.frames
 
-    def until_event(self, part: str) -> SourceEvent:
+    def until_event(self, part):
         self.until(lambda: any(part in event.text for event in self.events))
         return next(event for event in self.events if part in event.text)
 
     @property
-    def frames(self) -> FrameArray:
-        return np.concatenate([empty_frames(0), *self.arrays])
+    def frames(self):
+        return np.concatenate([fr.empty_frames(0), *self.arrays])
 
     @property
-    def fd_frames(self) -> FrameArray:
-        return np.concatenate([empty_fd_frames(0), *self.fd_arrays])
+    def fd_frames(self):
+        return np.concatenate([fr.empty_fd_frames(0), *self.fd_arrays])
 
     @property
-    def texts(self) -> list[str]:
+    def counts(self):
+        return self.source.counts
+
+    @property
+    def texts(self):
         return [event.text for event in self.events]
 
 
 @pytest.fixture
-def context(tmp_path: Path) -> Iterator[SourceContext]:
+def context(tmp_path):
     """A recording that has begun."""
     epoch_ns, start_ns = time.time_ns(), time.monotonic_ns()
     path = tmp_path / "session.mcap"
@@ -78,14 +68,14 @@ def context(tmp_path: Path) -> Iterator[SourceContext]:
 
 
 @pytest.fixture
-def listen(context: SourceContext) -> Iterator[Callable[[Source], Heard]]:
+def listen(context):
     """Start a source; it is stopped at the end, whatever happens."""
-    started: list[Source] = []
+    started = []
 
-    def start(source: Source) -> Heard:
+    def start(source):
         started.append(source)
         source.start(context)
-        return Heard(source)
+        return Reader(source)
 
     yield start
     for source in started:
@@ -94,7 +84,7 @@ def listen(context: SourceContext) -> Iterator[Callable[[Source], Heard]]:
 
 
 @pytest.fixture
-def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
+def sockets():
     """A bound datagram socket and one connected to it."""
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours,
@@ -105,66 +95,56 @@ def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
         yield ours, theirs
 
 
+def identifiers(rng, count):
+    """Random identifiers, three in ten of them of 29 bits."""
+    wide, narrow = rng.integers(0, 2**29, count) | fr.EXTENDED_FLAG, rng.integers(0, 2**11, count)
+    return np.where(rng.random(count) < 0.3, wide, narrow)
+
+
 @pytest.fixture
-def traffic() -> Callable[[int], FrameArray]:
+def traffic():
     """Random frames of both identifier widths and all lengths, a remote request now and then."""
 
-    def make(count: int) -> FrameArray:
+    def make(count):
         rng = np.random.default_rng(count)
-        frames = empty_frames(count)
-        extended = rng.random(count) < 0.3
+        frames = fr.empty_frames(count)
         remote = rng.random(count) < 0.02
-        frames["id_flags"] = np.where(
-            extended,
-            rng.integers(0, 2**29, count) | EXTENDED_FLAG,
-            rng.integers(0, 2**11, count),
-        ) | (remote * REMOTE_FLAG)
+        frames["id_flags"] = identifiers(rng, count) | (remote * fr.REMOTE_FLAG)
         frames["dlc"] = rng.integers(0, 9, count)
-        data = rng.integers(0, 256, (count, 8))
-        data[np.arange(8) >= frames["dlc"][:, None]] = 0
-        data[remote] = 0
-        frames["data"] = data
-        frames["t_device_ns"] = 1_700_000_000_123_456_000 + np.cumsum(
-            rng.integers(1, 9000, count) * 1000
-        )
+        frames["data"] = rng.integers(0, 256, (count, 8))
+        frames["data"][(np.arange(8) >= frames["dlc"][:, None]) | remote[:, None]] = 0
+        steps_ns = rng.integers(1, 9000, count) * 1000
+        frames["t_device_ns"] = 1_700_000_000_123_456_000 + np.cumsum(steps_ns)
         return frames
 
     return make
 
 
 @pytest.fixture
-def fd_traffic() -> Callable[[int], FrameArray]:
+def fd_traffic():
     """Random CAN FD frames of both identifier widths, all lengths, and some with the fast rate."""
 
-    def make(count: int) -> FrameArray:
+    def make(count):
         rng = np.random.default_rng(count)
-        frames = empty_fd_frames(count)
-        frames["id_flags"] = np.where(
-            rng.random(count) < 0.3,
-            rng.integers(0, 2**29, count) | EXTENDED_FLAG,
-            rng.integers(0, 2**11, count),
-        )
-        frames["fd_flags"] = np.where(rng.random(count) < 0.5, FD_BRS, 0)
+        frames = fr.empty_fd_frames(count)
+        frames["id_flags"] = identifiers(rng, count)
+        frames["fd_flags"] = np.where(rng.random(count) < 0.5, fr.FD_BRS, 0)
         lengths = [*range(9), 12, 16, 20, 24, 32, 48, 64]
         frames["len"] = np.array(lengths)[rng.integers(0, 16, count)]
-        data = rng.integers(0, 256, (count, 64))
-        data[np.arange(64) >= frames["len"][:, None]] = 0
-        frames["data"] = data
+        frames["data"] = rng.integers(0, 256, (count, 64))
+        frames["data"][np.arange(64) >= frames["len"][:, None]] = 0
         return frames
 
     return make
 
 
 @pytest.fixture
-def same() -> Callable[[FrameArray, FrameArray], bool]:
+def same():
     """Whether two lots of frames agree in everything but times."""
 
-    def compare(found: FrameArray, truth: FrameArray) -> bool:
-        names = ("id_flags", "len", "fd_flags", "data")
-        if truth.dtype == empty_frames(0).dtype:
-            names = ("id_flags", "dlc", "data")
-        return len(found) == len(truth) and all(
-            np.array_equal(found[name], truth[name]) for name in names
-        )
+    def compare(found, truth):
+        classic = truth.dtype == fr.empty_frames(0).dtype
+        names = ("id_flags", "dlc", "data") if classic else ("id_flags", "len", "fd_flags", "data")
+        return len(found) == len(truth) and all(np.array_equal(found[n], truth[n]) for n in names)
 
     return compare

@@ -5,7 +5,6 @@ import sys
 
 import pytest
 
-import undulog
 from support.paths import ROOT
 from support.processes import run
 
@@ -17,9 +16,7 @@ PICTURES = {"pictures.py", "side_by_side.py"}
 """Need the viewer's driver."""
 
 OWN_TESTS = {"paper_figures.py", "oscillator_tables.py"}
-TABLES = sorted(
-    path.name for path in DOCS.glob("*.py") if path.name not in RUN_ELSEWHERE | PICTURES | OWN_TESTS
-)
+TABLES = sorted({path.name for path in DOCS.glob("*.py")} - RUN_ELSEWHERE - PICTURES - OWN_TESTS)
 
 pytestmark = pytest.mark.slow
 
@@ -27,8 +24,7 @@ pytestmark = pytest.mark.slow
 def printed(*words):
     """What a script prints; it has to end well, with warnings as errors."""
     threads = {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-W", "error", *map(str, words)]
-    done = run(*command, env=os.environ | threads)
+    done = run(*[sys.executable, "-W", "error", *map(str, words)], env=os.environ | threads)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -43,9 +39,8 @@ def test_tables_are_printed(name):
 def test_the_oscillator_table_predicts_the_closed_loop():
     """Three yaw joints are few, but the closed loop has gone where P and R say."""
     text = printed(DOCS / "oscillator_tables.py", "--quick")
-    moved, off = (
-        float(text.partition(label)[2].partition("%")[0]) for label in ("moved by", "off by")
-    )
+    labels = ("moved by", "off by")
+    moved, off = (float(text.partition(label)[2].partition("%")[0]) for label in labels)
     assert 0 < off < moved
 
 
@@ -54,14 +49,11 @@ def test_the_figures_of_the_paper_are_drawn(tmp_path):
     assert names(tmp_path / "images") == {path.name for path in DOCS.glob("images/paper-*.svg")}
 
 
-def test_the_pictures_of_the_manual_are_drawn(tmp_path, vulkan, capsys):
+def test_the_pictures_of_the_manual_are_drawn(tmp_path, vulkan, command):
     session, result, page = (tmp_path / f for f in ("session.mcap", "result.json", "report.html"))
-    for words in (
-        ["sim", "run", "weak-servo-pi3", "--duration", "14.5", "-o", session],
-        ["analyse", session, "-o", result],
-        ["report", session, "-o", page],
-    ):
-        assert undulog.run([str(word) for word in words]) == 0, capsys.readouterr().err
+    command("sim", "run", "weak-servo-pi3", "--duration", "14.5", "-o", session)
+    command("analyse", session, "-o", result)
+    command("report", session, "-o", page)
     images = tmp_path / "images"
     printed(DOCS / "pictures.py", tmp_path, images, "--quick")
     assert names(images) == {"clip.gif", "replay-mean-cycle.png", "response.svg"}

@@ -20,12 +20,10 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
-    makefile = ROOT / "Makefile"
-    recipe = re.findall(r"\$\(call undulog,(.*)\)\n", makefile.read_text())
+    recipe = re.findall(r"\$\(call undulog,(.*)\)\n", (ROOT / "Makefile").read_text())
     assert len(recipe) == 4
     for line in recipe:
-        words = line.replace("$(DEMO)", str(folder)).split()
-        run(sys.executable, "-m", "undulog", *words)
+        run(sys.executable, "-m", "undulog", *line.replace("$(DEMO)", str(folder)).split())
     return folder
 
 

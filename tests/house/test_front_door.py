@@ -1,6 +1,5 @@
 """The command line: every command has help with an example, and wrong words exit with 2."""
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -13,21 +12,23 @@ from support.processes import python, run
 
 
 @pytest.mark.parametrize("verb", sorted(undulog.VERBS))
-def test_help_of_every_verb_shows_an_example(verb, capsys):
-    assert undulog.run([*verb.split(), "--help"]) == 0
-    shown = " ".join(capsys.readouterr().out.split())
+def test_help_of_every_verb_shows_an_example(verb, command):
+    shown = " ".join(command(*verb.split(), "--help").out.split())
     assert f"Usage: undulog {verb}" in shown
     assert f"Example: undulog {verb}" in shown
 
 
-def test_help_lists_all_verbs_without_importing_any():
-    code = (
-        "import sys, undulog; undulog.run(['--help']);"
-        "heavy = {'pandas', 'scipy', 'pybullet', 'rerun', 'matplotlib', 'can'} & set(sys.modules);"
-        "sys.exit(f'imported {heavy}' if heavy else 0)"
-    )
-    done = python(code)
+def without(code, *packages):
+    """Run code that imports none of some packages."""
+    heavy = f"import sys; heavy = {set(packages)} & set(sys.modules)"
+    done = python(f"{code}; {heavy}; sys.exit(f'imported {{heavy}}' if heavy else 0)")
     assert done.returncode == 0, done.stderr
+    return done
+
+
+def test_help_lists_all_verbs_without_importing_any():
+    packages = ("pandas", "scipy", "pybullet", "rerun", "matplotlib", "can")
+    done = without("import undulog; undulog.run(['--help'])", *packages)
     for word in ("import", "log", "sim", "analyse", "report", "view", "info"):
         assert word in done.stdout
 
@@ -42,35 +43,26 @@ COMMANDS = sorted(
 @pytest.mark.parametrize("module", COMMANDS)
 def test_a_command_loads_neither_viewer_nor_engine_before_it_runs(module):
     # Rerun reads its log level when it's loaded, so `view` has to be able to set it before.
-    code = (
-        f"import sys, {module};"
-        "heavy = {'pybullet', 'rerun', 'matplotlib'} & set(sys.modules);"
-        "sys.exit(f'imported {heavy}' if heavy else 0)"
-    )
-    done = python(code)
-    assert done.returncode == 0, done.stderr
+    without(f"import {module}", "pybullet", "rerun", "matplotlib")
 
 
-def test_a_mistyped_verb_exits_2_and_names_the_near_one(capsys):
-    assert undulog.run(["analyze", "x.mcap"]) == 2
-    said = capsys.readouterr().err
-    assert "no command 'analyze'" in said
-    assert "Did you mean 'analyse'?" in said
+def test_a_mistyped_verb_exits_2_and_names_the_near_one(command):
+    err = command("analyze", "x.mcap", code=2).err
+    assert "no command 'analyze'" in err
+    assert "Did you mean 'analyse'?" in err
 
 
 @pytest.mark.parametrize("words", [["--bogus"], ["-x", "analyse"], ["log", "--bogus"]])
-def test_an_unknown_option_is_named_and_exits_2(words, capsys):
-    assert undulog.run(words) == 2
+def test_an_unknown_option_is_named_and_exits_2(words, command):
     option = next(word for word in words if word.startswith("-"))
-    assert f"there is no option '{option}'" in capsys.readouterr().err
+    assert f"there is no option '{option}'" in command(*words, code=2).err
 
 
-def test_a_missing_argument_exits_2(capsys):
-    assert undulog.run(["log", "info"]) == 2
-    assert "FILE" in capsys.readouterr().err
+def test_a_missing_argument_exits_2(command):
+    assert "FILE" in command("log", "info", code=2).err
 
 
-def test_a_missing_extra_says_which_one_to_install():
+def test_a_missing_extra_is_named():
     # None in sys.modules makes Python raise the same ImportError as a package that isn't there.
     code = (
         "import sys; sys.modules['pybullet'] = None; import undulog;"
@@ -81,16 +73,14 @@ def test_a_missing_extra_says_which_one_to_install():
     assert "pip install 'undulog[sim]'" in done.stderr
 
 
-def test_info_names_versions(capsys):
-    assert undulog.run(["info"]) == 0
-    said = capsys.readouterr().out
-    assert "undulog 0" in said
-    assert "numpy" in said
+def test_info_names_versions(command):
+    out = command("info").out
+    assert "undulog 0" in out
+    assert "numpy" in out
 
 
 def test_a_closed_pipe_is_no_traceback():
-    command = f"{sys.executable} -m undulog info --json | true"
-    done = run("bash", "-c", command)
+    done = run("bash", "-c", f"{sys.executable} -m undulog info --json | true")
     assert "Traceback" not in done.stderr
 
 
@@ -104,7 +94,7 @@ def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path):
         "        writer.on_message_received(can.Message(timestamp=1.7e9 + k, arbitration_id=0x14B,"
         " is_extended_id=False, data=[k], channel=0))\n"
     )
-    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+    assert python(script).returncode == 0
     done = processes.undulog("import", trace, "-o", session, "-r", "arcsnake-joint", cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert "5 CAN frames" in done.stdout
@@ -112,17 +102,14 @@ def test_the_command_reads_mf4_though_it_defers_the_package(tmp_path):
 
 @pytest.mark.parametrize("words", ["--help", "info --json", "sim list"])
 def test_a_full_device_behind_the_output_is_an_error(words):
-    command = [sys.executable, "-m", "undulog", *words.split()]
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            command, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True, check=False
-        )
-        silent = subprocess.run(command, cwd=ROOT, stdout=full, stderr=full, check=False)
+        done = processes.undulog(*words.split(), cwd=ROOT, stdout=full)
+        silent = processes.undulog(*words.split(), cwd=ROOT, stdout=full, stderr=full)
     assert (done.returncode, silent.returncode) == (1, 1)
     assert done.stderr == "error: the output can't be written: No space left on device\n"
 
 
-def test_reading_a_robot_loads_python_can_only_when_it_is_used() -> None:
+def test_reading_a_robot_loads_python_can_only_when_it_is_used():
     code = (
         "import sys; from undulog.capture.common.lazy import defer; defer();"
         "from undulog.capture import load_robot; load_robot('snake25');"

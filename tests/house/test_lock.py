@@ -25,5 +25,4 @@ def test_every_package_is_pinned_with_a_hash():
 
 
 def test_the_lock_brings_the_build_tools_of_an_editable_install():
-    names = {line.partition("==")[0] for line in LINES}
-    assert {"hatchling", "editables"} <= names
+    assert {"hatchling", "editables"} <= {line.partition("==")[0] for line in LINES}

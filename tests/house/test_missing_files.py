@@ -1,4 +1,4 @@
-"""A file that isn't there is told alike by every command: one line that names it, exit code 1."""
+"""A missing file is reported alike by every command: one line that names it, exit code 1."""
 
 import hashlib
 import re
@@ -61,6 +61,11 @@ WITHOUT_FILES |= {"record unit", "sim list", "info"}
 OF_FOLDERS = {"catalog"}  # tests/analysis/catalog
 
 
+def suffix_of(line):
+    """The suffix of the file that isn't there."""
+    return re.search(r"\{no\}(\.\w+)", line)[1]
+
+
 @pytest.fixture(scope="module")
 def there(tmp_path_factory):
     """A session and a CSV that can be read."""
@@ -79,29 +84,24 @@ def test_a_folder_that_is_no_session_is_named_with_the_fix(line, kind, there, tm
         (folder / name).write_bytes(there["run"].read_bytes())
     if kind.startswith("rosbag2"):
         (folder / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
-    suffix = re.search(r"\{no\}(\.\w+)", line)
-    assert suffix is not None
-    words = line.replace("{no}" + suffix[1], str(folder))
-    given = {"out": tmp_path / "out", **there}
-    assert undulog.run(shlex.split(words.format_map(given))) in (1, 2)
-    said = capsys.readouterr().err
-    assert str(folder) in said
-    if suffix[1] == ".mcap" and not line.startswith("drive"):
+    suffix = suffix_of(line)
+    words = line.replace("{no}" + suffix, str(folder))
+    assert undulog.run(shlex.split(words.format_map({"out": tmp_path / "out", **there}))) in (1, 2)
+    err = capsys.readouterr().err
+    assert str(folder) in err
+    if suffix == ".mcap" and not line.startswith("drive"):
         fixes = {"empty": "name a session's file", "several": "name one: a.mcap, b.mcap"}
         fixes |= {"rosbag2": "undulog log merge", "rosbag2 of sqlite3": "ros2 bag convert"}
-        assert fixes[kind] in said
+        assert fixes[kind] in err
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "analyse {folder}",
-        "report {folder} -o {out}.html",
-        "compare {folder} {run}",
-        "view {folder} --save {out}.rrd",
-        "plan lag-sweep --like {folder} -o {out}",
-    ],
-)
+OF_ONE = [
+    *("analyse {folder}", "report {folder} -o {out}.html", "compare {folder} {run}"),
+    *("view {folder} --save {out}.rrd", "plan lag-sweep --like {folder} -o {out}"),
+]
+
+
+@pytest.mark.parametrize("line", OF_ONE)
 def test_a_folder_of_one_session_is_that_session(line, tmp_path, capsys):
     folder = tmp_path / "folder"
     folder.mkdir()
@@ -116,18 +116,14 @@ def test_every_verb_is_here():
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_a_file_that_is_not_there_is_named_and_the_work_has_failed(line, there, tmp_path, capsys):
+def test_a_file_that_is_not_there_is_named_and_the_work_has_failed(line, there, tmp_path, command):
     words = {"no": tmp_path / "nowhere", "out": tmp_path / "out", **there}
-    suffix = re.search(r"\{no\}(\.\w+)", line)
-    assert suffix is not None
-    assert undulog.run(shlex.split(line.format_map(words))) == 1
-    said = capsys.readouterr()
-    assert said.err == f"error: {tmp_path / 'nowhere'}{suffix[1]}: no such file\n"
-    assert said.out == ""
+    error = f"error: {tmp_path / 'nowhere'}{suffix_of(line)}: no such file\n"
+    assert command(*shlex.split(line.format_map(words)), code=1) == ("", error)
     assert not any(tmp_path.iterdir())
 
 
-def test_a_file_that_vanishes_meanwhile_is_named(there, tmp_path, monkeypatch, capsys):
+def test_a_file_that_vanishes_meanwhile_is_named(there, tmp_path, monkeypatch, command):
     path = tmp_path / "run.mcap"
     path.write_bytes(there["run"].read_bytes())
     digest = hashlib.sha256
@@ -137,5 +133,4 @@ def test_a_file_that_vanishes_meanwhile_is_named(there, tmp_path, monkeypatch, c
         return digest(*data)
 
     monkeypatch.setattr("hashlib.sha256", vanish)
-    assert undulog.run(["analyse", str(path)]) == 1
-    assert capsys.readouterr().err == f"error: {path}: No such file or directory\n"
+    assert command("analyse", path, code=1).err == f"error: {path}: No such file or directory\n"

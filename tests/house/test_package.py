@@ -21,8 +21,7 @@ BUILD = [sys.executable, "-m", "hatchling", "build"]
 
 
 def tracked(*patterns):
-    command = ["git", "ls-files", "--", *patterns]
-    done = processes.run(*command, cwd=ROOT)
+    done = processes.run("git", "ls-files", "--", *patterns, cwd=ROOT)
     if done.returncode:
         pytest.skip("not a git checkout: the list of tracked files is unknown")
     return [ROOT / name for name in done.stdout.splitlines()]
@@ -38,8 +37,7 @@ def run(*words, cwd=ROOT, fails=False, **environment):
 def record(wheel):
     with zipfile.ZipFile(wheel) as archive:
         (name,) = [n for n in archive.namelist() if n.endswith(".dist-info/RECORD")]
-        rows = csv.reader(archive.read(name).decode().splitlines())
-        return {row[0]: row[1] for row in rows}
+        return {row[0]: row[1] for row in csv.reader(archive.read(name).decode().splitlines())}
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +67,7 @@ def test_the_source_archive_holds_each_file_once_and_builds_the_same_wheel(tree,
     assert len(set(names)) == len(names)
     assert not [name for name in names if name.startswith(tuple(f"{one}/" for one in FOLDERS))]
     run(*BUILD, "-t", "wheel", "-d", tree.parent / "again", cwd=unpacked)
-    again = record(next((tree.parent / "again").glob("*.whl")))
-    assert again == record(wheel)
+    assert record(next((tree.parent / "again").glob("*.whl"))) == record(wheel)
 
 
 def test_the_wheel_holds_every_file_of_the_packages(wheel):
@@ -85,19 +82,16 @@ def test_a_tree_without_links_is_refused_when_it_is_built(tree, tmp_path):
     for name in FOLDERS:  # what git writes where links are not allowed
         (folder / "undulog" / name).unlink()
         (folder / "undulog" / name).write_text(f"../{name}")
-    said = run(*BUILD, "-t", "wheel", "-d", tmp_path / "wheel", cwd=folder, fails=True)
-    assert "undulog/analysis" in said
-    assert "symbolic link" in said
+    err = run(*BUILD, "-t", "wheel", "-d", tmp_path / "wheel", cwd=folder, fails=True)
+    assert "undulog/analysis" in err
+    assert "symbolic link" in err
 
 
 def test_an_installed_wheel_leaves_one_name_beside_modules_of_the_user(wheel, tmp_path):
     place, work = tmp_path / "site", tmp_path / "work"
     pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--quiet"]
     run(*pip, "--no-compile", "--target", place, wheel)
-    assert sorted(p.name for p in place.iterdir() if ".dist-info" not in p.name) == [
-        "bin",
-        "undulog",
-    ]
+    assert {p.name for p in place.iterdir() if ".dist-info" not in p.name} == {"bin", "undulog"}
     work.mkdir()
     for name in FOLDERS:
         (work / f"{name}.py").write_text("MINE = True\n")
@@ -116,8 +110,8 @@ def test_an_installed_wheel_leaves_one_name_beside_modules_of_the_user(wheel, tm
 @pytest.mark.parametrize("how", [("-c",), ("-m", "pytest", "-q", "-p", "no:cacheprovider")])
 def test_a_package_by_another_name_is_an_error(name, how, tmp_path):
     if how == ("-c",):
-        said = run(sys.executable, "-c", f"import {name}", fails=True)
-        assert f"ImportError: import undulog.{name} instead of {name}" in said
+        err = run(sys.executable, "-c", f"import {name}", fails=True)
+        assert f"ImportError: import undulog.{name} instead of {name}" in err
         return
     test = tmp_path / "test_names.py"
     test.write_text(

@@ -27,8 +27,7 @@ TRACE = "".join(
 
 
 def test_the_readme_shows_a_picture_before_anything_else():
-    picture = README.index("![")
-    assert picture < README.index("```")
+    assert README.index("![") < README.index("```")
     for path in re.findall(r"!\[[^]]*\]\(([^)]+)\)", README):
         assert (ROOT / path).is_file(), f"{path} is missing: make pictures"
 

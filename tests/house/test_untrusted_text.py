@@ -1,5 +1,6 @@
 """Names in a log are untrusted: none reaches a terminal, a spreadsheet or a page as it is."""
 
+import contextlib
 import csv
 import json
 import math
@@ -7,7 +8,6 @@ import os
 import pty
 import re
 import subprocess
-import sys
 import unicodedata
 from html.parser import HTMLParser
 
@@ -15,7 +15,10 @@ import pytest
 from mcap.writer import Writer
 from rerun.chunk import RrdReader
 
+from support import processes
 from support.paths import ROOT
+from support.processes import UNDULOG
+from support.written_sessions import joint_state
 from undulog.capture.log.messages.cdr import encode
 from undulog.capture.log.messages.definitions import message_type, schema_text
 
@@ -85,24 +88,16 @@ def write_hostile(path, *, seconds=12.0, session_id=f"s{CLEAR}"):
         other = writer.register_schema(f"x/msg/Y{TITLE}\n{FORGED}", f"e{CLEAR}", b"?")
         topics = ("/joint_commands", "/joint_states", *TOPICS[:2])
         unit = {"unit": f"rad{TITLE}\n{FORGED}"}
-        channels = [
-            writer.register_channel(t, "cdr", states, {} if k < 2 else unit)
-            for k, t in enumerate(topics)
-        ]
+        pairs = zip(topics, ({}, {}, unit, unit), strict=True)
+        channels = [writer.register_channel(t, "cdr", states, facts) for t, facts in pairs]
         odd = writer.register_channel(TOPICS[2], f"c{CLEAR}", other, unit)
         layout = message_type(JOINT_STATE)
         for tick in range(round(seconds * 50)):
             t_ns = EPOCH_NS + tick * 20_000_000
-            stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
             for channel, lag in zip(channels, (0.0, 0.3, 0.3, 0.3), strict=True):
                 phases = [2 * math.pi * tick / 50 - 0.5 * k - lag for k in range(len(NAMES))]
-                message = {
-                    "header": {"stamp": stamp, "frame_id": f"f{CLEAR}"},
-                    "name": list(NAMES),
-                    "position": [0.4 * math.sin(phase) for phase in phases],
-                    "velocity": [],
-                    "effort": [],
-                }
+                message = joint_state(t_ns, list(NAMES), [0.4 * math.sin(x) for x in phases])
+                message["header"]["frame_id"] = f"f{CLEAR}"
                 writer.add_message(channel, t_ns, encode(layout, message), t_ns, tick)
             writer.add_message(odd, t_ns, b"?", t_ns, tick)
         writer.finish()
@@ -119,24 +114,20 @@ def folder(tmp_path_factory):
 
 def words(command):
     named = {"A": "a.mcap", "B": "b.mcap"}
-    return [
-        sys.executable,
-        "-m",
-        "undulog",
-        *(
-            named.get(word, word.replace("N", f"n\x1b[2J\r{FORGED}\n{FORGED}"))
-            for word in command.split()
-        ),
-    ]
+    evil = f"n\x1b[2J\r{FORGED}\n{FORGED}"
+    return [*UNDULOG, *(named.get(word, word.replace("N", evil)) for word in command.split())]
 
 
 def run(folder, command, *more):
-    done = subprocess.run(
-        [*words(command), *more], cwd=folder, capture_output=True, check=False, env=environment()
-    )
+    """Run a command; return its output and its errors."""
+    done = processes.run(*words(command), *more, cwd=folder, text=False, env=environment())
     out, err = done.stdout.decode(), done.stderr.decode()
     assert "Traceback" not in err
-    return subprocess.CompletedProcess(done.args, done.returncode, out, err)
+    return out, err
+
+
+def forced(command):
+    return ("--force",) if " -o " in command or "--save" in command else ()
 
 
 def environment():
@@ -149,21 +140,16 @@ def raw(text):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_no_command_prints_a_control_character_or_a_forged_line(folder, command):
-    more = ("--force",) if " -o " in command or "--save" in command else ()
-    done = run(folder, command, *(() if "N" in command else more))
-    for text in (done.stdout, done.stderr):
+    for text in run(folder, command, *(() if "N" in command else forced(command))):
         assert raw(text) == set()
         assert not re.search(rf"(?m)^(# )?{FORGED[:6]}", text)
 
 
-@pytest.mark.parametrize(
-    "command", [one for one in COMMANDS if "N" not in one and "frames" not in one]
-)
+@pytest.mark.parametrize("command", [x for x in COMMANDS if "N" not in x and "frames" not in x])
 def test_json_is_one_value_and_keeps_the_names(folder, command):
-    more = ("--force",) if " -o " in command or "--save" in command else ()
-    done = run(folder, command, "--json", *more)
-    assert raw(done.stdout) == set()
-    value = json.loads(done.stdout)
+    out, _ = run(folder, command, "--json", *forced(command))
+    assert raw(out) == set()
+    value = json.loads(out)
     if command == "analyse A":
         assert [joint["name"] for joint in value["joints"]] == list(NAMES)
     if command == "log info A":
@@ -174,16 +160,13 @@ def test_json_is_one_value_and_keeps_the_names(folder, command):
 def test_a_terminal_gets_styles_and_progress_only(folder, command):
     (folder / "pty.csv").unlink(missing_ok=True)
     ours, theirs = pty.openpty()
-    with subprocess.Popen(
-        words(command), cwd=folder, stdin=theirs, stdout=theirs, stderr=theirs, env=environment()
-    ) as process:
+    streams = dict.fromkeys(("stdin", "stdout", "stderr"), theirs)
+    with subprocess.Popen(words(command), cwd=folder, env=environment(), **streams) as process:
         os.close(theirs)
         shown = b""
-        try:
+        with contextlib.suppress(OSError):  # Linux: the last one to hold the other end has left
             while part := os.read(ours, 65536):
                 shown += part
-        except OSError:  # Linux: the last one to hold the other end has left
-            pass
     os.close(ours)
     assert process.returncode == 0
     # SGR, erase and move within the line of the progress bar, show and hide the cursor
@@ -206,17 +189,15 @@ def test_spreadsheets_find_no_formula_and_names_come_back(folder):
 
 def test_entities_and_documents_of_rerun_are_as_meant(folder):
     run(folder, "view A --save c.rrd")
-    chunks = RrdReader(folder / "c.rrd").stream().to_chunks()
-    paths = {chunk.entity_path for chunk in chunks}
+    paths = {chunk.entity_path for chunk in RrdReader(folder / "c.rrd").stream().to_chunks()}
     assert not [path for path in paths if raw(path)]
-    roots = {path.split("/")[1] for path in paths}
-    assert not roots & {"j10", "t1", ".."}
+    assert not {path.split("/")[1] for path in paths} & {"j10", "t1", ".."}
 
 
 class _Tags(HTMLParser):
     def __init__(self):
         super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.found = []
 
     def handle_starttag(self, tag, attrs):
         self.found.append((tag, dict(attrs)))

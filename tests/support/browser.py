@@ -26,13 +26,10 @@ class Browser:
         # The protocol is spoken on descriptors 3 (to Chromium) and 4 (from it).
         shell = f'exec 3<&{fd} 4>&{fd}; exec "$@"'
         arguments = [path, *flags, "--remote-debugging-pipe", f"--user-data-dir={profile}"]
-        silent = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-        self._process = subprocess.Popen(
-            ["bash", "-c", shell, "bash", *arguments, "about:blank"],
-            pass_fds=(fd,),
-            start_new_session=True,
-            **silent,
-        )
+        options = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+        options |= {"pass_fds": (fd,), "start_new_session": True}
+        command = ["bash", "-c", shell, "bash", *arguments, "about:blank"]
+        self._process = subprocess.Popen(command, **options)
         theirs.close()
         self._buffer = b""
         self._number = 0
@@ -82,24 +79,20 @@ class Browser:
 
     def evaluate(self, script):
         """Return the awaited value of a script; it runs whatever the page's policy."""
-        result = self.call(
-            "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True
-        )
+        options = {"awaitPromise": True, "returnByValue": True}
+        result = self.call("Runtime.evaluate", expression=script, **options)
         assert "exceptionDetails" not in result, result["exceptionDetails"]
         return result["result"].get("value")
 
     def requests(self):
         """Return the addresses requested since ``open``."""
-        return [
-            e["params"]["request"]["url"]
-            for e in self.events
-            if e.get("method") == "Network.requestWillBeSent"
-        ]
+        sent = (e for e in self.events if e.get("method") == "Network.requestWillBeSent")
+        return [e["params"]["request"]["url"] for e in sent]
 
     def complaints(self):
         """Return console messages, log entries and exceptions since ``open``."""
-        said = ("Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded")
-        return [e for e in self.events if e.get("method") in said]
+        kinds = ("Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded")
+        return [e for e in self.events if e.get("method") in kinds]
 
     def close(self):
         """End this Chromium and nothing else."""
@@ -112,7 +105,7 @@ class Browser:
         while b"\0" not in self._buffer:
             left = deadline - time.monotonic()
             if left <= 0:
-                raise TimeoutError(f"Chromium said nothing for {self.patience_s} s")
+                raise TimeoutError(f"no answer of Chromium for {self.patience_s} s")
             self._ours.settimeout(left)
             data = self._ours.recv(1 << 16)
             if not data:

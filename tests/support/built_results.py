@@ -54,6 +54,7 @@ def provenance(path):
     return Provenance(f"undulog analyse {path}", versions, {path: "9f" * 32}, options)
 
 
+START_NS = 1_767_225_600_000_000_000
 PLACES = (("head", "link01"), ("middle", "link13"), ("tail", "link26"))
 
 
@@ -71,21 +72,21 @@ def exact(one):
     )
 
 
+RECORD = "kicks of the phase and amplitude of one joint at a time: undulog plan phase-kicks -o DIR"
+
+
 def make_snake(path="weak.mcap", rename=None, session_id="weak-servo-pi3-7f3a"):
     name = rename or (lambda text: text)
     labels = [name(f"joint{i + 1:02d}") for i in range(25)]
+    flags = {12: ("saturated",)}
     joints = [
-        passive_joint(label)
-        if i % 2
-        else driven_joint(label, i / 24, flags=("saturated",) if i == 12 else ())
+        passive_joint(label) if i % 2 else driven_joint(label, i / 24, flags=flags.get(i, ()))
         for i, label in enumerate(labels)
     ]
     body = BodyResult(
         plane="horizontal",
         observed=points(((52, 0), (35, -128), (30, 97)), name),
-        null={
-            "viscous": tuple(map(exact, points(((55, 0), (41, -117), (38, 110)), name))),
-        },
+        null={"viscous": tuple(map(exact, points(((55, 0), (41, -117), (38, 110)), name)))},
     )
     contrast = (-0.1082, (-0.1134, -0.1030))
     indices = {
@@ -96,14 +97,7 @@ def make_snake(path="weak.mcap", rename=None, session_id="weak-servo-pi3-7f3a"):
     }
     return answered(
         Analysis(
-            session=SessionFacts(
-                id=name(session_id),
-                path=path,
-                robot=name("snake25"),
-                start_ns=1_767_225_600_000_000_000,
-                duration_s=16.0,
-                verdict="good",
-            ),
+            session=SessionFacts(name(session_id), path, name("snake25"), START_NS, 16.0, "good"),
             gait=GaitFacts(
                 frequency_hz=around(0.5, 0.0002),
                 windows=(Window(8.0, 16.0, 4.0),),
@@ -113,12 +107,7 @@ def make_snake(path="weak.mcap", rename=None, session_id="weak-servo-pi3-7f3a"):
             joints=tuple(joints),
             body=body,
             heterogeneity=indices,
-            coupling=Coupling(
-                identifiable=False,
-                why="one gait gives 13 numbers for 169 unknowns",
-                record="kicks of the phase and amplitude of one joint at a time: "
-                "undulog plan phase-kicks -o DIR",
-            ),
+            coupling=Coupling(False, "one gait gives 13 numbers for 169 unknowns", RECORD),
             warnings=(
                 "Boundary and modules can't be told apart by one direction; record the reverse.",
                 name("E_el of joint02 is null: the session has no /joint_current of it."),
@@ -137,7 +126,7 @@ def make_still():
     )
     return answered(
         Analysis(
-            session=SessionFacts("ramp", "ramp.mcap", None, 1_767_225_600_000_000_000, 3.0, None),
+            session=SessionFacts("ramp", "ramp.mcap", None, START_NS, 3.0, None),
             gait=GaitFacts(nothing),
             joints=joints,
             body=None,

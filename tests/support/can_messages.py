@@ -5,35 +5,27 @@ import itertools
 import can
 import numpy as np
 
-from undulog.capture.log.messages.frames import (
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    ID_MASK,
-    REMOTE_FLAG,
-    empty_frames,
-)
+from undulog.capture.log.messages import frames as fr
 
 
 def can_message(frame, **options):
     """A frame, classic or CAN FD, as a message of python-can."""
     flags = int(frame["id_flags"])
     fields = {
-        "arbitration_id": flags & ID_MASK,
-        "is_extended_id": bool(flags & EXTENDED_FLAG),
+        "arbitration_id": flags & fr.ID_MASK,
+        "is_extended_id": bool(flags & fr.EXTENDED_FLAG),
         "timestamp": int(frame["t_device_ns"]) / 1e9,
         "check": True,
     }
     if "len" in frame.dtype.names:
         fields["is_fd"] = True
-        fields["bitrate_switch"] = bool(frame["fd_flags"] & FD_BRS)
-        fields["error_state_indicator"] = bool(frame["fd_flags"] & FD_ESI)
+        fields["bitrate_switch"] = bool(frame["fd_flags"] & fr.FD_BRS)
+        fields["error_state_indicator"] = bool(frame["fd_flags"] & fr.FD_ESI)
         fields["data"] = frame["data"][: frame["len"]].tolist()
     else:
-        remote = bool(flags & REMOTE_FLAG)
+        remote = bool(flags & fr.REMOTE_FLAG)
         fields["is_remote_frame"], fields["dlc"] = remote, int(frame["dlc"])
-        fields["is_error_frame"] = bool(flags & ERROR_FLAG)
+        fields["is_error_frame"] = bool(flags & fr.ERROR_FLAG)
         fields["data"] = None if remote else frame["data"][: frame["dlc"]].tolist()
     return can.Message(**fields | options)
 
@@ -43,9 +35,9 @@ def received(bus, count):
     messages = [bus.recv(60) for _ in range(count)]
     bus.shutdown()
     assert all(messages)
-    frames = empty_frames(count)
+    frames = fr.empty_frames(count)
     frames["id_flags"] = [
-        m.arbitration_id | m.is_extended_id * EXTENDED_FLAG | m.is_remote_frame * REMOTE_FLAG
+        m.arbitration_id | m.is_extended_id * fr.EXTENDED_FLAG | m.is_remote_frame * fr.REMOTE_FLAG
         for m in messages
     ]
     frames["dlc"] = [m.dlc for m in messages]

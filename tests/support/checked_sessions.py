@@ -1,75 +1,58 @@
 """A clean session, and faults planted in it, for the tests of `undulog log check`."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
+from hostile_logs import EPOCH_NS, joint_state
 
 from support.foreign_logs import foreign_log
 from undulog.capture import SessionWriter, load_robot
-from undulog.capture.log.health.session_check import SessionHealth
-from undulog.capture.log.health.tallies import Timing
-from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.definitions import message_type
 
-EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
 ROBOT = load_robot("snake25")
 NAMES = ROBOT.joint_names
 TICKS = 2000
 JOINT_STATE = "sensor_msgs/msg/JointState"
-Edit = Callable[[int, np.ndarray, np.ndarray], int | None]
-"""Tick, command and measured angles (edited in place) to stamp; None leaves the state out."""
 
 
-def gait(tick: int) -> np.ndarray:
+def gait(tick):
     return 0.4 * np.sin(np.pi * tick / 100 - 0.5 * np.arange(len(NAMES)))
 
 
-def write(path: Path, edit: Edit | None = None, verdict: str | None = None) -> Path:
-    """Write 20 s of 25 joints at 100 Hz, with a fault planted by ``edit``."""
+def write(path, edit=None, verdict=None, *, lost=lambda tick: False):
+    """Write 20 s of 25 joints at 100 Hz; some states are lost.
+
+    ``edit`` plants faults: it gets tick, command and measured angles [rad], changes them in place,
+    and may return another stamp [ns].
+    """
     noise = np.random.default_rng(3).normal(0.0, 1e-3, (TICKS, len(NAMES)))
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
         commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
         states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True)
         for tick in range(TICKS):
             command, angles = gait(tick), gait(tick - 5) + noise[tick]
-            log_ns = EPOCH_NS + tick * STEP_NS
-            t_ns: int | None = log_ns
-            if edit is not None:
-                t_ns = edit(tick, command, angles)
-            commands.write(log_ns, command)
-            if t_ns is not None:
-                states.write(t_ns, angles, command, log_time_ns=log_ns)
+            stamp_ns = edit and edit(tick, command, angles)
+            commands.write(at(tick), command)
+            if not lost(tick):
+                states.write(stamp_ns or at(tick), angles, command, log_time_ns=at(tick))
         if verdict is not None:
-            writer.set_verdict(verdict, ["so said the recorder"])
+            writer.set_verdict(verdict, ["as the recorder had it"])
     return path
 
 
-def at(tick: int) -> int:
+def at(tick):
     return EPOCH_NS + tick * STEP_NS
 
 
-def without(is_lost: Callable[[int], bool]) -> Edit:
-    """Leave out the states of some ticks."""
-    return lambda tick, command, angles: None if is_lost(tick) else at(tick)
-
-
-def timing_of(health: SessionHealth, topic: str = "/joint_states") -> Timing:
+def timing_of(health, topic="/joint_states"):
     (found,) = [each.timing for each in health.series if each.topic == topic]
     return found
 
 
-def write_raw(path: Path, sequences: list[int], **options: object) -> Path:
+def write_raw(path, sequences, **options):
     """Write JointState messages of three joints with given sequence numbers."""
     with foreign_log(path, JOINT_STATE, **options) as (writer, schema):
         for topic in ("/joint_commands", "/joint_states"):
             channel = writer.register_channel(topic, "cdr", schema)
             for k, sequence in enumerate(sequences):
-                stamp = {"sec": at(k) // 10**9, "nanosec": at(k) % 10**9}
-                values = {"header": {"stamp": stamp}, "name": list("abc"), "position": gait(k)[:3]}
-                message = encode(message_type(JOINT_STATE), values)
+                message = joint_state(at(k), "abc", gait(k)[:3])
                 writer.add_message(channel, at(k), message, at(k), sequence)
     return path

@@ -15,7 +15,6 @@ from support import twin_chains
 from support.analysed import experiment as together
 from undulog.analysis.oscillators.predictions import felt_response, relaxation
 from undulog.analysis.oscillators.weak_form import read_phases
-from undulog.analysis.results.experiment import Experiment
 from undulog.capture import Session
 from undulog.sim import GaitTick, load_scenario
 from undulog.sim.scenario.scenario import Kernels
@@ -105,7 +104,7 @@ def open_loop(folder, m, held_out=()):
     return together(paths)
 
 
-def closed_loop(folder, experiment: Experiment):
+def closed_loop(folder, experiment):
     """Run kicked generators, and predict them from the open loop without a fitted parameter."""
     P, R = (np.array(one.value) for one in (experiment.coupling.P, experiment.coupling.R))
     yaw = [one for one in experiment.sessions[0].joints if one.gain.value is not None]

@@ -1,9 +1,5 @@
 """Logs of several makes, and other readers of them, for the tests of edits."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 
@@ -32,18 +28,18 @@ MAKES = {
 }
 
 
-def text(value: str) -> bytes:
+def text(value):
     return encode(message_type(STRING), {"data": value})
 
 
-def write_log(path: Path, messages, *, attachments=(), metadata=(), units=None, **options) -> Path:
+def write_log(path, messages, *, attachments=(), metadata=(), units=None, **options):
     """Write a foreign log of Strings: (topic, log time [ns after the epoch], text)."""
     with foreign_log(path, chunk_size=512, **options) as (writer, schema):
         for name, facts in metadata:
             writer.add_metadata(name, facts)
         for name, data in attachments:
             writer.add_attachment(11, 22, name, "text/plain", data)
-        channels: dict[str, int] = {}
+        channels = {}
         for k, (topic, t_ns, said) in enumerate(messages):
             if topic not in channels:
                 facts = {"unit": (units or {}).get(topic, ""), "made": "elsewhere"}
@@ -53,7 +49,7 @@ def write_log(path: Path, messages, *, attachments=(), metadata=(), units=None, 
     return path
 
 
-def ticks(count: int = 200, topics=("/a", "/b"), start_ms: int = 0):
+def ticks(count=200, topics=("/a", "/b"), start_ms=0):
     return [
         (topics[k % len(topics)], (start_ms + 10 * k) * MS, f"word {k} " + "x" * (k % 30))
         for k in range(count)
@@ -75,16 +71,16 @@ def entry(schema, channel, message):
     )
 
 
-def read(path: Path, **window):
+def read(path, **window):
     """Return every message by mcap's own reader, by log time."""
     return [entry(*item) for item in messages_of(path, **window)]
 
 
-def in_file_order(path: Path):
+def in_file_order(path):
     return read(path, log_time_order=False)
 
 
-def records(path: Path):
+def records(path):
     with path.open("rb") as stream:
         reader = make_reader(stream)
         stored = {record.name: record.metadata for record in reader.iter_metadata()}
@@ -95,6 +91,6 @@ def records(path: Path):
     return stored, attached
 
 
-def in_window(messages, start_ms, stop_ms):
+def between(messages, start_ms, stop_ms):
     low, high = EPOCH_NS + round(start_ms * MS), EPOCH_NS + round(stop_ms * MS)
     return [message for message in messages if low <= message[0] < high]

@@ -1,6 +1,6 @@
 """The far end of a drive's bus, in processes of its own: a robot behind socketcand, and a router.
 
-It knows socketcand and the frames of two robots, and imports nothing of the project: the robot
+It has socketcand and the frames of two robots, and imports nothing of the project: the robot
 notes when each command arrived at its end, and :func:`largest_burst` judges by these times alone.
 
     far_end.py robot unasked|polled|slow|lossy PERIOD_S LATENCY_S
@@ -65,12 +65,8 @@ class Robot:
         """Return the data that are due, and the time until the next are [s]."""
         now, text = time.monotonic(), b""
         while self.due and self.due[0][0] <= now:
-            kind = heapq.heappop(self.due)[1]
-            text += (
-                self.angle()
-                if kind == 0x92
-                else frame(SERVO, struct.pack("<BbhhH", 0xA4, 30, 9, 0, 0))
-            )
+            moved = frame(SERVO, struct.pack("<BbhhH", 0xA4, 30, 9, 0, 0))
+            text += self.angle() if heapq.heappop(self.due)[1] == 0x92 else moved
         if self.kind in ("unasked", "slow") and now >= self.next_s:
             self.next_s = max(self.next_s + self.period_s, now)
             if self.kind == "unasked":

@@ -128,11 +128,8 @@ class Stage:
 
     def wait_for_commands(self, controller, count=150):
         """Wait until a number of ticks was commanded."""
-        wait_for(
-            lambda: len(self.command_lines) >= count * len(JOINTS),
-            "no commands on the bus",
-            alive=[controller],
-        )
+        most = count * len(JOINTS)
+        wait_for(lambda: len(self.command_lines) >= most, "commands", alive=[controller])
 
     def settle(self, quiet_s=0.3):
         """Wait while frames may still be sent, and until all of them are received.
@@ -148,9 +145,7 @@ class Stage:
             place = {"host": "127.0.0.1", "port": self.port, "channel": self.bus}
             with can.Bus(interface="socketcand", **place) as bus:
                 bus.send(can.Message(arbitration_id=MARK, is_extended_id=False))
-                wait_for(
-                    lambda: any(one["id"] == MARK for one in self.lines), "the mark is not heard"
-                )
+                wait_for(lambda: any(one["id"] == MARK for one in self.lines), "the mark")
         self._listener.send_signal(signal.SIGTERM)
         _, complained = self._listener.communicate(timeout=20)
         assert self._listener.returncode == 0, complained
@@ -247,8 +242,7 @@ class Written:
         """Return commands from an event on: joint to angles [rad]."""
         since_s = self.time_of(words)
         rows = [row for at_s, row in self.commands if at_s >= since_s - 1e-9]
-        names = self.commands[0][1]
-        return {name: np.array([row[name] for row in rows]) for name in names}
+        return {name: np.array([row[name] for row in rows]) for name in self.commands[0][1]}
 
 
 def check_session(path, lines, *, max_rate=MAX_RATE, lockstep=False):
@@ -284,8 +278,7 @@ def check_true_rates(written, lines, *, max_rate=MAX_RATE):
     shortest_s = math.inf
     for name, (_, angle) in commands_of(lines).items():
         apart_s = np.diff(sent_ns[name]) * 1e-9
-        step = np.abs(np.diff(angle))
-        beyond = step - max_rate * apart_s - STEP * (1 + 1e-6)
+        beyond = np.abs(np.diff(angle)) - max_rate * apart_s - STEP * (1 + 1e-6)
         assert beyond.max(initial=0.0) <= 0.0, (name, beyond.max(), apart_s[np.argmax(beyond)])
         shortest_s = min(shortest_s, apart_s.min(initial=math.inf))
     return shortest_s
@@ -294,8 +287,7 @@ def check_true_rates(written, lines, *, max_rate=MAX_RATE):
 def check_pace(times_s, late_s=0.02):
     """Never more commands than deadlines have passed: what was late is not made up in a burst."""
     ahead = np.arange(len(times_s)) / RATE_HZ - times_s
-    least = np.minimum.accumulate(ahead)
-    assert (ahead - least).max(initial=0.0) <= 1 / RATE_HZ + late_s
+    assert (ahead - np.minimum.accumulate(ahead)).max(initial=0.0) <= 1 / RATE_HZ + late_s
 
 
 def check_ramp_down(written, since, *, ramp_rate=RAMP_RATE, yields=()):

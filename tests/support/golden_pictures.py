@@ -79,8 +79,7 @@ def take(viewer, recording, view):
 
 def slug(view):
     """Return the file name of a view: its name without numbers and units after it."""
-    words = re.split(r"[:\[]|, [^a-z]", view)[0]
-    return re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")
+    return re.sub(r"[^a-z0-9]+", "-", re.split(r"[:\[]|, [^a-z]", view)[0].lower()).strip("-")
 
 
 def load(path):
@@ -107,8 +106,7 @@ def differing(found, golden, reach=1):
 
 def _lost(one, other, reach):
     around = np.pad(other, ((reach, reach), (reach, reach), (0, 0)), mode="edge")
-    size = (2 * reach + 1,) * 2
-    there = np.lib.stride_tricks.sliding_window_view(around, size, axis=(0, 1))
+    there = np.lib.stride_tricks.sliding_window_view(around, ((2 * reach + 1,) * 2), axis=(0, 1))
     return np.abs(one[..., None, None] - there).max(axis=2).min(axis=(-2, -1)) > FAR
 
 

@@ -1,10 +1,5 @@
 """Sessions of joints that are commanded and respond, written from arrays."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
-
 import numpy as np
 
 from undulog.capture import SessionWriter
@@ -13,17 +8,17 @@ EPOCH_NS = 1_735_689_600_000_000_000
 
 
 def write_joints(
-    path: Path,
-    names: Sequence[str],
-    commands: np.ndarray,
-    states: Sequence[np.ndarray] = (),
+    path,
+    names,
+    commands,
+    states=(),
     *,
-    rate_hz: int = 50,
-    epoch_ns: int = EPOCH_NS,
-    scenario: str | None = None,
-    more: Sequence[tuple[str, str, np.ndarray]] = (),
-    **options: object,
-) -> Path:
+    rate_hz=50,
+    epoch_ns=EPOCH_NS,
+    scenario=None,
+    more=(),
+    **options,
+):
     """Write /joint_commands and /joint_states at a steady rate.
 
     Args:
@@ -49,6 +44,6 @@ def write_joints(
     return path
 
 
-def turns(frequency_hz: float, count: int, rate_hz: int = 50) -> np.ndarray:
+def turns(frequency_hz, count, rate_hz=50):
     """Return exp(j omega t) of so many samples, shape (count, 1)."""
     return np.exp(2j * np.pi * frequency_hz * np.arange(count)[:, None] / rate_hz)

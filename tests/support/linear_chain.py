@@ -45,16 +45,10 @@ def kicked(folder):
     for step in (0.05j, -0.05j, 0.05, -0.05):
         off += [np.where(joint == PLACE, step, 0) for joint in range(M)]
     off.append(1j * np.array([0.1, -0.12, 0.05, 0.08, -0.11]))
-    return [
-        write_run(
-            folder / f"run{k:02d}.mcap",
-            WAVE * np.exp(one),
-            CHAIN @ (WAVE * np.exp(one)),
-            k,
-            0.002,
-        )
-        for k, one in enumerate(off)
-    ]
+    commands = WAVE * np.exp(off)
+    paths = [folder / f"run{k:02d}.mcap" for k in range(len(off))]
+    runs = enumerate(zip(paths, commands, strict=True))
+    return [write_run(path, command, CHAIN @ command, k, 0.002) for k, (path, command) in runs]
 
 
 def swept(folder):

@@ -22,7 +22,7 @@ from undulog.capture.log.wal.reader import recover
 from undulog.capture.robot.description import parse_robot
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from campaign.base import of_recorder, write_logs, write_texts
+from campaign.base import of_recorder, write_files, write_logs, write_texts
 from campaign.fuzz import read_session
 from campaign.mutate import mutate_bytes, mutate_text
 
@@ -45,9 +45,7 @@ def make_corpus(folder):
 def lay_out(files, place):
     """Write files in a folder that holds nothing else."""
     shutil.rmtree(place, ignore_errors=True)
-    for path, data in files.items():
-        (place / path).parent.mkdir(parents=True, exist_ok=True)
-        (place / path).write_bytes(data)
+    write_files(place, files)
 
 
 def check_and_read(path):

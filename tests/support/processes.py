@@ -33,6 +33,10 @@ def start(*words, **options):
     return subprocess.Popen([str(word) for word in words], **(PIPES | options))
 
 
+def python_started(code, *words, **options):
+    return start(sys.executable, "-c", code, *words, **options)
+
+
 @contextmanager
 def process(*words, **options):
     """Start a process that is ended with the block."""

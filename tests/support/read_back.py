@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from undulog.capture.log.edit.raw_messages import RawLog
 
@@ -22,6 +23,22 @@ def messages_of(path, **options):
     """Schema, channel and message of all messages of one file, by mcap's reader."""
     with path.open("rb") as stream:
         return list(make_reader(stream, validate_crcs=True).iter_messages(**options))
+
+
+def decoded_of(path, topics=None):
+    """Topic, log time and content of all messages of one file, by mcap-ros2-support."""
+    with path.open("rb") as stream:
+        found = make_reader(stream, decoder_factories=[DecoderFactory()])
+        rows = found.iter_decoded_messages(topics)
+        return [(channel.topic, message.log_time, content) for _, channel, message, content in rows]
+
+
+def rows_of(path):
+    """All messages of one file as :func:`read` has them, by mcap's reader."""
+    return [
+        (channel.topic, m.sequence, m.log_time, m.publish_time, m.data)
+        for _, channel, m in messages_of(path)
+    ]
 
 
 def summary_of(path):

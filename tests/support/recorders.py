@@ -13,6 +13,7 @@ from support import processes
 from support.paths import ROOT
 from support.processes import UNDULOG, wait_for
 from undulog.capture import Session
+from undulog.capture.log.messages.frames import DIR_TX, empty_frames
 
 
 def command(output, *arguments):
@@ -50,6 +51,23 @@ def counts(path):
     with path.open("rb") as stream:
         found = make_reader(stream, validate_crcs=True).iter_messages()
         return Counter(channel.topic for _, channel, _ in found)
+
+
+def polling(cycles, start_ns=10**9):
+    """Polling cycles of 10 ms of the shipped robot: each servo's command, then its answer.
+
+    Returns the frames, and the angles in them in hundredths of a degree.
+    """
+    frames = empty_frames(50 * cycles)
+    number = np.arange(len(frames))
+    is_command = number % 2 == 0
+    frames["t_device_ns"] = start_ns + number * 200_000
+    frames["id_flags"] = np.where(is_command, 257, 513) + number // 2 % 25
+    frames["dlc"] = np.where(is_command, 2, 8)
+    frames["dir"] = np.where(is_command, DIR_TX, 0)
+    hundredths = np.rint(2000 * np.sin(0.05 * number)).astype("<i2")
+    frames["data"][:, :2] = hundredths[:, None].view(np.uint8)
+    return frames, hundredths
 
 
 def greet(client, listening=b"< hi >"):

@@ -59,8 +59,7 @@ class Joint:
             followed = play(command(fine - lag_s), width)
         elif kind == "play behind a lag":
             turn = np.arctan(omega * lag_s)
-            slow = amplitude * np.cos(turn) * np.sin(omega * fine + phase - turn)
-            followed = play(slow, width)
+            followed = play(amplitude * np.cos(turn) * np.sin(omega * fine + phase - turn), width)
         elif kind == "stick":
             low = (width - excess) / 2
             followed = stick(command(fine), low + excess, low, lag_s, fine[1])
@@ -90,6 +89,5 @@ def found_in(joints, *, effort=None, second=None):
 
     empty = {field.name: {} for field in dataclasses.fields(Columns)}
     known = {"names": tuple(names), "effort": signals(effort), "reference": signals(second)}
-    columns = Columns(**empty | known)
-    found = dead_bands(columns, commands, responses, gait, 0)
+    found = dead_bands(Columns(**empty | known), commands, responses, gait, 0)
     return {int(name.removeprefix("joint")): one for name, one in found.items()}, gait

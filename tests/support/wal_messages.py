@@ -16,7 +16,7 @@ def message(position):
     payload = random.Random(-position).randbytes(size)
     return 1 + position % 3, 10**18 + position, 10**18 - position, position % 2**32, payload
 """
-_space: dict = {}
+_space = {}
 exec(MESSAGE, _space)
 message = functools.cache(_space["message"])
 

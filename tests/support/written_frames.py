@@ -2,40 +2,33 @@
 
 from itertools import product
 
+import can
 import numpy as np
 from can.util import CAN_FD_DLC
 
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.exchange.can_import import import_can
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    REMOTE_FLAG,
-    empty_fd_frames,
-    empty_frames,
-)
+from undulog.capture.log.messages import frames as fr
 
 T0 = 1_700_000_003_250_000_000
-IDENTIFIERS = (0, 0x14B, 0x7FF, EXTENDED_FLAG, EXTENDED_FLAG | 0x1FFF_FFFF)
+IDENTIFIERS = (0, 0x14B, 0x7FF, fr.EXTENDED_FLAG, fr.EXTENDED_FLAG | 0x1FFF_FFFF)
 
 
 def every_kind(*, fd=False, start_ns=T0, step_ns=1_000_000):
     """Each identifier, kind, way, length and flag that CAN or CAN FD has, one frame a step."""
     rng = np.random.default_rng(3)
-    others = [i | REMOTE_FLAG for i in IDENTIFIERS] + [0x80 | ERROR_FLAG, 0x1FFF_FFFF | ERROR_FLAG]
-    identifiers = IDENTIFIERS if fd else (*IDENTIFIERS, *others)
-    lengths, flags = (CAN_FD_DLC, (0, FD_BRS, FD_ESI, FD_BRS | FD_ESI)) if fd else (range(9), (0,))
-    kinds = list(product(identifiers, (DIR_RX, DIR_TX), lengths, flags))
-    frames = empty_fd_frames(len(kinds)) if fd else empty_frames(len(kinds))
+    errors = (0x80 | fr.ERROR_FLAG, 0x1FFF_FFFF | fr.ERROR_FLAG)
+    remote = [i | fr.REMOTE_FLAG for i in IDENTIFIERS]
+    identifiers = IDENTIFIERS if fd else (*IDENTIFIERS, *remote, *errors)
+    lengths = CAN_FD_DLC if fd else range(9)
+    flags = (0, fr.FD_BRS, fr.FD_ESI, fr.FD_BRS | fr.FD_ESI) if fd else (0,)
+    kinds = list(product(identifiers, (fr.DIR_RX, fr.DIR_TX), lengths, flags))
+    frames = fr.empty_fd_frames(len(kinds)) if fd else fr.empty_frames(len(kinds))
     for frame, (id_flags, way, length, fd_flags) in zip(frames, kinds, strict=True):
         frame["id_flags"], frame["dir"], frame["len" if fd else "dlc"] = id_flags, way, length
         if fd:
             frame["fd_flags"] = fd_flags
-        if not id_flags & REMOTE_FLAG:
+        if not id_flags & fr.REMOTE_FLAG:
             frame["data"][:length] = list(rng.bytes(length))
     frames = frames[rng.permutation(len(frames))]
     frames["t_host_ns"] = start_ns + step_ns * np.arange(len(frames))
@@ -59,10 +52,20 @@ def write_frames(path, topics, batch=37, **metadata):
     return path
 
 
+def frames_of(path, topic="/can/can0"):
+    with Session.open(path) as session:
+        return (session.fd_frames if "_fd/" in topic else session.frames)(topic)
+
+
 def imported(trace, folder, topic="/can/can0"):
     """Import a trace; return the report, and the frames of a topic of the session."""
-    run = folder / "back.mcap"
-    report = import_can(trace, run, load_robot("snake13"), force=True)
-    with Session.open(run) as session:
-        read = session.fd_frames if "_fd/" in topic else session.frames
-        return report, read(topic)
+    report = import_can(trace, folder / "back.mcap", load_robot("snake13"), force=True)
+    return report, frames_of(report.output, topic)
+
+
+def log_messages(path, messages, **options):
+    """Write a log by python-can's writer for its suffix."""
+    with can.Logger(str(path), **options) as writer:
+        for message in messages:
+            writer(message)
+    return path

@@ -1,14 +1,9 @@
 """Sessions by the session writer and by mcap-ros2-support."""
 
-from __future__ import annotations
-
 import itertools
-from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 import numpy as np
 from mcap_ros2.writer import Writer as RosWriter
-from numpy.typing import ArrayLike
 
 from undulog.capture import SessionWriter
 from undulog.capture.log.messages.definitions import schema_text
@@ -19,19 +14,18 @@ NAMES = ("joint01", "joint02", "joint03")
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
 
-def samples(count: int = 300) -> np.ndarray:
+def samples(count=300):
     return np.random.default_rng(7).normal(size=(count, 3, len(NAMES)))
 
 
-def write_session(path: Path, count: int = 300, **options: object) -> np.ndarray:
+def write_session(path, count=300, **options):
     data = samples(count)
     with SessionWriter(path, session_id="s1", epoch_ns=EPOCH_NS, **options) as writer:
         commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
         states = writer.joint_state("/joint_states", NAMES, unit="rad", velocity=True, effort=True)
         odometry = writer.odometry("/odom", frame="world", child="link01")
         events = writer.log("/rosout")
-        mode = writer.string("/gait/mode")
-        mode.write(EPOCH_NS, "walk")
+        writer.string("/gait/mode").write(EPOCH_NS, "walk")
         events.write(EPOCH_NS, "warn", "twin", "clamped")
         for tick, (position, velocity, effort) in enumerate(data):
             t_ns = EPOCH_NS + tick * STEP_NS
@@ -42,15 +36,7 @@ def write_session(path: Path, count: int = 300, **options: object) -> np.ndarray
     return data
 
 
-def write_commands(
-    path: Path,
-    names: Sequence[str],
-    commands: Iterable[ArrayLike],
-    *,
-    times_ns: Iterable[int] | None = None,
-    plan: dict[str, str] | None = None,
-    **options: object,
-) -> Path:
+def write_commands(path, names, commands, *, times_ns=None, plan=None, **options):
     """Write a session of joint commands and nothing else.
 
     Args:
@@ -69,9 +55,7 @@ def write_commands(
     return path
 
 
-def write_foreign(
-    path: Path, messages: list[tuple[str, int, dict]], type_name: str = JOINT_STATE
-) -> Path:
+def write_foreign(path, messages, type_name=JOINT_STATE):
     """Write messages (topic, log time, content) by mcap-ros2-support."""
     with path.open("wb") as stream:
         writer = RosWriter(stream)
@@ -82,6 +66,6 @@ def write_foreign(
     return path
 
 
-def joint_state(t_ns: int, names: list[str], position: list[float], **more: object) -> dict:
+def joint_state(t_ns, names, position, **more):
     stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
     return {"header": {"stamp": stamp}, "name": names, "position": position, **more}

@@ -4,14 +4,10 @@ The messages are laid out in NumPy, all of one topic at once: a hundred seeds of
 some hundred million numbers. A test reads them back with ``mcap_ros2``.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from .robot import SECOND_TOPIC, Log
+from .robot import SECOND_TOPIC
 
 EPOCH_NS = 1_700_000_000_000_000_000
 
@@ -31,15 +27,13 @@ uint32 nanosec
 """
 
 
-def write_bag(log: Log, path: Path) -> Path:
+def write_bag(log, path):
     """Write a log to a file, replaced if it exists; return the file."""
     robot = log.robot
     topics = ["/joint_commands", "/joint_states"] + [SECOND_TOPIC] * (log.second is not None)
     rows = _messages(0, robot.names, robot.sent_s, [robot.sent(), None, None])
-    for number, position, others in (
-        (1, log.position, (log.velocity, log.effort)),
-        (2, log.second, (None, None)),
-    ):
+    topics_of = ((log.position, log.velocity, log.effort), (log.second, None, None))
+    for number, (position, *others) in enumerate(topics_of, 1):
         if position is None:
             continue
         groups = [[j] for j in range(robot.m)] if robot.per_servo else [list(range(robot.m))]
@@ -66,8 +60,7 @@ def write_bag(log: Log, path: Path) -> Path:
 
 def _messages(number, names, times_s, columns):
     """Time, topic's number and CDR of each message, in order of time."""
-    count = len(names)
-    text = b"".join(_text(name) for name in names)
+    count, text = len(names), b"".join(map(_text, names))
     # Offsets count from after the encapsulation: stamp 8, empty frame id 4 + 1 and 3 to align.
     at = 8 + 8 + 4 + len(text)
     fields = [("head", "V4"), ("sec", "<i4"), ("ns", "<u4"), ("frame", "V8"), ("names", "<u4")]
@@ -94,6 +87,6 @@ def _messages(number, names, times_s, columns):
     return [(int(t), number, row.tobytes()) for t, row in zip(t_ns, rows, strict=True)]
 
 
-def _text(name: str) -> bytes:
+def _text(name):
     data = name.encode() + b"\0"
     return len(data).to_bytes(4, "little") + data + b"\0" * (-len(data) % 4)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .planting import FAULTS, GAIN, OFFSET, RESPONSE, fault, hold, single
+from .planting import FAULTS, GAIN, OFFSET, RESPONSE, fault, hold, single, spell
 from .responding import clipped, weak
 from .robot import Change
 from .sensing import misled
@@ -13,9 +13,7 @@ from .truth import PAUSED, STOPPED, Truth, either, standing
 @fault("jam that comes loose again")
 def _(robot, rng, j):
     """The position stands still for a third of the time, then follows again."""
-    start = float(rng.uniform(0.2, 0.4)) * robot.duration_s
-    t = robot.t_s[:, j]
-    acts = (t >= start) & (t < start + rng.uniform(0.25, 0.4) * robot.duration_s)
+    start, acts = spell(robot, j, rng, (0.2, 0.4), (0.25, 0.4))
     change = Change(j, position=hold(robot.moved(j), acts))
     kinds = again(standing(robot.channels, "pushing"))
     return single(change, {"jammed", "stalled", "intermittent"}, kinds, since_s=start)
@@ -36,8 +34,7 @@ def _(robot, rng, j):
     side, about = rng.choice([-1, 1]), robot.bias[j]
     level = rng.uniform(0.1, 0.6) * robot.swing(j)
     kinds = clipped(robot) | {"clipped_sensor"}
-    if not robot.channels.second:
-        kinds |= STOPPED | PAUSED
+    kinds |= robot.channels.unless_second(*STOPPED, *PAUSED)
     change = Change(j, reading=lambda read: about + side * np.minimum(side * (read - about), level))
     return single(change, {"clipped_sensor"}, kinds, stands_out=GAIN | OFFSET, checked=False)
 
@@ -50,22 +47,19 @@ def _(robot, rng, j):
     apart = np.angle(np.exp(1j * (robot.phase[other] - robot.phase[j])))
     if abs(apart) > np.radians(120):  # as good as inverted
         kinds |= either(robot.channels, "inverted", "inverted_sensor", cause="inverted")
-    change = misled(robot, j, other)
-    return single(change, kinds, stands_out=RESPONSE | OFFSET, checked=False)
+    return single(misled(robot, j, other), kinds, stands_out=RESPONSE | OFFSET, checked=False)
 
 
 @fault("off by a whole turn from the beginning")
 def _(robot, rng, j):
     """The position is off by a whole turn of the counter."""
     turn = rng.choice([-1, 1]) * 2 * np.pi
-    kinds = frozenset({"wrapped_sensor"})
-    if not robot.channels.second:
-        kinds |= {"slipped"}
+    kinds = robot.channels.unless_second("slipped") | {"wrapped_sensor"}
     change = Change(j, reading=lambda read: read + turn)
     return single(change, kinds, kinds | {"slipped_sensor"}, stands_out=OFFSET, checked=False)
 
 
-def _both(first: str, second: str):
+def _both(first, second):
     def plant(robot, rng, j):
         other = int((j + rng.integers(1, robot.m)) % robot.m)
         one = FAULTS[first].plant(robot, rng, j)

@@ -1,16 +1,9 @@
 """Right or wrong: statements of outputs against the truth."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-
-from .outputs import Statement
-from .robot import Robot
-from .truth import JointTruth, Truth
 
 MOST_NAMED = 4
 """So many joints a sentence must name; with more it may count the rest."""
@@ -32,21 +25,21 @@ class Judgement:
     narrow: bool = False
 
     @property
-    def right(self) -> bool:
+    def right(self):
         """Whether nothing is wrong; sound joints are counted apart."""
         return not self.missing
 
 
-def named_in(text: str, names: Sequence[str]) -> list[str]:
+def named_in(text, names):
     """Return the joints whose names a text contains as whole words, in order."""
-    found: dict[str, int] = {}
+    found = {}
     for name in names:
         if match := re.search(rf"(?<![\w/]){re.escape(name)}(?![\w/])", text):
             found[name] = match.start()
     return sorted(found, key=found.__getitem__)
 
 
-def judge(output: str, statement: Statement, truth: Truth, robot: Robot) -> Judgement:
+def judge(output, statement, truth, robot):
     """Judge the statement of an output against the planted truth."""
     if statement.error:
         return Judgement((f"error: {statement.error}",))
@@ -75,7 +68,7 @@ def judge(output: str, statement: Statement, truth: Truth, robot: Robot) -> Judg
     return Judgement(tuple(missing), sound, narrow)
 
 
-def _must_name(output: str, truth: JointTruth) -> bool:
+def _must_name(output, truth):
     """Whether an output has to name a joint; what a joint stands out by is not for all."""
     if output == "log check":
         return truth.checked
@@ -84,7 +77,7 @@ def _must_name(output: str, truth: JointTruth) -> bool:
     return output != "detection" or not truth.stands_out
 
 
-def _undecided(statement: Statement, named: Sequence[str]) -> Judgement:
+def _undecided(statement, named):
     """Of too few joints none may be named; any that is may as well be sound."""
     missing = ["does not say that no joint can be named"] if statement.undecided is False else []
     if named:
@@ -92,9 +85,7 @@ def _undecided(statement: Statement, named: Sequence[str]) -> Judgement:
     return Judgement(tuple(missing))
 
 
-def _of_joint(
-    name: str, truth: JointTruth, statement: Statement, robot: Robot
-) -> tuple[list[str], bool]:
+def _of_joint(name, truth, statement, robot):
     """What is wrong in the lists about one planted joint; whether its kinds are too few."""
     stated = (statement.not_following or {}).get(name)
     outside = (statement.stands_out or {}).get(name, frozenset())
@@ -108,7 +99,7 @@ def _of_joint(
         return [f"{name} not listed"], False
     if not truth.names:
         return [f"{name} listed as {_listed(stated.kinds)}, but follows"], False
-    wrong: list[str] = []
+    wrong = []
     if not stated.kinds & truth.names:
         wrong.append(f"{name}: {_listed(stated.kinds)} lacks {_listed(truth.names, ' or ')}")
     if excess := stated.kinds - truth.allowed:
@@ -117,7 +108,7 @@ def _of_joint(
     return wrong, stated.kinds < truth.allowed
 
 
-def _onset(name: str, truth: JointTruth, since_s: float | None, robot: Robot) -> list[str]:
+def _onset(name, truth, since_s, robot):
     """An onset that is off by more than a cycle and a half, and half a second."""
     if truth.since_s is None:
         return []
@@ -127,5 +118,5 @@ def _onset(name: str, truth: JointTruth, since_s: float | None, robot: Robot) ->
     return [f"{name} since {since_s} s, not {truth.since_s:.1f} s"]
 
 
-def _listed(words: frozenset[str], by: str = ", ") -> str:
+def _listed(words, by=", "):
     return by.join(sorted(words))

@@ -1,18 +1,14 @@
 """Outputs of undulog on a bag or on arrays: the only module here that imports it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from html import unescape
-from pathlib import Path
 
 import numpy as np
 
 from undulog.analysis.compare.compare import Choices, compare_sessions
 from undulog.analysis.present.page.page import render
-from undulog.analysis.results.answer import Answer
 from undulog.analysis.session.analyse import analyse_session
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session
@@ -23,7 +19,7 @@ from undulog.capture.log.health.session_check import check_session
 from undulog.replay.draw.facts import markdown
 from undulog.replay.samples.content import Content
 
-from .robot import SECOND_TOPIC, Log
+from .robot import SECOND_TOPIC
 
 OUTPUTS = ("answer", "log check", "compare", "page", "rerun")
 EMPTY = Content(None, None, None, None, (), (), (), False, (), (), 0, False, ())
@@ -63,9 +59,7 @@ class Statement:
     error: str = ""
 
 
-def statements(
-    path: Path, healthy: Path | None, *, second: bool, outputs: tuple[str, ...] = OUTPUTS
-) -> dict[str, Statement]:
+def statements(path, healthy, *, second, outputs=OUTPUTS):
     """Return the statement of each output on a bag.
 
     Args:
@@ -88,8 +82,8 @@ def statements(
     return found
 
 
-def _analysed(path: Path, options: Options, outputs: tuple[str, ...]) -> dict[str, Statement]:
-    found: dict[str, Statement] = {}
+def _analysed(path, options, outputs):
+    found = {}
     with Session.open(path) as session:
         analysis = analyse_session(session, options)
         if "answer" in outputs:
@@ -104,49 +98,45 @@ def _analysed(path: Path, options: Options, outputs: tuple[str, ...]) -> dict[st
     return found
 
 
-def structured(answer: Answer) -> Statement:
+def structured(answer):
     """Return the statement of an answer, with its lists."""
-    quantities: dict[str, frozenset[str]] = {}
+    quantities = {}
     for one in answer.stand_out:
         quantities[one.joint] = quantities.get(one.joint, frozenset()) | {one.quantity}
-    return Statement(
-        answer.sentence,
-        {one.joint: Named(frozenset(one.kinds), one.since_s) for one in answer.not_following},
-        quantities,
-        answer.undecided is not None,
-        bool(answer.alike),
-    )
+    undecided, alike = answer.undecided is not None, bool(answer.alike)
+    return Statement(answer.sentence, _named(answer.not_following), quantities, undecided, alike)
 
 
-def detected(log: Log) -> Statement:
+def detected(log):
     """Return the joints that do not follow by the detection alone, on arrays: no bag, no answer."""
     robot = log.robot
     sent = robot.sent()
 
-    def samples(columns: np.ndarray | None, j: int) -> Samples | None:
+    def samples(columns, j):
         if columns is None:
             return None
         kept = np.isfinite(columns[:, j])
         return Samples(robot.t_s[kept, j], columns[kept, j])
 
+    logged = {"velocity": log.velocity, "effort": log.effort, "reference": log.second}
     motions = [
         JointMotion(
             name,
             Samples(robot.sent_s, sent[:, j]),
             samples(log.position, j),
-            velocity=samples(log.velocity, j),
-            effort=samples(log.effort, j),
-            reference=samples(log.second, j),
+            **{key: samples(columns, j) for key, columns in logged.items()},
         )
         for j, name in enumerate(robot.names)
     ]
-    found = {
-        one.joint: Named(frozenset(one.kinds), one.since_s) for one in joints_not_following(motions)
-    }
+    found = _named(joints_not_following(motions))
     return Statement(" ".join(found), found)
 
 
-def _compared(healthy: Path, path: Path, options: Options) -> Statement:
+def _named(faults):
+    return {one.joint: Named(frozenset(one.kinds), one.since_s) for one in faults}
+
+
+def _compared(healthy, path, options):
     try:
         with Session.open(healthy) as first, Session.open(path) as other:
             found = compare_sessions(first, other, Choices(session=options))
@@ -155,12 +145,11 @@ def _compared(healthy: Path, path: Path, options: Options) -> Statement:
     return Statement(found.answer, alike=found.verdict in {"same", "open"})
 
 
-def _heading(page: str) -> str:
+def _heading(page):
     found = re.search(r'<h1 id="answer"[^>]*>(.*?)</h1>', page, re.DOTALL)
     return "" if found is None else found[1]
 
 
-def _plain(markup: str) -> str:
+def _plain(markup):
     """Text without tags, soft hyphens and zero-width spaces."""
-    text = unescape(re.sub(r"<wbr[^>]*>|<[^>]*>", "", markup))
-    return re.sub("[\u00ad\u200b\u2060]", "", text)
+    return re.sub("[\u00ad\u200b\u2060]", "", unescape(re.sub(r"<wbr[^>]*>|<[^>]*>", "", markup)))

@@ -1,12 +1,7 @@
 """The table of faults in docs/faults.md: ``PYTHONPATH=tests python -m zoo.page`` prints it."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-
-from .faults import FAULTS, Fault, plant
+from .faults import FAULTS, plant
 from .robot import Channels, draw
-from .truth import JointTruth
 
 COLUMNS = {
     "positions": Channels(),
@@ -17,11 +12,11 @@ COLUMNS = {
 """A velocity that is derived from the same positions adds nothing to the first column."""
 
 
-def lines() -> Iterator[str]:
+def lines():
     """Yield the table as Markdown; a fault that is planted at several joints has one line."""
     yield "| fault | what it looks like | " + " | ".join(COLUMNS) + " |"
     yield "|---|---|" + "---|" * len(COLUMNS)
-    shown_before: list[object] = []
+    shown_before = []
     for name, fault in FAULTS.items():
         if name.startswith("two at once") or (fault.plant in shown_before):
             continue
@@ -32,17 +27,16 @@ def lines() -> Iterator[str]:
         yield " | ".join([f"| {name.split(', head')[0]}", looks, *shown]) + " |"
 
 
-def _cell(fault: Fault, channels: Channels) -> str:
+def _cell(fault, channels):
     if fault.channels is not None and channels not in fault.channels:
         return "-"
-    robot = draw(1, small=True, channels=channels, joints=fault.joints)
-    _, truth = plant(fault, robot, 1)
+    _, truth = plant(fault, draw(1, small=True, channels=channels, joints=fault.joints), 1)
     if truth.undecided:
         return "joints differ; which one can't be decided"
     return _kinds(truth.joints[0]) if truth.joints else "nothing"
 
 
-def _kinds(truth: JointTruth) -> str:
+def _kinds(truth):
     kinds = ", ".join(f"`{kind}`" for kind in sorted(truth.allowed))
     outside = truth.stands_out and f"stands out by {' or '.join(sorted(truth.stands_out))}"
     return "; or ".join(filter(None, (kinds, outside)))

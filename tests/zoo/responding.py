@@ -13,8 +13,7 @@ def _responds(j, position, quantities):
 
 def weak(robot, rng, j):
     """The position is smaller."""
-    size = min(relative(robot, j, rng, 0.5), 0.6)
-    return _responds(j, robot.moved(j, gain=1 - size), GAIN)
+    return _responds(j, robot.moved(j, gain=1 - min(relative(robot, j, rng, 0.5), 0.6)), GAIN)
 
 
 for _place in ("head", "middle", "tail", None):
@@ -26,15 +25,13 @@ fault("gain less, of forty", joints=(40, 40))(weak)
 @fault("gain more")
 def _(robot, rng, j):
     """The position is larger."""
-    size = relative(robot, j, rng, 0.4)
-    return _responds(j, robot.moved(j, gain=1 + size), GAIN)
+    return _responds(j, robot.moved(j, gain=1 + relative(robot, j, rng, 0.4)), GAIN)
 
 
 @fault("lag more")
 def _(robot, rng, j):
     """The position is later."""
-    size = relative(robot, j, rng, 0.5)
-    return _responds(j, robot.moved(j, more_lag=size), LAG)
+    return _responds(j, robot.moved(j, more_lag=relative(robot, j, rng, 0.5)), LAG)
 
 
 @fault("offset only")
@@ -47,8 +44,7 @@ def _(robot, rng, j):
 @fault("gain fades")
 def _(robot, rng, j):
     """The position becomes smaller from cycle to cycle."""
-    size = min(2 * relative(robot, j, rng, 0.25), 0.9)
-    gain = 1 - size * robot.t_s[:, j] / robot.duration_s
+    gain = 1 - min(2 * relative(robot, j, rng, 0.25), 0.9) * robot.t_s[:, j] / robot.duration_s
     return _responds(j, robot.moved(j, gain=gain), GAIN)
 
 
@@ -62,8 +58,7 @@ def _(robot, rng, j):
 
 def clipped(robot):
     """Return the sensor's kinds of a flat top; none if another sensor shows it, too."""
-    kinds = () if robot.channels.second else ("clipped_sensor", "frozen_sensor")
-    return frozenset(kinds)
+    return robot.channels.unless_second("clipped_sensor", "frozen_sensor")
 
 
 def _at_limit(robot, j, position, more, quantities):
@@ -162,8 +157,7 @@ def _(robot, rng, j):
 def _(robot, rng, j):
     """The position becomes later from cycle to cycle."""
     size = 2 * relative(robot, j, rng, 0.3)
-    position = robot.moved(j, more_lag=size * robot.t_s[:, j] / robot.duration_s)
-    return _responds(j, position, LAG)
+    return _responds(j, robot.moved(j, more_lag=size * robot.t_s[:, j] / robot.duration_s), LAG)
 
 
 @fault("weak to one side")
@@ -172,5 +166,4 @@ def _(robot, rng, j):
     size = min(2 * relative(robot, j, rng, 0.25), 0.7)
     moved, about = robot.moved(j), robot.bias[j] + robot.zero[j]
     side = rng.choice([-1, 1]) * (moved - about) > 0
-    position = np.where(side, about + (1 - size) * (moved - about), moved)
-    return _responds(j, position, GAIN | OFFSET)
+    return _responds(j, np.where(side, about + (1 - size) * (moved - about), moved), GAIN | OFFSET)

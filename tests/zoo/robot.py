@@ -4,8 +4,6 @@ Nothing here imports undulog: the truth comes from closed forms. Three things th
 are kept apart: what reached the servo, where the joint is, and what each sensor reports of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -24,7 +22,7 @@ MARGIN_GAIN = 0.02
 MARGIN_RAD = np.radians(1.0)
 """Below these a deviation is nothing to name, however sure it is."""
 
-NAMINGS: tuple[Callable[[int, int], str], ...] = (
+NAMINGS = (
     lambda i, m: f"joint{i + 1}",
     lambda i, m: f"j_{i + 1:02d}",
     lambda i, m: f"{'yaw' if i % 2 == 0 else 'pitch'}_{i}",
@@ -48,7 +46,11 @@ class Channels:
     effort: bool = False
     second: bool = False
 
-    def __str__(self) -> str:
+    def unless_second(self, *kinds):
+        """Return kinds that a second sensor would exclude; none if there is one."""
+        return frozenset() if self.second else frozenset(kinds)
+
+    def __str__(self):
         """Return the names, joined."""
         names = [f"{self.velocity} velocity"] if self.velocity else []
         names += [name for name in ("effort", "second") if getattr(self, name)]
@@ -113,24 +115,22 @@ class Robot:
     channels: Channels
 
     @property
-    def m(self) -> int:
+    def m(self):
         """Number of joints."""
         return len(self.names)
 
-    def sent(self) -> np.ndarray:
+    def sent(self):
         """Return the commands as the controller sends them [rad], shape (k, m)."""
         t = self.sent_s[:, None]
         return self.bias + self.amplitude * self._wave(t, self.omega * t + self.phase)
 
-    def wanted(self, joint: int, at: int | None = None) -> np.ndarray:
+    def wanted(self, joint, at=None):
         """Command of a joint at the sampling times of ``at`` (itself if None) [rad], shape (n,)."""
         t = self.t_s[:, joint if at is None else at]
         wave = self._wave(t, self.omega * t + self.phase[joint])
         return self.bias[joint] + self.amplitude[joint] * wave
 
-    def moved(
-        self, joint: int, gain: float | np.ndarray = 1.0, more_lag: float = 0.0, of: int = -1
-    ) -> np.ndarray:
+    def moved(self, joint, gain=1.0, more_lag=0.0, of=-1):
         """Return the true position of a joint [rad], shape (n,).
 
         Args:
@@ -145,16 +145,16 @@ class Robot:
         size = gain * self.gain[joint] * self.amplitude[k]
         return self.bias[k] + self.zero[joint] + size * wave
 
-    def _wave(self, t: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    def _wave(self, t, angle):
         """A delay shifts the second harmonic by twice the angle."""
         grows = np.clip(t / self.start_s, 0.0, 1.0) if self.start_s > 0 else 1.0
         return grows * (np.sin(angle) + self.second * np.sin(2 * angle + 0.7))
 
-    def swing(self, joint: int) -> float:
+    def swing(self, joint):
         """Return the amplitude of the motion of a joint [rad]."""
         return float(self.gain[joint] * self.amplitude[joint])
 
-    def half(self, joint: int, count: float | None = None) -> tuple[float, float]:
+    def half(self, joint, count=None):
         """Return half widths of simultaneous 95 % intervals of a joint's deviation from the others.
 
         Bonferroni over 3 m deviations; each from what a common value, a trend and a parabola
@@ -178,14 +178,14 @@ class Robot:
             float(np.hypot(factor * slow / n**0.5, zero)),
         )
 
-    def _near(self, omega: float) -> float:
+    def _near(self, omega):
         """Amplitude density of the noise at a frequency, that of white noise being 1."""
         step_s = self.duration_s / len(self.t_s)
         power = (1 - self.color**2) / abs(1 - self.color * np.exp(-1j * omega * step_s)) ** 2
         return float(power**0.5)
 
 
-def leverage(m: int, joint: int) -> float:
+def leverage(m, joint):
     """Return the variance of the others' prediction for a joint, in variances of one joint.
 
     Args:
@@ -199,14 +199,7 @@ def leverage(m: int, joint: int) -> float:
     return float(basis[joint] @ np.linalg.solve(others.T @ others, basis[joint]))
 
 
-def draw(
-    seed: int,
-    *,
-    small: bool = False,
-    channels: Channels | None = None,
-    joints: tuple[int, int] | None = None,
-    least_s: float = 15.0,
-) -> Robot:
+def draw(seed, *, small=False, channels=None, joints=None, least_s=15.0):
     """Draw a healthy robot.
 
     Args:
@@ -274,12 +267,12 @@ def draw(
 
 @dataclass(frozen=True)
 class Change:
-    """Changes of one joint by a fault; None: no change.
+    """Changes of one joint by a fault.
 
     Attributes:
         joint: The joint.
-        position: Where it really is [rad], shape (n,).
-        wanted: Command that reached its servo [rad], shape (n,).
+        position: Where it really is [rad], shape (n,); None: as usual.
+        wanted: Command that reached its servo [rad], shape (n,); None: as usual.
         power: Share of the effort that the motor gives, shape (n,).
         exact: Where its sensors add no noise, shape (n,).
         reading: From the position that its sensor would report to the one that it does.
@@ -290,11 +283,11 @@ class Change:
     joint: int
     position: np.ndarray | None = None
     wanted: np.ndarray | None = None
-    power: np.ndarray | None = None
-    exact: np.ndarray | None = None
-    reading: Callable[[np.ndarray], np.ndarray] | None = None
-    telemetry: Callable[[np.ndarray], np.ndarray] | None = None
-    lost: np.ndarray | None = None
+    power: np.ndarray | float = 1.0
+    exact: np.ndarray | bool = False
+    reading: Callable[[np.ndarray], np.ndarray] = np.asarray
+    telemetry: Callable[[np.ndarray], np.ndarray] = np.asarray
+    lost: np.ndarray | bool = False
 
 
 @dataclass(frozen=True)
@@ -316,7 +309,7 @@ class Log:
     second: np.ndarray | None
 
 
-def record(robot: Robot, changes: tuple[Change, ...] = (), seed: int = 0) -> Log:
+def record(robot, changes=(), seed=0):
     """Return the log of a robot with some faults; the seed is that of the sensor noise."""
     rng = np.random.default_rng([seed, 2])
     n, m = robot.t_s.shape
@@ -328,26 +321,19 @@ def record(robot: Robot, changes: tuple[Change, ...] = (), seed: int = 0) -> Log
         t, swing = robot.t_s[:, j], robot.swing(j)
         where = robot.moved(j) if change.position is None else change.position
         wanted = robot.wanted(j) if change.wanted is None else change.wanted
-        noisy = np.ones(n) if change.exact is None else np.where(change.exact, 0.0, 1.0)
+        noisy = np.where(change.exact, 0.0, 1.0)
         read = where + noisy * noise[:, j]
         other = where + noisy * other_noise[:, j]
         if robot.step > 0:
             read, other = (np.round(one / robot.step) * robot.step for one in (read, other))
         rate = np.gradient(where, t) + 0.01 * robot.omega * swing * noisy * rng.normal(size=n)
         scale = STIFFNESS * robot.amplitude[j] * abs(1 - robot.gain[j] * np.exp(-1j * robot.lag[j]))
-        pull = STIFFNESS * (wanted - where)
-        if change.power is not None:
-            pull = pull * change.power
+        pull = STIFFNESS * (wanted - where) * change.power
         pull = pull + EFFORT_NOISE * scale * rng.normal(size=n)
-        if change.reading is not None:
-            read = change.reading(read)
+        read = change.reading(read)
         if robot.channels.velocity == "derived":
             rate = np.diff(read, prepend=read[0]) / np.diff(t, prepend=2 * t[0] - t[1])
-        channels = [read, rate, pull]
-        if change.telemetry is not None:
-            channels = [change.telemetry(one) for one in channels]
-        if change.lost is not None:
-            channels = [np.where(change.lost, np.nan, one) for one in channels]
+        channels = [np.where(change.lost, np.nan, change.telemetry(x)) for x in (read, rate, pull)]
         position[:, j], velocity[:, j], effort[:, j] = channels
         second[:, j] = other
     logged = robot.channels
@@ -355,7 +341,7 @@ def record(robot: Robot, changes: tuple[Change, ...] = (), seed: int = 0) -> Log
     return Log(robot, position, *(values if is_logged else None for values, is_logged in pairs))
 
 
-def _noise(robot: Robot, rng: np.random.Generator) -> np.ndarray:
+def _noise(robot, rng):
     """Noise of the joints' sensors [rad], shape (n, m)."""
     n, m = robot.t_s.shape
     drawn = (1 - robot.shared) ** 0.5 * rng.normal(size=(n + 100, m))

@@ -5,13 +5,10 @@ truth. Prints a table, one line a fault when it is done, below it the seeds that
 outputs.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile
 import zlib
-from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -21,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from .bags import write_bag
-from .faults import FAULTS, Fault, plant
+from .faults import FAULTS, plant
 from .judging import Judgement, judge
 from .outputs import OUTPUTS, Statement, detected, statements
 from .robot import Robot, draw, record
@@ -46,7 +43,7 @@ class Case:
     judged: dict[str, Judgement]
 
 
-def robot_for(fault: Fault, seed: int, *, small: bool = False) -> Robot:
+def robot_for(fault, seed, *, small=False):
     """Return the healthy robot into which a fault is planted; small: few joints and samples."""
     own = seed_of(fault.name, seed)
     rng = np.random.default_rng([own, 4])
@@ -54,14 +51,12 @@ def robot_for(fault: Fault, seed: int, *, small: bool = False) -> Robot:
     return draw(own, small=small, channels=channels, joints=fault.joints)
 
 
-def seed_of(name: str, seed: int) -> int:
+def seed_of(name, seed):
     """Return a seed that differs from fault to fault."""
     return seed + zlib.crc32(name.encode())
 
 
-def run_case(
-    name: str, seed: int, *, small: bool = False, outputs: tuple[str, ...] = OUTPUTS
-) -> Case:
+def run_case(name, seed, *, small=False, outputs=OUTPUTS):
     """Plant a fault, write the bag, run undulog, judge the outputs."""
     fault = FAULTS[name]
     robot = robot_for(fault, seed, small=small)
@@ -81,21 +76,14 @@ def run_case(
     return Case(name, seed, robot, truth, by_output, judged)
 
 
-def _work(name: str, seed: int, *, small: bool, outputs: tuple[str, ...]) -> Case:
+def _work(name, seed, *, small, outputs):
     try:
         return run_case(name, seed, small=small, outputs=outputs)
     except Exception as error:
         raise RuntimeError(f"{name}, seed {seed}") from error
 
 
-def run_all(
-    names: Sequence[str],
-    seeds: Sequence[int],
-    *,
-    small: bool = False,
-    outputs: tuple[str, ...] = OUTPUTS,
-    jobs: int = 1,
-) -> Iterator[Case]:
+def run_all(names, seeds, *, small=False, outputs=OUTPUTS, jobs=1):
     """Run every fault with every seed, in order."""
     work = partial(_work, small=small, outputs=outputs)
     pairs = zip(*product(names, seeds), strict=True)
@@ -106,38 +94,34 @@ def run_all(
         yield from pool.map(work, *pairs, chunksize=4)
 
 
-def header(width: int, outputs: tuple[str, ...] = OUTPUTS) -> str:
+def header(width, outputs=OUTPUTS):
     """Return the head of the table."""
     return f"{'fault':<{width}}  " + "  ".join(f"{o:>9}" for o in outputs) + "    sound  narrow"
 
 
-def line(cases: Sequence[Case], width: int, outputs: tuple[str, ...] = OUTPUTS) -> str:
+def line(cases, width, outputs=OUTPUTS):
     """Return the table's line of one fault: shares right, and naming a sound joint."""
     shares = [np.mean([case.judged[o].right for case in cases]) for o in outputs]
     sound = np.mean([any(one.sound for one in case.judged.values()) for case in cases])
     narrow = np.mean([any(one.narrow for one in case.judged.values()) for case in cases])
     fine = min(shares) >= RIGHT and sound <= SOUND
-    return (
-        f"{cases[0].fault:<{width}}  "
-        + "  ".join(f"{share:>9.0%}" for share in shares)
-        + f"  {sound:>7.0%} {narrow:>7.0%}  {'' if fine else 'FAILS'}"
-    )
+    row = "  ".join(f"{share:>9.0%}" for share in shares)
+    verdict = "" if fine else "FAILS"
+    return f"{cases[0].fault:<{width}}  {row}  {sound:>7.0%} {narrow:>7.0%}  {verdict}"
 
 
-def failures(cases: Sequence[Case]) -> Iterator[str]:
+def failures(cases):
     """Yield the failures, case by case."""
     for case in cases:
         for output, one in case.judged.items():
             if one.missing or one.sound:
                 why = [*one.missing, *(f"names {name}, which is sound" for name in one.sound)]
-                robot = case.robot
-                yield (
-                    f"{case.fault!r} seed {case.seed} ({robot.m} joints, {robot.channels}), "
-                    f"{output}: {'; '.join(why)}\n    said: {case.statements[output].text[:300]!r}"
-                )
+                robot, text = case.robot, case.statements[output].text[:300]
+                drawn = f"seed {case.seed} ({robot.m} joints, {robot.channels})"
+                yield f"{case.fault!r} {drawn}, {output}: {'; '.join(why)}\n    text: {text!r}"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments=None):
     """Run the zoo; return 0 if every fault meets the bar, else 1."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=100, help="seeds a fault")

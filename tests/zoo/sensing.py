@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .planting import GAIN, LAG, OFFSET, RESPONSE, fault, offset, onset, relative, single
+from .planting import GAIN, LAG, OFFSET, RESPONSE, fault, offset, onset, relative, single, spell
 from .robot import Change
 from .truth import PAUSED, Truth, either
 
@@ -10,8 +10,7 @@ from .truth import PAUSED, Truth, either
 @fault("inverted")
 def _(robot, rng, j):
     """The position is the mirror image of what it should be."""
-    about = robot.bias[j]
-    position = 2 * about - robot.moved(j)
+    position = 2 * robot.bias[j] - robot.moved(j)
     # Turned as a whole: its servo sees what it always saw, and so does its effort.
     wanted = robot.wanted(j) - robot.moved(j) + position
     kinds = either(robot.channels, "inverted", "inverted_sensor", cause="inverted")
@@ -87,10 +86,8 @@ def _(robot, rng, j):
 
 def _slip(robot, rng, j):
     since, acts = onset(robot, j, rng)
-    size = np.sign(rng.uniform(-1, 1)) * max(
-        abs(offset(robot, j, rng, 0.5, 0.3)), 0.35 * robot.amplitude[j]
-    )
-    return since, np.where(acts, size, 0.0)
+    side, least = np.sign(rng.uniform(-1, 1)), 0.35 * robot.amplitude[j]
+    return since, np.where(acts, side * max(abs(offset(robot, j, rng, 0.5, 0.3)), least), 0.0)
 
 
 def _slipped(change, name, kinds, since):
@@ -117,11 +114,8 @@ def _(robot, rng, j):
 @fault("sensor drifts")
 def _(robot, rng, j):
     """The mean of the position wanders."""
-    size = 2 * offset(robot, j, rng, 0.4)
-    drift = size * robot.t_s[:, j] / robot.duration_s
-    kinds = frozenset({"drifting_sensor"})
-    if not robot.channels.second:
-        kinds |= {"slipped", "slipped_sensor"}
+    drift = (2 * offset(robot, j, rng, 0.4)) * robot.t_s[:, j] / robot.duration_s
+    kinds = robot.channels.unless_second("slipped", "slipped_sensor") | {"drifting_sensor"}
     change = Change(j, reading=lambda read: read + drift)
     return single(change, {"drifting_sensor"}, kinds, stands_out=OFFSET, checked=False)
 
@@ -133,9 +127,7 @@ def _(robot, rng, j):
     starts = rng.uniform(0.05, 0.9, 4) * robot.duration_s
     acts = ((t[:, None] >= starts) & (t[:, None] < starts + 0.5)).any(axis=1)
     noise = max(20 * robot.sigma, 0.1) * rng.uniform(1, 3) * rng.normal(size=t.size) * acts
-    kinds = frozenset({"noisy_sensor"})
-    if not robot.channels.second:
-        kinds |= PAUSED
+    kinds = robot.channels.unless_second(*PAUSED) | {"noisy_sensor"}
     return single(Change(j, reading=lambda read: read + noise), {"noisy_sensor"}, kinds)
 
 
@@ -149,7 +141,5 @@ def _(robot, rng, j):
 @fault("one servo silent for a while")
 def _(robot, rng, j):
     """Samples of one joint are missing for seconds."""
-    start = float(rng.uniform(0.25, 0.5)) * robot.duration_s
-    t = robot.t_s[:, j]
-    lost = (t >= start) & (t < start + rng.uniform(0.15, 0.3) * robot.duration_s)
+    start, lost = spell(robot, j, rng, (0.25, 0.5), (0.15, 0.3))
     return single(Change(j, lost=lost), {"lost_samples"}, since_s=start, compared=False)

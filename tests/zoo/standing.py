@@ -9,7 +9,7 @@ from .truth import LOADED, PAUSED, STOPPED, Truth, standing
 
 def _jam(robot, rng, j, acts, since, *, exact=None):
     still = rng.random() < 0.5 if exact is None else exact
-    change = Change(j, position=hold(robot.moved(j), acts), exact=acts if still else None)
+    change = Change(j, position=hold(robot.moved(j), acts), exact=acts & still)
     return single(change, {"jammed", "stalled"}, standing(robot.channels, "pushing"), since_s=since)
 
 
@@ -55,7 +55,7 @@ def _(robot, rng, j):
     # The integral part of the loop has run to its limit: constant, whatever the command does.
     pull = rng.choice([-1, 1]) * robot.amplitude[j] * rng.uniform(2.0, 6.0)
     wanted = np.where(acts, position + pull, robot.wanted(j))
-    change = Change(j, position=position, wanted=wanted, exact=acts if rng.random() < 0.5 else None)
+    change = Change(j, position=position, wanted=wanted, exact=acts & (rng.random() < 0.5))
     return single(change, {"stalled"}, LOADED, since_s=since)
 
 
@@ -92,18 +92,15 @@ def _(robot, rng, j):
 def _(robot, rng, j):
     """The position repeats one value to the bit; all else goes on."""
     since, acts = onset(robot, j, rng)
-    kinds = standing(robot.channels, "sensor")
     change = Change(j, reading=lambda read: hold(read, acts))
-    return single(change, {"frozen_sensor"}, kinds, since_s=since)
+    return single(change, {"frozen_sensor"}, standing(robot.channels, "sensor"), since_s=since)
 
 
 @fault("sensor frozen from the beginning")
 def _(robot, rng, j):
     """The position is one value; all else is as usual."""
-    kinds = standing(robot.channels, "sensor")
-    return single(
-        Change(j, reading=lambda read: np.full_like(read, read[0])), {"frozen_sensor"}, kinds
-    )
+    change = Change(j, reading=lambda read: np.full_like(read, read[0]))
+    return single(change, {"frozen_sensor"}, standing(robot.channels, "sensor"))
 
 
 @fault("whole telemetry of a servo frozen half-way")
@@ -111,8 +108,8 @@ def _(robot, rng, j):
     """Position, velocity and effort of one servo each repeat one value."""
     since, acts = onset(robot, j, rng)
     # A constant effort is what a stall shows; a second sensor, of another make, goes on.
-    kinds = frozenset({"frozen_sensor", "stale_sensor", "lost_samples"})
-    kinds |= frozenset() if robot.channels.second else STOPPED
+    kinds = robot.channels.unless_second(*STOPPED)
+    kinds |= {"frozen_sensor", "stale_sensor", "lost_samples"}
     change = Change(j, telemetry=lambda one: hold(one, acts))
     return single(change, {"frozen_sensor", "stale_sensor"}, kinds, since_s=since)
 
@@ -127,8 +124,7 @@ def _(robot, rng, j):
     """The position stands still for a part of a cycle, again and again; the effort is zero then."""
     acts = bouts(robot, j, rng, 0.2)
     change = Change(j, position=hold(robot.moved(j), acts), power=np.where(acts, 0.0, 1.0))
-    kinds = again(standing(robot.channels, "dead"))
-    return single(change, {"intermittent", "dead"}, kinds)
+    return single(change, {"intermittent", "dead"}, again(standing(robot.channels, "dead")))
 
 
 @fault("sensor frozen at times, a fifth of the time")
@@ -166,10 +162,8 @@ def _(robot, rng, j):
     """Several positions stay at rest angles."""
     count = min(robot.m // 3, robot.m - 4)
     joints = sorted(rng.permutation(robot.m)[:count].tolist())
-    changes, truths = [], []
     acts = np.ones(len(robot.t_s), dtype=bool)
-    for one in joints:
-        made, truth = _dead(robot, one, acts, None, np.full(len(acts), robot.bias[one]))
-        changes += made
-        truths += truth.joints
-    return tuple(changes), Truth(tuple(truths))
+    rest = (np.full(len(acts), robot.bias[one]) for one in joints)
+    made = [_dead(robot, one, acts, None, at) for one, at in zip(joints, rest, strict=True)]
+    changes = tuple(change for (change,), _ in made)
+    return changes, Truth(tuple(one for _, truth in made for one in truth.joints))

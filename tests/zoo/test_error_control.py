@@ -16,7 +16,7 @@ def too_often(share, sessions, bar):
 
 
 @pytest.mark.slow
-def test_identical_joints_are_rarely_said_to_differ():
+def test_identical_joints_are_rarely_reported_to_differ():
     cells = answer_tables.identical(SESSIONS)
     print(cells)
     for cell, (any_of_them, broken, *_) in cells.items():
@@ -44,12 +44,8 @@ def test_half_widths_are_those_of_the_noise(noise):
     response = 0.4 * np.exp(-1j * np.arange(m))
     basis = np.linspace(-1, 1, m)[:, None] ** np.arange(3)
     carrier = 2 / t.size * np.exp(-1j * omega * t)
-    errors = np.array(
-        [
-            (answer_tables.noise_of(random, noise, m, t.size) @ carrier / response).real
-            for _ in range(400)
-        ]
-    )
+    drawn = (answer_tables.noise_of(random, noise, m, t.size) for _ in range(400))
+    errors = np.array([(one @ carrier / response).real for one in drawn])
     for joint in (0, 4):
         others = np.delete(np.arange(m), joint)
         predicted = errors[:, others] @ (basis[joint] @ np.linalg.pinv(basis[others]))

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import time
 from contextlib import closing
 
@@ -57,7 +58,7 @@ RUNS = [list(BUS)[:3], list(BUS)[3:]]
 
 
 class SnakeOfTheBus:
-    """What a judge has to know of a robot."""
+    """A robot as a judge takes it."""
 
     names = load_robot("snake25").joint_names
     omega = 2 * math.pi * FREQUENCY_HZ
@@ -132,28 +133,19 @@ def problems(path, healthy, truth):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("faults", RUNS, ids="; ".join)
-def test_faults_on_the_bus_are_named_by_every_output(
-    tmp_path, scenario, healthy_on_the_bus, faults
-):
+def test_faults_on_the_bus_are_named(tmp_path, scenario, healthy_on_the_bus, faults):
+    """By every output."""
     path = logged_on_the_bus(tmp_path, scenario, faults)
     place = SnakeOfTheBus.names.index
     with Session.open(path) as session:  # its clock starts before the robot's does
         sampled_ns = min(int(t_ns[0]) for t_ns in session.joints("/joint_states").t_ns)
         first_s = (sampled_ns - session.start_ns) * 1e-9
-    truth = Truth(
-        tuple(
-            JointTruth(
-                place(fault.split("@")[0].split(":")[1]),
-                kinds,
-                kinds,
-                since_s=None if since is None else first_s + since,
-                compared=kinds != {"lost_samples"},
-            )
-            for fault in faults
-            for kinds, since in [BUS[fault]]
-        )
-    )
-    wrong = problems(path, healthy_on_the_bus, truth)
+    truths = []
+    for fault in faults:
+        joint, (kinds, since) = place(re.split("[:@]", fault)[1]), BUS[fault]
+        times = {"since_s": None if since is None else first_s + since}
+        truths.append(JointTruth(joint, kinds, kinds, compared=kinds != {"lost_samples"}, **times))
+    wrong = problems(path, healthy_on_the_bus, Truth(tuple(truths)))
     assert not wrong, wrong
 
 

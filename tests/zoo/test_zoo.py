@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 from support.paths import DOCS
+from support.read_back import decoded_of
 from zoo.bags import write_bag
 from zoo.faults import FAULTS, plant
 from zoo.page import lines
@@ -18,24 +17,19 @@ SEED = 20250131
 
 @pytest.mark.parametrize("per_servo", [False, True])
 def test_bags_are_read_back_by_another_reader(tmp_path, per_servo):
-    robot = next(
-        robot
-        for seed in range(100)
-        if (robot := draw(seed, small=True, channels=Channels("true", effort=True, second=True)))
-        and robot.per_servo is per_servo
-    )
+    channels = Channels("true", effort=True, second=True)
+    robots = (draw(seed, small=True, channels=channels) for seed in range(100))
+    robot = next(robot for robot in robots if robot.per_servo is per_servo)
     log = record(robot, (), 7)
     seen = {}
-    with write_bag(log, tmp_path / "bag.mcap").open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for _, channel, message, state in reader.iter_decoded_messages():
-            stamp = state.header.stamp
-            assert stamp.sec * 10**9 + stamp.nanosec == message.log_time
-            for k, name in enumerate(state.name):
-                columns = seen.setdefault((channel.topic, name), ([], [], []))
-                columns[0].append(state.position[k])
-                columns[1].extend(state.velocity[k : k + 1])
-                columns[2].extend(state.effort[k : k + 1])
+    for topic, log_ns, state in decoded_of(write_bag(log, tmp_path / "bag.mcap")):
+        stamp = state.header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == log_ns
+        for k, name in enumerate(state.name):
+            columns = seen.setdefault((topic, name), ([], [], []))
+            columns[0].append(state.position[k])
+            columns[1].extend(state.velocity[k : k + 1])
+            columns[2].extend(state.effort[k : k + 1])
     for j, name in enumerate(robot.names):
         np.testing.assert_array_equal(seen["/joint_commands", name][0], robot.sent()[:, j])
         states = seen["/joint_states", name]
@@ -61,17 +55,13 @@ def test_a_fault_touches_no_joint_but_those_it_names(name):
 
 def test_a_healthy_robot_answers_as_drawn():
     """Gain and lag of each joint by least squares, by the seed's own numbers."""
-    robot = next(
-        robot
-        for seed in range(100)
-        if (robot := draw(seed, small=True)).start_s == 0 and robot.scatter[0] > 0
-    )
+    robots = (draw(seed, small=True) for seed in range(100))
+    robot = next(robot for robot in robots if robot.start_s == 0 and robot.scatter[0] > 0)
     log = record(robot, (), 3)
     for j in range(robot.m):
         angle = robot.omega * robot.t_s[:, j] + robot.phase[j]
-        model = np.stack(
-            [*(f(k * angle) for k in (1, 2) for f in (np.sin, np.cos)), np.ones(angle.size)], axis=1
-        )
+        waves = [f(k * angle) for k in (1, 2) for f in (np.sin, np.cos)]
+        model = np.stack([*waves, np.ones(angle.size)], axis=1)
         (sine, cosine, *_, bias), *_ = np.linalg.lstsq(model, log.position[:, j])
         response = complex(sine, cosine) / robot.amplitude[j]
         half, offset = robot.half(j)
@@ -81,8 +71,8 @@ def test_a_healthy_robot_answers_as_drawn():
 
 
 def test_the_manual_lists_the_kinds_of_every_fault():
-    page = DOCS / "faults.md"
-    assert "\n".join(lines()) in page.read_text(), "renew it: python -m zoo.page"
+    page = (DOCS / "faults.md").read_text()
+    assert "\n".join(lines()) in page, "renew it: python -m zoo.page"
 
 
 def verdict(cases):

@@ -4,11 +4,7 @@ The kinds follow from physics and from what is logged, never from what the code 
 ``docs/faults.md`` gives the same table with the reasons.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-
-from .robot import Channels
 
 STOPPED = frozenset({"jammed", "stalled", "dead", "at_limit"})
 """Mechanical reasons for a joint that stands still."""
@@ -59,7 +55,7 @@ class Truth:
     undecided: bool = False
 
 
-def standing(channels: Channels, cause: str) -> frozenset[str]:
+def standing(channels, cause):
     """Return kinds of a joint whose position stands still while its command moves.
 
     Args:
@@ -80,9 +76,7 @@ def standing(channels: Channels, cause: str) -> frozenset[str]:
     return STOPPED if channels.second else STOPPED | {"frozen_sensor"}
 
 
-def either(
-    channels: Channels, mechanics: str, sensor: str, *, cause: str, fast: bool = False
-) -> frozenset[str]:
+def either(channels, mechanics, sensor, *, cause, fast=False):
     """Return kinds of a fault that mechanics and sensor show alike, effort included.
 
     Args:

@@ -16,14 +16,7 @@ from undulog.capture import load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.bus.map_entry import BitField
 from undulog.capture.common.errors import DataError
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    REMOTE_FLAG,
-    empty_frames,
-)
+from undulog.capture.log.messages import frames as fr
 from undulog.capture.robot.bus_map import UNITS
 
 
@@ -34,8 +27,13 @@ def rng():
 
 def reference(signal, data):
     """Values as cantools decodes them, one message at a time."""
-    message = Message(1, "m", 8, [signal], strict=True)
-    return [float(message.decode(row.tobytes(), decode_choices=False)[signal.name]) for row in data]
+    message = Message(1, "m", data.shape[1], [signal], strict=True)
+    return [float(message.decode(row.tobytes(), decode_choices=False)["s"]) for row in data]
+
+
+def motorola(position):
+    """The top bit of a signal that is so far from the top of byte 0, in the numbers of a DBC."""
+    return 8 * (position // 8) + 7 - position % 8
 
 
 def layouts():
@@ -43,8 +41,7 @@ def layouts():
     for length in range(1, 65):
         for position in range(65 - length):
             yield "little_endian", position, length
-            # The top bit of a Motorola signal, counted from the top of byte 0, in DBC numbers.
-            yield "big_endian", 8 * (position // 8) + 7 - position % 8, length
+            yield "big_endian", motorola(position), length
 
 
 def test_integers_of_every_layout(rng):
@@ -68,16 +65,13 @@ def test_every_layout_in_the_64_bytes_of_can_fd(position, length, byte_order, ki
     if kind == "float":
         length = (16, 32, 64)[length % 3]
     position = min(position, 512 - length)
-    start = position
-    if byte_order == "big_endian":
-        start = 8 * (position // 8) + 7 - position % 8
+    start = motorola(position) if byte_order == "big_endian" else position
     conversion = BaseConversion.factory(scale=0.5, offset=-3, is_float=kind == "float")
     signal = Signal("s", start, length, byte_order, kind != "unsigned", conversion=conversion)
     data = np.random.default_rng(seed).integers(0, 256, (5, 64), dtype=np.uint8)
     data[0] = 255
-    message = Message(1, "m", 64, [signal], strict=True)
-    expected = [float(message.decode(row.tobytes(), decode_choices=False)["s"]) for row in data]
-    np.testing.assert_allclose(BitField.of(signal).values(data), expected, rtol=1e-15, atol=0)
+    found, expected = BitField.of(signal).values(data), reference(signal, data)
+    np.testing.assert_allclose(found, expected, rtol=1e-15, atol=0)
 
 
 @pytest.mark.parametrize("length", [16, 32, 64])
@@ -88,8 +82,8 @@ def test_floats_of_every_layout(byte_order, length, rng):
     for order, start, size in layouts():
         if (order, size) == (byte_order, length):
             signal = Signal("s", start, length, byte_order, True, conversion=conversion)
-            values = BitField.of(signal).values(data)
-            np.testing.assert_array_equal(values, reference(signal, data))
+            found, expected = BitField.of(signal).values(data), reference(signal, data)
+            np.testing.assert_array_equal(found, expected)
 
 
 @given(
@@ -148,8 +142,8 @@ def muxed():
     return bus_robot(MULTIPLEXED, SIGNALS)
 
 
-def some_frames(count, id_flags, dlc=8, way=DIR_RX):
-    frames = empty_frames(count)
+def some_frames(count, id_flags, dlc=8, way=fr.DIR_RX):
+    frames = fr.empty_frames(count)
     frames["t_host_ns"] = np.arange(count) * 1000 + 7
     frames["id_flags"], frames["dlc"], frames["dir"] = id_flags, dlc, way
     return frames
@@ -159,7 +153,7 @@ def some_frames(count, id_flags, dlc=8, way=DIR_RX):
 @given(seed=st.integers(0, 2**32 - 1))
 def test_nested_multiplexing(muxed, seed):
     rng = np.random.default_rng(seed)
-    frames = some_frames(200, 1024 | EXTENDED_FLAG)
+    frames = some_frames(200, 1024 | fr.EXTENDED_FLAG)
     frames["data"] = rng.integers(0, 256, (200, 8))
     frames["data"][:, 1] %= 11
     samples, tally = BusDecoder(muxed).decode(frames)
@@ -169,8 +163,7 @@ def test_nested_multiplexing(muxed, seed):
         try:
             decoded = database.decode_message("mux", frame["data"].tobytes())
         except DecodeError:  # a multiplexer value without signals; cantools then gives up on all
-            raw = frame["data"]
-            decoded = {"always": raw[7] * 0.5}
+            decoded = {"always": frame["data"][7] * 0.5}
         for name, value in decoded.items():
             expected.setdefault(name, {})[row] = value
     found = {sample.signals[0].signal: sample for sample in samples}
@@ -192,7 +185,7 @@ def test_frames_of_many_joints_and_sensors_at_once(seed):
     chosen = rng.choice(database.messages, 300)
     frames = some_frames(300, [message.frame_id for message in chosen])
     frames["dlc"] = [message.length for message in chosen]
-    frames["dir"] = [DIR_TX if way[message.name] == "tx" else DIR_RX for message in chosen]
+    frames["dir"] = [fr.DIR_TX if way[message.name] == "tx" else fr.DIR_RX for message in chosen]
     frames["data"] = rng.integers(0, 256, (300, 8))
     expected = {}
     for row, (message, frame) in enumerate(zip(chosen, frames, strict=True)):
@@ -224,17 +217,16 @@ def test_a_float_signal_of_a_database(muxed):
 
 
 def test_no_frame_goes_unaccounted_for(muxed):
-    frames = np.concatenate(
-        [
-            some_frames(2, 5, dlc=4),  # decoded
-            some_frames(3, 5, dlc=3),  # too short for its signal
-            some_frames(4, 5, way=DIR_TX),  # known, but nothing is mapped in that direction
-            some_frames(5, 5 | EXTENDED_FLAG),  # another identifier
-            some_frames(6, 0x7FF),
-            some_frames(7, 5 | REMOTE_FLAG),
-            some_frames(8, 0x80 | ERROR_FLAG),
-        ]
-    )
+    kinds = [
+        some_frames(2, 5, dlc=4),  # decoded
+        some_frames(3, 5, dlc=3),  # too short for its signal
+        some_frames(4, 5, way=fr.DIR_TX),  # known, but nothing is mapped in that direction
+        some_frames(5, 5 | fr.EXTENDED_FLAG),  # another identifier
+        some_frames(6, 0x7FF),
+        some_frames(7, 5 | fr.REMOTE_FLAG),
+        some_frames(8, 0x80 | fr.ERROR_FLAG),
+    ]
+    frames = np.concatenate(kinds)
     samples, tally = BusDecoder(muxed).decode(frames)
     assert sum(len(sample.rows) for sample in samples) == 2
     assert tally.problems() == [
@@ -252,7 +244,7 @@ def test_no_frame_goes_unaccounted_for(muxed):
 
 
 def test_a_frame_too_short_for_its_multiplexer_is_counted(muxed):
-    samples, tally = BusDecoder(muxed).decode(some_frames(1, 1024 | EXTENDED_FLAG, dlc=0))
+    samples, tally = BusDecoder(muxed).decode(some_frames(1, 1024 | fr.EXTENDED_FLAG, dlc=0))
     assert samples == ()
     assert set(tally.short) == {"mux.one", "mux.two", "mux.three", "mux.always"}
 
@@ -260,33 +252,24 @@ def test_a_frame_too_short_for_its_multiplexer_is_counted(muxed):
 def test_the_direction_tells_a_request_from_its_reply():
     decoder = BusDecoder(load_robot("arcsnake-joint"))
     frames = some_frames(5, 0x14B)
-    frames["data"] = [
-        list(bytes.fromhex(text))
-        for text in (
-            "A40076023FCCFFFF",  # command, 630 deg/s, -13249 * 0.01 deg
-            "A417FEFF0000C7A1",  # its reply: 23 degC, -2 * 33/2048 A, 0 deg/s
-            "9200000000000000",  # asks for the position: no position of 0
-            "923ECCFFFFFFFFFF",  # its reply: -13250 * 0.01 deg
-            "9C1721007E00F355",  # motor state: 126 deg/s
-        )
-    ]
-    frames["dir"] = [DIR_TX, DIR_RX, DIR_TX, DIR_RX, DIR_RX]
+    texts = (
+        "A40076023FCCFFFF",  # command, 630 deg/s, -13249 * 0.01 deg
+        "A417FEFF0000C7A1",  # its reply: 23 degC, -2 * 33/2048 A, 0 deg/s
+        "9200000000000000",  # asks for the position: no position of 0
+        "923ECCFFFFFFFFFF",  # its reply: -13250 * 0.01 deg
+        "9C1721007E00F355",  # motor state: 126 deg/s
+    )
+    frames["data"] = [list(bytes.fromhex(text)) for text in texts]
+    frames["dir"] = [fr.DIR_TX, fr.DIR_RX, fr.DIR_TX, fr.DIR_RX, fr.DIR_RX]
     samples, tally = decoder.decode(frames)
-    found = {
-        sample.signals[0].quantity: (sample.rows.tolist(), sample.values) for sample in samples
+    found = {s.signals[0].quantity: (s.rows.tolist(), s.values.tolist()) for s in samples}
+    assert found == {
+        "command": ([0], pytest.approx([math.radians(-132.49)], rel=1e-15)),
+        "position": ([3], pytest.approx([math.radians(-132.50)], rel=1e-15)),
+        "velocity": ([1, 4], pytest.approx([0, math.radians(126)], rel=1e-15)),
+        "current": ([1, 4], [-2 * 33 / 2048, 33 * 33 / 2048]),
+        "temperature": ([1, 4], [23, 23]),
     }
-    assert {quantity: rows for quantity, (rows, _) in found.items()} == {
-        "command": [0],
-        "position": [3],
-        "velocity": [1, 4],
-        "current": [1, 4],
-        "temperature": [1, 4],
-    }
-    assert found["command"][1] == pytest.approx(math.radians(-132.49), rel=1e-15)
-    assert found["position"][1] == pytest.approx(math.radians(-132.50), rel=1e-15)
-    assert found["velocity"][1] == pytest.approx([0, math.radians(126)], rel=1e-15)
-    assert found["current"][1].tolist() == [-2 * 33 / 2048, 33 * 33 / 2048]
-    assert found["temperature"][1].tolist() == [23, 23]
     assert dict(tally.silent) == {"14B": 1}
 
 
@@ -294,12 +277,8 @@ def test_without_directions_shared_identifiers_are_not_guessed():
     frames = some_frames(2, 0x14B)
     samples, tally = BusDecoder(load_robot("arcsnake-joint"), directions=False).decode(frames)
     assert samples == ()
-    assert tally.problems() == [
-        (
-            "2 frames not decoded: they differ only in direction, which the log does not have: "
-            "14B (2)"
-        )
-    ]
+    cause = "they differ only in direction, which the log does not have"
+    assert tally.problems() == [f"2 frames not decoded: {cause}: 14B (2)"]
 
 
 def test_without_directions_an_identifier_of_one_direction_is_decoded():

@@ -1,66 +1,57 @@
 """The commands import and log export, as the command line calls them."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import pytest
 
-import undulog
+from support.processes import UNDULOG, start, wait_for
 from undulog.capture import Session
 
 LOG = "".join(f"(100.{i:06d}) can0 {0x101 + i % 2:03X}#{i:02X}00 T\n" for i in range(10))
 
 
 @pytest.fixture
-def trace(tmp_path: Path):
-    path = tmp_path / "trace.log"
-    path.write_text(LOG)
-    return path
+def trace(tmp_path):
+    (tmp_path / "trace.log").write_text(LOG)
+    return tmp_path / "trace.log"
 
 
 @pytest.fixture
-def cli(trace, capsys):
-    """Runs a line with {log} and {dir}; returns exit code, output and errors."""
+def cli(trace, command):
+    """Runs a line with {log} and {dir} to its exit code; returns output and errors."""
 
-    def run(line):
-        words = [word.format(log=trace, dir=trace.parent) for word in line.split()]
-        code = undulog.run(words)
-        return code, *capsys.readouterr()
+    def run(line, code=0):
+        words = (word.format(log=trace, dir=trace.parent) for word in line.split())
+        return command(*words, code=code)
 
     return run
 
 
-def test_there_and_back(cli, tmp_path: Path):
+def test_there_and_back(cli, tmp_path):
     run, back = tmp_path / "run.mcap", tmp_path / "back.log"
-    code, out, _ = cli("import {log} -o {dir}/run.mcap --robot snake25")
-    lines = out.splitlines()
-    assert (code, lines[0]) == (0, f"{run}: 0.0 s of snake25, 10 CAN frames, verdict good")
+    lines = cli("import {log} -o {dir}/run.mcap --robot snake25").out.splitlines()
+    assert lines[0] == f"{run}: 0.0 s of snake25, 10 CAN frames, verdict good"
     assert "  /joint_commands        5 messages" in lines
-    code, out, _ = cli("log export {dir}/run.mcap -o {dir}/back.log")
-    assert (code, out) == (0, f"{back}: 10 frames of can0, in the format of candump -L\n")
+    done = f"{back}: 10 frames of can0, in the format of candump -L\n"
+    assert cli("log export {dir}/run.mcap -o {dir}/back.log").out == done
     assert back.read_text() == LOG
-    _, out, _ = cli("import {log} -o {dir}/run.mcap --robot snake25 --force --json")
-    report = json.loads(out)
+    report = json.loads(cli("import {log} -o {dir}/run.mcap -r snake25 --force --json").out)
     assert (report["frames"], report["verdict"], report["robot"]) == (10, "good", "snake25")
     assert report["messages"]["/joint_commands"] == 5
-    _, out, _ = cli("log export {dir}/run.mcap -o {dir}/back.log --force --json")
+    report = json.loads(cli("log export {dir}/run.mcap -o {dir}/back.log --force --json").out)
     paths = {"source": str(run), "output": str(back)}
-    assert json.loads(out) == {**paths, "frames": 10, "buses": {"can0": 10}, "warnings": []}
+    assert report == {**paths, "frames": 10, "buses": {"can0": 10}, "warnings": []}
 
 
-def test_a_csv_by_options_and_by_file(cli, tmp_path: Path):
+def test_a_csv_by_options_and_by_file(cli, tmp_path):
     (tmp_path / "joint.csv").write_text("time,angle\n0,170\n1,-170\n")
     common = "import {dir}/joint.csv --robot snake13"
     options = "--map time=time:s --map angle=joint01.position:deg,wrap=360"
-    assert cli(f"{common} -o {{dir}}/a.mcap {options}")[0] == 0
+    cli(f"{common} -o {{dir}}/a.mcap {options}")
     with Session.open(tmp_path / "a.mcap") as session:
         (tmp_path / "map.toml").write_bytes(session.attachments["columns.toml"])
-    assert cli(common + " -o {dir}/b.mcap --columns {dir}/map.toml")[0] == 0
+    cli(common + " -o {dir}/b.mcap --columns {dir}/map.toml")
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
@@ -77,22 +68,21 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("code", "line", "message"), WRONG)
-def test_what_is_wrong_is_reported(code, line, message, cli, tmp_path: Path):
+def test_what_is_wrong_is_reported(code, line, message, cli, tmp_path):
     (tmp_path / "a.csv").write_text("t,a\n0,1\n")
     (tmp_path / "bad.log").write_text("no log\n")
-    found, out, err = cli(f"import {line}")
-    assert (found, out) == (code, "")
+    out, err = cli(f"import {line}", code)
+    assert out == ""
     assert message in err
     assert not (tmp_path / "x.mcap").exists()
 
 
 def test_an_output_is_kept_without_force(cli):
     line = "import {log} -o {dir}/run.mcap --robot snake25"
-    assert cli(line)[0] == 0
-    code, _, err = cli(line)
-    assert code == 2
-    assert "run.mcap exists already; choose another name or give --force" in err
-    assert cli(f"{line} --force")[0] == 0
+    cli(line)
+    refused = "run.mcap exists already; choose another name or give --force"
+    assert refused in cli(line, 2).err
+    cli(f"{line} --force")
 
 
 @pytest.mark.parametrize(
@@ -103,37 +93,26 @@ def test_an_output_is_kept_without_force(cli):
         (1, "{dir}/csv.mcap -o x.log", "has no raw CAN frames; it has /joint_states"),
     ],
 )
-def test_what_export_cannot_do_is_reported(code, line, message, cli, tmp_path: Path):
+def test_what_export_cannot_do_is_reported(code, line, message, cli, tmp_path):
     (tmp_path / "a.csv").write_text("t,a\n0,1\n")
     columns = "--map t=time:s --map a=joint01.position:rad"
     cli("import {log} -o {dir}/run.mcap --robot snake25")
     cli("import {dir}/a.csv -o {dir}/csv.mcap --robot snake13 " + columns)
-    found, _, err = cli(f"log export {line}")
-    assert found == code
-    assert message in err
-
-
-def test_help_shows_an_example(capsys):
-    for verb in (["import"], ["log", "export"]):
-        undulog.run([*verb, "--help"])
-        assert f"Example: undulog {' '.join(verb)}" in capsys.readouterr().out
+    assert message in cli(f"log export {line}", code).err
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_leaves_a_whole_file(number, tmp_path: Path):
+def test_a_signal_leaves_a_whole_file(number, tmp_path):
     trace, run = tmp_path / "trace.log", tmp_path / "run.mcap"
-    with trace.open("w") as stream:
-        for i in range(1_500_000):
-            stream.write(f"({100 + i // 1000}.{i % 1000 * 1000:06d}) can0 101#0000 T\n")
-    arguments = ["import", str(trace), "-o", str(run), "--robot", "snake25"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "undulog", *arguments], stdout=subprocess.PIPE, text=True
+    lines = (
+        f"({100 + i // 1000}.{i % 1000 * 1000:06d}) can0 101#0000 T\n" for i in range(1_500_000)
     )
+    trace.write_text("".join(lines))
+    process = start(*UNDULOG, "import", trace, "-o", run, "--robot", "snake25")
     part = tmp_path / "run.mcap.part"
-    while process.poll() is None and not (part.exists() and part.stat().st_size > 1_000_000):
-        time.sleep(0.05)
-    os.kill(process.pid, number)
+    wait_for(lambda: part.exists() and part.stat().st_size > 1_000_000, alive=[process])
+    process.send_signal(number)
     out, _ = process.communicate()
     assert process.returncode == 1
     assert "stopped on request; the file is complete up to there" in out

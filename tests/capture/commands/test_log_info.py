@@ -2,13 +2,10 @@
 
 import itertools
 import json
-from pathlib import Path
 
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
-
-import undulog
 
 T0 = 1_700_000_000_000_000_000
 STEP = 100_000_000
@@ -17,8 +14,7 @@ HUMBLE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def std_string(store, serialize):
-    kind = store.types["std_msgs/msg/String"]
-    return bytes(serialize(kind(data="walk"), "std_msgs/msg/String"))
+    return bytes(serialize(store.types["std_msgs/msg/String"](data="walk"), "std_msgs/msg/String"))
 
 
 ROS1_TEXT, ROS1_SUM = NOETIC.generate_msgdef("std_msgs/msg/String")
@@ -67,13 +63,16 @@ def make(path, channels=CHANNELS, count=20, library="foreign 1.0", **options):
     return path
 
 
-def described(path, capsys):
-    """The object, and the text."""
-    assert undulog.run(["log", "info", str(path), "--json"]) == 0
-    captured = capsys.readouterr()
-    assert captured.err == ""
-    assert undulog.run(["log", "info", str(path)]) == 0
-    return json.loads(captured.out), capsys.readouterr().out
+@pytest.fixture
+def described(command):
+    """The object, and the text, of a file."""
+
+    def run(path):
+        out, err = command("log", "info", path, "--json")
+        assert err == ""
+        return json.loads(out), command("log", "info", path).out
+
+    return run
 
 
 NO_SUMMARY = {
@@ -100,24 +99,24 @@ MAKES = {
 
 
 @pytest.mark.parametrize("options", MAKES.values(), ids=MAKES)
-def test_files_of_other_makes(options, tmp_path: Path, capsys):
-    facts, text = described(make(tmp_path / "x.mcap", **options), capsys)
+def test_files_of_other_makes(options, tmp_path, described):
+    facts, text = described(make(tmp_path / "x.mcap", **options))
     topics = {topic["topic"]: topic for topic in facts["topics"]}
     # A channel without messages stands in no chunk's index; only a summary or a look inside has it.
     assert topics.keys() == CHANNELS.keys()
     for topic, (encoding, schema, message) in CHANNELS.items():
         found = topics[topic]
-        assert found["messages"] == (20 if message is not None else 0)
-        assert found["type"] == (schema[0] if schema else "")
-        assert (found["encoding"], found["schema"]) == (
-            encoding or None,
-            (schema[1] or None) if schema else None,
-        )
-        assert found["read"] == (topic not in FOREIGN)
+        assert found == found | {
+            "messages": 20 if message is not None else 0,
+            "type": schema[0] if schema else "",
+            "encoding": encoding or None,
+            "schema": (schema[1] or None) if schema else None,
+            "read": topic not in FOREIGN,
+        }
     session = facts["session"]
-    assert (session["start_ns"], session["start_utc"]) == (T0, "2023-11-14 22:13:20 UTC")
+    assert (session["start_ns"], session["library"]) == (T0, "foreign 1.0")
+    assert session["start_utc"] == "2023-11-14 22:13:20 UTC"
     assert session["duration_s"] == pytest.approx(1.9)
-    assert session["library"] == "foreign 1.0"
     lines = text.splitlines()
     assert lines[0].startswith("x: no robot, 1.90 s from 2023-11-14 22:13:20 UTC, 220 messages, ")
     assert (
@@ -128,33 +127,33 @@ def test_files_of_other_makes(options, tmp_path: Path, capsys):
     assert any("(json, no schema)" in line for line in lines)
 
 
-def test_a_file_without_messages_has_no_start(tmp_path: Path, capsys):
-    facts, text = described(make(tmp_path / "x.mcap", count=0), capsys)
+def test_a_file_without_messages_has_no_start(tmp_path, described):
+    facts, text = described(make(tmp_path / "x.mcap", count=0))
     assert (facts["session"]["start_ns"], facts["session"]["start_utc"]) == (None, None)
     assert text.startswith("x: no robot, no messages, ")
     assert "1970" not in text
 
 
-def test_a_file_of_one_message_and_an_unnamed_writer(tmp_path: Path, capsys):
+def test_a_file_of_one_message_and_an_unnamed_writer(tmp_path, described):
     channels = {"/schemaless": CHANNELS["/schemaless"]}
-    facts, text = described(make(tmp_path / "x.mcap", channels, count=1, library=""), capsys)
+    facts, text = described(make(tmp_path / "x.mcap", channels, count=1, library=""))
     assert facts["topics"][0]["rate_hz"] is None
     assert "1 topic is not of ROS 2" in text
     assert "written by an unnamed program" in text
 
 
 @pytest.mark.parametrize("options", [{}, {"use_chunking": False}, NO_SUMMARY])
-def test_a_cut_file_says_so(options, tmp_path: Path, capsys):
+def test_a_cut_file_says_so(options, tmp_path, described):
     path = make(tmp_path / "x.mcap", chunk_size=500, **options)
     whole = path.read_bytes()
     for cut in (len(whole) - 20, len(whole) * 3 // 4, len(whole) // 2):
         path.write_bytes(whole[:cut])
-        facts, text = described(path, capsys)
+        facts, text = described(path)
         assert any("cut short" in warning for warning in facts["warnings"])
         assert "warning: the file is cut short" in text
 
 
-def test_two_channels_of_one_topic(tmp_path: Path, capsys):
+def test_two_channels_of_one_topic(tmp_path, described):
     """Several publishers, and two types: the first is counted, the other reported."""
     path = tmp_path / "x.mcap"
     with path.open("wb") as stream:
@@ -168,6 +167,6 @@ def test_two_channels_of_one_topic(tmp_path: Path, capsys):
         for i, channel in itertools.product(range(5), ids):
             writer.add_message(channel, T0 + i, b"{}", T0 + i)
         writer.finish()
-    facts, _ = described(path, capsys)
+    facts, _ = described(path)
     assert [(t["type"], t["messages"]) for t in facts["topics"]] == [("a", 10)]
     assert facts["warnings"] == ["/x has several types, a, b: a is read"]

@@ -1,14 +1,10 @@
 """Real signals to a real process: the file is whole, the second signal kills."""
 
-from __future__ import annotations
-
 import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
+from support.processes import python_started
 from undulog.capture import Session
 
 RECORDER = """
@@ -29,17 +25,10 @@ print(tick, flush=True)
 """
 
 
-def started(code, *arguments):
-    command = [sys.executable, "-c", code, *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_a_signal_ends_between_samples_and_leaves_a_whole_file(
-    tmp_path: Path, number: signal.Signals
-) -> None:
+def test_a_signal_ends_between_samples_and_leaves_a_whole_file(tmp_path, number):
     path = tmp_path / "s.mcap"
-    process = started(RECORDER, path)
+    process = python_started(RECORDER, path)
     assert process.stdout.readline() == "recording\n"
     process.send_signal(number)
     ticks = int(process.communicate(timeout=30)[0])
@@ -49,7 +38,7 @@ def test_a_signal_ends_between_samples_and_leaves_a_whole_file(
         assert session.joints("/joint_states").values[0].tolist() == list(range(ticks))
 
 
-def test_the_second_signal_acts_as_usual() -> None:
+def test_the_second_signal_acts_as_usual():
     code = (
         "import time; from undulog.capture.common.process import interruptible\n"
         "with interruptible() as stop:\n"
@@ -58,7 +47,7 @@ def test_the_second_signal_acts_as_usual() -> None:
         "    print('asked', flush=True)\n"
         "    time.sleep(60)\n"
     )
-    process = started(code)
+    process = python_started(code)
     assert process.stdout.readline() == "in\n"
     process.send_signal(signal.SIGTERM)
     assert process.stdout.readline() == "asked\n"

@@ -2,7 +2,6 @@
 
 import threading
 import time
-from pathlib import Path
 
 import can
 import cantools
@@ -11,12 +10,10 @@ import pytest
 from can.util import CAN_FD_DLC
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
-import undulog
 from support.bus_robots import bus_robot
-from support.written_frames import T0, every_kind, imported, write_frames
+from support.read_back import decoded_of
+from support.written_frames import T0, every_kind, frames_of, imported, log_messages, write_frames
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError
 from undulog.capture.common.process import StopRequest
@@ -24,17 +21,7 @@ from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.export import export_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 from undulog.capture.log.health.session_check import check_session
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    FD_FRAME_LAYOUT,
-    REMOTE_FLAG,
-    empty_fd_frames,
-    empty_frames,
-)
+from undulog.capture.log.messages import frames as fr
 from undulog.capture.recorder.loop import Ending, Recorder
 from undulog.capture.recorder.status import SessionClock
 from undulog.capture.sources.contract import SourceContext, open_source, parse_address
@@ -45,7 +32,7 @@ FIELDS = ("t_host_ns", "id_flags", "len", "dir", "fd_flags", "data")
 
 
 def classic_frames(count, start_ns, step_ns):
-    frames = empty_frames(count)
+    frames = fr.empty_frames(count)
     frames["t_host_ns"] = start_ns + step_ns * np.arange(count)
     frames["id_flags"], frames["dlc"] = np.arange(count) % 0x800, 8
     frames["data"] = np.random.default_rng(1).integers(0, 256, (count, 8))
@@ -65,7 +52,7 @@ def same(found, expected, fields=FIELDS):
 def test_what_is_written_is_read_the_same(data, tmp_path_factory):
     sizes = data.draw(st.lists(st.integers(1, 9), min_size=1, max_size=6))
     raw = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
-    frames = np.frombuffer(raw.bytes(sum(sizes) * 88), empty_fd_frames(0).dtype)
+    frames = np.frombuffer(raw.bytes(sum(sizes) * 88), fr.empty_fd_frames(0).dtype)
     path = tmp_path_factory.mktemp("fd") / "x.mcap"
     with SessionWriter(path, session_id="s", epoch_ns=T0) as writer:
         channel = writer.fd_frames("/can_fd/can0")
@@ -78,15 +65,13 @@ def test_what_is_written_is_read_the_same(data, tmp_path_factory):
         assert window.tobytes() == frames[ends[0] : ends[0] + [*sizes, 0][1]].tobytes()
 
 
-def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path: Path):
+def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path):
     frames = every_kind(fd=True)[:5]
-    path = write_frames(tmp_path / "x.mcap", {"/can_fd/can0": frames})
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        ((_, channel, _, message),) = reader.iter_decoded_messages()
+    path = write_frames(tmp_path / "x.mcap", {FD: frames})
+    ((topic, _, message),) = decoded_of(path)
     frame, record = message.layout.dim
-    assert (channel.topic, frame.label, frame.size) == ("/can_fd/can0", "frame", 5)
-    assert (record.label, record.size) == (FD_FRAME_LAYOUT, 88)
+    assert (topic, frame.label, frame.size) == ("/can_fd/can0", "frame", 5)
+    assert (record.label, record.size) == (fr.FD_FRAME_LAYOUT, 88)
     # The label, taken by its word, is the layout.
     at, offsets = 0, {}
     for part in record.label.split(","):
@@ -103,7 +88,7 @@ def test_a_foreign_reader_finds_the_record_by_its_label(tmp_path: Path):
         assert row[offsets["data"] :] == expected["data"].tobytes()
 
 
-def test_the_kinds_are_not_mixed_up(tmp_path: Path):
+def test_the_kinds_are_not_mixed_up(tmp_path):
     # 4 CAN FD frames have as many bytes as 11 classic ones: the label tells them apart.
     topics = {"/can_fd/can0": every_kind(fd=True)[:4], "/can/can0_fd": classic_frames(11, T0, 1000)}
     path = write_frames(tmp_path / "x.mcap", topics)
@@ -115,34 +100,31 @@ def test_the_kinds_are_not_mixed_up(tmp_path: Path):
         assert len(session.frames("/can/can0_fd")) == 11
     with SessionWriter(tmp_path / "y.mcap", session_id="s", epoch_ns=T0) as writer:
         with pytest.raises(DataError, match="frames have the layout"):
-            writer.fd_frames("/can_fd/can0").write(T0, empty_frames(1))
+            writer.fd_frames("/can_fd/can0").write(T0, fr.empty_frames(1))
         with pytest.raises(DataError, match="frames have the layout"):
-            writer.frames("/can/can0").write(T0, empty_fd_frames(1))
+            writer.frames("/can/can0").write(T0, fr.empty_fd_frames(1))
 
 
-def test_the_check_counts_them(tmp_path: Path, capsys):
+def test_the_check_counts_them(tmp_path, command):
     # The classic frames pause for 3 s in which CAN FD frames come: the bus isn't silent.
     classic = classic_frames(200, T0, 10_000_000)
     classic["t_host_ns"][100:] += 3 * S
     fd = every_kind(fd=True, step_ns=10_000_000)
     path = write_frames(tmp_path / "x.mcap", {"/can/can0": classic, "/can_fd/can0": fd})
     health = check_session(path)
-    assert {bus.topic: bus.frames for bus in health.buses} == {
-        "/can/can0": 200,
-        "/can_fd/can0": len(fd),
-    }
-    rate = {bus.topic: bus.rate_hz for bus in health.buses}
-    assert rate["/can_fd/can0"] == pytest.approx(100)
-    assert not [finding for finding in health.findings if "silent" in finding.sentence]
-    assert not [finding for finding in health.findings if "can't be read" in finding.sentence]
+    found = {bus.topic: (bus.frames, bus.rate_hz) for bus in health.buses}
+    assert found.keys() == {"/can/can0", FD}
+    assert (found["/can/can0"][0], found[FD]) == (200, (len(fd), pytest.approx(100)))
+    text = " ".join(finding.sentence for finding in health.findings)
+    assert "silent" not in text
+    assert "can't be read" not in text
     alone = write_frames(tmp_path / "y.mcap", {"/can/can0": classic, "/can_fd/can1": fd})
     sentences = [finding.sentence for finding in check_session(alone).findings]
     (silence,) = (sentence for sentence in sentences if "silent" in sentence)
     assert silence.startswith("/can/can0: silent for 3.01 s, at ")
-    undulog.run(["log", "info", str(path)])
-    assert f"  {len(fd)} frames\n" in capsys.readouterr().out
-    undulog.run(["log", "check", str(path)])
-    assert f"/can_fd/can0: {len(fd)} frames, 100.0 Hz, 0 error frames" in capsys.readouterr().out
+    assert f"  {len(fd)} frames\n" in command("log", "info", path).out
+    checked = command("log", "check", path).out
+    assert f"/can_fd/can0: {len(fd)} frames, 100.0 Hz, 0 error frames" in checked
 
 
 # -- other tools ---------------------------------------------------------------------------
@@ -156,7 +138,7 @@ def session_of_every_kind(tmp_path_factory):
 
 
 @pytest.mark.parametrize("suffix", [".log", ".blf", ".asc"])
-def test_frames_of_every_kind_come_back(suffix, session_of_every_kind, tmp_path: Path):
+def test_frames_of_every_kind_come_back(suffix, session_of_every_kind, tmp_path):
     source, frames = session_of_every_kind
     report = export_log(source, tmp_path / f"x{suffix}")
     assert (report.buses, report.warnings) == ({"can0": len(frames)}, [])
@@ -187,20 +169,13 @@ def some_messages(channel=0):
 
 
 @pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".asc.gz"])
-def test_logs_of_python_can(suffix, tmp_path: Path):
+def test_logs_of_python_can(suffix, tmp_path):
     messages = some_messages()
-    source = tmp_path / f"log{suffix}"
-    with can.Logger(str(source)) as writer:
-        for message in messages:
-            writer(message)
-    report, frames = imported(source, tmp_path, FD)
+    report, frames = imported(log_messages(tmp_path / f"log{suffix}", messages), tmp_path, FD)
     fd = [message for message in messages if message.is_fd]
-    assert (report.frames, report.problems) == (
-        len(messages),
-        ["nothing decoded: the robot snake13 has no bus map"],
-    )
-    with Session.open(tmp_path / "back.mcap") as session:
-        assert len(session.frames("/can/can0")) == len(messages) - len(fd)
+    assert report.frames == len(messages)
+    assert report.problems == ["nothing decoded: the robot snake13 has no bus map"]
+    assert len(frames_of(report.output)) == len(messages) - len(fd)
     start_ns = T0 - RELATIVE_EPOCH_NS if ".asc" in suffix else 0
     expected = records_of(fd)
     expected["t_host_ns"] -= np.uint64(start_ns)
@@ -208,32 +183,29 @@ def test_logs_of_python_can(suffix, tmp_path: Path):
 
 
 def records_of(messages):
-    frames = empty_fd_frames(len(messages))
+    frames = fr.empty_fd_frames(len(messages))
     for frame, message in zip(frames, messages, strict=True):
         frame["t_host_ns"] = round(message.timestamp * 1e6) * 1000
         frame["id_flags"] = message.arbitration_id
-        frame["id_flags"] |= EXTENDED_FLAG if message.is_extended_id else 0
-        frame["len"], frame["dir"] = len(message.data), DIR_RX if message.is_rx else DIR_TX
-        frame["fd_flags"] |= FD_BRS if message.bitrate_switch else 0
-        frame["fd_flags"] |= FD_ESI if message.error_state_indicator else 0
+        frame["id_flags"] |= fr.EXTENDED_FLAG if message.is_extended_id else 0
+        frame["len"], frame["dir"] = len(message.data), fr.DIR_RX if message.is_rx else fr.DIR_TX
+        frame["fd_flags"] |= fr.FD_BRS if message.bitrate_switch else 0
+        frame["fd_flags"] |= fr.FD_ESI if message.error_state_indicator else 0
         frame["data"][: len(message.data)] = list(message.data)
     return frames
 
 
-def test_an_mf4_of_python_can(tmp_path: Path):
+def test_an_mf4_of_python_can(tmp_path):
     pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
     messages = some_messages()
-    with can.MF4Writer(tmp_path / "x.mf4") as writer:
-        for message in messages:
-            writer(message)
+    log_messages(tmp_path / "x.mf4", messages)
     report, frames = imported(tmp_path / "x.mf4", tmp_path, FD)
     fd = [message for message in messages if message.is_fd]
     assert report.frames == len(messages)
     same(frames, records_of(fd), [name for name in FIELDS if name != "t_host_ns"])
     truth_ns = [round(message.timestamp * 1e6) * 1000 for message in fd]
     assert np.abs(frames["t_host_ns"].astype(np.int64) - truth_ns).max() <= 1000
-    with Session.open(tmp_path / "back.mcap") as session:
-        classic = session.frames("/can/can0")
+    classic = frames_of(report.output)
     others = [message for message in messages if not message.is_fd]
     assert classic["dlc"].tolist() == [message.dlc for message in others]
     assert [bytes(f["data"][: f["dlc"]]) for f in classic] == [bytes(m.data) for m in others]
@@ -250,25 +222,23 @@ TRC = """;$FILEVERSION=2.1
 """
 
 
-def test_a_trc_of_version_2(tmp_path: Path):
-    data = " ".join(f"{k:02X}" for k in range(64))
-    (tmp_path / "x.trc").write_text(TRC.format(data))
+def test_a_trc_of_version_2(tmp_path):
+    (tmp_path / "x.trc").write_text(TRC.format(" ".join(f"{k:02X}" for k in range(64))))
     report, frames = imported(tmp_path / "x.trc", tmp_path, "/can_fd/can1")
     assert report.frames == 5
-    assert frames["id_flags"].tolist() == [0x300, 0x400, 0x18FEF100 | EXTENDED_FLAG, 0x500]
+    assert frames["id_flags"].tolist() == [0x300, 0x400, 0x18FEF100 | fr.EXTENDED_FLAG, 0x500]
     assert frames["len"].tolist() == [8, 12, 64, 0]
-    assert frames["fd_flags"].tolist() == [0, FD_BRS, FD_BRS | FD_ESI, FD_ESI]
-    assert frames["dir"].tolist() == [DIR_RX, DIR_TX, DIR_RX, DIR_RX]
+    assert frames["fd_flags"].tolist() == [0, fr.FD_BRS, fr.FD_BRS | fr.FD_ESI, fr.FD_ESI]
+    assert frames["dir"].tolist() == [fr.DIR_RX, fr.DIR_TX, fr.DIR_RX, fr.DIR_RX]
     assert frames["data"][2].tolist() == list(range(64))
     assert frames["data"][1].tolist() == [0] * 11 + [12] + [0] * 52
 
 
-def test_a_csv_shows_can_fd_by_the_length_alone(tmp_path: Path):
-    with can.Logger(str(tmp_path / "x.csv")) as writer:
-        for message in some_messages():
-            writer(message)
+def test_a_csv_shows_can_fd_by_the_length_alone(tmp_path):
+    messages = some_messages()
+    log_messages(tmp_path / "x.csv", messages)
     report, frames = imported(tmp_path / "x.csv", tmp_path, FD)
-    long = [message for message in some_messages() if len(message.data) > 8]
+    long = [message for message in messages if len(message.data) > 8]
     assert report.problems[0] == (
         f"{len(long)} frames of more than 8 bytes are CAN FD frames; the log does not mark them, "
         "and shorter ones count as classic"
@@ -277,7 +247,7 @@ def test_a_csv_shows_can_fd_by_the_length_alone(tmp_path: Path):
     assert found == [bytes(message.data) for message in long]
 
 
-def test_a_candump_log_of_both_kinds_comes_back_bit_for_bit(tmp_path: Path):
+def test_a_candump_log_of_both_kinds_comes_back_bit_for_bit(tmp_path):
     rng = np.random.default_rng(9)
     text = "".join(
         f"(1717639553.{i:06d}) {'vcan1' if i % 7 == 0 else 'can0'} {i % 0x800:03X}"
@@ -295,11 +265,10 @@ def test_a_candump_log_of_both_kinds_comes_back_bit_for_bit(tmp_path: Path):
     assert (tmp_path / "one.log").read_text().splitlines() == expected
 
 
-def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path: Path):
+def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path):
     frames = every_kind(fd=True)
     topics = {"/can_fd/can0": frames, "/can/can0": classic_frames(50, T0, 1000)}
-    source = write_frames(tmp_path / "run.mcap", topics)
-    report = export_log(source, tmp_path / "x.mcap")
+    report = export_log(write_frames(tmp_path / "run.mcap", topics), tmp_path / "x.mcap")
     assert report.buses == {"can0": 50}
     left_out = f"{len(frames)} CAN FD frames left out: the format has 8 bytes a frame"
     assert report.warnings == [left_out]
@@ -307,9 +276,9 @@ def test_can_msgs_have_no_can_fd(session_of_every_kind, tmp_path: Path):
     assert (report.buses, report.warnings) == ({"can0": 0}, [left_out])
 
 
-def test_what_a_format_loses_is_counted(tmp_path: Path):
+def test_what_a_format_loses_is_counted(tmp_path):
     frames = every_kind(fd=True, start_ns=T0 + 7)[:10]
-    frames["id_flags"][:3] |= REMOTE_FLAG  # there is no such thing in CAN FD
+    frames["id_flags"][:3] |= fr.REMOTE_FLAG  # there is no such thing in CAN FD
     frames["t_device_ns"] = frames["t_host_ns"] + 5
     source = write_frames(tmp_path / "run.mcap", {"/can_fd/can0": frames})
     assert export_log(source, tmp_path / "x.asc").warnings == [
@@ -340,7 +309,7 @@ SIGNALS = [
 ]
 
 
-def test_import_decodes_both_kinds(tmp_path: Path):
+def test_import_decodes_both_kinds(tmp_path):
     database = cantools.database.load_string(BIG, "dbc")
     lines, angles, targets = [], [], []
     for i in range(200):
@@ -353,8 +322,7 @@ def test_import_decodes_both_kinds(tmp_path: Path):
         targets.append(target)
     (tmp_path / "x.log").write_text("".join(lines))
     robot = bus_robot(BIG, SIGNALS)
-    report = import_can(tmp_path / "x.log", tmp_path / "run.mcap", robot)
-    assert report.problems == []
+    assert import_can(tmp_path / "x.log", tmp_path / "run.mcap", robot).problems == []
     with Session.open(tmp_path / "run.mcap") as session:
         state = session.joints("/joint_states").signal("joint01")
         effort = session.joints("/joint_states", "effort").signal("joint01")
@@ -365,43 +333,29 @@ def test_import_decodes_both_kinds(tmp_path: Path):
     assert (state.t_ns - command.t_ns).tolist() == [500_000] * 200
 
 
-def test_a_frame_too_short_for_its_signal_is_reported(tmp_path: Path):
-    (tmp_path / "x.log").write_text(
-        "(1.000000) can0 100##1" + "00" * 48 + " R\n(1.000100) can0 100#" + "00" * 8 + " R\n"
-    )
-    robot = bus_robot(BIG, SIGNALS)
-    report = import_can(tmp_path / "x.log", tmp_path / "run.mcap", robot)
-    assert report.problems == [
-        "3 values missing from frames too short for them: big.angle (2), big.torque (1)"
-    ]
+def test_a_frame_too_short_for_its_signal_is_reported(tmp_path):
+    lines = ("(1.000000) can0 100##1" + "00" * 48, "(1.000100) can0 100#" + "00" * 8)
+    (tmp_path / "x.log").write_text("".join(f"{line} R\n" for line in lines))
+    report = import_can(tmp_path / "x.log", tmp_path / "run.mcap", bus_robot(BIG, SIGNALS))
+    short = "3 values missing from frames too short for them: big.angle (2), big.torque (1)"
+    assert report.problems == [short]
 
 
 # -- recording -----------------------------------------------------------------------------
 
 
-def test_a_recording_keeps_and_decodes_both_kinds(tmp_path: Path):
+def test_a_recording_keeps_and_decodes_both_kinds(tmp_path):
     database = cantools.database.load_string(BIG, "dbc")
     robot = bus_robot(BIG, SIGNALS)
     output, clock, count = tmp_path / "run.mcap", SessionClock(), 300
     bus = can.Bus(interface="virtual", channel="fd", ignore_config=True, preserve_timestamps=True)
-    messages = []
+    messages, plain = [], {"is_extended_id": False}
     for i in range(count):
-        angle = {"angle": i * 0.5, "torque": i * 0.01}
-        messages += [
-            can.Message(
-                arbitration_id=257,
-                is_extended_id=False,
-                is_rx=False,
-                data=database.encode_message("small", {"target": -i * 0.25}),
-            ),
-            can.Message(
-                arbitration_id=256,
-                is_extended_id=False,
-                is_fd=True,
-                bitrate_switch=True,
-                data=database.encode_message("big", angle),
-            ),
-        ]
+        target = database.encode_message("small", {"target": -i * 0.25})
+        state = database.encode_message("big", {"angle": i * 0.5, "torque": i * 0.01})
+        fast = {"is_fd": True, "bitrate_switch": True}
+        messages.append(can.Message(arbitration_id=257, is_rx=False, data=target, **plain))
+        messages.append(can.Message(arbitration_id=256, data=state, **fast, **plain))
 
     def send():
         begun = time.monotonic()
@@ -409,6 +363,10 @@ def test_a_recording_keeps_and_decodes_both_kinds(tmp_path: Path):
             message.timestamp = 1000 + round(time.monotonic() - begun, 6)
             bus.send(message)
             time.sleep(0.0005)
+
+    def end():
+        if source.counts.frames >= 2 * count:
+            recorder.ending = Ending("all came")
 
     source = open_source(parse_address("front=can:virtual:fd?device_time=1&preserve_timestamps=1"))
     with SessionWriter(output, session_id="s", epoch_ns=clock.epoch_ns, robot=robot) as writer:
@@ -419,13 +377,7 @@ def test_a_recording_keeps_and_decodes_both_kinds(tmp_path: Path):
             context=SourceContext(clock.now_ns, writer),
             robot=robot,
             decoded="front",
-            each_tick=[
-                lambda: setattr(
-                    recorder,
-                    "ending",
-                    Ending("all came") if source.counts.frames >= 2 * count else None,
-                )
-            ],
+            each_tick=[end],
         )
         sender = threading.Thread(target=send)
         recorder.on_event(lambda *event: "connected" in event[3] and sender.start())

@@ -1,22 +1,12 @@
 """The candump format, against its definition in can-utils and against python-can."""
 
-from pathlib import Path
-
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.frame_log import candump_lines, joined, read_candump
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    REMOTE_FLAG,
-)
+from undulog.capture.log.messages import frames as fr
 
 
 def read(path, text):
@@ -58,7 +48,7 @@ def test_what_is_read_is_written_the_same(lines, ways, tmp_path):
     assert written(text, tmp_path / "x.log") == text
 
 
-def test_frames_of_every_kind(tmp_path: Path):
+def test_frames_of_every_kind(tmp_path):
     log, block = read(
         tmp_path / "x.log",
         "(1717639553.000022) can0 14B#9B01 T\n"
@@ -70,60 +60,47 @@ def test_frames_of_every_kind(tmp_path: Path):
     frames = block.classic()
     assert log.buses == ["can0", "can1"]
     assert block.bus.tolist() == [0, 1, 0, 0, 0]
-    assert frames["t_host_ns"].tolist() == [
-        *(1717639553_000022000 + 1000 * i for i in range(4)),
-        1717639553_000026123,
-    ]
+    times_ns = [1717639553_000022000 + 1000 * i for i in range(4)]
+    assert frames["t_host_ns"].tolist() == [*times_ns, 1717639553_000026123]
     assert not frames["t_device_ns"].any()
-    assert frames["id_flags"].tolist() == [
-        0x14B,
-        0x18FEF100 | EXTENDED_FLAG,
-        0x7FF | REMOTE_FLAG,
-        0x80 | ERROR_FLAG,
-        1,
-    ]
+    extended, remote = 0x18FEF100 | fr.EXTENDED_FLAG, 0x7FF | fr.REMOTE_FLAG
+    assert frames["id_flags"].tolist() == [0x14B, extended, remote, 0x80 | fr.ERROR_FLAG, 1]
     assert frames["dlc"].tolist() == [2, 8, 4, 8, 0]
-    assert frames["dir"].tolist() == [DIR_TX, DIR_RX, DIR_RX, DIR_RX, DIR_RX]
+    assert frames["dir"].tolist() == [fr.DIR_TX, *[fr.DIR_RX] * 4]
     assert frames["data"][0].tolist() == [0x9B, 1, 0, 0, 0, 0, 0, 0]
     assert log.problems == ["1 frames without a direction, unlike the first one"]
 
 
-def test_can_fd_frames(tmp_path: Path):
+def test_can_fd_frames(tmp_path):
     text = f"(1.0) can1 001#00\n(1.000001) can0 001##3{'AB' * 64}\n(1.000002) can1 00000002##5\n"
     log, block = read(tmp_path / "x.log", text)
     assert (len(block), log.problems) == (3, [])
     assert block.is_fd.tolist() == [False, True, True]
     assert block.times_ns().tolist() == [1_000_000_000, 1_000_001_000, 1_000_002_000]
     assert block.bus.tolist() == [0, 1, 0]
-    assert block.frames["id_flags"].tolist() == [1, 1, 2 | EXTENDED_FLAG]
+    assert block.frames["id_flags"].tolist() == [1, 1, 2 | fr.EXTENDED_FLAG]
     assert block.frames["len"].tolist() == [1, 64, 0]
-    assert block.frames["fd_flags"].tolist() == [0, FD_BRS | FD_ESI, FD_BRS | 4]
+    assert block.frames["fd_flags"].tolist() == [0, fr.FD_BRS | fr.FD_ESI, fr.FD_BRS | 4]
     assert block.frames["data"].tolist() == [[0] * 64, [0xAB] * 64, [0] * 64]
 
 
-def test_a_cut_last_line_is_reported(tmp_path: Path):
+def test_a_cut_last_line_is_reported(tmp_path):
     log, block = read(tmp_path / "x.log", "(1.000000) can0 001#00 R\n(1.000001) can0 001#0")
     assert len(block) == 1
     assert log.problems == ["the last line is cut short and left out: '(1.000001) can0 001#0'"]
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "(1.0) can0 1##1000",
-        "(1.0) can0 001##",
-        "(1.0) can0 1234#00",
-        "nonsense",
-        "(1.0) can0 123#0G",
-        "(x) c 1#",
-    ],
-)
-def test_a_wrong_line_is_named(line, tmp_path: Path):
+LINES = ("1##1000", "001##", "1234#00", "123#0G")
+WRONG = [*(f"(1.0) can0 {line}" for line in LINES), "nonsense", "(x) c 1#"]
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_a_wrong_line_is_named(line, tmp_path):
     text = f"(1.000000) can0 001#00\n\n{line}\n(1.000000) can0 001#00\n"
     with pytest.raises(ImportFormatError, match=r"x\.log: line 3 is no candump line: "):
         read(tmp_path / "x.log", text)
 
 
-def test_another_format_is_refused(tmp_path: Path):
+def test_another_format_is_refused(tmp_path):
     with pytest.raises(ImportFormatError, match="is not a candump log; its first line is 'Jan 1"):
         read(tmp_path / "x.log", "Jan 1 kernel: hello\n")

@@ -2,20 +2,15 @@
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-import undulog
 from support.paths import TRACE as RECORDING
+from support.written_sessions import joint_state, write_foreign
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.common.errors import (
-    DataError,
-    MissingChannelError,
-    MissingExtraError,
-)
+from undulog.capture.common.errors import DataError, MissingChannelError, MissingExtraError
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.csv_import import column_map_from_options, import_csv
 from undulog.capture.exchange.export import TABLE_FORMATS, export_columns
@@ -24,6 +19,8 @@ S = 1_000_000_000
 T0 = 1_700_000_000 * S
 NAMES = ("joint01", "joint02", "joint03")
 READ = {".csv": pd.read_csv, ".parquet": pd.read_parquet}
+COLUMNS = [f"joint_states.{name}" for name in ("position [rad]", "velocity [rad/s]")]
+COLUMNS.append("joint_current [A]")
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +60,7 @@ def assert_same_samples(table, session, topic, field, column):
 @pytest.mark.parametrize("rows_per_block", [100_000, 10])
 @pytest.mark.parametrize("suffix", TABLE_FORMATS)
 def test_each_sample_has_a_row_at_its_own_time(
-    suffix, rows_per_block, polled, tmp_path: Path, monkeypatch
+    suffix, rows_per_block, polled, tmp_path, monkeypatch
 ):
     monkeypatch.setattr("undulog.capture.exchange.export._ROWS_PER_BLOCK", rows_per_block)
     output = tmp_path / f"x{suffix}"
@@ -71,29 +68,19 @@ def test_each_sample_has_a_row_at_its_own_time(
     assert report.rows == {"/joint_states": 600, "/joint_current": 600}
     assert report.warnings == []
     table = READ[suffix](output)
-    assert list(table.columns) == report.columns
-    assert report.columns == [
-        "t_ns",
-        "topic",
-        "joint",
-        "joint_states.position [rad]",
-        "joint_states.velocity [rad/s]",
-        "joint_current [A]",
-    ]
+    assert list(table.columns) == report.columns == ["t_ns", "topic", "joint", *COLUMNS]
     assert table["t_ns"].dtype == np.int64
     with Session.open(polled) as session:
-        for topic, field, column in (
-            ("/joint_states", "position", "joint_states.position [rad]"),
-            ("/joint_states", "velocity", "joint_states.velocity [rad/s]"),
-            ("/joint_current", "position", "joint_current [A]"),
-        ):
+        topics = ("/joint_states", "/joint_states", "/joint_current")
+        fields = ("position", "velocity", "position")
+        for topic, field, column in zip(topics, fields, COLUMNS, strict=True):
             assert_same_samples(table, session, topic, field, column)
     first = table[table["topic"] == "/joint_states"].head(3)
     assert first["joint"].tolist() == list(NAMES)
     assert (first["t_ns"] - T0).tolist() == [0, 2_000_000, 4_000_000]
 
 
-def test_topics_can_be_chosen(polled, tmp_path: Path):
+def test_topics_can_be_chosen(polled, tmp_path):
     report = export_columns(polled, tmp_path / "x.csv", topics=["/gait", "/joint_current", "/gait"])
     assert report.rows == {"/gait": 200, "/joint_current": 600}
     table = pd.read_csv(tmp_path / "x.csv")
@@ -110,29 +97,14 @@ def test_topics_can_be_chosen(polled, tmp_path: Path):
 
 
 @pytest.mark.parametrize("suffix", TABLE_FORMATS)
-def test_a_foreign_log_with_fields_that_come_and_go(suffix, tmp_path: Path):
+def test_a_foreign_log_with_fields_that_come_and_go(suffix, tmp_path):
     # One message a servo, some without velocity: the fields don't share times.
-    from mcap.writer import Writer
-
-    from undulog.capture.log.messages.cdr import encode
-    from undulog.capture.log.messages.definitions import message_type, schema_text
-
-    kind = message_type("sensor_msgs/msg/JointState")
-    with (tmp_path / "run.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2")
-        schema = writer.register_schema(kind.name, "ros2msg", schema_text(kind.name).encode())
-        channel = writer.register_channel("/servo/states", "cdr", schema)
-        for k in range(40):
-            t_ns = T0 + k * 1_000_000
-            values = {
-                "header": {"stamp": {"sec": t_ns // S, "nanosec": t_ns % S}},
-                "name": [f"servo{k % 2}"],
-                "position": [k * 0.1],
-                "velocity": [k * 0.2] if k % 4 < 2 else [],
-            }
-            writer.add_message(channel, t_ns, encode(kind, values), t_ns)
-        writer.finish()
+    messages = []
+    for k in range(40):
+        velocity = [k * 0.2] if k % 4 < 2 else []
+        content = joint_state(T0 + k * 1_000_000, [f"servo{k % 2}"], [k * 0.1], velocity=velocity)
+        messages.append(("/servo/states", T0 + k * 1_000_000, content))
+    write_foreign(tmp_path / "run.mcap", messages)
     report = export_columns(tmp_path / "run.mcap", tmp_path / f"x{suffix}")
     assert report.rows == {"/servo/states": 60}
     table = READ[suffix](tmp_path / f"x{suffix}")
@@ -145,20 +117,18 @@ def test_a_foreign_log_with_fields_that_come_and_go(suffix, tmp_path: Path):
     assert velocity["servo/states.velocity [rad/s]"].tolist() == expected
 
 
-def test_parquet_keeps_nan_as_null_and_text_as_categories(polled, tmp_path: Path):
+def test_parquet_keeps_nan_as_null_and_text_as_categories(polled, tmp_path):
     import pyarrow.parquet as pq
 
     export_columns(polled, tmp_path / "x.parquet")
     table = pq.read_table(tmp_path / "x.parquet")
-    assert [str(kind) for kind in table.schema.types[:4]] == [
-        "int64",
-        *["dictionary<values=string, indices=int32, ordered=0>"] * 2,
-        "double",
-    ]
+    categories = "dictionary<values=string, indices=int32, ordered=0>"
+    kinds = [str(kind) for kind in table.schema.types[:4]]
+    assert kinds == ["int64", categories, categories, "double"]
     assert table["joint_states.position [rad]"].null_count == 600 + 4
 
 
-def test_a_csv_of_one_joint_can_be_imported_again(tmp_path: Path):
+def test_a_csv_of_one_joint_can_be_imported_again(tmp_path):
     if not RECORDING.exists():
         pytest.skip(f"the ArcSnake recording is not at {RECORDING}")
     robot = load_robot("arcsnake-joint")
@@ -172,33 +142,30 @@ def test_a_csv_of_one_joint_can_be_imported_again(tmp_path: Path):
         states = session.joints("/joint_states").signal("joint01")
     export_columns(tmp_path / "run.mcap", tmp_path / "x.csv", topics=["/joint_states"])
     options = ["t_ns=time:ns", "joint_states.position [rad]=joint01.position:rad"]
-    import_csv(
-        tmp_path / "x.csv", tmp_path / "back.mcap", robot, column_map_from_options(options, robot)
-    )
+    columns = column_map_from_options(options, robot)
+    import_csv(tmp_path / "x.csv", tmp_path / "back.mcap", robot, columns)
     with Session.open(tmp_path / "back.mcap") as session:
         back = session.joints("/joint_states").signal("joint01")
     np.testing.assert_array_equal(back.t_ns, states.t_ns)
     np.testing.assert_array_equal(back.values, states.values)
 
 
-def test_the_verb(polled, tmp_path: Path, capsys):
+def test_the_verb(polled, tmp_path, command):
     output = tmp_path / "x.csv"
-    arguments = ["log", "export", str(polled), "-o", str(output)]
-    assert undulog.run(arguments) == 0
-    assert capsys.readouterr().out == f"{output}: 1200 rows of /joint_states, /joint_current\n"
-    assert undulog.run(arguments) == 2
-    assert "x.csv exists already" in capsys.readouterr().err
-    assert undulog.run([*arguments, "--force", "--json", "--topics", "/gait"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    export = ("log", "export", polled, "-o", output)
+    report = f"{output}: 1200 rows of /joint_states, /joint_current\n"
+    assert command(*export) == (report, "")
+    assert "x.csv exists already" in command(*export, code=2).err
+    report = json.loads(command(*export, "--force", "--json", "--topics", "/gait").out)
     assert (report["rows"], report["topics"], report["warnings"]) == (200, {"/gait": 200}, [])
-    assert undulog.run([*arguments, "--force", "--bus", "can0"]) == 2
-    assert "--bus is for CAN frames; a .csv file has joint columns" in capsys.readouterr().err
+    refused = command(*export, "--force", "--bus", "can0", code=2).err
+    assert "--bus is for CAN frames; a .csv file has joint columns" in refused
 
 
-def test_a_missing_package_is_named(polled, tmp_path: Path, monkeypatch, capsys):
+def test_a_missing_package_is_named(polled, tmp_path, monkeypatch, command):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtraError):
         export_columns(polled, tmp_path / "x.parquet")
-    assert undulog.run(["log", "export", str(polled), "-o", str(tmp_path / "x.parquet")]) == 2
-    assert "a .parquet table needs the package pyarrow" in capsys.readouterr().err
+    refused = command("log", "export", polled, "-o", tmp_path / "x.parquet", code=2).err
+    assert "a .parquet table needs the package pyarrow" in refused
     assert list(tmp_path.iterdir()) == []

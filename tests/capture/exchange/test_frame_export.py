@@ -3,7 +3,6 @@
 import json
 import struct
 import zlib
-from pathlib import Path
 
 import can
 import numpy as np
@@ -13,9 +12,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-import undulog
 from support.paths import TRACE as RECORDING
-from support.written_frames import T0, every_kind, imported, write_frames
+from support.written_frames import T0, every_kind, frames_of, imported, write_frames
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.common.process import StopRequest
@@ -24,16 +22,7 @@ from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.export import TABLE_FORMATS, export_columns, export_log
 from undulog.capture.exchange.frame_formats import FRAME_FORMATS, channel_numbers
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
-from undulog.capture.log.messages.frames import (
-    DIR_RX,
-    DIR_TX,
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    FD_BRS,
-    FD_ESI,
-    REMOTE_FLAG,
-    empty_frames,
-)
+from undulog.capture.log.messages import frames as fr
 
 S = 1_000_000_000
 CAN_MSGS_FRAME = (
@@ -62,7 +51,7 @@ READERS = {
 
 @pytest.mark.parametrize("suffix", READERS)
 @pytest.mark.parametrize("fd", [False, True])
-def test_python_can_reads_them(suffix, fd, tmp_path: Path):
+def test_python_can_reads_them(suffix, fd, tmp_path):
     frames = every_kind(fd=fd)
     source = write_frames(tmp_path / "run.mcap", {"/can_fd/can0" if fd else "/can/can0": frames})
     export_log(source, tmp_path / f"x{suffix}")
@@ -73,19 +62,19 @@ def test_python_can_reads_them(suffix, fd, tmp_path: Path):
     for message, frame in zip(messages, frames, strict=True):
         id_flags = int(frame["id_flags"])
         assert message.is_fd == fd
-        assert message.is_error_frame == bool(id_flags & ERROR_FLAG)
+        assert message.is_error_frame == bool(id_flags & fr.ERROR_FLAG)
         if message.is_error_frame:
             continue
-        assert message.is_rx == (frame["dir"] == DIR_RX)
+        assert message.is_rx == (frame["dir"] == fr.DIR_RX)
         assert message.arbitration_id == id_flags & 0x1FFF_FFFF
-        assert message.is_extended_id == bool(id_flags & EXTENDED_FLAG)
+        assert message.is_extended_id == bool(id_flags & fr.EXTENDED_FLAG)
         if fd:
-            assert message.bitrate_switch == bool(frame["fd_flags"] & FD_BRS)
-            assert message.error_state_indicator == bool(frame["fd_flags"] & FD_ESI)
+            assert message.bitrate_switch == bool(frame["fd_flags"] & fr.FD_BRS)
+            assert message.error_state_indicator == bool(frame["fd_flags"] & fr.FD_ESI)
         else:
-            assert message.is_remote_frame == bool(id_flags & REMOTE_FLAG)
+            assert message.is_remote_frame == bool(id_flags & fr.REMOTE_FLAG)
             assert message.dlc == frame["dlc"]
-        if not id_flags & REMOTE_FLAG:
+        if not id_flags & fr.REMOTE_FLAG:
             assert bytes(message.data) == bytes(frame["data"][: frame["len" if fd else "dlc"]])
 
 
@@ -108,7 +97,7 @@ def blf_times(path):
     return times
 
 
-def test_a_blf_has_each_nanosecond(tmp_path: Path):
+def test_a_blf_has_each_nanosecond(tmp_path):
     frames = every_kind(step_ns=12_345_679, start_ns=T0 + 7)
     frames["t_host_ns"][5] = frames["t_host_ns"][0] - 3 * S  # a time may go back
     frames["t_host_ns"][-1] += 3600 * S
@@ -120,7 +109,7 @@ def test_a_blf_has_each_nanosecond(tmp_path: Path):
     assert header == (2023, 11, 2, 14, 22, 13, 20, 0)  # UTC, as python-can and Vector's library
 
 
-def test_asc_has_no_clock_of_this_machine(tmp_path: Path):
+def test_asc_has_no_clock_of_this_machine(tmp_path):
     source = write_session(tmp_path / "run.mcap", {"can0": every_kind()})
     export_log(source, tmp_path / "x.asc")
     text = (tmp_path / "x.asc").read_text()
@@ -131,28 +120,26 @@ def test_asc_has_no_clock_of_this_machine(tmp_path: Path):
     assert (tmp_path / "x.asc").read_text() == text
 
 
-def test_what_no_format_but_candump_has_is_counted(tmp_path: Path):
-    frames = empty_frames(3)
+def test_what_no_format_but_candump_has_is_counted(tmp_path):
+    frames = fr.empty_frames(3)
     frames["t_host_ns"], frames["id_flags"] = T0, [5, 6, 7]
     frames["dlc"], frames["t_device_ns"] = [11, 8, 8], [0, T0, 5]
     source = write_session(tmp_path / "run.mcap", {"can0": frames})
     device = "1 frame loses its device time"
     assert export_log(source, tmp_path / "x.log").warnings == [device]
     assert " can0 005#0000000000000000_B R\n" in (tmp_path / "x.log").read_text()
-    report = export_log(source, tmp_path / "x.blf")
-    assert report.warnings == [device]
+    assert export_log(source, tmp_path / "x.blf").warnings == [device]
     assert imported(tmp_path / "x.blf", tmp_path)[1]["dlc"].tolist() == [11, 8, 8]
-    report = export_log(source, tmp_path / "x.asc")
-    assert report.warnings == ["1 data frame loses its length code", device]
+    code = "1 data frame loses its length code"
+    assert export_log(source, tmp_path / "x.asc").warnings == [code, device]
 
 
 # -- ROS 2 ---------------------------------------------------------------------------------
 
 
-def test_ros_messages_hold_everything(session_of_every_kind, tmp_path: Path):
+def test_ros_messages_hold_everything(session_of_every_kind, tmp_path):
     source, frames = session_of_every_kind
-    report = export_log(source, tmp_path / "x.mcap")
-    assert report.warnings == []
+    assert export_log(source, tmp_path / "x.mcap").warnings == []
     found = {}
     with (tmp_path / "x.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -162,67 +149,54 @@ def test_ros_messages_hold_everything(session_of_every_kind, tmp_path: Path):
             assert decoded.header.frame_id == "can0"
             stamp_ns = decoded.header.stamp.sec * S + decoded.header.stamp.nanosec
             assert message.log_time == message.publish_time == stamp_ns
-            flags = (
-                decoded.is_extended * EXTENDED_FLAG
-                | decoded.is_rtr * REMOTE_FLAG
-                | decoded.is_error * ERROR_FLAG
-            )
-            way = {"/can0/from_can_bus": DIR_RX, "/can0/to_can_bus": DIR_TX}[channel.topic]
-            data = bytes(decoded.data)
-            found[message.sequence] = (stamp_ns, decoded.id | flags, decoded.dlc, way, data)
-    assert [found[k] for k in range(len(frames))] == [
-        (int(f["t_host_ns"]), int(f["id_flags"]), int(f["dlc"]), int(f["dir"]), bytes(f["data"]))
-        for f in frames
-    ]
+            way = {"/can0/from_can_bus": fr.DIR_RX, "/can0/to_can_bus": fr.DIR_TX}[channel.topic]
+            flags = decoded.is_extended * fr.EXTENDED_FLAG | decoded.is_rtr * fr.REMOTE_FLAG
+            flags |= decoded.id | decoded.is_error * fr.ERROR_FLAG
+            found[message.sequence] = (stamp_ns, flags, decoded.dlc, way, bytes(decoded.data))
+    columns = [frames[name].tolist() for name in ("t_host_ns", "id_flags", "dlc", "dir")]
+    assert found == dict(enumerate(zip(*columns, map(bytes, frames["data"]), strict=True)))
 
 
-def test_rosbags_reads_them(session_of_every_kind, tmp_path: Path):
+def test_rosbags_reads_them(session_of_every_kind, tmp_path):
     source, frames = session_of_every_kind
     export_log(source, tmp_path / "x.mcap")
     store = get_typestore(Stores.EMPTY)
     full = get_typestore(Stores.ROS2_HUMBLE)
     full.register(get_types_from_msg(CAN_MSGS_FRAME, "can_msgs/msg/Frame"))
     with AnyReader([tmp_path / "x.mcap"], default_typestore=store) as reader:
-        messages = [
-            (t, full.deserialize_cdr(data, connection.msgtype))
-            for connection, t, data in reader.messages()
-        ]
-    assert [t for t, _ in messages] == frames["t_host_ns"].tolist()
-    assert [m.id for _, m in messages] == (frames["id_flags"] & 0x1FFF_FFFF).tolist()
-    assert [bytes(m.data) for _, m in messages] == [bytes(row) for row in frames["data"]]
+        read = [(t, full.deserialize_cdr(data, c.msgtype)) for c, t, data in reader.messages()]
+    found = [(t, message.id, bytes(message.data)) for t, message in read]
+    columns = (frames["t_host_ns"], frames["id_flags"] & 0x1FFF_FFFF, map(bytes, frames["data"]))
+    assert found == list(zip(*columns, strict=True))
 
 
-def test_names_that_a_format_has_not_are_reported(tmp_path: Path):
+def test_names_that_a_format_has_not_are_reported(tmp_path):
     frames = every_kind()[:20]
-    buses = {"can3": frames, "left-arm": frames, "0": frames}
-    source = write_session(tmp_path / "run.mcap", buses)
+    source = write_session(tmp_path / "run.mcap", {"can3": frames, "left-arm": frames, "0": frames})
     report = export_log(source, tmp_path / "x.mcap")
-    assert report.warnings == [
-        "topics can't be named after bus 0: its are in /can_0",
-        "topics can't be named after bus left-arm: its are in /left_arm",
-    ]
-    report = export_log(source, tmp_path / "x.asc", bus="left-arm")
-    assert "it has no names: bus left-arm is channel 1" in report.warnings
+    names = {"0": "/can_0", "left-arm": "/left_arm"}
+    lost = [f"topics can't be named after bus {b}: its are in {name}" for b, name in names.items()]
+    assert report.warnings == lost
+    warnings = export_log(source, tmp_path / "x.asc", bus="left-arm").warnings
+    assert "it has no names: bus left-arm is channel 1" in warnings
     assert channel_numbers(["can3", "left-arm", "0", "can0", "can01"]) == [3, 1, 2, 0, 4]
 
 
 @pytest.mark.parametrize(
     ("suffix", "words"), [(".blf", "written as received"), (".mcap", "on from_can_bus")]
 )
-def test_directions_that_are_none_are_reported(suffix, words, tmp_path: Path):
+def test_directions_that_are_none_are_reported(suffix, words, tmp_path):
     facts = {"import.directions": "none"}
     source = write_session(tmp_path / "run.mcap", {"can0": every_kind()[:20]}, **facts)
-    report = export_log(source, tmp_path / f"x{suffix}")
-    assert f"no directions were recorded: all frames are {words}" in report.warnings
+    warnings = export_log(source, tmp_path / f"x{suffix}").warnings
+    assert f"no directions were recorded: all frames are {words}" in warnings
 
 
-def test_a_trace_without_a_date(tmp_path: Path):
+def test_a_trace_without_a_date(tmp_path):
     frames = every_kind(start_ns=100 * S)
-    source = write_session(tmp_path / "run.mcap", {"can0": frames})
-    report = export_log(source, tmp_path / "x.blf")
-    assert report.warnings[0] == (
-        "its dates begin in 1990: the times are those since 1970, without a date"
-    )
+    report = export_log(write_session(tmp_path / "run.mcap", {"can0": frames}), tmp_path / "x.blf")
+    note = "its dates begin in 1990: the times are those since 1970, without a date"
+    assert report.warnings[0] == note
     back = imported(tmp_path / "x.blf", tmp_path)[1]["t_host_ns"] - RELATIVE_EPOCH_NS
     assert back.tolist() == frames["t_host_ns"].tolist()
 
@@ -231,7 +205,7 @@ def test_a_trace_without_a_date(tmp_path: Path):
 
 
 @pytest.mark.parametrize("suffix", FRAME_FORMATS)
-def test_stretches_make_no_difference(suffix, tmp_path: Path, monkeypatch):
+def test_stretches_make_no_difference(suffix, tmp_path, monkeypatch):
     rng = np.random.default_rng(1)
     buses = {}
     for bus in ("can0", "can1", "can2"):
@@ -250,7 +224,7 @@ def test_stretches_make_no_difference(suffix, tmp_path: Path, monkeypatch):
         assert times == sorted(times)
     for bus, frames in buses.items() if suffix != ".mcap" else ():
         back = imported(tmp_path / f"parts{suffix}", tmp_path, f"/can/{bus}")[1]
-        keep = (frames["id_flags"] & ERROR_FLAG) == 0
+        keep = (frames["id_flags"] & fr.ERROR_FLAG) == 0
         for name in ("id_flags", "dlc", "data", "dir"):
             assert back[name][keep].tolist() == frames[name][keep].tolist()
 
@@ -264,12 +238,11 @@ def arcsnake(tmp_path_factory):
         pytest.skip(f"the ArcSnake recording is not at {RECORDING}")
     path = tmp_path_factory.mktemp("arcsnake") / "run.mcap"
     import_can(RECORDING, path, load_robot("arcsnake-joint"))
-    with Session.open(path) as session:
-        return path, session.frames("/can/can0")
+    return path, frames_of(path)
 
 
 @pytest.mark.parametrize("suffix", [".blf", ".asc"])
-def test_a_real_trace_comes_back(suffix, arcsnake, tmp_path: Path):
+def test_a_real_trace_comes_back(suffix, arcsnake, tmp_path):
     path, frames = arcsnake
     report = export_log(path, tmp_path / f"x{suffix}")
     assert (report.buses, report.warnings) == ({"can0": 19_297}, [])
@@ -280,12 +253,12 @@ def test_a_real_trace_comes_back(suffix, arcsnake, tmp_path: Path):
     np.testing.assert_array_equal(back["t_host_ns"] + start_ns, frames["t_host_ns"])
 
 
-def test_a_real_trace_as_ros_messages(arcsnake, tmp_path: Path):
+def test_a_real_trace_as_ros_messages(arcsnake, tmp_path):
     path, frames = arcsnake
     export_log(path, tmp_path / "x.mcap")
     with Session.open(tmp_path / "x.mcap") as session:
         assert session.warnings == []
-        for topic, way in (("/can0/from_can_bus", DIR_RX), ("/can0/to_can_bus", DIR_TX)):
+        for topic, way in (("/can0/from_can_bus", fr.DIR_RX), ("/can0/to_can_bus", fr.DIR_TX)):
             table, own = session.table(topic), frames[frames["dir"] == way]
             assert table.index.tolist() == own["t_host_ns"].tolist()
             assert table["id"].tolist() == own["id_flags"].tolist()
@@ -297,22 +270,16 @@ def test_a_real_trace_as_ros_messages(arcsnake, tmp_path: Path):
 # -- the command ------------------------------------------------------------------------------
 
 
-def test_the_verb_says_what_is_lost(session_of_every_kind, tmp_path: Path, capsys):
-    source, frames = session_of_every_kind
-    output = tmp_path / "x.blf"
-    assert undulog.run(["log", "export", str(source), "-o", str(output)]) == 0
-    assert capsys.readouterr().out.splitlines() == [
-        f"{output}: {len(frames)} frames of can0, in the format of Vector BLF",
-        "  warning: 18 error frames lose their direction",
-    ]
-    arguments = ["log", "export", str(source), "-o", str(output), "--force", "--json"]
-    assert undulog.run(arguments) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert report["warnings"] == ["18 error frames lose their direction"]
-    assert report["buses"] == {"can0": len(frames)}
-    arguments = ["log", "export", str(source), "-o", str(output), "--force", "--topics", "/x"]
-    assert undulog.run(arguments) == 2
-    assert "--topics is for tables; a .blf file has CAN frames" in capsys.readouterr().err
+def test_the_verb_lists_what_is_lost(session_of_every_kind, tmp_path, command):
+    (source, frames), output = session_of_every_kind, tmp_path / "x.blf"
+    export = ("log", "export", source, "-o", output)
+    loss = "18 error frames lose their direction"
+    done = f"{output}: {len(frames)} frames of can0, in the format of Vector BLF"
+    assert command(*export).out == f"{done}\n  warning: {loss}\n"
+    report = json.loads(command(*export, "--force", "--json").out)
+    assert (report["warnings"], report["buses"]) == ([loss], {"can0": len(frames)})
+    refused = command(*export, "--force", "--topics", "/x", code=2).err
+    assert "--topics is for tables; a .blf file has CAN frames" in refused
 
 
 EXPORTS = [
@@ -322,7 +289,7 @@ EXPORTS = [
 
 
 @pytest.mark.parametrize("case", EXPORTS, ids=lambda case: case[1])
-def test_what_fails_leaves_nothing_behind(case, tmp_path: Path, monkeypatch):
+def test_what_fails_leaves_nothing_behind(case, tmp_path, monkeypatch):
     exporter, suffix, owner, step = case
     source, output = tmp_path / "run.mcap", tmp_path / f"x{suffix}"
     with SessionWriter(source, session_id="s", epoch_ns=T0) as writer:
@@ -342,7 +309,7 @@ def test_what_fails_leaves_nothing_behind(case, tmp_path: Path, monkeypatch):
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_session_is_not_replaced_by_its_export(tmp_path: Path):
+def test_a_session_is_not_replaced_by_its_export(tmp_path):
     source = write_session(tmp_path / "run.mcap", {"can0": every_kind()[:1]})
     with pytest.raises(UsageError, match="is the session itself"):
         export_log(source, source, force=True)

@@ -6,22 +6,18 @@ import random
 import struct
 import sys
 from datetime import UTC, datetime, timedelta, timezone
-from pathlib import Path
 
 import can
 import numpy as np
 import pytest
 
-import undulog
+from support.written_frames import log_messages
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.can_logs import open_frame_log
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS, joined
-from undulog.capture.log.messages.frames import (
-    ERROR_FLAG,
-    REMOTE_FLAG,
-)
+from undulog.capture.log.messages.frames import ERROR_FLAG, REMOTE_FLAG
 
 asammdf = pytest.importorskip("asammdf", reason="the extra mf4 is not installed")
 from asammdf.blocks.v4_blocks import SourceInformation  # noqa: E402
@@ -32,7 +28,7 @@ START = datetime(2024, 2, 29, 12, 0, 0, 125_000, tzinfo=UTC)
 START_NS = 1_709_208_000_125_000_000
 
 
-def read(path: Path):
+def read(path):
     """Everything in a file: frames, name of each one's bus, the log."""
     with open_frame_log(path) as log:
         blocks = list(log.blocks)
@@ -42,33 +38,29 @@ def read(path: Path):
     return frames, buses, log
 
 
-def group(kind, times, columns, *, bus=True):
+def group(kind, times, columns):
     """A channel group as loggers write it, for asammdf's ``append``."""
-    size = len(times)
     dtype = [(f"{kind}.{name}", *field) for name, (field, _) in columns.items()]
-    samples = np.zeros(size, dtype=dtype)
+    samples = np.zeros(len(times), dtype=dtype)
     for name, (_, values) in columns.items():
         samples[f"{kind}.{name}"] = values
-    source = SourceInformation(source_type=SOURCE_BUS, bus_type=BUS_TYPE_CAN) if bus else None
+    source = SourceInformation(source_type=SOURCE_BUS, bus_type=BUS_TYPE_CAN)
     return asammdf.Signal(samples, np.asarray(times, dtype="<f8"), name=kind, source=source)
 
 
-def data_group(times, ids, data, *, way=None, bus=None, wide=None, dlc=None, width=8):
+def data_group(times, ids, data):
     lengths = [len(each) for each in data]
-    cells = np.array([list(each.ljust(width, b"\xee")) for each in data], dtype=np.uint8)
+    cells = np.array([list(each.ljust(8, b"\xee")) for each in data], dtype=np.uint8)
     columns = {
         "ID": (("<u4",), ids),
-        "DLC": (("u1",), lengths if dlc is None else dlc),
+        "DLC": (("u1",), lengths),
         "DataLength": (("u1",), lengths),
-        "DataBytes": (("u1", (width,)), cells),
+        "DataBytes": (("u1", (8,)), cells),
     }
-    for name, values in (("Dir", way), ("BusChannel", bus), ("IDE", wide)):
-        if values is not None:
-            columns[name] = (("u1",), values)
     return group("CAN_DataFrame", times, columns)
 
 
-def written(path: Path, *groups, start=START, compression=0, ways=None):
+def written(path, *groups, start=START, compression=0, ways=None):
     """``ways``: conversion of the directions, as loggers have it: numbers that stand for texts."""
     mdf = asammdf.MDF(version="4.10")
     mdf.header.start_time = start
@@ -82,11 +74,14 @@ def written(path: Path, *groups, start=START, compression=0, ways=None):
     return path
 
 
-def test_a_compressed_file_is_read_the_same(tmp_path: Path):
+def some_messages(count, step_s):
+    for i in range(count):
+        yield can.Message(timestamp=T0 + i * step_s, arbitration_id=i, data=bytes(i % 9))
+
+
+def test_a_compressed_file_is_read_the_same(tmp_path):
     plain, packed = tmp_path / "log.mf4", tmp_path / "log.mf4.gz"
-    with can.MF4Writer(plain) as writer:
-        for i in range(500):
-            writer(can.Message(timestamp=T0 + i * 1e-3, arbitration_id=i, data=bytes(i % 9)))
+    log_messages(plain, some_messages(500, 1e-3))
     packed.write_bytes(gzip.compress(plain.read_bytes()))
     frames, buses, log = read(packed)
     assert frames.tobytes() == read(plain)[0].tobytes()
@@ -94,13 +89,12 @@ def test_a_compressed_file_is_read_the_same(tmp_path: Path):
 
 
 @pytest.mark.parametrize("compression", [0, 1, 2])
-def test_groups_of_a_logger_merge_by_time_to_the_nanosecond(compression, tmp_path: Path):
+def test_groups_of_a_logger_merge_by_time_to_the_nanosecond(compression, tmp_path):
     """One group for each bus, with texts for directions, the extended bit in the identifier."""
     steps = np.arange(200_000) * 12_345  # more than one block of either
     times = steps / 1e9
     ways = {"val_0": 0, "text_0": b"Rx", "val_1": 1, "text_1": b"Tx"}
-    expected = []
-    groups = []
+    expected, groups = [], []
     for bus in (1, 2):
         mine = np.flatnonzero(steps % 5 < 3 if bus == 1 else steps % 5 >= 3)
         ids = np.where(mine % 2, 0x8000_0000 | mine, mine % 2048)
@@ -124,11 +118,10 @@ def test_groups_of_a_logger_merge_by_time_to_the_nanosecond(compression, tmp_pat
     np.testing.assert_array_equal(frames["dir"], truth[2])
     np.testing.assert_array_equal(frames["data"].view("<u8")[:, 0], truth[0])
     assert buses == [f"can{number}" for number in truth[3]]
-    assert log.time == "to 1 ns from a start to 1 us, in UTC"
-    assert log.problems == []
+    assert (log.time, log.problems) == ("to 1 ns from a start to 1 us, in UTC", [])
 
 
-def test_fields_that_a_group_may_lack(tmp_path: Path):
+def test_fields_that_a_group_may_lack(tmp_path):
     path = written(
         tmp_path / "log.mf4",
         data_group([0.5, 1.5], [0x123, 0x456], [b"\1\2", b""]),
@@ -144,7 +137,7 @@ def test_fields_that_a_group_may_lack(tmp_path: Path):
     assert log.directions is False
 
 
-def test_what_is_left_out_is_reported(tmp_path: Path):
+def test_what_is_left_out_is_reported(tmp_path):
     long_columns = {
         "ID": (("<u4",), 2),
         "DLC": (("u1",), 15),
@@ -183,22 +176,21 @@ def test_what_is_left_out_is_reported(tmp_path: Path):
         (START.astimezone().replace(tzinfo=None), START_NS),
     ],
 )
-def test_the_start_of_the_measurement(start, truth_ns, tmp_path: Path):
+def test_the_start_of_the_measurement(start, truth_ns, tmp_path):
     path = written(tmp_path / "log.mf4", data_group([0.0, 0.25], [1, 2], [b"", b""]), start=start)
     frames, _, log = read(path)
     assert (frames["t_host_ns"].astype(np.int64) - truth_ns).tolist() == [0, 250_000_000]
     assert ("this machine's" in log.time) == (start.tzinfo is None)
 
 
-def test_times_that_go_back_stay_in_their_order(tmp_path: Path):
-    times = [0.0, 2.0, 1.0, 3.0]
-    ids = [1, 2, 3, 4]
+def test_times_that_go_back_stay_in_their_order(tmp_path):
+    one = data_group([0.0, 2.0, 1.0, 3.0], [1, 2, 3, 4], [b""] * 4)
     other = data_group([1.5, 2.5], [5, 6], [b"", b""])
-    frames, *_ = read(written(tmp_path / "log.mf4", data_group(times, ids, [b""] * 4), other))
+    frames, *_ = read(written(tmp_path / "log.mf4", one, other))
     assert frames["id_flags"].tolist() == [1, 5, 2, 3, 6, 4]
 
 
-def test_files_that_hold_no_frames(tmp_path: Path):
+def test_files_that_hold_no_frames(tmp_path):
     temperature = asammdf.Signal(np.arange(4.0), np.arange(4.0), name="temperature")
     path = written(tmp_path / "log.mf4", temperature)
     with pytest.raises(ImportFormatError, match=r"log\.mf4: holds no CAN frames"):
@@ -212,14 +204,12 @@ def test_files_that_hold_no_frames(tmp_path: Path):
         read(path)
 
 
-def test_a_damaged_file_is_one_error_and_nothing_else(tmp_path: Path, capfd, monkeypatch):
+def test_a_damaged_file_is_one_error_and_nothing_else(tmp_path, capfd, monkeypatch):
     """Read or refused, whatever is damaged; neither asammdf nor the interpreter says a word."""
     messages = []
     monkeypatch.setattr(sys, "unraisablehook", messages.append)
     path = tmp_path / "log.mf4"
-    with can.MF4Writer(path) as writer:
-        for i in range(300):
-            writer(can.Message(timestamp=T0 + i, arbitration_id=i, data=bytes(i % 9)))
+    log_messages(path, some_messages(300, 1.0))
     whole, chance, refused = path.read_bytes(), random.Random(7), 0
     for k in range(60):
         damaged = bytearray(whole[: chance.randrange(len(whole))] if k % 3 == 0 else whole)
@@ -236,19 +226,17 @@ def test_a_damaged_file_is_one_error_and_nothing_else(tmp_path: Path, capfd, mon
     assert capfd.readouterr() == ("", "")
 
 
-def test_without_asammdf_the_command_names_the_extra(tmp_path: Path, capsys, monkeypatch):
+def test_without_asammdf_the_command_names_the_extra(tmp_path, command, monkeypatch):
     (tmp_path / "x.mf4").write_bytes(b"MDF     4.10    ".ljust(64, b"\0"))
     monkeypatch.setitem(sys.modules, "asammdf", None)
-    arguments = ["import", str(tmp_path / "x.mf4"), "-o", str(tmp_path / "run.mcap")]
-    assert undulog.run([*arguments, "--robot", "snake25"]) == 2
-    assert capsys.readouterr().err == (
-        "error: importing x.mf4 needs the package asammdf, which is not installed: "
-        "pip install 'undulog[mf4]'\n"
-    )
+    source, output = tmp_path / "x.mf4", tmp_path / "run.mcap"
+    refused = command("import", source, "-o", output, "--robot", "snake25", code=2).err
+    missing = "importing x.mf4 needs the package asammdf, which is not installed"
+    assert refused == f"error: {missing}: pip install 'undulog[mf4]'\n"
     assert not (tmp_path / "run.mcap").exists()
 
 
-def test_the_times_are_rounded_not_cut(tmp_path: Path):
+def test_the_times_are_rounded_not_cut(tmp_path):
     """A time as a floating-point number of seconds lies beside its nanosecond."""
     steps = [1, 3, 999_999_999, 1_000_000_001, 3_600_000_000_007]
     times = [math.nextafter(step / 1e9, 0) for step in steps]
@@ -256,7 +244,7 @@ def test_the_times_are_rounded_not_cut(tmp_path: Path):
     assert (read(path)[0]["t_host_ns"].astype(np.int64) - START_NS).tolist() == steps
 
 
-def test_a_file_that_its_logger_did_not_finish(tmp_path: Path):
+def test_a_file_that_its_logger_did_not_finish(tmp_path):
     """No counts, no lengths, as a logger leaves it that lost its power."""
     times = np.arange(500) * 1e-3
     frames = data_group(times, np.arange(500), [bytes([i % 256]) for i in range(500)])
@@ -278,9 +266,9 @@ def test_a_file_that_its_logger_did_not_finish(tmp_path: Path):
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_data_of_varying_length(text, tmp_path: Path):
+def test_data_of_varying_length(text, tmp_path):
     """Data bytes in a list of their own, each as long as it is; as text they would lose zeros."""
-    lengths = np.arange(300) % 9
+    lengths, times = np.arange(300) % 9, np.arange(300) * 1e-3
     data = [bytes((i + k) % 256 for k in range(length)) for i, length in enumerate(lengths)]
     columns = {
         "": np.zeros(300, dtype="u1"),
@@ -289,14 +277,10 @@ def test_data_of_varying_length(text, tmp_path: Path):
         ".DataLength": lengths.astype("u1"),
         ".DataBytes": np.array(data, dtype="S8"),
     }
+    encodings = {".DataBytes": "latin-1"}
     signals = [
-        asammdf.Signal(
-            samples,
-            np.arange(300) * 1e-3,
-            name=f"CAN_DataFrame{name}",
-            encoding="latin-1" if samples.dtype.kind == "S" else None,
-        )
-        for name, samples in columns.items()
+        asammdf.Signal(cells, times, name=f"CAN_DataFrame{name}", encoding=encodings.get(name))
+        for name, cells in columns.items()
     ]
     path = written(tmp_path / "log.mf4", signals)
     if not text:  # asammdf writes lists of texts alone; the type is the third byte of the channel

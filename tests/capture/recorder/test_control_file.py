@@ -13,15 +13,8 @@ import pytest
 from support.control_clients import connected, drain, echo, polled, polls, started_recorder
 from support.processes import wait_for
 from undulog.capture.common.errors import ControlError
+from undulog.capture.recorder import control_client
 from undulog.capture.recorder.control import TEND_POLLS, ControlServer
-from undulog.capture.recorder.control_client import (
-    ControlClient,
-    default_sockets,
-    find_sockets,
-    listen,
-    release,
-    socket_folder,
-)
 
 # -- the file ------------------------------------------------------------------------------------
 
@@ -57,11 +50,11 @@ def test_a_second_recorder_is_refused_while_the_first_lives_and_succeeds_it_afte
     with started_recorder(path):
         with pytest.raises(ControlError, match="another recorder listens there"):
             ControlServer(path, echo)
-        with ControlClient(path) as client:
+        with control_client.ControlClient(path) as client:
             assert client.ask({"do": "x"}) == {}
     assert path.is_socket(), "a killed recorder leaves its socket"
     with pytest.raises(ControlError, match="no recorder listens there"):
-        ControlClient(path)
+        control_client.ControlClient(path)
     ControlServer(path, echo).close()
 
 
@@ -77,31 +70,33 @@ def test_of_many_recorders_that_find_a_stale_socket_one_gets_it(tmp_path):
             for racer in racers:
                 racer.stdin.write("go\n")
                 racer.stdin.flush()
-            said = [racer.stdout.readline() for racer in racers]
-            assert said.count("ready\n") == 1
-            assert sum("another recorder listens" in line for line in said) == 5
-            with ControlClient(path) as client:
+            lines = [racer.stdout.readline() for racer in racers]
+            assert lines.count("ready\n") == 1
+            assert sum("another recorder listens" in line for line in lines) == 5
+            with control_client.ControlClient(path) as client:
                 assert client.ask({"do": "x"}) == {}
         path.unlink()
 
 
-@pytest.mark.parametrize("kind", ["file", "folder", "link"])
+MAKERS = {
+    "file": lambda path: path.write_text("data"),
+    "folder": Path.mkdir,
+    "link": lambda path: path.symlink_to(path.with_name("precious")),
+}
+
+
+@pytest.mark.parametrize("kind", MAKERS)
 def test_what_is_no_socket_is_left_alone(tmp_path, kind):
     path = tmp_path / "c.sock"
     (tmp_path / "precious").write_text("data")
-    if kind == "file":
-        path.write_text("data")
-    elif kind == "folder":
-        path.mkdir()
-    else:
-        path.symlink_to(tmp_path / "precious")
+    MAKERS[kind](path)
     with pytest.raises(ControlError, match="no socket"):
         ControlServer(path, echo)
     assert os.path.lexists(path)
     assert (tmp_path / "precious").read_text() == "data"
 
 
-def test_an_impossible_path_is_told(tmp_path):
+def test_an_impossible_path_is_reported(tmp_path):
     with pytest.raises(ControlError, match="at most 107 bytes"):
         ControlServer(tmp_path / ("x" * 120), echo)
     with pytest.raises(ControlError, match="No such file"):
@@ -111,7 +106,7 @@ def test_an_impossible_path_is_told(tmp_path):
 def test_the_longest_path_is_served(tmp_path):
     for name in ("x", "x" * (107 - len(str(tmp_path)) - 1)):
         server = ControlServer(tmp_path / name, echo)
-        with polled(server), ControlClient(tmp_path / name) as client:
+        with polled(server), control_client.ControlClient(tmp_path / name) as client:
             client.ask({"do": "x"})
         server.close()
     assert list(tmp_path.iterdir()) == []
@@ -130,10 +125,10 @@ def test_whoever_sees_the_file_can_connect(tmp_path):
 
     thread = threading.Thread(target=connect_at_once)
     thread.start()
-    made = [(path, *listen(path, backlog=8)) for path in paths]
+    made = [(path, *control_client.listen(path, backlog=8)) for path in paths]
     thread.join()
     for one in made:
-        release(*one)
+        control_client.release(*one)
     assert results == [0] * len(paths)
 
 
@@ -143,7 +138,7 @@ def test_a_successor_s_socket_is_not_removed_by_a_late_close(tmp_path):
     path.unlink()
     second = ControlServer(path, echo)
     first.close()
-    with polled(second), ControlClient(path) as client:
+    with polled(second), control_client.ControlClient(path) as client:
         client.ask({"do": "x"})
     second.close()
 
@@ -151,7 +146,7 @@ def test_a_successor_s_socket_is_not_removed_by_a_late_close(tmp_path):
 def test_a_socket_whose_folder_went_with_a_log_out_comes_back_with_the_next_log_in(tmp_path):
     session = tmp_path / "user"
     session.mkdir()
-    path, _ = default_sockets(Path("run.mcap"), {"XDG_RUNTIME_DIR": str(session)})
+    path, _ = control_client.default_sockets(Path("run.mcap"), {"XDG_RUNTIME_DIR": str(session)})
     server = ControlServer(path, echo)
     with connected(server) as client:
         client.sendall(b'{"do": "x"}\n')
@@ -174,7 +169,7 @@ def test_a_socket_whose_folder_went_with_a_log_out_comes_back_with_the_next_log_
 
 def test_the_usual_place_and_finding_what_runs(tmp_path):
     environ = {"XDG_RUNTIME_DIR": str(tmp_path)}
-    path, _ = default_sockets(Path("somewhere/run.mcap"), environ)
+    path, _ = control_client.default_sockets(Path("somewhere/run.mcap"), environ)
     assert path == tmp_path / "undulog" / "run.sock"
     assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
     stale = path.with_name("stale.sock")
@@ -184,19 +179,19 @@ def test_the_usual_place_and_finding_what_runs(tmp_path):
     (path.parent / "service").mkdir()
     one = ControlServer(path, echo)
     two = ControlServer(path.parent / "service" / "a.sock", echo)
-    found = [p for p in find_sockets(environ) if tmp_path in p.parents]
+    found = [p for p in control_client.find_sockets(environ) if tmp_path in p.parents]
     assert found == sorted([path, path.parent / "service" / "a.sock"])
     one.close()
     two.close()
-    assert [p for p in find_sockets(environ) if tmp_path in p.parents] == []
+    assert [p for p in control_client.find_sockets(environ) if tmp_path in p.parents] == []
 
 
 def test_a_service_has_its_own_folder_and_no_session_uses_the_temporary_one(tmp_path, monkeypatch):
     service = {"RUNTIME_DIRECTORY": f"{tmp_path}/a:{tmp_path}/b", "XDG_RUNTIME_DIR": "/x"}
-    assert socket_folder(service) == tmp_path / "a"
+    assert control_client.socket_folder(service) == tmp_path / "a"
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
     for environ in ({}, {"XDG_RUNTIME_DIR": str(tmp_path / "gone")}):
-        assert socket_folder(environ) == tmp_path / f"undulog-{os.getuid()}"
+        assert control_client.socket_folder(environ) == tmp_path / f"undulog-{os.getuid()}"
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
@@ -204,4 +199,4 @@ def test_a_folder_of_another_user_is_not_trusted(tmp_path):
     (tmp_path / "undulog").mkdir()
     os.chown(tmp_path / "undulog", 65534, 65534)
     with pytest.raises(ControlError, match="not a folder of this user"):
-        default_sockets(Path("run.mcap"), {"XDG_RUNTIME_DIR": str(tmp_path)})
+        control_client.default_sockets(Path("run.mcap"), {"XDG_RUNTIME_DIR": str(tmp_path)})

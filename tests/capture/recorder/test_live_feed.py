@@ -14,20 +14,8 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 
 from support.processes import process, wait_for
 from undulog.capture.common.errors import DataError
-from undulog.capture.recorder import live_feed
+from undulog.capture.recorder import live_feed, live_wire
 from undulog.capture.recorder.live_feed import LiveCounts, LiveFeed
-from undulog.capture.recorder.live_wire import (
-    MAX_DATAGRAM,
-    MAX_MESSAGE,
-    DatagramHead,
-    Kind,
-    LiveMessage,
-    pack_datagram,
-    pack_description,
-    pack_message,
-    read_head,
-    read_records,
-)
 
 EPOCH_NS = 1_735_689_600_000_000_000
 STEP_NS = 10_000_000
@@ -81,13 +69,12 @@ def make(path):
 def received(link):
     """What lies in the socket: heads, and records in order."""
     heads, records = [], []
-    while True:
-        try:
-            data = link.recv(MAX_DATAGRAM)
-        except BlockingIOError:
-            return heads, records
-        heads.append(read_head(data))
-        records += read_records(data)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            data = link.recv(live_wire.MAX_DATAGRAM)
+            heads.append(live_wire.read_head(data))
+            records += live_wire.read_records(data)
+    return heads, records
 
 
 def pump_until(feed, condition):
@@ -125,49 +112,44 @@ def offer(feed, number, channel=1, payload=b"data", step_ns=STEP_NS):
 
 
 def messages(records):
-    return [record for record in records if isinstance(record, LiveMessage)]
+    return [record for record in records if isinstance(record, live_wire.LiveMessage)]
 
 
-@given(
-    st.lists(
-        st.tuples(
-            *(st.integers(0, 2**n - 1) for n in (16, 32, 64, 64, 64)), st.binary(max_size=300)
-        ),
-        max_size=20,
-    ),
-    st.integers(0, 2**64 - 1),
-)
+NUMBERS = (st.integers(0, 2**n - 1) for n in (16, 32, 64, 64, 64))
+FIELDS = st.lists(st.tuples(*NUMBERS, st.binary(max_size=300)), max_size=20)
+
+
+@given(FIELDS, st.integers(0, 2**64 - 1))
 def test_datagram_comes_back_as_it_was(fields, dropped):
-    head = DatagramHead(Kind.MESSAGES, len(fields), 7, dropped)
-    data = pack_datagram(head, map(pack_message, fields))
-    assert read_head(data) == head
-    assert read_records(data) == [LiveMessage(*one) for one in fields]
+    head = live_wire.DatagramHead(live_wire.Kind.MESSAGES, len(fields), 7, dropped)
+    data = live_wire.pack_datagram(head, map(live_wire.pack_message, fields))
+    assert live_wire.read_head(data) == head
+    assert live_wire.read_records(data) == [live_wire.LiveMessage(*one) for one in fields]
 
 
 @pytest.mark.parametrize("record", DEFINITIONS)
 def test_definition_comes_back_as_it_was(record):
-    head = DatagramHead(Kind.DEFINITIONS, 0, 7, 0)
-    data = pack_datagram(head, [pack_description(record)])
-    assert read_records(data) == [record]
+    head = live_wire.DatagramHead(live_wire.Kind.DEFINITIONS, 0, 7, 0)
+    data = live_wire.pack_datagram(head, [live_wire.pack_description(record)])
+    assert live_wire.read_records(data) == [record]
 
 
 @given(st.binary(max_size=200))
 def test_noise_is_refused_not_believed(noise):
     with pytest.raises(DataError):
-        read_head(noise)
+        live_wire.read_head(noise)
 
 
 @given(st.data())
 def test_any_cut_or_flipped_datagram_is_read_or_refused(data):
-    head = DatagramHead(Kind.DEFINITIONS, 0, 7, 0)
-    whole = pack_datagram(head, [pack_description(one) for one in DEFINITIONS[:4]])
+    head = live_wire.DatagramHead(live_wire.Kind.DEFINITIONS, 0, 7, 0)
+    whole = live_wire.pack_datagram(head, map(live_wire.pack_description, DEFINITIONS[:4]))
     at = data.draw(st.integers(24, len(whole) - 1))
+    damaged = whole[:at]
     if data.draw(st.booleans()):
-        damaged = whole[:at]
-    else:
-        damaged = whole[:at] + bytes([whole[at] ^ data.draw(st.integers(1, 255))]) + whole[at + 1 :]
+        damaged += bytes([whole[at] ^ data.draw(st.integers(1, 255))]) + whole[at + 1 :]
     with contextlib.suppress(DataError):
-        read_records(damaged)
+        live_wire.read_records(damaged)
 
 
 def test_nothing_is_kept_while_nobody_watches(make):
@@ -189,14 +171,13 @@ def test_relay_that_comes_late_gets_definitions_first_and_then_every_message(mak
     pump_until(feed, lambda: feed.connected)
     heads, records = received(link)
     assert records == DEFINITIONS
-    assert {head.kind for head in heads} == {Kind.DEFINITIONS}
+    assert {head.kind for head in heads} == {live_wire.Kind.DEFINITIONS}
     for number in range(100, 300):
         offer(feed, number)
     records = all_sent(feed, link)
     assert [one.sequence for one in messages(records)] == list(range(100, 300))
     assert messages(records)[0][2:4] == (EPOCH_NS + 100 * STEP_NS, EPOCH_NS + 100 * STEP_NS - 5)
-    assert feed.counts.sent == 200
-    assert feed.counts.dropped == 0
+    assert (feed.counts.sent, feed.counts.dropped) == (200, 0)
 
 
 def test_offered_time_is_this_machines_monotonic_clock(watched):
@@ -214,8 +195,7 @@ def test_definitions_of_later_channels_come_before_their_messages(watched):
     feed.define(late)
     offer(feed, 0, channel=9)
     records = all_sent(feed, link)
-    assert records[0] == late
-    assert records[1].channel_id == 9
+    assert (records[0], records[1].channel_id) == (late, 9)
 
 
 def test_definitions_are_repeated(make, listen, monkeypatch):
@@ -223,15 +203,15 @@ def test_definitions_are_repeated(make, listen, monkeypatch):
     feed, link = make(), listen()
     seen = []
 
-    def told_thrice():
+    def defined_thrice():
         seen.extend(received(link)[1])
         return seen.count(STATES) >= 3
 
-    pump_until(feed, told_thrice)
+    pump_until(feed, defined_thrice)
     assert feed.counts.connections == 1
 
 
-def test_a_state_that_holds_is_told_to_a_relay_that_comes_later(make, listen):
+def test_a_state_that_holds_is_sent_to_a_relay_that_comes_later(make, listen):
     feed = make()
     schema = Schema(id=7, name="std_msgs/msg/String", encoding="ros2msg", data=b"string data")
     mode = Channel(id=7, topic="/gait/mode", message_encoding="cdr", metadata={}, schema_id=7)
@@ -244,7 +224,7 @@ def test_a_state_that_holds_is_told_to_a_relay_that_comes_later(make, listen):
     _, records = received(link)
     assert records[:-1] == [*DEFINITIONS, schema, mode]
     assert records[-1].payload == b"mode 2"
-    assert feed.counts.sent == 0  # as a message: it was told, like the definitions
+    assert feed.counts.sent == 0  # as a message: it was sent like the definitions
 
 
 def test_raw_frames_are_not_sent(watched):
@@ -277,8 +257,8 @@ def test_a_jittering_channel_at_the_highest_rate_is_not_thinned(watched):
 
 def test_a_message_beyond_a_datagram_is_left_out_and_counted(watched):
     feed, link = watched()
-    offer(feed, 0, payload=bytes(MAX_MESSAGE + 1))
-    offer(feed, 1, payload=bytes(MAX_MESSAGE))
+    offer(feed, 0, payload=bytes(live_wire.MAX_MESSAGE + 1))
+    offer(feed, 1, payload=bytes(live_wire.MAX_MESSAGE))
     offer(feed, 2)
     assert [one.sequence for one in messages(all_sent(feed, link))] == [1, 2]
     assert feed.counts.too_big == 1
@@ -320,21 +300,21 @@ def test_a_full_socket_drops_the_oldest_and_every_tick_completes(watched):
     assert numbers == sorted(numbers)
     assert numbers[-1] == 19_999
     assert len(numbers) + feed.counts.dropped == 20_000
-    assert read_head(feed._pack(Kind.END).data).dropped == feed.counts.dropped
+    assert live_wire.read_head(feed._pack(live_wire.Kind.END).data).dropped == feed.counts.dropped
 
 
-def test_a_relay_that_is_replaced_is_found_and_told_everything(watched, listen, monkeypatch):
+def test_a_relay_that_is_replaced_is_found_and_gets_everything(watched, listen, monkeypatch):
     monkeypatch.setattr(live_feed, "RENEW_NS", 50_000_000)
     feed, first = watched()
     second = listen()  # the first is still there, bound to nothing any more
     seen = []
 
-    def told():
+    def known():
         offer(feed, feed.counts.sent)
         seen.extend(received(second)[1])
         return ROBOT in seen and bool(messages(seen))
 
-    pump_until(feed, told)
+    pump_until(feed, known)
     first.close()
 
 
@@ -355,7 +335,7 @@ def test_a_relay_that_goes_and_comes_again_is_found(watched, listen, monkeypatch
     assert feed.counts.connections == 2
 
 
-def test_the_end_is_told(watched):
+def test_the_end_is_sent(watched):
     feed, link = watched()
     offer(feed, 0)
     feed.close()
@@ -364,7 +344,7 @@ def test_the_end_is_told(watched):
     assert not feed.connected
     heads, records = received(link)
     assert [one.sequence for one in messages(records)] == [0]
-    assert heads[-1].kind is Kind.END
+    assert heads[-1].kind is live_wire.Kind.END
     offer(feed, 1)
     feed.pump()
     assert not feed.connected

@@ -5,7 +5,7 @@ import shutil
 import socket
 import subprocess
 import uuid
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from itertools import pairwise
 
 import pytest
@@ -37,11 +37,10 @@ def notifier_of():
 def heard(listener):
     """All messages that have come, as lists of lines."""
     messages = []
-    while True:
-        try:
+    with suppress(BlockingIOError):
+        while True:
             messages.append(listener.recv(65536).decode().split("\n"))
-        except BlockingIOError:
-            return messages
+    return messages
 
 
 def test_a_recording_s_life(manager, notifier_of):
@@ -91,15 +90,11 @@ def test_the_watchdog_is_fed_at_half_its_time_by_the_loop_s_clock(manager, notif
     assert all(b - a == 1_000_000_000 for a, b in pairwise(sent_ns))
 
 
+OTHERS = {"WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"}
+
+
 @pytest.mark.parametrize(
-    "environ",
-    [
-        {},
-        {"WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"},
-        {"WATCHDOG_USEC": "0"},
-        {"WATCHDOG_USEC": "soon"},
-        {"WATCHDOG_USEC": "-5"},
-    ],
+    "environ", [{}, OTHERS, *({"WATCHDOG_USEC": text} for text in ("0", "soon", "-5"))]
 )
 def test_a_watchdog_that_is_not_ours_or_no_time_is_not_fed(manager, environ, notifier_of):
     name, listener = manager
@@ -128,8 +123,7 @@ def test_a_manager_that_hears_nothing_or_is_gone_never_holds_us_up(tmp_path, not
         full = notifier.failed
         assert full > 0
         deaf.setblocking(False)
-        taken = len(heard(deaf))
-        assert taken + full == 5000
+        assert len(heard(deaf)) + full == 5000
         notifier.status("goes on")
         assert heard(deaf) == [["STATUS=goes on"]]
     notifier.status("to nobody")

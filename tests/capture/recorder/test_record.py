@@ -14,11 +14,11 @@ import pytest
 
 from support.paths import ROOT
 from support.processes import run, wait_for
-from support.recorders import command, ended, events, recording, send
-from undulog.capture import Session, load_robot
+from support.recorders import command, ended, events, polling, recording, send
+from support.written_frames import frames_of
+from undulog.capture import Session
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.health.session_check import check_session
-from undulog.capture.log.messages.frames import DIR_TX, empty_frames
 from undulog.capture.recorder.health import LiveHealth
 from undulog.capture.recorder.recording import Recording
 from undulog.capture.recorder.settings import resolve
@@ -46,22 +46,6 @@ def bus(tmp_path):
     return tmp_path / "bus.sock"
 
 
-def polling(cycles, period_ns=10_000_000):
-    """Frames of a polling cycle of the shipped robot: each servo's command, then its answer."""
-    robot = load_robot("snake25")
-    frames = empty_frames(50 * cycles)
-    number = np.arange(len(frames))
-    joint = number // 2 % len(robot.joints)
-    is_command = number % 2 == 0
-    frames["t_device_ns"] = 10**9 + number * (period_ns // 50)
-    frames["id_flags"] = np.where(is_command, 257, 513) + joint
-    frames["dlc"] = np.where(is_command, 2, 8)
-    frames["dir"] = np.where(is_command, DIR_TX, 0)
-    hundredths = np.rint(2000 * np.sin(0.05 * number)).astype("<i2")
-    frames["data"][:, :2] = hundredths[:, None].view(np.uint8)
-    return frames, hundredths
-
-
 # -- sources ---------------------------------------------------------------------------------
 
 
@@ -69,9 +53,7 @@ def test_frames_come_back_exactly_and_mean_what_the_map_says(output, bus):
     frames, hundredths = polling(40)
     with recording(output, f"can0=unix:{bus}", "--robot", "snake25") as process:
         send(bus, frames)
-        wait_for(
-            lambda: ask(output, do="status")["sources"][0]["frames"] == len(frames), "all frames"
-        )
+        wait_for(lambda: ask(output, do="status")["sources"][0]["frames"] == len(frames))
         assert ask(output, do="stop", wait=True)["ok"]
         report, _ = ended(process)
     assert process.returncode == 0
@@ -81,8 +63,7 @@ def test_frames_come_back_exactly_and_mean_what_the_map_says(output, bus):
         for field in ("t_device_ns", "id_flags", "dlc", "dir", "data"):
             np.testing.assert_array_equal(kept[field], frames[field], err_msg=field)
         assert (np.diff(kept["t_host_ns"].astype(np.int64)) >= 0).all()
-        states = session.joints("/joint_states")
-        commands = session.joints("/joint_commands")
+        states, commands = map(session.joints, ("/joint_states", "/joint_commands"))
         for k, (measured, commanded) in enumerate(zip(states.values, commands.values, strict=True)):
             mine = np.deg2rad(hundredths.reshape(-1, 25, 2)[:, k] / 100)
             np.testing.assert_allclose(commanded, mine[:, 0], rtol=0, atol=1e-12)
@@ -91,16 +72,15 @@ def test_frames_come_back_exactly_and_mean_what_the_map_says(output, bus):
         device = frames["t_device_ns"].reshape(-1, 25, 2)
         shift = np.array([states.t_ns[k] - device[:, k, 1].astype(np.int64) for k in range(25)])
         assert np.ptp(shift) < 20_000_000
-        clock = session.metadata["undulog.clock"]
-        assert int(clock["can0.samples"]) == len(frames)
+        assert int(session.metadata["undulog.clock"]["can0.samples"]) == len(frames)
         references = session.table("/clock/can0")
-        assert np.isin(
-            references["time_ref.sec"] * 10**9 + references["time_ref.nanosec"],
-            frames["t_device_ns"],
-        ).all()
+        device_ns = references["time_ref.sec"] * 10**9 + references["time_ref.nanosec"]
+        assert np.isin(device_ns, frames["t_device_ns"]).all()
 
 
-def test_unknown_identifiers_and_losses_are_told_and_the_verdict_is_that_of_a_check(output, bus):
+def test_unknown_identifiers_and_losses_are_reported_and_the_verdict_is_that_of_a_check(
+    output, bus
+):
     frames, _ = polling(300)
     frames = np.delete(frames, slice(5000, 7000))
     frames["id_flags"][::50] = 0x7AB
@@ -112,20 +92,16 @@ def test_unknown_identifiers_and_losses_are_told_and_the_verdict_is_that_of_a_ch
     assert report["verdict"] == health.verdict == health.stored != "good"
     assert tuple(report["reasons"]) == health.reasons == health.stored_reasons
     text = "identifiers that are in no database: 7AB"
-    assert {("can0", text), ("can0", f"{unknown} frames with {text} ({unknown})")} <= {
-        *events(output)
-    }
-    with Session.open(output) as session:
-        assert (session.frames("/can/can0")["id_flags"] == 0x7AB).sum() == unknown
+    reported = {("can0", text), ("can0", f"{unknown} frames with {text} ({unknown})")}
+    assert reported <= {*events(output)}
+    assert (frames_of(output)["id_flags"] == 0x7AB).sum() == unknown
 
 
 def test_the_twin_brings_its_robot_and_ends_by_itself(tmp_path):
     output = tmp_path / "twin.mcap"
     options = ("--fast", "--duration", "4s", "--json", "--floor", "0")
-    done = run(*command(output, "twin:flat"), *options, cwd=ROOT)
-    report = json.loads(done.stdout)
-    assert report["robot"] == "snake25"
-    assert report["ended"] == "all sources have ended"
+    report = json.loads(run(*command(output, "twin:flat"), *options, cwd=ROOT).stdout)
+    assert (report["robot"], report["ended"]) == ("snake25", "all sources have ended")
     with Session.open(output) as session:
         states = session.joints("/joint_states")
         np.testing.assert_array_equal(np.diff(states.t_ns[0]), 10_000_000)
@@ -152,32 +128,24 @@ def test_a_mistake_in_what_looks_on_does_not_end_the_recording(output, bus, monk
         raise ZeroDivisionError(f"at {now_ns}")
 
     monkeypatch.setattr(LiveHealth, "step", fails)
-    settings = resolve(
-        {
-            "sources": (f"can0=unix:{bus}",),
-            "output": output,
-            "robot": "snake25",
-            "duration": 2.5,
-            "floor": 0,
-            "socket": output.with_name("control.sock"),
-        },
-        {},
-    )
+    given = {"sources": (f"can0=unix:{bus}",), "output": output, "robot": "snake25"}
+    given |= {"duration": 2.5, "floor": 0, "socket": output.with_name("control.sock")}
+    settings = resolve(given, {})
     frames, _ = polling(100)
     sender = threading.Thread(target=send, args=(bus, frames))
     sender.start()
     report = Recording(settings, StopRequest()).run()
     sender.join()
     assert not report.ending.failed
+    assert len(frames_of(output)) == len(frames)
     with Session.open(output) as session:
-        assert len(session.frames("/can/can0")) == len(frames)
         assert len(session.joints("/joint_states").t_ns[0]) == 100
         assert session.verdict == "degraded"
     assert any("live health is given up" in text for _, text in events(output))
 
 
 @pytest.mark.parametrize(
-    ("existing", "floor", "code", "said"),
+    ("existing", "floor", "code", "fault"),
     [
         ("bus.sock", "0", 1, "is no socket"),
         ("run.mcap", "0", 2, "exists already"),
@@ -185,19 +153,19 @@ def test_a_mistake_in_what_looks_on_does_not_end_the_recording(output, bus, monk
     ],
     ids=["a source that can never work", "an existing output", "no space to begin with"],
 )
-def test_what_can_not_be_recorded_leaves_no_file(existing, floor, code, said, tmp_path):
+def test_what_can_not_be_recorded_leaves_no_file(existing, floor, code, fault, tmp_path):
     output, bus = tmp_path / "run.mcap", tmp_path / "bus.sock"
     if existing is not None:
         (tmp_path / existing).write_text("precious")
     done = run(*command(output, f"unix:{bus}"), "--floor", floor, cwd=ROOT)
     assert done.returncode == code
-    assert said in done.stderr
+    assert fault in done.stderr
     left = {path.name: path.read_text() for path in tmp_path.iterdir()}
     assert left == ({} if existing is None else {existing: "precious"})
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "fault"),
     [
         (["cam:0"], "no kind of source 'cam'"),
         (["unix:/tmp/a.sock", "unix:/tmp/b.sock", "--robot", "snake25"], "--bus NAME"),
@@ -207,10 +175,10 @@ def test_what_can_not_be_recorded_leaves_no_file(existing, floor, code, said, tm
         (["unix:/tmp/a.sock", "--split-size", "many"], "--split-size"),
     ],
 )
-def test_wrong_usage_is_told_before_anything_is_made(arguments, said, tmp_path):
+def test_wrong_usage_is_reported_before_anything_is_made(arguments, fault, tmp_path):
     done = run(*command(tmp_path / "run.mcap", *arguments), cwd=ROOT)
     assert done.returncode == 2, done.stderr
-    assert said in done.stderr
+    assert fault in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
@@ -238,8 +206,8 @@ def test_a_full_disk_ends_the_recording_in_good_order(floor, disk_of, tmp_path):
     assert process.returncode == 1, err  # not -SIGBUS
     assert "MB" in err or "space" in err
     assert report["failed"]
+    kept = frames_of(output)
     with Session.open(output) as session:
-        kept = session.frames("/can/can0")
         assert session.verdict is not None
     assert check_session(output).file.indexed
     sent = np.concatenate(sent)

@@ -1,6 +1,7 @@
 """The commands that speak to a running recorder: real recorders, real command lines."""
 
 import contextlib
+import functools
 import json
 import os
 import signal
@@ -8,13 +9,11 @@ import subprocess
 import sys
 
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
-import undulog
 from support import processes
 from support.processes import UNDULOG, python, wait_for
 from support.processes import undulog as undulog_command
+from support.read_back import decoded_of
 from undulog.capture import Session
 from undulog.capture.recorder.control_client import ControlClient, find_sockets
 
@@ -47,53 +46,43 @@ def recorder(place):
         yield start
 
 
-def said(capsys, *words):
-    """Exit code and output of a command."""
-    code = undulog.run(["record", *words])
-    out, err = capsys.readouterr()
-    return code, out, err
+@pytest.fixture
+def ask(place, command):
+    """Runs ``undulog record`` with some words to its exit code; returns output and errors."""
+    return functools.partial(command, "record")
 
 
 def decoded(path, topic):
     """Messages by a foreign reader."""
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        return [message for *_, message in reader.iter_decoded_messages([topic])]
+    return [content for *_, content in decoded_of(path, [topic])]
 
 
 def events(path):
-    """Who said what on /rosout."""
+    """Name, level and text of what is on /rosout."""
     return [(event.name, event.level, event.msg) for event in decoded(path, "/rosout")]
 
 
-def test_without_a_recorder_there_is_nobody_to_ask(place, capsys):
+def test_without_a_recorder_there_is_nobody_to_ask(place, ask):
     for words in (["status"], ["mark"], ["split"], ["stop"], ["note", "x"]):
-        code, out, err = said(capsys, *words)
-        assert (code, out) == (1, "")
+        out, err = ask(*words, code=1)
+        assert out == ""
         assert "no recorder runs here" in err
-    code, _, err = said(capsys, "stop", "--socket", str(place / "none.sock"))
-    assert code == 1
+    err = ask("stop", "--socket", place / "none.sock", code=1).err
     assert "none.sock: no recorder listens there" in err
 
 
-def test_a_recording_from_status_to_stop(recorder, place, capsys):
+def test_a_recording_from_status_to_stop(recorder, place, ask):
     process = recorder("run", "--operator", "Ada")
-    code, out, _ = said(capsys, "status")
-    assert code == 0
-    assert out.startswith(f"{place}/run.mcap: recording, ")
-    code, out, _ = said(capsys, "status", "--json")
-    (status,) = json.loads(out)["recordings"]
+    assert ask("status").out.startswith(f"{place}/run.mcap: recording, ")
+    (status,) = json.loads(ask("status", "--json").out)["recordings"]
     assert status["output"] == f"{place}/run.mcap"
     assert status["socket"] == f"{place}/r/undulog/run.sock"
-    assert said(capsys, "mark", "slipped", "on", "sand") == (0, "marked\n", "")
-    assert said(capsys, "note", "--level", "warn", "battery changed") == (0, "noted\n", "")
-    code, out, _ = said(capsys, "split", "--json")
-    assert json.loads(out)["part"] == 2
-    code, out, _ = said(capsys, "stop", "--wait")
-    assert code == 0
+    assert ask("mark", "slipped", "on", "sand") == ("marked\n", "")
+    assert ask("note", "--level", "warn", "battery changed") == ("noted\n", "")
+    assert json.loads(ask("split", "--json").out)["part"] == 2
     first, second = place / "run.mcap", place / "run_0002.mcap"
-    assert out.startswith(f"{first}, {second}: ")
-    # It was told only when the files were whole.
+    assert ask("stop", "--wait").out.startswith(f"{first}, {second}: ")
+    # The command ends only when the files are whole.
     assert ("operator", 20, "mark: slipped on sand") in events(first)
     assert ("operator", 30, "battery changed") in events(first)
     events(second)
@@ -104,28 +93,25 @@ def test_a_recording_from_status_to_stop(recorder, place, capsys):
     assert find_sockets(os.environ) == []
 
 
-def test_of_several_recorders_one_must_be_named(recorder, place, capsys):
+def test_of_several_recorders_one_must_be_named(recorder, place, ask):
     first, second = recorder("one"), recorder("two")
-    code, out, _ = said(capsys, "status")
-    assert code == 0
+    out = ask("status").out
     assert out.index("one.mcap") < out.index("two.mcap")
-    code, _, err = said(capsys, "mark", "x")
-    assert code == 2
+    err = ask("mark", "x", code=2).err
     assert "2 recorders run; which one?" in err
     assert f"--socket {place}/r/undulog/two.sock" in err
-    code, *_ = said(capsys, "stop", "--wait", "--socket", f"{place}/r/undulog/two.sock")
-    assert code == 0
+    ask("stop", "--wait", "--socket", f"{place}/r/undulog/two.sock")
     second.communicate(timeout=PATIENCE_S)
-    code, out, _ = said(capsys, "status")
+    out = ask("status").out
     assert "one.mcap" in out
     assert "two.mcap" not in out
     assert first.poll() is None
-    assert said(capsys, "stop") == (0, "stopping\n", "")  # without --wait at once
+    assert ask("stop") == ("stopping\n", "")  # without --wait at once
     first.communicate(timeout=PATIENCE_S)
     assert (first.returncode, second.returncode) == (0, 0)
 
 
-def test_a_recorder_that_is_killed_while_we_wait_is_told(recorder, capsys):
+def test_a_recorder_that_is_killed_while_we_wait_is_reported(recorder):
     process = recorder("run")
     process.send_signal(signal.SIGSTOP)
     waiting = processes.start(*UNDULOG, "record", "stop", "--wait")
@@ -151,7 +137,7 @@ def test_a_second_recording_at_that_socket_is_refused_and_leaves_nothing(recorde
         assert client.ask({"do": "status"})["output"] == f"{place}/run.mcap"
 
 
-def test_a_controller_in_another_process_tells_its_gait_for_a_while(recorder, place, capsys):
+def test_a_controller_in_another_process_sends_its_gait_for_a_while(recorder, place, ask):
     """Two seconds of a 100 Hz controller, as fast as it is answered."""
     process = recorder("run")
     controller = (
@@ -164,25 +150,20 @@ def test_a_controller_in_another_process_tells_its_gait_for_a_while(recorder, pl
         "        recorder.ask({'do': 'gait', 'values': values})\n"
     )
     assert python(controller, place / "r" / "undulog" / "run.sock").returncode == 0
-    assert said(capsys, "stop", "--wait")[0] == 0
+    ask("stop", "--wait")
     process.communicate(timeout=PATIENCE_S)
     found = decoded(place / "run.mcap", "/gait")
     assert len(found) == 200
     assert found[50].position[1] == pytest.approx(1.5707963267948966, rel=1e-15)
 
 
-def test_a_ring_is_written_when_marked(recorder, place, capsys):
-    process = recorder("run", "--ring", "20s")
-    code, out, _ = said(capsys, "mark", "--json", "slipped")
-    assert code == 0
-    first = place / "run_mark0001.mcap"
-    assert json.loads(out)["file"] == str(first)
-    code, _, err = said(capsys, "split")
-    assert code == 1
-    assert "a ring has no parts" in err
-    said(capsys, "note", "later")
-    assert said(capsys, "mark")[0] == 0
-    assert said(capsys, "stop", "--wait")[0] == 0
+def test_a_ring_is_written_when_marked(recorder, place, ask):
+    process, first = recorder("run", "--ring", "20s"), place / "run_mark0001.mcap"
+    assert json.loads(ask("mark", "--json", "slipped").out)["file"] == str(first)
+    assert "a ring has no parts" in ask("split", code=1).err
+    ask("note", "later")
+    ask("mark")
+    ask("stop", "--wait")
     process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
     assert not (place / "run.mcap").exists()
@@ -191,27 +172,24 @@ def test_a_ring_is_written_when_marked(recorder, place, capsys):
     assert ("operator", 20, "later") in events(place / "run_mark0002.mcap")
 
 
-def test_a_note_needs_a_text(place, capsys):
-    code, _, err = said(capsys, "note")
-    assert code == 2
-    assert "a note needs a text" in err
+def test_a_note_needs_a_text(ask):
+    assert "a note needs a text" in ask("note", code=2).err
 
 
-def test_the_unit_is_printed_with_this_installation_s_command(place, capsys):
-    code, out, _ = said(capsys, "unit")
-    assert code == 0
-    assert f"ExecStart={sys.prefix}/bin/undulog record --settings /etc/undulog/%i.toml" in out
+def test_the_unit_is_printed_with_this_installation_s_command(ask):
+    start = f"ExecStart={sys.prefix}/bin/undulog record --settings /etc/undulog/%i.toml"
+    assert start in ask("unit").out
 
 
-def test_two_outputs_of_one_name_in_two_folders(recorder, place, capsys):
+def test_two_outputs_of_one_name_in_two_folders(recorder, place, ask):
     started = []
     for folder in ("a", "b"):
         (place / folder).mkdir()
         started.append(recorder(f"{folder}/run", "--floor", "0"))
-    _, out, _ = said(capsys, "status", "--json")
-    found = {each["output"]: each["socket"] for each in json.loads(out)["recordings"]}
+    recordings = json.loads(ask("status", "--json").out)["recordings"]
+    found = {each["output"]: each["socket"] for each in recordings}
     assert set(found) == {str(place / folder / "run.mcap") for folder in ("a", "b")}
     assert f"{place}/r/undulog/run.sock" in found.values()
     for socket in found.values():
-        assert said(capsys, "stop", "--wait", "--socket", socket)[0] == 0
+        ask("stop", "--wait", "--socket", socket)
     assert [process.wait(PATIENCE_S) for process in started] == [0, 0]

@@ -1,17 +1,14 @@
 """The stored verdict and clock of a real recording, against what was done to its source."""
 
-from __future__ import annotations
-
 import signal
 import socket
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 from support.processes import wait_for
+from support.read_back import metadata_of
 from support.recorders import ended, recording
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.frames import empty_frames
@@ -20,7 +17,7 @@ from undulog.capture.sources.contract import HEAD
 NS = 1_000_000_000
 
 
-def send(path: Path, seconds: float, lost: int) -> int:
+def send(path, seconds, lost):
     """Frames at about 1 kHz on a clock that runs 80 ppm fast; some numbers are never sent."""
     sequence = sent = 0
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
@@ -39,7 +36,7 @@ def send(path: Path, seconds: float, lost: int) -> int:
 
 
 @pytest.mark.slow
-def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path: Path) -> None:
+def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path):
     output, source = tmp_path / "run.mcap", tmp_path / "snake.sock"
     with recording(output, f"bus=unix:{source}") as recorder:
         wait_for(source.exists, "the source", alive=[recorder])
@@ -52,9 +49,7 @@ def test_what_is_stored_is_what_a_check_finds_and_what_was_done(tmp_path: Path) 
     (found,) = health.sources
     assert (found.name, found.frames, found.dropped) == ("bus", sent, 12)
     assert any(f"source bus lost 12 of {sent + 12} frames" in text for text in health.reasons)
-    with output.open("rb") as stream:
-        facts = {m.name: m.metadata for m in make_reader(stream).iter_metadata()}
-    clock = facts["undulog.clock"]
+    clock = metadata_of(output)["undulog.clock"]
     unsure = float(clock["bus.drift_uncertainty_ppm"])
     assert float(clock["bus.drift_ppm"]) == pytest.approx(80.0, abs=10.0 + 4 * unsure)
     assert int(clock["bus.samples"]) == sent

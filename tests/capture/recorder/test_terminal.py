@@ -1,7 +1,5 @@
 """What an operator sees, on real terminals and pipes, also on those that take nothing."""
 
-from __future__ import annotations
-
 import fcntl
 import io
 import os
@@ -11,7 +9,6 @@ import select
 import struct
 import termios
 import time
-from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 
@@ -84,11 +81,11 @@ SNAPSHOT = RecorderSnapshot(
 )
 
 
-def rows(snapshot: RecorderSnapshot, width: int, height: int | None = None) -> list[str]:
+def rows(snapshot, width, height=None):
     return screen(snapshot, width, height).plain.split("\n")
 
 
-def row(lines: list[str], first: str) -> list[str]:
+def row(lines, first):
     (found,) = [line for line in lines if line.startswith(first)]
     return re.split(r"\s{2,}", found.strip())
 
@@ -96,7 +93,7 @@ def row(lines: list[str], first: str) -> list[str]:
 # -- what is drawn -----------------------------------------------------------------------------
 
 
-def test_the_answer_comes_first_and_everything_is_on_the_screen() -> None:
+def test_the_answer_comes_first_and_everything_is_on_the_screen():
     lines = rows(SNAPSHOT, 120)
     assert lines[0].split() == ["recording", "/data/run.mcap", "snake25", "0:12:34"]
     assert "123 MB (+35.2 kB/s) | part 2 | 1,234,567 messages" in lines[1]
@@ -114,7 +111,7 @@ def test_the_answer_comes_first_and_everything_is_on_the_screen() -> None:
     assert lines[-1] == "0:12:22 error imu: the connection is lost"
 
 
-def test_a_good_recording_says_so_in_words() -> None:
+def test_a_good_recording_says_so_in_words():
     good = replace(SNAPSHOT, verdict="good", reasons=(), events=(), topics=(), sources=())
     assert "GOOD" in rows(good, 80)[2]
     assert "nothing found so far" in rows(good, 80)[2]
@@ -125,9 +122,7 @@ texts = st.text(max_size=200)
 
 @given(st.integers(40, 200), st.integers(8, 60), texts, texts, texts)
 @settings(max_examples=60, deadline=None)
-def test_no_screen_is_wider_than_the_terminal_whatever_names_say(
-    width: int, height: int, reason: str, path: str, said: str
-) -> None:
+def test_no_screen_is_wider_than_the_terminal_whatever_names_say(width, height, reason, path, said):
     snapshot = replace(
         SNAPSHOT,
         path=path,
@@ -142,7 +137,7 @@ def test_no_screen_is_wider_than_the_terminal_whatever_names_say(
     console.print(screen(snapshot, width, height))
 
 
-def test_a_small_screen_counts_the_topics_that_it_leaves_out() -> None:
+def test_a_small_screen_counts_the_topics_that_it_leaves_out():
     many = tuple(TopicSnapshot(f"/topic_{k}", 1, 1.0, 0.0) for k in range(40))
     lines = rows(replace(SNAPSHOT, topics=many), 80, 24)
     assert len(lines) <= 24
@@ -161,7 +156,7 @@ def test_a_small_screen_counts_the_topics_that_it_leaves_out() -> None:
         (400_000.0, "111:06:40", "4 d"),
     ],
 )
-def test_times_are_shown_in_units_that_matter(time_s: float, clock: str, left: str) -> None:
+def test_times_are_shown_in_units_that_matter(time_s, clock, left):
     assert (clock_time(time_s), time_left(time_s)) == (clock, left)
 
 
@@ -169,7 +164,7 @@ def test_times_are_shown_in_units_that_matter(time_s: float, clock: str, left: s
 
 
 @contextmanager
-def terminal() -> Iterator[tuple[int, io.TextIOWrapper]]:
+def terminal():
     """A real terminal of 100 x 30: the end of whoever looks at it, and the stream."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 30, 100, 0, 0))
@@ -177,7 +172,7 @@ def terminal() -> Iterator[tuple[int, io.TextIOWrapper]]:
         yield ours, stream
 
 
-def read_until(number: int, wanted: str, patience_s: float = 30.0) -> str:
+def read_until(number, wanted, patience_s=30.0):
     found, deadline = b"", time.monotonic() + patience_s
     while wanted.encode() not in found:
         left_s = deadline - time.monotonic()
@@ -187,15 +182,12 @@ def read_until(number: int, wanted: str, patience_s: float = 30.0) -> str:
     return found.decode()
 
 
-def test_a_terminal_gets_a_screen_that_is_cleared_at_the_end(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_terminal_gets_a_screen_that_is_cleared_at_the_end(monkeypatch):
     monkeypatch.setenv("TERM", "xterm-256color")
     with terminal() as (ours, stream):
         shown = Terminal(stream)
         shown.show(SNAPSHOT)
-        said = read_until(ours, "the connection is lost")
-        assert "DEGRADED" in said
+        assert "DEGRADED" in read_until(ours, "the connection is lost")
         shown.show(replace(SNAPSHOT, elapsed_s=755.3))
         assert "0:12:35" in read_until(ours, "the connection is lost")
         assert shown.close()
@@ -204,9 +196,7 @@ def test_a_terminal_gets_a_screen_that_is_cleared_at_the_end(
         assert "\x1b[2K" in read_until(ours, "the report")  # lines of the screen are erased
 
 
-def test_a_terminal_that_takes_nothing_does_not_stop_the_recording(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_terminal_that_takes_nothing_does_not_stop_the_recording(monkeypatch):
     """As after Ctrl-S: nobody reads, the kernel's buffer is full, a write waits for ever."""
     monkeypatch.setenv("TERM", "xterm-256color")
     with terminal() as (ours, stream):
@@ -223,7 +213,7 @@ def test_a_terminal_that_takes_nothing_does_not_stop_the_recording(
                 os.read(ours, 1 << 16)
 
 
-def test_a_process_whose_terminal_is_stuck_can_end() -> None:
+def test_a_process_whose_terminal_is_stuck_can_end():
     program = (
         "import sys, time\n"
         "from tests_snapshot import SNAPSHOT, Terminal\n"
@@ -242,7 +232,7 @@ def test_a_process_whose_terminal_is_stuck_can_end() -> None:
     assert (done.returncode, done.stdout) == (0, "False\n")
 
 
-def test_a_pipe_gets_a_line_every_ten_seconds_and_each_trouble_once() -> None:
+def test_a_pipe_gets_a_line_every_ten_seconds_and_each_trouble_once():
     number, other = os.pipe()
     with os.fdopen(other, "w") as stream:
         shown = Terminal(stream)
@@ -264,7 +254,7 @@ def test_a_pipe_gets_a_line_every_ten_seconds_and_each_trouble_once() -> None:
     assert not any(line.startswith("info") for line in lines)
 
 
-def test_a_terminal_that_has_gone_is_no_trouble() -> None:
+def test_a_terminal_that_has_gone_is_no_trouble():
     number, other = os.pipe()
     os.close(number)
     with os.fdopen(other, "w") as stream:
@@ -279,7 +269,7 @@ def test_a_terminal_that_has_gone_is_no_trouble() -> None:
     assert text.getvalue() == ""
 
 
-def test_the_line_says_what_matters() -> None:
+def test_the_line_says_what_matters():
     line = plain_line(SNAPSHOT)
     assert line.startswith("0:12:34 degraded; 1,234,567 messages, 123 MB; can0 connected, lost 12")
     assert line.endswith("reason 0 (and 4 more)")
@@ -288,12 +278,11 @@ def test_the_line_says_what_matters() -> None:
 # -- the same as diagnostics -------------------------------------------------------------------
 
 
-def test_the_statuses_say_what_the_screen_says() -> None:
+def test_the_statuses_say_what_the_screen_says():
     found = {status.name: status for status in statuses(SNAPSHOT)}
     names = "recorder, session, source can0, source imu, topics ir, topics joints"
     assert list(found) == names.split(", ")
-    assert found["recorder"].level == OK
-    assert found["session"].level == WARN
+    assert (found["recorder"].level, found["session"].level) == (OK, WARN)
     assert found["session"].values["reason.2"] == "reason 1"
     assert (found["source can0"].level, found["source imu"].level) == (WARN, ERROR)
     assert found["source can0"].values["clock_drift_ppm"] == "-23.420"
@@ -301,16 +290,15 @@ def test_the_statuses_say_what_the_screen_says() -> None:
     assert "frozen: joint07" in found["topics joints"].message
 
 
-def test_a_silent_source_is_stale_and_a_full_disk_an_error() -> None:
-    silent = replace(CAN, age_s=3.0, dropped=0)
-    snapshot = replace(SNAPSHOT, sources=(silent,), free=1_000_000)
+def test_a_silent_source_is_stale_and_a_full_disk_an_error():
+    snapshot = replace(SNAPSHOT, sources=(replace(CAN, age_s=3.0, dropped=0),), free=1_000_000)
     found = {status.name: status for status in statuses(snapshot)}
     assert (found["source can0"].level, found["source can0"].message) == (STALE, "silent for 3 s")
     recorder = found["recorder"]
     assert (recorder.level, recorder.message) == (ERROR, "the disk is full in 28 s")
 
 
-def test_what_is_written_is_what_a_check_reads(tmp_path) -> None:
+def test_what_is_written_is_what_a_check_reads(tmp_path):
     """Statuses to a file and back, the counts of the sources included."""
     from undulog.capture import SessionWriter
     from undulog.capture.log.columns.topics import Topics

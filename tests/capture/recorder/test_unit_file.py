@@ -6,6 +6,7 @@ import shutil
 import signal
 import socket
 import subprocess
+from collections import defaultdict
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -22,12 +23,10 @@ EXPOSURE = 2.0  # of 10, as `systemd-analyze security` counts; 2.5 would still b
 @pytest.fixture
 def systemd_analyze(display_tests_required):
     """Path of systemd-analyze; skips where there is none, fails where one is required."""
-    path = shutil.which("systemd-analyze")
-    if path is None and display_tests_required:
-        pytest.fail("no systemd-analyze on the path")
-    if path is None:
-        pytest.skip("no systemd-analyze on the path")
-    return path
+    if path := shutil.which("systemd-analyze"):
+        return path
+    refuse = pytest.fail if display_tests_required else pytest.skip
+    return refuse("no systemd-analyze on the path")
 
 
 @pytest.fixture
@@ -40,23 +39,20 @@ def unit(tmp_path):
 
 def settings_of(text):
     """Key to all its values, without comments."""
-    found = {}
-    for line in text.splitlines():
-        key, equals, value = line.partition("=")
-        if equals and not line.startswith("#"):
-            found.setdefault(key, []).append(value)
+    found = defaultdict(list)
+    for key, value in re.findall(r"^([^#=\n]+)=(.*)$", text, re.MULTILINE):
+        found[key].append(value)
     return found
 
 
 def test_systemd_finds_nothing_wrong(systemd_analyze, unit):
     done = run(systemd_analyze, "verify", "--man=no", unit)
     assert done.returncode == 0, done.stderr
-    said = [line for line in done.stderr.splitlines() if unit.name in line]
-    assert said == []
+    assert unit.name not in done.stderr
 
 
 def judged(systemd_analyze, unit):
-    """What systemd says of a unit's security."""
+    """systemd's verdict on a unit's security."""
     threshold = f"--threshold={EXPOSURE * 10:.0f}"
     return run(systemd_analyze, "security", "--offline=true", "--no-pager", threshold, unit)
 
@@ -66,8 +62,7 @@ def test_systemd_finds_it_well_hardened(systemd_analyze, unit):
     if "unrecognized option" in done.stderr:
         pytest.skip("this systemd-analyze can't judge a file")
     assert done.returncode == 0, done.stdout
-    exposure = float(re.search(r"exposure level for \S+: ([0-9.]+)", done.stdout)[1])
-    assert exposure <= EXPOSURE
+    assert float(re.search(r"exposure level for \S+: ([0-9.]+)", done.stdout)[1]) <= EXPOSURE
 
 
 def test_a_weaker_unit_would_not_pass(systemd_analyze, unit):
@@ -80,29 +75,26 @@ def test_a_weaker_unit_would_not_pass(systemd_analyze, unit):
 
 def test_what_the_recorder_relies_on_is_there(unit):
     found = settings_of(unit.read_text())
-    assert found["Type"] == ["notify"]
-    assert found["KillSignal"] == ["SIGTERM"]
+    assert (found["Type"], found["KillSignal"]) == (["notify"], ["SIGTERM"])
     assert found["Restart"] == ["on-failure"]
     assert found["AssertPathExists"] == ["/etc/undulog/%i.toml"]
     assert found["RestartPreventExitStatus"] == ["2"]
     assert found["RuntimeDirectory"] == found["StateDirectory"] == ["undulog/%i"]
-    families = found["RestrictAddressFamilies"][0].split()
-    assert {"AF_UNIX", "AF_CAN", "AF_INET"} <= set(families)
+    assert {"AF_UNIX", "AF_CAN", "AF_INET"} <= set(found["RestrictAddressFamilies"][0].split())
     assert {"char-ttyACM rw", "char-ttyUSB rw"} <= set(found["DeviceAllow"])
 
 
 def test_the_program_s_path_stands_in_the_unit():
-    text = unit_text(Path("/opt/undulog/bin/undulog"))
-    assert "ExecStart=/opt/undulog/bin/undulog record " in text
-    text = unit_text(Path("/opt/a 50%/$HOME/undulog"))
-    assert 'ExecStart="/opt/a 50%%/$HOME/undulog" record ' in text
+    plain, odd = (unit_text(Path(f"/opt/{f}/undulog")) for f in ("undulog/bin", "a 50%/$HOME"))
+    assert "ExecStart=/opt/undulog/bin/undulog record " in plain
+    assert 'ExecStart="/opt/a 50%%/$HOME/undulog" record ' in odd
     for path in ("bin/undulog", "/opt/two\nlines/undulog", '/opt/a"b/undulog', "/opt/a*/undulog"):
         with pytest.raises(UsageError, match="an absolute path"):
             unit_text(Path(path))
 
 
 @pytest.mark.parametrize("folder", ["/opt/with space", "/opt/50%", "/opt/a;b", "/opt/$x", "/opt/ü"])
-def test_odd_paths_mean_to_systemd_what_they_say(systemd_analyze, tmp_path, folder):
+def test_odd_paths_mean_to_systemd_what_they_spell(systemd_analyze, tmp_path, folder):
     """systemd looks for the program, and names the path that it understood."""
     unit = tmp_path / UNIT_NAME.replace("@", "@snake")
     unit.write_text(unit_text(Path(folder) / "undulog"))
@@ -110,7 +102,7 @@ def test_odd_paths_mean_to_systemd_what_they_say(systemd_analyze, tmp_path, fold
     assert f"Command {folder}/undulog is not executable" in done.stderr
 
 
-def test_a_program_that_the_unit_hides_is_told(tmp_path):
+def test_a_program_that_the_unit_hides_is_reported(tmp_path):
     assert hidden_folder(Path("/home/ann/venv/bin/undulog")) == "/home"
     assert hidden_folder(Path("/opt/undulog/bin/undulog")) is None
     (tmp_path / "undulog").write_text("")
@@ -131,8 +123,7 @@ def heard(manager, wanted):
 
 def start_command(unit, name):
     """What the unit would run, with its specifiers filled in."""
-    command = settings_of(unit.read_text())["ExecStart"][0]
-    return command.replace("%i", name).split()
+    return settings_of(unit.read_text())["ExecStart"][0].replace("%i", name).split()
 
 
 def without_capabilities():
@@ -174,8 +165,7 @@ def service(unit, tmp_path):
 
 def control(runtime, *words):
     """Run a command of the control socket as the operator would."""
-    environ = {**os.environ, "RUNTIME_DIRECTORY": str(runtime)}
-    return undulog("record", *words, env=environ)
+    return undulog("record", *words, env={**os.environ, "RUNTIME_DIRECTORY": str(runtime)})
 
 
 def test_a_service_says_ready_feeds_its_watchdog_and_ends_whole_on_sigterm(service, tmp_path):
@@ -192,8 +182,7 @@ def test_a_service_says_ready_feeds_its_watchdog_and_ends_whole_on_sigterm(servi
     output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
     assert output == "", "--quiet"
-    raw = (tmp_path / "state" / "run.mcap").read_bytes()
-    assert raw.endswith(b"\x89MCAP0\r\n")
+    assert (tmp_path / "state" / "run.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
     assert not (tmp_path / "runtime" / "run.sock").exists()
 
 

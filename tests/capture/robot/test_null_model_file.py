@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from undulog.capture.common.errors import InputFileError, NullModelError
-from undulog.capture.robot.null_model import (
-    NullModel,
-    SharedParameter,
-    read_null_model,
-    write_null_model,
-)
+from undulog.capture.robot import null_model
 
 
 def some_model():
@@ -21,14 +16,14 @@ def some_model():
         return rng.normal(size=shape) + 1j * rng.normal(size=shape)
 
     bend = y(2, 2, 3)
-    return NullModel(
+    return null_model.NullModel(
         robot="snake",
         frequency_hz=0.5,
         joints=("a", "b", "c"),
         command=0.4 * np.exp(1j * np.arange(3)),
         parameters=(
-            SharedParameter("stall_torque", "N m", 0.25, 0.2),
-            SharedParameter("mu_normal", "1", 0.5, 0.3),
+            null_model.SharedParameter("stall_torque", "N m", 0.25, 0.2),
+            null_model.SharedParameter("mu_normal", "1", 0.5, 0.3),
         ),
         covariance=np.array([[0.04, 0.01], [0.01, 0.09]]),
         response=y(3),
@@ -42,8 +37,8 @@ def some_model():
 
 def test_there_and_back(tmp_path):
     model, path = some_model(), tmp_path / "model.json"
-    write_null_model(path, model)
-    again = read_null_model(path)
+    null_model.write_null_model(path, model)
+    again = null_model.read_null_model(path)
     for name in ("response", "slope", "curvature", "covariance"):
         np.testing.assert_array_equal(getattr(again, name), getattr(model, name))
     np.testing.assert_allclose(again.command, model.command, rtol=1e-15)
@@ -74,16 +69,16 @@ def test_its_slope_is_that_of_its_value():
 )
 def test_faults_are_named(tmp_path, change, fault):
     path = tmp_path / "model.json"
-    write_null_model(path, some_model())
+    null_model.write_null_model(path, some_model())
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(NullModelError, match=fault):
-        read_null_model(path)
+        null_model.read_null_model(path)
 
 
 def test_what_is_no_json(tmp_path):
     path = tmp_path / "model.json"
     path.write_text("{")
     with pytest.raises(NullModelError, match="syntax"):
-        read_null_model(path)
+        null_model.read_null_model(path)
     with pytest.raises(InputFileError, match="no such file"):
-        read_null_model(tmp_path / "none.json")
+        null_model.read_null_model(tmp_path / "none.json")

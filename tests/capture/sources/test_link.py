@@ -19,12 +19,12 @@ from undulog.capture.sources.socketcan import SocketcanLink
 FRAME = bytes.fromhex("23010000020000001122000000000000")
 
 
-def source_of(open_link) -> LinkedSource:
+def source_of(open_link):
     address = parse_address("can:test:can0")
     return LinkedSource(address, open_link, place="can0", clock=ClockDomain.HOST, facts={})
 
 
-def test_a_fault_of_an_opener_is_told_and_tried_again(sockets, listen) -> None:
+def test_a_fault_of_an_opener_is_reported_and_tried_again(sockets, listen):
     ours, theirs = sockets
     faults = [RuntimeError("a bug"), RuntimeError("a bug"), OSError(5, "Input/output error")]
 
@@ -33,20 +33,20 @@ def test_a_fault_of_an_opener_is_told_and_tried_again(sockets, listen) -> None:
             raise faults.pop(0)
         return SocketcanLink(ours, tally)
 
-    heard = listen(source_of(open_link))
-    heard.until_event("connected to can0")
-    assert heard.texts == [
+    reader = listen(source_of(open_link))
+    reader.until_event("connected to can0")
+    assert reader.texts == [
         "can't open can0: RuntimeError('a bug')",
         "waits for can0: Input/output error",
         "connected to can0 (never transmits)",
     ]
     theirs.send(FRAME)
-    (frame,) = heard.until_frames(1)
+    (frame,) = reader.until_frames(1)
     assert (frame["id_flags"], frame["dlc"], bytes(frame["data"][:2])) == (0x123, 2, b"\x11\x22")
     assert frame.dtype == FRAME_DTYPE
 
 
-def test_a_fault_of_a_link_is_a_lost_connection(sockets, listen) -> None:
+def test_a_fault_of_a_link_is_a_lost_connection(sockets, listen):
     ours, theirs = sockets
 
     class Faulty(SocketcanLink):
@@ -55,61 +55,60 @@ def test_a_fault_of_a_link_is_a_lost_connection(sockets, listen) -> None:
                 raise ZeroDivisionError("a bug") from None
             return found
 
-        def close(self) -> None:
+        def close(self):
             pass  # the test's socket lives on
 
     links = [Faulty, SocketcanLink]
-    heard = listen(source_of(lambda tally: links.pop(0)(ours, tally)))
-    heard.until_event("connected")
+    reader = listen(source_of(lambda tally: links.pop(0)(ours, tally)))
+    reader.until_event("connected")
     theirs.send(FRAME)
-    heard.until_event("lost can0: ZeroDivisionError('a bug')")
-    heard.until_event("is back")
+    reader.until_event("lost can0: ZeroDivisionError('a bug')")
+    reader.until_event("is back")
     theirs.send(FRAME)
-    heard.until_frames(1)
-    assert heard.source.counts.reconnects == 1
+    reader.until_frames(1)
+    assert reader.counts.reconnects == 1
 
 
-def test_what_the_thread_took_and_what_the_kernel_dropped_is_all(sockets, listen) -> None:
+def test_what_the_thread_took_and_what_the_kernel_dropped_is_all(sockets, listen):
     ours, theirs = sockets
     for option in (SO_TIMESTAMPNS, SO_RXQ_OVFL):
         ours.setsockopt(socket.SOL_SOCKET, option, 1)
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    heard = listen(
+    reader = listen(
         source_of(lambda tally: DrainedLink(SocketcanLink(ours, tally), tally, pause_s=0.01))
     )
-    heard.until_event("connected")
+    reader.until_event("connected")
     sent = 3000
     for _ in range(sent):  # nobody polls, and the socket holds a few at a time
         theirs.send(FRAME)
 
     def send_one():
         nonlocal sent
-        theirs.send(FRAME)  # drops are told with the next packet
+        theirs.send(FRAME)  # drops come with the next packet
         sent += 1
         time.sleep(0.05)
-        heard.poll()
+        reader.poll()
 
-    wait_for(lambda: len(heard.frames) + (heard.source.counts.dropped or 0) == sent, each=send_one)
-    assert heard.source.counts.dropped
-    assert heard.source.counts.frames == len(heard.frames)
+    wait_for(lambda: len(reader.frames) + (reader.counts.dropped or 0) == sent, each=send_one)
+    assert reader.counts.dropped
+    assert reader.counts.frames == len(reader.frames)
 
 
-def test_what_is_found_impossible_late_ends_the_source_only(listen) -> None:
+def test_what_is_found_impossible_late_ends_the_source_only(listen):
     go = threading.Event()
 
     def open_link(tally):
         go.wait(60)
         raise SourceError("can:test:can0", "there is no such driver")
 
-    heard = listen(source_of(open_link))
-    assert not heard.source.finished
+    reader = listen(source_of(open_link))
+    assert not reader.source.finished
     go.set()
-    event = heard.until_event("there is no such driver")
-    assert event.level == "error"
-    assert heard.source.finished
+    assert reader.until_event("there is no such driver").level == "error"
+    assert reader.source.finished
 
 
-def test_what_is_found_impossible_at_once_is_raised(context) -> None:
+def test_what_is_found_impossible_at_once_is_raised(context):
     def open_link(tally):
         raise SourceError("can:test:can0", "there is no such driver")
 
@@ -119,7 +118,7 @@ def test_what_is_found_impossible_at_once_is_raised(context) -> None:
     source.stop()
 
 
-def test_a_connection_that_opens_after_the_end_is_closed(sockets, context) -> None:
+def test_a_connection_that_opens_after_the_end_is_closed(sockets, context):
     ours, _ = sockets
     go = threading.Event()
 

@@ -17,8 +17,10 @@ import numpy as np
 import pytest
 
 from support.processes import python, start, wait_for
-from support.recorders import ended, greet, recording
-from undulog.capture import Session, SessionWriter, load_robot
+from support.read_back import messages_of
+from support.recorders import ended, events, greet, recording
+from support.written_frames import frames_of
+from undulog.capture import SessionWriter, load_robot
 from undulog.capture.common.process import raised_priority
 from undulog.capture.log.messages.frames import empty_frames
 from undulog.capture.recorder.bus_recorder import BusRecorder
@@ -122,11 +124,9 @@ def test_what_was_accepted_before_the_end_is_in_the_session(seed, tmp_path):
         wait_for((output.parent / "run.mcap.wal").exists, "the log")
         time.sleep(1.0 + seed / 7)
         report, err = ended(recorder, signal.SIGINT)
-        accepted, _, _ = sender.result()  # its send() failed: it knows that nobody records
+        accepted, _, _ = sender.result()  # its send() failed: nobody records
     assert recorder.returncode == 0, err
-    with Session.open(output) as session:
-        numbers = session.frames("/can/bus")["t_device_ns"]
-    np.testing.assert_array_equal(numbers, np.arange(accepted))
+    np.testing.assert_array_equal(frames_of(output, "/can/bus")["t_device_ns"], np.arange(accepted))
     assert report["sources"]["bus"]["frames"] == accepted
 
 
@@ -149,8 +149,7 @@ def test_a_stream_is_kept_up_to_the_end(tmp_path):
                 time.sleep(0.0002)
             _, err = ended(recorder)
     assert recorder.returncode == 0, err
-    with Session.open(output) as session:
-        frames = session.frames("/can/bus")
+    frames = frames_of(output, "/can/bus")
     seconds = frames["t_device_ns"] // 1_000_000_000
     np.testing.assert_array_equal(seconds, np.arange(len(seconds)))
     assert len(seconds) >= 3000
@@ -176,20 +175,12 @@ def test_decoding_stops_when_its_time_is_over(tmp_path):
                 calls += 1
             bus.finish(lambda: 1)
         assert name == "whole" or (most <= until_ns + 2 and calls > 100)
-    sessions = [Session.open(tmp_path / f"{name}.mcap") for name in ("whole", "bits")]
+    paths = [tmp_path / f"{name}.mcap" for name in ("whole", "bits")]
     for topic in ("/joint_states", "/joint_commands", "/joint_sample_offset"):
-        first, second = (sorted(m.data for m in raw(each, topic)) for each in sessions)
+        found = [messages_of(path, topics=[topic]) for path in paths]
+        first, second = (sorted(m.data for *_, m in messages) for messages in found)
         assert first == second
         assert len(first) > 10
-    for each in sessions:
-        each.close()
-
-
-def raw(session, topic):
-    from mcap.reader import make_reader
-
-    with session.path.open("rb") as stream:
-        yield from (message for _, _, message in make_reader(stream).iter_messages([topic]))
 
 
 root_only = pytest.mark.skipif(
@@ -236,9 +227,8 @@ def test_the_recorder_reports_its_priority(before, text, tmp_path):
         time.sleep(0.5)
         report, _ = ended(recorder, signal.SIGINT)
     assert report["recorder"]["priority"] == text
-    with Session.open(output) as session:
-        said = [message.msg for _, message in session.messages("/rosout")]
-    assert any("priority was refused" in line for line in said) == text.startswith("refused")
+    refused = any("priority was refused" in line for _, line in events(output))
+    assert refused == text.startswith("refused")
 
 
 def test_a_quiet_sender_has_no_frames():

@@ -1,4 +1,4 @@
-"""Other processes, with our sender and with one that knows only the packets' description."""
+"""Other processes, with our sender and with one made from the packets' description alone."""
 
 import json
 import os
@@ -20,7 +20,7 @@ from undulog.capture.robot.model import ClockDomain
 from undulog.capture.sources.contract import open_source, parse_address
 from undulog.capture.sources.unix_socket import MOST_SENDERS, FrameSender
 
-# Knows nothing of us but the packets: 32 bytes a frame, packed by struct.
+# Shares nothing with us but the packets: 32 bytes a frame, packed by struct.
 FOREIGN = """
 import socket, struct, sys
 path, first, count, per_packet, head = sys.argv[1], *map(int, sys.argv[2:6])
@@ -50,17 +50,16 @@ with FrameSender(sys.argv[2]) as sender:
 """
 
 
-def foreign_truth(first: int, count: int):
-    frames = empty_frames(count)
-    for row, n in enumerate(range(first, first + count)):
-        frames["t_device_ns"][row] = 10**18 + n * 1000
-        frames["id_flags"][row], frames["dlc"][row] = n % 2048, n % 9
-        data = (n.to_bytes(8, "little") * 2)[: n % 9].ljust(8, b"\0")
-        frames["data"][row] = list(data)
+def foreign_truth(first, count):
+    frames, numbers = empty_frames(count), np.arange(first, first + count)
+    frames["t_device_ns"] = 10**18 + numbers * 1000
+    frames["id_flags"], frames["dlc"] = numbers % 2048, numbers % 9
+    frames["data"] = numbers.astype("<u8").view(np.uint8).reshape(-1, 8)
+    frames["data"][np.arange(8) >= frames["dlc"][:, None]] = 0
     return frames
 
 
-def source_at(path: Path, query: str = ""):
+def source_at(path, query=""):
     return open_source(parse_address(f"unix:{path}{query}"))
 
 
@@ -70,7 +69,7 @@ def path(tmp_path):
 
 
 @pytest.fixture
-def heard(path, listen):
+def reader(path, listen):
     """A source at that path."""
     return listen(source_at(path))
 
@@ -80,7 +79,7 @@ def peer(path):
     """Connects sockets of this process."""
     with ExitStack() as opened:
 
-        def connect() -> socket.socket:
+        def connect():
             sock = opened.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
             sock.connect(str(path))
             return sock
@@ -89,71 +88,70 @@ def peer(path):
 
 
 @pytest.mark.parametrize(("per_packet", "head"), [(256, 1), (1, 0), (7, 1)])
-def test_twenty_thousand_frames_of_a_foreign_process(path, heard, same, per_packet, head) -> None:
+def test_twenty_thousand_frames_of_a_foreign_process(path, reader, same, per_packet, head):
     truth = foreign_truth(0, 20_000)
     with start(sys.executable, "-c", FOREIGN, path, 0, 20_000, per_packet, head) as process:
-        found = heard.until_frames(20_000)
+        found = reader.until_frames(20_000)
         assert process.wait(60) == 0
     assert same(found, truth)
     assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
     assert (np.diff(found["t_host_ns"].astype(np.int64)) >= 0).all()
-    assert heard.source.counts.frames == 20_000
-    assert heard.source.counts.dropped == (0 if head else None)
-    heard.until_event("disconnected")
-    assert heard.texts[1:] == ["a sender connected", "a sender disconnected"]
-    assert heard.source.clock is ClockDomain.DEVICE
+    assert reader.counts.frames == 20_000
+    assert reader.counts.dropped == (0 if head else None)
+    reader.until_event("disconnected")
+    assert reader.texts[1:] == ["a sender connected", "a sender disconnected"]
+    assert reader.source.clock is ClockDomain.DEVICE
 
 
-def test_what_our_sender_offers_arrives(tmp_path, path, heard, traffic, same) -> None:
+def test_what_our_sender_offers_arrives(tmp_path, path, reader, traffic, same):
     truth = traffic(20_000)
     np.save(tmp_path / "frames.npy", truth)
     with start(sys.executable, "-c", OURS, tmp_path / "frames.npy", path) as process:
-        found = heard.until_frames(20_000)
+        found = reader.until_frames(20_000)
         accepted, refused = json.loads(process.communicate(timeout=60)[0])
-    heard.until_event("disconnected")
+    reader.until_event("disconnected")
     assert accepted == 20_000
     assert same(found, truth)
     assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
-    before = 0 if heard.source.counts.dropped == refused else refused
-    assert heard.source.counts.dropped == refused - before  # refused before it was connected
+    before = 0 if reader.counts.dropped == refused else refused
+    assert reader.counts.dropped == refused - before  # refused before it was connected
 
 
-def test_frames_that_found_no_room_are_proved_lost(path, heard, traffic, same) -> None:
+def test_frames_that_found_no_room_are_proved_lost(path, reader, traffic, same):
     truth = traffic(200)
     sender = FrameSender(path)
     sent = []
     while sender.refused == 0:  # faster than it is read: the buffer fills
         sent.append(truth[: sender.send(truth)])
-    found = heard.until_frames(sender.accepted)
-    assert same(found, np.concatenate(sent))
-    assert heard.source.counts.dropped == 0  # not known yet
+    assert same(reader.until_frames(sender.accepted), np.concatenate(sent))
+    assert reader.counts.dropped == 0  # not known yet
     sent.append(truth[: sender.send(truth)])
-    assert same(heard.until_frames(sender.accepted), np.concatenate(sent))
-    assert heard.source.counts.dropped == sender.refused > 0
-    heard.until_event("lost before it reached us")
+    assert same(reader.until_frames(sender.accepted), np.concatenate(sent))
+    assert reader.counts.dropped == sender.refused > 0
+    reader.until_event("lost before it reached us")
     sender.close()
 
 
-def test_the_last_losses_are_told_on_leaving(path, heard, traffic) -> None:
+def test_the_last_losses_are_reported_on_leaving(path, reader, traffic):
     truth = traffic(200)
     sender = FrameSender(path)
     while sender.refused == 0:
         sender.send(truth)
-    heard.until_frames(sender.accepted)
+    reader.until_frames(sender.accepted)
     sender.close()
-    heard.until_event("disconnected")
-    assert heard.source.counts.dropped == sender.refused > 0
+    reader.until_event("disconnected")
+    assert reader.counts.dropped == sender.refused > 0
 
 
-def test_a_gap_in_the_numbers_is_a_loss(heard, peer) -> None:
+def test_a_gap_in_the_numbers_is_a_loss(reader, peer):
     sock, record = peer(), bytes(empty_frames(1).tobytes())
     for sequence, dropped in ((1000, 5), (1001, 5), (1012, 5), (1013, 8), (1014, 8), (0, 0)):
         sock.send(struct.pack("<QQ", sequence, dropped) + record)
-    heard.until_frames(6)
-    assert heard.source.counts.dropped == 10 + 3
+    reader.until_frames(6)
+    assert reader.counts.dropped == 10 + 3
 
 
-def test_malformed_packets_are_counted_and_told(heard, peer, traffic, same) -> None:
+def test_malformed_packets_are_counted_and_reported(reader, peer, traffic, same):
     truth = traffic(3)
     sock = peer()
     sock.send(truth[:1].tobytes())
@@ -161,15 +159,15 @@ def test_malformed_packets_are_counted_and_told(heard, peer, traffic, same) -> N
         sock.send(bad)
     sock.send(struct.pack("<QQ", 0, 0))  # a head alone is allowed
     sock.send(truth[1:].tobytes())
-    assert same(heard.until_frames(3), truth)
-    assert heard.source.counts.malformed == 6
-    heard.until_event("malformed packet")
-    assert heard.source.connected
+    assert same(reader.until_frames(3), truth)
+    assert reader.counts.malformed == 6
+    reader.until_event("malformed packet")
+    assert reader.source.connected
 
 
-def test_arrival_is_when_it_came_not_when_it_was_fetched(heard, peer, context) -> None:
+def test_arrival_is_when_it_came_not_when_it_was_fetched(reader, peer, context):
     sock = peer()
-    heard.until_event("connected")
+    reader.until_event("connected")
     record = empty_frames(1).tobytes()
     bounds = []
     for _ in range(20):
@@ -178,57 +176,56 @@ def test_arrival_is_when_it_came_not_when_it_was_fetched(heard, peer, context) -
         bounds.append((before_ns, context.now_ns()))
         time.sleep(0.002)
     time.sleep(0.05)
-    found = heard.until_frames(20)
+    found = reader.until_frames(20)
     slack_ns = 1_000_000  # two clocks are read one after the other
     for t_ns, (low_ns, high_ns) in zip(found["t_host_ns"].tolist(), bounds, strict=True):
         assert low_ns - slack_ns <= t_ns <= high_ns + slack_ns
 
 
-def test_two_senders_are_put_in_the_order_of_arrival(heard, peer) -> None:
+def test_two_senders_are_put_in_the_order_of_arrival(reader, peer):
     one, two = peer(), peer()
-    heard.until(lambda: len(heard.source._senders) == 2)
+    reader.until(lambda: len(reader.source._senders) == 2)
     frames = empty_frames(40)
     frames["id_flags"] = np.arange(40)
     for number in range(40):
         (one, two)[number % 3 == 0].send(frames[number : number + 1].tobytes())
-    while any(sender.receiver.pending for sender in heard.source._senders):
+    while any(sender.receiver.pending for sender in reader.source._senders):
         time.sleep(0.001)
-    found = heard.until_frames(40)
-    assert found["id_flags"].tolist() == list(range(40))
+    assert reader.until_frames(40)["id_flags"].tolist() == list(range(40))
 
 
-def test_a_sender_may_leave_and_come_back(path, heard, same) -> None:
+def test_a_sender_may_leave_and_come_back(path, reader, same):
     for first in (0, 100):
         with start(sys.executable, "-c", FOREIGN, path, first, 100, 10, 1) as process:
-            heard.until_frames(first + 100)
-            heard.until(lambda: not heard.source.connected)
+            reader.until_frames(first + 100)
+            reader.until(lambda: not reader.source.connected)
             assert process.wait(60) == 0
-    assert same(heard.frames, foreign_truth(0, 200))
-    assert heard.source.counts.reconnects == 1
-    heard.until_event("is back")
-    assert heard.source.counts.dropped == 0
-    assert not heard.source.finished
+    assert same(reader.frames, foreign_truth(0, 200))
+    assert reader.counts.reconnects == 1
+    reader.until_event("is back")
+    assert reader.counts.dropped == 0
+    assert not reader.source.finished
 
 
-def test_a_killed_sender_loses_nothing_that_it_sent(path, heard, same) -> None:
+def test_a_killed_sender_loses_nothing_that_it_sent(path, reader, same):
     code = FOREIGN.replace("peer.close()", "import os; os.kill(os.getpid(), 9)")
     assert python(code, path, 0, 200, 1, 1).returncode == -9
-    assert same(heard.until_frames(200), foreign_truth(0, 200))
-    heard.until_event("disconnected")
-    assert heard.source.counts.malformed == 0
+    assert same(reader.until_frames(200), foreign_truth(0, 200))
+    reader.until_event("disconnected")
+    assert reader.counts.malformed == 0
 
 
-def test_our_sender_waits_for_a_recorder_and_for_the_next_one(path, listen, traffic) -> None:
+def test_our_sender_waits_for_a_recorder_and_for_the_next_one(path, listen, traffic):
     truth, sender = traffic(10), FrameSender(path)
     assert sender.send(truth) == 0
     assert not sender.connected
     for _ in range(2):
-        heard = listen(source_at(path))
+        reader = listen(source_at(path))
         wait_for(lambda: sender.send(truth) != 0)
-        assert len(heard.until_frames(10)) == 10
+        assert len(reader.until_frames(10)) == 10
         # What was refused without a recorder is not its loss.
-        assert heard.source.counts.dropped == 0
-        heard.source.stop()
+        assert reader.counts.dropped == 0
+        reader.source.stop()
         while sender.connected:
             sender.send(truth)
     sender.close()
@@ -236,59 +233,57 @@ def test_our_sender_waits_for_a_recorder_and_for_the_next_one(path, listen, traf
         sender.send(np.zeros(3))
 
 
-def test_senders_that_never_leave_hold_a_bounded_number_of_descriptors(heard, peer) -> None:
+def test_senders_that_never_leave_hold_a_bounded_number_of_descriptors(reader, peer):
     worker = peer()
     worker.send(foreign_truth(0, 3).tobytes())
-    heard.until_frames(3)
-    before = len(list(Path("/proc/self/fd").iterdir()))
-    idle = []
+    reader.until_frames(3)
+
+    def descriptors():
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    before, idle = descriptors(), []
     for _ in range(3 * MOST_SENDERS):
         idle.append(peer())
-        heard.poll()
-    wait_for(
-        lambda: len(list(Path("/proc/self/fd").iterdir())) - before - len(idle) <= MOST_SENDERS,
-        each=heard.poll,
-    )
-    heard.until_event("more than 64 senders")
+        reader.poll()
+    most = before + len(idle) + MOST_SENDERS
+    reader.until(lambda: descriptors() <= most)
+    reader.until_event("more than 64 senders")
     worker.send(foreign_truth(3, 4).tobytes())  # who sends is not silent
-    heard.until_frames(7)
+    reader.until_frames(7)
     with pytest.raises(BrokenPipeError):
         idle[1].send(foreign_truth(0, 1).tobytes())
     idle[-1].send(foreign_truth(0, 1).tobytes())
-    heard.until_frames(8)
+    reader.until_frames(8)
 
 
-def test_no_frame_of_a_sender_that_gives_its_place_is_lost(heard, peer) -> None:
+def test_no_frame_of_a_sender_that_gives_its_place_is_lost(reader, peer):
     """Every sender's packets are counted by itself; none that was accepted is missing."""
-    accepted = 0
-    senders = []
+    accepted, senders = 0, []
     for _ in range(3 * MOST_SENDERS):
         senders.append(peer())
         for sender in senders[-2 * MOST_SENDERS :: 7]:
             with suppress(BrokenPipeError):
                 accepted += sender.send(foreign_truth(accepted, 1).tobytes()) == 32
         if len(senders) % 5 == 0:
-            heard.poll()
-    assert len(heard.until_frames(accepted)) == accepted > 3 * MOST_SENDERS
+            reader.poll()
+    assert len(reader.until_frames(accepted)) == accepted > 3 * MOST_SENDERS
 
 
-def test_error_frames_are_counted(heard, peer) -> None:
+def test_error_frames_are_counted(reader, peer):
     frames = empty_frames(2)
     frames["id_flags"] = [ERROR_FLAG | 0x4, 5]
     frames["dlc"] = 8
     frames["data"][0, 1] = 0x10
     peer().send(frames.tobytes())
-    heard.until_frames(2)
-    assert heard.source.counts.error_frames == 1
-    heard.until_event("controller problem, reception error passive")
+    reader.until_frames(2)
+    assert reader.counts.error_frames == 1
+    reader.until_event("controller problem, reception error passive")
 
 
-def test_only_we_may_send_and_the_socket_goes_with_the_source(path, context) -> None:
+def test_only_we_may_send_and_the_socket_goes_with_the_source(path, context):
     source = source_at(path)
     source.start(context)
-    mode = path.lstat().st_mode
-    assert stat.S_ISSOCK(mode)
-    assert stat.S_IMODE(mode) == 0o600
+    assert path.lstat().st_mode == stat.S_IFSOCK | 0o600
     with pytest.raises(SourceError, match="another program listens at"):
         source_at(path).start(context)
     assert path.exists()
@@ -297,7 +292,7 @@ def test_only_we_may_send_and_the_socket_goes_with_the_source(path, context) -> 
     assert source.finished
 
 
-def test_a_socket_left_behind_is_replaced_and_nothing_else(path, context) -> None:
+def test_a_socket_left_behind_is_replaced_and_nothing_else(path, context):
     code = (
         "import os, socket, sys\n"
         "s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)\n"
@@ -324,7 +319,7 @@ def test_a_socket_left_behind_is_replaced_and_nothing_else(path, context) -> Non
             source_at(path).start(context)
 
 
-def test_the_successors_socket_is_not_removed(path, context) -> None:
+def test_the_successors_socket_is_not_removed(path, context):
     first, second = source_at(path), source_at(path)
     first.start(context)
     path.unlink()
@@ -334,7 +329,7 @@ def test_the_successors_socket_is_not_removed(path, context) -> None:
     second.stop()
 
 
-def test_a_place_that_can_not_be_used(tmp_path, context) -> None:
+def test_a_place_that_can_not_be_used(tmp_path, context):
     for path in (tmp_path / "no" / "folder.sock", tmp_path / ("x" * 120)):
         with pytest.raises(SourceError, match=r"can't listen at|No such file"):
             source_at(path).start(context)

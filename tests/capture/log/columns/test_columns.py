@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 import zstandard
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
-from support.read_back import chunks_of
+from support.read_back import chunks_of, decoded_of
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.columns.buffers import ColumnStore, EchoColumn, Times, TimeStore
@@ -46,12 +44,9 @@ def test_one_pass_gives_what_each_reader_gives(tmp_path):
     with Session(path) as session:
         signals, tables = session.columns(wanted, {"/imu": ["linear_acceleration.z"]})
         table = session.table("/imu")
-    for (topic, field), scale in {
-        ("/joint_states", "position"): 1,
-        ("/joint_states", "velocity"): -1,
-        ("/joint_current", "position"): 2,
-    }.items():
-        found = signals[topic, field]
+    keys = [(topic, field) for topic, fields in wanted.items() for field in fields]
+    for key, scale in zip(keys, (1, -1, 2), strict=True):
+        found = signals[key]
         np.testing.assert_array_equal(np.array(found.values).T, scale * values)
         np.testing.assert_array_equal(np.array(found.t_ns).T, t_ns)
     assert list(tables["/imu"].columns) == ["linear_acceleration.z"]
@@ -79,11 +74,11 @@ def test_a_window_is_what_the_whole_has_of_it(tmp_path, stall):
     rng = np.random.default_rng(4)
     with Session(path) as session:
         for start in [0, 1450, 1550, 1790, *rng.integers(0, 3900, 20).tolist()]:
-            window = EPOCH_NS + start * STEP_NS + 3_000_000
-            window = window, window + int(rng.integers(1, 100)) * STEP_NS
-            found = session.joints("/joint_states", start_ns=window[0], stop_ns=window[1])
+            start_ns = EPOCH_NS + start * STEP_NS + 3_000_000
+            stop_ns = start_ns + int(rng.integers(1, 100)) * STEP_NS
+            found = session.joints("/joint_states", start_ns=start_ns, stop_ns=stop_ns)
             for j in range(5):
-                inside = (t_ns[:, j] >= window[0]) & (t_ns[:, j] < window[1])
+                inside = (t_ns[:, j] >= start_ns) & (t_ns[:, j] < stop_ns)
                 np.testing.assert_array_equal(found.t_ns[j], t_ns[inside, j])
                 np.testing.assert_array_equal(found.values[j], values[inside, j])
 
@@ -130,10 +125,9 @@ def test_stores_grow_and_keep_far_log_times():
 @pytest.mark.parametrize("seed", range(20))
 def test_echoes_keep_their_own_rows_whatever_the_others_get(seed):
     rng = np.random.default_rng(seed)
-    columns: list[EchoColumn] = []
-    for _ in range(4):
+    columns, truth = [], [[] for _ in range(4)]
+    for _ in truth:
         columns.append(EchoColumn("<i8", 3, tuple(columns)))
-    truth: list[list[int]] = [[] for _ in columns]
     for _ in range(30):
         rows = rng.integers(0, 9, rng.integers(0, 5))
         for column, kept in zip(columns, truth, strict=True):
@@ -165,10 +159,8 @@ def test_sensors_of_shared_and_own_stamps_are_what_a_foreign_reader_finds(tmp_pa
     path = tmp_path / "s.mcap"
     topics = [f"/ir/{k:02d}" for k in range(1, 5)]
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS) as writer:
-        limits = {"min_range": 0.0, "max_range": 4.0, "field_of_view": 0.1}
-        channels = [
-            writer.range(topic, frame=topic[1:], infrared=True, **limits) for topic in topics
-        ]
+        options = {"infrared": True, "min_range": 0.0, "max_range": 4.0, "field_of_view": 0.1}
+        channels = [writer.range(topic, frame=topic[1:], **options) for topic in topics]
         field = writer.magnetic_field("/compass", frame="compass")
         for tick in range(400):
             t_ns = EPOCH_NS + tick * STEP_NS
@@ -179,15 +171,10 @@ def test_sensors_of_shared_and_own_stamps_are_what_a_foreign_reader_finds(tmp_pa
                     channel.write(own, rng.random(), log_time_ns=t_ns + 5 * (chance < 0.06))
             if tick % 2:
                 field.write(t_ns, rng.normal(size=3))
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        found = [
-            (channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()
-        ]
     with Session(path) as session:
         _, tables = session.columns({}, {topic: ["range"] for topic in topics})
     for topic in topics:
-        theirs = [message for name, message in found if name == topic]
+        theirs = [content for *_, content in decoded_of(path, [topic])]
         stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in theirs]
         order = np.argsort(stamps, kind="stable")
         assert tables[topic].index.tolist() == np.array(stamps)[order].tolist()

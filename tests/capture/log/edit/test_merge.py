@@ -1,29 +1,14 @@
-"""Merged logs against other readers: each message once, in order, and what differs is told."""
-
-from __future__ import annotations
+"""Merged logs against other readers: each message once, in order, and what differs is reported."""
 
 import hashlib
 import json
-from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
-import undulog
-from support.edited_logs import (
-    EPOCH_NS,
-    MAKES,
-    MS,
-    STRING,
-    in_file_order,
-    read,
-    records,
-    text,
-    ticks,
-    write_log,
-)
+from support.edited_logs import EPOCH_NS, MAKES, MS, STRING, read, records, text, ticks, write_log
 from support.foreign_logs import foreign_log
 from support.read_back import summary_of
 from undulog.capture import Session, SessionWriter, load_robot
@@ -42,19 +27,14 @@ from undulog.capture.log.edit.merge import merge_logs
 )
 def test_cuts_side_by_side_make_the_whole_again(tmp_path_factory, times, bounds, make):
     folder = tmp_path_factory.mktemp("cuts")
-    first = min(times)
     a, b, c = bounds
-    inside = [t - first for t in times]
+    inside = [t - min(times) for t in times]
     if not (any(a <= t < b for t in inside) and any(b <= t < c for t in inside)):
         return  # an empty cut is refused
-    said = [(f"/{'abc'[k % 3]}", t * MS, f"{k}" * (k % 40)) for k, t in enumerate(times)]
-    facts = [
-        ("undulog", {"session_id": "s", "robot": "r"}),
-        ("undulog.health", {"verdict": "good"}),
-    ]
-    whole = write_log(
-        folder / "whole.mcap", said, metadata=facts, attachments=[("x", b"x")], **MAKES[make]
-    )
+    texts = [(f"/{'abc'[k % 3]}", t * MS, f"{k}" * (k % 40)) for k, t in enumerate(times)]
+    facts = {"undulog": {"session_id": "s", "robot": "r"}, "undulog.health": {"verdict": "good"}}
+    more = {"metadata": facts.items(), "attachments": [("x", b"x")]}
+    whole = write_log(folder / "whole.mcap", texts, **more, **MAKES[make])
     for name, start, stop in [("ab", a, b), ("bc", b, c), ("ac", a, c)]:
         cut_log(whole, folder / f"{name}.mcap", start_s=start / 1e3, stop_s=stop / 1e3)
     report = merge_logs([folder / "ab.mcap", folder / "bc.mcap"], folder / "merged.mcap")
@@ -66,25 +46,21 @@ def test_cuts_side_by_side_make_the_whole_again(tmp_path_factory, times, bounds,
     assert report.warnings == [w for w in report.warnings if "overlap" not in w]
 
 
-def test_a_merge_interleaves_by_log_time_and_is_stable(tmp_path: Path):
+def test_a_merge_interleaves_by_log_time_and_is_stable(tmp_path):
     one = write_log(tmp_path / "one.mcap", [("/a", t * MS, f"one {t}") for t in (0, 2, 2, 4, 9)])
-    two = write_log(
-        tmp_path / "two.mcap",
-        [("/b", t * MS, f"two {t}") for t in (1, 2, 4, 5)],
-        use_chunking=False,
-    )
+    texts = [("/b", t * MS, f"two {t}") for t in (1, 2, 4, 5)]
+    two = write_log(tmp_path / "two.mcap", texts, use_chunking=False)
     three = write_log(tmp_path / "three.mcap", [("/c", 2 * MS, "three")], **MAKES["lz4"])
     merge_logs([one, two, three], tmp_path / "all.mcap")
-    found = in_file_order(tmp_path / "all.mcap")
+    found = read(tmp_path / "all.mcap", log_time_order=False)
     assert [(m[1], (m[0] - EPOCH_NS) // MS) for m in found] == [
         *[("/a", 0), ("/b", 1), ("/a", 2), ("/a", 2), ("/b", 2), ("/c", 2)],
         *[("/a", 4), ("/b", 4), ("/b", 5), ("/a", 9)],
     ]
-    everything = [m for path in (one, two, three) for m in read(path)]
-    assert sorted(found) == sorted(everything)
+    assert sorted(found) == sorted(m for path in (one, two, three) for m in read(path))
 
 
-def test_a_topic_of_several_logs_becomes_one_channel(tmp_path: Path):
+def test_a_topic_of_several_logs_becomes_one_channel(tmp_path):
     one = write_log(tmp_path / "one.mcap", ticks(50))
     two = write_log(tmp_path / "two.mcap", ticks(50, start_ms=5000))
     report = merge_logs([one, two], tmp_path / "both.mcap")
@@ -96,14 +72,14 @@ def test_a_topic_of_several_logs_becomes_one_channel(tmp_path: Path):
     assert read(tmp_path / "both.mcap") == read(one) + read(two)
 
 
-def test_a_merge_warns_when_the_same_topics_overlap(tmp_path: Path):
+def test_a_merge_warns_when_the_same_topics_overlap(tmp_path):
     one = write_log(tmp_path / "one.mcap", ticks(50))
     two = write_log(tmp_path / "two.mcap", ticks(50, start_ms=405))
     warnings = merge_logs([one, two], tmp_path / "both.mcap").warnings
     assert ["overlap by 0.09 s" in text for text in warnings] == [True]
 
 
-def test_a_merge_keeps_ids_hashes_and_what_differs(tmp_path: Path):
+def test_a_merge_keeps_ids_hashes_and_what_differs(tmp_path):
     health = [{"verdict": "good", "reasons": "[]"}, {"verdict": "bad", "reasons": '["hot"]'}]
     logs = [
         write_log(
@@ -124,26 +100,23 @@ def test_a_merge_keeps_ids_hashes_and_what_differs(tmp_path: Path):
     edits = {k: v["verb"] for k, v in records(tmp_path / "again.mcap")[0].items() if "edit" in k}
     assert edits == {"undulog.edit.1": "merge", "undulog.edit.2": "cut", "undulog.edit": "merge"}
     stored, attached = records(tmp_path / "both.mcap")
-    assert [a[:2] for a in attached] == [
-        *[("same.txt", b"="), ("cal.v1.yaml", b"one"), ("cal.v1-2.yaml", b"two")]
-    ]
+    kept = [("same.txt", b"="), ("cal.v1.yaml", b"one"), ("cal.v1-2.yaml", b"two")]
+    assert [a[:2] for a in attached] == kept
     assert any("kept as cal.v1-2.yaml" in warning for warning in report.warnings)
-    edit = stored["undulog.edit"]
+    edit, facts = stored["undulog.edit"], stored["undulog"]
     assert json.loads(edit["session_ids"]) == ["one", "two"]
     digests = [hashlib.sha256(log.read_bytes()).hexdigest() for log in logs]
     assert json.loads(edit["sha256"]) == digests
-    assert stored["undulog"]["operator"] == "Ada"
-    assert stored["undulog"]["epoch_ns"] == "900"
-    assert stored["undulog"]["session_id"].startswith("merge-")
+    assert (facts["operator"], facts["epoch_ns"]) == ("Ada", "900")
+    assert facts["session_id"].startswith("merge-")
     assert stored["undulog.source.2"]["session_id"] == "two"
     assert (stored["place"], stored["place.2"]) == ({"room": "one"}, {"room": "two"})
     assert stored["undulog.health"]["verdict"] == "bad"
-    assert json.loads(stored["undulog.health"]["reasons"]) == [
-        *["one.mcap: good", "two.mcap: bad", "two.mcap: hot"]
-    ]
+    reasons = ["one.mcap: good", "two.mcap: bad", "two.mcap: hot"]
+    assert json.loads(stored["undulog.health"]["reasons"]) == reasons
 
 
-def test_a_merge_refuses_topics_of_other_type_or_unit(tmp_path: Path, capsys):
+def test_a_merge_refuses_topics_of_other_type_or_unit(tmp_path, command):
     one = write_log(tmp_path / "one.mcap", ticks(20), units={"/b": "rad"})
     two = write_log(tmp_path / "two.mcap", ticks(20), units={"/b": "deg"})
     with pytest.raises(DataError, match=r"^/b is in rad in .*one.mcap and in deg in .*two"):
@@ -154,19 +127,14 @@ def test_a_merge_refuses_topics_of_other_type_or_unit(tmp_path: Path, capsys):
     path = tmp_path / "three.mcap"
     with foreign_log(path, "sensor_msgs/msg/Range") as (writer, schema):
         writer.add_message(writer.register_channel("/a", "cdr", schema), EPOCH_NS, b"", 0)
-    assert (
-        undulog.run(["log", "merge", *map(str, [one, path]), "-o", str(tmp_path / "x.mcap")]) == 1
-    )
-    said = capsys.readouterr().err
-    assert "/a is std_msgs/msg/String" in said
-    assert "sensor_msgs/msg/Range in" in said
-    assert sorted(p.name for p in tmp_path.iterdir()) == [
-        *["one.mcap", "silent.mcap", "three.mcap", "two.mcap"]
-    ]
+    refused = command("log", "merge", one, path, "-o", tmp_path / "x.mcap", code=1).err
+    assert "/a is std_msgs/msg/String" in refused
+    assert "sensor_msgs/msg/Range in" in refused
+    assert set(tmp_path.iterdir()) == {one, two, silent, path}
 
 
-def test_a_definition_with_other_comments_is_the_same_type(tmp_path: Path):
-    definitions = ["string data", "# what is said\nstring   data  # a word\n", "float64 data"]
+def test_a_definition_with_other_comments_is_the_same_type(tmp_path):
+    definitions = ["string data", "# a text\nstring   data  # a word\n", "float64 data"]
     *logs, other = [tmp_path / f"{k}.mcap" for k in range(3)]
     for k, definition in enumerate(definitions):
         with foreign_log(tmp_path / f"{k}.mcap", STRING, definition) as (writer, schema):
@@ -180,23 +148,18 @@ def test_a_definition_with_other_comments_is_the_same_type(tmp_path: Path):
         merge_logs([logs[0], other], tmp_path / "never.mcap")
 
 
-def test_a_merge_of_different_robots_must_be_told_which(tmp_path: Path, capsys):
-    for k, name in enumerate(["snake13", "snake25"]):
-        with SessionWriter(
-            tmp_path / f"{name}.mcap", session_id=name, epoch_ns=EPOCH_NS, robot=load_robot(name)
-        ) as writer:
-            writer.string(f"/said{k}").write(EPOCH_NS + k, name)
-    run = ["log", "merge", *(str(tmp_path / f"{n}.mcap") for n in ("snake13", "snake25"))]
-    run += ["-o", str(tmp_path / "both.mcap")]
+def test_a_merge_of_different_robots_needs_the_name_of_one(tmp_path, command):
+    logs = {name: tmp_path / f"{name}.mcap" for name in ("snake13", "snake25")}
+    for name, path in logs.items():
+        facts = {"session_id": name, "epoch_ns": EPOCH_NS, "robot": load_robot(name)}
+        with SessionWriter(path, **facts) as writer:
+            writer.string(f"/{name}").write(EPOCH_NS, name)
+    merge = ("log", "merge", *logs.values(), "-o", tmp_path / "both.mcap")
     for extra in ([], ["--force"]):
-        assert undulog.run([*run, *extra]) == 2
-        assert "different robots: snake13 (" in capsys.readouterr().err
-    assert undulog.run([*run, "--robot", "snake7"]) == 2
-    assert "robots are: snake13, snake25" in capsys.readouterr().err
-    assert undulog.run([*run, "--robot", "snake25"]) == 0
-    assert "warning: robot.toml of" in capsys.readouterr().out
+        assert "different robots: snake13 (" in command(*merge, *extra, code=2).err
+    assert "robots are: snake13, snake25" in command(*merge, "--robot", "snake7", code=2).err
+    assert "warning: robot.toml of" in command(*merge, "--robot", "snake25").out
     with Session.open(tmp_path / "both.mcap") as session:
-        assert session.robot is not None
         assert session.robot.name == "snake25"
         assert session.metadata["undulog"]["robot"] == "snake25"
         assert b"snake13" in session.attachments["robot-2.toml"]
@@ -204,7 +167,7 @@ def test_a_merge_of_different_robots_must_be_told_which(tmp_path: Path, capsys):
         assert reader.message_count == 2
 
 
-def test_a_merge_refuses_one_log_and_the_same_log(tmp_path: Path):
+def test_a_merge_refuses_one_log_and_the_same_log(tmp_path):
     one = write_log(tmp_path / "one.mcap", ticks(20))
     (tmp_path / "copy.mcap").write_bytes(one.read_bytes())
     with pytest.raises(UsageError, match="two logs or more"):

@@ -1,13 +1,8 @@
 """Logs that are hardly of one session: refused with the option that allows it, or warned of."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 from hostile_logs import EPOCH_NS, NS, HostileLog, joint_state
 
-import undulog
 from support.read_back import messages_of
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.common.errors import UsageError
@@ -16,7 +11,7 @@ from undulog.capture.log.edit.merge import merge_logs
 DAY = 86400 * NS
 
 
-def bag(path: Path, names: list[str], start_ns: int = EPOCH_NS) -> Path:
+def bag(path, names, start_ns=EPOCH_NS):
     """One second of joints of another make's recorder, which names no robot."""
     log = HostileLog()
     log.channel("/joint_states", log.schema())
@@ -25,47 +20,43 @@ def bag(path: Path, names: list[str], start_ns: int = EPOCH_NS) -> Path:
     return log.write(path)
 
 
-def session(path: Path, robot: str) -> Path:
+def session(path, robot):
     with SessionWriter(path, session_id=robot, epoch_ns=EPOCH_NS, robot=load_robot(robot)) as log:
         log.joint_state("/joint_states", ["joint01"], unit="rad").write(EPOCH_NS + 5, [0.1])
     return path
 
 
-def test_logs_two_months_apart_are_merged_on_request(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_logs_two_months_apart_are_merged_on_request(tmp_path, command):
     early = bag(tmp_path / "early.mcap", ["a", "b"])
     late = bag(tmp_path / "late.mcap", ["a", "b"], EPOCH_NS + 62 * DAY)
     out = tmp_path / "out.mcap"
-    command = ["log", "merge", str(late), str(early), "-o", str(out)]
-    assert undulog.run(command) == 2
-    said = capsys.readouterr().err
-    assert "late.mcap begins 62.0 days after" in said
-    assert "--apart" in said
+    merge = ("log", "merge", late, early, "-o", out)
+    refused = command(*merge, code=2).err
+    assert "late.mcap begins 62.0 days after" in refused
+    assert "--apart" in refused
     assert not out.exists()
-    assert undulog.run([*command, "--apart"]) == 0
-    assert "warning: " in (said := capsys.readouterr().out)
-    assert "62.0 days" in said
+    report = command(*merge, "--apart").out
+    assert "warning: " in report
+    assert "62.0 days" in report
     assert len(messages_of(out)) == 22
 
 
-def test_an_hour_between_logs_is_warned_of_and_a_second_is_not(tmp_path: Path) -> None:
+def test_an_hour_between_logs_is_warned_of_and_a_second_is_not(tmp_path):
     one = bag(tmp_path / "one.mcap", ["a"])
     hour = bag(tmp_path / "hour.mcap", ["a"], EPOCH_NS + 2 * 3600 * NS)
     near = bag(tmp_path / "near.mcap", ["a"], EPOCH_NS + 2 * NS)
-    (said,) = merge_logs([one, hour], tmp_path / "far.mcap").warnings
-    assert "hour.mcap begins 2.0 h after" in said
+    (warning,) = merge_logs([one, hour], tmp_path / "far.mcap").warnings
+    assert "hour.mcap begins 2.0 h after" in warning
     assert merge_logs([one, near], tmp_path / "both.mcap").warnings == []
     late = bag(tmp_path / "late.mcap", ["a"], EPOCH_NS + 3 * DAY)
     log = HostileLog()  # that bridges the time between the two
     log.channel("/temperature", log.schema())
     log.chunk([(1, EPOCH_NS + k * DAY, joint_state(EPOCH_NS, ["a"], [20.0])) for k in range(5)])
-    long = log.write(tmp_path / "long.mcap")
-    report = merge_logs([one, late, long], tmp_path / "out.mcap")
+    report = merge_logs([one, late, log.write(tmp_path / "long.mcap")], tmp_path / "out.mcap")
     assert not any("begins" in text for text in report.warnings)
 
 
-def test_logs_without_a_joint_in_common_are_warned_of(tmp_path: Path) -> None:
+def test_logs_without_a_joint_in_common_are_warned_of(tmp_path):
     one = bag(tmp_path / "one.mcap", ["a", "b"])
     other = bag(tmp_path / "other.mcap", ["x", "y"])
     warnings = merge_logs([one, other], tmp_path / "out.mcap").warnings
@@ -75,7 +66,7 @@ def test_logs_without_a_joint_in_common_are_warned_of(tmp_path: Path) -> None:
     assert not any("one robot" in text for text in warnings)
 
 
-def test_logs_of_two_robots_are_refused_and_on_request_warned_of(tmp_path: Path) -> None:
+def test_logs_of_two_robots_are_refused_and_on_request_warned_of(tmp_path):
     one, other = (session(tmp_path / f"{name}.mcap", name) for name in ("snake25", "snake13"))
     with pytest.raises(UsageError, match=r"different robots.*--robot NAME"):
         merge_logs([one, other], tmp_path / "out.mcap")

@@ -8,73 +8,62 @@ import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
 from rosbags.highlevel import AnyReader
 
-import undulog
 from support import durable_child as recorder
 from support import processes
 from support.damage import damaged_bytes
 from support.kills import killed_after, last_number
 from support.processes import wait_for
-from support.read_back import messages_of, read, summary_of
+from support.read_back import read, rows_of, summary_of
 from undulog.capture import Session, SessionWriter
-from undulog.capture.common.errors import (
-    LogError,
-    NotALogError,
-    OutputExistsError,
-    UndulogError,
-    UsageError,
-)
+from undulog.capture.common import errors
 from undulog.capture.log.edit.cut import cut_log
 from undulog.capture.log.edit.merge import merge_logs
 from undulog.capture.log.edit.recover import recover_log, recovered_path
 from undulog.capture.log.health.session_check import check_session
 
-CHILD = recorder.__file__
-
 
 def fingerprint(folder):
     """Every file below a folder and its bytes."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def command(path, **options):
+def child_command(path, **options):
     """The command of a recorder in a process of its own."""
-    options = {
-        "segment_size": 1 << 16,
-        "ballast": 1 << 16,
-        "sync_interval_s": 0.05,
-        "flush_interval_s": 0.2,
-        **options,
-    }
-    return [sys.executable, CHILD, str(path), json.dumps(options)]
+    sizes, intervals = (
+        ("segment_size", "ballast"),
+        {"sync_interval_s": 0.05, "flush_interval_s": 0.2},
+    )
+    options = {**dict.fromkeys(sizes, 1 << 16), **intervals, **options}
+    return [sys.executable, recorder.__file__, str(path), json.dumps(options)]
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "run.mcap"
 
 
 def start(path, **options):
-    return subprocess.Popen(command(path, **options), stdout=subprocess.PIPE)
+    return subprocess.Popen(child_command(path, **options), stdout=subprocess.PIPE)
 
 
 def unfinished(path, count, **options):
     """A session whose recorder died after so many messages, the disk having what it could."""
     with start(path, count=count, flush_interval_s=60.0, **options) as child:
         reported, _ = child.communicate(timeout=120)
-    assert child.returncode == -9
-    assert last_number(reported) == count
-    return path
+    assert (child.returncode, last_number(reported)) == (-9, count)
 
 
 def check_killed(path, accepted):
     """Everything that was accepted is read, once, and nothing on the disk is changed by it."""
     before = fingerprint(path.parent)
     found, warnings = read(path)
-    # The child may have been killed between accepting and telling.
+    # The child may have been killed between accepting and reporting.
     assert len(found) in (accepted, accepted + 1)
     assert found == recorder.truth(len(found))
     assert fingerprint(path.parent) == before
@@ -88,10 +77,11 @@ def check_killed(path, accepted):
     ("run", "split_size", "split_every"),
     [(0, None, 0), (1, None, 0), (2, 1 << 18, 0), (3, None, 700)],
 )
-def test_a_killed_session_reads_as_if_it_had_been_closed(tmp_path, run, split_size, split_every):
+def test_a_killed_session_reads_as_if_it_had_been_closed(path, run, split_size, split_every):
     seconds = random.Random(run).uniform(0.1, 0.8)
-    path = tmp_path / "run.mcap"
-    accepted = killed_after(command(path, split_size=split_size, split_every=split_every), seconds)
+    accepted = killed_after(
+        child_command(path, split_size=split_size, split_every=split_every), seconds
+    )
     warnings = check_killed(path, accepted)
     assert "the recorder did not finish" in warnings[0]
     assert "none is missing" in warnings[0]
@@ -111,12 +101,11 @@ def test_thirty_kills_lose_no_accepted_message(tmp_path):
         path.parent.mkdir()
         options = {"split_size": rng.choice([None, 1 << 17, 1 << 19])}
         options["split_every"] = rng.choice([0, 0, 300])
-        accepted = killed_after(command(path, **options), rng.uniform(0.0, 1.5))
+        accepted = killed_after(child_command(path, **options), rng.uniform(0.0, 1.5))
         warnings = check_killed(path, accepted)
         assert any("none is missing" in text for text in warnings)
         output = path.with_name("whole.mcap")
-        report = recover_log(path, output)
-        assert report.missing == 0
+        assert recover_log(path, output).missing == 0
         found, warnings = read(output)
         assert found == recorder.truth(len(found))
         assert warnings == []
@@ -132,9 +121,9 @@ def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
         path.parent.mkdir()
         splits = [3000] if run % 2 else []
         with start(path, count=6000, splits=splits, close=True) as child:
-            told = b""
-            while len(told) < 6000 * 8:
-                told += os.read(child.stdout.fileno(), 1 << 16)
+            reported = b""
+            while len(reported) < 6000 * 8:
+                reported += os.read(child.stdout.fileno(), 1 << 16)
             time.sleep(rng.uniform(0.0, 0.04))
             child.kill()
             child.stdout.read()
@@ -150,8 +139,7 @@ def test_a_kill_while_it_is_finalised_loses_nothing(tmp_path, runs):
     assert whole > 0
 
 
-def test_a_recording_that_runs_can_be_read(tmp_path):
-    path = tmp_path / "run.mcap"
+def test_a_recording_that_runs_can_be_read(tmp_path, path):
     sink = recorder.open_sink(path, segment_size=1 << 16)
     for count in range(1, 3001):
         recorder.write(sink, count - 1)
@@ -161,7 +149,7 @@ def test_a_recording_that_runs_can_be_read(tmp_path):
             assert len(warnings) == 1
             assert f"this recording is running: its first {count} messages are read" in warnings[0]
     assert check_session(path).file.running
-    with pytest.raises(LogError, match="is running; end it first"):
+    with pytest.raises(errors.LogError, match="is running; end it first"):
         recover_log(path, tmp_path / "out.mcap")
     sink.close(())
     assert read(path) == (recorder.truth(3000), [])
@@ -169,9 +157,8 @@ def test_a_recording_that_runs_can_be_read(tmp_path):
 
 
 @pytest.mark.parametrize("looks", [5, pytest.param(40, marks=pytest.mark.slow)])
-def test_a_recording_can_be_read_at_any_moment(tmp_path, looks):
+def test_a_recording_can_be_read_at_any_moment(path, looks):
     """A reader that comes while the recorder writes and splits in another process."""
-    path = tmp_path / "run.mcap"
     with start(path, split_size=1 << 17) as child:
         try:
             os.read(child.stdout.fileno(), 8)
@@ -196,11 +183,7 @@ def test_what_the_log_let_go_of_while_it_was_read_is_no_reason_to_read_twice(tmp
     early = {path.name: path.read_bytes() for path in sorted(folder.glob("0*.seg"))[:1]}
     for number in range(1000, 8000):
         recorder.write(sink, number)
-    wait_for(
-        lambda: not (folder / next(iter(early))).exists(),
-        "the first segment was never let go of",
-        each=sink.tick,
-    )
+    wait_for(lambda: not (folder / next(iter(early))).exists(), "a release", each=sink.tick)
     copy = tmp_path / "copy"
     (copy / folder.name).mkdir(parents=True)
     for name, data in early.items():
@@ -219,10 +202,9 @@ def test_what_the_log_let_go_of_while_it_was_read_is_no_reason_to_read_twice(tmp
 
 
 @pytest.mark.parametrize("left", ["missing", "empty", "magic"])
-def test_a_session_of_which_only_the_write_ahead_log_is_left(tmp_path, left):
-    path = unfinished(tmp_path / "run.mcap", 100)
-    with path.open("rb+") as stream:
-        stream.truncate({"missing": 0, "empty": 0, "magic": 8}[left])
+def test_a_session_of_which_only_the_write_ahead_log_is_left(tmp_path, path, left):
+    unfinished(path, 100)
+    os.truncate(path, 8 if left == "magic" else 0)
     if left == "missing":
         path.unlink()
     found, warnings = read(path)
@@ -235,9 +217,9 @@ def test_a_session_of_which_only_the_write_ahead_log_is_left(tmp_path, left):
         assert session.session_id == "killed"
 
 
-def test_wherever_the_file_ends_the_write_ahead_log_has_the_rest(tmp_path):
+def test_wherever_the_file_ends_the_write_ahead_log_has_the_rest(path):
     """Power is lost: of the file's last chunks, which were not synced, only some is there."""
-    path = unfinished(tmp_path / "run.mcap", 4000, segment_size=8 << 20)  # nothing released
+    unfinished(path, 4000, segment_size=8 << 20)  # nothing released
     whole = path.read_bytes()
     assert len(whole) > 300_000
     rng = random.Random(3)
@@ -248,8 +230,8 @@ def test_wherever_the_file_ends_the_write_ahead_log_has_the_rest(tmp_path):
         assert any("none is missing" in text for text in warnings)
 
 
-def test_damaged_chunks_come_from_the_write_ahead_log_where_it_still_has_them(tmp_path):
-    path = unfinished(tmp_path / "run.mcap", 8000, segment_size=16 << 20)
+def test_damaged_chunks_come_from_the_write_ahead_log_where_it_still_has_them(path):
+    unfinished(path, 8000, segment_size=16 << 20)
     whole = path.read_bytes()
     rng = random.Random(4)
     for _ in range(20):
@@ -261,8 +243,8 @@ def test_damaged_chunks_come_from_the_write_ahead_log_where_it_still_has_them(tm
         assert sorted(found, key=lambda m: m[2]) == recorder.truth(8000)
 
 
-def test_what_is_in_neither_is_counted(tmp_path):
-    path = unfinished(tmp_path / "run.mcap", 6000)
+def test_what_is_in_neither_is_counted(tmp_path, path):
+    unfinished(path, 6000)
     segments = sorted((tmp_path / "run.mcap.wal").glob("0*.seg"))
     assert len(segments) > 3
     segments[1].unlink()
@@ -278,15 +260,12 @@ def test_what_is_in_neither_is_counted(tmp_path):
     assert f"{lost} of 6000 messages that the recorder accepted are missing" in health.reasons
 
 
-def test_a_complete_session_is_degraded_at_most_and_a_cut_file_without_its_log(tmp_path):
-    path = unfinished(tmp_path / "run.mcap", 6000)
+def test_a_complete_session_is_degraded_at_most_and_a_cut_file_without_its_log(tmp_path, path):
+    unfinished(path, 6000)
     health = check_session(path)
-    assert health.file.truncated
-    assert health.file.damage == ()
-    assert any(
-        text.startswith("the recorder did not finish: 6000 messages are read")
-        for text in health.reasons
-    )
+    assert (health.file.truncated, health.file.damage) == (True, ())
+    start = "the recorder did not finish: 6000 messages are read"
+    assert any(text.startswith(start) for text in health.reasons)
     assert not any("cut short" in text for text in (*health.reasons, *health.notes))
     shutil.rmtree(tmp_path / "run.mcap.wal")
     found, warnings = read(path)
@@ -298,54 +277,45 @@ def test_a_complete_session_is_degraded_at_most_and_a_cut_file_without_its_log(t
 # -- log recover ---------------------------------------------------------------------------------
 
 
-def test_log_recover_writes_one_whole_file(tmp_path, capsys):
-    path = unfinished(tmp_path / "run.mcap", 5000, splits=(1500, 3000))
+def test_log_recover_writes_one_whole_file(tmp_path, path, command):
+    unfinished(path, 5000, splits=(1500, 3000))
     before = fingerprint(tmp_path)
-    assert undulog.run(["log", "recover", str(path)]) == 0
     output = tmp_path / "run.recovered.mcap"
-    printed = capsys.readouterr().out
+    printed = command("log", "recover", path).out
     assert printed.startswith(f"{output}: 5000 messages over 5.00 s, ")
     assert "none is missing" in printed
     after = fingerprint(tmp_path)
-    recovered = after.pop(output.name)
+    recovered = after.pop(output)
     assert after == before
     assert read(output) == (recorder.truth(5000), [])
     health = check_session(output)
-    assert health.file.damage == ()
-    assert health.file.indexed
+    assert (health.file.damage, health.file.indexed) == ((), True)
     with Session(output) as session:
         facts = session.metadata["undulog.recovered"]
-        assert facts["messages"] == "5000"
-        assert facts["missing"] == "0"
+        assert (facts["messages"], facts["missing"]) == ("5000", "0")
         assert json.loads(facts["sources"]) == ["run.mcap", "run_0002.mcap", "run_0003.mcap"]
         assert "undulog.part" not in session.metadata
         assert session.session_id == "killed"
-    assert undulog.run(["log", "recover", str(path)]) == 2  # it is there
-    assert "exists already" in capsys.readouterr().err
+    assert "exists already" in command("log", "recover", path, code=2).err
     assert output.read_bytes() == recovered
-    assert (
-        undulog.run(["log", "recover", str(tmp_path / "run_0002.mcap"), "--json", "--force"]) == 0
-    )
-    report = json.loads(capsys.readouterr().out)
+    recover = ("log", "recover", tmp_path / "run_0002.mcap", "--json", "--force")
+    report = json.loads(command(*recover).out)
     assert (sum(report["messages"].values()), report["missing"]) == (5000, 0)
     assert output.read_bytes() == recovered
 
 
-def test_a_recovered_file_opens_in_foreign_readers(tmp_path):
-    path = unfinished(tmp_path / "run.mcap", 500)
+def test_a_recovered_file_opens_in_foreign_readers(path):
+    unfinished(path, 500)
     output = recovered_path(path)
     recover_log(path, output)
     truth = recorder.truth(500)
-    assert [
-        (channel.topic, m.sequence, m.log_time, m.publish_time, m.data)
-        for _, channel, m in messages_of(output)
-    ] == truth
+    assert rows_of(output) == truth
     with AnyReader([output]) as reader:
-        read_by_rosbags = [
+        by_rosbags = [
             (connection.topic, t_ns, reader.deserialize(data, connection.msgtype).data)
             for connection, t_ns, data in reader.messages()
         ]
-    assert read_by_rosbags == [(m[0], m[2], m[4][8:-1].decode()) for m in truth]
+    assert by_rosbags == [(m[0], m[2], m[4][8:-1].decode()) for m in truth]
 
     rerun = Path(sys.executable).with_name("rerun")
     if not rerun.exists():
@@ -354,16 +324,14 @@ def test_a_recovered_file_opens_in_foreign_readers(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_a_damaged_file_without_a_write_ahead_log_gives_what_is_readable(tmp_path):
-    path = tmp_path / "run.mcap"
+def test_a_damaged_file_without_a_write_ahead_log_gives_what_is_readable(tmp_path, path):
     recorder.record(path, range(6000))
     raw = bytearray(path.read_bytes())
     third = len(raw) // 3
     raw[third : third + 100_000] = bytes(100_000)
     path.write_bytes(raw[:-2000])
     report = recover_log(path, tmp_path / "out.mcap")
-    assert report.missing is None
-    assert report.warnings
+    assert (report.missing, bool(report.warnings)) == (None, True)
     found, warnings = read(tmp_path / "out.mcap")
     assert warnings == []
     times = {m[2] for m in found}
@@ -371,10 +339,9 @@ def test_a_damaged_file_without_a_write_ahead_log_gives_what_is_readable(tmp_pat
     assert 1000 < len(found) < 6000
 
 
-def test_a_write_ahead_log_left_behind_by_a_copy_is_not_mixed_in(tmp_path, capsys):
+def test_a_write_ahead_log_left_behind_by_a_copy_is_not_mixed_in(tmp_path, path, command):
     """Another session is copied over a killed one; what that had can still be recovered."""
-    path = unfinished(tmp_path / "run.mcap", 3000)
-    wal = path.with_name("run.mcap.wal")
+    unfinished(path, 3000)
     other = tmp_path / "other.mcap"
     with SessionWriter(other, session_id="other", epoch_ns=recorder.EPOCH_NS) as writer:
         channel = writer.string("/gait/mode")
@@ -390,43 +357,35 @@ def test_a_write_ahead_log_left_behind_by_a_copy_is_not_mixed_in(tmp_path, capsy
     health = check_session(path)
     assert (health.file.unfinished, health.file.damage) == ("", ())
     assert warnings[0] in health.file.notes
-    assert undulog.run(["log", "recover", str(path), "-o", str(tmp_path / "out.mcap")]) == 0
-    assert warnings[0] in capsys.readouterr().out
+    assert warnings[0] in command("log", "recover", path, "-o", tmp_path / "out.mcap").out
     assert read(tmp_path / "out.mcap")[0] == truth
-    wal.rename(tmp_path / "old.mcap.wal")  # as the warning says
-    assert undulog.run(["log", "recover", str(tmp_path / "old.mcap")]) == 0
+    path.with_name("run.mcap.wal").rename(tmp_path / "old.mcap.wal")  # as the warning says
+    command("log", "recover", tmp_path / "old.mcap")
     rescued, warnings = read(tmp_path / "old.recovered.mcap")
     assert warnings == []
     assert rescued == [m for m in recorder.truth(3000) if m in rescued]
     assert recorder.truth(3000)[-1] in rescued
 
 
-def test_a_recovery_gives_no_advice_to_recover_and_asks_for_what_a_copy_left_behind(
-    tmp_path, capsys
-):
-    (tmp_path / "copy").mkdir()
-    path = unfinished(tmp_path / "run.mcap", 6000)
+def test_a_recovery_gives_no_advice_to_recover_but_names_what_a_copy_lacks(path, command):
+    copy = path.parent / "copy" / "run.mcap"
+    copy.parent.mkdir()
+    unfinished(path, 6000)
     with Session(path) as session:
         assert any("'undulog log recover'" in text for text in session.warnings)
-    assert undulog.run(["log", "recover", str(path)]) == 0
-    out = capsys.readouterr().out
+    out = command("log", "recover", path).out
     assert "the recorder did not finish" in out
     assert "log recover" not in out
-    copy = tmp_path / "copy" / "run.mcap"
     shutil.copy(path, copy)
     with Session(copy) as session:
         assert len(session.warnings) == 1
-    assert undulog.run(["log", "recover", str(copy)]) == 0
-    out = capsys.readouterr().out
-    assert "note: there is no run.mcap.wal beside run.mcap" in out
+    assert "note: there is no run.mcap.wal beside run.mcap" in command("log", "recover", copy).out
     shutil.copytree(path.with_name("run.mcap.wal"), copy.with_name("run.mcap.wal"))
-    assert undulog.run(["log", "recover", str(copy), "--force"]) == 0
-    assert "; none is missing" in capsys.readouterr().out
+    assert "; none is missing" in command("log", "recover", copy, "--force").out
     assert read(copy.with_name("run.recovered.mcap")) == (recorder.truth(6000), [])
 
 
-def test_a_whole_file_needs_no_recovery(tmp_path):
-    path = tmp_path / "run.mcap"
+def test_a_whole_file_needs_no_recovery(tmp_path, path):
     recorder.record(path, range(1))
     report = recover_log(path, tmp_path / "out.mcap")
     assert report.notes == ["the log was whole: nothing had to be recovered"]
@@ -436,19 +395,19 @@ def test_an_empty_write_ahead_log_and_an_empty_file_are_no_log(tmp_path):
     (tmp_path / "run.mcap").touch()
     (tmp_path / "run.mcap.wal").mkdir()
     for use in (Session, lambda path: recover_log(path, tmp_path / "out.mcap")):
-        with pytest.raises(NotALogError):
+        with pytest.raises(errors.NotALogError):
             use(tmp_path / "run.mcap")
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_edits_take_an_unfinished_session_as_it_is(tmp_path):
-    path = unfinished(tmp_path / "run.mcap", 1000, splits=(400,))
+def test_edits_take_an_unfinished_session_as_it_is(tmp_path, path):
+    unfinished(path, 1000, splits=(400,))
     before = fingerprint(tmp_path)
     for output in (path, tmp_path / "run_0002.mcap"):
-        with pytest.raises(UsageError, match="is a source"):
+        with pytest.raises(errors.UsageError, match="is a source"):
             recover_log(path, output, force=True)
     (tmp_path / "out.mcap").write_bytes(b"mine")
-    with pytest.raises(OutputExistsError):
+    with pytest.raises(errors.OutputExistsError):
         recover_log(path, tmp_path / "out.mcap")
     (tmp_path / "out.mcap").unlink()
     assert fingerprint(tmp_path) == before
@@ -461,8 +420,7 @@ def test_edits_take_an_unfinished_session_as_it_is(tmp_path):
     assert len(read(tmp_path / "merged.mcap")[0]) == 1600
 
 
-def test_behind_a_broken_chain_of_records_the_next_chunks_are_found(tmp_path):
-    path = tmp_path / "run.mcap"
+def test_behind_a_broken_chain_of_records_the_next_chunks_are_found(path):
     recorder.record(path, range(12_000))
     raw = path.read_bytes()
     chunks = summary_of(path).chunk_indexes
@@ -488,22 +446,18 @@ def damage(rng, folder):
     """Damage up to three files of a session in one of several ways each."""
     files = [path for path in sorted(folder.rglob("*")) if path.suffix in (".mcap", ".seg")]
     for path in rng.sample(files, rng.randint(1, 3)):
-        raw = path.read_bytes()
-        damaged = damaged_bytes(rng, raw, rng.choice([1, 8, 64, 4096]))
-        if damaged is None:
-            path.unlink()
-        else:
-            path.write_bytes(damaged)
+        damaged = damaged_bytes(rng, path.read_bytes(), rng.choice([1, 8, 64, 4096]))
+        path.unlink() if damaged is None else path.write_bytes(damaged)
 
 
 @pytest.mark.parametrize("runs", [40, pytest.param(1000, marks=pytest.mark.slow)])
-def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_told(tmp_path, runs):
+def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_reported(tmp_path, runs):
     source = tmp_path / "source"
     source.mkdir()
     unfinished(source / "run.mcap", 2400, splits=[900, 1800])
     truth = set(recorder.truth(2400))
     place = tmp_path / "damaged"
-    outcomes = {"all": 0, "some": 0, "none": 0}
+    outcomes = Counter()
     rng = random.Random(runs)
     for run in range(runs):
         shutil.rmtree(place, ignore_errors=True)
@@ -513,7 +467,7 @@ def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_told(tmp
             found, warnings = read(place / "run.mcap")
             check_session(place)
             report = recover_log(place, tmp_path / "out.mcap", force=True)
-        except UndulogError:
+        except errors.UndulogError:
             outcomes["none"] += 1
             continue
         assert set(found) <= truth, run
@@ -524,5 +478,4 @@ def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_told(tmp
         assert len(found) == 2400 or warnings, run
         outcomes["all" if len(found) == 2400 else "some"] += 1
     assert outcomes["none"] <= runs // 20
-    assert outcomes["all"] > 0
-    assert outcomes["some"] > 0
+    assert outcomes.keys() >= {"all", "some"}

@@ -1,15 +1,15 @@
 """Split sessions: parts that are read as one, and told when one is missing."""
 
 import hashlib
+import itertools
 import shutil
 import time
 from pathlib import Path
 
 import pytest
 
-import undulog
 from support import durable_child as recorder
-from support.read_back import messages_of, metadata_of, read
+from support.read_back import messages_of, metadata_of, read, rows_of
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import LogError, LogWriteError, NotALogError, OutputExistsError
 from undulog.capture.log.edit.cut import cut_log
@@ -62,25 +62,19 @@ def test_each_part_explains_itself_and_names_its_neighbours(tmp_path):
     split_session(tmp_path / "run.mcap")
     names = ["run.mcap", "run_0002.mcap", "run_0003.mcap"]
     assert sorted(p.name for p in tmp_path.iterdir()) == names
-    found = [part_record(tmp_path / name) for name in names]
     digests = [hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() for name in names]
-    assert found == [
+    previous = [{}] + [
+        {"previous": name, "previous_sha256": digest}
+        for name, digest in zip(names, digests, strict=True)
+    ]
+    assert [part_record(tmp_path / name) for name in names] == [
         {"part": "1", "next": "run_0002.mcap"},
-        {
-            "part": "2",
-            "previous": "run.mcap",
-            "previous_sha256": digests[0],
-            "next": "run_0003.mcap",
-        },
-        {"part": "3", "previous": "run_0002.mcap", "previous_sha256": digests[1], "parts": "3"},
+        {"part": "2", "next": "run_0003.mcap", **previous[1]},
+        {"part": "3", "parts": "3", **previous[2]},
     ]
     assert [metadata_of(tmp_path / n)["undulog"]["session_id"] for n in names] == ["killed"] * 3
-    for part, name in enumerate(names):
-        messages = [  # by a foreign reader, one file at a time
-            (channel.topic, m.sequence, m.log_time, m.publish_time, m.data)
-            for _, channel, m in messages_of(tmp_path / name)
-        ]
-        assert messages == recorder.truth(900)[300 * part : 300 * (part + 1)]
+    for part, name in enumerate(names):  # by a foreign reader, one file at a time
+        assert rows_of(tmp_path / name) == recorder.truth(900)[300 * part : 300 * (part + 1)]
 
 
 def test_parts_by_size(tmp_path):
@@ -157,27 +151,24 @@ def test_a_next_part_that_is_there_already_costs_no_message(tmp_path):
     assert read(path) == (recorder.truth(500), [])
 
 
-def test_a_file_that_somebody_deletes_is_told_before_the_end(tmp_path):
+def test_a_file_that_somebody_deletes_is_reported_before_the_end(tmp_path):
     sink = recorder.open_sink(tmp_path / "run.mcap", flush_interval_s=0.01)
     recorder.write(sink, 0)
     (tmp_path / "run.mcap").unlink()
 
     def go_on():
-        number = 1
-        while True:
+        for number in itertools.count(1):
             recorder.write(sink, number)
-            number += 1
             time.sleep(0.001)
 
     with pytest.raises(LogWriteError, match=r"run\.mcap: was deleted while it was being written"):
         go_on()
-    with pytest.raises(
-        LogWriteError, match=r"was deleted .*; only what .*run\.mcap\.wal still has"
-    ):
+    kept = r"was deleted .*; only what .*run\.mcap\.wal still has"
+    with pytest.raises(LogWriteError, match=kept):
         sink.close(())
 
 
-def test_a_folder_that_is_gone_is_told(tmp_path):
+def test_a_folder_that_is_gone_is_reported(tmp_path):
     place = tmp_path / "gone"
     place.mkdir()
     sink = recorder.open_sink(place / "run.mcap")
@@ -192,27 +183,19 @@ def test_a_folder_that_is_gone_is_told(tmp_path):
 # -- reading -------------------------------------------------------------------------------------
 
 
-def test_naming_any_part_or_the_folder_opens_the_whole(tmp_path, capsys):
-    path = split_session(tmp_path / "run.mcap")
+def test_naming_any_part_or_the_folder_opens_the_whole(tmp_path, command):
+    split_session(tmp_path / "run.mcap")
     for name in ("run.mcap", "run_0002.mcap", "run_0003.mcap", "."):
-        found, warnings = read(tmp_path / name)
-        assert found == recorder.truth(900)
-        assert warnings == []
+        assert read(tmp_path / name) == (recorder.truth(900), [])
         with Session(tmp_path / name) as session:
             assert session.channels["/rare"].count == 18
             assert len(session.table("/a")) == 450
-            window = session.table(
-                "/b", start_ns=EPOCH_NS + 299 * 10**6, stop_ns=EPOCH_NS + 302 * 10**6
-            )
-            assert len(window) == 1
+            start_ns, stop_ns = (EPOCH_NS + ms * 10**6 for ms in (299, 302))
+            assert len(session.table("/b", start_ns=start_ns, stop_ns=stop_ns)) == 1
             assert session.duration_s == pytest.approx(0.899)
-        assert undulog.run(["log", "info", str(tmp_path / name)]) == 0
-        assert "900 messages" in capsys.readouterr().out
-        health = check_session(tmp_path / name)
-        assert health.file.damage == ()
-        assert health.file.indexed
-        assert health.file.chunks == health.file.checked == 3
-    assert read(path)[0] == recorder.truth(900)
+        assert "900 messages" in command("log", "info", tmp_path / name).out
+        file = check_session(tmp_path / name).file
+        assert (file.damage, file.indexed, file.chunks, file.checked) == ((), True, 3, 3)
 
 
 def test_a_folder_with_other_sessions_is_refused_and_part_names_are_not_enough(tmp_path):
@@ -229,26 +212,26 @@ def test_a_folder_with_other_sessions_is_refused_and_part_names_are_not_enough(t
 
 
 @pytest.mark.parametrize(
-    ("gone", "told"),
+    ("gone", "warning"),
     [
         (1, r"part 1 (run.mcap) is missing"),
         (2, r"part 2 (run_0002.mcap) is missing"),
         (3, r"part 3 (run_0003.mcap) is missing; whether more followed it is unknown"),
     ],
 )
-def test_a_missing_part_is_told(tmp_path, gone, told):
+def test_a_missing_part_is_reported(tmp_path, gone, warning):
     path = split_session(tmp_path / "run.mcap")
     part_path(path, gone).unlink()
     truth = recorder.truth(900)
     del truth[300 * (gone - 1) : 300 * gone]
     for number in {1, 2, 3} - {gone}:
-        assert read(part_path(path, number)) == (truth, [told])
-    assert read(tmp_path) == (truth, [told])
+        assert read(part_path(path, number)) == (truth, [warning])
+    assert read(tmp_path) == (truth, [warning])
     with Session(tmp_path) as session:
-        assert session.warnings == [told]
+        assert session.warnings == [warning]
     health = check_session(tmp_path)
     assert health.verdict == "bad"
-    assert told in health.reasons
+    assert warning in health.reasons
 
 
 def test_an_exchanged_part_is_found_and_one_of_another_session_is_left_out(tmp_path):
@@ -257,18 +240,13 @@ def test_an_exchanged_part_is_found_and_one_of_another_session_is_left_out(tmp_p
     (tmp_path / "x_0002.mcap").replace(tmp_path / "run_0002.mcap")
     health = check_session(path)
     assert health.verdict == "bad"
-    reason = (
-        "run_0002.mcap is not the file that run_0003.mcap was recorded after: its hash is another"
-    )
-    assert reason in health.reasons
+    fault = "is not the file that run_0003.mcap was recorded after: its hash is another"
+    assert f"run_0002.mcap {fault}" in health.reasons
     for part in ("x.mcap", "x_0003.mcap"):
         (tmp_path / part).unlink()
-    with SessionWriter(
-        tmp_path / "x.mcap",
-        session_id="other",
-        epoch_ns=EPOCH_NS,
-        sink=(sink := DurableSink(tmp_path / "x.mcap")),
-    ) as writer:
+    other = tmp_path / "x.mcap"
+    sink = DurableSink(other)
+    with SessionWriter(other, session_id="other", epoch_ns=EPOCH_NS, sink=sink) as writer:
         channel = writer.string("/a")
         channel.write(EPOCH_NS, "0")
         sink.split()

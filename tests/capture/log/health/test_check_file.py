@@ -1,39 +1,25 @@
 """`undulog log check` against faults planted in the file, and logs of other makes."""
 
-from __future__ import annotations
-
 import re
 import struct
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType
 
-import undulog
-from support.checked_sessions import (
-    EPOCH_NS,
-    NAMES,
-    ROBOT,
-    TICKS,
-    at,
-    gait,
-    timing_of,
-    write_raw,
-)
+from support.checked_sessions import EPOCH_NS, NAMES, ROBOT, TICKS, at, gait, timing_of, write_raw
 from support.read_back import chunks_of
 from support.written_sessions import joint_state, write_foreign
 from undulog.capture import SessionWriter
-from undulog.capture.log.health.session_check import SessionHealth, check_session
+from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.mcap.chunk import walk_records
 
 
-def flip(data: bytearray, at_byte: int) -> None:
+def flip(data, at_byte):
     data[at_byte] ^= 0x10
 
 
-def changed(path: Path, source: Path, change: Callable[[bytearray], object]) -> SessionHealth:
+def changed(path, source, change):
     """The health of a copy of a file with changed bytes."""
     data = bytearray(source.read_bytes())
     change(data)
@@ -42,27 +28,25 @@ def changed(path: Path, source: Path, change: Callable[[bytearray], object]) -> 
 
 
 @pytest.mark.parametrize("part", [0.02, 0.5, 0.9])
-def test_a_flipped_bit_is_found_and_bad(clean: Path, tmp_path: Path, part: float) -> None:
+def test_a_flipped_bit_is_found_and_bad(clean, tmp_path, part):
     chunk = chunks_of(clean, "/joint_states")[0]
     at_byte = chunk.chunk_start_offset + 60 + int(part * (chunk.chunk_length - 60))
     health = changed(tmp_path / "s.mcap", clean, lambda data: flip(data, at_byte))
     assert health.verdict == "bad"
     assert health.file.checked == health.file.chunks - 1
-    assert len(health.file.damage) == 1
-    assert "the chunk at byte" in health.file.damage[0]
+    (fault,) = health.file.damage
+    assert "the chunk at byte" in fault
     left = timing_of(health).count
     assert 0 < left < TICKS
-    held = re.search(r"; it held (\d+) messages: (\d+) of /joint_states$", health.file.damage[0])
-    assert held is not None  # the index tells it, whatever is around it in the file
+    held = re.search(r"; it held (\d+) messages: (\d+) of /joint_states$", fault)
+    assert held is not None  # the index has it, whatever is around it in the file
     assert int(held[1]) == int(held[2]) == TICKS - left
     assert timing_of(health, "/joint_commands").count == TICKS
 
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4])
 @pytest.mark.parametrize("indexed", [True, False])
-def test_a_flipped_bit_is_found_however_the_chunk_is_stored(
-    tmp_path: Path, compression: CompressionType, indexed: bool
-) -> None:
+def test_a_flipped_bit_is_found_however_the_chunk_is_stored(tmp_path, compression, indexed):
     kinds = IndexType.ALL if indexed else IndexType.NONE
     options = {"compression": compression, "chunk_size": 20_000, "index_types": kinds}
     path = write_raw(tmp_path / "s.mcap", list(range(500)), **options)
@@ -76,7 +60,7 @@ def test_a_flipped_bit_is_found_however_the_chunk_is_stored(
     assert health.file.indexed is indexed
 
 
-def test_an_index_that_lists_a_message_twice_is_found(tmp_path: Path) -> None:
+def test_an_index_that_lists_a_message_twice_is_found(tmp_path):
     path = write_raw(tmp_path / "s.mcap", list(range(100)))
     data = bytearray(path.read_bytes())
     _, start, _ = next(span for span in walk_records(bytes(data), 8, len(data)) if span[0] == 7)
@@ -87,7 +71,7 @@ def test_an_index_that_lists_a_message_twice_is_found(tmp_path: Path) -> None:
     assert "does not list its messages" in health.file.damage[0]
 
 
-def test_a_summary_that_counts_more_than_there_is_is_found(tmp_path: Path) -> None:
+def test_a_summary_that_counts_more_than_there_is_is_found(tmp_path):
     path = write_raw(tmp_path / "s.mcap", list(range(100)), enable_crcs=False)
     data = bytearray(path.read_bytes())
     counts = struct.pack("<HQHQ", 1, 100, 2, 100)
@@ -95,23 +79,21 @@ def test_a_summary_that_counts_more_than_there_is_is_found(tmp_path: Path) -> No
     at_count = data.index(counts) + 2
     data[at_count : at_count + 8] = struct.pack("<Q", 107)
     path.write_bytes(data)
-    assert check_session(path).file.damage == (
-        "the summary counts 107 messages of /joint_commands, 100 are in the file",
-    )
+    fault = "the summary counts 107 messages of /joint_commands, 100 are in the file"
+    assert check_session(path).file.damage == (fault,)
 
 
-def test_a_flipped_bit_in_an_attachment_is_found(clean: Path, tmp_path: Path) -> None:
+def test_a_flipped_bit_in_an_attachment_is_found(clean, tmp_path):
     at_byte = clean.read_bytes().index(b"+-30 degrees")
     health = changed(tmp_path / "s.mcap", clean, lambda data: flip(data, at_byte))
     assert health.verdict == "bad"
     assert "the attachment" in health.file.damage[0]
 
 
-def test_a_cut_file_is_degraded_and_says_what_is_left(clean: Path, tmp_path: Path) -> None:
+def test_a_cut_file_is_degraded_with_what_is_left(clean, tmp_path):
     chunk = chunks_of(clean, "/joint_states")[0]
-    (tmp_path / "s.mcap").write_bytes(
-        clean.read_bytes()[: chunk.chunk_start_offset + chunk.chunk_length // 2]
-    )
+    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
+    (tmp_path / "s.mcap").write_bytes(clean.read_bytes()[:middle])
     health = check_session(tmp_path / "s.mcap")
     assert health.file.truncated
     assert health.verdict == "degraded"
@@ -119,16 +101,14 @@ def test_a_cut_file_is_degraded_and_says_what_is_left(clean: Path, tmp_path: Pat
     assert 0 < timing_of(health).count < TICKS
 
 
-def test_a_file_without_index_is_degraded(tmp_path: Path) -> None:
-    path = write_raw(tmp_path / "s.mcap", list(range(300)), use_chunking=False)
-    health = check_session(path)
-    assert not health.file.truncated
-    assert not health.file.indexed
+def test_a_file_without_index_is_degraded(tmp_path):
+    health = check_session(write_raw(tmp_path / "s.mcap", list(range(300)), use_chunking=False))
+    assert (health.file.truncated, health.file.indexed) == (False, False)
     assert health.verdict == "degraded"
     assert timing_of(health).count == 300
 
 
-def test_an_uncovered_chunk_is_told(tmp_path: Path) -> None:
+def test_an_uncovered_chunk_is_noted(tmp_path):
     health = check_session(write_raw(tmp_path / "s.mcap", list(range(300)), enable_crcs=False))
     assert health.verdict == "good"
     assert "carry no CRC" in health.notes[0]
@@ -137,7 +117,7 @@ def test_an_uncovered_chunk_is_told(tmp_path: Path) -> None:
 # -- foreign bags ----------------------------------------------------------------------------------
 
 
-def foreign(path: Path, topic: str, names: list[list[str]]) -> Path:
+def foreign(path, topic, names):
     """Each tick one message a list of names, as mcap-ros2-support writes them."""
     messages = [
         (topic, t_ns, joint_state(t_ns, group, [float(np.sin(tick / 20 + k))] * len(group)))
@@ -148,19 +128,15 @@ def foreign(path: Path, topic: str, names: list[list[str]]) -> Path:
     return write_foreign(path, messages)
 
 
-def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path: Path) -> None:
-    path = foreign(tmp_path / "s.mcap", "/joint_states", [["a"], ["b"], ["c"]])
-    health = check_session(path)
-    assert {each.label: each.timing.gaps for each in health.series} == {
-        "/joint_states (a)": 0,
-        "/joint_states (b)": 0,
-        "/joint_states (c)": 0,
-    }
+def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path):
+    health = check_session(foreign(tmp_path / "s.mcap", "/joint_states", [["a"], ["b"], ["c"]]))
+    gaps = {each.label: each.timing.gaps for each in health.series}
+    assert gaps == {f"/joint_states ({name})": 0 for name in "abc"}
     assert [each.sequence.kind for each in health.channels] == ["none"]
     assert health.reasons == ("/joint_commands is missing; JointStates are on /joint_states",)
 
 
-def test_missing_contract_topics_are_named(tmp_path: Path) -> None:
+def test_missing_contract_topics_are_named(tmp_path):
     health = check_session(foreign(tmp_path / "s.mcap", "/arm/state", [["a", "b"]]))
     assert health.verdict == "degraded"
     assert "/joint_states is missing; JointStates are on /arm/state" in health.reasons
@@ -169,7 +145,7 @@ def test_missing_contract_topics_are_named(tmp_path: Path) -> None:
     assert check_session(tmp_path / "t.mcap").verdict == "bad"
 
 
-def test_a_joint_that_never_speaks_is_named(tmp_path: Path) -> None:
+def test_a_joint_without_samples_is_named(tmp_path):
     path = tmp_path / "s.mcap"
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
         commands = writer.joint_state("/joint_commands", NAMES, unit="rad")
@@ -180,7 +156,6 @@ def test_a_joint_that_never_speaks_is_named(tmp_path: Path) -> None:
     assert check_session(path).reasons == ("/joint_states never carries joint25",)
 
 
-def test_what_is_no_log_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_log_is_an_error(tmp_path, command):
     (tmp_path / "x.mcap").write_bytes(b"no log at all")
-    assert undulog.run(["log", "check", str(tmp_path / "x.mcap")]) == 1
-    assert "not an MCAP file" in capsys.readouterr().err
+    assert "not an MCAP file" in command("log", "check", tmp_path / "x.mcap", code=1).err

@@ -1,15 +1,10 @@
 """`undulog log check` of raw frames: their lengths on the wire, load and silence of a bus."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import undulog
 from support.checked_sessions import EPOCH_NS, ROBOT, at
-from support.paths import ARCSNAKE
+from support.paths import TRACE
 from undulog.capture import SessionWriter
 from undulog.capture.log.health.bus_tally import BusTally, frame_bits
 from undulog.capture.log.health.session_check import check_session
@@ -18,7 +13,7 @@ from undulog.capture.log.messages.frames import ERROR_FLAG, EXTENDED_FLAG, empty
 # -- raw frames --------------------------------------------------------------------------------
 
 
-def test_frame_lengths_are_those_of_the_paper() -> None:
+def test_frame_lengths_are_those_of_the_paper():
     frames = empty_frames(4)
     frames["dlc"] = [8, 8, 0, 8]
     frames["id_flags"] = [0x123, 0x123 | EXTENDED_FLAG, 0x123, 0x123 | ERROR_FLAG]
@@ -28,7 +23,7 @@ def test_frame_lengths_are_those_of_the_paper() -> None:
     assert fewest.tolist() == [111, 131, 47, 0]
 
 
-def test_load_rate_silence_and_errors_of_a_bus() -> None:
+def test_load_rate_silence_and_errors_of_a_bus():
     tally = BusTally()
     frames = empty_frames(4001)
     t_ns = EPOCH_NS + np.arange(4001) * 1_000_000
@@ -45,7 +40,7 @@ def test_load_rate_silence_and_errors_of_a_bus() -> None:
     assert bus.peak_load == pytest.approx((990 * 111 / 250_000, 990 * 135 / 250_000))
 
 
-def test_frames_in_a_session_are_checked_as_they_were_logged(tmp_path: Path) -> None:
+def test_frames_in_a_session_are_checked_as_they_were_logged(tmp_path):
     path = tmp_path / "s.mcap"
     sizes = np.random.default_rng(5).integers(0, 40, 300)
     with SessionWriter(path, session_id="s", epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
@@ -63,20 +58,17 @@ def test_frames_in_a_session_are_checked_as_they_were_logged(tmp_path: Path) -> 
     assert any(sentence.startswith(none) for sentence in health.reasons)
 
 
-def test_a_real_trace_has_its_own_frame_count(tmp_path: Path) -> None:
-    trace = ARCSNAKE / "linear_trajectory.candump.log"
-    if not trace.is_file():
+def test_a_real_trace_has_its_own_frame_count(tmp_path, command):
+    if not TRACE.is_file():
         pytest.skip("the recording of ArcSnake is not there")
-    output = tmp_path / "s.mcap"
-    done = undulog.run(["import", str(trace), "-o", str(output), "--robot", "arcsnake-joint"])
-    assert done == 0
-    health = check_session(output)
+    command("import", TRACE, "-o", tmp_path / "s.mcap", "--robot", "arcsnake-joint")
+    health = check_session(tmp_path / "s.mcap")
     (bus,) = health.buses
-    assert bus.frames == len(trace.read_text().splitlines()) == 19_297
-    assert bus.error_frames == 0
+    lines = TRACE.read_text().splitlines()
+    assert (bus.frames, bus.error_frames) == (len(lines), 0) == (19_297, 0)
     # 1,787 frames a second of 111 to 135 bits on 1 Mbit/s.
     assert bus.load == pytest.approx((0.198, 0.241), abs=0.003)
     # The trace pauses before the motion and its log stamps have holes; it is fit for use.
     assert health.verdict == "degraded"
-    stamps = [float(line.split(")")[0][1:]) for line in trace.read_text().splitlines()]
+    stamps = [float(line.split(")")[0][1:]) for line in lines]
     assert bus.longest_s == pytest.approx(np.diff(stamps).max(), abs=1e-6)

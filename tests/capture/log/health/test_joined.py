@@ -4,16 +4,13 @@ from itertools import product
 
 import numpy as np
 import pytest
+from hostile_logs import EPOCH_NS, joint_state
 
 from support.foreign_logs import foreign_log
-from support.written_sessions import joint_state
 from undulog.capture.log.health.rules import Fault, joined, listed
 from undulog.capture.log.health.session_check import check_session
-from undulog.capture.log.messages.cdr import encode
-from undulog.capture.log.messages.definitions import message_type
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
-EPOCH_NS = 1_700_000_000_000_000_000
 JOINTS = tuple(f"j{k}" for k in range(1, 13))
 TOPICS = ("/joint_states", "/joint_current", "/joint_temperature")
 TICKS = 400
@@ -21,7 +18,6 @@ TICKS = 400
 
 def lost(path, *, of_topic=None, whole=True, servos=False):
     """20 s at 20 Hz; in each topic a cycle is lost, or its numbers: 200, or ``of_topic``'s."""
-    kind = message_type(JOINT_STATE)
     with foreign_log(path, JOINT_STATE) as (writer, schema):
         topics = (*TOPICS, "/joint_commands")
         channels = {topic: writer.register_channel(topic, "cdr", schema) for topic in topics}
@@ -32,8 +28,8 @@ def lost(path, *, of_topic=None, whole=True, servos=False):
                 continue
             t_ns = EPOCH_NS + tick * 50_000_000
             values = 0.4 * np.sin(0.1 * tick - np.arange(len(names)))
-            fields = joint_state(t_ns, names, np.full(len(names), np.nan) if gone else values)
-            writer.add_message(channels[topic], t_ns, encode(kind, fields), t_ns, 0)
+            message = joint_state(t_ns, names, values * (np.nan if gone else 1.0))
+            writer.add_message(channels[topic], t_ns, message, t_ns, 0)
     return check_session(path)
 
 
@@ -49,14 +45,11 @@ def test_one_lost_bus_cycle_is_one_reason(tmp_path, whole, servos):
 
 
 def test_losses_at_two_times_are_two_reasons(tmp_path):
-    health = lost(tmp_path / "s.mcap", of_topic={"/joint_current": 300})
-    apart, together = sorted(health.reasons)
-    assert apart.startswith(
-        "/joint_current: 1 gaps, 1 samples missing (0.25%); the longest is 0.1 s"
-    )
-    assert together.startswith(
-        "/joint_states and /joint_temperature, lost together: at most 1 gaps"
-    )
+    apart, together = sorted(lost(tmp_path / "s.mcap", of_topic={"/joint_current": 300}).reasons)
+    gap = "1 gaps, 1 samples missing (0.25%); the longest is 0.1 s"
+    assert apart.startswith(f"/joint_current: {gap}")
+    both = "/joint_states and /joint_temperature, lost together"
+    assert together.startswith(f"{both}: at most 1 gaps")
 
 
 def test_the_figures_are_those_of_the_worst():

@@ -1,16 +1,12 @@
 """Chunks that hold more than they declare, or declare much: bounded memory, the rest is read."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource
-from pathlib import Path
 
 import pytest
 from hostile_logs import EPOCH_NS, NS, HostileLog, joint_state, lz4_zeros, zeros
 
-import undulog
 from support.processes import python
 from support.read_back import messages_of
 
@@ -20,7 +16,7 @@ ROOM = 600 * MIB
 """Largest memory of a process that reads such a file, its own 120 MiB included [byte]."""
 
 
-def ticks(start_s: int, count: int = 50) -> list:
+def ticks(start_s, count=50):
     return [
         (channel, t_ns, joint_state(t_ns, ["a", "b"], [tick / 100, 0.5]))
         for tick in range(count)
@@ -29,7 +25,7 @@ def ticks(start_s: int, count: int = 50) -> list:
     ]
 
 
-def with_bomb(path: Path, packed: bytes, size: int, *, whole: bool = True, **options) -> int:
+def with_bomb(path, packed, size, *, whole=True, **options):
     """A good chunk, one that is not what it says, and a good one where the file is whole.
 
     Returns where the bytes of the second begin.
@@ -48,7 +44,7 @@ def with_bomb(path: Path, packed: bytes, size: int, *, whole: bool = True, **opt
     return at
 
 
-def run(*commands: list[object], most: int = ROOM) -> list[str]:
+def run(*commands, most=ROOM):
     """Run commands in a process of its own and give what each prints; none may fail.
 
     Its memory is held against a limit.
@@ -58,28 +54,27 @@ def run(*commands: list[object], most: int = ROOM) -> list[str]:
         "from pathlib import Path\n"
         "found = []\n"
         "for command in json.loads(sys.argv[1]):\n"
-        "    with contextlib.redirect_stdout(io.StringIO()) as said:\n"
+        "    with contextlib.redirect_stdout(io.StringIO()) as printed:\n"
         "        code = undulog.run(command)\n"
-        "    found.append([code, said.getvalue()])\n"
+        "    found.append([code, printed.getvalue()])\n"
         # ru_maxrss would count what the process had before it became this program.
         "status = Path('/proc/self/status').read_text()\n"
         "used = 1024 * int(re.search(r'VmHWM:\\s+(\\d+)', status)[1])\n"
         "print(json.dumps([used, found]))\n"
     )
 
-    def limited() -> None:
+    def limited():
         resource.setrlimit(resource.RLIMIT_AS, (3 * GIB, 3 * GIB))
 
     listed = json.dumps([[str(word) for word in command] for command in commands])
-    done = python(
-        script, listed, preexec_fn=limited, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    )
+    env = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    done = python(script, listed, preexec_fn=limited, env=env)
     assert not done.returncode, done.stderr
     used, found = json.loads(done.stdout)
     assert used < most, f"{used / MIB:.0f} MiB"
     for command, (code, _) in zip(commands, found, strict=True):
         assert code == 0 or "check" in command, command
-    return [said for _, said in found]
+    return [printed for _, printed in found]
 
 
 BOMBS = {
@@ -92,16 +87,13 @@ BOMBS = {
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_chunks_that_expand_beyond_their_size_are_refused_and_the_rest_is_kept(
-    tmp_path: Path, whole: bool
-) -> None:
-    places: dict[Path, int] = {}
+def test_chunks_that_expand_beyond_their_size_are_refused_and_the_rest_is_kept(tmp_path, whole):
+    places = {}
     for kind, make in BOMBS.items():
         packed, size, options = make()
         path = tmp_path / f"{kind}.mcap"
         places[path] = with_bomb(path, packed, size, whole=whole, **options)
-    recovered = [path.with_suffix(".recovered.mcap") for path in places]
-    said = run(
+    printed = run(
         *(["log", "recover", path] for path in places),
         *(["log", "check", path, "--json"] for path in places),
         *(["analyse", path, "--json"] for path in places),
@@ -110,17 +102,17 @@ def test_chunks_that_expand_beyond_their_size_are_refused_and_the_rest_is_kept(
     starts = [0, 3] if whole else [0]
     wanted = [t_ns for start in starts for _, t_ns, _ in ticks(start)]
     for k, (path, at) in enumerate(places.items()):
-        assert "chunk" in said[k], path
-        kept = [message.log_time for _, _, message in messages_of(recovered[k])]
-        assert kept == wanted, path
-        health = json.loads(said[count + k])
+        assert "chunk" in printed[k], path
+        recovered = messages_of(path.with_suffix(".recovered.mcap"))
+        assert [message.log_time for _, _, message in recovered] == wanted, path
+        health = json.loads(printed[count + k])
         if whole:
             assert health["verdict"] == "bad", path
             assert any(f"the chunk at byte {at} " in text for text in health["reasons"]), path
-        assert any("chunk" in text for text in json.loads(said[2 * count + k])["warnings"]), path
+        assert any("chunk" in text for text in json.loads(printed[2 * count + k])["warnings"]), path
 
 
-def test_the_error_names_the_option_that_reads_a_larger_chunk(tmp_path: Path) -> None:
+def test_the_error_names_the_option_that_reads_a_larger_chunk(tmp_path):
     path = tmp_path / "big.mcap"
     with_bomb(path, zeros(300 * MIB), 300 * MIB)
     command = ["log", "check", path, "--json"]
@@ -131,11 +123,9 @@ def test_the_error_names_the_option_that_reads_a_larger_chunk(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("wrong", ["", "0", "-1", "many", "1e9", "99999999999999999999"])
-def test_a_chunk_limit_is_a_positive_whole_number(
-    wrong: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert undulog.run(["log", "info", "x.mcap", f"--max-chunk-mib={wrong}"]) == 2
-    assert "--max-chunk-mib" in capsys.readouterr().err
+def test_a_chunk_limit_is_a_positive_whole_number(wrong, command):
+    option = f"--max-chunk-mib={wrong}"
+    assert "--max-chunk-mib" in command("log", "info", "x.mcap", option, code=2).err
 
 
 IMAGE = (
@@ -145,7 +135,7 @@ IMAGE = (
 )
 
 
-def test_constant_images_open_however_well_they_compress(tmp_path: Path) -> None:
+def test_constant_images_open_however_well_they_compress(tmp_path):
     """Black pictures, zero depth and an empty map compress 10,000 times and more."""
     log = HostileLog()
     kind = log.schema("sensor_msgs/msg/Image", IMAGE)

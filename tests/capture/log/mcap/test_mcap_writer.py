@@ -89,8 +89,7 @@ def test_a_long_file_of_many_channels():
     ]
     ours, theirs = (written(kind, calls, 1 << 17)[0] for kind in (McapWriter, Writer))
     assert ours == theirs
-    summary = make_reader(io.BytesIO(ours)).get_summary()
-    assert summary.statistics.message_count == 20_000
+    assert make_reader(io.BytesIO(ours)).get_summary().statistics.message_count == 20_000
 
 
 def test_a_number_out_of_range_leaves_the_chunk_as_it_was():

@@ -1,9 +1,5 @@
 """Logs that are dropped without being closed, while others are read."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -39,7 +35,7 @@ print("read")
 """
 
 
-def test_a_forgotten_log_may_be_collected_at_any_moment(tmp_path: Path) -> None:
+def test_a_forgotten_log_may_be_collected_at_any_moment(tmp_path):
     path = tmp_path / "some.mcap"
     with SessionWriter(path, session_id="some", epoch_ns=1_735_689_600_000_000_000) as writer:
         states = writer.joint_state("/joint_states", ("a", "b"), unit="rad")
@@ -49,11 +45,11 @@ def test_a_forgotten_log_may_be_collected_at_any_moment(tmp_path: Path) -> None:
     assert done.stdout == "read\n", done.stderr
 
 
-def test_an_interrupt_stays_one_where_a_frame_still_holds_bytes_of_the_log(tmp_path: Path) -> None:
+def test_an_interrupt_stays_one_where_a_frame_still_holds_bytes_of_the_log(tmp_path):
     path = tmp_path / "run.mcap"
     path.write_bytes(b"0123456789" * 100)
 
-    def read(log: McapPayloads) -> None:
+    def read(log):
         held = memoryview(log.buffer)[10:20]
         try:
             raise KeyboardInterrupt

@@ -14,9 +14,8 @@ import sys
 import threading
 
 from support import mutation_child
+from support.processes import start
 
-CHILD = mutation_child.__file__
-GROWTH = 192 << 20
 PATIENCE_S = 120.0
 """A small file is read in milliseconds; one that takes so long will take for ever."""
 
@@ -50,10 +49,8 @@ def lines_of(process):
 
 def read_mutated(first, stop):
     """Read the files of some seeds; checks each and gives how many came out in which way."""
-    command = [sys.executable, str(CHILD), str(first), str(stop)]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
+    words = (sys.executable, mutation_child.__file__, first, stop)
+    process = start(*words, stderr=subprocess.DEVNULL)
     with process.stdout:
         came, stray, seed, done = collections.Counter(), [], None, 0
         for line in lines_of(process):
@@ -66,7 +63,9 @@ def read_mutated(first, stop):
                 stray.append(f"seed {line['seed']}\n{line['trace']}")
             else:
                 came[line["came"].split(" ")[0]] += 1
-            assert line["grown"] < GROWTH, f"seed {seed} needed {line['grown']} bytes"
+            assert line["grown"] < mutation_child.GROWTH, (
+                f"seed {seed} needed {line['grown']} bytes"
+            )
     assert not stray, f"{len(stray)} stray errors:\n" + "\n".join(stray[:5])
     assert done == stop - first, f"the process ended while it read seed {seed}"
     return came

@@ -1,8 +1,8 @@
 """The recorder's sink: nothing accepted is lost, whatever the disk does."""
 
+import itertools
 import os
 import shutil
-import sys
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,8 +13,7 @@ from mcap.records import Channel, Metadata
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from support import durable_child as recorder
-from support import processes
-from support.processes import wait_for
+from support.processes import python, wait_for
 from support.read_back import messages_of, metadata_of, read
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError, LogWriteError, OutputExistsError
@@ -23,7 +22,6 @@ from undulog.capture.log.messages.definitions import ERROR, OK, DiagnosticStatus
 from undulog.capture.log.sinks.durable_sink import DurableSink
 from undulog.capture.recorder.recording import TappedSink
 
-CHILD = recorder.__file__
 EPOCH_NS = recorder.EPOCH_NS
 
 
@@ -58,8 +56,7 @@ def test_a_session_is_the_same_through_either_sink(tmp_path):
         assert run.metadata == plain.metadata
         assert run.metadata["undulog.clock"] == {"can0.drift_ppm": "1.5"}
         assert run.attachments == plain.attachments
-        assert run.verdict == "good"
-        assert run.warnings == []
+        assert (run.verdict, run.warnings) == ("good", [])
         assert next(t.data for _, t in run.messages("/gait/mode")) == "mode 1000"
     assert len(messages_of(tmp_path / "run.mcap")) == 3020
     health = check_session(tmp_path / "run.mcap")
@@ -68,11 +65,9 @@ def test_a_session_is_the_same_through_either_sink(tmp_path):
     assert np.isclose(health.duration_s, 29.99)
 
 
-def test_listeners_hear_what_was_accepted_and_nothing_else(tmp_path):
+def test_listeners_get_what_was_accepted_and_nothing_else(tmp_path):
     offered = []
-    listener = SimpleNamespace(
-        define=lambda record: None, offer=lambda *message: offered.append(message)
-    )
+    listener = SimpleNamespace(define=id, offer=lambda *message: offered.append(message))
     kept = recorder.open_sink(tmp_path / "run.mcap")
     sink = TappedSink(kept, [listener])
     for number in range(100):
@@ -80,8 +75,7 @@ def test_listeners_hear_what_was_accepted_and_nothing_else(tmp_path):
     with pytest.raises(DataError, match="out of range"):
         sink.write(1, -1, 0, 0, b"")
     sink.close(())
-    expected = [(c, t, p, s, data) for c, s, t, p, data in map(recorder.message, range(100))]
-    assert offered == expected
+    assert offered == [(c, t, p, s, data) for c, s, t, p, data in map(recorder.message, range(100))]
     assert (kept.messages, kept.part) == (100, 1)
     assert kept.size == (tmp_path / "run.mcap").stat().st_size
 
@@ -243,20 +237,17 @@ except LogWriteError as error:
 
 
 def fill(place, ballast, split_size=0, hog="never"):
-    command = [sys.executable, "-c", FILL, CHILD, place, ballast, split_size, hog]
-    done = processes.run(*command)
+    done = python(FILL, recorder.__file__, place, ballast, split_size, hog)
     assert done.returncode == 0, done.stderr
-    told, end = done.stdout.splitlines()
-    accepted, foreseen, error = told.split("|")
+    report, end = done.stdout.splitlines()
+    accepted, foreseen, error = report.split("|")
     assert foreseen == "True"
     assert "bytes are missing" in error or "No space left on device" in error
     return int(accepted), end
 
 
 @pytest.mark.parametrize(("split_size", "hog"), [(0, "never"), (1 << 19, "never"), (0, "early")])
-def test_a_full_disk_ends_in_a_finalised_file_with_all_that_was_accepted(
-    small_disk, split_size, hog
-):
+def test_a_full_disk_ends_in_a_file_with_all_that_was_accepted(small_disk, split_size, hog):
     accepted, end = fill(small_disk, 1 << 20, split_size, hog)
     assert end == "finalised"
     assert accepted > (900 if hog == "early" else 3000)
@@ -276,7 +267,7 @@ def test_a_disk_too_full_to_finalise_keeps_all_in_the_write_ahead_log(small_disk
         assert any("none is missing" in text for text in warnings)
 
 
-def test_a_disk_full_from_the_start_is_told_and_left_as_it_was(small_disk):
+def test_a_disk_full_from_the_start_is_reported_and_left_as_it_was(small_disk):
     with pytest.raises(LogWriteError, match=r"ballast: needs 8388608 bytes .* are missing"):
         DurableSink(small_disk / "run.mcap", segment_size=1 << 16)
     assert names(small_disk) == []
@@ -293,22 +284,21 @@ def test_a_failing_disk_ends_the_recording_and_loses_nothing(tmp_path, monkeypat
         return real(file, data)
 
     monkeypatch.setattr(os, "write", broken)
-    accepted = 0
+    accepted = []
 
     def go_on():
-        nonlocal accepted
-        while True:
-            recorder.write(sink, accepted)
-            accepted += 1
+        for number in itertools.count():
+            recorder.write(sink, number)
+            accepted.append(number)
 
     with pytest.raises(LogWriteError, match=r"run\.mcap: can't be written: Input/output error"):
         go_on()
-    with pytest.raises(LogWriteError, match=f"all {accepted} messages are kept"):
+    with pytest.raises(LogWriteError, match=f"all {len(accepted)} messages are kept"):
         sink.close(())
     monkeypatch.undo()
     assert not (tmp_path / "run.mcap.wal" / "ballast").exists()
     found, warnings = read(path)
-    assert found == recorder.truth(accepted)
+    assert found == recorder.truth(len(accepted))
     assert any("none is missing" in text for text in warnings)
 
 
@@ -340,11 +330,10 @@ def test_clocks_and_diagnostics_are_standard_messages(tmp_path):
     ]
     assert clocks[1][1].header.stamp.nanosec == EPOCH_NS % 10**9 + 1
     last = [m for topic, _, m in messages if topic == "/diagnostics"][-1]
-    told = [
+    assert [
         (s.level, s.name, s.message, s.hardware_id, {v.key: v.value for v in s.values})
         for s in last.status
-    ]
-    assert told == [
+    ] == [
         (2, "source can0", "lost 3 frames", "can:x", {"dropped": "3", "ü": ""}),
         (0, "recorder", "fine", "", {}),
     ]

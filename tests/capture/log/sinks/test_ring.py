@@ -33,6 +33,7 @@ EPOCH_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
 SECOND = 1000 * MS
 PATIENCE_S = 60.0
+TOPICS = ["/a", "/b", "/gait/mode", "/tf_static"]
 
 
 def written(ring):
@@ -43,10 +44,9 @@ def written(ring):
 
 def read(path):
     """All messages of a file by a foreign reader: channel by channel, as each was written."""
-    found = messages_of(path, log_time_order=False)
-    return by_channel(
-        [(c.id, m.log_time, m.publish_time, m.sequence, bytes(m.data)) for _, c, m in found]
-    )
+    rows = messages_of(path, log_time_order=False)
+    found = [(c.id, m.log_time, m.publish_time, m.sequence, bytes(m.data)) for _, c, m in rows]
+    return by_channel(found)
 
 
 def by_channel(messages):
@@ -76,41 +76,34 @@ def defined(ring):
     """Two ordinary channels, a latched one and static transforms."""
     ring.define(Schema(id=1, data=b"x", encoding="ros2msg", name="sensor_msgs/msg/JointState"))
     ring.define(Schema(id=2, data=b"string data", encoding="ros2msg", name="std_msgs/msg/String"))
-    ring.define(Channel(1, "/a", "cdr", {"unit": "rad"}, 1))
-    ring.define(Channel(2, "/b", "cdr", {}, 1))
-    ring.define(Channel(3, "/gait/mode", "cdr", {}, 2))
-    ring.define(Channel(4, "/tf_static", "cdr", {}, 1))
+    facts = ({"unit": "rad"}, {}, {}, {})
+    for key, (topic, metadata, kind) in enumerate(zip(TOPICS, facts, (1, 1, 2, 1), strict=True), 1):
+        ring.define(Channel(key, topic, "cdr", metadata, kind))
     return ring
 
 
-@given(
-    steps=st.lists(
-        st.tuples(st.integers(1, 2), st.integers(0, 400), st.binary(max_size=40)), max_size=60
-    ),
-    window_ms=st.integers(1, 2000),
-    marks=st.sets(st.integers(0, 59), max_size=3),
-)
+STEP = st.tuples(st.integers(1, 2), st.integers(0, 400), st.binary(max_size=40))
+
+
+@given(st.lists(STEP, max_size=60), st.integers(1, 2000), st.sets(st.integers(0, 59), max_size=3))
 @settings(deadline=None, max_examples=60)
-def test_a_mark_holds_the_messages_of_the_last_seconds_bit_for_bit(
-    tmp_path_factory, steps, window_ms, marks
-):
+def test_a_mark_has_the_last_seconds_bit_for_bit(tmp_path_factory, steps, window_ms, marks):
     folder = tmp_path_factory.mktemp("ring")
     ring = defined(RingSink(folder / "run.mcap", window_ms * MS))
-    said, wanted, t_ns = [], {}, EPOCH_NS
+    sent, wanted, t_ns = [], {}, EPOCH_NS
     for k, (channel, step_ms, payload) in enumerate(steps):
         t_ns += step_ms * MS
-        message = (channel, t_ns, t_ns - k, k, payload)
-        ring.write(*message)
-        said.append(message)
+        sent.append((channel, t_ns, t_ns - k, k, payload))
+        ring.write(*sent[-1])
         if k in marks:
-            wanted[ring.mark()] = [m for m in said if m[1] >= t_ns - window_ms * MS]
+            wanted[ring.mark()] = [m for m in sent if m[1] >= t_ns - window_ms * MS]
     ring.close(())
     assert [mark.path for mark in ring.marks] == list(wanted)
     for mark in ring.marks:
-        assert mark.error is None
-        assert read(mark.path) == by_channel(wanted[mark.path])
-        assert mark.messages == len(wanted[mark.path])
-        assert (mark.start_ns, mark.stop_ns) == (wanted[mark.path][0][1], wanted[mark.path][-1][1])
+        truth = wanted[mark.path]
+        assert (mark.error, mark.messages) == (None, len(truth))
+        assert read(mark.path) == by_channel(truth)
+        assert (mark.start_ns, mark.stop_ns) == (truth[0][1], truth[-1][1])
     shutil.rmtree(folder)
 
 
@@ -138,27 +131,22 @@ def test_what_was_in_force_before_the_window_is_carried_to_its_start(ring):
     facts = metadata_of(path)[MARK_RECORD]
     assert (facts["number"], facts["text"], facts["ring_s"]) == ("1", "slipped", "1.0")
     assert facts["stop_ns"] == str(now_ns + 9)
-    carried = {"/gait/mode": EPOCH_NS + 5, "/tf_static": EPOCH_NS + 4}
-    assert json.loads(facts["carried"]) == carried
+    assert json.loads(facts["carried"]) == {"/gait/mode": EPOCH_NS + 5, "/tf_static": EPOCH_NS + 4}
 
 
 def test_every_mark_explains_itself_and_opens_as_a_session(tmp_path):
     """Through the session writer and reader: three marks of one robot, each complete."""
     ring = RingSink(tmp_path / "run.mcap", 2 * SECOND)
-    writer = SessionWriter(
-        tmp_path / "run.mcap", session_id="s", epoch_ns=EPOCH_NS, sink=ring, metadata={"place": "x"}
-    )
+    facts = {"session_id": "s", "epoch_ns": EPOCH_NS, "metadata": {"place": "x"}}
+    writer = SessionWriter(tmp_path / "run.mcap", sink=ring, **facts)
     writer.attach("scenario.toml", "application/toml", b"a = 1")
     states = writer.joint_state("/joint_states", ["j1", "j2"], unit="rad")
-    mode = writer.string("/gait/mode")
-    mode.write(EPOCH_NS, "walk")
+    writer.string("/gait/mode").write(EPOCH_NS, "walk")
     for k in range(1000):
-        t_ns = EPOCH_NS + k * 10 * MS
-        states.write(t_ns, [k, -k])
+        states.write(EPOCH_NS + k * 10 * MS, [k, -k])
         if k in (300, 600):
             ring.mark()
-    late = writer.log()
-    late.write(EPOCH_NS + 9990 * MS, "info", "test", "late channel")
+    writer.log().write(EPOCH_NS + 9990 * MS, "info", "test", "late channel")
     ring.mark()
     writer.set_verdict("good")
     writer.close()
@@ -171,9 +159,8 @@ def test_every_mark_explains_itself_and_opens_as_a_session(tmp_path):
             assert session.attachments["scenario.toml"] == b"a = 1"
             assert session.warnings == []
             wanted = np.arange(last - 200, last + 1.0)
-            np.testing.assert_array_equal(
-                session.joints("/joint_states").values, np.stack([wanted, -wanted])
-            )
+            states = session.joints("/joint_states").values
+            np.testing.assert_array_equal(states, [wanted, -wanted])
             assert [m.data for _, m in session.messages("/gait/mode")] == ["walk"]
     with Session(path) as session:
         assert [m.msg for _, m in session.messages("/rosout")] == ["late channel"]
@@ -186,8 +173,7 @@ def test_nothing_is_overwritten_and_numbers_go_on(tmp_path):
     ring = defined(RingSink(tmp_path / "run.mcap", SECOND))
     put(ring, (0, b"x"))
     (tmp_path / "run_mark0008.mcap").write_bytes(b"came later")
-    assert ring.mark().name == "run_mark0009.mcap"
-    assert ring.mark().name == "run_mark0010.mcap"
+    assert [ring.mark().name for _ in range(2)] == ["run_mark0009.mcap", "run_mark0010.mcap"]
     ring.close(())
     assert (tmp_path / "run_mark0007.mcap").read_bytes() == b"precious"
     assert (tmp_path / "run_mark0008.mcap").read_bytes() == b"came later"
@@ -207,7 +193,7 @@ def test_a_file_that_comes_in_between_is_not_overwritten_either(tmp_path):
     ring.close(())
 
 
-def test_a_failed_mark_is_told_once_and_the_ring_goes_on(tmp_path):
+def test_a_failed_mark_is_reported_once_and_the_ring_goes_on(tmp_path):
     folder = tmp_path / "gone"
     folder.mkdir()
     ring = defined(RingSink(folder / "run.mcap", SECOND))
@@ -225,7 +211,7 @@ def test_a_failed_mark_is_told_once_and_the_ring_goes_on(tmp_path):
     ring.close(())
 
 
-def test_close_tells_of_a_failure_that_nobody_heard_of(tmp_path):
+def test_close_raises_a_failure_that_nobody_has_seen(tmp_path):
     ring = defined(RingSink(tmp_path / "none" / "run.mcap", SECOND))
     put(ring, (0, b"x"))
     with pytest.raises(LogWriteError, match=r"run_mark0001\.mcap"):
@@ -233,7 +219,7 @@ def test_close_tells_of_a_failure_that_nobody_heard_of(tmp_path):
     ring.close(())
 
 
-def test_a_full_disk_is_told_and_what_fits_stays(disk_of):
+def test_a_full_disk_is_reported_and_what_fits_stays(disk_of):
     ring = defined(RingSink(disk_of("256k") / "run.mcap", SECOND))
     noise = random.Random(1).randbytes(1000)
     for k in range(1000):
@@ -334,14 +320,13 @@ def test_definitions_of_every_kind_come_back(ring):
         reader = make_reader(stream)
         channels = reader.get_summary().channels
         (attachment,) = reader.iter_attachments()
-    topics = ["/a", "/b", "/gait/mode", "/tf_static"]
-    assert [channel.topic for channel in channels.values()] == topics
+    assert [channel.topic for channel in channels.values()] == TOPICS
     assert channels[1].metadata == {"unit": "rad"}
     assert (attachment.name, attachment.data) == ("robot.toml", b"data")
     assert metadata_of(path)["undulog"] == {"session_id": "s"}
 
 
-def test_a_recording_kept_in_a_ring_tells_of_its_marks(tmp_path):
+def test_a_recording_kept_in_a_ring_reports_its_marks(tmp_path):
     folder = tmp_path / "out"
     with pytest.raises(LogWriteError, match="doesn't exist"):
         RingStorage(folder / "run.mcap", 1.5)

@@ -9,13 +9,7 @@ from mcap.records import Attachment, Header, Metadata, Schema
 
 from support.processes import wait_for
 from support.wal_messages import CHANNEL, check_messages, filled, message
-from undulog.capture.common.errors import (
-    DataError,
-    LogError,
-    LogWriteError,
-    NotALogError,
-    OutputExistsError,
-)
+from undulog.capture.common import errors
 from undulog.capture.log.wal.reader import recover
 from undulog.capture.log.wal.writer import WriteAheadLog, wal_folder
 
@@ -92,17 +86,16 @@ def test_a_number_out_of_range_is_refused_and_leaves_no_trace(tmp_path, values):
     with WriteAheadLog(tmp_path / "w") as wal:
         wal.define(CHANNEL)
         wal.append(1, 0, 0, 0, b"before")
-        with pytest.raises(DataError, match="out of range"):
+        with pytest.raises(errors.DataError, match="out of range"):
             wal.append(*values, b"x" * 1000)
-        with pytest.raises(DataError, match="go up to 1"):
+        with pytest.raises(errors.DataError, match="go up to 1"):
             wal.release(2)
         assert wal.append(1, 0, 0, 0, b"after") == 2
     assert payloads(tmp_path / "w") == [b"before", b"after"]
 
 
 def test_bytes_of_another_log_in_a_payload_are_not_taken_for_messages(tmp_path):
-    inner = filled(tmp_path / "inner", 3)
-    raw = (inner / "000001.seg").read_bytes()
+    raw = (filled(tmp_path / "inner", 3) / "000001.seg").read_bytes()
     with WriteAheadLog(tmp_path / "w") as wal:
         wal.define(CHANNEL)
         wal.append(1, 0, 0, 0, raw)
@@ -127,23 +120,21 @@ def test_segments_go_when_released_and_the_folder_when_all_is(tmp_path):
         wal.append(*message(position))
     before = len(list(folder.glob("0*.seg")))
     wal.release(150)
-    wait_for(
-        lambda: len(list(folder.glob("0*.seg"))) <= before / 2, "released segments are still there"
-    )
+    wait_for(lambda: len(list(folder.glob("0*.seg"))) <= before / 2, "the release")
     assert check_messages(list(recover(folder)))[-1] == 200  # a log in use can be looked at
     wal.release(200)
     wal.close()
     wal.close()
     assert not folder.exists()
-    with pytest.raises(LogWriteError, match="closed"):
+    with pytest.raises(errors.LogWriteError, match="closed"):
         wal.append(1, 0, 0, 0, b"")
-    with pytest.raises(LogWriteError, match="closed"):
+    with pytest.raises(errors.LogWriteError, match="closed"):
         wal.define(CHANNEL)
 
 
 def test_a_log_that_was_not_released_is_kept_and_not_written_over(tmp_path):
     filled(tmp_path / "w", 5)
-    with pytest.raises(OutputExistsError):
+    with pytest.raises(errors.OutputExistsError):
         WriteAheadLog(tmp_path / "w")
     assert len(list(recover(tmp_path / "w"))) == 5
     (tmp_path / "w" / "note.txt").write_text("not ours")
@@ -154,15 +145,15 @@ def test_a_log_that_was_not_released_is_kept_and_not_written_over(tmp_path):
 
 @pytest.mark.parametrize("options", [{"segment_size": 100}, {"sync_interval_s": 0.0}])
 def test_senseless_options_are_refused(tmp_path, options):
-    with pytest.raises(DataError, match="at least 4096"):
+    with pytest.raises(errors.DataError, match="at least 4096"):
         WriteAheadLog(tmp_path / "w", **options)
     assert not (tmp_path / "w").exists()
 
 
-def test_what_is_no_log_is_told(tmp_path):
-    with pytest.raises(LogWriteError, match=r"no/w: can't be created: No such file"):
+def test_what_is_no_log_is_refused(tmp_path):
+    with pytest.raises(errors.LogWriteError, match=r"no/w: can't be created: No such file"):
         WriteAheadLog(tmp_path / "no" / "w")
-    with pytest.raises(LogError, match="No such file"):
+    with pytest.raises(errors.LogError, match="No such file"):
         recover(tmp_path / "none")
-    with pytest.raises(NotALogError, match="no segment"):
+    with pytest.raises(errors.NotALogError, match="no segment"):
         recover(tmp_path)

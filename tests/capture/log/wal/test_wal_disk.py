@@ -17,7 +17,7 @@ from undulog.capture.log.wal.writer import WriteAheadLog
 # -- the disk --------------------------------------------------------------------------------
 
 
-def test_a_failing_disk_is_told_by_the_next_append_and_by_close(tmp_path, monkeypatch):
+def test_a_failing_disk_is_reported_by_the_next_append_and_by_close(tmp_path, monkeypatch):
     wal = WriteAheadLog(tmp_path / "w", sync_interval_s=0.01)
     wal.append(*message(1))
 
@@ -43,7 +43,7 @@ def test_a_failing_disk_is_told_by_the_next_append_and_by_close(tmp_path, monkey
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_dead_background_thread_is_told_by_the_next_append(tmp_path, monkeypatch):
+def test_a_dead_background_thread_is_reported_by_the_next_append(tmp_path, monkeypatch):
     def broken(self):
         raise RuntimeError("unforeseen")
 
@@ -58,8 +58,7 @@ def test_a_dead_background_thread_is_told_by_the_next_append(tmp_path, monkeypat
 
 
 def test_room_is_asked_for_beforehand(tmp_path):
-    free = free_bytes(tmp_path / "not" / "yet.mcap")
-    assert free > 0
+    assert free_bytes(tmp_path / "not" / "yet.mcap") > 0
     require_space(tmp_path, 1)
     with pytest.raises(LogWriteError, match=r"needs \d+ bytes .* bytes are missing"):
         require_space(tmp_path / "x.mcap", 1 << 60)
@@ -72,9 +71,7 @@ def small_disk(disk_of):
 
 
 # In a child, for the failure to be feared is a SIGBUS.
-FILL = (
-    MESSAGE
-    + """
+FILL = f"""{MESSAGE}
 import sys
 from undulog.capture.common.errors import LogWriteError
 from undulog.capture.log.wal.writer import WriteAheadLog
@@ -97,20 +94,17 @@ if sys.argv[2] == "release":
 wal.close()
 print(accepted)
 """
-)
 
 
 @pytest.mark.parametrize("then", ["close", "release"])
 def test_a_full_disk_is_an_error_that_loses_nothing(small_disk, then):
     done = python(FILL, small_disk / "w", then)
     assert done.returncode == 0, done.stderr
-    told, again, last = done.stdout.splitlines()
-    accepted, foreseen, error = told.split("|")
-    assert foreseen == "True"
-    assert again == "again"
-    assert re.search(
-        r"w/\d{6}\.seg: needs 65536 bytes and the disk has \d+ free: \d+ bytes are missing", error
-    )
+    report, again, last = done.stdout.splitlines()
+    accepted, foreseen, error = report.split("|")
+    assert (foreseen, again) == ("True", "again")
+    shortage = r"needs 65536 bytes and the disk has \d+ free: \d+ bytes are missing"
+    assert re.search(rf"w/\d{{6}}\.seg: {shortage}", error)
     recovery = recover(small_disk / "w")
     positions = check_messages(list(recovery))
     assert recovery.missing == 0
@@ -120,7 +114,7 @@ def test_a_full_disk_is_an_error_that_loses_nothing(small_disk, then):
         assert int(accepted) > 1500  # the disk was used, all but the last segments
 
 
-def test_a_disk_full_from_the_start_is_told_and_left_as_it_was(small_disk):
+def test_a_disk_full_from_the_start_is_reported_and_left_as_it_was(small_disk):
     with pytest.raises(LogWriteError, match=r"000001\.seg: needs 2097152 bytes"):
         WriteAheadLog(small_disk / "w", segment_size=2 << 20)
     assert list(small_disk.iterdir()) == []

@@ -2,16 +2,14 @@
 
 import os
 import resource
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
 
-from support.paths import ROOT
 from support.processes import wait_for
 from support.read_back import summary_of
+from support.recorders import ended, recording
 from support.wal_messages import message
 from undulog.capture import Session
 from undulog.capture.log.messages.frames import empty_frames
@@ -47,29 +45,20 @@ def test_a_page_that_is_written_no_more_is_synced_in_the_end(tmp_path):
 @pytest.mark.parametrize("size", [0, 2 * PAGE])
 def test_a_recorder_whose_log_is_cut_short_ends_in_good_order(size, tmp_path):
     output, path = tmp_path / "run.mcap", tmp_path / "bus.sock"
-    command = [sys.executable, "-m", "undulog", "record", f"bus=unix:{path}", "-o", str(output)]
-    command += ["--floor", "0", "--socket", str(tmp_path / "control.sock"), "--quiet"]
-    recorder = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     frame, accepted = empty_frames(1), 1
-    try:
-        with FrameSender(path) as sender:
-            wait_for(lambda: sender.send(frame), "the recorder")
-            before = sender.refused
-            while recorder.poll() is None and sender.refused < before + 10:
-                frame["t_device_ns"] = number = accepted
-                accepted += sender.send(frame)
-                if number == 500:
-                    time.sleep(0.5)  # long enough to have taken them
-                    os.truncate(tmp_path / "run.mcap.wal" / "000001.seg", size)
-                time.sleep(0.001)
-        _, said = recorder.communicate(timeout=60)
-    finally:
-        if recorder.poll() is None:
-            recorder.kill()
-            recorder.wait()
-    assert recorder.returncode == 1, said
-    assert "000001.seg: was cut short by another program" in said
-    assert "Traceback" not in said
+    with recording(output, f"bus=unix:{path}", "--quiet") as recorder, FrameSender(path) as sender:
+        wait_for(lambda: sender.send(frame), "the recorder")
+        before = sender.refused
+        while recorder.poll() is None and sender.refused < before + 10:
+            frame["t_device_ns"] = number = accepted
+            accepted += sender.send(frame)
+            if number == 500:
+                time.sleep(0.5)  # long enough to have taken them
+                os.truncate(tmp_path / "run.mcap.wal" / "000001.seg", size)
+            time.sleep(0.001)
+        _, err = ended(recorder)
+    assert recorder.returncode == 1, err
+    assert "000001.seg: was cut short by another program" in err
     assert summary_of(output) is not None  # a whole file
     with Session.open(output) as session:
         frames = session.frames("/can/bus")
