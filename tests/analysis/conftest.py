@@ -80,8 +80,7 @@ class Wave:
         )
 
     def command(self, t_ns):
-        t = (t_ns - EPOCH_NS) * 1e-9
-        return self.amplitude * np.sin(self.omega * t + self.phase) + 0.05
+        return self.amplitude * np.sin(self.omega * ((t_ns - EPOCH_NS) * 1e-9) + self.phase) + 0.05
 
     def response(self, t_ns):
         """At one time a joint."""

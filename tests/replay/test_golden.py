@@ -108,8 +108,7 @@ def bent(link, degrees):
         return points.tolist()
 
     def turned(row):
-        pose = Rotation.from_quat(np.array(row))
-        return [*row[:link], *(turn * pose[link:]).as_quat().tolist()]
+        return [*row[:link], *(turn * Rotation.from_quat(np.array(row))[link:]).as_quat().tolist()]
 
     move = changed(BODY, "Capsules3D:translations", moved)
     rotate = changed(BODY, "Capsules3D:quaternions", turned)

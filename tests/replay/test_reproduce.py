@@ -19,8 +19,7 @@ def room(tmp_path_factory):
     run = {"duration_s": 5.0, "settle_s": 1.0, "physics_rate_hz": 4000, "gait": {"ramp_s": 0.5}}
     world = wave(**run, horizontal={"lag": 1.0}, noise={"position": 0.001})
     (folder / "wave.toml").write_text(world)
-    words = ["sim", "run", str(folder / "wave.toml"), "-o", str(folder / "run.mcap")]
-    assert front.run(words) == 0
+    assert front.run(["sim", "run", str(folder / "wave.toml"), "-o", str(folder / "run.mcap")]) == 0
     (folder / "chain.toml").unlink()
     return folder
 
@@ -44,8 +43,7 @@ def test_in_its_own_world_a_run_is_the_same_to_the_last_bit(room, tmp_path, caps
     both = f"{room / 'run.mcap'} {path}"
     assert told[2:] == [f"Next: undulog view {both}", f"      undulog compare {both}"]
     with Session.open(path) as session, Session.open(room / "run.mcap") as first:
-        facts = session.metadata["undulog"]
-        assert facts["driven.session_id"] == first.session_id
+        assert session.metadata["undulog"]["driven.session_id"] == first.session_id
         assert session.settle_s == first.settle_s == 1.0
         topics = [topic for topic in first.channels if topic != "/rosout"]
         messages = sum(first.channels[topic].count for topic in topics)
@@ -55,7 +53,7 @@ def test_in_its_own_world_a_run_is_the_same_to_the_last_bit(room, tmp_path, caps
     assert f"all {messages} messages on {len(topics)} topics" in told[1]
 
 
-def test_what_was_changed_is_named_with_intervals(room, tmp_path, capsys):
+def test_what_was_changed_is_named_with_intervals(room, tmp_path, capsys, opened):
     change = "servo_of.joint02.stall_torque=0.1"
     path = again(room, tmp_path / "weak.mcap", "--set", change, "--json")
     report = json.loads(capsys.readouterr().out)
@@ -78,8 +76,7 @@ def test_what_was_changed_is_named_with_intervals(room, tmp_path, capsys):
     assert "Differs: " in told
     assert "/joint_commands" not in told.partition("\n\n")[0]
     assert "B differs from A: joint02 most" in told
-    with Session.open(path) as session:
-        assert "servo_of.joint02" in session.attachments["scenario.toml"].decode()
+    assert "servo_of.joint02" in opened(path).attachments["scenario.toml"].decode()
 
 
 @pytest.fixture(scope="module")
@@ -107,8 +104,7 @@ def test_one_altered_command_changes_what_comes_after_it_alone(commands, tmp_pat
     told = capsys.readouterr().out
     assert "plain.mcap has commands and no response" in told
     assert told.endswith(f"\nNext: undulog view {commands / 'plain.mcap'} {plain}\n")
-    altered = again(commands, tmp_path / "altered.mcap", source="altered.mcap")
-    found = compare_logs(plain, altered)
+    found = compare_logs(plain, again(commands, tmp_path / "altered.mcap", source="altered.mcap"))
     assert found.differs_s["/joint_commands"] == pytest.approx(2.0)
     # The command acts from its tick on; states of that period arrive two ticks later.
     for topic in ("/odom", "/energy_ledger", "/joint_states"):
@@ -164,6 +160,5 @@ def test_a_wrong_change_names_the_key(room, tmp_path, capsys, change, told):
         ("--on twin -o a.json", "name it"),
     ],
 )
-def test_wrong_usage_says_what_would_be_right(room, capsys, words, told):
-    assert front.run(["replay", str(room / "run.mcap"), *words.split()]) == 2
-    assert told in capsys.readouterr().err
+def test_wrong_usage_says_what_would_be_right(room, words, told, command):
+    assert told in command("replay", room / "run.mcap", *words.split(), code=2).err

@@ -41,7 +41,7 @@ def recorded(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_on_the_bus_the_same_commands_give_the_same_motion(recorded, tmp_path, capsys):
+def test_on_the_bus_the_same_commands_give_the_same_motion(recorded, tmp_path, capsys, report_of):
     path = tmp_path / "again.mcap"
     capsys.readouterr()
     with served("weak-servo-pi3", "--duration", "60") as on:
@@ -60,9 +60,7 @@ def test_on_the_bus_the_same_commands_give_the_same_motion(recorded, tmp_path, c
         assert second.settle_s == first.settle_s
         assert {"/gait", "/gait/mode", "/gate/wanted", "/gate/phase"} <= set(second.channels)
     # Commands are rounded by the bus, and states are: nothing differs by more than that.
-    assert front.run(["compare", str(recorded), str(path), "--json"]) == 0
-    comparison = json.loads(capsys.readouterr().out)
-    assert comparison == report["comparison"]
+    assert report_of("compare", recorded, path) == report["comparison"]
 
 
 @pytest.mark.slow
@@ -77,6 +75,8 @@ def test_an_early_end_is_said_and_nothing_is_compared(recorded, tmp_path, capsys
     assert "ompared" not in told.out
 
 
-def test_a_gait_is_no_session(tmp_path, capsys):
-    assert front.run(["replay", "flat", "--on", "can:virtual:x", "--arm", "-o", "x.mcap"]) == 2
-    assert "'undulog drive flat --on can:virtual:x' drives a gait" in capsys.readouterr().err
+def test_a_gait_is_no_session(tmp_path, command):
+    assert (
+        "'undulog drive flat --on can:virtual:x' drives a gait"
+        in command("replay", "flat", "--on", "can:virtual:x", "--arm", "-o", "x.mcap", code=2).err
+    )

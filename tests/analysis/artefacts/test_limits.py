@@ -6,8 +6,7 @@ import pytest
 from support import planted_artefacts, twin_chains
 from undulog.analysis.signals.columns import read_columns
 from undulog.capture import Session
-from undulog.sim import load_scenario
-from undulog.sim.twin.recording import record
+from undulog.sim import load_scenario, record
 
 STALL = 1.5
 """Of the planted sessions' servos [N m]."""
@@ -68,8 +67,7 @@ def test_a_weak_twin_gives_its_full_voltage_when_the_servo_law_says(tmp_path):
 
 def duty(t_s, command, angle):
     """What the servo law gives, as a mean over the control period around each sample."""
-    period_s = t_s[1] - t_s[0]
-    off_s = period_s * (np.arange(20) - 9.5) / 20
+    off_s = (t_s[1] - t_s[0]) * (np.arange(20) - 9.5) / 20
     held = np.stack([np.roll(command, 1) if off < 0 else command for off in off_s])
     held[:, 0] = command[0]
     moved = np.stack([np.interp(t_s + off, t_s, angle) for off in off_s])

@@ -106,8 +106,7 @@ def test_a_row_a_session_with_the_results_beside_it(lab, analysed):
     assert rows.index.to_list() == ["day1/gait.mcap", "plain.mcap"]
     with Session.open(lab / "plain.mcap") as session:
         plain = rows.loc["plain.mcap"]
-        assert plain.duration_s == session.duration_s
-        assert plain.start_ns == session.start_ns
+        assert (plain.duration_s, plain.start_ns) == (session.duration_s, session.start_ns)
         assert plain.start == pd.Timestamp(session.start_ns)  # UTC
         assert (plain.verdict, plain.operator, plain.session_id) == ("good", "Ada", "s1")
         assert plain.messages == sum(channel.count for channel in session.channels.values())
@@ -152,8 +151,7 @@ def test_analyses_are_made_on_request_and_again_when_the_session_changes(lab, an
     (lab / "day1" / "gait.json").unlink()
     catalog = Catalog(str(lab))
     catalog.scan()
-    faults = catalog.analyse()
-    assert faults == {}
+    assert catalog.analyse() == {}
     rows = catalog.find().set_index("path")
     assert rows.sentence["day1/gait.mcap"] == result.answer.sentence
     assert (rows.status == "analysed").all()
@@ -256,8 +254,7 @@ def test_the_command(lab):
     assert len(pd.read_csv(lab / "joints.csv")) > 1
     query = "select robot, count(*) as n from catalog group by robot"
     assert undulog("catalog", lab, "--sql", query).returncode == 0
-    refused = undulog("catalog", lab, "--sql", query, "--joints")
-    assert refused.returncode == 2
+    assert undulog("catalog", lab, "--sql", query, "--joints").returncode == 2
     assert undulog("catalog", lab / "none").returncode == 1
 
 
@@ -272,6 +269,5 @@ def test_a_bucket_has_the_catalogue_of_a_folder(lab, monkeypatch):
         catalog = Catalog("s3://robots")
         assert catalog.scan().read == 4
         pd.testing.assert_frame_equal(catalog.find(), local.find(), check_dtype=False)
-        assert catalog.scan().read == 0
-        assert catalog.analyse() == {}
+        assert (catalog.scan().read, catalog.analyse()) == (0, {})
         assert (catalog.find().status == "analysed").all()

@@ -86,15 +86,13 @@ def test_a_topic_that_was_chosen_must_be_there(good, capsys):
     ],
 )
 def test_no_answer_says_what_is_lacking(kind, why, tmp_path, capsys):
-    path = written(tmp_path / "lacking.mcap", **kind)
-    code, out, _ = said(capsys, "analyse", path)
+    code, out, _ = said(capsys, "analyse", written(tmp_path / "lacking.mcap", **kind))
     assert code == 0
     assert out.splitlines()[1] == why
 
 
 def test_a_sample_that_is_no_number_is_flagged_and_json_stays_json(tmp_path, capsys):
-    path = written(tmp_path / "nan.mcap", lost=(200,))
-    code, out, _ = said(capsys, "analyse", path, "--json")
+    code, out, _ = said(capsys, "analyse", written(tmp_path / "nan.mcap", lost=(200,)), "--json")
     assert code == 0
 
     def refuse(name):

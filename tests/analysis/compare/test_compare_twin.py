@@ -6,8 +6,7 @@ import pytest
 from support import twin_chains
 from undulog.analysis import compare_sessions
 from undulog.capture import Session
-from undulog.sim import load_scenario
-from undulog.sim.twin.recording import record
+from undulog.sim import load_scenario, record
 
 pytestmark = pytest.mark.slow
 
@@ -59,8 +58,7 @@ def test_the_weak_servo_is_named_first_with_what_was_changed(twins):
 def test_other_noise_makes_no_difference(twins):
     (base, again, _), _ = twins
     result = compared(base, again)
-    assert result.verdict == "same"
-    assert result.changed == ()
+    assert (result.verdict, result.changed) == ("same", ())
 
 
 def test_speed_is_that_of_the_centre_of_mass_in_the_physics(twins):

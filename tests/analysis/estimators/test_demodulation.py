@@ -100,8 +100,7 @@ def test_what_a_cycle_cannot_tell_is_missing():
     holed = (found.stop_s > 20) & (found.start_s < 23)
     # Also the neighbours, whose mean over a cycle around each sample reaches in.
     assert np.isnan(found.ratio[holed]).all()
-    far = (found.stop_s < 18) | (found.start_s > 25)
-    assert np.isfinite(found.ratio[far]).all()
+    assert np.isfinite(found.ratio[(found.stop_s < 18) | (found.start_s > 25)]).all()
     still = Series("q", T, np.where(T < 30, 0.0, command.values))
     found = cycles(phi, still, Series("q", T, response))
     assert np.isnan(found.ratio[found.stop_s < 28]).all()

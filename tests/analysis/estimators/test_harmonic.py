@@ -58,8 +58,7 @@ class Trials:
                 commands.append(Series(f"c{i}", t, command))
                 responses.append(Series(f"r{i}", own, response))
             channels = commands + responses
-            guess = omega + 2 * np.pi / duration * rng.uniform(-0.2, 0.2)
-            fit = fit_shared(channels, guess)
+            fit = fit_shared(channels, omega + 2 * np.pi / duration * rng.uniform(-0.2, 0.2))
             noise = residual_noise(channels, fit)
             variance, dof = omega_variance(fit, noise)
             answer = respond(

@@ -8,7 +8,6 @@ import shlex
 import numpy as np
 import pytest
 
-import undulog
 from support.analysed import experiment
 from support.joint_runs import EPOCH_NS, turns, write_joints
 from undulog.analysis.present.text_experiment import render_experiment
@@ -44,8 +43,7 @@ def write_run(
     command = amplitude * np.exp(1j * (ahead * step * np.arange(M) + rng.uniform(-np.pi, np.pi)))
     if kick is not None:
         command[kick[0]] *= kick[1]
-    identical = BOUNDARY if ahead < 0 else BOUNDARY[::-1]
-    answer = command * np.exp(identical + module)
+    answer = command * np.exp((BOUNDARY if ahead < 0 else BOUNDARY[::-1]) + module)
     epoch_ns = EPOCH_NS + round(start_s * 1e9)
     turn = turns(frequency, round(4 / frequency * 50))
     asked, seen = np.zeros((len(turn), 25)), rng.normal(0.0, sigma, (len(turn), 25))
@@ -131,8 +129,7 @@ def test_one_direction_is_not_separable(alike):
     assert result.answer.endswith(
         "; boundary or module is open: one direction only; record the reverse"
     )
-    assert result.reversal is None
-    assert result.pooled.runs == 6
+    assert (result.reversal, result.pooled.runs) == (None, 6)
     truth = np.exp(BOUNDARY)
     for k, joint in enumerate(result.pooled.joints):
         assert joint.name == ROBOT.joint_names[YAW[k]]
@@ -185,8 +182,7 @@ def test_runs_that_are_too_few_or_not_in_turn(alike):
 
 def test_a_robot_that_is_not_its_own_mirror_image():
     driven = [ROBOT.joint_names[k] for k in YAW]
-    assert mirror_fault(ROBOT, driven) is None
-    assert mirror_fault(None, driven) is None
+    assert (mirror_fault(ROBOT, driven), mirror_fault(None, driven)) == (None, None)
     assert "not their own mirror image" in mirror_fault(ROBOT, driven[:-1])
     alternate = load_robot("snake13")  # 6 + 6 joints: a yaw joint at the head, a pitch joint behind
     assert "come in another order" in mirror_fault(alternate, alternate.joint_names[::2])
@@ -203,19 +199,17 @@ def test_bags_without_a_robot_are_taken_as_a_chain(tmp_path):
 
 
 def test_nothing_that_travels(tmp_path):
-    standing = [write_run(tmp_path / f"{k}.mcap", k, step=0.0) for k in (1, 2)]
-    result = experiment(standing)
+    result = experiment([write_run(tmp_path / f"{k}.mcap", k, step=0.0) for k in (1, 2)])
     assert result.answer.startswith("no gait with a travelling wave")
     assert (result.reversal, result.heterogeneity["common_response"].value) == (None, None)
     assert json.dumps(result.to_dict(), allow_nan=False)
     assert render_experiment(result).startswith("2 sessions: no gait with a travelling wave")
 
 
-def test_the_json_object(weak, capsys, tmp_path):
+def test_the_json_object(weak, tmp_path, report_of):
     out = tmp_path / "experiment.json"
     words = ["analyse", *map(str, weak), "--start", "0.02"]
-    assert undulog.run([*words, "--json", "-o", str(out)]) == 0
-    printed = json.loads(capsys.readouterr().out)
+    printed = report_of(*words, "-o", out)
     assert json.loads(out.read_text()) == printed
     assert list(printed) == [
         "answer",
@@ -241,9 +235,8 @@ def test_the_json_object(weak, capsys, tmp_path):
         assert {"value", "ci95", "p", "unit", "label"} == set(index)
 
 
-def test_the_first_line_is_the_answer(weak, alike, capsys):
-    assert undulog.run(["analyse", *map(str, weak)]) == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_the_first_line_is_the_answer(weak, alike, command):
+    lines = command("analyse", *weak).out.splitlines()
     assert lines[0].startswith(
         "12 sessions: the modules differ: joint07 answers less than its mirror joint19 (p = 0.002)"
     )

@@ -1,6 +1,5 @@
 """Experiments on recorded twins, a short chain on the ground: six runs each way, and kicks."""
 
-import json
 import math
 
 import pytest
@@ -8,8 +7,7 @@ import pytest
 import undulog
 from support import twin_chains
 from support.analysed import experiment
-from undulog.sim import load_scenario
-from undulog.sim.twin.recording import record
+from undulog.sim import load_scenario, record
 
 pytestmark = pytest.mark.slow
 
@@ -74,7 +72,7 @@ def test_the_weak_servo_is_named(answered):
     assert result.reversal.boundary_share.value > result.reversal.module_share.value
 
 
-def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, capsys):
+def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, capsys, report_of):
     """From a recorded gait to the pair, by the commands, on a floor that falls by 1 degree."""
     (tmp_path / "chain.toml").write_text(ROBOT)
     like, folder = tmp_path / "like.mcap", tmp_path / "plan"
@@ -94,8 +92,7 @@ def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, capsys):
         at_one_heading = [path for path in driven if path.endswith("-0.mcap")]
         for plan, paths in (("balanced", driven), ("one heading", at_one_heading)):
             capsys.readouterr()
-            assert undulog.run(["analyse", *paths, "--json"]) == 0
-            answers[name, plan] = json.loads(capsys.readouterr().out)
+            answers[name, plan] = report_of("analyse", *paths)
     sound, weak = (answers[name, "balanced"] for name in ("sound", "weak"))
     for one in (sound, weak):
         reversal = one["reversal"]
@@ -112,13 +109,12 @@ def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, capsys):
     assert (alone["forward_runs"], alone["reverse_runs"]) == (3, 3)
     tilt = alone["tilt"]
     assert (tilt["headings"], tilt["excluded"]) == ("unbalanced", False)
-    largest = max(abs(one["lag_difference_rad"]["value"]) for one in alone["joints"])
-    assert largest > 5 * max(
+    assert max(abs(one["lag_difference_rad"]["value"]) for one in alone["joints"]) > 5 * max(
         abs(one["lag_difference_rad"]["value"]) for one in sound["reversal"]["joints"]
     )
 
 
-def test_kicks_in_contact_predict_what_was_held_out(tmp_path, capsys):
+def test_kicks_in_contact_predict_what_was_held_out(tmp_path, capsys, report_of):
     """From a recorded gait to its coupling, by the commands: plan, drive, analyse."""
     (tmp_path / "chain.toml").write_text(ROBOT)
     scenario = tmp_path / "wave.toml"
@@ -133,8 +129,7 @@ def test_kicks_in_contact_predict_what_was_held_out(tmp_path, capsys):
         on = ["--on", f"twin:{scenario}", "-o", driven[-1]]
         assert undulog.run(["drive", str(commands), *on]) == 0
     capsys.readouterr()
-    assert undulog.run(["analyse", *driven, "--start", "4", "--json"]) == 0
-    coupling = json.loads(capsys.readouterr().out)["coupling"]
+    coupling = report_of("analyse", *driven, "--start", "4")["coupling"]
     assert (coupling["base_runs"], coupling["kicked_runs"]) == (6, 16)
     # Time shift, whatever the ground does.
     for rows in ("phase_rows", "gain_rows"):

@@ -74,8 +74,7 @@ def test_it_is_generalised_least_squares():
 
     found = verdict(seen, model)
     free = minimize(q, np.zeros(3), tol=1e-10)
-    assert found.fit == pytest.approx(free.fun, rel=1e-6)
-    assert found.named == (2,)
+    assert (found.fit, found.named) == (pytest.approx(free.fun, rel=1e-6), (2,))
     other = minimize(q, np.zeros(5), args=(2,), tol=1e-10)
     np.testing.assert_allclose(found.x, other.x[:3], atol=1e-4)
     np.testing.assert_allclose(found.deviation[2], other.x[3:], atol=0.01 * found.error[2].max())
@@ -143,7 +142,6 @@ def test_joints_without_an_answer_are_left_out():
     model = planted()
     seen = answered(np.random.default_rng(6), model, np.zeros(3), [("stall_torque", 4, -0.3)])
     some = np.array([0, 1, 3, 4, 5, 6])
-    found = null_test(seen.select(some), some, model)
-    assert found.named[:1] == (4,)
+    assert null_test(seen.select(some), some, model).named[:1] == (4,)
     with pytest.raises(DataError, match="1 joints with gain and lag are too few"):
         null_test(seen.select([0]), np.array([0]), model)

@@ -142,8 +142,7 @@ def test_constant_and_missing_series_have_no_change():
 
 
 def test_one_joint_does_not_move_the_others():
-    rng = np.random.default_rng(2)
-    values = rng.normal(size=(40, 5)) * 0.01 + np.arange(5)
+    values = np.random.default_rng(2).normal(size=(40, 5)) * 0.01 + np.arange(5)
     moved = values.copy()
     moved[20:, 2] -= 3.0
     nothing = np.zeros(40, dtype=np.int64)

@@ -90,14 +90,11 @@ def test_integrated_oscillators_do_what_is_predicted():
 
     def rate(_, d):
         c_now = A * np.exp(1j * (phase + d))
-        ratio = (H @ c_now) / c_now
-        return EPS * (ratio.imag - bias)
+        return EPS * (((H @ c_now) / c_now).imag - bias)
 
-    times = found.relaxation.times_s
-    done = solve_ivp(rate, (0.0, 20.0), off, t_eval=times, rtol=1e-9, atol=1e-12)
+    done = solve_ivp(rate, (0.0, 20.0), off, t_eval=found.relaxation.times_s, rtol=1e-9, atol=1e-12)
     error = np.linalg.norm(np.array(found.relaxation.phase_rad) - done.y.T, axis=1)
-    moved = np.linalg.norm(done.y.T[-1] - off)
-    assert moved > 0.3 * np.linalg.norm(off)
+    assert np.linalg.norm(done.y.T[-1] - off) > 0.3 * np.linalg.norm(off)
     assert error.max() < 0.03 * np.linalg.norm(off)  # second order in a kick of 0.03 rad
 
 
@@ -114,8 +111,7 @@ def test_intervals_of_rates_hold_under_scatter():
     random = np.random.default_rng(3)
     inside = []
     for _ in range(20):
-        found = closed_loop(measured(random, 0.1)[2], EPS)
-        ends = [one.rate.ci95 for one in found.modes]
+        ends = [one.rate.ci95 for one in closed_loop(measured(random, 0.1)[2], EPS).modes]
         # Of the sums: rates that lie close together change places.
         inside += [low <= t <= high for (low, high), t in zip(ends, truth, strict=True)]
     assert np.mean(inside) >= 0.91
@@ -139,13 +135,12 @@ def test_what_is_left_of_a_kick_has_an_interval():
 def test_the_limits_are_stated():
     coupling = measured()[2]
     known = dataclasses.replace(coupling, valid_to=0.1)
-    failed = dataclasses.replace(known, checks_pass=False)
     for given, eps, kick, limit in (
         (coupling, EPS, None, "isn't known"),
         (known, EPS, {"j1": 0.2}, "beyond 0.1 rad"),
         (known, EPS, None, "holds for deviations up to 0.1 rad"),
         (known, 20.0, None, "take a smaller eps"),
-        (failed, EPS, None, "the prediction is doubtful"),
+        (dataclasses.replace(known, checks_pass=False), EPS, None, "the prediction is doubtful"),
     ):
         assert limit in closed_loop(given, eps, kick=kick).limits[0]
 
@@ -165,24 +160,21 @@ def result(tmp_path_factory):
     """The result file of a kick experiment, and one of its sessions."""
     folder = tmp_path_factory.mktemp("kicked")
     files = linear_chain.kicked(folder)
-    words = ["analyse", *map(str, files), "-o", str(folder / "kicks.json")]
-    assert undulog.run(words) == 0
+    assert undulog.run(["analyse", *map(str, files), "-o", str(folder / "kicks.json")]) == 0
     return folder / "kicks.json", files
 
 
-def test_the_verb_takes_sessions_or_their_result(result, tmp_path, capsys):
+def test_the_verb_takes_sessions_or_their_result(result, tmp_path, capsys, command, report_of):
     file, sessions = result
     capsys.readouterr()
-    assert undulog.run(["predict", str(file), "--eps", "0.3", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert undulog.run(["predict", *map(str, sessions), "--eps", "0.3", "--json"]) == 0
-    again = json.loads(capsys.readouterr().out)
-    np.testing.assert_allclose(found["J"], again["J"], atol=1e-12)
+    found = report_of("predict", file, "--eps", "0.3")
+    np.testing.assert_allclose(
+        found["J"], report_of("predict", *sessions, "--eps", "0.3")["J"], atol=1e-12
+    )
     np.testing.assert_allclose(found["J"], rates_of(CHAIN, WAVE), atol=0.02)
     output = tmp_path / "predicted.json"
     words = ["predict", str(file), "--eps", "0.3", "--kick", "j2=0.05", "-o", str(output)]
-    assert undulog.run(words) == 0
-    text = capsys.readouterr().out
+    text = command(*words).out
     assert text.startswith("With feedback of 0.3 1/s and the body as the only coupling, of 4")
     assert "Of the kick" in text
     assert json.loads(output.read_text())["relaxation"]["times_s"][0] == 0.0
@@ -201,16 +193,17 @@ def test_the_verb_takes_sessions_or_their_result(result, tmp_path, capsys):
         ("--eps 0.3 --age -1", 2, "--age is at least 0"),
     ],
 )
-def test_wrong_usage(result, capsys, words, code, told):
-    assert undulog.run(["predict", str(result[0]), *words.split()]) == code
-    assert told in capsys.readouterr().err
+def test_wrong_usage(result, words, code, told, command):
+    assert told in command("predict", result[0], *words.split(), code=code).err
 
 
-def test_sessions_without_kicks_fail_and_say_what_to_record(result, capsys):
+def test_sessions_without_kicks_fail_and_say_what_to_record(result, command):
     _, sessions = result
-    assert undulog.run(["predict", str(sessions[0]), "--eps", "0.3"]) == 1
-    assert "phase-kicks around this gait" in capsys.readouterr().err
-    assert undulog.run(["predict"]) == 2
+    assert (
+        "phase-kicks around this gait"
+        in command("predict", sessions[0], "--eps", "0.3", code=1).err
+    )
+    command("predict", code=2)
 
 
 def test_a_result_of_kicks_reads_back(result):

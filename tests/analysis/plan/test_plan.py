@@ -74,7 +74,7 @@ def test_kicks_read_back_as_kicks(like, tmp_path, capsys):
         np.testing.assert_allclose(offset, np.linspace(-0.1, 0.1, 25), atol=1e-5)
 
 
-def test_names_of_joints_lead_out_of_no_folder(tmp_path, capsys):
+def test_names_of_joints_lead_out_of_no_folder(tmp_path, capsys, opened):
     names = ["../up", "/etc/x", "nul\0", "l" * 300]
     asked = np.real(BASE * turns(0.8, 300))
     like = write_joints(tmp_path / "like.mcap", names, asked, [asked])
@@ -84,8 +84,7 @@ def test_names_of_joints_lead_out_of_no_folder(tmp_path, capsys):
     assert len(set(files)) == len(list(folder.iterdir())) == 4 * 4 + 6 + 3
     kicked = set()
     for file in files:
-        with Session.open(file) as session:
-            kicked.add(session.metadata["undulog.plan"].get("joint"))
+        kicked.add(opened(file).metadata["undulog.plan"].get("joint"))
     assert set(names) <= kicked
 
 
@@ -93,8 +92,7 @@ def test_a_reversal_alternates(like, tmp_path, capsys):
     words = ("--like", like, "-o", tmp_path / "both", "--runs", 2, "--settle", 2, "--measure", 5)
     files = planned(capsys, "reversal", *words)["files"]
     assert len(files) == 4
-    command = [phasors(file, 2.0)[0][0, YAW] for file in files]
-    step = np.angle([one[1] / one[0] for one in command])
+    step = np.angle([one[1] / one[0] for one in [phasors(file, 2.0)[0][0, YAW] for file in files]])
     np.testing.assert_allclose(step, np.array([-1, 1, -1, 1]) * np.pi / 3, atol=1e-5)
     plans = [phasors(file, 2.0)[2] for file in files]
     assert [float(one["heading_rad"]) for one in plans] == pytest.approx([0, np.pi, np.pi, 0])
@@ -116,40 +114,36 @@ def test_half_of_each_direction_is_turned_and_drift_cancels(each):
     assert (np.diff(turn) != 0).sum() <= each
 
 
-def test_what_is_refused(like, tmp_path, capsys):
+def test_what_is_refused(like, tmp_path, capsys, command):
     folder = tmp_path / "kicks"
     words = ["plan", "phase-kicks", "-o", str(folder), "--like"]
     assert undulog.run([*words, str(like), "--runs", "0"]) == 2
     high = write_gait(tmp_path / "high.mcap", amplitude=BASE * 1.65)
-    assert undulog.run([*words, str(high)]) == 2
-    assert "its limits are" in capsys.readouterr().err
-    odd = write_gait(tmp_path / "odd.mcap", overtone=0.1)
-    assert undulog.run([*words, str(odd)]) == 2
-    assert "is no sine" in capsys.readouterr().err
+    assert "its limits are" in command(*words, high, code=2).err
+    assert (
+        "is no sine" in command(*words, write_gait(tmp_path / "odd.mcap", overtone=0.1), code=2).err
+    )
     assert not folder.exists()
     short = [str(like), "--settle", "1", "--measure", "1"]
-    assert undulog.run([*words, *short]) == 0
-    assert capsys.readouterr().out.startswith(f"{folder}: phase-kicks, 25 runs of 2 s")
+    assert command(*words, *short).out.startswith(f"{folder}: phase-kicks, 25 runs of 2 s")
     assert undulog.run([*words, *short]) != 0
     assert "exists" in capsys.readouterr().err
 
 
-def test_a_folder_that_can_not_be_written_is_an_error(like, tmp_path, disk_of, capsys):
+def test_a_folder_that_can_not_be_written_is_an_error(like, tmp_path, disk_of, command):
     words = ["plan", "phase-kicks", "--like", str(like), "--settle", "1", "--measure", "1", "-o"]
     (tmp_path / "file").write_text("")
     disk = disk_of("1m")
     subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
     for folder in (tmp_path / "file", tmp_path / "file" / "below", disk, disk / "below"):
-        assert undulog.run([*words, str(folder)]) == 1
-        complaint = capsys.readouterr().err
+        complaint = command(*words, folder, code=1).err
         assert complaint.startswith(f"error: {folder}")
         assert "can't be written" in complaint or "no folder for the plan" in complaint
 
 
-def test_a_full_disk_ends_a_plan(like, disk_of, capsys):
+def test_a_full_disk_ends_a_plan(like, disk_of, command):
     disk = disk_of("200k")
-    assert undulog.run(["plan", "phase-kicks", "--like", str(like), "-o", str(disk)]) == 1
-    assert "No space left" in capsys.readouterr().err
+    assert "No space left" in command("plan", "phase-kicks", "--like", like, "-o", disk, code=1).err
     assert not list(disk.glob("*.part"))
 
 
@@ -230,13 +224,11 @@ def test_two_rods_have_their_textbook_inertia():
     np.testing.assert_allclose(inertia, [[0.2 * 0.3**2 / 24]], rtol=1e-12)
 
 
-def test_sweeps_that_are_refused(like, tmp_path, capsys):
+def test_sweeps_that_are_refused(like, tmp_path, command):
     words = ["plan", "lag-sweep", "--like", str(like), "-o", str(tmp_path / "x")]
-    assert undulog.run([*words, "--amplitude", "0.2"]) == 2
-    assert "would saturate" in capsys.readouterr().err
-    assert undulog.run([*words, "--amplitude", "0.6"]) == 2
-    assert undulog.run([*words, "--amplitude", "0"]) == 2
-    assert undulog.run(["plan", "multisine", *words[2:], "--tones", "1"]) == 2
+    assert "would saturate" in command(*words, "--amplitude", "0.2", code=2).err
+    command(*words, "--amplitude", "0.6", code=2)
+    command(*words, "--amplitude", "0", code=2)
+    command("plan", "multisine", *words[2:], "--tones", "1", code=2)
     assert not (tmp_path / "x").exists()
-    assert undulog.run([*words, "--settle", "2"]) == 0
-    assert "Warning: it needs 12 s to settle; 2 s is less" in capsys.readouterr().out
+    assert "Warning: it needs 12 s to settle; 2 s is less" in command(*words, "--settle", "2").out

@@ -25,8 +25,7 @@ def test_a_pipe_gets_the_answer_first_every_column_and_the_method_last(snake):
             continue
         gain, lag = re.findall(r"(\S+) \[", rows[0].replace("−", "-"))
         for shown, exact in ((gain, joint.gain.value), (lag, math.degrees(joint.lag_rad.value))):
-            decimals = len(shown.partition(".")[2])
-            assert abs(float(shown) - exact) <= 0.5000001 * 10**-decimals
+            assert abs(float(shown) - exact) <= 0.5000001 * 10 ** -len(shown.partition(".")[2])
 
 
 @pytest.mark.parametrize("width", [80, 100, 200])

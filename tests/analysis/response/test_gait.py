@@ -75,8 +75,7 @@ def test_direction_of_the_wave():
     # Eq. 2 with a negative lag: crests move towards the high indices, the tail.
     step = phase_step(0.4 * np.exp(-1j * np.pi / 3 * np.arange(12)))
     assert step == pytest.approx(-np.pi / 3)
-    assert wave_name(step) == "head-to-tail"
-    assert wave_name(-step) == "tail-to-head"
+    assert (wave_name(step), wave_name(-step)) == ("head-to-tail", "tail-to-head")
     assert wave_name(0.0) == wave_name(np.pi) == "standing"
 
 
@@ -117,10 +116,8 @@ def test_steady_runs_of_the_logged_gait():
 
 def test_settling_time_counts_from_the_start_or_from_the_change():
     second = 10**9
-    ramped = settled(Stretch(2 * second, 16 * second), 0, 8.0)
-    assert ramped == Stretch(8 * second, 16 * second)
-    changed = settled(Stretch(20 * second, 40 * second), 0, 8.0)
-    assert changed == Stretch(28 * second, 40 * second)
+    assert settled(Stretch(2 * second, 16 * second), 0, 8.0) == Stretch(8 * second, 16 * second)
+    assert settled(Stretch(20 * second, 40 * second), 0, 8.0) == Stretch(28 * second, 40 * second)
     assert settled(Stretch(0, 5 * second), 0, 8.0).duration_s == 0
 
 

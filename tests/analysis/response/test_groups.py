@@ -39,8 +39,7 @@ def test_odd_and_even_joints_at_two_frequencies(ratio):
     )
     for group in gait.groups:
         own = snake.omega[snake.names.index(group.driven[0]) % 2]
-        assert group.fit.omega == pytest.approx(own, rel=1e-9)
-        assert group.answered == group.driven
+        assert (group.fit.omega, group.answered) == (pytest.approx(own, rel=1e-9), group.driven)
     # A dense least-squares fit of everything, at the true frequencies, is the reference.
     t = snake.t + snake.skew_s
     rows = [np.ones_like(t)]
@@ -64,8 +63,7 @@ def test_odd_and_even_joints_at_two_frequencies(ratio):
 def test_one_frequency_is_one_group_with_the_numbers_of_the_plain_fit():
     snake = Snake(1.0)
     gait = snake.fit()
-    assert gait.others == ()
-    assert gait.driven == tuple(snake.names)
+    assert (gait.others, gait.driven) == ((), tuple(snake.names))
     assert gait.fit.model == HarmonicModel()
 
 
@@ -73,8 +71,7 @@ def test_a_group_of_one_and_a_joint_that_follows_nothing():
     snake = Snake(1.5, joints=9)
     rng = np.random.default_rng(1)
     snake.group[:] = 1
-    slow = 2 * np.pi * 0.954
-    snake.command[:] = 0.4 * np.sin(slow * snake.t - np.arange(9)[:, None])
+    snake.command[:] = 0.4 * np.sin((2 * np.pi * 0.954) * snake.t - np.arange(9)[:, None])
     snake.command[4] = 0.2 * np.sin(2 * np.pi * 0.4 * snake.t)
     snake.command[7] = 0.2 * rng.normal(size=snake.t.size)
     snake.command[8] = 0.0
@@ -173,8 +170,7 @@ def test_a_fit_with_further_lines_is_least_squares():
     rng = np.random.default_rng(2)
     t = np.sort(rng.uniform(-5, 5, 400))
     y = np.sin(3 * t) + 0.3 * np.cos(2 * t) + 0.1 * rng.normal(size=t.size)
-    model = HarmonicModel(harmonics=2, trend=1, lines=(2.0, 4.5))
-    fit = fit_at([Series("q", t, y)], 3.0, model)
+    fit = fit_at([Series("q", t, y)], 3.0, HarmonicModel(harmonics=2, trend=1, lines=(2.0, 4.5)))
     rows = [np.ones_like(t), t]
     for line in (2.0, 4.5, 3.0, 6.0):
         rows += [np.cos(line * t), -np.sin(line * t)]
@@ -223,8 +219,7 @@ def test_one_gait_is_not_split_by_noise_modulation_or_harmonics(seed):
         np.sin(omega * t + 0.5 * np.sin(0.5 * t) - k),
         0.6 * wave + np.sin(2 * (omega * t - k)) * (k < 4),
     ):
-        named = [Series(f"j{i}", t, one) for i, one in enumerate(commands)]
-        found = find_groups(named, 15.0)
+        found = find_groups([Series(f"j{i}", t, one) for i, one in enumerate(commands)], 15.0)
         assert len(found.rhythms) == 1
         assert found.unresolved == ()
 

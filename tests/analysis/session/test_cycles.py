@@ -43,8 +43,7 @@ def maps(tmp_path_factory):
 
 
 def test_each_cycle_tells_its_own_gain_and_lag(maps):
-    assert maps.driven == NAMES
-    assert maps.start_s.size == CYCLES
+    assert (maps.driven, maps.start_s.size) == (NAMES, CYCLES)
     assert maps.period_s == pytest.approx(1.0, abs=1e-5)
     known = np.arange(CYCLES) != 5
     truth = np.array([gains(cycle) for cycle in range(CYCLES)]).T
@@ -76,8 +75,7 @@ def test_a_cycle_without_samples_is_missing_not_zero(maps):
 
 
 def test_amplitudes_are_exact_on_uneven_times():
-    rng = np.random.default_rng(2)
-    t_s = np.sort(rng.uniform(0.0, 3.0, 240))
+    t_s = np.sort(np.random.default_rng(2).uniform(0.0, 3.0, 240))
     values = 0.3 + np.real(0.7 * np.exp(0.4j) * np.exp(2j * np.pi * t_s))
     found = amplitudes(Series("x", t_s, values), starts_of(t_s, np.arange(4.0)), 2 * np.pi)
     np.testing.assert_allclose(found, 0.7 * np.exp(0.4j), atol=1e-12)

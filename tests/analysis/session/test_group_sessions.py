@@ -41,8 +41,7 @@ def slither(tmp_path_factory):
     path = tmp_path_factory.mktemp("slither") / "slither.mcap"
     group = np.arange(16) % 2
     waves = 0.4 * np.exp(-0.8j * np.arange(16))
-    omegas = 2 * np.pi * np.array([1.432, 0.954])
-    return write(path, omegas, group, waves, np.ones(16))
+    return write(path, 2 * np.pi * np.array([1.432, 0.954]), group, waves, np.ones(16))
 
 
 def test_every_joint_is_compared_at_its_own_frequency(slither):
@@ -74,9 +73,8 @@ def test_every_joint_is_compared_at_its_own_frequency(slither):
     )
 
 
-def test_text_json_page_and_file_carry_the_groups(slither, tmp_path, capsys):
-    assert undulog.run(["analyse", str(slither)]) == 0
-    text = capsys.readouterr().out
+def test_text_json_page_and_file_carry_the_groups(slither, tmp_path, capsys, command):
+    text = command("analyse", slither).out
     assert "1.432" in text
     assert "0.954" in text
     assert "(8 joints)" in text
@@ -130,16 +128,13 @@ def test_a_reversal_of_one_group_only_is_none(tmp_path):
     assert any("in some groups only" in text for text in result.warnings)
 
 
-def test_compared_at_their_own_frequencies(tmp_path, capsys):
+def test_compared_at_their_own_frequencies(tmp_path, command):
     group = np.arange(8) // 4
     omegas = 2 * np.pi * np.array([0.8, 0.5])
     waves = 0.4 * np.exp(-0.8j * np.arange(8))
     weak = np.where(np.arange(8) == 6, 0.8, 1.0)
     a = write(tmp_path / "a.mcap", omegas, group, waves, np.ones(8), seed=1)
     b = write(tmp_path / "b.mcap", omegas, group, waves * np.where(group, 1j, 1), weak, seed=2)
-    file = tmp_path / "c.json"
-    assert undulog.run(["compare", str(a), str(b), "-o", str(file)]) == 0
-    assert "joint07" in capsys.readouterr().out
+    assert "joint07" in command("compare", a, b, "-o", tmp_path / "c.json").out
     slow = write(tmp_path / "slow.mcap", 0.99 * omegas, group, waves, weak, seed=3)
-    assert undulog.run(["compare", str(a), str(slow)]) == 1
-    assert "Hz" in capsys.readouterr().err
+    assert "Hz" in command("compare", a, slow, code=1).err

@@ -124,8 +124,7 @@ def test_fewer_than_two_joints_have_no_spread():
 def test_box_degrees_of_freedom():
     values = np.array([1.0, 2.0, 4.0])
     equal = spread(values, np.full(3, 0.5), np.full(3, 1e12))
-    assert equal.dof == pytest.approx(2.0)
-    assert equal.expected == pytest.approx(1.0)
+    assert (equal.dof, equal.expected) == (pytest.approx(2.0), pytest.approx(1.0))
     # One joint far noisier than the others: one degree of freedom is left.
     assert spread(values, np.array([1.0, 1e-9, 1e-9]), np.full(3, 1e12)).dof == pytest.approx(1.0)
 

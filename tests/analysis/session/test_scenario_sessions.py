@@ -10,9 +10,8 @@ import pytest
 from support.paths import DOCS
 from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
-from undulog.sim import load_scenario, scenario_names
+from undulog.sim import load_scenario, record, scenario_names
 from undulog.sim.scenario.scenario import EngineKind, Kernels
-from undulog.sim.twin.recording import record
 
 STEADY = [
     *("caterpillar", "caterpillar-pi2", "combined", "delay-blocks", "flat", "horizontal"),
@@ -68,8 +67,7 @@ def test_energies_are_those_of_the_ledger(name, engine, kernels, tmp_path):
 
 
 def test_the_page_has_every_scenario_within_the_bar():
-    page = (DOCS / "energy.md").read_text()
-    rows = re.findall(r"^\| `([\w-]+)` \|(.*)\|$", page, re.MULTILINE)
+    rows = re.findall(r"^\| `([\w-]+)` \|(.*)\|$", (DOCS / "energy.md").read_text(), re.MULTILINE)
     assert [name for name, _ in rows] == list(scenario_names())
     for _, cells in rows:
         assert float(cells.split("|")[len(energy_tables.TITLES)]) <= 100 * energy_tables.BAR

@@ -59,8 +59,7 @@ def test_twenty_sessions_of_known_gain_lag_and_noise(bag, wave):
     assert 0.93 <= np.mean(covered + gain_covered) <= 0.97
     # The last joint is sampled 5 ms late, 1.75 degrees at this frequency.
     assert np.max(np.abs(np.degrees(np.mean(error, axis=0)))) < 0.05
-    slope = np.polyfit(truth.skew_s, np.mean(error, axis=0), 1)[0]
-    assert abs(np.degrees(slope * 5e-3)) < 0.05
+    assert abs(np.degrees(np.polyfit(truth.skew_s, np.mean(error, axis=0), 1)[0] * 5e-3)) < 0.05
 
 
 def test_polling_skew_biases_the_lag_only_where_it_is_not_logged(bag, wave):
@@ -134,14 +133,10 @@ def test_a_ramp_has_no_gait(bag, epoch_ns):
         one.write("/joint_states", epoch_ns + tick * 10**7, ["a", "b"], q - 1e-3)
     one.close()
     result = analysed(one.path)
-    assert result.gait.frequency_hz.value is None
-    assert result.gait.wave is None
+    assert (result.gait.frequency_hz.value, result.gait.wave) == (None, None)
     for joint in result.joints:
-        assert joint.gain.value is None
-        assert joint.gain.ci95 is None
-        assert joint.lag_rad.value is None
-        assert joint.command_amplitude_rad is None
-        assert joint.samples == 600
+        assert (joint.gain.value, joint.gain.ci95, joint.lag_rad.value) == (None, None, None)
+        assert (joint.command_amplitude_rad, joint.samples) == (None, 600)
     assert {index.value for index in result.heterogeneity.values()} == {None}
     (why,) = [text for text in result.warnings if text.startswith("no gait")]
     assert "no rhythm of at least 3 cycles" in why
@@ -188,8 +183,7 @@ def test_a_real_arcsnake_trajectory_has_no_gait(bag):
     one.close()
     result = analysed(one.path)
     (joint,) = result.joints
-    assert joint.gain.value is None
-    assert joint.lag_rad.value is None
+    assert (joint.gain.value, joint.lag_rad.value) == (None, None)
     assert joint.samples > 1000
     assert any(text.startswith("no gait") for text in result.warnings)
     assert result.to_dict()["joints"][0]["lag_ci95"] is None
@@ -281,8 +275,7 @@ def test_samples_without_effort_count_no_energy(bag, epoch_ns):
     one.close()
     result = analysed(one.path)
     (window,) = result.gait.windows
-    counted = 6.0 - window.start_s
-    assert result.joints[0].energy_net_j == pytest.approx(2.0 * counted, abs=0.05)
+    assert result.joints[0].energy_net_j == pytest.approx(2.0 * (6.0 - window.start_s), abs=0.05)
     assert result.joints[0].coverage == pytest.approx(1.0)
     assert any("the power of a has gaps" in text for text in result.warnings)
 
@@ -315,8 +308,7 @@ def test_start_and_stop(bag, wave):
     write_wave(one := bag(), truth, np.zeros((truth.ticks_ns.size, 2)), offsets=False)
     result = analysed(one.path, Options(start_s=2.0, stop_s=7.0))
     (window,) = result.gait.windows
-    assert window.stop_s == pytest.approx(7.0)
-    assert window.cycles == 4
+    assert (window.stop_s, window.cycles) == (pytest.approx(7.0), 4)
     assert window.stop_s - window.start_s == pytest.approx(4 / 0.97)
     assert result.gait.fitted.start_s == pytest.approx(2.0)
     assert "--start 2.0 --stop 7.0" in result.provenance.command

@@ -9,7 +9,7 @@ import undulog
 from support.analysed import analysed
 from undulog.analysis.body.null import SAMPLES, one_cycle, places, viscous_chain
 from undulog.analysis.signals.stretch import Options
-from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture import SessionWriter, load_robot
 from undulog.capture.robot.model import Plane
 
 EPOCH_NS = 1_735_689_600_000_000_000
@@ -119,8 +119,7 @@ def test_the_settled_whole_cycles_are_analysed(result):
     assert result.gait.wave == "head-to-tail"
     assert result.gait.lag_per_joint_rad == {"horizontal": pytest.approx(-np.pi / 3)}
     assert {joint.samples for joint in result.joints} == {1200}  # 12 s at 100 Hz, half-open
-    assert result.session.verdict == "good"
-    assert result.session.robot == "snake25"
+    assert (result.session.verdict, result.session.robot) == ("good", "snake25")
 
 
 def test_energies_and_their_units(result):
@@ -162,8 +161,7 @@ def test_perfect_joints_show_no_heterogeneity(result):
 def test_weaker_middle_joints_show(tmp_path):
     robot = load_robot("snake25")
     place = np.abs(np.arange(25) - 12) / 12
-    path = write_twin(tmp_path / "weak.mcap", lag=0.25 - 0.1 * place, odometry=False)
-    result = analysed(path)
+    result = analysed(write_twin(tmp_path / "weak.mcap", lag=0.25 - 0.1 * place, odometry=False))
     contrast = result.heterogeneity["boundary_contrast_lag"]
     # The first and last joint lag by 0.15; the middle five yaw joints are 0, 2 and 4 from joint 13.
     middle = 0.25 - 0.1 * np.mean([4, 2, 0, 2, 4]) / 12
@@ -220,8 +218,7 @@ def test_a_change_of_gait_splits_the_session(tmp_path):
 
 
 def test_two_driven_planes(tmp_path):
-    path = write_twin(tmp_path / "both.mcap", planes=(Plane.HORIZONTAL, Plane.VERTICAL))
-    result = analysed(path)
+    result = analysed(write_twin(tmp_path / "both.mcap", planes=(Plane.HORIZONTAL, Plane.VERTICAL)))
     assert all(joint.gain.value == pytest.approx(1.0, abs=1e-3) for joint in result.joints)
     assert {"gain_cv_horizontal", "gain_cv_vertical"} <= set(result.heterogeneity)
     assert set(result.gait.lag_per_joint_rad) == {"horizontal", "vertical"}
@@ -229,9 +226,8 @@ def test_two_driven_planes(tmp_path):
     assert any("both planes are driven" in text for text in result.notes)
 
 
-def test_the_json_object(twin, capsys):
-    assert undulog.run(["analyse", str(twin), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
+def test_the_json_object(twin, report_of):
+    printed = report_of("analyse", twin)
     parts = {"session", "gait", "joints", "body", "heterogeneity", "coupling", "warnings"}
     assert parts <= set(printed)
     assert {"id", "robot", "duration_s", "verdict"} <= set(printed["session"])
@@ -243,29 +239,26 @@ def test_the_json_object(twin, capsys):
     driven = printed["joints"][0]
     assert driven["gain_ci95"][0] < driven["gain"] < driven["gain_ci95"][1]
     assert driven["lag_ci95"][0] < driven["lag_rad"] < driven["lag_ci95"][1]
-    assert printed["joints"][1]["gain"] is None
-    assert printed["joints"][1]["gain_ci95"] is None
+    assert (printed["joints"][1]["gain"], printed["joints"][1]["gain_ci95"]) == (None, None)
     assert {"value", "ci95", "p"} <= set(printed["heterogeneity"]["gain_cv"])
     assert printed["coupling"]["identifiable"] is False
     assert len(printed["provenance"]["inputs"][str(twin)]) == 64
 
 
-def test_the_first_line_is_the_answer_and_the_last_the_method(twin, capsys):
-    assert undulog.run(["analyse", str(twin)]) == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_the_first_line_is_the_answer_and_the_last_the_method(twin, command):
+    lines = command("analyse", twin).out.splitlines()
     assert lines[0].startswith("twin.mcap: The segments move alike: all 13 joints are within 2 %")
     assert lines[1].startswith("13 of 25 joints respond to a gait of 0.5")
     assert any(line.startswith("joint25  horizontal") for line in lines)
     assert "Method: harmonic least squares" in "\n".join(lines[-4:])
 
 
-def test_files_and_options_of_the_verb(twin, tmp_path, capsys):
+def test_files_and_options_of_the_verb(twin, tmp_path, capsys, command):
     out = tmp_path / "result.json"
     assert undulog.run(["analyse", str(twin), str(twin), "-o", str(out)]) == 0
     assert len(json.loads(out.read_text())["sessions"]) == 2
     assert f"Result: {out}" in capsys.readouterr().out
-    assert undulog.run(["analyse", str(twin), "-o", str(out)]) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "exists already" in command("analyse", twin, "-o", out, code=2).err
     assert undulog.run(["analyse", str(twin), "-o", str(out), "--force", "--stop", "9"]) == 0
     assert json.loads(out.read_text())["gait"]["fitted"]["stop_s"] == pytest.approx(9.0)
     assert list(tmp_path.iterdir()) == [out]
@@ -276,12 +269,11 @@ def test_files_and_options_of_the_verb(twin, tmp_path, capsys):
         (["analyse", str(twin), "-o", str(tmp_path / "x.txt")], "end its name in .json"),
         (["analyse", str(twin), "--start", "400"], "nothing between --start and --stop"),
     ):
-        assert undulog.run(wrong) == 2
-        assert why in capsys.readouterr().err
+        assert why in command(*wrong, code=2).err
     assert (
-        undulog.run(["analyse", str(twin), "--command-topic", "/a", "--response-topic", "/b"]) == 1
+        "it has /gait, /joint_commands"
+        in command("analyse", twin, "--command-topic", "/a", "--response-topic", "/b", code=1).err
     )
-    assert "it has /gait, /joint_commands" in capsys.readouterr().err
 
 
 def test_help_has_an_example(capsys):
@@ -289,11 +281,10 @@ def test_help_has_an_example(capsys):
     assert "undulog analyse run.mcap --json" in capsys.readouterr().out
 
 
-def test_a_session_cut_before_it_settled_is_answered_with_a_warning(twin, tmp_path, capsys):
-    with Session.open(twin) as session:
-        settle_s = float(session.metadata["undulog"]["settle_s"])
-        stop = settle_s + 5.5  # 2.75 cycles, of 3.75 in all
-    assert undulog.run(["analyse", str(twin), "--stop", str(stop), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+def test_a_session_cut_before_it_settled_is_answered_with_a_warning(
+    twin, tmp_path, report_of, opened
+):
+    stop = float(opened(twin).metadata["undulog"]["settle_s"]) + 5.5  # 2.75 cycles, of 3.75 in all
+    result = report_of("analyse", twin, "--stop", stop)
     assert result["gait"]["frequency_hz"] == pytest.approx(0.5, abs=1e-3)
     assert any("before it has settled" in warning for warning in result["warnings"])

@@ -54,8 +54,7 @@ TWO = ("--only", "stall_torque", "--only", "coulomb_friction", "--within", "0.03
 def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, capsys):
     output, world = tmp_path / "fitted.toml", tmp_path / "world.toml"
     report, found = fitted(small, capsys, *TWO, "-o", str(output), "--scenario", str(world))
-    truth = {("stall_torque", None): 0.33, ("coulomb_friction", None): 0.025}
-    assert_true_or_open(found, truth)
+    assert_true_or_open(found, {("stall_torque", None): 0.33, ("coulomb_friction", None): 0.025})
     assert found["stall_torque", None]["determined"]
     assert report["converged"]
     assert report["rms_rad"]["after"] == pytest.approx(0.001, rel=0.05)  # the encoders' noise
@@ -66,8 +65,7 @@ def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, capsys):
     assert servo.gear_stiffness == 12.0  # what wasn't fitted stays
     assert "[defaults.servo]  # of the data sheet\n" in output.read_text()
     again = load_scenario(str(world))
-    assert again.robot.joints[0].servo == servo
-    assert again.duration_s == pytest.approx(4.5)
+    assert (again.robot.joints[0].servo, again.duration_s) == (servo, pytest.approx(4.5))
 
 
 def test_a_dead_time_is_told_and_not_written(small, tmp_path, capsys):
@@ -98,18 +96,17 @@ def test_a_dead_time_is_told_and_not_written(small, tmp_path, capsys):
         ("-o a.mine.toml", "--force"),
     ],
 )
-def test_wrong_usage_says_what_would_be_right(small, tmp_path, capsys, words, told):
+def test_wrong_usage_says_what_would_be_right(small, tmp_path, words, told, command):
     mine = tmp_path / "a.mine.toml"
     mine.write_text("mine")
     words = words.replace("a.", f"{tmp_path}/a.").split()
     code = 1 if "--settle" in words else 2
-    assert front.run(["sim", "fit", str(small / "run.mcap"), *words]) == code
-    assert told in capsys.readouterr().err
+    assert told in command("sim", "fit", small / "run.mcap", *words, code=code).err
     assert list(tmp_path.iterdir()) == [mine]
     assert mine.read_text() == "mine"
 
 
-def test_an_interrupted_fit_leaves_nothing(small, tmp_path, capsys, monkeypatch):
+def test_an_interrupted_fit_leaves_nothing(small, tmp_path, monkeypatch, command):
     @contextmanager
     def interrupted():
         request = StopRequest()
@@ -117,9 +114,10 @@ def test_an_interrupted_fit_leaves_nothing(small, tmp_path, capsys, monkeypatch)
         yield request
 
     monkeypatch.setattr(cli, "interruptible", interrupted)
-    words = ["sim", "fit", str(small / "run.mcap"), "-o", str(tmp_path / "a.toml")]
-    assert front.run(words) == 1
-    assert "nothing is written" in capsys.readouterr().err
+    assert (
+        "nothing is written"
+        in command("sim", "fit", small / "run.mcap", "-o", tmp_path / "a.toml", code=1).err
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -206,8 +204,7 @@ def test_a_real_ramp_tells_a_lag_and_no_servo(tmp_path, capsys):
     """A motor at constant speed, in the air: one lag for six parameters."""
     if not TRACE.is_file():
         pytest.skip(f"the real recording {TRACE.name} is not beside this checkout")
-    session = tmp_path / "arc.mcap"
-    words = ["import", str(TRACE), "--robot", "arcsnake-joint", "-o", str(session)]
+    words = ["import", str(TRACE), "--robot", "arcsnake-joint", "-o", str(tmp_path / "arc.mcap")]
     assert front.run(words) == 0
     (tmp_path / "nominal.toml").write_text(AIR)
     report, found = fitted(
@@ -236,8 +233,7 @@ def test_scores_of_coloured_noise_vary_as_its_spectrum_says(rho):
     """J = cos(w t): the sum of n samples varies by n/2 times the spectrum at w."""
     n, w = 40000, 2 * np.pi * 0.01
     noise = colored(np.random.default_rng(4), rho, n)
-    column = np.cos(w * np.arange(n))[:, None]
-    got = score_covariance([column], [noise], np.ones(1), np.ones(1))
+    got = score_covariance([np.cos(w * np.arange(n))[:, None]], [noise], np.ones(1), np.ones(1))
     spectrum = (1 - rho**2) / abs(1 - rho * np.exp(-1j * w)) ** 2
     assert got[0, 0] == pytest.approx(n / 2 * spectrum, rel=0.1)
 
@@ -282,8 +278,7 @@ def solve_linear(columns, measured, prior):
 def test_a_ridge_is_the_direction_that_keeps_what_is_told():
     """Only the product of two parameters is known."""
     pair = [Unknown(name, "1", 2.0, 0.5) for name in ("stall_torque", "proportional_gain")]
-    precise = 1e6 * np.ones((2, 2)) + np.eye(2) / 0.25
-    (ridge,) = ridges(pair, np.linalg.inv(precise))
+    (ridge,) = ridges(pair, np.linalg.inv(1e6 * np.ones((2, 2)) + np.eye(2) / 0.25))
     up, down = ridge.factors.values()
     assert up * down == pytest.approx(1.0)
     assert math.log(max(up, down)) == pytest.approx(0.5 / math.sqrt(2))

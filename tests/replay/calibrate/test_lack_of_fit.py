@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import undulog as front
 from support import twin_fits
 from support.twin_fits import colored
 from undulog.replay.calibrate.identifiability import play_direction
@@ -142,11 +141,9 @@ def test_the_level_is_of_all_joints_and_checks_together():
 
 
 def test_joints_without_enough_cycles_are_tested_for_memory():
-    random = np.random.default_rng(7)
-    rest = SIGMA * random.standard_normal(200)
+    rest = SIGMA * np.random.default_rng(7).standard_normal(200)
     measured = Measured(("a",), (T[:200],), (rest,))
-    found = lack_of_fit(measured, [rest], OMEGA, None)
-    assert found.joints["a"].periodic_rad is None
+    assert lack_of_fit(measured, [rest], OMEGA, None).joints["a"].periodic_rad is None
     assert lack_of_fit(measured, [rest], 4 * OMEGA, None).joints["a"].periodic_rad is not None
 
 
@@ -180,15 +177,14 @@ def test_another_friction_law_excludes_no_truth(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_another_friction_law_is_the_first_line_where_the_session_shows_it(tmp_path, capsys):
-    hidden = '[world.ground]\nlaw = "transeth"\n'
-    twin_fits.room_for(tmp_path, 4, 6.0, hidden, noise=0.001)
+def test_another_friction_law_is_the_first_line_where_the_session_shows_it(
+    tmp_path, capsys, command
+):
+    twin_fits.room_for(tmp_path, 4, 6.0, '[world.ground]\nlaw = "transeth"\n', noise=0.001)
     words = [word for name in ONLY for word in ("--only", name)]
     command = ["sim", "fit", str(tmp_path / "run.mcap"), "-o", str(tmp_path / "f.toml")]
     capsys.readouterr()
-    on = f"twin:{tmp_path / 'nominal.toml'}"
-    assert front.run([*command, "--on", on, *words]) == 0
-    text = capsys.readouterr().out
+    text = command(*command, "--on", f"twin:{tmp_path / 'nominal.toml'}", *words).out
     assert text.startswith("The twin doesn't fit this session (p < 0.001): ")
     assert "Parameters (no interval; before):" in text
     assert "The twin does not fit that session" in (tmp_path / "f.toml").read_text()
@@ -222,8 +218,7 @@ def with_play(source, target, width):
 
 @pytest.mark.slow
 def test_the_right_law_is_left_alone(tmp_path, capsys):
-    hidden = "[servo]\nstall_torque = 0.33\n"
-    twin_fits.room_for(tmp_path, 4, 6.0, hidden)
+    twin_fits.room_for(tmp_path, 4, 6.0, "[servo]\nstall_torque = 0.33\n")
     report, found = fitted(tmp_path, capsys, ONLY)
     assert report["fits"]
     assert found["stall_torque"]["ci95"][0] <= 0.33 <= found["stall_torque"]["ci95"][1]

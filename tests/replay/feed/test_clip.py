@@ -57,8 +57,7 @@ def gif_frames(path):
 
 class TestShot:
     def test_frames_stand_at_equal_steps_and_end_before_the_end(self):
-        times = Shot(2.0, 3.0, fps=10).times_s
-        assert np.allclose(times, 2.0 + 0.1 * np.arange(10), atol=1e-12)
+        assert np.allclose(Shot(2.0, 3.0, fps=10).times_s, 2.0 + 0.1 * np.arange(10), atol=1e-12)
         assert len(Shot(0.0, 2.0, fps=25, speed=0.25).times_s) == 200  # slow motion
         assert Shot(1.0, 1.001).times_s.tolist() == [1.0]
 
@@ -164,8 +163,7 @@ def test_nothing_is_overwritten_without_force(session_file, view, tmp_path):
 
 
 def test_a_session_without_a_body_says_what_it_takes(write, view, tmp_path):
-    session = write(tmp_path / "a.mcap", robot=False)
-    code, _, err = view(session, "--clip", tmp_path / "a.gif")
+    code, _, err = view(write(tmp_path / "a.mcap", robot=False), "--clip", tmp_path / "a.gif")
     assert code == 1
     assert "robot description" in err
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
@@ -250,5 +248,4 @@ def test_ctrl_c_leaves_nothing_behind(session_file, vulkan, tmp_path):
             process.communicate()
     assert process.returncode == 1
     assert "stopped on request" in err
-    assert list(scratch.iterdir()) == []
-    assert list(tmp_path.iterdir()) == [scratch]
+    assert (list(scratch.iterdir()), list(tmp_path.iterdir())) == ([], [scratch])

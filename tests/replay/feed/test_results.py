@@ -103,8 +103,7 @@ def experiment(analysis):
 
 def test_the_numbers_shown_are_the_saved_ones(session, analysis, tmp_path):
     layer = saved(session, [analysis.save(tmp_path / "made.json")])
-    assert layer.analysis == analysis
-    assert layer.named == ()
+    assert (layer.analysis, layer.named) == (analysis, ())
     assert layer.notes == ("gain, lag and energy are those of made.json",)
 
 

@@ -231,8 +231,7 @@ def test_servos_polled_in_turn_are_drawn_where_they_were_at_the_first_ones_times
     np.testing.assert_array_equal(found.times("/joints/measured"), t - START)
     shown = np.radians(rows(found.column("/joints/measured", "Angle:degrees")))
     assert np.isnan(shown[0, 1:]).all()  # none of them was sampled before
-    line = np.broadcast_to((t - START)[1:, None] * 1e-9, (49, 25))
-    assert_drawn(shown[1:], line)
+    assert_drawn(shown[1:], np.broadcast_to((t - START)[1:, None] * 1e-9, (49, 25)))
 
 
 def test_a_foreign_bag_with_a_message_a_servo_shows_every_servo(read_back, tmp_path):

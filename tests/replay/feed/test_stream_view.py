@@ -139,10 +139,8 @@ def test_the_body_comes_first_and_whoever_looks_keeps_his_place(view, long_file,
     lag = rgb(shown.client.take_screenshot(ids["Lag [°]"]))
     line = until(shown.process.stdout.readline)
     assert line == f"{long_file}: {LONG_S - 0.2:.1f} s, all of it in the viewer\n"
-    assert shown.at_s == 12.5
-    assert shown.views == ids
-    filled = until(lambda: np.abs(shown.picture(rgb, "Lag [°]") - lag).max() > 60)
-    assert filled
+    assert (shown.at_s, shown.views) == (12.5, ids)
+    assert until(lambda: np.abs(shown.picture(rgb, "Lag [°]") - lag).max() > 60)
     shown.client.set_time("session_time", duration=LONG_S - 5.0, play_state="paused")
     until(lambda: glows(shown.picture(rgb, body)) > 300)
     assert [one.reports for one in shown.client.get_state().views if one.reports] == []

@@ -114,8 +114,7 @@ def test_gain_lag_and_power_are_those_that_were_written(walk, snake25):
         np.testing.assert_allclose(cycle.lag_rad[yaw], 0.1 + 0.02 * np.arange(13), atol=2e-3)
         np.testing.assert_allclose(cycle.power_w[yaw], TORQUE * SPEED / 2, rtol=0.01)
         assert np.isnan(np.delete(cycle.gain, yaw)).all()  # held still
-        period_s = (cycle.stop_ns - cycle.start_ns) * 1e-9
-        assert period_s == pytest.approx(1 / FREQUENCY_HZ, abs=1e-6)
+        assert (cycle.stop_ns - cycle.start_ns) * 1e-9 == pytest.approx(1 / FREQUENCY_HZ, abs=1e-6)
 
 
 def test_without_a_logged_phase_there_are_no_cycles(write, tmp_path):
@@ -147,7 +146,7 @@ def test_the_live_view_draws_bars_and_steps_of_each_cycle(walk, snake25, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_real_recording_is_seen_as_it_is_analysed_afterwards(tmp_path, read_back):
+def test_a_real_recording_is_seen_as_it_is_analysed_afterwards(tmp_path, read_back, opened):
     """A recorder of the twin in real time, and a relay: two processes."""
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
     environment.pop("RUNTIME_DIRECTORY", None)
@@ -167,8 +166,7 @@ def test_a_real_recording_is_seen_as_it_is_analysed_afterwards(tmp_path, read_ba
             process.wait()
     assert report["dropped"] == report["unread"] == 0
     drawn = read_back(tmp_path / "live.rrd")
-    with Session.open(session_file) as session:
-        joints = {one.name: one for one in analyse_session(session).over_time.joints}
+    joints = {one.name: one for one in analyse_session(opened(session_file)).over_time.joints}
     names = drawn.static("/cycles/lag_degrees", "SeriesLines:names")
     rows = drawn.column("/cycles/lag_degrees", "Scalars:scalars")
     assert len(rows) >= 2

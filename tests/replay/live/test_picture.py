@@ -24,10 +24,9 @@ def replay(session_file, tmp_path_factory, read_back):
     return read_back(path)
 
 
-def test_every_message_is_shown(live, session_file):
+def test_every_message_is_shown(live, session_file, opened):
     report, _ = live
-    with Session.open(session_file) as session:
-        count = sum(channel.count for channel in session.channels.values())
+    count = sum(channel.count for channel in opened(session_file).channels.values())
     assert report["sessions"] == ["made-for-tests"]
     assert (report["shown"], report["dropped"], report["unread"]) == (count, 0, 0)
     assert report["lag_s"]["p50"] > 0

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-import undulog
 from support.live_stage import WAIT_S
 from support.processes import freeze, listening
 from undulog.replay.viewer.viewer import free_ports, viewer_binary
@@ -93,13 +92,11 @@ def test_web_serves_this_machine_only_and_leaves_nothing(stage):
         (["--live", "s", "--connect", "x", "--web"], "without --web"),
     ],
 )
-def test_wrong_usage_is_told(arguments, why, capsys):
-    assert undulog.run(["view", *arguments]) == 2
-    assert why in capsys.readouterr().err
+def test_wrong_usage_is_told(arguments, why, command):
+    assert why in command("view", *arguments, code=2).err
 
 
-def test_window_without_a_display_is_refused_at_once(monkeypatch, tmp_path, capsys):
+def test_window_without_a_display_is_refused_at_once(monkeypatch, tmp_path, command):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
-    assert undulog.run(["view", "--live", str(tmp_path / "s")]) == 2
-    assert "no display" in capsys.readouterr().err
+    assert "no display" in command("view", "--live", tmp_path / "s", code=2).err

@@ -127,8 +127,7 @@ def overlaid(capsys, tmp_path, read_back):
     """Puts sessions side by side: standard output, and what is in the file."""
 
     def save(*words):
-        out = view(capsys, *words, "--save", tmp_path / "x.rrd")
-        return out, read_back(tmp_path / "x.rrd")
+        return view(capsys, *words, "--save", tmp_path / "x.rrd"), read_back(tmp_path / "x.rrd")
 
     return save
 
@@ -172,9 +171,11 @@ def beside(files, read_back, tmp_path_factory):
     return found
 
 
-def test_every_session_keeps_its_entities_under_its_own_name(files, beside, read_back, tmp_path):
+def test_every_session_keeps_its_entities_under_its_own_name(
+    files, beside, read_back, tmp_path, command
+):
     for name, file in zip(("robot", "twin"), files, strict=True):
-        assert undulog.run(["view", str(file), "--save", str(tmp_path / f"{name}.rrd")]) == 0
+        command("view", file, "--save", tmp_path / f"{name}.rrd")
         alone = {e for e in read_back(tmp_path / f"{name}.rrd").entities if "__" not in e}
         assert {f"/{name}{entity}" for entity in alone} <= beside["time"].entities
     assert len(beside["time"].stores) == 1
@@ -251,8 +252,7 @@ def test_bodies_have_their_look_and_name_and_leave_when_their_session_ends(besid
     found = beside["time"]
     solid, wires = 3, 1
     for name, mode in (("robot", solid), ("twin", wires)):
-        modes = found.statics(f"/{name}/world/snake/measured", "Capsules3D:fill_mode")
-        assert [mode] in modes
+        assert [mode] in found.statics(f"/{name}/world/snake/measured", "Capsules3D:fill_mode")
     for name in ("robot", "twin"):
         labels = found.column(f"/{name}/world/snake/name", "Points3D:labels")
         assert {label for row in labels for label in row} == {name}
@@ -282,8 +282,7 @@ def test_bars_and_their_differences_are_those_of_compare(make, tmp_path, overlai
         assert abs(lag - math.degrees(0.1)) < 0.05
         assert gain == pytest.approx(100 * said["gain", joint].difference.value)
         assert lag == pytest.approx(math.degrees(said["lag", joint].difference.value))
-        own = bar("/compared/segments/gain/b/estimate", joint)
-        assert abs(own - 100 * (0.36 / 0.4 - 1)) < 0.05
+        assert abs(bar("/compared/segments/gain/b/estimate", joint) - 100 * (0.36 / 0.4 - 1)) < 0.05
     facts = found.static("/compared/facts", "TextDocument:text")[0]
     said_first = facts.splitlines()[0].replace("\\", "")  # what Markdown would mark up is escaped
     assert said_first == f"**b (B) against a (A): {comparison.answer}.**"
@@ -351,8 +350,7 @@ def test_joints_in_common_are_compared_and_without_one_nothing_is(make, tmp_path
     other = make(tmp_path / "other.mcap", ROBOT, robot=False, names=("left", "right"))
     out, found = overlaid(long, short, other)
     assert found.static("/compared/short/angles", "SeriesLines:names") == list(NAMES[:3])
-    facts = found.static("/compared/facts", "TextDocument:text")[0]
-    assert "robot: chain5 → chain3" in facts
+    assert "robot: chain5 → chain3" in found.static("/compared/facts", "TextDocument:text")[0]
     assert "\nother (B) against long (A): not compared: no joint" in out
     assert "/compared/other/angles" not in found.entities
 
@@ -386,8 +384,7 @@ def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
 def test_servos_polled_in_turn_differ_at_times_of_the_first(make, tmp_path, overlaid):
     wave = Wave(amplitude=0.3, frequency_hz=0.9, seconds=3.0)
     a = make(tmp_path / "a.mcap", Wave(seconds=3.0), noise=0.0, polled_s=1e-3)
-    b = make(tmp_path / "b.mcap", wave, noise=0.0, polled_s=1.5e-3)
-    _, found = overlaid(a, b)
+    _, found = overlaid(a, make(tmp_path / "b.mcap", wave, noise=0.0, polled_s=1.5e-3))
     entity, joints = "/compared/b/angles", np.arange(5)
     at = found.times(entity) * 1e-9
     np.testing.assert_array_equal(found.times(entity), found.times("/a/joints/measured"))
@@ -450,21 +447,20 @@ def test_an_end_that_is_asked_for_leaves_what_was_there(converted, tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_an_end_that_is_asked_for_is_noticed_while_a_session_is_read(files, tmp_path):
+def test_an_end_that_is_asked_for_is_noticed_while_a_session_is_read(files, tmp_path, opened):
     path, stop, steps = tmp_path / "x.rrd", StopRequest(), []
-    with Session.open(files[0]) as opened:
-        session = opened.view(on_read=partial(check_stop, path, stop))
-        assert session.joints("/joint_states").names
-        stop.signal = signal.SIGTERM
-        for read in (
-            lambda: next(session.messages("/joint_states")),
-            lambda: session.joints("/joint_states"),
-            lambda: session.table("/joint_states"),
-            lambda: session.columns({"/joint_states": ["position"]}, {}),
-            session.forget,
-        ):
-            with pytest.raises(LogWriteError, match="stopped on request"):
-                read()
+    session = opened(files[0]).view(on_read=partial(check_stop, path, stop))
+    assert session.joints("/joint_states").names
+    stop.signal = signal.SIGTERM
+    for read in (
+        lambda: next(session.messages("/joint_states")),
+        lambda: session.joints("/joint_states"),
+        lambda: session.table("/joint_states"),
+        lambda: session.columns({"/joint_states": ["position"]}, {}),
+        session.forget,
+    ):
+        with pytest.raises(LogWriteError, match="stopped on request"):
+            read()
 
     stop.signal = None
 

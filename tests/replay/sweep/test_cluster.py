@@ -59,8 +59,7 @@ def wait_for(output, rows):
 def local(tmp_path_factory):
     """The same sweep on the processes of this computer."""
     folder = tmp_path_factory.mktemp("local")
-    plan = write_plan(folder, STRENGTHS)
-    assert undulog("sweep", plan, "-o", folder / "rows").returncode == 0
+    assert undulog("sweep", write_plan(folder, STRENGTHS), "-o", folder / "rows").returncode == 0
     return rows_of(folder / "rows")
 
 
@@ -103,8 +102,7 @@ def test_a_sweep_on_a_cluster_can_be_interrupted_and_goes_on_here(local, tmp_pat
         wait_for(output, 3)
         sweep.send_signal(signal.SIGINT)
         out, _ = sweep.communicate(timeout=60)
-    report = json.loads(out)
-    assert report["complete"] is False
+    assert json.loads(out)["complete"] is False
     there = len(rows_of(output))
     rest = json.loads(undulog(*words[3:]).stdout)
     assert (rest["there_before"], rest["run"]) == (there, 20 - there)
@@ -113,8 +111,7 @@ def test_a_sweep_on_a_cluster_can_be_interrupted_and_goes_on_here(local, tmp_pat
 
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path):
     address = f"tcp://127.0.0.1:{free_port()}"
-    plan = write_plan(tmp_path)
-    done = undulog("sweep", plan, "-o", tmp_path / "rows", "--cluster", address)
+    done = undulog("sweep", write_plan(tmp_path), "-o", tmp_path / "rows", "--cluster", address)
     assert done.returncode == 1
     assert f"{address}: no Dask scheduler answers" in done.stderr
     assert "Traceback" not in done.stderr

@@ -142,8 +142,7 @@ def _begun(output, rows):
 
 def _workers(parent):
     """Processes that work for a sweep, by id; the tracker of resources is none."""
-    found = run("pgrep", "-P", parent, "-f", "spawn_main").stdout.split()
-    return [int(word) for word in found]
+    return [int(word) for word in run("pgrep", "-P", parent, "-f", "spawn_main").stdout.split()]
 
 
 def _alive(worker):

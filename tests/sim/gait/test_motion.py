@@ -13,10 +13,8 @@ import pytest
 
 from undulog.capture import Session
 from undulog.capture.robot.model import Plane
-from undulog.sim import Readings, load_scenario
+from undulog.sim import Readings, Twin, load_scenario, record
 from undulog.sim.scenario.gaits import generator
-from undulog.sim.twin.recording import record
-from undulog.sim.twin.twin import Twin
 
 CYCLE = 200  # ticks
 
@@ -135,8 +133,7 @@ def test_felt_servos_keep_the_wave_and_slow_it_a_little():
     late = shift[-1 - CYCLE : -1].mean(axis=0)
     assert np.ptp(late) < math.radians(10.0)
     drift = (late - shift[1000 : 1000 + CYCLE].mean(axis=0)) / (time_s[-1 - CYCLE] - 10.0)
-    expected = -(chain.feedback**2) / (2 * math.pi)
-    np.testing.assert_allclose(drift, expected, rtol=0.2)
+    np.testing.assert_allclose(drift, -(chain.feedback**2) / (2 * math.pi), rtol=0.2)
 
 
 @pytest.mark.parametrize("name", ["delay-blocks", "oscillators-one-way"])

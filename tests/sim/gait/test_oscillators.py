@@ -93,8 +93,7 @@ def test_the_slowest_mode_decays_as_the_path_graph_says(make_robot, n):
     robot, start = make_robot(n + 1, planar=True), tuple((1e-3 * mode).tolist())
     theta, _, _ = run(robot, 3.0 / expected, forward=K, backward=K, start_phase=start)
     share = (theta + PSI * np.arange(n)) @ mode
-    t = np.arange(len(share)) / 100
-    slope = np.polyfit(t, np.log(share), 1)[0]
+    slope = np.polyfit(np.arange(len(share)) / 100, np.log(share), 1)[0]
     assert slope == pytest.approx(-expected, rel=1e-4)
 
 
@@ -110,8 +109,7 @@ def test_a_one_way_chain_settles_in_sequence(make_robot):
     t = np.arange(len(theta)) / 100
     start = theta[0, 1] + PSI - theta[0, 0]
     expected = 2.0 * np.arctan(np.tan(start / 2.0) * np.exp(-2.0 * t))
-    found = theta[:, 1] + PSI - theta[:, 0]
-    np.testing.assert_allclose(found, expected, atol=1e-8)
+    np.testing.assert_allclose(theta[:, 1] + PSI - theta[:, 0], expected, atol=1e-8)
 
 
 @pytest.mark.parametrize("ratio", [0.5, 0.99, 1.01, 2.0])
@@ -344,8 +342,7 @@ def test_a_joint_that_has_reported_nothing_is_not_fed_back(make_robot):
         return np.array([np.nan, 0.1, np.nan, np.nan])
 
     half, _, _ = run(robot, 3.0, answer=answer, feedback=2.0, **UNCOUPLED)
-    moved = np.ptp(half, axis=0) > 1e-3
-    assert moved.tolist() == [False, True, False, False]
+    assert (np.ptp(half, axis=0) > 1e-3).tolist() == [False, True, False, False]
 
 
 def test_the_frequency_factor_turns_every_oscillator(make_robot):

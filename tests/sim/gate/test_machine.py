@@ -30,6 +30,11 @@ COUNT = 25
 RATE_HZ = 100
 
 
+def fastest(commands):
+    """Return the largest change of a command from tick to tick [rad]."""
+    return np.abs(np.diff(commands, axis=0)).max()
+
+
 class Wave:
     """A gait: joint i follows amplitude sin(w t + i), from the first tick on."""
 
@@ -107,7 +112,7 @@ def test_from_the_pose_by_a_ramp_to_the_first_command_then_the_gait_as_it_is():
     np.testing.assert_array_equal(
         sent[ramp_ticks:], [bench.gait.at(tick / RATE_HZ) for tick in range(101)]
     )
-    assert np.abs(np.diff(sent[: ramp_ticks + 1], axis=0)).max() <= 0.5 / RATE_HZ * (1 + 1e-9)
+    assert fastest(sent[: ramp_ticks + 1]) <= 0.5 / RATE_HZ * (1 + 1e-9)
     assert np.abs(sent[0] - 0.1).max() <= 0.5 / RATE_HZ
     assert bench.gait.asked == [tick / RATE_HZ for tick in range(101)]  # once a tick, in order
     assert bench.gate.step(bench.tick, heard(0.0)).command is None
@@ -128,26 +133,21 @@ def test_nothing_is_sent_until_every_joint_is_known():
 
 def test_a_bus_that_has_to_be_listened_to_is():
     bench = Bench(start=0.0, listen_s=0.5)
-    found = [bench.step().command is None for _ in range(60)]
-    assert found == [True] * 50 + [False] * 10
+    assert [bench.step().command is None for _ in range(60)] == [True] * 50 + [False] * 10
 
 
 @pytest.mark.parametrize(
-    ("more", "error", "told"),
+    ("more", "error"),
     [
-        ({"another_robot": "another robot"}, UsageError, "no command was sent: another robot"),
-        (
-            {"trouble": GateFault(FaultKind.STRANGER, "somebody else commands")},
-            SourceError,
-            "no command was sent: somebody else commands",
-        ),
+        ({"another_robot": "somebody else"}, UsageError),
+        ({"trouble": GateFault(FaultKind.STRANGER, "somebody else")}, SourceError),
     ],
 )
-def test_before_the_first_command_trouble_is_a_refusal(more, error, told):
+def test_before_the_first_command_trouble_is_a_refusal(more, error):
     bench = Bench(listen_s=0.01)
     if error is UsageError:
         bench.step(**more)  # it listens
-    with pytest.raises(error, match=told):
+    with pytest.raises(error, match="no command was sent: somebody else"):
         bench.step(**more)
     assert bench.sent == []
 
@@ -176,7 +176,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("how", list(OnFault))
-@pytest.mark.parametrize("kind", list(CASES))
+@pytest.mark.parametrize("kind", CASES)
 def test_each_fault_is_found_in_its_time_and_ends_as_the_file_says(kind, how):
     change, more, text, after_s = CASES[kind]
     limits = dataclasses.replace(LIMITS, on_fault=how, voltage=np.full(COUNT, 5.0))
@@ -188,19 +188,18 @@ def test_each_fault_is_found_in_its_time_and_ends_as_the_file_says(kind, how):
     while bench.gate.phase is Phase.RUN:
         bench.step(change, **more)
     assert (bench.tick - 1 - first) / RATE_HZ == pytest.approx(after_s, abs=0.0101)
-    assert bench.gate.outcome.fault.kind == kind
-    assert bench.gate.outcome.why.startswith(text)
+    outcome = bench.gate.outcome
+    assert (outcome.fault.kind, outcome.how) == (kind, DriveEnding.FAULT)
+    assert outcome.why.startswith(text)
     begun = len(bench.sent)
     while bench.gate.phase is Phase.ENDING:
         bench.step(change, **more)
-    steps = np.abs(np.diff(np.array(bench.sent)[begun - 2 :], axis=0))
-    assert steps.max() <= 4.0 / RATE_HZ * (1 + 1e-9)
+    assert fastest(bench.sent[begun - 2 :]) <= 4.0 / RATE_HZ * (1 + 1e-9)
     assert len(bench.sent) - begun <= (0.53 / 4.0 + 1.5 * 0.53 / 0.5 + 0.21) * RATE_HZ
     if how is OnFault.RAMP_DOWN and kind != "current":
         np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
     if how is OnFault.HOLD:
         np.testing.assert_allclose(bench.sent[-1], bench.sent[-5], atol=1e-12)
-    assert bench.gate.outcome.how is DriveEnding.FAULT
     assert bench.gate.step(bench.tick, heard(0.0)).command is None  # and nothing after it
 
 
@@ -232,11 +231,11 @@ def test_a_late_tick_is_caught_up_without_a_jump_and_too_late_a_one_is_a_fault()
         bench.step(skip=19, late_s=0.19)
     assert bench.gate.phase is Phase.RUN
     assert bench.gate.cuts["by_rate"] > 0
-    assert np.abs(np.diff(np.array(bench.sent), axis=0)).max() <= 4.0 / RATE_HZ * (1 + 1e-9)
+    assert fastest(bench.sent) <= 4.0 / RATE_HZ * (1 + 1e-9)
     before = bench.sent[-1]
     bench.step(skip=100, late_s=1.0)
     assert bench.gate.phase is Phase.ENDING
-    assert np.abs(bench.sent[-1] - before).max() <= 0.5 / RATE_HZ * (1 + 1e-9)
+    assert fastest([before, bench.sent[-1]]) <= 0.5 / RATE_HZ * (1 + 1e-9)
 
 
 def test_asked_to_stop_it_ends_and_asked_again_at_once():
@@ -245,8 +244,9 @@ def test_asked_to_stop_it_ends_and_asked_again_at_once():
     assert bench.gate.phase is Phase.ENDING
     bench.step(stop="asked")
     assert bench.step(stop="asked", at_once=True).command is None
-    assert (bench.gate.phase, bench.gate.outcome.how) == (Phase.DONE, DriveEnding.STOPPED)
-    assert bench.gate.outcome.why == "asked, twice"
+    assert bench.gate.phase is Phase.DONE
+    outcome = bench.gate.outcome
+    assert (outcome.how, outcome.why) == (DriveEnding.STOPPED, "asked, twice")
 
 
 def test_what_goes_wrong_while_it_ends_is_told_once_and_ends_nothing_twice():
@@ -269,7 +269,7 @@ def test_while_the_bus_is_silent_nothing_is_sent_and_then_it_ends():
     assert np.abs(bench.sent[-1] - last).max() <= 2 * 4.0 / RATE_HZ
     bench.until(Phase.DONE)
     np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
-    assert np.abs(np.diff(bench.sent[sent + 2 :], axis=0)).max() <= 0.5 / RATE_HZ
+    assert fastest(bench.sent[sent + 2 :]) <= 0.5 / RATE_HZ
     assert bench.gate.outcome.fault.kind is FaultKind.SILENT
     assert bench.gate.outcome.ended.startswith("the servos held for 2 s, then the joints were ")
 
@@ -287,10 +287,8 @@ def test_asked_to_stop_before_anything_was_sent_nothing_is():
     bench = Bench(listen_s=1.0)
     bench.step()
     assert bench.step(stop="asked").command is None
-    assert (bench.gate.outcome.how, bench.gate.outcome.ended) == (
-        DriveEnding.STOPPED,
-        "no command was sent",
-    )
+    outcome = bench.gate.outcome
+    assert (outcome.how, outcome.ended) == (DriveEnding.STOPPED, "no command was sent")
 
 
 def test_a_gait_that_says_nonsense_moves_nothing():
@@ -321,7 +319,7 @@ def test_a_gait_that_fails_and_a_log_that_can_not_be_written_end_as_a_fault_does
         bench.gate.report(GateFault(FaultKind.LOG, "the disk is full"))
     bench.until(Phase.DONE)
     np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
-    assert np.abs(np.diff(np.array(bench.sent), axis=0)).max() <= 4.0 / RATE_HZ
+    assert fastest(bench.sent) <= 4.0 / RATE_HZ
     outcome = bench.gate.outcome
     if from_the_gait:
         assert isinstance(bench.gate.gait_error, ZeroDivisionError)
@@ -356,8 +354,7 @@ def test_lateness_is_summed_up_as_numpy_has_it():
     late = np.random.default_rng(3).exponential(2e-3, 5000)
     found = jitter(late.tolist())
     assert found.median_s == pytest.approx(np.median(late))
-    assert found.p99_s == pytest.approx(np.percentile(late, 99))
-    assert found.worst_s == late.max()
+    assert (found.p99_s, found.worst_s) == (pytest.approx(np.percentile(late, 99)), late.max())
     assert sum(found.counts) == 5000
     assert found.counts[3] == ((late > 0.5e-3) & (late <= 1e-3)).sum()
     assert list(found.to_dict()["counts"])[3] == "<= 1 ms"

@@ -9,7 +9,7 @@ from support.processes import python
 from support.twin_runs import simulate
 from undulog.capture import Session
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
-from undulog.sim import FrictionLaw, Ground, World, load_scenario
+from undulog.sim import Cylinder, FrictionLaw, Ground, World, load_scenario, record
 from undulog.sim.physics.bullet import BulletEngine
 from undulog.sim.physics.compiled_bullet import CompiledBulletEngine
 from undulog.sim.physics.compiled_kernels import CompiledLaws
@@ -17,9 +17,7 @@ from undulog.sim.physics.engine import BodyStart
 from undulog.sim.physics.laws import NumpyLaws
 from undulog.sim.physics.servo import Servos
 from undulog.sim.physics.steps import Steps
-from undulog.sim.scenario.obstacles import Cylinder
 from undulog.sim.scenario.scenario import EngineKind, Kernels
-from undulog.sim.twin.recording import record
 
 START = BodyStart((0.3, 0, -9.81), 0.3, 0.7, (0.2, 0.1, 0.0), 1e-3)
 
@@ -74,8 +72,7 @@ def test_without_ground_there_is_no_force(uneven):
     steps = Steps.empty(1, 6, 5)
     steps.table[:] = np.random.default_rng(3).normal(size=steps.table.shape)
     steps.stacked.body.position[:, 2] = 0.0
-    laws = CompiledLaws(steps, uneven, None, Servos([j.servo for j in uneven.joints]), 1e-3)
-    laws.start(0)
+    CompiledLaws(steps, uneven, None, Servos([j.servo for j in uneven.joints]), 1e-3).start(0)
     assert not steps.stacked.contact.force.any()
 
 

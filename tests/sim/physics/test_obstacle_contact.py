@@ -86,14 +86,12 @@ def test_over_the_top_it_does_not_touch():
         )
         return len(found.link)
 
-    assert touching(0.1 - RADIUS + 1e-6) == 1
-    assert touching(0.1 - RADIUS - 1e-6) == 0
+    assert (touching(0.1 - RADIUS + 1e-6), touching(0.1 - RADIUS - 1e-6)) == (1, 0)
 
 
 def test_between_two_obstacles_both_push():
     gap = RADIUS - 0.001
-    pair = [Cylinder((0.0, 0.1 + gap), 0.1), Cylinder((0.0, -0.1 - gap), 0.1)]
-    contact = law(pair, links=2)(
+    contact = law([Cylinder((0.0, 0.1 + gap), 0.1), Cylinder((0.0, -0.1 - gap), 0.1)], links=2)(
         np.array([[0.0, 0.0, 0.025], [1.0, 0.0, 0.025]]).T,
         about_z(np.zeros(2)),
         *np.zeros((2, 3, 2)),
@@ -143,8 +141,7 @@ def test_friction_and_damper_only_take(seed):
 def test_friction_never_turns_the_slip_of_a_free_link_within_a_step(dt):
     links = random_links(7)
     contact, position = law(FIELD, links=400, dt=dt)(*links), links[0]
-    press = (contact.force * contact.normal).sum(axis=0)
-    friction = contact.force - press * contact.normal
+    friction = contact.force - (contact.force * contact.normal).sum(axis=0) * contact.normal
     arm = contact.point - position[:, contact.link]
     slip = contact.velocity - (contact.velocity * contact.normal).sum(axis=0) * contact.normal
     # A free ball of the link's mass and least moment, the bluntest body that there could be.

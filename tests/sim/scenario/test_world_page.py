@@ -6,23 +6,14 @@ import re
 import pytest
 
 from support.paths import DOCS
-from undulog.sim import (
-    AccelerometerModel,
-    CompassModel,
-    InfraredModel,
-    ObstacleMaterial,
-    RandomField,
-    ServoPolling,
-    SonarModel,
-    parse_scenario,
-)
+from undulog import sim
 
 PAGE = (DOCS / "twin-world.md").read_text()
 
 
 def test_the_examples_make_a_scenario():
     examples = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
-    scenario = parse_scenario("\n".join(examples), "x.toml")
+    scenario = sim.parse_scenario("\n".join(examples), "x.toml")
     assert [push.link for push in scenario.disturbances] == ["link07"]
     assert len(scenario.world.obstacles) == 10
     assert scenario.sensing.ir.noise_v == 0.058
@@ -31,13 +22,13 @@ def test_the_examples_make_a_scenario():
 @pytest.mark.parametrize(
     ("table", "kind"),
     [
-        ("world.field", RandomField),
-        ("world.obstacle_contact", ObstacleMaterial),
-        ("sensing.servo", ServoPolling),
-        ("sensing.ir", InfraredModel),
-        ("sensing.sonar", SonarModel),
-        ("sensing.accelerometer", AccelerometerModel),
-        ("sensing.compass", CompassModel),
+        ("world.field", sim.RandomField),
+        ("world.obstacle_contact", sim.ObstacleMaterial),
+        ("sensing.servo", sim.ServoPolling),
+        ("sensing.ir", sim.InfraredModel),
+        ("sensing.sonar", sim.SonarModel),
+        ("sensing.accelerometer", sim.AccelerometerModel),
+        ("sensing.compass", sim.CompassModel),
     ],
 )
 def test_the_tables_have_all_keys_and_their_defaults(table, kind):

@@ -95,13 +95,13 @@ def test_a_turning_mount_feels_the_centripetal_force(make_accelerometer):
     # Spinning about z at 6 rad/s, 0.03 m off the axis: w^2 r towards the axis.
     w = 6.0
     kind = make_accelerometer(accelerometer((0.03, 0.01, 0.0)))
-    samples = told(
-        kind, 10, lambda t: ((0, 0, 0), (0, 0, 0), Rotation.from_rotvec((0, 0, w * t)), (0, 0, w))
-    )
-    for sample in samples:
-        np.testing.assert_allclose(
-            sample.vector, (-w * w * 0.03, -w * w * 0.01, G), rtol=1e-4, atol=1e-9
-        )
+
+    def motion(t):
+        return (0, 0, 0), (0, 0, 0), Rotation.from_rotvec((0, 0, w * t)), (0, 0, w)
+
+    for sample in told(kind, 10, motion):
+        expected = (-w * w * 0.03, -w * w * 0.01, G)
+        np.testing.assert_allclose(sample.vector, expected, rtol=1e-4, atol=1e-9)
 
 
 def test_a_swinging_mount_feels_the_tangential_force_too(make_accelerometer):
@@ -115,29 +115,25 @@ def test_a_swinging_mount_feels_the_tangential_force_too(make_accelerometer):
 
     for sample in told(kind, 100, motion):
         rate, change = a * n * math.cos(n * sample.time_s), -a * n * n * math.sin(n * sample.time_s)
-        expected = (-rate * rate * r, change * r, G)
-        np.testing.assert_allclose(sample.vector, expected, atol=2e-3)
+        np.testing.assert_allclose(sample.vector, (-rate * rate * r, change * r, G), atol=2e-3)
 
 
 def test_the_sensor_frame_is_turned_in_the_links(make_accelerometer):
     rpy = (0.3, -0.2, 1.1)
-    np.testing.assert_allclose(
-        rotation_from_rpy(rpy), Rotation.from_euler("xyz", rpy).as_matrix(), atol=1e-15
-    )
+    turn = Rotation.from_euler("xyz", rpy)
+    np.testing.assert_allclose(rotation_from_rpy(rpy), turn.as_matrix(), atol=1e-15)
     found = told(make_accelerometer(accelerometer(rpy=rpy)), 1, at_rest(0.4, 0.1, -0.3))[0].vector
-    frame = Rotation.from_euler("ZYX", (0.4, 0.1, -0.3)) * Rotation.from_euler("xyz", rpy)
+    frame = Rotation.from_euler("ZYX", (0.4, 0.1, -0.3)) * turn
     np.testing.assert_allclose(found, frame.inv().apply((0, 0, G)), atol=1e-12)
 
 
 def test_slower_sampling_means_over_its_own_period(make_accelerometer):
-    model = dataclasses.replace(EXACT, rate_hz=40.0)
-    kind = make_accelerometer(model=model)
+    kind = make_accelerometer(model=dataclasses.replace(EXACT, rate_hz=40.0))
     thrust = told(kind, 10, lambda t: ((0, 0, 0), (t * t, 0, 0), Rotation.identity(), (0, 0, 0)))
     assert [one.time_s for one in thrust] == pytest.approx([0.0125, 0.0375, 0.0625, 0.0875])
     # v = t^2: the mean acceleration around t is 2 t.
-    np.testing.assert_allclose(
-        [one.vector[0] for one in thrust], [2 * one.time_s for one in thrust], atol=1e-9
-    )
+    expected = [2 * one.time_s for one in thrust]
+    np.testing.assert_allclose([one.vector[0] for one in thrust], expected, atol=1e-9)
 
 
 def test_the_accelerometer_has_noise_and_steps(make_accelerometer):
@@ -146,8 +142,7 @@ def test_the_accelerometer_has_noise_and_steps(make_accelerometer):
     values = np.array([one.vector for one in told(kind, 3000, at_rest(0.0, 0.0, 0.0))])
     np.testing.assert_allclose(values.std(axis=0), 0.05, rtol=0.05)
     np.testing.assert_allclose(values.mean(axis=0), (0, 0, G), atol=4e-3)
-    steps = dataclasses.replace(noisy, resolution=0.04)
-    kind = make_accelerometer(model=steps)
+    kind = make_accelerometer(model=dataclasses.replace(noisy, resolution=0.04))
     values = np.array([one.vector for one in told(kind, 100, at_rest(0.0, 0.0, 0.0))]) / 0.04
     np.testing.assert_allclose(values, np.rint(values), atol=1e-9)
 
@@ -178,10 +173,8 @@ def test_north_can_be_turned_and_a_third_axis_sees_the_dip(make_compass):
     model = dataclasses.replace(FIELD, north=0.5)
     kind = make_compass(magnetometer(axes=("x", "y", "z")), model=model)
     sample = told(kind, 1, at_rest(0.5, 0.0, 0.0))[0]
-    level = 20e-6
-    np.testing.assert_allclose(
-        sample.vector, (level, 0.0, -level * math.tan(math.radians(65))), atol=1e-15
-    )
+    expected = (20e-6, 0.0, -20e-6 * math.tan(math.radians(65)))
+    np.testing.assert_allclose(sample.vector, expected, atol=1e-15)
 
 
 def test_the_compass_has_its_rate_noise_and_steps(make_compass):

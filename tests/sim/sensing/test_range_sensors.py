@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from undulog.capture.robot.model import Sensor, SensorKind
+from undulog.sim import Cylinder, InfraredModel, SonarModel, Wall
 from undulog.sim.physics.steps import Steps
-from undulog.sim.scenario.obstacles import Cylinder, Wall
-from undulog.sim.scenario.sensors import InfraredModel, SonarModel
 from undulog.sim.sensing.ranging import Infrared, RayCaster, Sonar, cone, decoded, voltage
 
 DT, PERIOD = 1e-3, 10
@@ -68,12 +67,8 @@ def infrared_at(robot):
     # Sharp GP2Y0A02YK0F: typical output, read off the data sheet's diagram; the last from its
     # table, 0.25 to 0.55 V.
     [
-        (20, 2.5, 0.1),
-        (30, 2.0, 0.1),
-        (40, 1.55, 0.1),
-        (60, 1.1, 0.1),
-        (100, 0.65, 0.1),
-        (150, 0.4, 0.05),
+        *((20, 2.5, 0.1), (30, 2.0, 0.1), (40, 1.55, 0.1)),
+        *((60, 1.1, 0.1), (100, 0.65, 0.1), (150, 0.4, 0.05)),
     ],
 )
 def test_the_curve_is_that_of_the_data_sheet(centimetres, volts, tolerance):
@@ -122,8 +117,7 @@ def test_beyond_its_range_it_tells_infinity(infrared_at):
 
 def test_a_new_value_comes_every_38_ms_and_the_sensors_take_turns(robot):
     sensors = [infrared(f"ir{i:02d}") for i in range(1, 16)]
-    kind = Infrared(EXACT, sensors, robot, RayCaster([], ground=True), dt=DT, seed=1)
-    samples = told(kind, 100)
+    samples = told(Infrared(EXACT, sensors, robot, RayCaster([], ground=True), dt=DT, seed=1), 100)
     first = {}
     for name in (sensor.name for sensor in sensors):
         times = [sample.time_s for sample in samples if sample.name == name]
@@ -144,8 +138,7 @@ def test_a_sample_is_of_its_own_time(infrared_at):
 
 def test_the_converter_has_its_steps(infrared_at):
     kind = infrared_at(0.99, InfraredModel(noise_v=0.05, adc_bits=8))
-    volts = voltage(np.array([s.distance for s in told(kind, 2000)]), 0.15)
-    steps = volts / (3.3 / 255)
+    steps = voltage(np.array([s.distance for s in told(kind, 2000)]), 0.15) / (3.3 / 255)
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)
     assert len(set(np.rint(steps))) > 5
 
@@ -174,8 +167,7 @@ def test_the_sonar_hears_the_nearest_thing_in_its_cone(robot):
     middle = np.array([2.01 * c + 0.03, 2.01 * s])
     ends = [tuple(middle + side * 4.0 * np.array([-s, c])) for side in (-1, 1)]
     caster = RayCaster([Wall(*ends, 0.02, 3.0)], ground=True)
-    kind = Sonar(QUIET, [SONAR], robot, caster, dt=DT, seed=1)
-    samples = told(kind, 100)
+    samples = told(Sonar(QUIET, [SONAR], robot, caster, dt=DT, seed=1), 100)
     assert len(samples) == 20
     np.testing.assert_allclose(np.diff([one.time_s for one in samples]), 0.05, atol=1e-12)
     assert samples[0].distance == pytest.approx(2.0, rel=2e-3)
@@ -199,8 +191,7 @@ def test_the_sonar_is_limited_and_has_steps_and_noise(robot):
         kind = Sonar(model, [SONAR], robot, caster, dt=DT, seed=1)
         return np.array([one.distance for one in told(kind, periods)])
 
-    assert samples(4.2, QUIET)[0] == math.inf
-    assert samples(0.01, QUIET)[0] == 0.03
+    assert (samples(4.2, QUIET)[0], samples(0.01, QUIET)[0]) == (math.inf, 0.03)
     noisy = samples(2.0, dataclasses.replace(QUIET, noise=0.005), 4000)
     assert noisy.std() == pytest.approx(0.005, rel=0.1)
     assert noisy.mean() == pytest.approx(2.0, abs=5e-4)
@@ -212,9 +203,7 @@ def test_the_cone_is_filled_evenly():
     rays = cone(61, math.pi / 6)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=0), 1.0, rtol=1e-12)
     off = np.arccos(rays[0])
-    assert off[0] == 0.0
-    assert off.max() == pytest.approx(math.pi / 12)
+    assert (off[0], off.max()) == (0.0, pytest.approx(math.pi / 12))
     # Half of the rays within half of the solid angle.
     assert (off < math.pi / 12 / math.sqrt(2)).mean() == pytest.approx(0.5, abs=0.02)
-    azimuth = np.sort(np.arctan2(rays[1], rays[0]))
-    assert np.diff(azimuth).max() < math.radians(2.0)
+    assert np.diff(np.sort(np.arctan2(rays[1], rays[0]))).max() < math.radians(2.0)

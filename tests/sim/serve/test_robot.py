@@ -9,13 +9,14 @@ import can
 import numpy as np
 import pytest
 
+from support.can_messages import can_message, frames_of
 from support.processes import wait_for
 from support.twin_runs import sensed, simulate
 from undulog.capture import load_robot
 from undulog.capture.bus.decoding import BusDecoder
 from undulog.capture.bus.encoding import BusEncoder
 from undulog.capture.common.process import StopRequest
-from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
+from undulog.capture.log.messages.frames import ERROR_FLAG
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Direction, Quantity
 from undulog.sim.gait.contract import CONTROL_RATE_HZ, GaitTick
@@ -51,10 +52,8 @@ def robot():
 
 @pytest.fixture(scope="module")
 def scenario(make_scenario, robot):
-    servo = ServoPolling(slot_s=0.0005, resolution=STEP, command_resolution=STEP)
-    sensing = SensorModels(servo=servo)
-    noise = Noise(position=0.001)
-    return make_scenario(robot, duration_s=0.5, noise=noise, sensing=sensing)
+    sensing = SensorModels(servo=ServoPolling(0.0005, STEP, command_resolution=STEP))
+    return make_scenario(robot, duration_s=0.5, noise=Noise(position=0.001), sensing=sensing)
 
 
 class Running:
@@ -91,22 +90,12 @@ class Running:
     def command(self, angles):
         values = {(f"joint0{i + 1}", Quantity.COMMAND, ""): angle for i, angle in enumerate(angles)}
         for frame in self.encoder.encode(values):
-            data = frame["data"][: frame["dlc"]].tobytes()
-            message = can.Message(
-                arbitration_id=int(frame["id_flags"]), is_extended_id=False, data=data
-            )
-            self.client.send(message)
+            self.client.send(can_message(frame))
 
     def replies(self, count):
-        frames = empty_frames(count)
-        for frame in frames:
-            message = self.client.recv(60)
-            assert message is not None
-            frame["id_flags"] = message.arbitration_id | message.is_error_frame * ERROR_FLAG
-            frame["dlc"] = message.dlc
-            frame["data"][: message.dlc] = list(message.data)
-            frame["t_device_ns"] = round(message.timestamp * 1e6) * 1000
-        return frames
+        messages = [self.client.recv(60) for _ in range(count)]
+        assert all(messages)
+        return frames_of(messages)
 
     def ended(self):
         self.thread.join(60)
@@ -249,8 +238,7 @@ def test_a_tick_that_comes_much_too_late_leaves_a_gap_and_no_time_goes_back():
     assert pacer.tally.overruns >= 1
     assert pacer.tally.worst_s >= late
     times = np.array([pacer.clock_ns(k * PERIOD_NS) for k in range(13)])
-    steps = np.diff(times)
-    assert (steps >= PERIOD_NS).all()
+    assert (np.diff(times) >= PERIOD_NS).all()
     assert times[10] - start >= 10 * PERIOD_NS + 1e9 * late - 1
     assert pacer.clock_ns(12 * PERIOD_NS + 7_000_000) == times[12] + 7_000_000
 
@@ -259,8 +247,7 @@ def test_a_fast_clock_shows_simulated_time():
     pacer = Pacer(PERIOD_NS, fast=True)
     pacer.start(123)
     for tick in range(5):
-        assert pacer.wait_s(tick) == 0.0
-        assert pacer.begin(tick) == 0.0
+        assert (pacer.wait_s(tick), pacer.begin(tick)) == (0.0, 0.0)
         assert pacer.now_ns() == pacer.clock_ns(tick * PERIOD_NS) == tick * PERIOD_NS
     assert pacer.tally.overruns == 0
 
@@ -274,8 +261,7 @@ def cycles(robot, line, count):
     rng = np.random.default_rng(1)
     shown = []
     for tick in range(count):
-        values = rng.uniform(-0.5, 0.5, (5, JOINTS))
-        sample = JointSample(tick, np.zeros(JOINTS), *values)
+        sample = JointSample(tick, np.zeros(JOINTS), *rng.uniform(-0.5, 0.5, (5, JOINTS)))
         time_s = tick / CONTROL_RATE_HZ
         frames = encoder.frames(line.samples([sample], time_s), lambda t: t)
         shown.append(line.replies(frames, tick * PERIOD_NS, time_s))
@@ -303,8 +289,7 @@ def test_lost_replies_are_those_of_the_joint_in_the_share_that_was_ordered(robot
     other = np.concatenate(cycles(robot, fault_line(robot, "lost:joint02:0.3", seed=2), 2000))
     assert again.tobytes() == shown.tobytes()
     assert other.tobytes() != shown.tobytes()
-    everyone = fault_line(robot, "lost:1@0.5+0.25")
-    sizes = [len(frames) for frames in cycles(robot, everyone, 100)]
+    sizes = [len(frames) for frames in cycles(robot, fault_line(robot, "lost:1@0.5+0.25"), 100)]
     assert sizes == [4] * 50 + [0] * 25 + [4] * 25
 
 
@@ -320,8 +305,7 @@ def test_noise_makes_error_frames_and_every_frame_gets_through(robot):
 
 def test_delayed_frames_keep_their_times_and_their_order(robot):
     shown = cycles(robot, fault_line(robot, "delay:0.02@0.05+0.03"), 20)
-    sizes = [len(frames) for frames in shown]
-    assert sizes == [4] * 5 + [0, 0, 4, 8, 8] + [4] * 10
+    assert [len(frames) for frames in shown] == [4] * 5 + [0, 0, 4, 8, 8] + [4] * 10
     times = np.concatenate(shown)["t_device_ns"] // PERIOD_NS
     assert sorted(times.tolist()) == np.repeat(np.arange(20), 4).tolist()
     assert shown[7]["t_device_ns"].tolist() == [5 * PERIOD_NS] * 4
@@ -338,10 +322,8 @@ def test_off_the_bus_the_robot_neither_speaks_nor_hears(robot):
 
 def test_a_frozen_encoder_tells_its_last_angle_and_a_stuck_servo_holds_it(robot):
     line = fault_line(robot, "frozen:joint03@0.1", "stuck:joint01@0.1+0.1")
-    shown = cycles(robot, line, 30)
-    told = np.array([positions(robot, frames) for frames in shown])
-    assert len(np.unique(told[:10, 2])) == 10
-    assert len(np.unique(told[10:, 2])) == 1
+    told = np.array([positions(robot, frames) for frames in cycles(robot, line, 30)])
+    assert (len(np.unique(told[:10, 2])), len(np.unique(told[10:, 2]))) == (10, 1)
     assert len(np.unique(told[:, 0])) == 30
     command, angle = np.full(JOINTS, 0.3), np.full(JOINTS, 0.1)
     assert line.command(command, angle, 0.05).tolist() == [0.3] * 4

@@ -200,12 +200,11 @@ SENSOR_COLUMNS = {
 
 
 @pytest.mark.slow
-def test_times_over_the_bus_are_those_of_the_run(run):
+def test_times_over_the_bus_are_those_of_the_run(run, opened):
     """Device times to the microsecond; what the recorder makes of them, within 2 ms."""
     start_ns = round(run.end["start_s"] * 1e9)
-    with Session.open(run.in_process) as truth:
-        _, _, expected = columns(truth, "/joint_states", "position")
-        expected = expected - expected.min()
+    _, _, expected = columns(opened(run.in_process), "/joint_states", "position")
+    expected = expected - expected.min()
     for way, path in run.over_bus.items():
         with Session.open(path) as found:
             frames = found.frames("/can/can0")
@@ -225,7 +224,7 @@ def test_times_over_the_bus_are_those_of_the_run(run):
 
 
 @pytest.mark.slow
-def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario):
+def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario, opened):
     words = ("lost:joint07:0.2", "frozen:joint03@0.2", "noise:0.02", "bus-off@1.5+0.4")
     faults = [word for text in words for word in ("--fault", text)]
     _, end, _, over_bus = on_the_bus(tmp_path, scenario, *faults, controller=heedless)
@@ -241,8 +240,7 @@ def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario):
         assert "error frames" in reasons
         (bus,) = health.buses
         assert bus.error_frames == end["hit"] + 2  # off, and back again
-        with Session.open(path) as session:
-            said = [message.msg for _, message in session.messages("/rosout")]
+        said = [message.msg for _, message in opened(path).messages("/rosout")]
         assert "bus-off: the controller left the bus" in said
         assert "the controller is back on the bus" in said
 
@@ -250,8 +248,7 @@ def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_it_ends_in_good_order(number, tmp_path):
-    bus = tmp_path / "bus.sock"
-    words = ("--wait", "--unix", str(bus)) if number is signal.SIGINT else ()
+    words = ("--wait", "--unix", str(tmp_path / "bus.sock")) if number is signal.SIGINT else ()
     with serving("flat", *words, stderr=subprocess.PIPE) as (robot, ready):
         assert ready["waits"] is bool(words)
         with socket.create_connection((ready["host"], ready["port"])) as client:
@@ -319,7 +316,7 @@ def test_the_manuals_own_controller_moves_the_robot():
     assert end["ticks"] > 10
 
 
-def test_what_cannot_be_served_is_said_at_once(capsys):
+def test_what_cannot_be_served_is_said_at_once(command):
     for words, said in (
         (["flat"], "give --socketcand PORT or --unix PATH"),
         (["flat", "--socketcand", "1e3"], "expected [HOST:]PORT"),
@@ -331,5 +328,4 @@ def test_what_cannot_be_served_is_said_at_once(capsys):
         (["flat", "--socketcand", "0", "--duration", "0"], "a duration of 0 s"),
         (["flat", "--unix", "x" * 200], "AF_UNIX path too long"),
     ):
-        assert front.run(["sim", "serve", *words]) == 2
-        assert said in capsys.readouterr().err
+        assert said in command("sim", "serve", *words, code=2).err

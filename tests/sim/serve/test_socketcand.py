@@ -15,6 +15,7 @@ from can.interfaces.socketcand.socketcand import (
 from hypothesis import given
 from hypothesis import strategies as st
 
+from support.can_messages import can_message, frames_of
 from support.processes import wait_for
 from undulog.capture import SessionWriter
 from undulog.capture.common.errors import UsageError
@@ -30,14 +31,8 @@ from undulog.capture.sources.contract import SourceContext, records
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcand import SocketcandText
 from undulog.sim.drive.links import find_virtual_robot
+from undulog.sim.serve import socketcand_server
 from undulog.sim.serve.socketcand_protocol import ClientText, frame_text, sent_frame
-from undulog.sim.serve.socketcand_server import (
-    HOLD_S,
-    MOST_CLIENTS,
-    MOST_SENT,
-    SocketcandServer,
-    VirtualBus,
-)
 
 PATIENCE_S = 60.0
 
@@ -62,36 +57,16 @@ def same(found, truth):
     return len(found) == len(truth) and all(np.array_equal(found[f], truth[f]) for f in fields)
 
 
-def as_frames(messages):
-    frames = empty_frames(len(messages))
-    for frame, message in zip(frames, messages, strict=True):
-        frame["id_flags"] = message.arbitration_id | message.is_extended_id * EXTENDED_FLAG
-        frame["dlc"] = message.dlc
-        frame["data"] = list(bytes(message.data).ljust(8, b"\0"))
-    return frames
-
-
-def as_messages(frames):
-    return [
-        can.Message(
-            arbitration_id=int(f["id_flags"]) & 0x1FFFFFFF,
-            is_extended_id=bool(f["id_flags"] & EXTENDED_FLAG),
-            data=f["data"][: f["dlc"]].tobytes(),
-        )
-        for f in frames
-    ]
-
-
 class Serving:
     """A bus whose clients are served by a thread; its robot is the test."""
 
     def __init__(self):
         self.said = []
-        self.server = SocketcandServer(
+        self.server = socketcand_server.SocketcandServer(
             "localhost", 0, "can0", lambda level, text: self.said.append((level, text))
         )
         self.port = self.server.address[1]
-        self.bus = VirtualBus(self.server, None, lambda *_: None)
+        self.bus = socketcand_server.VirtualBus(self.server, None, lambda *_: None)
         self.lock, self.ended = threading.Lock(), False
         self.pulling = True
         self.pulled = []
@@ -162,11 +137,8 @@ def heard(sock, end):
 
 
 def received(bus, count):
-    messages = []
-    while len(messages) < count:
-        message = bus.recv(PATIENCE_S)
-        assert message is not None, len(messages)
-        messages.append(message)
+    messages = [bus.recv(PATIENCE_S) for _ in range(count)]
+    assert all(messages)
     return messages
 
 
@@ -181,8 +153,7 @@ def test_what_the_server_writes_both_clients_read_alike():
     assert same(found, truth)
     assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
     pieces = [piece + ">" for piece in text.decode().split(">")[:-1]]
-    theirs = [convert_ascii_message_to_can_message(piece) for piece in pieces]
-    assert same(as_frames(theirs), truth)
+    assert same(frames_of([convert_ascii_message_to_can_message(piece) for piece in pieces]), truth)
     odd = empty_frames(2)
     odd["id_flags"] = [ERROR_FLAG | 0x40, REMOTE_FLAG | 0x123]
     odd["dlc"] = [8, 3]
@@ -193,20 +164,15 @@ def test_what_the_server_writes_both_clients_read_alike():
     assert tally.counts.malformed == 0
 
 
-@given(
-    identifier=st.integers(0, 2**29 - 1),
-    extended=st.booleans(),
-    data=st.binary(max_size=8),
-)
+@given(st.integers(0, 2**29 - 1), st.booleans(), st.binary(max_size=8))
 def test_what_python_can_sends_is_read(identifier, extended, data):
     identifier &= 0x1FFFFFFF if extended else 0x7FF
     message = can.Message(arbitration_id=identifier, is_extended_id=extended, data=data)
-    text = convert_can_message_to_ascii_message(message).encode()
-    (said,) = ClientText().feed(text)
+    (said,) = ClientText().feed(convert_can_message_to_ascii_message(message).encode())
     word, _, rest = said.partition(" ")
     record = sent_frame(word, rest.strip())
     assert record is not None
-    assert same(records([record]), as_frames([message]))
+    assert same(records([record]), frames_of([message]))
     assert records([record])["dir"].tolist() == [DIR_TX]
 
 
@@ -222,8 +188,8 @@ def test_remote_requests_have_a_length_and_no_data():
     record = sent_frame("sendrtr", "1AAAAAAA 2")
     assert record is not None
     (frame,) = records([record])
-    assert frame["id_flags"] == 0x1AAAAAAA | EXTENDED_FLAG | REMOTE_FLAG
-    assert (frame["dlc"], frame["data"].any()) == (2, False)
+    found = frame["id_flags"], frame["dlc"], frame["data"].any()
+    assert found == (0x1AAAAAAA | EXTENDED_FLAG | REMOTE_FLAG, 2, False)
     assert sent_frame("sendrtr", "123 1 22") is None
 
 
@@ -235,12 +201,12 @@ def test_frames_go_to_everyone_but_their_sender(serving):
     with peer(serving) as first, peer(serving) as second:
         wait_for(lambda: serving.raw() == 2, "two clients")
         serving.send(own)
-        assert same(as_frames(received(first, 300)), own)
-        assert same(as_frames(received(second, 300)), own)
-        for message in as_messages(other):
-            first.send(message)
+        assert same(frames_of(received(first, 300)), own)
+        assert same(frames_of(received(second, 300)), own)
+        for frame in other:
+            first.send(can_message(frame))
         messages = received(second, 200)
-        assert same(as_frames(messages), other)
+        assert same(frames_of(messages), other)
         assert {message.timestamp for message in messages} == {12.345678}
         wait_for(lambda: len(serving.frames()) == 200, "all frames at the robot")
         assert same(serving.frames(), other)
@@ -257,8 +223,8 @@ def test_our_own_source_records_the_bus(serving, tmp_path):
             arrays = []
             serving.send(own)
             with peer(serving) as foreign:
-                for message in as_messages(other):
-                    foreign.send(message)
+                for frame in other:
+                    foreign.send(can_message(frame))
 
                 def enough():
                     arrays.extend(source.poll().frames)
@@ -343,15 +309,13 @@ def test_who_sends_more_than_the_robot_takes_has_to_wait_and_loses_nothing(servi
     with serving.lock:
         serving.pulling = False
     many = traffic(60_000, 7)
-    text = b"".join(
-        convert_can_message_to_ascii_message(message).encode() for message in as_messages(many)
-    )
+    text = "".join(convert_can_message_to_ascii_message(can_message(frame)) for frame in many)
     with hand(serving, b"open can0") as sock:
-        thread = threading.Thread(target=sock.sendall, args=(text,))
+        thread = threading.Thread(target=sock.sendall, args=(text.encode(),))
         thread.start()
-        wait_for(lambda: serving.bus.waiting >= MOST_SENT, "a full queue")
+        wait_for(lambda: serving.bus.waiting >= socketcand_server.MOST_SENT, "a full queue")
         time.sleep(0.2)
-        assert serving.bus.waiting < MOST_SENT + 2000
+        assert serving.bus.waiting < socketcand_server.MOST_SENT + 2000
         with serving.lock:
             serving.pulling = True
         wait_for(lambda: sum(map(len, serving.pulled)) == len(many), "all frames")
@@ -367,7 +331,7 @@ def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(
         serving.server.mark(0)
     address = parse_address(f"can:socketcand:can0?port={serving.port}")
     link = find_virtual_robot(address, Tally(lambda: 0))
-    time.sleep(2 * HOLD_S)
+    time.sleep(2 * socketcand_server.HOLD_S)
     with serving.lock:  # the robot does not listen
         # It sent more than the controller has read, so that the end resets the connection; and it
         # sends again before it listens.
@@ -384,7 +348,7 @@ def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(
 
 def test_no_more_clients_than_there_is_room_for(serving):
     with ExitStack() as clients:
-        for _ in range(MOST_CLIENTS):
+        for _ in range(socketcand_server.MOST_CLIENTS):
             clients.enter_context(hand(serving, b"open can0", b"rawmode"))
         with socket.create_connection(("127.0.0.1", serving.port)) as late:
             late.settimeout(PATIENCE_S)
@@ -397,7 +361,7 @@ def test_silent_clients_lock_nobody_out(serving, said):
     frames = traffic(50)
     with ExitStack() as clients:
         worker = clients.enter_context(hand(serving, b"open can0", b"rawmode"))
-        for _ in range(3 * MOST_CLIENTS):
+        for _ in range(3 * socketcand_server.MOST_CLIENTS):
             clients.enter_context(hand(serving, *said))
         late = clients.enter_context(peer(serving))
         wait_for(lambda: serving.raw() == 2, "both in raw mode")
@@ -405,8 +369,7 @@ def test_silent_clients_lock_nobody_out(serving, said):
         found = received(late, len(frames))
         text = frame_text(frames)
         assert heard(worker, text[-40:]) == text
-    sane = (frames["id_flags"] & REMOTE_FLAG) == 0
-    assert same(as_frames(found), frames[sane])
+    assert same(frames_of(found), frames[(frames["id_flags"] & REMOTE_FLAG) == 0])
 
 
 def test_only_loopback_is_served():
@@ -419,4 +382,4 @@ def test_only_loopback_is_served():
             ("127.0.0.1", port, f"can't serve at 127.0.0.1:{port}: Address already"),
         ):
             with pytest.raises(UsageError, match=said):
-                SocketcandServer(host, at, "can0", lambda *_: None)
+                socketcand_server.SocketcandServer(host, at, "can0", lambda *_: None)

@@ -25,8 +25,7 @@ def pushed(make_robot, make_scenario):
     def run(*pushes, **fields):
         robot = make_robot(5)
         fields |= {"amplitude": 0.0, "world": FREE, "disturbances": pushes}
-        scenario = make_scenario(robot, **fields)
-        return simulate(scenario)[-1], robot
+        return simulate(make_scenario(robot, **fields))[-1], robot
 
     return run
 
@@ -82,5 +81,4 @@ def test_a_push_is_read_and_written_back():
 
 
 def test_a_push_on_nobody_is_a_fault():
-    found = faults_of(TEXT.replace("link07", "link14"))
-    assert 'found "link14"' in found["disturbances[0].link"]
+    assert 'found "link14"' in faults_of(TEXT.replace("link07", "link14"))["disturbances[0].link"]

@@ -8,7 +8,6 @@ import kick_tables
 import numpy as np
 import pytest
 
-import undulog
 from support import linear_chain
 from support.analysed import experiment
 from support.linear_chain import M, asymmetry, within
@@ -29,8 +28,7 @@ def write_run(path, off, seed):
 def deviations():
     """The gait, each joint kicked four ways, and two patterns of all joints."""
     kicks = [sign * step * unit for step in (0.05j, 0.05) for unit in np.eye(M) for sign in (1, -1)]
-    patterns = 1j * np.random.default_rng(4).uniform(-0.15, 0.15, (2, M))
-    return [np.zeros(M), *kicks, *patterns]
+    return [np.zeros(M), *kicks, *(1j * np.random.default_rng(4).uniform(-0.15, 0.15, (2, M)))]
 
 
 @pytest.fixture(scope="module")
@@ -125,8 +123,7 @@ def test_held_out_runs_are_predicted(result):
 def test_roles_warnings_and_text(result, sessions):
     assert [run.role for run in result.runs] == ["base"] + ["kick"] * 4 * M + ["held-out"] * 2
     assert all(run.why is None for run in result.runs)
-    assert result.warnings == ()
-    assert result.reversal is None
+    assert (result.warnings, result.reversal) == ((), None)
     text = render_experiment(result).splitlines()
     assert text[0].startswith("23 sessions: coupling around this gait: j")
     assert "nonlinearity" in text[0]
@@ -137,12 +134,10 @@ def test_roles_warnings_and_text(result, sessions):
     assert any(line.startswith(method) for line in text)
 
 
-def test_the_json_object(sessions, capsys):
-    assert undulog.run(["analyse", *map(str, sessions), "--json"]) == 0
-    coupling = json.loads(capsys.readouterr().out)["coupling"]
+def test_the_json_object(sessions, report_of):
+    coupling = report_of("analyse", *sessions)["coupling"]
     assert coupling["identifiable"] is True
-    assert coupling["record"] is None
-    assert coupling["matrix"] == coupling["P"]["value"]
+    assert (coupling["record"], coupling["matrix"]) == (None, coupling["P"]["value"])
     assert coupling["condition_number"] == coupling["lti"]["condition_number"]
     for name, field in product("PRGS", ("value", "standard_error", "ci95_half")):
         assert np.shape(coupling[name][field]) == (M, M)

@@ -190,8 +190,7 @@ def test_the_linear_reading_gives_back_what_was_planted(reciprocal):
     np.testing.assert_allclose(reading.real, H.real, atol=1e-7)
     np.testing.assert_allclose(reading.imag, H.imag, atol=1e-7)
     assert reading.condition_number == pytest.approx(np.linalg.cond(H), rel=1e-6)
-    found = [one.value for one in shape(reading)]
-    assert found == pytest.approx(planted_shape(H), abs=1e-6)
+    assert [one.value for one in shape(reading)] == pytest.approx(planted_shape(H), abs=1e-6)
     # Also where the coupling isn't directed: an asymmetric P is no sign of that.
     assert np.linalg.norm(P.value - P.value.T) > 0.1
 
@@ -238,8 +237,7 @@ def test_held_out_patterns_tell_how_far_it_holds():
     # What is left is of second order: nine times as much at three times the size.
     assert 7 < errors[1] / errors[0] < 11
     assert found[0].error_kept / found[0].error > 10
-    assert valid_to(found[:2]) == found[1].size
-    assert valid_to([]) is None
+    assert (valid_to(found[:2]), valid_to([])) == (found[1].size, None)
 
 
 def test_kicks_are_told_from_phasors():
@@ -249,8 +247,7 @@ def test_kicks_are_told_from_phasors():
     pattern = command * np.exp(0.15j * np.array([1, -1, 0.5, 0.2, -0.7]))
     runs = [command, command, *(kicked(command, one) for one in kicks), pattern]
     order = rng.permutation(len(runs))
-    turned = np.stack([runs[k] * np.exp(1j * rng.uniform(-np.pi, np.pi)) for k in order])
-    found = sort_kicks(turned)
+    found = sort_kicks(np.stack([runs[k] * np.exp(1j * rng.uniform(-np.pi, np.pi)) for k in order]))
     assert {int(order[k]) for k in found.base} == {0, 1}
     assert [int(order[k]) for k in found.patterns] == [len(runs) - 1]
     for k, kick in found.kicks.items():
@@ -262,8 +259,7 @@ def test_kicks_are_told_from_phasors():
 
 def test_what_is_no_kick():
     _, command = planted()
-    both = deviation_of(command * np.exp([0, 0.05 + 0.05j, 0, 0, 0]), command)
-    assert kick_of(both) is None
+    assert kick_of(deviation_of(command * np.exp([0, 0.05 + 0.05j, 0, 0, 0]), command)) is None
     assert kick_of(deviation_of(command * np.exp([0, 0.3j, 0, 0, 0]), command)) is None
     assert sort_kicks(np.stack([command, command])) is None
     assert sort_kicks(np.stack([command[:2]] * 3)) is None

@@ -46,8 +46,7 @@ def test_intervals_hold_and_a_linear_robot_is_linear(scatter_deg, how, base_runs
 
 
 def test_without_coupling_the_headline_shows_none():
-    random = np.random.default_rng(4)
-    found = kick_tables.row(random, 200, 5, 0.1, coupled=False, index=False)
+    found = kick_tables.row(np.random.default_rng(4), 200, 5, 0.1, coupled=False, index=False)
     assert found["headline"] <= 0.05
 
 
@@ -150,8 +149,7 @@ def test_kicks_too_small_are_stated_with_what_to_record(size, scatter_deg):
 def test_what_is_to_be_recorded_would_do():
     """The size or number of repeats that the answer asks for brings the interval to 0.1."""
     coupling, answer = answered(0.1, 0.03)
-    wanted = float(answer.rpartition("record kicks of ")[2].split()[0])
-    again, _ = answered(wanted / 0.05, 0.03)
+    again, _ = answered(float(answer.rpartition("record kicks of ")[2].split()[0]) / 0.05, 0.03)
     assert again.kick_size.verdict == "fits"
     assert coupling.kick_size.resolved > 0.1
 

@@ -176,8 +176,7 @@ def test_ground_that_differs_fore_and_aft_names_no_module():
     y = pattern(7)
     forward, reverse = scattered(rng, y, 6, 0.002), scattered(rng, y[::-1] - 0.05j, 6, 0.002)
     result = reversal_of("abcdefg", forward, reverse)
-    assert result.p == pytest.approx(2 / 924)
-    assert result.pairs == ()
+    assert (result.p, result.pairs) == (pytest.approx(2 / 924), ())
 
 
 @pytest.mark.parametrize(("runs", "floor"), [((3, 3), 0.1), ((4, 4), 2 / 70), ((4, 5), 1 / 126)])
@@ -185,8 +184,7 @@ def test_few_runs_leave_a_floor_under_p(runs, floor):
     rng = np.random.default_rng(1)
     module = np.array([1.0, 0, 0, 0, 0, 0])
     test = mirror_test(*both_ways(rng, pattern(6), module, runs=runs, scatter=1e-3))
-    assert test.floor == pytest.approx(floor)
-    assert test.p == pytest.approx(floor)
+    assert (test.floor, test.p) == (pytest.approx(floor), pytest.approx(floor))
 
 
 def test_intervals_hold_together():
@@ -222,8 +220,7 @@ def test_shares_in_closed_form():
     rng = np.random.default_rng(8)
     boundary, module = pattern(9), 0.05 * rng.normal(size=9) + 0.05j * rng.normal(size=9)
     shares = variance_shares(*both_ways(rng, boundary, module, scatter=1e-7))
-    paired = np.arange(9) != 4
-    own = np.mean(np.abs(module - module[::-1])[paired] ** 2) / 2
+    own = np.mean(np.abs(module - module[::-1])[np.arange(9) != 4] ** 2) / 2
     ways = [np.var(one + module, ddof=1) for one in (boundary, boundary[::-1])]
     assert shares.module_variance.value == pytest.approx(own, rel=1e-5)
     assert shares.boundary_variance.value == pytest.approx(np.mean(ways) - own, rel=1e-5)

@@ -8,10 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from undulog.analysis import Choices, Experiment, compare_sessions, load
+from undulog.analysis import Choices, Estimate, Experiment, compare_sessions, load
 from undulog.analysis.results.artefact import Artefact
 from undulog.analysis.results.coupling import Route
-from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError, InputFileError, OutputExistsError, UsageError
@@ -160,8 +159,7 @@ def test_pictures_are_whole_files_of_their_own(results, name, pictures, tmp_path
     assert result.plot().caption == result.plot(pictures[0]).caption
     for what in pictures:
         picture = result.plot(what)
-        root = ET.fromstring(picture.save(tmp_path / f"{what}.svg").read_text())
-        assert root.tag == f"{SVG}svg"
+        assert ET.fromstring(picture.save(tmp_path / f"{what}.svg").read_text()).tag == f"{SVG}svg"
         text = picture.to_svg()
         assert "http" not in text.replace("http://www.w3.org/2000/svg", "")
         assert "var(--ink)" not in text
@@ -195,8 +193,7 @@ def test_what_can_not_be_drawn_says_why(results, snake):
 
 
 def test_the_comparison_shows_the_margins_and_the_differences(comparison):
-    frame = comparison.frames()["differences"]
-    assert list(frame.place.unique()) != []
+    assert list(comparison.frames()["differences"].place.unique()) != []
     assert comparison.partial is not None
     assert comparison.frames()["waveforms"].groupby("name").size().eq(72).all()
 

@@ -56,8 +56,7 @@ def address(tmp_path_factory, request):
 def test_it_opens_without_a_word_and_asks_for_nothing(browser, address, name):
     url = address(name)
     browser.open(url)
-    assert browser.requests() == [url]
-    assert browser.complaints() == []
+    assert (browser.requests(), browser.complaints()) == ([url], [])
     assert browser.evaluate("document.scripts.length") == 0
 
 

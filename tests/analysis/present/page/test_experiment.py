@@ -50,8 +50,7 @@ def test_mirror_pairs_are_those_of_the_result(pages, both_ways):
         gain, lag = joint.log_gain_difference, joint.lag_difference_rad
         percent = [100 * math.expm1(v) for v in (gain.value, *gain.ci95)]
         degrees = [math.degrees(v) for v in (lag.value, *lag.ci95)]
-        assert row[2] == pytest.approx(percent)
-        assert row[3] == pytest.approx(degrees)
+        assert (row[2], row[3]) == (pytest.approx(percent), pytest.approx(degrees))
         assert row[4] == [joint.p]
 
 
@@ -73,8 +72,7 @@ def test_profiles_are_the_runs_and_mirrored(both_ways):
 
 def test_matrices_and_row_sums_are_those_of_the_result(pages, kicked):
     coupling = kicked.coupling
-    shown = rows(pages["kicked"], "coupling")
-    assert [[cell[0] for cell in row[1:]] for row in shown] == [
+    assert [[cell[0] for cell in row[1:]] for row in rows(pages["kicked"], "coupling")] == [
         list(row) for row in coupling.P.value
     ]
     sums = rows(pages["kicked"], "rows")
@@ -114,8 +112,7 @@ def test_every_matrix_has_a_picture_and_a_table(pages):
 def test_tests_answer_in_words(both_ways, kicked, snake):
     told = {one.question: one for one in experiment_trials(both_ways)}
     mirror = told["Do the modules mirror, as identical ones do? (H1, reversal)"]
-    assert mirror.p == both_ways.reversal.p
-    assert mirror.verdict == "no, modules differ"
+    assert (mirror.p, mirror.verdict) == (both_ways.reversal.p, "no, modules differ")
     verdicts = [one.verdict for one in experiment_trials(kicked)]
     assert verdicts[:2] == ["as any settled gait's do"] * 2
     assert verdicts[2] == "a deviation could not be shown"
@@ -125,8 +122,7 @@ def test_tests_answer_in_words(both_ways, kicked, snake):
 
 
 def test_what_was_not_recorded_is_named(both_ways):
-    alone = dataclasses.replace(both_ways, reversal=None, warnings=("record the reverse",))
-    page = render(alone)
+    page = render(dataclasses.replace(both_ways, reversal=None, warnings=("record the reverse",)))
     assert "Not tested; the" in page
     assert "Record the reverse." in page
     assert "Not identifiable from these sessions" in page
@@ -190,5 +186,4 @@ def test_artefacts_are_shown_with_their_times_once_for_all_joints(snake):
     assert (second.joints, second.about) == ("all 25 joints", "the record, not mechanics")
     # Ten of sixteen seconds into the session, two long.
     assert 'd="M62.50 0h12.50v10h-12.50z"' in str(first.line)
-    page = render(known)
-    assert page.count("10.00 to 12.00 s") == 1
+    assert render(known).count("10.00 to 12.00 s") == 1

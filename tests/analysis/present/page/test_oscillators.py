@@ -7,9 +7,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
+from undulog.analysis import Estimate, render
 from undulog.analysis.present.page.oscillators import chain_view, entrainment_entries
-from undulog.analysis.present.page.page import render
-from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 
 LINKS = (
@@ -53,8 +52,7 @@ def test_locked_phases_say_what_to_record(page):
 
 
 def test_the_picture_leaves_out_what_was_not_looked_for():
-    view = chain_view(CHAIN, "x")
-    root = ET.fromstring(view["matrix"].svg)
+    root = ET.fromstring(chain_view(CHAIN, "x")["matrix"].svg)
     rows = [g for g in root.iter("g") if g.get("class") == "row"]
     cells = [sum("style" in r.attrib for r in row.iter("rect")) for row in rows]
     assert cells == [1, 1, 1]  # who turns a, who turns b, who turns c

@@ -109,8 +109,7 @@ def test_a_step_spans_its_cycle_and_ends_with_it(by_cycle, written):
     assert np.isnan(rows[1]).all()
     assert np.isnan(rows[3]).all()
     # The session's gait runs at 0.5 Hz: a second is half a cycle.
-    beat = recorded.times(entity, "gait_cycle") / 1e9
-    np.testing.assert_allclose(beat, [0, 0.5, 1.0], atol=1e-6)
+    np.testing.assert_allclose(recorded.times(entity, "gait_cycle") / 1e9, [0, 0.5, 1.0], atol=1e-6)
 
 
 def test_a_steady_gait_without_a_logged_phase_shows_the_reports_maps(analysis):
@@ -180,14 +179,12 @@ def test_frame_and_white_bars_are_of_the_cycle_at_the_cursor(by_cycle, written):
 def test_energies_of_a_cycle_stand_beside_bars_of_a_mean_cycle(by_cycle, analysis):
     window = dataclasses.replace(analysis.gait.windows[0], cycles=4.0)
     four = dataclasses.replace(analysis, gait=dataclasses.replace(analysis.gait, windows=(window,)))
-    energy = charts(four)[2]
-    assert energy.bars[3].value == pytest.approx(0.01 / 4)
+    assert charts(four)[2].bars[3].value == pytest.approx(0.01 / 4)
 
 
 def test_without_cycles_there_are_no_views_of_them(analysis, written):
     said, recorded = written(analysis)
-    assert said.content.cycles == ()
-    assert said.content.maps == ()
+    assert (said.content.cycles, said.content.maps) == ((), ())
     assert not any(path.startswith(("/cycles", "/maps")) for path in recorded.entities)
 
 
@@ -201,8 +198,7 @@ def test_bars_show_gain_lag_and_energy_of_the_joints_that_have_them(analysis):
     assert lag.bars[1].value == pytest.approx(7.6)
     assert lag.bars[1].far == pytest.approx(7.6 + math.degrees(0.02))
     assert len(energy.bars) == 25
-    assert energy.bars[3].value == pytest.approx(0.01)
-    assert energy.bars[3].far is None
+    assert (energy.bars[3].value, energy.bars[3].far) == (pytest.approx(0.01), None)
 
 
 def test_what_no_joint_has_gets_no_chart(analysis):

@@ -122,18 +122,18 @@ def test_other_numbers_are_plotted_words_are_events_and_the_rest_is_named(shown)
     assert f"not shown: {left_out}" in said["warnings"]
 
 
-def test_without_names_the_joints_are_plotted_and_the_notes_say_what_to_do(bag, tmp_path, capsys):
-    assert undulog.run(["view", str(bag), "--save", str(tmp_path / "a.rrd"), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+def test_without_names_the_joints_are_plotted_and_the_notes_say_what_to_do(
+    bag, tmp_path, report_of
+):
+    said = report_of("view", bag, "--save", tmp_path / "a.rrd")
     assert said["joints"] == []
     (why,) = [note for note in said["warnings"] if note.startswith("not analysed")]
     assert "/snake/encoders, /snake/targets; name them with --command-topic" in why
 
 
-def test_a_name_that_is_not_there_fails_and_lists_what_is(bag, tmp_path, capsys):
+def test_a_name_that_is_not_there_fails_and_lists_what_is(bag, tmp_path, command):
     words = ["view", str(bag), "--command-topic", "/none", "--save", str(tmp_path / "a.rrd")]
-    assert undulog.run(words) == 1
-    assert "has no /none; it has /camera, /currents" in capsys.readouterr().err
+    assert "has no /none; it has /camera, /currents" in command(*words, code=1).err
     with Session.open(bag) as session, pytest.raises(MissingChannelError):
         session.view(rename={"/joint_commands": "/none"})
 

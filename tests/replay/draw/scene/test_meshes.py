@@ -82,5 +82,4 @@ def test_only_links_without_a_mesh_are_capsules(file, read_back):
 
 @pytest.mark.slow
 def test_the_viewer_draws_the_boxes(file, show):
-    viewer = show(file, 0.09)
-    assert viewer.complaints() == []
+    assert show(file, 0.09).complaints() == []
