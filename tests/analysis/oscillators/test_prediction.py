@@ -164,23 +164,19 @@ def result(tmp_path_factory):
     return folder / "kicks.json", files
 
 
-def test_the_verb_takes_sessions_or_their_result(result, tmp_path, capsys, command, report_of):
+def test_the_verb_takes_sessions_or_their_result(result, tmp_path, command, report_of):
     file, sessions = result
-    capsys.readouterr()
-    found = report_of("predict", file, "--eps", "0.3")
-    np.testing.assert_allclose(
-        found["J"], report_of("predict", *sessions, "--eps", "0.3")["J"], atol=1e-12
-    )
-    np.testing.assert_allclose(found["J"], rates_of(CHAIN, WAVE), atol=0.02)
+    found, direct = (report_of("predict", *one, "--eps", "0.3")["J"] for one in ([file], sessions))
+    np.testing.assert_allclose(found, direct, atol=1e-12)
+    np.testing.assert_allclose(found, rates_of(CHAIN, WAVE), atol=0.02)
     output = tmp_path / "predicted.json"
-    words = ["predict", str(file), "--eps", "0.3", "--kick", "j2=0.05", "-o", str(output)]
+    words = ("predict", file, "--eps", "0.3", "--kick", "j2=0.05", "-o", output)
     text = command(*words).out
     assert text.startswith("With feedback of 0.3 1/s and the body as the only coupling, of 4")
     assert "Of the kick" in text
     assert json.loads(output.read_text())["relaxation"]["times_s"][0] == 0.0
-    assert undulog.run(words) == 2  # it is there
-    assert "--force" in capsys.readouterr().err
-    assert undulog.run([*words, "--force"]) == 0
+    assert "--force" in command(*words, code=2).err  # it is there
+    command(*words, "--force")
 
 
 @pytest.mark.parametrize(

@@ -78,10 +78,8 @@ def test_a_group_of_one_and_a_joint_that_follows_nothing():
     snake.response = 0.9 * snake.command
     said = []
     gait = snake.fit(warn=said.append)
-    assert [group.driven for group in gait.groups] == [
-        tuple(snake.names[k] for k in (0, 1, 2, 3, 5, 6)),
-        (snake.names[4],),
-    ]
+    most = tuple(snake.names[k] for k in (0, 1, 2, 3, 5, 6))
+    assert [group.driven for group in gait.groups] == [most, (snake.names[4],)]
     assert gait.group_of(snake.names[7]) is None
     assert any("joint08" in text and "commanded something else" in text for text in said)
     assert any("joint09" in text and "held still" in text for text in said)
@@ -126,14 +124,13 @@ def test_what_falls_on_a_groups_own_tone_is_named():
 
 
 def test_mixed_tones_of_lowest_order():
-    tones = mixed_tones([3.0, 2.0], 2 * np.pi * 100)
-    assert [(one.group, dict(one.factors)) for one in tones] == [
-        (0, {0: -1, 1: 3}),
-        (1, {0: 2, 1: -2}),
-    ]
-    tones = mixed_tones([1.0, 2.0], 2 * np.pi * 100)
-    assert [(one.group, dict(one.factors)) for one in tones] == [(0, {0: -1, 1: 1}), (1, {0: 2})]
-    assert mixed_tones([GOLDEN, 1.0], 2 * np.pi * 100) == []
+    for omegas, expected in (
+        ([3.0, 2.0], [(0, {0: -1, 1: 3}), (1, {0: 2, 1: -2})]),
+        ([1.0, 2.0], [(0, {0: -1, 1: 1}), (1, {0: 2})]),
+        ([GOLDEN, 1.0], []),
+    ):
+        tones = mixed_tones(omegas, 2 * np.pi * 100)
+        assert [(one.group, dict(one.factors)) for one in tones] == expected
 
 
 def test_lines_of_the_other_groups_are_distinct():
@@ -175,10 +172,8 @@ def test_a_fit_with_further_lines_is_least_squares():
     for line in (2.0, 4.5, 3.0, 6.0):
         rows += [np.cos(line * t), -np.sin(line * t)]
     theta, (rss,), *_ = np.linalg.lstsq(np.stack(rows).T, y, rcond=None)
-    ours = [
-        *fit.trend[0],
-        *np.ravel([(a.real, a.imag) for a in (*fit.lines[0], *fit.amplitudes[0])]),
-    ]
+    parts = np.array([*fit.lines[0], *fit.amplitudes[0]])
+    ours = [*fit.trend[0], *np.ravel([parts.real, parts.imag], order="F")]
     np.testing.assert_allclose(ours, theta, rtol=0, atol=1e-10)
     assert fit.rss[0] == pytest.approx(rss)
     np.testing.assert_allclose(fit.predict(0, t), np.stack(rows).T @ theta, atol=1e-10)
@@ -189,15 +184,9 @@ def test_the_noise_beside_a_tone_leaves_out_the_other_groups_lines():
     rng = np.random.default_rng(3)
     t = np.arange(2000) / 100 - 10
     level = []
+    wave = np.sin(2 * np.pi * t) + 0.05 * np.sin(2 * np.pi * 1.2 * t + 1)
     for lines in ((), (2 * np.pi * 1.2,)):
-        draws = [
-            Series(
-                "q",
-                t,
-                np.sin(2 * np.pi * t) + 0.05 * np.sin(2 * np.pi * 1.2 * t + 1) + 0.01 * noise,
-            )
-            for noise in rng.normal(size=(200, t.size))
-        ]
+        draws = [Series("q", t, wave + 0.01 * n) for n in rng.normal(size=(200, t.size))]
         fit = fit_at(draws, 2 * np.pi, HarmonicModel(lines=lines))
         level.append(residual_noise(draws, fit).level.mean())
     assert level[0] > 10 * level[1]
@@ -226,11 +215,10 @@ def test_one_gait_is_not_split_by_noise_modulation_or_harmonics(seed):
 
 def test_too_slow_or_too_few_samples_for_a_group_are_reported():
     snake = Snake(1.5, joints=6)
-    commands = {n: Series(n, snake.t, v) for n, v in zip(snake.names, snake.command, strict=True)}
-    few = slice(None, None, 60)
-    responses = {
-        n: Series(n, snake.t[few], v[few]) for n, v in zip(snake.names, snake.response, strict=True)
-    }
+    commands, responses = (
+        {n: Series(n, snake.t[::step], v[::step]) for n, v in zip(snake.names, rows, strict=True)}
+        for rows, step in ((snake.command, 1), (snake.response, 60))
+    )
     said = []
     gait = fit_gait(commands, responses, snake.seconds, said.append)
     assert all(group.answered == () for group in gait.groups)

@@ -16,10 +16,8 @@ def write(path, *, moving=True):
     """20 s of eight joints that follow 0.5 Hz: positions only."""
     noise = np.random.default_rng(1).normal(0, 1e-3, (2000, len(NAMES)))
     phase = np.pi * 0.01 * np.arange(2000)[:, None] - np.arange(len(NAMES))
-    commands = 0.4 * np.sin(phase) * moving
-    return write_joints(
-        path, NAMES, commands, [0.38 * np.sin(phase - 0.1) + noise], rate_hz=100, session_id="s"
-    )
+    commands, states = 0.4 * np.sin(phase) * moving, [0.38 * np.sin(phase - 0.1) + noise]
+    return write_joints(path, NAMES, commands, states, rate_hz=100, session_id="s")
 
 
 def test_worst_first_and_each_once():

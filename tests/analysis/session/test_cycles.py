@@ -50,19 +50,14 @@ def test_each_cycle_tells_its_own_gain_and_lag(maps):
     # The period is told from the responses, too, whose steps move it by 1e-6; the limits of the
     # cycles move with it.
     np.testing.assert_allclose(maps.gain[:, known], truth[:, known], atol=1e-4)
-    np.testing.assert_allclose(
-        maps.lag_rad[:, known], np.tile(LAG[:, None], CYCLES)[:, known], atol=1e-3
-    )
+    expected = np.tile(LAG[:, None], CYCLES)[:, known]
+    np.testing.assert_allclose(maps.lag_rad[:, known], expected, atol=1e-3)
 
 
 def test_power_is_torque_times_velocity_with_its_sign(maps):
     # Mean of drag v^2 is drag (2 pi f A)^2 / 2.
-    truth = np.array(
-        [
-            np.array([0.5, -0.2, 0.1]) * (2 * np.pi * AMPLITUDE * gains(cycle)) ** 2 / 2
-            for cycle in range(CYCLES)
-        ]
-    ).T
+    peak = 2 * np.pi * AMPLITUDE * np.array([gains(cycle) for cycle in range(CYCLES)]).T
+    truth = np.array([[0.5], [-0.2], [0.1]]) * peak**2 / 2
     known = np.arange(CYCLES) != 5
     assert maps.powered == NAMES
     np.testing.assert_allclose(maps.power_w[:, known], truth[:, known], rtol=0.02)

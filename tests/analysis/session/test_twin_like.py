@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-import undulog
 from support.analysed import analysed
 from undulog.analysis.body.null import SAMPLES, one_cycle, places, viscous_chain
 from undulog.analysis.signals.stretch import Options
@@ -50,15 +49,10 @@ def write_twin(
     phase = np.arange(head.size) * 200 / SAMPLES
     ticks = np.arange(round(duration * 100) + 1)
     x, y = np.interp(ticks, phase, head.real), np.interp(ticks, phase, head.imag)
-    yaw = np.interp(
-        ticks % 200,
-        np.arange(SAMPLES + 1) * 200 / SAMPLES,
-        np.append(motion.heading, motion.heading[0]),
-    )
-    facts = {"settle_s": repr(settle_s), "scenario": "test"}
-    with SessionWriter(
-        path, session_id="twin-like", epoch_ns=EPOCH_NS, robot=robot, metadata=facts
-    ) as w:
+    one_turn = np.arange(SAMPLES + 1) * 200 / SAMPLES
+    yaw = np.interp(ticks % 200, one_turn, np.append(motion.heading, motion.heading[0]))
+    facts = {"metadata": {"settle_s": repr(settle_s), "scenario": "test"}, "robot": robot}
+    with SessionWriter(path, session_id="twin-like", epoch_ns=EPOCH_NS, **facts) as w:
         w.attach("scenario.toml", "application/toml", SCENARIO)
         commands = w.joint_state("/joint_commands", names, unit="rad")
         states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
@@ -84,18 +78,16 @@ def write_twin(
             states.write(t_ns, seen + rng.normal(0, 1e-4, 25), rate, 0.5 * rate)
             current.write(t_ns, np.full(25, 0.5))
             voltage.write(t_ns, np.full(25, 2.0))
-            gait.write(
-                t_ns, np.tile([0.3 * ramp, OMEGA, -np.pi / 3, 0.0, OMEGA * k / 100], len(planes))
-            )
+            wave = [0.3 * ramp, OMEGA, -np.pi / 3, 0.0, OMEGA * k / 100]
+            gait.write(t_ns, np.tile(wave, len(planes)))
             for name, channel in accumulated.items():
                 channel.write(t_ns + TICK_NS // 2, np.full(25, powers[name]))
             if booked is not None:
                 booked.write(t_ns, np.array(ledger) * k / 100)
             if odometry is not None:
                 quaternion = np.array([0, 0, np.sin(yaw[k] / 2), np.cos(yaw[k] / 2)])
-                odometry.write(
-                    t_ns, np.array([x[k], y[k], 0.02]), quaternion, np.zeros(3), np.zeros(3)
-                )
+                position = np.array([x[k], y[k], 0.02])
+                odometry.write(t_ns, position, quaternion, np.zeros(3), np.zeros(3))
         w.set_verdict("good")
     return path
 
@@ -112,8 +104,7 @@ def result(twin):
 
 def test_the_settled_whole_cycles_are_analysed(result):
     (window,) = result.gait.windows
-    assert (window.start_s, window.stop_s) == (pytest.approx(2.0), pytest.approx(14.0))
-    assert window.cycles == 6
+    assert (window.start_s, window.stop_s, window.cycles) == pytest.approx((2.0, 14.0, 6))
     assert result.gait.fitted.start_s == pytest.approx(2.0)
     assert result.gait.frequency_hz.value == pytest.approx(0.5, abs=1e-9)
     assert result.gait.wave == "head-to-tail"
@@ -177,9 +168,8 @@ def test_the_twins_own_ledger_is_the_judge(tmp_path):
     # 13 joints of 0.25 (A omega)^2 W each, and 25 W electrical, which the ledger books as 20 W.
     mechanical = 13 * 0.25 * (0.3 * OMEGA) ** 2
     path = write_twin(tmp_path / "booked.mcap", ledger=(mechanical, 20.0), odometry=False)
-    said = [text for text in analysed(path).warnings if "ledger" in text]
-    assert len(said) == 1
-    assert said[0].startswith("electrical energy is 300 J from the samples but 240 J")
+    (said,) = [text for text in analysed(path).warnings if "ledger" in text]
+    assert said.startswith("electrical energy is 300 J from the samples but 240 J")
 
 
 def test_accumulated_powers_are_preferred_and_their_absence_is_stated_once(tmp_path, result):
@@ -193,10 +183,8 @@ def test_accumulated_powers_are_preferred_and_their_absence_is_stated_once(tmp_p
     result = analysed(write_twin(tmp_path / "m.mcap", powers=mechanical, odometry=False))
     assert "mechanical energies" not in result.energy.unknown
     for joint in result.joints:
-        assert joint.energy_net_j == pytest.approx(-6.0)
-        assert joint.energy_plus_j == pytest.approx(3.0)
-        assert joint.energy_abs_j == pytest.approx(12.0)
-        assert joint.energy_el_j == pytest.approx(12.0)  # 0.5 A at 2 V
+        energies = joint.energy_net_j, joint.energy_plus_j, joint.energy_abs_j, joint.energy_el_j
+        assert energies == pytest.approx((-6.0, 3.0, 12.0, 12.0))  # 0.5 A at 2 V
     both = mechanical | {"electrical": 1.5, "electrical_plus": 1.75}
     result = analysed(write_twin(tmp_path / "b.mcap", powers=both, odometry=False))
     assert result.energy.unknown is None
@@ -253,32 +241,27 @@ def test_the_first_line_is_the_answer_and_the_last_the_method(twin, command):
     assert "Method: harmonic least squares" in "\n".join(lines[-4:])
 
 
-def test_files_and_options_of_the_verb(twin, tmp_path, capsys, command):
+def test_files_and_options_of_the_verb(twin, tmp_path, command):
     out = tmp_path / "result.json"
-    assert undulog.run(["analyse", str(twin), str(twin), "-o", str(out)]) == 0
+    assert f"Result: {out}" in command("analyse", twin, twin, "-o", out).out
     assert len(json.loads(out.read_text())["sessions"]) == 2
-    assert f"Result: {out}" in capsys.readouterr().out
     assert "exists already" in command("analyse", twin, "-o", out, code=2).err
-    assert undulog.run(["analyse", str(twin), "-o", str(out), "--force", "--stop", "9"]) == 0
+    command("analyse", twin, "-o", out, "--force", "--stop", "9")
     assert json.loads(out.read_text())["gait"]["fitted"]["stop_s"] == pytest.approx(9.0)
     assert list(tmp_path.iterdir()) == [out]
-    capsys.readouterr()
     for wrong, why in (
-        (["analyse"], "needs at least one session"),
-        (["analyse", str(twin), "--start", "5", "--stop", "4"], "--stop 4 is not after --start 5"),
-        (["analyse", str(twin), "-o", str(tmp_path / "x.txt")], "end its name in .json"),
-        (["analyse", str(twin), "--start", "400"], "nothing between --start and --stop"),
+        ((), "needs at least one session"),
+        ((twin, "--start", "5", "--stop", "4"), "--stop 4 is not after --start 5"),
+        ((twin, "-o", tmp_path / "x.txt"), "end its name in .json"),
+        ((twin, "--start", "400"), "nothing between --start and --stop"),
     ):
-        assert why in command(*wrong, code=2).err
-    assert (
-        "it has /gait, /joint_commands"
-        in command("analyse", twin, "--command-topic", "/a", "--response-topic", "/b", code=1).err
-    )
+        assert why in command("analyse", *wrong, code=2).err
+    topics = ("--command-topic", "/a", "--response-topic", "/b")
+    assert "it has /gait, /joint_commands" in command("analyse", twin, *topics, code=1).err
 
 
-def test_help_has_an_example(capsys):
-    undulog.run(["analyse", "--help"])
-    assert "undulog analyse run.mcap --json" in capsys.readouterr().out
+def test_help_has_an_example(command):
+    assert "undulog analyse run.mcap --json" in command("analyse", "--help").out
 
 
 def test_a_session_cut_before_it_settled_is_answered_with_a_warning(

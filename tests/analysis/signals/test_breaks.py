@@ -44,9 +44,8 @@ def test_the_longest_unbroken_stretch_gives_the_numbers(
 
 
 def test_start_and_stop_choose_another_stretch(tmp_path: Path, opened) -> None:
-    found = analyse_session(
-        opened(gait(tmp_path / "run.mcap", jumps={1200: HOUR})), Options(start_s=3000.0)
-    )
+    path = gait(tmp_path / "run.mcap", jumps={1200: HOUR})
+    found = analyse_session(opened(path), Options(start_s=3000.0))
     assert length(found) == pytest.approx(8.0, abs=0.05)
     assert found.joints[0].gain.value == pytest.approx(0.9, abs=2e-3)
     assert not any("unbroken" in text for text in found.warnings)

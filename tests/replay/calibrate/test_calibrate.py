@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import undulog as front
 from support.paths import TRACE
 from support.twin_fits import colored, fitted, rewritten, room_for
 from undulog.capture import load_robot
@@ -114,10 +113,8 @@ def test_an_interrupted_fit_leaves_nothing(small, tmp_path, monkeypatch, command
         yield request
 
     monkeypatch.setattr(cli, "interruptible", interrupted)
-    assert (
-        "nothing is written"
-        in command("sim", "fit", small / "run.mcap", "-o", tmp_path / "a.toml", code=1).err
-    )
+    words = ("sim", "fit", small / "run.mcap", "-o", tmp_path / "a.toml")
+    assert "nothing is written" in command(*words, code=1).err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -137,20 +134,12 @@ mu_normal = 0.42
     world = tmp_path / "fitted-world.toml"
     words = ["--modules", "--within", "0.03", "--scenario", str(world)]
     report, found = fitted(room, capsys, *words, "-o", str(tmp_path / "fitted.toml"))
-    assert report["search"]["named"]
-    assert report["search"]["module"] == "joint04"
-    truth = {
-        ("stall_torque", None): 0.345,
-        ("proportional_gain", None): 6.8,
-        ("coulomb_friction", None): 0.024,
-        ("viscous_friction", None): 0.005,
-        ("gear_stiffness", None): 12.0,
-        ("gear_damping", None): 0.008,
-        ("mu_tangential", None): 0.06,
-        ("mu_normal", None): 0.42,
-        ("stall_torque", "joint04"): 0.8,
-    }
-    assert_true_or_open(found, truth)
+    assert (report["search"]["named"], report["search"]["module"]) == (True, "joint04")
+    truth = {"stall_torque": 0.345, "proportional_gain": 6.8, "coulomb_friction": 0.024}
+    truth |= {"viscous_friction": 0.005, "gear_stiffness": 12.0, "gear_damping": 0.008}
+    truth |= {"mu_tangential": 0.06, "mu_normal": 0.42}
+    assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
+    assert_true_or_open(found, {("stall_torque", "joint04"): 0.8})
     # Short of full voltage a servo's viscous friction acts as its back EMF does.
     ridge = next(one["factors"] for one in report["ridges"] if "stall torque" in one["factors"])
     assert "viscous friction" in ridge
@@ -189,9 +178,8 @@ mu_normal = 0.56
     room = room_for(tmp_path, 5, 14.0, hidden, seed=0)
     names = ("stall_torque", "proportional_gain", "coulomb_friction", "mu_tangential", "mu_normal")
     words = [word for name in names for word in ("--only", name)]
-    report, found = fitted(
-        room, capsys, *words, "--modules", "--within", "0.03", "-o", str(tmp_path / "fitted.toml")
-    )
+    words += ["--modules", "--within", "0.03", "-o", str(tmp_path / "fitted.toml")]
+    report, found = fitted(room, capsys, *words)
     assert not report["search"]["named"]  # no module differs
     truth = dict(zip(names, (0.27, 9.0, 0.035, 0.045, 0.56), strict=True))
     assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
@@ -200,22 +188,19 @@ mu_normal = 0.56
 
 
 @pytest.mark.slow
-def test_a_real_ramp_tells_a_lag_and_no_servo(tmp_path, capsys):
+def test_a_real_ramp_gives_a_lag_and_no_servo(tmp_path, capsys, command):
     """A motor at constant speed, in the air: one lag for six parameters."""
     if not TRACE.is_file():
         pytest.skip(f"the real recording {TRACE.name} is not beside this checkout")
-    words = ["import", str(TRACE), "--robot", "arcsnake-joint", "-o", str(tmp_path / "arc.mcap")]
-    assert front.run(words) == 0
+    command("import", TRACE, "--robot", "arcsnake-joint", "-o", tmp_path / "arc.mcap")
     (tmp_path / "nominal.toml").write_text(AIR)
-    report, found = fitted(
-        tmp_path, capsys, "--settle", "1", "-o", str(tmp_path / "f.toml"), source="arc.mcap"
-    )
+    words = ("--settle", "1", "-o", str(tmp_path / "f.toml"))
+    report, found = fitted(tmp_path, capsys, *words, source="arc.mcap")
     assert not any(one["determined"] for one in found.values())
     assert report["rms_rad"]["after"] < report["rms_rad"]["before"]
     assert report["rms_rad"]["after"] < 0.005  # of a way of 17 rad
     assert report["residual_memory_samples"] > 3.0  # the twin isn't this servo
-    fitted_robot = load_robot(tmp_path / "f.toml")  # its DBC files lie beside it
-    assert fitted_robot.bus is not None
+    assert load_robot(tmp_path / "f.toml").bus is not None  # its DBC files lie beside it
 
 
 def test_the_memory_of_noise_is_that_of_its_closed_form():

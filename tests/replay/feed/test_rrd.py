@@ -57,16 +57,14 @@ def test_all_entities_are_there_by_name(recording):
 def test_what_is_drawn_follows_from_the_columns(recording, truth):
     _, found = recording
     power = truth.effort * truth.velocity
-    total = power.sum(axis=1, keepdims=True)
-    electrical = 6.0 * truth.effort.sum(axis=1, keepdims=True)
     for entity, values in {
         "/joints/measured": np.degrees(truth.position),
         "/joints/commanded": np.degrees(truth.command),
         "/joints/error": np.degrees(truth.position - truth.command),
         "/joints/places/measured": np.degrees(truth.position[:, [0, 12, 24]]),
         "/power/mechanical": power,
-        "/power/total/mechanical": total,
-        "/power/total/electrical": electrical,
+        "/power/total/mechanical": power.sum(axis=1, keepdims=True),
+        "/power/total/electrical": 6.0 * truth.effort.sum(axis=1, keepdims=True),
         "/signals/joint_current": truth.effort,  # in its own unit
     }.items():
         is_angle = entity.startswith("/joints") and "places" not in entity
@@ -146,8 +144,8 @@ def test_a_folder_that_is_not_there_is_an_error(session_file, tmp_path):
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_full_disk_is_an_error_and_leaves_nothing(session_file, disk_of):
     disk = disk_of("64k")
-    with Session.open(session_file) as session, pytest.raises(LogWriteError, match="can't be wr"):
-        write_recording(session, disk / "run.rrd")
+    with pytest.raises(LogWriteError, match="can't be written"):
+        converted(session_file, disk / "run.rrd")
     assert list(disk.iterdir()) == []
 
 
@@ -268,6 +266,5 @@ def test_rerun_opens_our_sessions_itself_with_the_joints_named(
     assert ", ".join(names[:10]) in printed  # it cuts long lists short
     found = read_back(path)
     assert found.column("/joint_states/position", "SeriesLines:names")[0] == names
-    np.testing.assert_array_equal(
-        rows(found.column("/joint_states/position", "Scalars:scalars")), truth.position
-    )
+    shown = rows(found.column("/joint_states/position", "Scalars:scalars"))
+    np.testing.assert_array_equal(shown, truth.position)

@@ -144,7 +144,7 @@ def test_the_defaults_are_those_of_the_manual():
         ),
         ('kind = "serpentin"\n[horizontal]\nlag = 1.0', "kind"),
         ('kind = "oscillators"', "horizontal"),
-        ('kind = "oscillators"\nhorizontal = 3', "horizontal"),
+        ('kind = "oscillators"\nhorizontal = 3', "horizontal amplitude frequency_hz lag"),
     ],
 )
 def test_all_faults_are_listed_at_once(text, expected):

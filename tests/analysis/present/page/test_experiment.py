@@ -38,9 +38,10 @@ def rows(page, table):
 @pytest.mark.parametrize("name", ["both_ways", "kicked", "swept"])
 def test_the_answer_is_the_first_heading(pages, name, request):
     heading = re.search(r"<h1[^>]*>(.*?)</h1>", pages[name], re.DOTALL)[1]
-    told = re.sub(r"<[^>]+>", "", heading)
-    told = told.replace("\N{NO-BREAK SPACE}", " ").replace("⁻¹", "^-1")
-    assert told == sentence(request.getfixturevalue(name).answer)
+    text = re.sub(r"<[^>]+>", "", heading)
+    assert text.replace("\N{NO-BREAK SPACE}", " ").replace("⁻¹", "^-1") == sentence(
+        request.getfixturevalue(name).answer
+    )
 
 
 def test_mirror_pairs_are_those_of_the_result(pages, both_ways):
@@ -57,11 +58,8 @@ def test_mirror_pairs_are_those_of_the_result(pages, both_ways):
 def test_profiles_are_the_runs_and_mirrored(both_ways):
     seen = profiles(both_ways, both_ways.reversal)
     assert seen.gain.shape == seen.mirrored_lag_deg.shape == (6, 5)
-    reverse = next(
-        s
-        for s, run in zip(both_ways.sessions, both_ways.runs, strict=True)
-        if run.role == "reverse"
-    )
+    roles = [run.role for run in both_ways.runs]
+    reverse = both_ways.sessions[roles.index("reverse")]
     gains = [joint.gain.value for joint in reverse.joints]
     np.testing.assert_array_equal(seen.mirrored_gain[0], gains[::-1])
     # What the figure shows is what was tested: d = ln of the ratio of geometric means.
@@ -72,9 +70,8 @@ def test_profiles_are_the_runs_and_mirrored(both_ways):
 
 def test_matrices_and_row_sums_are_those_of_the_result(pages, kicked):
     coupling = kicked.coupling
-    assert [[cell[0] for cell in row[1:]] for row in rows(pages["kicked"], "coupling")] == [
-        list(row) for row in coupling.P.value
-    ]
+    shown = rows(pages["kicked"], "coupling")
+    assert [[cell[0] for cell in row[1:]] for row in shown] == list(map(list, coupling.P.value))
     sums = rows(pages["kicked"], "rows")
     assert [row[1][0] for row in sums] == [one.total.value for one in coupling.phase_rows]
     held = rows(pages["kicked"], "heldout")
@@ -129,9 +126,8 @@ def test_what_was_not_recorded_is_named(both_ways):
 
 
 def test_a_page_that_grows_too_large_goes_without_every_run(both_ways, pages, monkeypatch):
-    monkeypatch.setattr(
-        "undulog.analysis.present.page.page.LARGEST_BYTES", len(pages["both_ways"].encode()) - 1
-    )
+    largest = len(pages["both_ways"].encode()) - 1
+    monkeypatch.setattr("undulog.analysis.present.page.page.LARGEST_BYTES", largest)
     assert "Gain and lag of every run are left out" in render(both_ways)
 
 
@@ -175,10 +171,9 @@ def test_times_of_artefacts():
 
 
 def test_artefacts_are_shown_with_their_times_once_for_all_joints(snake):
-    gaps = [
-        Artefact(j.name, "/joint_states", "position", "gaps", ((9.0, 9.5),)) for j in snake.joints
-    ]
-    frozen = Artefact("joint07", "/joint_states", "position", "frozen", ((10.0, 12.0),), "stuck")
+    where = ("/joint_states", "position")
+    gaps = [Artefact(joint.name, *where, "gaps", ((9.0, 9.5),)) for joint in snake.joints]
+    frozen = Artefact("joint07", *where, "frozen", ((10.0, 12.0),), "stuck")
     known = dataclasses.replace(snake, artefacts=(*gaps, frozen))
     first, second = artefact_rows(known)
     assert (first.joints, first.flag, first.times) == ("joint07", "frozen", "10.00 to 12.00 s")

@@ -37,7 +37,8 @@ def bag(tmp_path_factory):
     folder = tmp_path_factory.mktemp("foreign") / "bag"
     vector, turn = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
     still = turn(x=0.0, y=0.0, z=0.0, w=1.0)
-    none = np.zeros(0)
+    none, parts = np.zeros(0), ("orientation", "angular_velocity", "linear_acceleration")
+    unknown = {f"{part}_covariance": np.zeros(9) for part in parts}
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         ways = {t: writer.add_connection(t, kind, typestore=store) for t, kind in TOPICS.items()}
 
@@ -53,17 +54,10 @@ def bag(tmp_path_factory):
             joints = {"header": header, "name": NAMES, "velocity": none, "effort": none}
             write("/snake/targets", t_ns, **joints, position=0.4 * np.sin(phase))
             write("/snake/encoders", t_ns, **joints, position=0.36 * np.sin(phase - 0.2))
-            write(
-                "/imu/data",
-                t_ns,
-                header=header,
-                orientation=still,
-                orientation_covariance=np.zeros(9),
-                angular_velocity=vector(x=0.01 * tick, y=0.0, z=0.0),
-                angular_velocity_covariance=np.zeros(9),
-                linear_acceleration=vector(x=0.0, y=0.0, z=9.81),
-                linear_acceleration_covariance=np.zeros(9),
-            )
+            imu = {"header": header, "orientation": still} | unknown
+            imu["angular_velocity"] = vector(x=0.01 * tick, y=0.0, z=0.0)
+            imu["linear_acceleration"] = vector(x=0.0, y=0.0, z=9.81)
+            write("/imu/data", t_ns, **imu)
             layout = types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
             write("/currents", t_ns, layout=layout, data=np.array([tick, -tick, 2.0]))
             if tick % 100 == 0:
@@ -132,7 +126,7 @@ def test_without_names_the_joints_are_plotted_and_the_notes_say_what_to_do(
 
 
 def test_a_name_that_is_not_there_fails_and_lists_what_is(bag, tmp_path, command):
-    words = ["view", str(bag), "--command-topic", "/none", "--save", str(tmp_path / "a.rrd")]
+    words = ("view", bag, "--command-topic", "/none", "--save", tmp_path / "a.rrd")
     assert "has no /none; it has /camera, /currents" in command(*words, code=1).err
     with Session.open(bag) as session, pytest.raises(MissingChannelError):
         session.view(rename={"/joint_commands": "/none"})
