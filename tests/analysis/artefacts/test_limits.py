@@ -15,6 +15,12 @@ GAIN = 8.0
 """Kp of the twin's servos [1/rad]."""
 
 
+def within(t_s, spans_s):
+    """Return which times lie in one of the half-open intervals."""
+    start_s, stop_s = np.reshape(spans_s, (-1, 2)).T[..., None] - 1e-6
+    return ((t_s > start_s) & (t_s < stop_s)).any(axis=0)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_torque_cut_at_the_stall_torque_is_a_limit(seed, tmp_path):
     """Asked for a third to twice more than the servo has, for some seconds."""
@@ -27,20 +33,16 @@ def test_torque_cut_at_the_stall_torque_is_a_limit(seed, tmp_path):
     assert (found.joint, found.quantity) == (snake.robot.joint_names[j], "effort")
     assert (found.flag, found.note) == ("saturated", "torque")
     # By the sample: within two of each other, two stretches are one.
-    told = np.zeros(k - i, dtype=bool)
-    for start_s, stop_s in found.spans_s:
-        told |= (snake.t[i:k] > start_s - 1e-6) & (snake.t[i:k] < stop_s - 1e-6)
-    assert np.mean(told == beyond) > 0.97
-    assert not np.any(beyond & ~told)
+    flagged = within(snake.t[i:k], found.spans_s)
+    assert np.mean(flagged == beyond) > 0.97
+    assert not np.any(beyond & ~flagged)
 
 
 def test_a_weak_twin_gives_its_full_voltage_when_the_servo_law_says(tmp_path):
     """duty = Kp (command - angle), at most 1; nothing else is wrong with the session."""
     (tmp_path / "chain.toml").write_text(twin_chains.chain(5))
-    scenario = twin_chains.wave(
-        duration_s=5.0, settle_s=2.0, gait={"ramp_s": 1.0}, servo={"stall_torque": 0.1}
-    )
-    (tmp_path / "weak.toml").write_text(scenario)
+    weak = {"gait": {"ramp_s": 1.0}, "servo": {"stall_torque": 0.1}}
+    (tmp_path / "weak.toml").write_text(twin_chains.wave(duration_s=5.0, settle_s=2.0, **weak))
     path = tmp_path / "weak.mcap"
     record(load_scenario(tmp_path / "weak.toml"), path)
     found = planted_artefacts.artefacts(path)
@@ -54,9 +56,7 @@ def test_a_weak_twin_gives_its_full_voltage_when_the_servo_law_says(tmp_path):
         command, angle = columns.command[name], columns.position[name]
         np.testing.assert_array_equal(command.t_ns, angle.t_ns)
         t_s = (angle.t_ns - start_ns) * 1e-9
-        inside = np.zeros(t_s.size, dtype=bool)
-        for start_s, stop_s in spans_s:
-            inside |= (t_s > start_s - 1e-6) & (t_s < stop_s - 1e-6)
+        inside = within(t_s, spans_s)
         # A stretch ends at the sample after it, which the last one has not.
         part = np.abs(duty(t_s, command.values, angle.values))[:-1]
         assert np.mean(part > 0.999) > 0.1

@@ -32,8 +32,7 @@ def write(bag, wave, epoch_ns):
             size = truth.omega * truth.gain * truth.amplitude
             rate = size * np.cos(truth.omega * t + truth.phase - truth.lag)
             torque = energy * rate / size + rng.normal(0, 0.05, joints)
-            one.write("/joint_commands", t_ns, truth.names, truth.command(own_ns))
-            one.write("/joint_states", t_ns, truth.names, q, rate, torque)
+            one.write_both(t_ns, truth.names, truth.command(own_ns), q, rate, torque)
         one.close()
         return one.path
 
@@ -87,11 +86,8 @@ def test_mean_cycles_differ_as_in_closed_form(write, wave):
 
 def test_two_runs_of_one_truth_are_equivalent(write):
     result = compared(write("a", 5), write("b", 6, late_s=0.5))
-    assert result.verdict == "same"
-    assert result.answer == (
-        "no difference found; gain and lag of all 5 joints are equivalent within 2 % and 1°"
-    )
-    assert result.named == ()
+    alike = "no difference found; gain and lag of all 5 joints are equivalent within 2 % and 1°"
+    assert (result.verdict, result.answer, result.named) == ("same", alike, ())
 
 
 def test_a_session_is_the_same_as_itself(write):
@@ -115,9 +111,8 @@ def test_energy_alone_may_differ(write):
     result = compared(write("a", 10), write("b", 11, energy=1.2))
     assert result.verdict == "small"
     assert "are equivalent within 2 % and 1°; beyond doubt" in result.answer
-    ratios = [
-        one.difference.value / one.a for one in result.differences if one.quantity == "energy_abs"
-    ]
+    energies = [one for one in result.differences if one.quantity == "energy_abs"]
+    ratios = [one.difference.value / one.a for one in energies]
     # E_abs of noisy torque is not quite proportional to it.
     assert ratios == pytest.approx([0.2] * 5, abs=0.01)
 
@@ -172,14 +167,13 @@ def test_the_page_ranks_what_differs_and_holds_every_number(write, tmp_path, com
 def test_a_page_is_not_replaced_unasked(write, tmp_path, command):
     page = tmp_path / "page.html"
     page.write_text("mine")
-    files = [str(write("a", 1)), str(write("b", 2))]
-    command("compare", *files, "-o", page, code=2)
+    command("compare", write("a", 1), write("b", 2), "-o", page, code=2)
     assert page.read_text() == "mine"
 
 
 def test_groups_by_the_command_line(write, tmp_path, command, report_of):
-    a = [str(write(f"a{k}", 20 + k, late_s=0.1 * k)) for k in range(4)]
-    b = [str(write(f"b{k}", 30 + k, late_s=0.3 * k, change=weaken)) for k in range(4)]
+    a = [write(f"a{k}", 20 + k, late_s=0.1 * k) for k in range(4)]
+    b = [write(f"b{k}", 30 + k, late_s=0.3 * k, change=weaken) for k in range(4)]
     out = tmp_path / "result.json"
     said = command("compare", "--a", *a, "--b", *b, "-o", out).out
     assert said.startswith("B differs from A: joint03 most")
@@ -189,10 +183,8 @@ def test_groups_by_the_command_line(write, tmp_path, command, report_of):
     result = report_of("compare", "--a", *a, "--b", *b, "--paired")
     assert (result["design"], result["named"][0]["name"]) == ("pairs", "joint03")
     assert " --paired" in result["provenance"]["command"]
-    assert (
-        "a copy is not a run of its own"
-        in command("compare", "--a", a[0], a[0], "--b", *b, code=1).err
-    )
+    err = command("compare", "--a", a[0], a[0], "--b", *b, code=1).err
+    assert "a copy is not a run of its own" in err
 
 
 @pytest.mark.parametrize(

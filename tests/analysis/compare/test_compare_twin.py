@@ -14,10 +14,7 @@ pytestmark = pytest.mark.slow
 WEAK = {"servo_of": {"joint03": {"stall_torque": 0.2}}}
 
 
-def wave(**tables):
-    return twin_chains.wave(
-        duration_s=7.0, settle_s=3.0, gait={"ramp_s": 0.5}, noise={"position": 0.002}, **tables
-    )
+WAVE = {"duration_s": 7.0, "settle_s": 3.0, "gait": {"ramp_s": 0.5}, "noise": {"position": 0.002}}
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +29,7 @@ def twins(tmp_path_factory):
 
     files = []
     for seed, more in enumerate(({}, {}, WEAK), start=1):
-        (folder / "wave.toml").write_text(wave(**more))
+        (folder / "wave.toml").write_text(twin_chains.wave(**WAVE, **more))
         files.append(folder / f"run{seed}.mcap")
         scenario = load_scenario(folder / "wave.toml").changed(seed=seed)
         record(scenario, files[-1], on_sample=follow if seed == 1 else None)

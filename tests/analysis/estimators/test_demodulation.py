@@ -70,9 +70,8 @@ def test_responses_on_their_own_times():
     lagging = np.interp(own, T, phi) - 0.4 - np.interp(own, T, LAG)
     values = np.interp(own, T, GAIN * AMPLITUDE) * np.sin(lagging)
     found = cycles(phi, command, Series("q", own, values))
-    np.testing.assert_allclose(
-        -np.angle(found.ratio), np.interp(middle(found), T, LAG), atol=np.radians(0.4)
-    )
+    lag = np.interp(middle(found), T, LAG)
+    np.testing.assert_allclose(-np.angle(found.ratio), lag, atol=np.radians(0.4))
 
 
 @pytest.mark.slow

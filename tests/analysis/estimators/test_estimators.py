@@ -16,16 +16,9 @@ GUESS = 2 * np.pi * 1.002  # the truth is 1 Hz
 )
 def test_lag_and_gain_reach_the_bound(rate, cycles, skew_s, lost, sigma):
     """Rife & Boorstyn 1974: at known omega var phase >= 1/(eta N), eta = A^2/(2 sigma^2)."""
-    draws = 3000
-    data = estimator_tables.sampled(
-        np.random.default_rng(7),
-        draws=draws,
-        cycles=cycles,
-        rate=rate,
-        sigma=sigma,
-        skew_s=skew_s,
-        lost=lost,
-    )
+    draws, rng = 3000, np.random.default_rng(7)
+    case = {"cycles": cycles, "rate": rate, "sigma": sigma, "skew_s": skew_s, "lost": lost}
+    data = estimator_tables.sampled(rng, draws=draws, **case)
     lag, gain, _ = estimator_tables.fitted(*data, GUESS)
     samples = round(0.8 * cycles * rate) if lost else round(cycles * rate)
     assert data[3].shape == (draws, samples)

@@ -45,26 +45,25 @@ def test_no_step_in_few_levels():
     assert lattice_step(np.sign(turn(1.0))) == 0
 
 
+FEW = {"draws": 500}
+"""The standard error of the coverage is 1 %."""
+
+
 @pytest.mark.parametrize(
-    "name",
+    ("name", "options"),
     [
-        "0.5 Hz at 50 Hz, any mean",
-        "0.5 Hz at 50 Hz, mean zero",
-        "the same, command rounded as well",
-        "the same, noise of 1 step",
+        ("0.5 Hz at 50 Hz, any mean", FEW),
+        ("0.5 Hz at 50 Hz, mean zero", FEW),
+        ("the same, command rounded as well", FEW),
+        ("the same, noise of 1 step", FEW),
+        *(
+            pytest.param(name, {"seed": 2}, marks=pytest.mark.slow)
+            for name in estimator_tables.ROUNDED
+        ),
     ],
 )
-def test_intervals_of_rounded_channels(name):
-    """500 draws: the standard error of the coverage is 1 %."""
-    covered, _, width = estimator_tables.rounded(**estimator_tables.ROUNDED[name], draws=500)
-    assert np.all(covered > 0.91)
-    assert np.all(width < 3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", list(estimator_tables.ROUNDED))
-def test_intervals_of_all_rounded_cases(name):
-    covered, _, width = estimator_tables.rounded(**estimator_tables.ROUNDED[name], seed=2)
+def test_intervals_of_rounded_channels(name, options):
+    covered, _, width = estimator_tables.rounded(**estimator_tables.ROUNDED[name], **options)
     assert np.all(covered > 0.91)
     assert np.all(width < 3)
 

@@ -120,9 +120,8 @@ def test_a_weak_module_is_found_and_named(module):
 def test_two_modules_are_named_one_after_the_other():
     model = planted()
     rng = np.random.default_rng(4)
-    seen = answered(
-        rng, model, np.zeros(3), [("stall_torque", 1, np.log(0.7)), ("mass", 5, np.log(3.0))]
-    )
+    changes = [("stall_torque", 1, np.log(0.7)), ("mass", 5, np.log(3.0))]
+    seen = answered(rng, model, np.zeros(3), changes)
     found = verdict(seen, model)
     assert set(found.named[:2]) == {1, 5}
     assert found.rest_p > 0.05

@@ -77,10 +77,8 @@ def test_heterogeneous_couplings_are_recovered_from_noisy_kicked_phases():
     chains = [Planted(rng, 7) for _ in range(6)]
     for chain, phases in zip(chains, walk(chains, rng, 60.0, 0.05, 1.0), strict=True):
         coupling = chain.answer(phases)
-        assert coupling.identifiable
-        assert coupling.kicks == 11
+        assert (coupling.identifiable, coupling.kicks, len(coupling.links)) == (True, 11, 12)
         assert coupling.condition_number < MOST_CONDITION
-        assert len(coupling.links) == 12
         errors, held = chain.errors(coupling)
         assert np.median(errors) < 0.05
         off += errors
@@ -116,8 +114,7 @@ def test_locked_phases_are_refused(noise):
     chains = [Planted(rng, 7) for _ in range(4)]
     for chain, phases in zip(chains, walk(chains, rng, 65.0, noise, 0.0, steps=2), strict=True):
         coupling = chain.answer(phases[500:])
-        assert not coupling.identifiable
-        assert coupling.links == ()
+        assert (coupling.identifiable, coupling.links) == (False, ())
         assert "locked" in coupling.why
         assert "condition number" in coupling.why
         assert "kicked as it runs" in coupling.record
@@ -137,15 +134,11 @@ def test_a_coupling_that_is_not_there_has_an_interval_from_zero():
     chain = Planted(rng, 6)
     chain.K[np.triu_indices(6)] = 0.0  # nothing from behind
     coupling = chain.answer(walk([chain], rng, 60.0, 0.05, 1.0)[0])
-    at_zero = [
-        link.K.ci95[0] == 0.0
-        for link in coupling.links
-        if chain.names.index(link.source) > chain.names.index(link.target)
-    ]
+    # Names are in the order of the chain.
+    at_zero = [link.K.ci95[0] == 0.0 for link in coupling.links if link.source > link.target]
     assert len(at_zero) == 5
     assert sum(at_zero) >= 4
-    forward = [link for link in coupling.links if link.source < link.target]
-    assert all(link.K.ci95[0] > 0.5 for link in forward)
+    assert all(link.K.ci95[0] > 0.5 for link in coupling.links if link.source < link.target)
 
 
 def test_a_known_input_is_told_apart_from_couplings():

@@ -27,29 +27,20 @@ EPS = 0.3
 def measured(random=None, scatter_deg=0.0, m=5):
     """A kick experiment on a linear chain, analysed."""
     H, c = kick_tables.chain(m)
-    experiment = kicked(
-        random or np.random.default_rng(1),
-        H,
-        c,
-        kick_tables.plan(m),
-        math.radians(scatter_deg),
-        noise=1e-6 if scatter_deg == 0.0 else None,
-    )
+    random = random or np.random.default_rng(1)
+    noise = 1e-6 if scatter_deg == 0.0 else None
+    scatter = math.radians(scatter_deg)
+    experiment = kicked(random, H, c, kick_tables.plan(m), scatter, noise=noise)
     return H, c, kick_coupling(experiment, lambda _: None)
 
 
 def exact(P, R, gain=1.0, lag=0.0):
     """A coupling that is known without error."""
     m = len(P)
-    zero = np.zeros((m, m))
-
-    def matrix(value):
-        return Matrix(rows_of(value), rows_of(zero), rows_of(zero))
-
-    _, _, like = measured(m=m)
-    nothing = tuple([0.0] * m)
-    base = BaseResponse(0.5, tuple([gain] * m), tuple([lag] * m), nothing, nothing)
-    return dataclasses.replace(like, P=matrix(P), R=matrix(R), base=base)
+    zero, nothing = rows_of(np.zeros((m, m))), (0.0,) * m
+    base = BaseResponse(0.5, (gain,) * m, (lag,) * m, nothing, nothing)
+    P, R = (Matrix(rows_of(value), zero, zero) for value in (P, R))
+    return dataclasses.replace(measured(m=m)[2], P=P, R=R, base=base)
 
 
 @pytest.mark.parametrize("m", [4, 7])
@@ -194,11 +185,8 @@ def test_wrong_usage(result, words, code, told, command):
 
 
 def test_sessions_without_kicks_fail_and_say_what_to_record(result, command):
-    _, sessions = result
-    assert (
-        "phase-kicks around this gait"
-        in command("predict", sessions[0], "--eps", "0.3", code=1).err
-    )
+    words = ("predict", result[1][0], "--eps", "0.3")
+    assert "phase-kicks around this gait" in command(*words, code=1).err
     command("predict", code=2)
 
 

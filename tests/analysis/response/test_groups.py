@@ -209,8 +209,7 @@ def test_one_gait_is_not_split_by_noise_modulation_or_harmonics(seed):
         0.6 * wave + np.sin(2 * (omega * t - k)) * (k < 4),
     ):
         found = find_groups([Series(f"j{i}", t, one) for i, one in enumerate(commands)], 15.0)
-        assert len(found.rhythms) == 1
-        assert found.unresolved == ()
+        assert (len(found.rhythms), found.unresolved) == (1, ())
 
 
 def test_too_slow_or_too_few_samples_for_a_group_are_reported():

@@ -51,8 +51,7 @@ def test_every_joint_is_compared_at_its_own_frequency(slither):
         group = found[joint]
         assert group.frequency_hz.value == pytest.approx(frequency, rel=1e-9)
         (window,) = group.windows
-        assert window.cycles == np.floor(15.0 * frequency)
-        assert group.wave == "head-to-tail"
+        assert (window.cycles, group.wave) == (np.floor(15.0 * frequency), "head-to-tail")
         assert group.lag_per_joint_rad == {"chain": pytest.approx(-1.6)}
     assert result.gait.frequency_hz == result.gait.groups[0].frequency_hz
     for joint in result.joints:

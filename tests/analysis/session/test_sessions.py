@@ -100,8 +100,7 @@ def test_energies_of_sinusoidal_torque_and_velocity(bag, epoch_ns):
         one.write_both(epoch_ns + tick * 10**7, ["a", "b"], q, q, rate, effort)
     result = one.analysed()
     (window,) = result.gait.windows
-    assert window.cycles == 8
-    assert window.stop_s - window.start_s == pytest.approx(10.0)
+    assert (window.cycles, window.stop_s - window.start_s) == (8, pytest.approx(10.0))
     net = torque * speed * np.sin(phase) / 2 * 10
     # |sin(wt + p) cos(wt)| = |sin(2wt + p) + sin p| / 2, mean over a cycle.
     absolute = torque * speed * (np.abs(phase) * np.sin(np.abs(phase)) + np.cos(phase)) / np.pi * 10

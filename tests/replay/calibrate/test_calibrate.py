@@ -101,8 +101,7 @@ def test_wrong_usage_says_what_would_be_right(small, tmp_path, words, told, comm
     words = words.replace("a.", f"{tmp_path}/a.").split()
     code = 1 if "--settle" in words else 2
     assert told in command("sim", "fit", small / "run.mcap", *words, code=code).err
-    assert list(tmp_path.iterdir()) == [mine]
-    assert mine.read_text() == "mine"
+    assert (list(tmp_path.iterdir()), mine.read_text()) == ([mine], "mine")
 
 
 def test_an_interrupted_fit_leaves_nothing(small, tmp_path, monkeypatch, command):

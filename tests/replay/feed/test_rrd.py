@@ -132,8 +132,7 @@ def test_a_recording_is_replaced_by_a_whole_one_only(session_file, tmp_path):
 
     with pytest.raises(RuntimeError, match="no layout"):
         converted(session_file, path, layout=fail)
-    assert path.read_bytes() == b"the former one"
-    assert list(tmp_path.iterdir()) == [path]
+    assert (path.read_bytes(), list(tmp_path.iterdir())) == (b"the former one", [path])
 
 
 def test_a_folder_that_is_not_there_is_an_error(session_file, tmp_path):

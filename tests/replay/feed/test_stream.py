@@ -112,17 +112,15 @@ def test_a_long_session_arrives_whole_after_a_brief_survey(receive, long_file, t
     with Session.open(long_file) as session:
         layer = computed(session)
         path = tmp_path / "saved.rrd"
-        written = write_recording(
-            session, path, analysis=layer.analysis, steady=layer.steady, notes=layer.notes
-        )
+        shown = {"analysis": layer.analysis, "steady": layer.steady, "notes": layer.notes}
+        written = write_recording(session, path, **shown)
     saved = read_back(path)
     assert notes == written.warnings
     assert drawn(received) == drawn(saved)
     for entity in drawn(saved):
         # Once each, at its own time, beginning and rest joined without a seam.
-        np.testing.assert_array_equal(
-            np.sort(received.times(entity)), np.sort(saved.times(entity)), entity
-        )
+        ours, theirs = (np.sort(one.times(entity)) for one in (received, saved))
+        np.testing.assert_array_equal(ours, theirs, entity)
     for entity in ("/joints/measured", "/power/mechanical", "/joints/places/commanded"):
         for component, rows in rows_of(saved, entity).items():
             ours = np.array([row for _, row in rows_of(received, entity)[component]], dtype=float)
@@ -165,9 +163,8 @@ def test_without_odometry_the_body_is_drawn_throughout(
     saved = read_back(tmp_path / "saved.rrd")
     assert "no /odom in the session: the head is held at the origin" in notes
     for entity in ("/world/snake/measured", "/world/snake/commanded"):
-        np.testing.assert_array_equal(
-            np.sort(received.times(entity)), np.sort(saved.times(entity)), entity
-        )
+        ours, theirs = (np.sort(one.times(entity)) for one in (received, saved))
+        np.testing.assert_array_equal(ours, theirs, entity)
 
 
 def test_the_layout_foreseen_is_that_of_the_analysed_session(tmp_path):
@@ -179,9 +176,8 @@ def test_the_layout_foreseen_is_that_of_the_analysed_session(tmp_path):
     assert progressive.same_arrangement(progressive.predict_layout(before, rhythm), content)
     assert not progressive.same_arrangement(progressive.predict_layout(before, None), content)
     assert not progressive.same_arrangement(before, content)
-    assert progressive.predict_layout(replace(before, commanded=()), rhythm) == replace(
-        before, commanded=()
-    )
+    silent = replace(before, commanded=())
+    assert progressive.predict_layout(silent, rhythm) == silent
 
 
 def test_an_end_that_is_asked_for_comes_soon_and_ends_the_viewer(long_file, tmp_path):

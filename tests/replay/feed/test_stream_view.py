@@ -45,15 +45,8 @@ class Shown:
 
     def __init__(self, file, scratch, *options):
         self.scratch = scratch
-        self.process = processes.start(
-            sys.executable,
-            "-c",
-            HEADLESS,
-            "view",
-            file,
-            *options,
-            env={**os.environ, "TMPDIR": str(scratch)},
-        )
+        words, env = (sys.executable, "-c", HEADLESS, "view", file), {"TMPDIR": str(scratch)}
+        self.process = processes.start(*words, *options, env=os.environ | env)
         address = self.process.stdout.readline().strip()
         page, _, query = address.partition("/?url=")
         self.page, self.address = page, unquote(query) if query else address
@@ -181,8 +174,7 @@ def test_a_viewer_that_is_killed_is_told(view, long_file, rgb):
     until_the_body_stands(shown, rgb)
     os.kill(viewer_of(shown), signal.SIGKILL)
     code, out, err = shown.finish()
-    assert (code, out) == (1, "")
-    assert err == "error: the Rerun viewer was ended by signal 9\n"
+    assert (code, out, err) == (1, "", "error: the Rerun viewer was ended by signal 9\n")
 
 
 def test_a_frozen_viewer_takes_no_memory_and_can_be_ended(view, long_file, rgb):

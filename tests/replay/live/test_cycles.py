@@ -1,14 +1,13 @@
 """Cycles computed while a session comes in are those of its analysis."""
 
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
 from support.live_stage import EPOCH_NS, WAIT_S, Relay, seen_live
+from support.processes import UNDULOG, process
 from support.written_topics import write_topics
 from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
@@ -100,9 +99,8 @@ def test_cycles_are_those_of_the_analysis_however_they_come_in(walk, length_ns):
     }
     assert len(expected) == 13 * 4  # two whole cycles and their surroundings in either run
     assert told.keys() == expected.keys()
-    np.testing.assert_allclose(
-        [told[key] for key in expected], [*expected.values()], rtol=0, atol=1e-9
-    )
+    ours = [told[key] for key in expected]
+    np.testing.assert_allclose(ours, [*expected.values()], rtol=0, atol=1e-9)
 
 
 def test_gain_lag_and_power_are_those_that_were_written(walk, snake25):
@@ -140,9 +138,8 @@ def test_the_live_view_draws_bars_and_steps_of_each_cycle(walk, snake25, tmp_pat
             bar = f"/segments/{key}/estimate/{snake25.joint_names[i]}"
             assert drawn.times(bar).tolist() == starts
             heights = [row[0]["buffer"] for row in drawn.column(bar, "BarChart:values")]
-            np.testing.assert_allclose(
-                np.ravel(heights).astype(float), [of(cycle)[i] for cycle in expected], atol=1e-4
-            )
+            own = [of(cycle)[i] for cycle in expected]
+            np.testing.assert_allclose(np.ravel(heights).astype(float), own, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -153,17 +150,14 @@ def test_a_real_recording_is_seen_as_it_is_analysed_afterwards(tmp_path, read_ba
     session_file, sockets = tmp_path / "run.mcap", tmp_path / "undulog"
     sockets.mkdir(mode=0o700)
     relay = Relay(sockets / "run.live", tmp_path / "live.rrd")
-    words = ["record", "twin:weak-servo-pi3", "-o", str(session_file), "--duration", "9s"]
-    recorder = subprocess.Popen(
-        [sys.executable, "-m", "undulog", *words, "--quiet"], env=environment
-    )
+    words = ("record", "twin:weak-servo-pi3", "-o", session_file, "--duration", "9s", "--quiet")
     try:
-        report = relay.finish()
-        assert recorder.wait(WAIT_S) == 0
+        with process(*UNDULOG, *words, env=environment) as recorder:
+            report = relay.finish()
+            assert recorder.wait(WAIT_S) == 0
     finally:
-        for process in (recorder, relay.process):
-            process.kill()
-            process.wait()
+        relay.process.kill()
+        relay.process.wait()
     assert report["dropped"] == report["unread"] == 0
     drawn = read_back(tmp_path / "live.rrd")
     joints = {one.name: one for one in analyse_session(opened(session_file)).over_time.joints}

@@ -34,17 +34,13 @@ def test_every_message_is_shown(live, session_file, opened):
 
 def test_angles_and_power_are_those_that_were_measured(live, truth):
     _, drawn = live
+    angle, scalar = "Angle:degrees", "Scalars:scalars"
     for entity, component, values, atol in (
-        ("/joints/measured", "Angle:degrees", np.degrees(truth.position), 2e-6),
-        ("/joints/commanded", "Angle:degrees", np.degrees(truth.command), 2e-6),
-        ("/joints/error", "Angle:degrees", np.degrees(truth.position - truth.command), 2e-6),
-        ("/power/mechanical", "Scalars:scalars", truth.effort * truth.velocity, 1e-8),
-        (
-            "/power/total/electrical",
-            "Scalars:scalars",
-            6.0 * truth.effort.sum(axis=1)[:, None],
-            1e-6,
-        ),
+        ("/joints/measured", angle, np.degrees(truth.position), 2e-6),
+        ("/joints/commanded", angle, np.degrees(truth.command), 2e-6),
+        ("/joints/error", angle, np.degrees(truth.position - truth.command), 2e-6),
+        ("/power/mechanical", scalar, truth.effort * truth.velocity, 1e-8),
+        ("/power/total/electrical", scalar, 6.0 * truth.effort.sum(axis=1)[:, None], 1e-6),
     ):
         found = drawn.rows(entity, component)
         assert list(found) == (truth.t_ns - EPOCH_NS).tolist()

@@ -37,8 +37,7 @@ def test_frozen_and_killed_viewer_costs_the_feed_nothing(stage, server):
     assert recorder.send(1.0, 2.0) == 50
     process.kill()
     assert recorder.send(2.0) >= 49
-    assert recorder.feed.counts.dropped == 0
-    assert relay.process.poll() is None
+    assert (recorder.feed.counts.dropped, relay.process.poll()) == (0, None)
     relay.process.send_signal(signal.SIGTERM)
     relay.process.communicate(timeout=WAIT_S)
     assert not stage.path.exists()
@@ -74,8 +73,7 @@ def test_web_serves_this_machine_only_and_leaves_nothing(stage):
         Path(f"/proc/{relay.process.pid}/task/{relay.process.pid}/children").read_text().split()
     )
     ports = {int(text) for text in re.findall(r"(?:127.0.0.1:|127.0.0.1%3A)(\d+)", page)}
-    assert len(ports) == 2
-    assert listening(*ports) == {("0100007F", port) for port in ports}
+    assert (len(ports), listening(*ports)) == (2, {("0100007F", port) for port in ports})
     relay.process.send_signal(signal.SIGINT)
     relay.process.communicate(timeout=WAIT_S)
     assert relay.process.returncode == 0

@@ -421,8 +421,7 @@ def test_an_end_that_is_asked_for_leaves_what_was_there(converted, tmp_path):
     stop.signal = signal.SIGTERM
     with pytest.raises(LogWriteError, match="stopped on request"):
         write_overlay(converted, path, Align.TIME, stop=stop)
-    assert path.read_bytes() == b"mine"
-    assert list(tmp_path.iterdir()) == [path]
+    assert (path.read_bytes(), list(tmp_path.iterdir())) == (b"mine", [path])
 
 
 def test_an_end_that_is_asked_for_is_noticed_while_a_session_is_read(files, tmp_path, opened):

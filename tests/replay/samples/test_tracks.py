@@ -38,14 +38,12 @@ def test_a_lost_sample_stays_a_hole():
 
 
 def test_resampling_puts_columns_in_order_and_leaves_unknown_joints_nan():
-    found = tracks.resampled(
-        [track("b", T + 5), track("a")], ("a", "x", "b"), T[1:3], tracks.interpolate
-    )
+    b = track("b", T + 5)
+    found = tracks.resampled([b, track("a")], ("a", "x", "b"), T[1:3], tracks.interpolate)
     np.testing.assert_allclose(found[:, [0, 2]], [[1.0, 0.5], [2.0, 1.5]])
     assert np.isnan(found[:, 1]).all()
-    np.testing.assert_array_equal(
-        tracks.resampled([track("b", T + 5)], ("b",), T[1:3], tracks.hold), [[0.0], [1.0]]
-    )
+    held = tracks.resampled([b], ("b",), T[1:3], tracks.hold)
+    np.testing.assert_array_equal(held, [[0.0], [1.0]])
 
 
 def test_joints_in_turn_have_one_sample_between_two_of_the_first():
@@ -66,7 +64,7 @@ def test_joints_in_turn_are_brought_to_the_first_ones_times():
     assert np.isnan(table.values[-1, 1])  # nothing comes after it
 
 
-MS = 1_000_000
+MS, NAN = 1_000_000, np.nan
 
 
 def ticks(*milliseconds):
@@ -108,25 +106,18 @@ def test_nothing_is_drawn_across_a_gap():
 @pytest.mark.parametrize(
     ("t", "values", "at", "expected"),
     [
-        (
-            (0, 10, 20, 30),
-            [0.0, np.nan, 2.0, 3.0],
-            (0, 5, 10, 15, 20, 25),
-            [0, *[np.nan] * 3, 2, 2.5],
-        ),
+        ((0, 10, 20, 30), [0, NAN, 2, 3], (0, 5, 10, 15, 20, 25), [0, NAN, NAN, NAN, 2, 2.5]),
         ((0, 10), [[0.0, 10.0], [1.0, 20.0]], (5,), [[0.5, 15.0]]),
     ],
 )
 def test_a_missing_sample_spoils_its_neighbourhood_only(t, values, at, expected):
-    np.testing.assert_array_equal(
-        tracks.interpolate(ticks(*t), np.array(values), ticks(*at)), expected
-    )
+    found = tracks.interpolate(ticks(*t), np.array(values), ticks(*at))
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_a_command_is_held_until_the_next():
-    found = tracks.hold(
-        ticks(0, 10, 20), np.array([1.0, 2.0, 3.0]), ticks(-1, 0, 9, 10, 19, 69, 71)
-    )
+    at = ticks(-1, 0, 9, 10, 19, 69, 71)
+    found = tracks.hold(ticks(0, 10, 20), np.array([1.0, 2.0, 3.0]), at)
     np.testing.assert_array_equal(found, [np.nan, 1.0, 1.0, 2.0, 2.0, 3.0, np.nan])
 
 
@@ -148,8 +139,7 @@ def test_silence_before_the_end_is_a_gap():
     np.testing.assert_array_equal(found[0], ticks(0, 10, 20, 30))
     assert np.isnan(found[1][-1]).all()
     whole = tracks.mark_gaps(t, values, end_ns=40 * MS)
-    assert whole[0] is t
-    assert whole[1] is values
+    assert all(one is given for one, given in zip(whole, (t, values), strict=True))
 
 
 def test_samples_out_of_order_are_sorted():
@@ -186,12 +176,8 @@ def test_a_step_follows_the_range_of_nearly_all_samples():
 
 
 def test_a_flat_line_and_no_line_are_left_alone():
-    assert (
-        tracks.plot_step(np.full(10, 3.3))
-        == tracks.plot_step(np.zeros(0))
-        == tracks.plot_step(np.full(3, np.nan))
-        == 0
-    )
+    flat = (np.full(10, 3.3), np.zeros(0), np.full(3, np.nan))
+    assert [tracks.plot_step(one) for one in flat] == [0, 0, 0]
     values = np.array([[0.1, 0.1], [np.nan, 0.3]])
     np.testing.assert_array_equal(tracks.rounded(values, [0.0, 0.0]), values)
     np.testing.assert_array_equal(tracks.rounded(values, [0.25, 0.0]), [[0.0, 0.1], [np.nan, 0.3]])

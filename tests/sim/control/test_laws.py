@@ -124,9 +124,8 @@ def test_path_heading_has_neither_the_swing_nor_half_a_period_of_delay(turn_rate
     """Across the cut at pi, and while a turn begins: without the model it would be pi c Y late."""
     phase, way, told = swing(turn_rate)
     error = np.abs([math.remainder(e, filters.TURN) for e in told - way])
-    assert (
-        error[phase > filters.TURN].max() < 0.005
-    )  # the trapezoidal rule, and a sample more or less
+    # The trapezoidal rule, and a sample more or less:
+    assert error[phase > filters.TURN].max() < 0.005
     assert error[phase < filters.TURN].max() > 0.1  # not yet a period
 
 

@@ -247,8 +247,7 @@ def test_the_course_turns_the_body():
     field = {"compass": np.array(north_at(0.0))}
     ticks = [gait.step(k / 100, Readings(STILL, STILL, {}, {}, field)) for k in range(150)]
     values = dict(zip(gait.names, ticks[-1].values, strict=True))
-    assert values["steer.offset"] == pytest.approx(0.2, abs=2e-3)
-    assert ticks[-1].mode == TURN
+    assert (values["steer.offset"], ticks[-1].mode) == (pytest.approx(0.2, abs=2e-3), TURN)
 
 
 def gliding(robot: Robot, speed, curve, time_s):

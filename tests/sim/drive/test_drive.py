@@ -128,9 +128,8 @@ def test_a_plan_is_driven_and_kept_in_the_session(tmp_path, command, opened):
     again = tmp_path / "again.mcap"
     command("drive", path, "--on", "twin", "-o", again)
     assert column_bytes(again) == column_bytes(path)
-    assert (
-        opened(again).attachments["plan.toml"].decode() == PLAN
-    )  # what the commands were made from
+    # What the commands were made from:
+    assert opened(again).attachments["plan.toml"].decode() == PLAN
 
 
 def test_a_gait_can_be_driven_in_another_world(tmp_path, command):
@@ -249,12 +248,10 @@ def test_each_joint_holds_its_newest_command(tmp_path, make_robot):
 def test_commands_without_a_gait_give_a_session_without_one(tmp_path, command):
     source = tmp_path / "given.mcap"
     written(source, [(0, (0.0, 0.0)), (50_000_000, (0.1, 0.0))])
-    path = tmp_path / "a.mcap"
-    assert (
-        "name one by its world" in command("drive", source, "--on", "twin", "-o", path, code=1).err
-    )
-    command("drive", source, "--on", "twin:flat", "-o", path)
-    with Session.open(path) as session:
+    words = ("drive", source, "-o", tmp_path / "a.mcap", "--on")
+    assert "name one by its world" in command(*words, "twin", code=1).err
+    command(*words, "twin:flat")
+    with Session.open(tmp_path / "a.mcap") as session:
         assert "/gait" not in session.channels
         given = session.joints("/joint_commands").signal("joint01").values.tolist()
         assert given == [*[0.0] * 5, 0.1]

@@ -68,8 +68,7 @@ def test_a_recorder_is_told_the_gait_through_its_control_socket(tmp_path, alone)
         commands = session.joints("/joint_commands")
         states = session.joints("/joint_states")
         assert session.robot.name == "snake25"
-    assert len(gait.t_ns[0]) == report["ticks"]
-    assert modes == ["walk"]
+    assert (len(gait.t_ns[0]), modes) == (report["ticks"], ["walk"])
     assert any(text.startswith("drives weak-servo-pi3 (gait) on can:") for text in said)
     assert any(text.startswith("drove weak-servo-pi3 for 2 s") for text in said)
     assert len(states.t_ns[0]) > 50

@@ -75,8 +75,7 @@ def test_what_json_has_no_number_for_is_null(tmp_path):
 def test_commands_without_a_gait_publish_their_mode_only(tmp_path):
     with publishing(tmp_path / "a.sock", ()) as (teller, heard):
         teller.publish(tick(0, "replay", count=0), 1)
-    assert heard == [{"do": "mode", "text": "replay"}]
-    assert teller.told == 0
+    assert (heard, teller.told) == ([{"do": "mode", "text": "replay"}], 0)
 
 
 def test_a_recorder_that_goes_or_refuses_is_told_nothing_more(tmp_path):

@@ -71,9 +71,8 @@ def test_a_bidirectional_chain_locks_at_the_lag_it_asks_for(make_robot, kind, si
 def test_a_locked_chain_is_the_serpentine_gait(make_robot, kind):
     robot = make_robot()
     _, commands, amplitudes = run(robot, 6.0, oscillator=kind)
-    serpentine = SerpentineGait(
-        Serpentine({Plane.HORIZONTAL: PlaneGait(0.4, 0.5, PSI)}, 0.0), robot
-    )
+    wave = Serpentine({Plane.HORIZONTAL: PlaneGait(0.4, 0.5, PSI)}, 0.0)
+    serpentine = SerpentineGait(wave, robot)
     t = np.arange(601) / 100
     expected = [serpentine.step(x, nothing(25)).command[0::2] for x in t]
     np.testing.assert_allclose(commands[500:], expected[500:], atol=1e-6)
@@ -188,15 +187,9 @@ def test_hopf_oscillators_against_scipy_and_the_paper_s_form(make_robot):
     first = np.concatenate([A * np.cos(phase), A * np.sin(phase)])
     times = np.arange(801) / 100
     foreign = solve_ivp(rate, (0, 8.0), first, "DOP853", t_eval=times, rtol=1e-11, atol=1e-12).y.T
-    _, commands, _ = run(
-        make_robot(n + 1, planar=True),
-        8.0,
-        oscillator=OscillatorKind.HOPF,
-        amplitude=A,
-        attraction=alpha,
-        approach_rate=100.0,
-        **chain(forward, backward, detuning, start),
-    )
+    fields = chain(forward, backward, detuning, start) | {"oscillator": OscillatorKind.HOPF}
+    fields |= {"amplitude": A, "attraction": alpha, "approach_rate": 100.0}
+    _, commands, _ = run(make_robot(n + 1, planar=True), 8.0, **fields)
     np.testing.assert_allclose(commands[100:], foreign[100:, n:], atol=1e-7)
 
 
@@ -228,9 +221,8 @@ def test_the_approach_against_scipy_under_moving_targets():
 
 def test_a_change_of_amplitude_and_offset_does_not_jump(make_robot):
     robot = make_robot(7, planar=True)
-    gait = OscillatorGait(
-        OscillatorChains({Plane.HORIZONTAL: OscillatorChain(0.3, 0.5, PSI)}), robot
-    )
+    chains = OscillatorChains({Plane.HORIZONTAL: OscillatorChain(0.3, 0.5, PSI)})
+    gait = OscillatorGait(chains, robot)
     commands = []
     for k in range(800):
         if k == 400:

@@ -218,8 +218,7 @@ def test_where_nobody_hears_or_another_commands_nothing_more_is_sent(kind):
     bench = Bench(duration_s=60.0).running()
     count = len(bench.sent)
     assert bench.step(trouble=GateFault(kind, "so")).command is None
-    assert bench.gate.phase is Phase.DONE
-    assert len(bench.sent) == count
+    assert (bench.gate.phase, len(bench.sent)) == (Phase.DONE, count)
     assert bench.gate.outcome.ended.startswith("nothing more was sent")
 
 

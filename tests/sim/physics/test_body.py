@@ -158,8 +158,7 @@ def test_the_urdf_describes_the_same_body(uneven, tmp_path):
 
 def test_the_urdf_is_plain_xml_with_shapes(uneven):
     root = ET.fromstring(urdf(uneven))
-    assert root.get("name") == uneven.name
-    assert len(root.findall("link")) == 5
+    assert (root.get("name"), len(root.findall("link"))) == (uneven.name, 5)
     assert {len(link.findall("visual")) for link in root.findall("link")} == {3}
 
 

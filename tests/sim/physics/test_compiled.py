@@ -27,20 +27,12 @@ def uneven(make_uneven):
     """Servos and radii differ too."""
     robot = make_uneven(6)
     links = [dataclasses.replace(one, radius=0.02 + 1e-3 * i) for i, one in enumerate(robot.links)]
-    servos = [
-        dataclasses.replace(
-            joint.servo,
-            stall_torque=0.2 + 0.1 * i,
-            backlash=0.02 * (i % 2),
-            supply_v=6 + i,
-            static_friction=0.05 * (i % 3 == 0),
-        )
-        for i, joint in enumerate(robot.joints)
-    ]
-    joints = [
-        dataclasses.replace(joint, servo=servo)
-        for joint, servo in zip(robot.joints, servos, strict=True)
-    ]
+    joints = []
+    for i, joint in enumerate(robot.joints):
+        own = {"stall_torque": 0.2 + 0.1 * i, "backlash": 0.02 * (i % 2), "supply_v": 6 + i}
+        own["static_friction"] = 0.05 * (i % 3 == 0)
+        servo = dataclasses.replace(joint.servo, **own)
+        joints.append(dataclasses.replace(joint, servo=servo))
     return dataclasses.replace(robot, links=tuple(links), joints=tuple(joints))
 
 
@@ -139,9 +131,8 @@ def test_compiled_runs_give_the_same_bytes_and_say_how_they_were_made(
 )
 def test_a_missing_extra_is_named_and_auto_goes_without(tmp_path, package, words):
     engine = "mujoco" if package == "mujoco" else "bullet"
-    scenario = dataclasses.replace(
-        load_scenario("flat").changed(duration_s=0.02), engine=EngineKind(engine)
-    )
+    short = load_scenario("flat").changed(duration_s=0.02)
+    scenario = dataclasses.replace(short, engine=EngineKind(engine))
     (tmp_path / "a.toml").write_text(scenario.toml())
     code = (
         f"import sys; sys.modules[{package!r}] = None; import undulog\n"

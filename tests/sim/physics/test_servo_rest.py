@@ -51,14 +51,9 @@ def test_it_comes_to_rest_where_friction_can_hold_it_and_stays_there_bit_by_bit(
 
 
 def test_a_free_rotor_stops_after_j_om2_over_2_t_c():
-    servo = Servo(
-        stall_torque=1e-12,  # no drag by the winding
-        viscous_friction=0.0,
-        gear_stiffness=0.0,
-        gear_damping=0.0,
-        coulomb_friction=0.03,
-        static_friction=0.03,
-    )
+    nothing = dict.fromkeys(("viscous_friction", "gear_stiffness", "gear_damping"), 0.0)
+    # Without drag by the winding either:
+    servo = Servo(stall_torque=1e-12, coulomb_friction=0.03, static_friction=0.03, **nothing)
     servos, zero, dt = Servos([servo]), np.zeros(1), 1e-5
     state = Rotors(np.zeros(1), np.array([2.0]))
     steps = 0
@@ -91,9 +86,8 @@ def test_servos_without_it_keep_their_smooth_friction_beside_one_that_has_it():
 
 def test_a_scenario_asks_for_it_and_less_than_kinetic_friction_is_a_fault():
     text = load_scenario("flat").toml()
-    scenario = parse_scenario(
-        text, "flat.toml", changes={"servo.static_friction": 0.05, "servo.stribeck_speed": 0.1}
-    )
+    changes = {"servo.static_friction": 0.05, "servo.stribeck_speed": 0.1}
+    scenario = parse_scenario(text, "flat.toml", changes=changes)
     servo = scenario.robot.joints[0].servo
     assert (servo.static_friction, servo.stribeck_speed) == (0.05, 0.1)
     assert parse_scenario(scenario.toml(), "flat.toml").robot.joints[0].servo == servo

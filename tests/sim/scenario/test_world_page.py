@@ -15,8 +15,7 @@ def test_the_examples_make_a_scenario():
     examples = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     scenario = sim.parse_scenario("\n".join(examples), "x.toml")
     assert [push.link for push in scenario.disturbances] == ["link07"]
-    assert len(scenario.world.obstacles) == 10
-    assert scenario.sensing.ir.noise_v == 0.058
+    assert (len(scenario.world.obstacles), scenario.sensing.ir.noise_v) == (10, 0.058)
 
 
 @pytest.mark.parametrize(

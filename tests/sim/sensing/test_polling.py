@@ -61,8 +61,7 @@ def test_a_cycle_comes_two_ticks_after_its_start_and_each_tick_has_one():
     released = [[sample.cycle for sample in poll.observe(period)] for period in ramps(5)]
     # The period that is handed over p-th ends with tick p + 1.
     assert released == [[], [0], [1], [2], [3]]
-    assert [sample.cycle for sample in poll.flush()] == [4, 5]
-    assert poll.flush() == []
+    assert ([sample.cycle for sample in poll.flush()], poll.flush()) == ([4, 5], [])
 
 
 def test_a_run_without_a_control_period_has_no_cycle_and_a_short_one_has_all():

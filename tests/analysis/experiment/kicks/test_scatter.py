@@ -32,10 +32,8 @@ def coupled(experiment):
     + [(0.1, how, 6) for how in ("each", "common", "odd", "drift")],
 )
 def test_intervals_hold_and_a_linear_robot_is_linear(scatter_deg, how, base_runs):
-    random = np.random.default_rng(3)
-    found = kick_tables.row(
-        random, 50, 5, scatter_deg, how=how, base_runs=base_runs, index=scatter_deg == 0.1
-    )
+    random, options = np.random.default_rng(3), {"how": how, "base_runs": base_runs}
+    found = kick_tables.row(random, 50, 5, scatter_deg, **options, index=scatter_deg == 0.1)
     assert min(found[name] for name in "PRGS") >= 0.91
     assert found["worst"] >= 0.90  # of one row, 250 elements that share an estimate of scatter
     assert found["nonlinear"] <= 0.05
@@ -69,16 +67,14 @@ def test_the_errors_of_a_run_are_those_planted(common):
     random = np.random.default_rng(6)
     L = H * c[None, :] / (H @ c)[:, None]
     found, correlated = [], []
-    for answers in kick_tables.experiments(
-        random, count, kicks, H, c, scatter=sigma, how="common" if common else "each"
-    ):
+    how = {"scatter": sigma, "how": "common" if common else "each"}
+    for answers in kick_tables.experiments(random, count, kicks, H, c, **how):
         variance = np.hstack([answers.phase_variance, answers.log_gain_variance])
         errors = run_errors(kicks, answers.log, variance, (L, L))
         found.append(errors.variance)
         correlated.append(errors.correlation[0, 1])
-        assert (
-            errors.dof == 2 + 2 * (m - 2) + 1
-        )  # repeats, others' pairs of two kinds, the rows' sum
+        # Repeats, others' pairs of two kinds, the rows' sum.
+        assert errors.dof == 2 + 2 * (m - 2) + 1
     expected = sigma**2 + kick_tables.NOISE**2
     np.testing.assert_allclose(np.mean(found, axis=0), expected, rtol=0.1)
     # Each estimate has the spread of a mean of seven squares.

@@ -76,8 +76,7 @@ def test_many_labellings_of_strata_are_drawn_at_random():
     index = np.repeat([0, 1], 6)
     strata = Strata.of(index, index)
     labels = strata.labellings()
-    assert strata.count == 924**2
-    assert labels.shape == (10_000, 24)
+    assert (strata.count, labels.shape) == (924**2, (10_000, 24))
     for s in (0, 1):
         assert (labels[:, strata.index == s].sum(axis=1) == 6).all()
     with pytest.raises(UsageError, match="fewer than 2 runs of a way"):

@@ -57,10 +57,8 @@ def write_run(
     t = np.arange(RATE * SECONDS)[:, None] / RATE
     shift = rng.uniform(-np.pi, np.pi)
     turn = [np.exp(1j * omega * (t + shift)) for omega in omegas]
-    moved = [
-        response(w) @ c * x * (1 + drift * t)
-        for w, c, x in zip(omegas, commands, turn, strict=True)
-    ]
+    tones = zip(omegas, commands, turn, strict=True)
+    moved = [response(w) @ c * x * (1 + drift * t) for w, c, x in tones]
     angle = np.real(sum(moved))
     speed = np.real(sum(1j * w * q for w, q in zip(omegas, moved, strict=True)))
     torque = sum(np.real(q @ impedance(w).T) for w, q in zip(omegas, moved, strict=True))
@@ -155,8 +153,7 @@ def test_the_text_and_the_object(result, lag_sweep, report_of):
     coupling = report_of("analyse", *lag_sweep)["coupling"]
     assert coupling["identifiable"] is True
     (tone,) = coupling["tones"]
-    assert tone["route"] == "torque"
-    assert np.shape(tone["Z"]["real"]) == (M, M)
+    assert (tone["route"], np.shape(tone["Z"]["real"])) == ("torque", (M, M))
     H = np.array(tone["H"]["real"]) + 1j * np.array(tone["H"]["imag"])
     np.testing.assert_allclose(coupling["matrix"], np.abs(H))
 
@@ -234,8 +231,7 @@ def test_a_multisine_in_contact_tells_what_is_mixed(tmp_path, opened):
     paths = sweep(tmp_path, robot=ROBOT, **how)
     result = experiment(paths)
     coupling = result.coupling
-    assert coupling.identifiable
-    assert coupling.contact is True
+    assert (coupling.identifiable, coupling.contact) == (True, True)
     assert coupling.validity.startswith("in contact")
     assert any(one.startswith("not linear") for one in result.warnings)
     # A record holds two periods of the grid: line k of 0.1 Hz is bin 2 k of its transform.

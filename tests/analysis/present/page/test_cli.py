@@ -44,8 +44,7 @@ def test_several_sessions_are_one_experiment(both_ways_files, tmp_path, command,
     told = page.read_text(encoding="utf-8").replace("\N{NO-BREAK SPACE}", " ")
     assert f"The modules differ: {order}" in told
     said = report_of("report", *files, "-o", page, "--force")
-    assert said["answer"] == first
-    assert [one["path"] for one in said["answers"]] == files
+    assert (said["answer"], [one["path"] for one in said["answers"]]) == (first, files)
 
 
 def test_an_existing_page_stays_without_force(recorded, tmp_path, command):

@@ -64,11 +64,8 @@ def test_what_three_harmonics_do_not_hold_is_kept(rhythm):
 
 def test_the_interval_holds_the_truth_as_often_as_it_says(rhythm):
     t = jittered()
-    rng = np.random.default_rng(11)
-    tracks = [
-        Track(str(i), ns(t), 0.4 * np.sin(chirp(t)) + 0.02 * rng.standard_normal(t.size))
-        for i in range(60)
-    ]
+    waves = 0.4 * np.sin(chirp(t)) + 0.02 * np.random.default_rng(11).standard_normal((60, t.size))
+    tracks = [Track(str(i), ns(t), wave) for i, wave in enumerate(waves)]
     found = mean_cycles(tracks, pace(rhythm))
     assert 0.93 < (np.abs(found.value - 0.4 * np.sin(PHASE)) <= found.half)[:, :-1].mean() < 0.97
 
@@ -135,10 +132,8 @@ def test_the_frame_goes_along_with_the_body(snake25):
     assert np.linalg.eigvalsh(mean).min() > 0
     # And it is the same body: a rigid motion of what forward kinematics has.
     world, _ = link_poses(snake25, np.zeros((7, 3)), np.tile(np.eye(3), (7, 1, 1)), angles)
-    apart = np.linalg.norm(world[:, :, None] - world[:, None], axis=-1)
-    np.testing.assert_allclose(
-        np.linalg.norm(centre[:, :, None] - centre[:, None], axis=-1), apart, atol=1e-12
-    )
+    own, other = (np.linalg.norm(x[:, :, None] - x[:, None], axis=-1) for x in (centre, world))
+    np.testing.assert_allclose(own, other, atol=1e-12)
 
 
 def test_a_straight_body_lies_along_x_head_first(snake25):

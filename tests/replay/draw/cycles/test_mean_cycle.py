@@ -127,12 +127,11 @@ def test_the_cycles_agree_with_the_reports_maps(twin, opened):
     maps = cycle_maps(measured)
     gain, lag, energy = cycle_tables(measured.analysis)
     inside = gain.start_s >= maps.start_s[0]
-    np.testing.assert_allclose(
-        gain.value[:, inside].mean(axis=1), 100 * (maps.gain.mean(axis=1) - 1), atol=0.02
-    )
-    np.testing.assert_allclose(
-        lag.value[:, inside].mean(axis=1), np.degrees(maps.lag_rad.mean(axis=1)), atol=0.02
-    )
+    for table, expected in (
+        (gain, 100 * (maps.gain.mean(axis=1) - 1)),
+        (lag, np.degrees(maps.lag_rad.mean(axis=1))),
+    ):
+        np.testing.assert_allclose(table.value[:, inside].mean(axis=1), expected, atol=0.02)
     np.testing.assert_allclose(energy.value / (energy.stop_s - energy.start_s), maps.power_w)
 
 

@@ -29,11 +29,8 @@ def test_capsules_run_from_behind_the_centre_to_before_it(snake25, postures):
     along = drawn.apply([0.0, 0.0, 1.0]).reshape(origin.shape)
     # An error of half a rounding step in each of three components.
     np.testing.assert_allclose(along, rotation[..., 0], atol=2 * body.TURN_ROUNDING)
-    np.testing.assert_allclose(
-        origin + 0.5 * length[:, None] * along,
-        centre,
-        atol=body.ROUNDING / 2 + length[0] * body.TURN_ROUNDING,
-    )
+    room = body.ROUNDING / 2 + length[0] * body.TURN_ROUNDING
+    np.testing.assert_allclose(origin + 0.5 * length[:, None] * along, centre, atol=room)
 
 
 def test_capsules_point_straight_up_and_straight_down(snake25):
@@ -55,9 +52,8 @@ def test_a_straight_snake_lies_behind_its_head(snake25):
     centre, rotation = link_poses(snake25, np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 25)))
     origin, _ = body.capsule_poses(snake25, centre, rotation)
     length, radius = body.capsule_shape(snake25)
-    np.testing.assert_allclose(
-        origin[0, :, 0], -0.06 * np.arange(26) - length / 2, atol=body.ROUNDING / 2
-    )
+    expected = -0.06 * np.arange(26) - length / 2
+    np.testing.assert_allclose(origin[0, :, 0], expected, atol=body.ROUNDING / 2)
     np.testing.assert_allclose(length + radius, [link.length for link in snake25.links])
 
 
