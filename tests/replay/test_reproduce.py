@@ -37,11 +37,11 @@ def test_in_its_own_world_a_run_is_the_same_to_the_last_bit(room, tmp_path, caps
     assert "--force" in capsys.readouterr().err
     assert path.read_text() == "mine"
     again(room, path, "--force")
-    told = capsys.readouterr().out.splitlines()
-    assert told[0].startswith(f"{path}: run.mcap again on the twin of chain5 in wave, 5 s")
-    assert told[1].startswith("The same to the last bit: all ")
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].startswith(f"{path}: run.mcap again on the twin of chain5 in wave, 5 s")
+    assert printed[1].startswith("The same to the last bit: all ")
     both = f"{room / 'run.mcap'} {path}"
-    assert told[2:] == [f"Next: undulog view {both}", f"      undulog compare {both}"]
+    assert printed[2:] == [f"Next: undulog view {both}", f"      undulog compare {both}"]
     with Session.open(path) as session, Session.open(room / "run.mcap") as first:
         assert session.metadata["undulog"]["driven.session_id"] == first.session_id
         assert session.settle_s == first.settle_s == 1.0
@@ -50,7 +50,7 @@ def test_in_its_own_world_a_run_is_the_same_to_the_last_bit(room, tmp_path, caps
     again(room, tmp_path / "b.mcap", "--json")
     report = json.loads(capsys.readouterr().out)
     assert (report["exact"], report["differs_s"], report["one_sided"]) == (True, {}, [])
-    assert f"all {messages} messages on {len(topics)} topics" in told[1]
+    assert f"all {messages} messages on {len(topics)} topics" in printed[1]
 
 
 def test_what_was_changed_is_named_with_intervals(room, tmp_path, capsys, opened):
@@ -67,10 +67,10 @@ def test_what_was_changed_is_named_with_intervals(room, tmp_path, capsys, opened
     low, high = found["joint02", "lag"]["ci95"]
     assert 0.0 < low < high  # a weak servo lags
     again(room, tmp_path / "weak.mcap", "--set", change, "--force")
-    told = capsys.readouterr().out
-    assert "Differs: " in told
-    assert "/joint_commands" not in told.partition("\n\n")[0]
-    assert "B differs from A: joint02 most" in told
+    printed = capsys.readouterr().out
+    assert "Differs: " in printed
+    assert "/joint_commands" not in printed.partition("\n\n")[0]
+    assert "B differs from A: joint02 most" in printed
     assert "servo_of.joint02" in opened(path).attachments["scenario.toml"].decode()
 
 
@@ -95,9 +95,9 @@ def commands(room):
 
 def test_one_altered_command_changes_what_comes_after_it_alone(commands, tmp_path, capsys):
     plain = again(commands, tmp_path / "plain.mcap", source="plain.mcap")
-    told = capsys.readouterr().out
-    assert "plain.mcap has commands and no response" in told
-    assert told.endswith(f"\nNext: undulog view {commands / 'plain.mcap'} {plain}\n")
+    printed = capsys.readouterr().out
+    assert "plain.mcap has commands and no response" in printed
+    assert printed.endswith(f"\nNext: undulog view {commands / 'plain.mcap'} {plain}\n")
     found = compare_logs(plain, again(commands, tmp_path / "altered.mcap", source="altered.mcap"))
     assert found.differs_s["/joint_commands"] == pytest.approx(2.0)
     # The command acts from its tick on; states of that period arrive two ticks later.
@@ -125,7 +125,7 @@ def test_a_run_too_short_to_compare_says_so(room, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ("servo.stall_torqe=1", "did you mean stall_torque"),
         ("duration_s.x=1", "duration_s.x: found a part of what is no table"),
@@ -134,14 +134,14 @@ def test_a_run_too_short_to_compare_says_so(room, tmp_path, capsys):
         ("=3", "expected KEY=VALUE"),
     ],
 )
-def test_a_wrong_change_names_the_key(room, tmp_path, capsys, change, told):
-    again(room, tmp_path / "a.mcap", "--set", change, code=2 if "KEY" in told else 1)
-    assert told in capsys.readouterr().err
+def test_a_wrong_change_names_the_key(room, tmp_path, capsys, change, message):
+    again(room, tmp_path / "a.mcap", "--set", change, code=2 if "KEY" in message else 1)
+    assert message in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         ("--on cam:socketcan:can0 -o a.mcap", "expected twin, twin:SCENARIO or can:"),
         ("--on can:virtual:x -o a.mcap --set engine=mujoco", "on a bus the world is as it is"),
@@ -153,5 +153,5 @@ def test_a_wrong_change_names_the_key(room, tmp_path, capsys, change, told):
         ("--on twin -o a.json", "name it"),
     ],
 )
-def test_wrong_usage_says_what_would_be_right(room, words, told, command):
-    assert told in command("replay", room / "run.mcap", *words.split(), code=2).err
+def test_wrong_usage_says_what_would_be_right(room, words, message, command):
+    assert message in command("replay", room / "run.mcap", *words.split(), code=2).err

@@ -1,4 +1,4 @@
-"""Servos at their limits: told as such and when, and not taken for a fault of a sensor."""
+"""Servos at their limits: reported as such and when, and not taken for a fault of a sensor."""
 
 import numpy as np
 import pytest
@@ -47,12 +47,12 @@ def test_a_weak_twin_gives_its_full_voltage_when_the_servo_law_says(tmp_path):
     record(load_scenario(tmp_path / "weak.toml"), path)
     found = planted_artefacts.artefacts(path)
     assert {one.flag for one in found} == {"saturated"}
-    told = {one.joint: one.spans_s for one in found if one.quantity == "voltage"}
+    shown = {one.joint: one.spans_s for one in found if one.quantity == "voltage"}
     with Session.open(path) as session:
         columns = read_columns(session, "/joint_commands", "/joint_states", lambda _: None)
         start_ns = session.start_ns
-    assert sorted(told) == ["joint01", "joint03", "joint05"]
-    for name, spans_s in told.items():
+    assert sorted(shown) == ["joint01", "joint03", "joint05"]
+    for name, spans_s in shown.items():
         command, angle = columns.command[name], columns.position[name]
         np.testing.assert_array_equal(command.t_ns, angle.t_ns)
         t_s = (angle.t_ns - start_ns) * 1e-9

@@ -21,7 +21,7 @@ RUNS = [
 
 
 def session_of(name, path):
-    """The joint's angle by its motor (wrapped and unwrapped) and as its reader told it."""
+    """The joint's angle by its motor (wrapped and unwrapped) and as its reader gave it."""
     if not ARCSNAKE.exists():
         pytest.skip(f"the ArcSnake data are not at {ARCSNAKE}")
     raw = np.genfromtxt(ARCSNAKE / name, delimiter=",", names=True)

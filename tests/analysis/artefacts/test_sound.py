@@ -45,7 +45,7 @@ def test_no_artefact_is_found(response, seed, tmp_path):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_joint_that_answers_upside_down_at_all_tones_is_told(seed, tmp_path):
+def test_a_joint_that_answers_upside_down_at_all_tones_is_reported(seed, tmp_path):
     snake = multisine(seed, (0.0,), lambda rng: rng.uniform(0.8, 1.1) * np.exp(-0.01j * TONES))
     j = snake.joint()
     snake.position[:, j] *= -1

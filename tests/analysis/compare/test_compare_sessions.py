@@ -175,10 +175,10 @@ def test_groups_by_the_command_line(write, tmp_path, command, report_of):
     a = [write(f"a{k}", 20 + k, late_s=0.1 * k) for k in range(4)]
     b = [write(f"b{k}", 30 + k, late_s=0.3 * k, change=weaken) for k in range(4)]
     out = tmp_path / "result.json"
-    said = command("compare", "--a", *a, "--b", *b, "-o", out).out
-    assert said.startswith("B differs from A: joint03 most")
-    assert "What was changed" in said
-    assert said.rstrip().endswith(f"Result: {out}")
+    message = command("compare", "--a", *a, "--b", *b, "-o", out).out
+    assert message.startswith("B differs from A: joint03 most")
+    assert "What was changed" in message
+    assert message.rstrip().endswith(f"Result: {out}")
     assert json.loads(out.read_text())["design"] == "groups"
     result = report_of("compare", "--a", *a, "--b", *b, "--paired")
     assert (result["design"], result["named"][0]["name"]) == ("pairs", "joint03")
@@ -188,7 +188,7 @@ def test_groups_by_the_command_line(write, tmp_path, command, report_of):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ([], "compare needs sessions on both sides"),
         (["x.mcap"], "here are 1"),
@@ -197,5 +197,5 @@ def test_groups_by_the_command_line(write, tmp_path, command, report_of):
         (["x.mcap", "y.mcap", "--margin-gain", "2"], "--margin-gain lies between"),
     ],
 )
-def test_wrong_usage_exits_2(words, said, command):
-    assert said in command("compare", *words, code=2).err
+def test_wrong_usage_exits_2(words, message, command):
+    assert message in command("compare", *words, code=2).err

@@ -93,14 +93,14 @@ def test_equivalence_is_claimed_wrongly_in_one_of_twenty_at_the_margin():
     rng = np.random.default_rng(3)
     margin, sigma = 0.02, 0.004
     claimed = {0.0: [], margin: []}
-    for shift, said in claimed.items():
+    for shift, notes in claimed.items():
         truth = np.zeros(2 * JOINTS)
         truth[3] = shift
         for _ in range(SEEDS):
             a = single(rng, np.zeros(truth.size), sigma / 2, 20)
             b = single(rng, truth, sigma / 2, 20)
             decided = decide(keys_of(JOINTS), a, b, independent(a, b), Margins(lag_rad=1.0))
-            said.append(decided.equivalence[0].p < 0.05)
+            notes.append(decided.equivalence[0].p < 0.05)
     assert np.mean(claimed[0.0]) > 0.95
     assert within(np.mean(claimed[margin]), 0.05)
 

@@ -43,7 +43,7 @@ AMPLITUDE = 0.3 + 0.06 * np.sin(2 * np.pi * T / 29)
 OFFSET = 0.15 * np.sin(2 * np.pi * T / 17)
 
 
-def test_a_steady_wave_is_told_to_rounding():
+def test_a_steady_wave_is_estimated_to_rounding():
     same = np.ones(T.size)
     phi, command, response = wave(np.pi * same, 0.9 * same, 0.3 * same, 0.4 * same)
     found = cycles(phi, command, Series("q", T, response))
@@ -106,7 +106,7 @@ def test_what_a_cycle_cannot_tell_is_missing():
     assert np.isfinite(found.ratio[found.start_s > 32]).all()
 
 
-def test_a_phase_that_does_not_drive_the_command_tells_nothing():
+def test_a_phase_that_does_not_drive_the_command_gives_nothing():
     phi, _, response = wave(OMEGA, GAIN, LAG, AMPLITUDE)
     other = Series("q", T, 0.3 * np.sin(9.0 * T))
     assert np.isnan(cycles(phi, other, Series("q", T, response)).ratio).all()

@@ -1,4 +1,4 @@
-"""Several sessions as one experiment: which of them belong, and what is said of them."""
+"""Several sessions as one experiment: which of them belong, and what is reported of them."""
 
 import dataclasses
 import json
@@ -151,8 +151,8 @@ def test_sessions_that_do_not_belong_are_named(alike, tmp_path):
     assert [run.role for run in result.runs[:12]] == ["forward", "reverse"] * 6
     assert all(run.role is None for run in result.runs[12:])
     assert (result.reversal.forward_runs, result.reversal.reverse_runs) == (6, 6)
-    for k, said in enumerate(odd):
-        assert said in result.runs[12 + k].why
+    for k, found in enumerate(odd):
+        assert found in result.runs[12 + k].why
         assert any(w.startswith(f"odd{k}.mcap ") for w in result.warnings)
     assert "a copy is not a run of its own" in result.runs[-1].why
 

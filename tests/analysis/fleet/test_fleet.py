@@ -116,7 +116,7 @@ def test_an_odd_session_is_an_outlier_and_no_change():
     assert first.deviation == pytest.approx(0.2, abs=0.04)
 
 
-def test_few_or_incomplete_sessions_are_said_to_be_so():
+def test_few_or_incomplete_sessions_are_reported():
     sessions, rows, _, _ = frames(1, n=40)
     few = analyse_fleet(sessions.head(5), rows)
     assert few.robots == ()

@@ -92,7 +92,7 @@ def test_heterogeneous_couplings_are_recovered_from_noisy_kicked_phases():
     assert np.mean(inside) > 0.90
 
 
-def test_couplings_beyond_neighbours_are_told_where_they_are_looked_for():
+def test_couplings_beyond_neighbours_are_found_where_they_are_looked_for():
     rng = np.random.default_rng(3)
     chain = Planted(rng, 5, reach=4)
     coupling = chain.answer(chain.flow(rng, 12, 2.0, 1.0), reach=4)
@@ -141,7 +141,7 @@ def test_a_coupling_that_is_not_there_has_an_interval_from_zero():
     assert all(link.K.ci95[0] > 0.5 for link in coupling.links if link.source < link.target)
 
 
-def test_a_known_input_is_told_apart_from_couplings():
+def test_a_known_input_is_separated_from_couplings():
     rng = np.random.default_rng(4)
     chain = Planted(rng, 4)
     gain = np.array([0.3, 0.6, 0.0, 0.9])

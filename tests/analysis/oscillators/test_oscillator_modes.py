@@ -102,15 +102,15 @@ def test_intervals_of_rates_hold_the_truth():
     for _ in range(60):
         table = noisy(P, 0.01, rng)
         found = laplacian.spectrum(table.value)
-        said = laplacian.intervals_of(table.value, table.value + noise_draws(table, 21))
+        shown = laplacian.intervals_of(table.value, table.value + noise_draws(table, 21))
         order = [int(np.argmin(np.abs(found.rates - rate))) for rate in truth.rates]
         for rate, k in zip(truth.rates, order, strict=True):
-            held.append(said.real[k, 0] <= rate.real <= said.real[k, 1])
+            held.append(shown.real[k, 0] <= rate.real <= shown.real[k, 1])
             if abs(rate.imag) > 0.1:  # of a real eigenvalue the imaginary part is exactly zero
-                held.append(said.imag[k, 0] <= rate.imag <= said.imag[k, 1])
-        held.append(said.gap.ci95[0] <= truth.gap <= said.gap.ci95[1])
-        held.append(said.growth.ci95[0] <= laplacian.growth(P) <= said.growth.ci95[1])
-        held.append(said.strong.ci95[0] <= truth.strong <= said.strong.ci95[1])
+                held.append(shown.imag[k, 0] <= rate.imag <= shown.imag[k, 1])
+        held.append(shown.gap.ci95[0] <= truth.gap <= shown.gap.ci95[1])
+        held.append(shown.growth.ci95[0] <= laplacian.growth(P) <= shown.growth.ci95[1])
+        held.append(shown.strong.ci95[0] <= truth.strong <= shown.strong.ci95[1])
     assert np.mean(held) > 0.92
 
 

@@ -27,7 +27,7 @@ def write(path, seconds, **fields):
     gait = OscillatorGait(OscillatorChains({Plane.HORIZONTAL: chain}), ROBOT)
     readings = Readings.nothing(ROBOT)
     with SessionWriter(path, session_id=path.stem, epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
-        told = writer.joint_state("/gait", gait.names, unit="rad, omega in rad/s")
+        found = writer.joint_state("/gait", gait.names, unit="rad, omega in rad/s")
         commands = writer.joint_state("/joint_commands", ROBOT.joint_names, unit="rad")
         states = writer.joint_state("/joint_states", ROBOT.joint_names, unit="rad")
         before = np.zeros(len(ROBOT.joints))
@@ -35,7 +35,7 @@ def write(path, seconds, **fields):
             t_ns = EPOCH_NS + k * 10_000_000
             tick = gait.step(k / 100, readings)
             angle = before + 0.2 * (tick.command - before)
-            told.write(t_ns, tick.values)
+            found.write(t_ns, tick.values)
             commands.write(t_ns, tick.command)
             states.write(t_ns, before)
             # What a sample tells is known a period later.

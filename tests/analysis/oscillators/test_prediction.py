@@ -171,7 +171,7 @@ def test_the_verb_takes_sessions_or_their_result(result, tmp_path, command, repo
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "told"),
+    ("words", "code", "message"),
     [
         ("--eps -1", 2, "--eps -1"),
         ("--eps 0.3 --kick j2", 2, "expected JOINT=RAD"),
@@ -180,8 +180,8 @@ def test_the_verb_takes_sessions_or_their_result(result, tmp_path, command, repo
         ("--eps 0.3 --age -1", 2, "--age is at least 0"),
     ],
 )
-def test_wrong_usage(result, words, code, told, command):
-    assert told in command("predict", result[0], *words.split(), code=code).err
+def test_wrong_usage(result, words, code, message, command):
+    assert message in command("predict", result[0], *words.split(), code=code).err
 
 
 def test_sessions_without_kicks_fail_and_say_what_to_record(result, command):

@@ -36,8 +36,8 @@ def test_nothing_is_wider_than_the_terminal(snake, width):
     left_out = [line for line in lines if line.startswith("Without ")]
     assert bool(left_out) == (width < 120)
     heading = next(line for line in lines if line.startswith("joint "))
-    told = left_out[0].partition(":")[0].removeprefix("Without ") if left_out else ""
-    assert not [name for name in told.split(", ") if name and name in heading]
+    missing = left_out[0].partition(":")[0].removeprefix("Without ") if left_out else ""
+    assert not [name for name in missing.split(", ") if name and name in heading]
 
 
 def test_nulls_are_dashes_and_every_joint_stays_when_none_was_driven(still):

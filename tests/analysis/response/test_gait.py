@@ -50,10 +50,10 @@ def test_what_is_no_gait():
         lambda t, i: np.zeros_like(t),
         lambda t, i: np.sin(2 * np.pi * 0.2 * t),
     ):
-        said = []
+        notes = []
         named = {one.name: one for one in channels(make)}
-        assert fit_gait(named, named, 10.0, said.append) is None
-        assert said[0].startswith("no gait")
+        assert fit_gait(named, named, 10.0, notes.append) is None
+        assert notes[0].startswith("no gait")
 
 
 def test_a_strong_second_harmonic_is_not_taken_for_the_gait():
@@ -84,12 +84,12 @@ def test_planes_with_different_frequencies_are_not_averaged():
     t = np.arange(1000) / 100
     named = {f"h{i}": Series(f"h{i}", t, 0.4 * np.sin(3 * t - i)) for i in range(5)}
     named |= {f"v{i}": Series(f"v{i}", t, 0.1 * np.sin(4.3 * t - i)) for i in range(2)}
-    said = []
-    fit = fit_gait(named, named, 10.0, said.append)
+    notes = []
+    fit = fit_gait(named, named, 10.0, notes.append)
     driven_joints = [group.driven for group in fit.groups]
     assert driven_joints == [tuple(f"h{i}" for i in range(5)), ("v0", "v1")]
     assert [group.fit.omega for group in fit.groups] == pytest.approx([3.0, 4.3], rel=1e-9)
-    assert not any("commanded something else" in text for text in said)
+    assert not any("commanded something else" in text for text in notes)
 
 
 def test_steady_runs_of_the_logged_gait():

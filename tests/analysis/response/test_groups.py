@@ -76,13 +76,13 @@ def test_a_group_of_one_and_a_joint_that_follows_nothing():
     snake.command[7] = 0.2 * rng.normal(size=snake.t.size)
     snake.command[8] = 0.0
     snake.response = 0.9 * snake.command
-    said = []
-    gait = snake.fit(warn=said.append)
+    notes = []
+    gait = snake.fit(warn=notes.append)
     most = tuple(snake.names[k] for k in (0, 1, 2, 3, 5, 6))
     assert [group.driven for group in gait.groups] == [most, (snake.names[4],)]
     assert gait.group_of(snake.names[7]) is None
-    assert any("joint08" in text and "commanded something else" in text for text in said)
-    assert any("joint09" in text and "held still" in text for text in said)
+    assert any("joint08" in text and "commanded something else" in text for text in notes)
+    assert any("joint09" in text and "held still" in text for text in notes)
 
 
 def test_commands_with_the_tones_of_both_groups_go_where_their_own_is_largest():
@@ -100,27 +100,27 @@ def test_frequencies_that_the_record_does_not_resolve():
     """0.2 cycles apart over the record one frequency fits all; 1.2 apart it doesn't."""
     for apart, others_null in ((0.2, False), (1.2, True)):
         snake = Snake(1 + apart / 12.0 / 0.954)
-        said = []
-        gait = snake.fit(warn=said.append)
-        (text,) = [text for text in said if "one group or two can't be decided" in text]
+        notes = []
+        gait = snake.fit(warn=notes.append)
+        (text,) = [text for text in notes if "one group or two can't be decided" in text]
         assert gait.others == ()
         assert len(gait.driven) == (8 if others_null else 16)
         assert ("gain and lag of" in text) == others_null
         assert f"record {1.5 * 12 / apart:.3g} s or more" in text
-    said = []
-    assert len(Snake(1 + 1.7 / 12.0 / 0.954).fit(warn=said.append).groups) == 2
-    assert not any("can't be decided" in text for text in said)
+    notes = []
+    assert len(Snake(1 + 1.7 / 12.0 / 0.954).fit(warn=notes.append).groups) == 2
+    assert not any("can't be decided" in text for text in notes)
 
 
 def test_what_falls_on_a_groups_own_tone_is_named():
-    said = []
-    Snake(1.5).fit(warn=said.append)
-    (text,) = [text for text in said if "commensurate" in text]
+    notes = []
+    Snake(1.5).fit(warn=notes.append)
+    (text,) = [text for text in notes if "commensurate" in text]
     assert "3 x 0.954 Hz - 1.431 Hz falls on 1.431 Hz" in text
     assert "2 x 1.431 Hz - 2 x 0.954 Hz falls on 0.954 Hz" in text
-    said = []
-    Snake(GOLDEN).fit(warn=said.append)
-    assert said == []
+    notes = []
+    Snake(GOLDEN).fit(warn=notes.append)
+    assert notes == []
 
 
 def test_mixed_tones_of_lowest_order():
@@ -218,10 +218,10 @@ def test_too_slow_or_too_few_samples_for_a_group_are_reported():
         {n: Series(n, snake.t[::step], v[::step]) for n, v in zip(snake.names, rows, strict=True)}
         for rows, step in ((snake.command, 1), (snake.response, 60))
     )
-    said = []
-    gait = fit_gait(commands, responses, snake.seconds, said.append)
+    notes = []
+    gait = fit_gait(commands, responses, snake.seconds, notes.append)
     assert all(group.answered == () for group in gait.groups)
-    assert any("too few response samples" in text for text in said)
+    assert any("too few response samples" in text for text in notes)
 
 
 def test_the_shared_frequencies_have_intervals_that_hold():

@@ -35,8 +35,8 @@ def test_topics_that_were_not_recorded_are_no_warnings(tmp_path, opened):
     assert found.warnings == ()
     for lacking in ("effort and velocity", "/joint_current and no /joint_voltage", "/gait"):
         assert any(lacking in note for note in found.notes), lacking
-    told = found.to_dict()
-    assert (told["warnings"], told["notes"]) == ([], list(found.notes))
+    shown = found.to_dict()
+    assert (shown["warnings"], shown["notes"]) == ([], list(found.notes))
 
 
 @pytest.mark.parametrize("kind", ["text", "page"])

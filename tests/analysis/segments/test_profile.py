@@ -45,7 +45,7 @@ def test_many_independent_contrasts_have_the_quantile_of_their_largest():
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.8])
-def test_identical_joints_are_rarely_told_apart(shared):
+def test_identical_joints_rarely_differ(shared):
     rng = np.random.default_rng(3)
     wrong = 0
     for _ in range(200):

@@ -42,12 +42,12 @@ def maps(tmp_path_factory):
         return cycle_maps(measure_session(session))
 
 
-def test_each_cycle_tells_its_own_gain_and_lag(maps):
+def test_each_cycle_has_its_own_gain_and_lag(maps):
     assert (maps.driven, maps.start_s.size) == (NAMES, CYCLES)
     assert maps.period_s == pytest.approx(1.0, abs=1e-5)
     known = np.arange(CYCLES) != 5
     truth = np.array([gains(cycle) for cycle in range(CYCLES)]).T
-    # The period is told from the responses, too, whose steps move it by 1e-6; the limits of the
+    # The period comes from the responses, too, whose steps move it by 1e-6; the limits of the
     # cycles move with it.
     np.testing.assert_allclose(maps.gain[:, known], truth[:, known], atol=1e-4)
     expected = np.tile(LAG[:, None], CYCLES)[:, known]

@@ -50,25 +50,25 @@ def test_naming_the_topics_is_enough(bag, report_of):
     assert [joint["gain"] for joint in result["joints"]] == pytest.approx(GAIN, abs=5e-4)
     assert [joint["lag_rad"] for joint in result["joints"]] == pytest.approx(LAG, abs=5e-4)
     assert result["artefacts"] == []
-    # Its limits, said one by one: no torque, no current, no robot, no phase.
+    # Its limits, one by one: no torque, no current, no robot, no phase.
     for joint in result["joints"]:
         assert {joint[key] for key in ("energy_net_j", "energy_el_j", "plane")} == {None}
     assert (result["over_time"], result["energy"]["electrical"]) == (None, None)
     assert (result["energy"]["closure"], result["energy"]["transport"]["abs"]) == (None, None)
-    said = " ".join(result["notes"])
+    found = " ".join(result["notes"])
     for note in (
         "/snake/encoders carries no effort and velocity: mechanical energies are null",
         "no /joint_current and no /joint_voltage: electrical energies are null",
         "cost of transport is not applicable: ",
         "gain and lag over time are null: the session has no /gait",
     ):
-        assert note in said
+        assert note in found
     assert f"{topics[0]} {topics[1]}" in result["provenance"]["command"]
 
 
 def test_topics_that_are_not_named_are_listed(bag, command, report_of):
     assert "it has /snake/encoders, /snake/targets" in command("analyse", bag, code=1).err
     warnings = report_of("analyse", bag, "--response-topic", "/snake/encoders")["warnings"]
-    (said,) = [text for text in warnings if text.startswith("no commands on /joint_commands")]
-    assert said.endswith("(other JointStates: /snake/targets; choose with --command-topic)")
+    (found,) = [text for text in warnings if text.startswith("no commands on /joint_commands")]
+    assert found.endswith("(other JointStates: /snake/targets; choose with --command-topic)")
     command("analyse", bag, "--reference-topic", "/none", code=1)

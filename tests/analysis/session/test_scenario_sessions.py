@@ -112,10 +112,10 @@ def test_an_adaptive_scenario_gives_sense_over_time(name, tmp_path):
         gain = np.array(joint.gain, dtype=float)
         lag = np.array(joint.lag_rad, dtype=float)
         assert gain.size >= 6
-        told = ~np.isnan(gain)  # one that couldn't be told in a cycle is null, and so is its lag
-        assert told.sum() >= gain.size - 1
-        np.testing.assert_array_equal(np.isnan(lag), ~told)
-        gain, lag = gain[told], lag[told]
+        found = ~np.isnan(gain)  # what could not be estimated in a cycle is null, and so is its lag
+        assert found.sum() >= gain.size - 1
+        np.testing.assert_array_equal(np.isnan(lag), ~found)
+        gain, lag = gain[found], lag[found]
         assert ((gain > 0.7) & (gain < 1.3)).all()
         assert ((lag > 0.0) & (lag < 0.7)).all()
         intervals = [ends for ends in joint.gain_ci95 if ends is not None]

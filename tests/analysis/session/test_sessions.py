@@ -187,7 +187,7 @@ def test_joints_that_are_held_have_no_gain_and_are_named_once(bag, wave):
     np.testing.assert_allclose(gains(result)[::2].astype(float), truth.gain[::2], atol=1e-7)
 
 
-def test_artefacts_are_dropped_flagged_and_said(bag, wave):
+def test_artefacts_are_dropped_flagged_and_reported(bag, wave):
     truth = wave(np.random.default_rng(7), joints=3, duration=8.0)
     one = bag()
     for tick, t_ns in enumerate(truth.ticks_ns):

@@ -38,9 +38,9 @@ def test_the_longest_unbroken_stretch_gives_the_numbers(
         assert joint.lag_rad.value == pytest.approx(0.3, abs=2e-3)
         assert joint.coverage == pytest.approx(1.0, abs=1e-2)
     assert length(found) == pytest.approx(12.0, abs=0.05)
-    said = "longest unbroken stretch, 12.0 s, is analysed, 1 other stretch of 8.0 s altogether"
-    assert said in found.answer.sentence
-    assert any(said in text for text in found.warnings)
+    shown = "longest unbroken stretch, 12.0 s, is analysed, 1 other stretch of 8.0 s altogether"
+    assert shown in found.answer.sentence
+    assert any(shown in text for text in found.warnings)
 
 
 def test_start_and_stop_choose_another_stretch(tmp_path: Path, opened) -> None:

@@ -67,7 +67,7 @@ def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, capsys):
     assert (again.robot.joints[0].servo, again.duration_s) == (servo, pytest.approx(4.5))
 
 
-def test_a_dead_time_is_told_and_not_written(small, tmp_path, capsys):
+def test_a_dead_time_is_reported_and_not_written(small, tmp_path, capsys):
     late_s = 0.012
     late_ns = round(late_s * 1e9)
     rewritten(small / "run.mcap", tmp_path / "late.mcap", lambda t, rows: (t + late_ns, rows))
@@ -81,7 +81,7 @@ def test_a_dead_time_is_told_and_not_written(small, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         ("-o a.json", "end its name in .toml"),
         ("-o a.toml --scenario a.toml", "that is the robot's file"),
@@ -95,12 +95,12 @@ def test_a_dead_time_is_told_and_not_written(small, tmp_path, capsys):
         ("-o a.mine.toml", "--force"),
     ],
 )
-def test_wrong_usage_says_what_would_be_right(small, tmp_path, words, told, command):
+def test_wrong_usage_says_what_would_be_right(small, tmp_path, words, message, command):
     mine = tmp_path / "a.mine.toml"
     mine.write_text("mine")
     words = words.replace("a.", f"{tmp_path}/a.").split()
     code = 1 if "--settle" in words else 2
-    assert told in command("sim", "fit", small / "run.mcap", *words, code=code).err
+    assert message in command("sim", "fit", small / "run.mcap", *words, code=code).err
     assert (list(tmp_path.iterdir()), mine.read_text()) == ([mine], "mine")
 
 
@@ -259,7 +259,7 @@ def solve_linear(columns, measured, prior):
     return found.x, found.covariance
 
 
-def test_a_ridge_is_the_direction_that_keeps_what_is_told():
+def test_a_ridge_is_the_direction_that_keeps_the_outputs():
     """Only the product of two parameters is known."""
     pair = [Unknown(name, "1", 2.0, 0.5) for name in ("stall_torque", "proportional_gain")]
     (ridge,) = ridges(pair, np.linalg.inv(1e6 * np.ones((2, 2)) + np.eye(2) / 0.25))

@@ -27,8 +27,8 @@ def test_save_writes_a_recording_and_reports_it(
 
 def test_a_session_without_a_gait_is_shown_all_the_same(write, tmp_path, command):
     session = write(tmp_path / "a.mcap", robot=False, gait=False, odometry=False)
-    said = command("view", session, "--save", tmp_path / "a.rrd").out
-    assert "no robot description" in said
+    found = command("view", session, "--save", tmp_path / "a.rrd").out
+    assert "no robot description" in found
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_wrong_usage_is_explained(session_file, command, arguments, complaint):
 
 def test_without_a_display_the_way_out_is_named(session_file, command, monkeypatch):
     if not sys.platform.startswith("linux"):
-        pytest.skip("only on Linux can a display be told to be missing")
+        pytest.skip("only on Linux can a display be declared missing")
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
     err = command("view", session_file, code=2).err
@@ -67,9 +67,9 @@ def test_the_viewer_is_reruns_own(rerun_command):
 
 
 @pytest.mark.slow
-def test_web_serves_this_machine_only_until_told_to_end(session_file, tmp_path):
+def test_web_serves_this_machine_only_until_it_is_ended(session_file, tmp_path):
     if not Path("/proc/net/tcp").exists():
-        pytest.skip("listening sockets are told from /proc/net/tcp")
+        pytest.skip("listening sockets are read from /proc/net/tcp")
     with served_page(session_file, tmp_path) as (process, address):
         page, data = (int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", address))
         wait_for(lambda: listening(data), alive=(process,))  # the page may answer before it does

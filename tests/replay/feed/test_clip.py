@@ -181,9 +181,9 @@ def shared(one, other):
 @pytest.mark.slow
 def test_an_mp4_of_the_body_plays_in_chromium(session_file, vulkan, browser, command, tmp_path):
     part = ("--to", 1, "--fps", 10, "--speed", 0.5, "--size", "640x360")
-    said = command("view", session_file, "--clip", tmp_path / "a.mp4", *part).out
+    found = command("view", session_file, "--clip", tmp_path / "a.mp4", *part).out
     facts, frame = played(browser, tmp_path / "a.mp4", 1.0)
-    assert "20 frames of 640x360" in said
+    assert "20 frames of 640x360" in found
     assert facts == {"width": 640, "height": 360, "duration": 2.0}
     assert glowing(frame).sum() > 500
 

@@ -13,14 +13,14 @@ from undulog.replay.feed.recording import recording_id, write_recording
 
 
 def converted(file, path, **options):
-    """Convert a session; what was said."""
+    """Convert a session; what was reported."""
     with Session.open(file) as session:
         return write_recording(session, path, **options)
 
 
 @pytest.fixture
 def made(write, tmp_path, read_back):
-    """Writes and converts the session without some parts: what was said, what is in the file."""
+    """Writes and converts the session without some parts: report, file."""
 
     def make(**parts):
         written = converted(write(tmp_path / "a.mcap", **parts), tmp_path / "a.rrd")

@@ -30,10 +30,10 @@ class Told:
     """Hears how far it is; asks for an end as soon as the first picture is out, if wanted."""
 
     def __init__(self, stop=None):
-        self.heard, self.stop = [], stop
+        self.calls, self.stop = [], stop
 
     def update(self, done, note=""):
-        self.heard.append((done, note))
+        self.calls.append((done, note))
         if self.stop is not None:
             self.stop.signal = signal.SIGINT
 
@@ -187,10 +187,10 @@ def test_an_end_that_is_asked_for_comes_soon_and_ends_the_viewer(long_file, tmp_
         with pytest.raises(progressive.NoLongerWantedError):
             progressive.show_session(task_of(bar), viewer, stop)
         assert viewer.ended
-    assert len(bar.heard) == 1
+    assert len(bar.calls) == 1
 
 
-def test_a_viewer_that_dies_is_told(long_file, tmp_path):
+def test_a_viewer_that_dies_is_reported(long_file, tmp_path):
     with streaming(long_file, tmp_path / "a.rrd") as (viewer, task_of):
 
         class Killing(Told):

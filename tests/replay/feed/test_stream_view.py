@@ -169,7 +169,7 @@ def test_an_interrupt_while_it_is_converted_ends_the_command(view, long_file, rg
     assert not Path(f"/proc/{viewer}").exists()
 
 
-def test_a_viewer_that_is_killed_is_told(view, long_file, rgb):
+def test_a_viewer_that_is_killed_is_reported(view, long_file, rgb):
     shown = view(long_file)
     until_the_body_stands(shown, rgb)
     os.kill(viewer_of(shown), signal.SIGKILL)

@@ -86,11 +86,11 @@ def test_cycles_are_those_of_the_analysis_however_they_come_in(walk, length_ns):
         start_ns = session.start_ns
     found = measured_in_batches(walk, length_ns)
     assert len({cycle.start_ns for cycle in found}) == len(found)  # each once
-    told = {}
+    given = {}
     for cycle in found:
         for name, gain, lag in zip(cycle.names, cycle.gain, cycle.lag_rad, strict=True):
             if np.isfinite(gain):
-                told[name, round((cycle.start_ns - start_ns) * 1e-6)] = gain, lag
+                given[name, round((cycle.start_ns - start_ns) * 1e-6)] = gain, lag
     expected = {
         (name, round(start_s * 1e3)): (gain, lag)
         for name, one in joints.items()
@@ -98,8 +98,8 @@ def test_cycles_are_those_of_the_analysis_however_they_come_in(walk, length_ns):
         if gain is not None
     }
     assert len(expected) == 13 * 4  # two whole cycles and their surroundings in either run
-    assert told.keys() == expected.keys()
-    ours = [told[key] for key in expected]
+    assert given.keys() == expected.keys()
+    ours = [given[key] for key in expected]
     np.testing.assert_allclose(ours, [*expected.values()], rtol=0, atol=1e-9)
 
 
@@ -166,7 +166,7 @@ def test_a_real_recording_is_seen_as_it_is_analysed_afterwards(tmp_path, read_ba
     assert len(rows) >= 2
     # The feed found its relay a moment after the gait began, so the cycles are not the same ones;
     # once the gait has settled they are alike.
-    told = {name: lag for name, lag in zip(names, rows[-1], strict=True) if np.isfinite(lag)}
-    assert len(told) == 13
-    for name, lag in told.items():
+    given = {name: lag for name, lag in zip(names, rows[-1], strict=True) if np.isfinite(lag)}
+    assert len(given) == 13
+    for name, lag in given.items():
         assert lag == pytest.approx(np.degrees(joints[name].lag_rad[-1]), abs=0.05)

@@ -78,7 +78,7 @@ def test_live_and_replay_draw_the_same(live, replay, entity, component):
             assert np.allclose(one, other, atol=atol, equal_nan=True)
 
 
-def test_entities_names_and_colours_are_the_replays_and_said_once(live, replay):
+def test_entities_names_and_colours_are_the_replays_and_sent_once(live, replay):
     _, drawn = live
     assert {entity for entity in drawn.entities if not entity.startswith("/__")} <= replay.entities
     for entity in ("/joints/measured", "/joints/commanded", "/power/total/mechanical"):

@@ -29,7 +29,7 @@ def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back)
     found = drawn.rows("/joints/measured", "Angle:degrees")
     assert list(found) == (truth.t_ns - EPOCH_NS)[150:].tolist()
     np.testing.assert_allclose(list(found.values()), np.degrees(truth.position[150:]), atol=2e-6)
-    # The mode was said before, and still holds.
+    # The mode was sent before, and still holds.
     assert drawn.rows("/gait/mode", "StateChange:state") == {1_000_000_000: ["avoid"]}
 
 
@@ -169,7 +169,7 @@ def test_inbox_drops_the_oldest_and_keeps_what_explains_the_rest(tmp_path, sessi
         assert sum(len(one.data) for one in taken) <= 150_000
 
 
-def test_spawned_relay_is_in_a_session_of_its_own_and_ends_when_told(stage, tmp_path):
+def test_spawned_relay_is_in_a_session_of_its_own_and_ends_on_request(stage, tmp_path):
     output = tmp_path / "spawned.rrd"
     relay = spawn_relay(stage.path, ["--save", str(output)])
     try:

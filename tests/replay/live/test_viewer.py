@@ -90,7 +90,7 @@ def test_web_serves_this_machine_only_and_leaves_nothing(stage):
         (["--live", "s", "--connect", "x", "--web"], "without --web"),
     ],
 )
-def test_wrong_usage_is_told(arguments, why, command):
+def test_wrong_usage_is_refused(arguments, why, command):
     assert why in command("view", *arguments, code=2).err
 
 

@@ -257,14 +257,14 @@ def test_bars_and_their_differences_are_those_of_compare(make, tmp_path, overlai
         return height
 
     comparison = compare_sessions(*map(opened, files), Choices(any_gait=True))
-    said = {(one.quantity, one.place): one for one in comparison.differences}
+    noted = {(one.quantity, one.place): one for one in comparison.differences}
     for joint in NAMES:
         gain = bar("/compared/b/segments/gain/estimate", joint)
         lag = bar("/compared/b/segments/lag/estimate", joint)
         assert abs(gain - 100 * (0.36 / 0.4 - 1)) < 0.05
         assert abs(lag - math.degrees(0.1)) < 0.05
-        assert gain == pytest.approx(100 * said["gain", joint].difference.value)
-        assert lag == pytest.approx(math.degrees(said["lag", joint].difference.value))
+        assert gain == pytest.approx(100 * noted["gain", joint].difference.value)
+        assert lag == pytest.approx(math.degrees(noted["lag", joint].difference.value))
         assert abs(bar("/compared/segments/gain/b/estimate", joint) - 100 * (0.36 / 0.4 - 1)) < 0.05
     facts = found.static("/compared/facts", "TextDocument:text")[0]
     said_first = facts.splitlines()[0].replace("\\", "")  # what Markdown would mark up is escaped
@@ -292,7 +292,7 @@ def test_without_a_gait_phases_are_refused_and_times_are_not(files, still, make,
 
 
 def test_a_phase_is_found_where_it_was_first_reached():
-    """A gait at 1 Hz that rests from 2 s to 3 s, and is not heard of from 5 s to 6 s."""
+    """A gait at 1 Hz that rests from 2 s to 3 s, and is missing from 5 s to 6 s."""
     t = np.round(np.concatenate([np.arange(0, 5.005, 0.01), np.arange(6, 8.005, 0.01)]), 2)
     cycles = np.where(t < 2, t, np.where(t < 3, 2.0, t - 1.0))
     rhythm = Rhythm(np.round(t * 1e9).astype(np.int64), cycles)

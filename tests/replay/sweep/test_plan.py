@@ -60,7 +60,7 @@ def test_a_sobol_design_covers_better_than_chance():
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("[", "syntax"),
         ('scenario = "flat"', "parameters"),
@@ -76,10 +76,10 @@ def test_a_sobol_design_covers_better_than_chance():
         ('scenario = "flat"\nduration_s = 1\n[parameters.duration_s]\nvalues = [1]', "left out"),
     ],
 )
-def test_what_can_not_be_meant_is_refused_with_the_key(text, said, tmp_path):
+def test_what_can_not_be_meant_is_refused_with_the_key(text, message, tmp_path):
     path = tmp_path / "plan.toml"
     path.write_text(text)
-    with pytest.raises(PlanError, match=said):
+    with pytest.raises(PlanError, match=message):
         read_plan(path)
 
 

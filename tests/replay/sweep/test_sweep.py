@@ -112,7 +112,7 @@ def test_parameters_of_robot_and_analysis(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (("servo.stall_torque", "servo.stal_torque"), "stal_torque"),
         (("servo.stall_torque", "robot.chian.joints"), "chian"),
@@ -120,12 +120,12 @@ def test_parameters_of_robot_and_analysis(tmp_path):
         (('"wave.toml"', '"wvae"'), "wvae"),
     ],
 )
-def test_a_key_that_is_none_is_refused_before_anything_runs(change, said, tmp_path):
+def test_a_key_that_is_none_is_refused_before_anything_runs(change, message, tmp_path):
     plan = write_plan(tmp_path)
     plan.write_text(plan.read_text().replace(*change))
     done = undulog("sweep", plan, "-o", tmp_path / "rows")
     assert done.returncode in (1, 2)
-    assert said in done.stderr
+    assert message in done.stderr
     assert not (tmp_path / "rows").exists()
 
 

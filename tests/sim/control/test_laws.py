@@ -114,25 +114,25 @@ def swing(turn_rate, periods=6, gain=1.6):
     for phase in np.arange(0.0, periods * filters.TURN, 0.03):
         bent = 0.0 if phase < 2 * filters.TURN else -turn_rate / gain
         way = math.pi + turn_rate * max(phase - 2 * filters.TURN, 0.0)
-        told = math.remainder(way + 0.6 * math.sin(phase), filters.TURN)
-        rows.append((phase, way, path.step(phase, told, bent)))
+        measured = math.remainder(way + 0.6 * math.sin(phase), filters.TURN)
+        rows.append((phase, way, path.step(phase, measured, bent)))
     return np.array(rows).T
 
 
 @pytest.mark.parametrize("turn_rate", [0.0, 0.2, -0.3])
 def test_path_heading_has_neither_the_swing_nor_half_a_period_of_delay(turn_rate):
     """Across the cut at pi, and while a turn begins: without the model it would be pi c Y late."""
-    phase, way, told = swing(turn_rate)
-    error = np.abs([math.remainder(e, filters.TURN) for e in told - way])
+    phase, way, measured = swing(turn_rate)
+    error = np.abs([math.remainder(e, filters.TURN) for e in measured - way])
     # The trapezoidal rule, and a sample more or less:
     assert error[phase > filters.TURN].max() < 0.005
     assert error[phase < filters.TURN].max() > 0.1  # not yet a period
 
 
 def test_path_heading_goes_on_over_a_full_turn():
-    phase, way, told = swing(0.3, periods=12)
+    phase, way, measured = swing(0.3, periods=12)
     assert way[-1] - way[0] > 2 * filters.TURN
-    assert np.abs(np.diff(told[phase > filters.TURN])).max() < 0.05
+    assert np.abs(np.diff(measured[phase > filters.TURN])).max() < 0.05
 
 
 def test_path_heading_waits_for_a_heading_and_outlasts_it():

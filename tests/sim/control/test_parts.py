@@ -222,7 +222,7 @@ def north_at(angle):
 def test_the_course_points_to_the_target_from_wherever_the_robot_started_to_look(start):
     """Whatever way the head looked at first, and however far it has come since."""
     course = TargetHeadingPolicy(TargetHeading(gain=0.35, largest=0.2), (3.0, 1.0), 0.3, 0.4, SNAKE)
-    assert course.step(moment(0.0)) == 0.0  # the compass has not told anything yet
+    assert course.step(moment(0.0)) == 0.0  # the compass has not measured anything yet
     course.step(moment(0.01, field=north_at(start)))
     turn = 0.2
     offset = course.step(moment(0.02, (0.5, 0.1), turn, north_at(start + turn)))
@@ -274,8 +274,8 @@ def test_odometry_of_a_chain_that_follows_its_path(make_robot, curve):
     cos, sin = math.cos(heading_now), math.sin(heading_now)
     truth = [cos * step[0] + sin * step[1], cos * step[1] - sin * step[0]]
     truth.append((turned - heading) / (2 * dt))
-    told = SlipOdometry(robot, 1e6).velocity(angle, (after - before) / (2 * dt))
-    np.testing.assert_allclose(told, truth, atol=0.02 * speed)
+    found = SlipOdometry(robot, 1e6).velocity(angle, (after - before) / (2 * dt))
+    np.testing.assert_allclose(found, truth, atol=0.02 * speed)
 
 
 def test_odometry_of_a_body_that_holds_its_shape(make_robot):

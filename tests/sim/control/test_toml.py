@@ -109,8 +109,8 @@ def test_a_controller_needs_its_sensors_its_target_and_a_horizontal_gait():
     assert "[world.target]" in faults_of(SNAKE25 + follow)["controller.kind"]
     vertical = BASE.replace("gait.horizontal", "gait.vertical")
     assert "horizontal" in faults_of(vertical + follow)["controller.kind"]
-    told = faults_of(f'{SNAKE13}{TARGET}[controller]\nkind = "avoidance"')["controller.kind"]
-    assert all(part in told for part in ("looks ahead", "looks sideways", "snake13"))
+    shown = faults_of(f'{SNAKE13}{TARGET}[controller]\nkind = "avoidance"')["controller.kind"]
+    assert all(part in shown for part in ("looks ahead", "looks sideways", "snake13"))
 
 
 @pytest.mark.parametrize("gait", ["flat", "delay-blocks", "oscillators"])
@@ -128,7 +128,7 @@ def test_every_controller_wraps_every_generator(gait, kind):
     assert "steer.offset" in one.names
 
 
-def test_the_target_is_told_from_magnetic_north():
+def test_the_target_is_measured_from_magnetic_north():
     """North a quarter turn to the left of x: a target ahead lies to the right of north."""
     text = '[controller]\nkind = "target-following"\n[sensing.compass]\nnorth = 1.5707963267948966'
     gait = build_gait(parsed(text))

@@ -112,7 +112,7 @@ def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, co
         assert (over_bus.frames("/can/can0")["dir"] == DIR_TX).sum() == 31 * 25
         assert over_bus.metadata["undulog.gate"]["rate"] == "4.0"
         assert [message.data for _, message in over_bus.messages("/gate/phase")] == ["run"]
-    # The robot did what the twin does with commands rounded to the bus, and said so, rounded.
+    # The robot did what the twin does with commands rounded to the bus, and reported it, rounded.
     samples = sensed(weak(0.3), Rounded(build_gait(weak(0.3))))
     cycles = np.array([one.position for one in samples if isinstance(one, JointSample)])[:-2]
     found = np.array(measured.values)
@@ -180,7 +180,7 @@ def test_asked_to_stop_it_ends_as_the_robots_file_says(tmp_path, how):
     assert report.outcome.why == "stop requested (Ctrl-C)"
     with Session.open(path) as session:
         commands = np.array(session.joints("/joint_commands").values)
-        said = [message.msg for _, message in session.messages("/rosout")]
+        notes = [message.msg for _, message in session.messages("/rosout")]
         phases = [message.data for _, message in session.messages("/gate/phase")]
         assert session.verdict == "good"
     assert phases == ["run", "ending"]
@@ -194,7 +194,7 @@ def test_asked_to_stop_it_ends_as_the_robots_file_says(tmp_path, how):
         assert not ending[:, -1].any()
         assert np.abs(np.diff(commands[:, 80:])).max() <= 0.5 * 0.01 * (1 + 1e-9)
         assert ending.shape[1] == pytest.approx(100 * (1.5 * np.abs(held).max() / 0.5 + 0.2), abs=1)
-    assert said[-1].startswith("stopped: stop requested (Ctrl-C); the joints were ")
+    assert notes[-1].startswith("stopped: stop requested (Ctrl-C); the joints were ")
 
 
 def angles_of(received):
@@ -214,14 +214,14 @@ def test_a_session_that_can_not_be_written_brings_the_robot_to_rest_first(tmp_pa
         listener = can.Bus(interface="socketcand", host="127.0.0.1", port=port, channel="can0")
         plan = planned("weak-servo-pi3", on, path, duration_s=9.0)
         with listener:
-            said = "the joints were brought straight .* the last 1?[0-9]{2} control ticks are"
-            with pytest.raises(LogWriteError, match=f"no space left on device; {said}"):
+            reason = "the joints were brought straight .* the last 1?[0-9]{2} control ticks are"
+            with pytest.raises(LogWriteError, match=f"no space left on device; {reason}"):
                 drive_bus(plan, stop=StopRequest(), on_tick=full)
-            heard = {}
+            taken = {}
             while (message := listener.recv(0.2)) is not None:
                 if 0x101 <= message.arbitration_id <= 0x119:
-                    heard.setdefault(message.arbitration_id, []).append(bytes(message.data))
-    raw = angles_of(heard)
+                    taken.setdefault(message.arbitration_id, []).append(bytes(message.data))
+    raw = angles_of(taken)
     assert raw.shape[0] == 25
     assert raw.shape[1] > 41 + 20
     assert np.abs(raw[:, 40]).max() > 0
@@ -266,12 +266,12 @@ def test_any_bus_of_python_can_will_do(tmp_path):
     robot = load_robot("snake25")
     reply = BusEncoder(robot, Direction.RX)
     pose = np.linspace(-0.1, 0.1, 25)
-    heard = {}
+    taken = {}
 
     def answer(bus):
-        """A robot that is where it was told to be."""
+        """A robot that is where it was commanded to be."""
         while (message := bus.recv(0)) is not None:
-            heard.setdefault(message.arbitration_id, []).append(bytes(message.data))
+            taken.setdefault(message.arbitration_id, []).append(bytes(message.data))
             angle = int.from_bytes(message.data[:2], "little", signed=True) * STEP
             pose[message.arbitration_id - 0x101] = angle
         keys = [(name, Quantity.POSITION, "") for name in robot.joint_names]
@@ -283,8 +283,8 @@ def test_any_bus_of_python_can_will_do(tmp_path):
         report = drive_bus(plan, stop=StopRequest())
     assert report.outcome.how is DriveEnding.COMPLETE, report.outcome
     assert report.approach_s >= LISTEN_S + 1.5 * 0.1 / 0.5 - 0.02
-    assert {len(each) for each in heard.values()} == {report.tally.sent // 25}
-    raw = angles_of(heard)
+    assert {len(each) for each in taken.values()} == {report.tally.sent // 25}
+    raw = angles_of(taken)
     assert np.abs(np.diff(raw)).max() * STEP <= 4.0 * 0.01 + STEP  # also where ticks were late
     with Session.open(tmp_path / "a.mcap") as session:
         assert (session.frames("/can/gate_any")["dir"] == DIR_TX).sum() == report.tally.sent
@@ -328,7 +328,7 @@ def test_another_controller_on_the_bus_is_not_joined(command, tmp_path):
 def plain_server(answers, stream=()):
     """A server of one client: answers each message by its first word, then sends a stream."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        heard = []
+        taken = []
 
         def serve():
             client, _ = listener.accept()
@@ -337,9 +337,9 @@ def plain_server(answers, stream=()):
                 while chunk := client.recv(65536):
                     for message in chunk.decode().split(">")[:-1]:
                         word = message.strip(" <").split()[0]
-                        heard.append(word)
+                        taken.append(word)
                         client.sendall(answers.get(word, b""))
-                    if heard[-1] == "rawmode":
+                    if taken[-1] == "rawmode":
                         time.sleep(0.2)  # python-can takes what comes with "ok" for a refusal
                         for piece in stream:
                             client.sendall(piece)
@@ -348,7 +348,7 @@ def plain_server(answers, stream=()):
         thread = threading.Thread(target=serve)
         thread.start()
         port = listener.getsockname()[1]
-        yield f"can:socketcand:can0?host=127.0.0.1&port={port}", heard
+        yield f"can:socketcand:can0?host=127.0.0.1&port={port}", taken
         thread.join()
 
 
@@ -414,9 +414,9 @@ def test_nobody_there_exits_1(tmp_path, command):
 def test_a_robot_that_says_nothing_is_sent_nothing(tmp_path):
     answers = SOCKETCAND | {"undulog": b"< undulog virtual-robot snake25 paced >"}
     silent = pytest.raises(SourceError, match=r"no command was sent: the pose is not known, all 25")
-    with plain_server(answers) as (on, heard), silent:
+    with plain_server(answers) as (on, taken), silent:
         drive_bus(planned("flat", on, tmp_path / "a.mcap", duration_s=5.0), stop=StopRequest())
-    assert heard == ["undulog", "open", "rawmode"]
+    assert taken == ["undulog", "open", "rawmode"]
 
 
 @pytest.mark.parametrize("cut", [3, 12, 40, 60, 100, 120])
@@ -447,13 +447,13 @@ def test_what_python_can_can_not_read_is_counted_and_nothing_is_printed(capfd):
     tally = Tally(time.time_ns)
     with plain_server(SOCKETCAND, stream) as (on, _):
         bus = open_link(parse_address(f"{on}&plain=yes"), tally)
-        heard, deadline = [], time.monotonic() + 20
-        while 0x203 not in heard:
-            assert time.monotonic() < deadline, heard
-            heard += identifiers(bus.receive())
+        taken, deadline = [], time.monotonic() + 20
+        while 0x203 not in taken:
+            assert time.monotonic() < deadline, taken
+            taken += identifiers(bus.receive())
             time.sleep(0.01)
         bus.close()
-    assert (heard, tally.counts.malformed) == ([0x201, 0x202, 0x203], 1)
+    assert (taken, tally.counts.malformed) == ([0x201, 0x202, 0x203], 1)
     assert [event.text for event in tally.events.flush()] == ["malformed message"]
     assert capfd.readouterr() == ("", "")
 

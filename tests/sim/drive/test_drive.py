@@ -83,7 +83,7 @@ def everything(path):
     return found
 
 
-# In what it tells of its gait, target following has values that nobody knows yet.
+# Among its logged values, target following has some that are not known yet.
 @pytest.mark.parametrize(
     "name",
     [
@@ -114,9 +114,9 @@ horizontal = { offset = 0.1, frequency_hz = 1.0 }
 def test_a_plan_is_driven_and_kept_in_the_session(tmp_path, command, opened):
     plan, path = tmp_path / "bend.toml", tmp_path / "bend.mcap"
     plan.write_text(PLAN)
-    told = command("drive", plan, "--on", "twin", "-o", path).out.splitlines()
-    assert told[0] == f"{path}: drove bend for 0.7 s"
-    assert told[1].startswith("plan on the twin of snake25 in flat, 71 ticks")
+    shown = command("drive", plan, "--on", "twin", "-o", path).out.splitlines()
+    assert shown[0] == f"{path}: drove bend for 0.7 s"
+    assert shown[1].startswith("plan on the twin of snake25 in flat, 71 ticks")
     with Session.open(path) as session:
         assert session.attachments["plan.toml"].decode() == PLAN
         facts = session.metadata["undulog"]
@@ -154,15 +154,15 @@ def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number, request):
     wait_for(lambda: unfinished.exists() and unfinished.stat().st_size > 0, alive=[process])
     time.sleep(1.0)
     process.send_signal(number)
-    told, complained = process.communicate(timeout=60)
+    shown, complained = process.communicate(timeout=60)
     assert (process.returncode, complained) == (0, "")
-    assert told.startswith("stopped at rest at ")
+    assert shown.startswith("stopped at rest at ")
     with Session.open(path) as session:
         assert (session.verdict, session.warnings) == ("good", [])
         commands = np.array(session.joints("/joint_commands").values)
         modes = [(t_ns - session.start_ns, m.data) for t_ns, m in session.messages("/gait/mode")]
-        said = [message.msg for _, message in session.messages("/rosout")]
-    assert said[-1].endswith("of 3600 s: it was stopped")
+        notes = [message.msg for _, message in session.messages("/rosout")]
+    assert notes[-1].endswith("of 3600 s: it was stopped")
     assert [mode for _, mode in modes] == ["walk", "stop"]
     assert not commands[:, -1].any()
     begun = modes[1][0] // 10_000_000
@@ -178,9 +178,9 @@ def test_fading_shrinks_amplitude_and_offset_and_leaves_the_phase(make_robot):
         sim.SerpentineGait(wave, robot),
         FadingGait(sim.SerpentineGait(wave, robot), robot, 0.5),
     )
-    knows = sim.Readings.nothing(robot)
+    nothing = sim.Readings.nothing(robot)
     for k in range(160):  # whatever the rounding of times: 0.5 s are 50 ticks
-        expected, tick = own.step(k / 100, knows), faded.step(k / 100, knows)
+        expected, tick = own.step(k / 100, nothing), faded.step(k / 100, nothing)
         if k == 99:
             faded.begin()
         x = min(max((k - 100) / 50, 0.0), 1.0)

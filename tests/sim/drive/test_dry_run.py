@@ -108,13 +108,13 @@ def test_torque_current_and_energy_are_those_of_the_session_of_that_run(waved):
     with Session.open(path) as session:
         assert (session.verdict, session.warnings) == ("good", [])
         modes = [(t_ns, m.data) for t_ns, m in session.messages("/gait/mode")]
-        said = [m.msg for _, m in session.messages("/rosout")]
+        notes = [m.msg for _, m in session.messages("/rosout")]
         effort = session.joints("/joint_states", "effort")
         current = session.joints("/joint_current")
         ledger = session.joints("/energy_ledger")
         commands = session.joints("/joint_commands")
     assert [mode for _, mode in modes] == ["reading the pose", "approach", "replay"]
-    assert "gate: run" in said
+    assert "gate: run" in notes
     begin_ns = modes[-1][0]
     end_ns = begin_ns + round(1.5e9)
     rows = np.array(commands.values)[:, commands.t_ns[0] >= begin_ns]
@@ -123,10 +123,10 @@ def test_torque_current_and_energy_are_those_of_the_session_of_that_run(waved):
     ):
         assert given.max() == pytest.approx(joint.greatest, abs=STEP)
         # What the servos tell comes two ticks late: those of the last two are not in it.
-        heard = (effort.t_ns[0] >= begin_ns - 10_000_000) & (effort.t_ns[0] <= end_ns - 20_000_000)
-        assert np.abs(torques[heard]).max() == pytest.approx(joint.torque_peak, rel=1e-12)
-        assert np.sqrt(np.mean(torques[heard] ** 2)) == pytest.approx(joint.torque_rms, rel=1e-12)
-        assert np.abs(currents[heard]).max() == pytest.approx(joint.current_peak, rel=1e-12)
+        span = (effort.t_ns[0] >= begin_ns - 10_000_000) & (effort.t_ns[0] <= end_ns - 20_000_000)
+        assert np.abs(torques[span]).max() == pytest.approx(joint.torque_peak, rel=1e-12)
+        assert np.sqrt(np.mean(torques[span] ** 2)) == pytest.approx(joint.torque_rms, rel=1e-12)
+        assert np.abs(currents[span]).max() == pytest.approx(joint.current_peak, rel=1e-12)
     window = (ledger.t_ns[0] >= begin_ns) & (ledger.t_ns[0] <= end_ns)
     names = ("mechanical_net", "mechanical_abs", "electrical_net")
     for name, value in zip(names, run.energy_j, strict=True):
@@ -228,9 +228,9 @@ def test_what_arming_would_refuse_the_dry_run_refuses_too(tmp_path, command):
     whole = load_robot("snake25")
     few = tmp_path / "few.mcap"
     write_commands(few, ("joint01", "joint02"), [np.zeros(2)], robot=whole, clock={"c": "host"})
-    said = command("drive", few, *on, code=2).err
-    assert "it commands 2 joints: joint01, joint02" in said
-    assert "snake25 has 25: joint01, joint02, joint03" in said
+    err = command("drive", few, *on, code=2).err
+    assert "it commands 2 joints: joint01, joint02" in err
+    assert "snake25 has 25: joint01, joint02, joint03" in err
 
 
 def test_a_twin_that_fails_leaves_a_session_that_says_so(robot, tmp_path):

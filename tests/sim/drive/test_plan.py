@@ -143,7 +143,7 @@ def test_without_a_gait_of_its_own_a_plan_starts_from_its_scenarios():
     assert (dict(plan.start), plan.ramp_s) == (flat.planes, flat.ramp_s)
 
 
-def test_all_faults_of_a_plan_are_told_at_once():
+def test_all_faults_of_a_plan_are_reported_at_once():
     text = """
 scenario = "flt"
 speed = 3
@@ -184,7 +184,7 @@ duration_s = 1.0
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("segments = 3", "an array of tables"),
         ('description = "d"\nscenario = "flat"\nsegments = []', "at least one table"),
@@ -192,8 +192,8 @@ duration_s = 1.0
         (DELAY_PLAN, "a serpentine gait"),
     ],
 )
-def test_what_is_no_plan_says_why(text, told):
-    with pytest.raises(PlanError, match=told):
+def test_what_is_no_plan_says_why(text, message):
+    with pytest.raises(PlanError, match=message):
         parse_plan(text, Path("p.toml"))
 
 

@@ -28,7 +28,7 @@ class Servo(threading.Thread):
 
     def __init__(self, channel, degrees):
         super().__init__()
-        self.degrees, self.temperature, self.heard = degrees, 30, []
+        self.degrees, self.temperature, self.received = degrees, 30, []
         self.ended = threading.Event()
         self.bus = can.Bus(interface="virtual", channel=channel)
 
@@ -39,7 +39,7 @@ class Servo(threading.Thread):
                     self.answer(bytes(message.data))
 
     def answer(self, data):
-        self.heard.append(data)
+        self.received.append(data)
         if data[0] == 0x92:
             reply = bytes([0x92]) + round(self.degrees * 100).to_bytes(7, "little", signed=True)
         elif data[0] == 0xA4:
@@ -90,17 +90,17 @@ def test_it_is_asked_where_it_is_and_driven_from_there(tmp_path, robot):
     with servo("polled", math.degrees(0.3)) as one:
         report = drive_bus(planned(tmp_path, robot, "polled", angles), stop=StopRequest())
     assert report.outcome.how is DriveEnding.COMPLETE, report.outcome
-    requests = [data for data in one.heard if data[0] == 0x92]
-    commands = [data for data in one.heard if data[0] == 0xA4]
-    assert len(requests) + len(commands) == report.tally.sent == len(one.heard)
-    assert one.heard[:40] == [bytes([0x92]) + bytes(7)] * 40  # it listens before it commands
+    requests = [data for data in one.received if data[0] == 0x92]
+    commands = [data for data in one.received if data[0] == 0xA4]
+    assert len(requests) + len(commands) == report.tally.sent == len(one.received)
+    assert one.received[:40] == [bytes([0x92]) + bytes(7)] * 40  # it listens before it commands
     given = np.radians([struct.unpack("<i", data[4:])[0] / 100 for data in commands])
     assert given[0] == pytest.approx(0.3, abs=0.011)
     assert np.abs(np.diff(given)).max() <= 4.0 * 0.01 + 2e-4
     assert given[-1] == pytest.approx(angles[-1], abs=1e-4)
     with Session.open(tmp_path / "a.mcap") as session:
         frames = session.frames("/can/polled")
-        assert (frames["dir"] == DIR_TX).sum() == len(one.heard)
+        assert (frames["dir"] == DIR_TX).sum() == len(one.received)
         assert (frames["dir"] == DIR_RX).sum() > 0
         assert np.nanmax(np.abs(session.joints("/joint_states").values[0] - 0.3)) < 0.5
 

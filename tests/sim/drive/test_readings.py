@@ -1,4 +1,4 @@
-"""Readings from the bus: frames that the shared encoder packs, decoded into what a gait is told."""
+"""Readings from the bus: frames that the shared encoder packs, decoded for a gait."""
 
 import math
 
@@ -98,7 +98,7 @@ def test_what_was_handed_out_does_not_change_later(known):
 
 def test_frames_of_others_are_counted_and_give_no_reading(known):
     frames = empty_frames(2)
-    frames["id_flags"] = [0x101, 0x7FF]  # a command, and an identifier that nobody knows
+    frames["id_flags"] = [0x101, 0x7FF]  # a command, and an unknown identifier
     frames["dlc"], frames["dir"] = 2, [0, DIR_TX]
     known.add(frames, 0.0)
     assert (known.status(1.0).silence_s == math.inf).all()

@@ -132,14 +132,14 @@ def test_where_all_joints_are_cut_the_plane_is_named_else_the_joints():
     assert tick.command[4] == math.pi / 6
 
 
-def test_unlike_limits_cut_each_joint_by_its_own_and_are_told():
+def test_unlike_limits_cut_each_joint_by_its_own_and_are_reported():
     limits = ((-0.1, 0.3), (-0.5, 0.5), (-0.5, 0.5), *(((-0.5, 0.5),) * 4))
     gait = generator(Serpentine({Plane.HORIZONTAL: PlaneGait(0.4, 0.5, 0.8)}, 0.0), snake(limits))
     tick = gait.step(0.0, NOTHING)
-    told = dict(zip(gait.names, tick.values, strict=True))
+    found = dict(zip(gait.names, tick.values, strict=True))
     assert tick.clamped == ("joint01.A",)
-    assert [told[f"joint0{i}.A"] for i in (1, 3, 5, 7)] == [0.1, 0.4, 0.4, 0.4]
-    assert "joint02.A" not in told  # its plane is not driven
+    assert [found[f"joint0{i}.A"] for i in (1, 3, 5, 7)] == [0.1, 0.4, 0.4, 0.4]
+    assert "joint02.A" not in found  # its plane is not driven
 
 
 @pytest.mark.parametrize(

@@ -137,14 +137,14 @@ def test_felt_servos_keep_the_wave_and_slow_it_a_little():
 
 
 @pytest.mark.parametrize("name", ["delay-blocks", "oscillators-one-way"])
-def test_a_session_tells_what_each_joint_was_meant_to_do(tmp_path, name):
+def test_a_session_records_what_each_joint_was_meant_to_do(tmp_path, name):
     scenario = load_scenario(name).changed(duration_s=0.3)
     record(scenario, tmp_path / "run.mcap")
     with Session.open(tmp_path / "run.mcap") as session:
         meant, commands = session.joints("/gait"), session.joints("/joint_commands")
-    told = dict(zip(meant.names, meant.values, strict=True))
+    shown = dict(zip(meant.names, meant.values, strict=True))
     commanded = dict(zip(commands.names, commands.values, strict=True))
     for i in scenario.robot.joint_indices(Plane.HORIZONTAL):
         joint = scenario.robot.joint_names[i]
-        angle = told[f"{joint}.A"] * np.sin(told[f"{joint}.phase"]) + told[f"{joint}.offset"]
+        angle = shown[f"{joint}.A"] * np.sin(shown[f"{joint}.phase"]) + shown[f"{joint}.offset"]
         np.testing.assert_allclose(commanded[joint], angle, atol=1e-12)

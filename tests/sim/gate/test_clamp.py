@@ -48,7 +48,7 @@ def test_what_is_within_the_limits_passes_bit_by_bit():
     assert clamp.cuts == {"by_position": 0, "by_rate": 0, "unconfirmed": 0, "not_finite": 0}
 
 
-def test_cuts_are_told_by_joint_and_reason():
+def test_cuts_are_reported_by_joint_and_reason():
     clamp = Clamp(LIMITS, np.zeros(25), PERIOD_S)
     wanted = np.zeros(25)
     wanted[[3, 4, 5]] = 1.0, 0.3, np.nan

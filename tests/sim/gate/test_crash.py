@@ -31,11 +31,11 @@ def check_kept(written, lines):
         given = np.array([row[name] for _, row in written.commands])
         assert len(angle) - len(given) in {0, 1}
         assert np.abs(given - angle[: len(given)]).max() <= gate_stage.STEP / 2 * (1 + 1e-6)
-    said = [text for _, _, text in written.said]
-    assert said[0] == "drives wave.mcap (commands) on " + said[0].rpartition(" on ")[2]
-    assert "gate: reading the pose" in said
-    assert any(text.startswith("gate: approach, ") for text in said)
-    assert "gate: run" in said
+    notes = [text for _, _, text in written.said]
+    assert notes[0] == "drives wave.mcap (commands) on " + notes[0].rpartition(" on ")[2]
+    assert "gate: reading the pose" in notes
+    assert any(text.startswith("gate: approach, ") for text in notes)
+    assert "gate: run" in notes
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -88,7 +88,7 @@ def check_missing(err, size):
 
 
 def check_told(controller, path, disk, *, ramp_rate=gate_stage.RAMP_RATE):
-    """The robot came to its safe end, and that is in a whole session; what was said and written."""
+    """The robot came to its safe end, and that is in a whole session; its report and log."""
     _, err = controller.communicate(timeout=120)
     assert controller.returncode == 1, err
     assert err.startswith(f"error: the disk at {disk} is full or fails: {path}")

@@ -70,7 +70,7 @@ def errors(written):
 
 
 def check_told(written, reason):
-    """The fault is told when it is found and at the end, and no other one is."""
+    """The fault is reported when it is found and at the end, and no other one is."""
     found, end = errors(written)
     assert found.startswith(f"fault: {reason}")
     assert end.startswith(f"fault: {reason}")
@@ -151,7 +151,7 @@ def test_a_process_that_comes_late_does_not_jump(driving):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plain", [False, True])
-def test_a_process_that_stops_and_goes_on_tells_no_joint_to_be_too_fast(plain, driving):
+def test_a_process_that_stops_and_goes_on_commands_no_joint_too_fast(plain, driving):
     """It catches up at the greatest rate that the robot's file allows: in true time, too."""
     with driving(plain=plain) as drive:
         drive.begun()
@@ -163,10 +163,10 @@ def test_a_process_that_stops_and_goes_on_tells_no_joint_to_be_too_fast(plain, d
     left_out = [text for _, _, text in written.said if " control ticks were left out" in text]
     assert sum("s of the gait" in text for text in left_out) >= 4
     assert any("command held back to 4 rad/s" in text for _, _, text in written.said)
-    told = re.search(r"(\d+) control ticks were left out, as the one before took too long", out)
+    given = re.search(r"(\d+) control ticks were left out, as the one before took too long", out)
     skipped = [re.search(r"late, (\S+) control tick", text) for _, _, text in written.said]
     counts = [1 if found[1] == "a" else int(found[1]) for found in skipped if found]
-    assert sum(counts) <= int(told[1]) >= 4 * 25
+    assert sum(counts) <= int(given[1]) >= 4 * 25
 
 
 # -- what is refused ----------------------------------------------------------------------------
@@ -174,31 +174,31 @@ def test_a_process_that_stops_and_goes_on_tells_no_joint_to_be_too_fast(plain, d
 
 def refused(folder, scenario, sessions):
     """What the controller says of sessions that it refuses, by name; nothing at all is sent."""
-    said = {}
+    noted = {}
     with staged(folder, scenario) as on_stage, ExitStack() as running:
         started = {
             name: running.enter_context(on_stage.replay(chosen, folder / f"{name}-out.mcap"))
             for name, chosen in sessions.items()
         }
         for name, controller in started.items():
-            _, said[name] = controller.communicate(timeout=60)
-            assert controller.returncode == 2, (name, said)
+            _, noted[name] = controller.communicate(timeout=60)
+            assert controller.returncode == 2, (name, noted)
             assert not (folder / f"{name}-out.mcap").exists(), name
         on_stage.settle()
         assert on_stage.lines  # the robot spoke all the while
         assert not on_stage.command_lines
-    return said
+    return noted
 
 
 def test_a_robot_without_limits_is_refused_and_nothing_is_sent(small, tmp_path):
     bare, _ = gate_stage.robot_files(tmp_path / "bare", safety=None)
     session = gate_stage.commanded(tmp_path / "limits.mcap", bare, 1.0)
-    said = refused(tmp_path, small[1], {"limits": session})["limits"]
-    assert said.startswith(
+    noted = refused(tmp_path, small[1], {"limits": session})["limits"]
+    assert noted.startswith(
         "error: snake4 can't be armed: its description lacks max_rate, ramp_rate, "
         "max_tracking_error, reply_timeout_s, max_late_s, max_current in [safety]"
     )
-    assert "\n  [safety]\n  max_rate = " in said
+    assert "\n  [safety]\n  max_rate = " in noted
 
 
 @pytest.mark.slow
@@ -210,12 +210,12 @@ def test_another_joint_set_and_another_robot_are_refused_and_nothing_is_sent(sma
     whole = {"names": [f"joint{k + 1:02d}" for k in range(25)]}
     whole["commands"] = lambda times_s: np.full((len(times_s), 25), 0.1)
     sessions["robot"] = write(tmp_path / "robot.mcap", "snake25", 1.0, **whole)
-    said = refused(tmp_path, small[1], sessions)
+    noted = refused(tmp_path, small[1], sessions)
     for last in ("wheel", "joint04"):
-        assert f"joint01, joint02, joint03, {last}" in said["foreign"]
-    assert "it commands 3 joints: joint01, joint02, joint03\n" in said["fewer"]
-    assert "snake4 has 4: joint01, joint02, joint03, joint04" in said["fewer"]
-    assert " is snake4, and robot.mcap is for snake25; nothing was sent" in said["robot"]
+        assert f"joint01, joint02, joint03, {last}" in noted["foreign"]
+    assert "it commands 3 joints: joint01, joint02, joint03\n" in noted["fewer"]
+    assert "snake4 has 4: joint01, joint02, joint03, joint04" in noted["fewer"]
+    assert " is snake4, and robot.mcap is for snake25; nothing was sent" in noted["robot"]
 
 
 @pytest.mark.slow

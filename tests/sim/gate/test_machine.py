@@ -53,7 +53,7 @@ class Wave:
         return GaitTick(self.at(time_s), np.empty(0), "walk", ())
 
 
-def heard(angle, *, current=0.0, temperature=30.0, voltage=np.nan, silence_s=0.0, **more):
+def reading(angle, *, current=0.0, temperature=30.0, voltage=np.nan, silence_s=0.0, **more):
     def all_of(value):
         return np.broadcast_to(np.asarray(value, dtype=float), COUNT).copy()
 
@@ -64,7 +64,7 @@ def heard(angle, *, current=0.0, temperature=30.0, voltage=np.nan, silence_s=0.0
 
 
 class Bench:
-    """A gate with a robot that is where it was told to be one tick before."""
+    """A gate with a robot that is where it was commanded to be one tick before."""
 
     def __init__(self, gait=None, start=0.0, *, duration_s=1.0, limits=LIMITS, **options):
         self.gait = gait or Wave()
@@ -79,7 +79,7 @@ class Bench:
         if change is not None:
             change(angle)
         self.tick += skip
-        found = self.gate.step(self.tick, heard(angle, **more), stop, at_once=at_once)
+        found = self.gate.step(self.tick, reading(angle, **more), stop, at_once=at_once)
         self.tick += 1
         if found.command is not None:
             self.sent.append(found.command)
@@ -115,7 +115,7 @@ def test_from_the_pose_by_a_ramp_to_the_first_command_then_the_gait_as_it_is():
     assert fastest(sent[: ramp_ticks + 1]) <= 0.5 / RATE_HZ * (1 + 1e-9)
     assert np.abs(sent[0] - 0.1).max() <= 0.5 / RATE_HZ
     assert bench.gait.asked == [tick / RATE_HZ for tick in range(101)]  # once a tick, in order
-    assert bench.gate.step(bench.tick, heard(0.0)).command is None
+    assert bench.gate.step(bench.tick, reading(0.0)).command is None
 
 
 def test_nothing_is_sent_until_every_joint_is_known():
@@ -200,7 +200,7 @@ def test_each_fault_is_found_in_its_time_and_ends_as_the_file_says(kind, how):
         np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
     if how is OnFault.HOLD:
         np.testing.assert_allclose(bench.sent[-1], bench.sent[-5], atol=1e-12)
-    assert bench.gate.step(bench.tick, heard(0.0)).command is None  # and nothing after it
+    assert bench.gate.step(bench.tick, reading(0.0)).command is None  # and nothing after it
 
 
 def test_an_excess_that_goes_away_in_time_is_no_fault():
@@ -209,12 +209,12 @@ def test_an_excess_that_goes_away_in_time_is_no_fault():
     for k in range(280):
         remarks += bench.step(current=1.5 if k % 29 < 28 else 1.0).remarks  # 0.28 s of 0.29 s
     assert bench.gate.phase is Phase.RUN
-    told = "gate: {}: draws more than 1.4 A: its command gives way"
-    assert {text for _, text in remarks} >= {told.format(name) for name in ROBOT.joint_names}
+    shown = "gate: {}: draws more than 1.4 A: its command gives way"
+    assert {text for _, text in remarks} >= {shown.format(name) for name in ROBOT.joint_names}
 
 
 @pytest.mark.parametrize("kind", [FaultKind.BUS_OFF, FaultKind.STRANGER])
-def test_where_nobody_hears_or_another_commands_nothing_more_is_sent(kind):
+def test_where_nobody_listens_or_another_commands_nothing_more_is_sent(kind):
     bench = Bench(duration_s=60.0).running()
     count = len(bench.sent)
     assert bench.step(trouble=GateFault(kind, "so")).command is None
@@ -248,13 +248,13 @@ def test_asked_to_stop_it_ends_and_asked_again_at_once():
     assert (outcome.how, outcome.why) == (DriveEnding.STOPPED, "asked, twice")
 
 
-def test_what_goes_wrong_while_it_ends_is_told_once_and_ends_nothing_twice():
+def test_what_goes_wrong_while_it_ends_is_reported_once_and_ends_nothing_twice():
     bench = Bench(duration_s=60.0).running(50)
     remarks = list(bench.step(stop="asked").remarks)
     while bench.gate.phase is Phase.ENDING:
         remarks += bench.step(stop="asked", temperature=99.0).remarks
-    said = [text for level, text in remarks if level == "error"]
-    assert said == ["fault while ending: joint01: temperature 99 degC, more than 70 degC for 0.3 s"]
+    logs = [text for level, text in remarks if level == "error"]
+    assert logs == ["fault while ending: joint01: temperature 99 degC, more than 70 degC for 0.3 s"]
     assert bench.gate.outcome.how is DriveEnding.STOPPED
     np.testing.assert_allclose(bench.sent[-1], 0.0, atol=1e-12)
 
@@ -300,9 +300,9 @@ def test_a_gait_that_says_nonsense_moves_nothing():
     while bench.gate.phase is not Phase.DONE:
         remarks += bench.step().remarks
     assert not np.array(bench.sent).any()
-    said = [text for level, text in remarks if level == "warn"]
-    assert said[0] == "gate: joint01: command is no number; the one before is held"
-    assert len(said) == COUNT  # once a joint
+    logs = [text for level, text in remarks if level == "warn"]
+    assert logs[0] == "gate: joint01: command is no number; the one before is held"
+    assert len(logs) == COUNT  # once a joint
 
 
 @pytest.mark.parametrize("from_the_gait", [True, False])
@@ -344,7 +344,7 @@ def test_who_is_on_the_bus():
     assert presence.add(frames_of(ERROR_FLAG | 0x80)) is None  # a hit frame is repeated
     presence.add(frames_of(*[0x14B] * 7))
     assert "received 4 are of snake25" in presence.another_robot()
-    # A request and its reply that share an identifier can't be told apart.
+    # A request and its reply that share an identifier cannot be separated.
     assert BusCheck(load_robot("arcsnake-joint")).add(frames_of(0x14B)) is None
 
 

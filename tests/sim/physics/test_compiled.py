@@ -138,10 +138,10 @@ def test_a_missing_extra_is_named_and_auto_goes_without(tmp_path, package, words
         f"import sys; sys.modules[{package!r}] = None; import undulog\n"
         f"sys.exit(undulog.run(['sim', 'run', 'a.toml', '-o', 'a.mcap', *{words.split()!r}]))"
     )
-    said = python(code, cwd=tmp_path)
+    found = python(code, cwd=tmp_path)
     if words.endswith("auto"):
-        assert (said.returncode, said.stderr) == (0, "")
+        assert (found.returncode, found.stderr) == (0, "")
     else:
-        assert said.returncode == 2
-        assert f"needs the package {package}, which is not installed" in said.stderr
-        assert f"pip install 'undulog[{package}]'" in said.stderr
+        assert found.returncode == 2
+        assert f"needs the package {package}, which is not installed" in found.stderr
+        assert f"pip install 'undulog[{package}]'" in found.stderr

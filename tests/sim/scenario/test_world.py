@@ -155,7 +155,7 @@ def test_a_field_stands_clear_of_what_is_there_and_joins_it():
     assert len(redrawn.obstacles) == len(world.obstacles) == 13
 
 
-def test_no_room_is_told():
+def test_no_room_is_reported():
     text = FIELD.replace("[4.0, 3.0]", "[0.4, 0.4]")
     assert "room for" in faults_of(SNAKE13 + text)["world.field"]
     scenario = sim.parse_scenario(SNAKE13 + FIELD, "x.toml")

@@ -37,38 +37,38 @@ def run(scenario):
         return [(sample, twin._sensing.readings) for sample in twin.samples()], twin.flush()
 
 
-def test_nothing_is_told_before_it_was_measured_or_twice(run):
+def test_nothing_is_delivered_before_it_was_measured_or_twice(run):
     seen = {}
     for sample, _ in run[0]:
-        cycles = [told.cycle for told in sample.sensed if isinstance(told, JointSample)]
+        cycles = [value.cycle for value in sample.sensed if isinstance(value, JointSample)]
         assert cycles == ([sample.tick - 2] if sample.tick >= 2 else [])
-        for told in sample.sensed:
-            if isinstance(told, JointSample):
+        for value in sample.sensed:
+            if isinstance(value, JointSample):
                 continue
-            assert sample.time_s - 0.01 <= told.time_s + 1e-9 < sample.time_s + 1e-9
-            assert told.time_s > seen.get(told.name, -1.0)
-            seen[told.name] = told.time_s
-        times = [told.time_s for told in sample.sensed if not isinstance(told, JointSample)]
+            assert sample.time_s - 0.01 <= value.time_s + 1e-9 < sample.time_s + 1e-9
+            assert value.time_s > seen.get(value.name, -1.0)
+            seen[value.name] = value.time_s
+        times = [value.time_s for value in sample.sensed if not isinstance(value, JointSample)]
         assert times == sorted(times)
-    assert (len(seen), [told.cycle for told in run[1]]) == (18, [59, 60])
+    assert (len(seen), [value.cycle for value in run[1]]) == (18, [59, 60])
 
 
 def test_the_readings_hold_the_newest_value_of_each_sensor(run, scenario):
     newest = {}
     assert run[0][0][1].angle.tolist() == pytest.approx([math.nan] * 25, nan_ok=True)
     for sample, readings in run[0]:
-        for told in sample.sensed:
-            newest["joints" if isinstance(told, JointSample) else told.name] = told
-        for name, told in newest.items():
-            if isinstance(told, JointSample):
-                np.testing.assert_array_equal(readings.angle, told.position)
-                np.testing.assert_array_equal(readings.velocity, told.velocity)
-            elif isinstance(told, RangeSample):
-                assert readings.ranges[name] == told.distance
+        for value in sample.sensed:
+            newest["joints" if isinstance(value, JointSample) else value.name] = value
+        for name, value in newest.items():
+            if isinstance(value, JointSample):
+                np.testing.assert_array_equal(readings.angle, value.position)
+                np.testing.assert_array_equal(readings.velocity, value.velocity)
+            elif isinstance(value, RangeSample):
+                assert readings.ranges[name] == value.distance
             elif name == "compass":
-                np.testing.assert_array_equal(readings.magnetic_field[name], told.vector)
+                np.testing.assert_array_equal(readings.magnetic_field[name], value.vector)
             else:
-                np.testing.assert_array_equal(readings.acceleration[name], told.vector)
+                np.testing.assert_array_equal(readings.acceleration[name], value.vector)
     last = run[0][-1][1]
     assert len(last.ranges) == 16
     # The head looks at the cylinder, 0.2 rad off to the left.
@@ -80,11 +80,11 @@ def test_the_readings_hold_the_newest_value_of_each_sensor(run, scenario):
 def test_a_session_holds_every_sample_with_both_its_times(run, scenario, tmp_path):
     path = tmp_path / "senses.mcap"
     sim.record(scenario, path)
-    told = [(sample.tick, one) for sample, _ in run[0] for one in sample.sensed]
+    value = [(sample.tick, one) for sample, _ in run[0] for one in sample.sensed]
     topics = {one.name: one.topic for one in scenario.robot.sensors}
     with Session.open(path) as session:
         for name, topic in topics.items():
-            mine = [(tick, one) for tick, one in told if getattr(one, "name", "") == name]
+            mine = [(tick, one) for tick, one in value if getattr(one, "name", "") == name]
             found = list(session.messages(topic))
             assert len(found) == len(mine) > 5
             for (tick, one), (log_ns, message) in zip(mine, found, strict=True):
@@ -147,12 +147,12 @@ def test_a_robot_without_sensors_has_none(make_scenario):
 
 
 def test_seeds_change_the_noise_and_only_that(scenario):
-    def told(seed):
+    def value(seed):
         samples = simulate(scenario.changed(seed=seed, duration_s=0.1))
         values = [one.vector for s in samples for one in s.sensed if isinstance(one, VectorSample)]
         return np.nan_to_num(values), samples[-1].step.body.angle
 
-    (first, angle), (again, _), (other, same) = told(1), told(1), told(2)
+    (first, angle), (again, _), (other, same) = value(1), value(1), value(2)
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
     np.testing.assert_array_equal(angle, same)

@@ -37,7 +37,7 @@ def test_faults_on_the_command_line(text, fault):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "why"),
     [
         ("lsot:0.1", "did you mean lost?"),
         ("", "no fault ''"),
@@ -61,8 +61,8 @@ def test_faults_on_the_command_line(text, fault):
         ("bus-off@", "'' is not a time in s"),
     ],
 )
-def test_what_is_no_fault_is_refused_with_what_would_be(text, said):
-    with pytest.raises(UsageError, match=re.escape(said)):
+def test_what_is_no_fault_is_refused_with_what_would_be(text, why):
+    with pytest.raises(UsageError, match=re.escape(why)):
         parse_faults([text], ROBOT)
 
 
@@ -94,7 +94,7 @@ def test_a_scenario_with_faults_is_read_as_it_is_written(faults):
     assert (again.faults, again.session_id) == (scenario.faults, scenario.session_id)
 
 
-def test_all_faults_of_a_scenarios_faults_are_told_at_once():
+def test_all_faults_of_a_scenarios_faults_are_reported_at_once():
     text = """
 [[faults]]
 kind = "lost"
@@ -129,10 +129,10 @@ until_s = 3
 def test_a_run_without_a_bus_says_that_it_has_no_faults_of_one(tmp_path, opened):
     scenario = parse_scenario(BASE + '[[faults]]\nkind = "noise"\nvalue = 0.1\n', "noisy.toml")
     plain = load_scenario("flat").changed(duration_s=0.05)
-    said = {}
+    logs = {}
     for one in (scenario, plain):
         path = tmp_path / f"{one.name}.mcap"
         record(one, path)
-        said[one.name] = [message.msg for _, message in opened(path).messages("/rosout")]
-    assert "the scenario's faults are those of a bus, which this run does not have" in said["noisy"]
-    assert not any("fault" in text for text in said["flat"])
+        logs[one.name] = [message.msg for _, message in opened(path).messages("/rosout")]
+    assert "the scenario's faults are those of a bus, which this run does not have" in logs["noisy"]
+    assert not any("fault" in text for text in logs["flat"])

@@ -60,7 +60,7 @@ class Running:
     """A virtual robot in a thread, and python-can's client of its bus."""
 
     def __init__(self, scenario, *, fast=True, **options):
-        self.said = []
+        self.events = []
         self.server = SocketcandServer("127.0.0.1", 0, "can0", self.log_event)
         self.bus = VirtualBus(self.server, None, self.log_event)
         self.stop = StopRequest()
@@ -79,7 +79,7 @@ class Running:
         self.encoder = BusEncoder(scenario.robot, Direction.TX)
 
     def log_event(self, level, text):
-        self.said.append(text)
+        self.events.append(text)
 
     def run(self):
         try:
@@ -127,9 +127,9 @@ def positions(robot, frames, quantity=Quantity.POSITION):
     samples, _ = BusDecoder(robot).decode(frames)
     (found,) = [one for one in samples if one.signals[0].quantity is quantity]
     order = [robot.joint_names.index(found.signals[k].target) for k in found.member]
-    told = np.full(JOINTS, np.nan)
-    told[order] = found.values
-    return told
+    angles = np.full(JOINTS, np.nan)
+    angles[order] = found.values
+    return angles
 
 
 def answer(angle, tick):
@@ -160,8 +160,8 @@ def test_a_loop_closed_over_the_bus_in_lockstep_is_the_loop_in_process(scenario,
     found += [live.replies(JOINTS), live.replies(JOINTS)]
     served = live.ended()
     assert (served.complete, served.commands) == (True, JOINTS * scenario.tick_count)
-    told = np.array([positions(robot, frames) for frames in found])
-    np.testing.assert_allclose(told, truth, rtol=0, atol=1e-12)
+    angles = np.array([positions(robot, frames) for frames in found])
+    np.testing.assert_allclose(angles, truth, rtol=0, atol=1e-12)
     times = np.array([frames["t_device_ns"].astype(np.int64) for frames in found])
     expected = PERIOD_NS * np.arange(len(found))[:, None] + 500_000 * np.arange(JOINTS)
     expected[-1] = expected[-1, 0]  # the end of the run has no turns any more
@@ -192,23 +192,23 @@ def test_it_waits_for_the_first_command_and_then_keeps_time(scenario, robot, run
     stood_still = round(served.pace.stood_still_s * 1e9)
     assert cycles[0, 0] == 0
     assert cycles[-1, 0] <= 30 * PERIOD_NS + stood_still + 1000
-    assert any("starts at" in text for text in live.said)
+    assert any("starts at" in text for text in live.events)
 
 
 def test_without_commands_it_holds_still_and_says_whose_commands_are_missing(scenario, running):
     live = running(scenario.changed(duration_s=0.5), lockstep=True)
     live.command([0.0] * (JOINTS - 1))
-    wait_for(lambda: "waits for commands of joint04" in live.said, live.said)
+    wait_for(lambda: "waits for commands of joint04" in live.events, live.events)
     live.stop.signal = 15
     served = live.ended()
     assert (served.complete, served.duration_s) == (False, 0.0)
 
 
-def test_silence_of_the_controller_is_told_and_so_is_its_return(scenario, running):
+def test_silence_of_the_controller_is_reported_and_so_is_its_return(scenario, running):
     live = running(scenario.changed(duration_s=30.0), fast=False, wait=True)
 
     def until(part):
-        wait_for(lambda: any(part in text for text in live.said), live.said)
+        wait_for(lambda: any(part in text for text in live.events), live.events)
 
     live.command([0.6] * JOINTS)
     until("no command for 0.5 s: joint01, joint02, joint03, joint04 hold their angles")
@@ -311,7 +311,7 @@ def test_delayed_frames_keep_their_times_and_their_order(robot):
     assert shown[7]["t_device_ns"].tolist() == [5 * PERIOD_NS] * 4
 
 
-def test_off_the_bus_the_robot_neither_speaks_nor_hears(robot):
+def test_off_the_bus_the_robot_neither_sends_nor_receives(robot):
     line = fault_line(robot, "bus-off@0.05+0.1")
     shown = cycles(robot, line, 30)
     assert [len(frames) for frames in shown] == [4] * 5 + [1] + [0] * 9 + [5] + [4] * 14
@@ -320,11 +320,11 @@ def test_off_the_bus_the_robot_neither_speaks_nor_hears(robot):
     assert [line.is_receiving(t) for t in (0.04, 0.05, 0.14, 0.15)] == [True, False, False, True]
 
 
-def test_a_frozen_encoder_tells_its_last_angle_and_a_stuck_servo_holds_it(robot):
+def test_a_frozen_encoder_sends_its_last_angle_and_a_stuck_servo_holds_it(robot):
     line = fault_line(robot, "frozen:joint03@0.1", "stuck:joint01@0.1+0.1")
-    told = np.array([positions(robot, frames) for frames in cycles(robot, line, 30)])
-    assert (len(np.unique(told[:10, 2])), len(np.unique(told[10:, 2]))) == (10, 1)
-    assert len(np.unique(told[:, 0])) == 30
+    angles = np.array([positions(robot, frames) for frames in cycles(robot, line, 30)])
+    assert (len(np.unique(angles[:10, 2])), len(np.unique(angles[10:, 2]))) == (10, 1)
+    assert len(np.unique(angles[:, 0])) == 30
     command, angle = np.full(JOINTS, 0.3), np.full(JOINTS, 0.1)
     assert line.command(command, angle, 0.05).tolist() == [0.3] * 4
     assert line.command(command, angle, 0.10).tolist() == [0.1, 0.3, 0.3, 0.3]
@@ -338,13 +338,13 @@ def test_a_servo_that_draws_too_much_says_so_and_nothing_else_is_changed(robot):
         for faults in ((), ("over-current:joint02:1.5@0.1+0.1",))
     )
     for quantity in (Quantity.POSITION, Quantity.VELOCITY, Quantity.EFFORT, Quantity.CURRENT):
-        told, expected = (
+        angles, expected = (
             np.array([positions(robot, frames, quantity) for frames in shown])
             for shown in (struck, clean)
         )
         if quantity is Quantity.CURRENT:
             expected[10:20, 1] = 1.5
-        np.testing.assert_array_equal(told, expected)
+        np.testing.assert_array_equal(angles, expected)
 
 
 def test_a_stuck_servo_does_not_follow_its_commands(scenario, robot, running):
@@ -354,5 +354,5 @@ def test_a_stuck_servo_does_not_follow_its_commands(scenario, robot, running):
     for tick in range(quiet.tick_count):
         live.command([0.3 * math.sin(0.1 * tick), 0.0, 0.3 * math.sin(0.1 * tick), 0.0])
     frames = live.replies(JOINTS * quiet.tick_count).reshape(-1, JOINTS)
-    told = np.array([positions(robot, one) for one in frames])
-    assert np.ptp(told[40:, 0]) < 0.1 * np.ptp(told[40:, 2])
+    angles = np.array([positions(robot, one) for one in frames])
+    assert np.ptp(angles[40:, 0]) < 0.1 * np.ptp(angles[40:, 2])

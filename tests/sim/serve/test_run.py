@@ -126,7 +126,7 @@ def heedless(scenario, port, control):
 
 
 def on_the_bus(folder, scenario, *words, controller=driven):
-    """Robot, two recorders and a controller; returns what each said and wrote."""
+    """Robot, two recorders and a controller; returns what each reported and wrote."""
     bus = folder / "bus.sock"
     over_bus = {way: folder / f"{way}.mcap" for way in ("tcp", "unix")}
     words = ("--unix", str(bus), "--duration", str(DURATION_S), "--lockstep", *words)
@@ -240,9 +240,9 @@ def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario, opened)
         assert "error frames" in reasons
         (bus,) = health.buses
         assert bus.error_frames == end["hit"] + 2  # off, and back again
-        said = [message.msg for _, message in opened(path).messages("/rosout")]
-        assert "bus-off: the controller left the bus" in said
-        assert "the controller is back on the bus" in said
+        notes = [message.msg for _, message in opened(path).messages("/rosout")]
+        assert "bus-off: the controller left the bus" in notes
+        assert "the controller is back on the bus" in notes
 
 
 @pytest.mark.slow
@@ -283,8 +283,8 @@ def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
         with process(*UNDULOG, *record, **options) as recording:
 
             def connected():
-                said = undulog("record", "status", "--json", **options)
-                found = json.loads(said.stdout or "{}").get("recordings", [])
+                status = undulog("record", "status", "--json", **options)
+                found = json.loads(status.stdout or "{}").get("recordings", [])
                 return found and found[0]["sources"][0]["connected"]
 
             wait_for(connected, "the recorder")
@@ -292,9 +292,9 @@ def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
                 subprocess.run([*UNDULOG, *words], check=True, timeout=PATIENCE_S, **options)
             assert recording.wait(60) == 0
         robot.send_signal(signal.SIGINT)
-        told, _ = robot.communicate(timeout=60)
+        shown, _ = robot.communicate(timeout=60)
         assert robot.returncode == 0
-        assert re.match(r"snake25 ran for [\d.]+ s of flat ", told)
+        assert re.match(r"snake25 ran for [\d.]+ s of flat ", shown)
     with Session.open(tmp_path / "run.mcap") as session:
         commanded, measured = (session.joints(f"/joint_{w}") for w in ("commands", "states"))
         assert commanded.names == measured.names == session.robot.joint_names
@@ -316,8 +316,8 @@ def test_the_manuals_own_controller_moves_the_robot():
     assert end["ticks"] > 10
 
 
-def test_what_cannot_be_served_is_said_at_once(command):
-    for words, said in (
+def test_what_cannot_be_served_is_refused_at_once(command):
+    for words, message in (
         (["flat"], "give --socketcand PORT or --unix PATH"),
         (["flat", "--socketcand", "1e3"], "expected [HOST:]PORT"),
         (["flat", "--socketcand", "192.0.2.1:0"], "is not this computer's loopback"),
@@ -328,4 +328,4 @@ def test_what_cannot_be_served_is_said_at_once(command):
         (["flat", "--socketcand", "0", "--duration", "0"], "a duration of 0 s"),
         (["flat", "--unix", "x" * 200], "AF_UNIX path too long"),
     ):
-        assert said in command("sim", "serve", *words, code=2).err
+        assert message in command("sim", "serve", *words, code=2).err

@@ -61,9 +61,9 @@ class Serving:
     """A bus whose clients are served by a thread; its robot is the test."""
 
     def __init__(self):
-        self.said = []
+        self.events = []
         self.server = socketcand_server.SocketcandServer(
-            "localhost", 0, "can0", lambda level, text: self.said.append((level, text))
+            "localhost", 0, "can0", lambda level, text: self.events.append((level, text))
         )
         self.port = self.server.address[1]
         self.bus = socketcand_server.VirtualBus(self.server, None, lambda *_: None)
@@ -119,14 +119,14 @@ def hand(serving, *words):
     """A client by hand; what it asked for has been answered when the block begins."""
     with socket.create_connection(("127.0.0.1", serving.port)) as sock:
         sock.settimeout(PATIENCE_S)
-        assert heard(sock, b"< hi >") == b"< hi >"
+        assert read_until(sock, b"< hi >") == b"< hi >"
         for word in words:
             sock.sendall(b"< %s >" % word)
-            assert heard(sock, b"< ok >") == b"< ok >"
+            assert read_until(sock, b"< ok >") == b"< ok >"
         yield sock
 
 
-def heard(sock, end):
+def read_until(sock, end):
     data = b""
     while not data.endswith(end):
         chunk = sock.recv(65536)
@@ -168,8 +168,8 @@ def test_what_the_server_writes_both_clients_read_alike():
 def test_what_python_can_sends_is_read(identifier, extended, data):
     identifier &= 0x1FFFFFFF if extended else 0x7FF
     message = can.Message(arbitration_id=identifier, is_extended_id=extended, data=data)
-    (said,) = ClientText().feed(convert_can_message_to_ascii_message(message).encode())
-    word, _, rest = said.partition(" ")
+    (text,) = ClientText().feed(convert_can_message_to_ascii_message(message).encode())
+    word, _, rest = text.partition(" ")
     record = sent_frame(word, rest.strip())
     assert record is not None
     assert same(records([record]), frames_of([message]))
@@ -264,23 +264,26 @@ def test_pythons_client_can_join_a_busy_bus(serving):
 
 def test_answers_are_those_of_the_protocol(serving):
     with hand(serving, b"open can0") as sock:
-        for said, answer in (
+        for request, answer in (
             (b"echo", b"< echo >"),
             (b"bcmmode", b"< ok >"),
             (b"subscribe 0 0 123", b"< error only the raw mode is served >"),
             (b"statistics 100", b"< error unknown command >"),
             (b"send 123 2 11", b"< error syntax error >"),
         ):
-            sock.sendall(b"< %s >" % said)
-            assert heard(sock, b">") == answer
+            sock.sendall(b"< %s >" % request)
+            assert read_until(sock, b">") == answer
         sock.sendall(b"< send 123 1 A >")  # without the raw mode one can send, too
         wait_for(lambda: len(serving.pulled), "the frame")
-    for said in (b"< send 123 1 A >", b"< open can7 >"):
+    for request in (b"< send 123 1 A >", b"< open can7 >"):
         with hand(serving) as sock:
-            sock.sendall(said)
-            assert heard(sock, b">") == b"< error could not open bus >"
+            sock.sendall(request)
+            assert read_until(sock, b">") == b"< error could not open bus >"
             assert sock.recv(10) == b""
-    wait_for(lambda: any("there is only can0" in text for _, text in serving.said), "why")
+    wait_for(
+        lambda: any("there is only can0" in text for _, text in serving.events),
+        "can7 refused",
+    )
 
 
 def test_a_client_that_does_not_listen_is_let_go_and_the_others_hear_all(serving):
@@ -293,9 +296,9 @@ def test_a_client_that_does_not_listen_is_let_go_and_the_others_hear_all(serving
             sent += 1000
             assert len(received(good, 1000)) == 1000
             assert sent < 2_000_000
-    said = [text for level, text in serving.said if level == "warn"]
-    assert len(said) == 1
-    assert "does not take its frames" in said[0]
+    warnings = [text for level, text in serving.events if level == "warn"]
+    assert len(warnings) == 1
+    assert "does not take its frames" in warnings[0]
 
 
 def test_a_client_that_makes_no_sense_is_let_go(serving):
@@ -355,31 +358,31 @@ def test_no_more_clients_than_there_is_room_for(serving):
             assert late.recv(10) == b""
 
 
-@pytest.mark.parametrize("said", [(), (b"open can0",)], ids=["nothing", "open"])
-def test_silent_clients_lock_nobody_out(serving, said):
+@pytest.mark.parametrize("words", [(), (b"open can0",)], ids=["nothing", "open"])
+def test_silent_clients_lock_nobody_out(serving, words):
     """Whoever connects and stays silent gives way; who works on the bus stays."""
     frames = traffic(50)
     with ExitStack() as clients:
         worker = clients.enter_context(hand(serving, b"open can0", b"rawmode"))
         for _ in range(3 * socketcand_server.MOST_CLIENTS):
-            clients.enter_context(hand(serving, *said))
+            clients.enter_context(hand(serving, *words))
         late = clients.enter_context(peer(serving))
         wait_for(lambda: serving.raw() == 2, "both in raw mode")
         serving.send(frames)
         found = received(late, len(frames))
         text = frame_text(frames)
-        assert heard(worker, text[-40:]) == text
+        assert read_until(worker, text[-40:]) == text
     assert same(frames_of(found), frames[(frames["id_flags"] & REMOTE_FLAG) == 0])
 
 
 def test_only_loopback_is_served():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        for host, at, said in (
+        for host, at, why in (
             ("0.0.0.0", 0, "is not this computer's loopback"),
             ("192.0.2.1", 0, "is not this computer's loopback"),
             ("no.such.host.invalid", 0, "no address to serve at"),
             ("127.0.0.1", port, f"can't serve at 127.0.0.1:{port}: Address already"),
         ):
-            with pytest.raises(UsageError, match=said):
+            with pytest.raises(UsageError, match=why):
                 socketcand_server.SocketcandServer(host, at, "can0", lambda *_: None)

@@ -49,12 +49,12 @@ def session(recording):
 
 @pytest.fixture(scope="module")
 def run(scenario):
-    """The twin's samples, and what its sensors told of the joints with the time of arrival [s]."""
+    """The twin's samples, and its sensors' joint samples with the time of arrival [s]."""
     with sim.Twin(scenario) as twin:
         samples = list(twin.samples())
-        heard = [(s.time_s, told) for s in samples for told in s.sensed]
-        heard += [(samples[-1].time_s, told) for told in twin.flush()]
-    return samples, [(at, told) for at, told in heard if isinstance(told, JointSample)]
+        received = [(s.time_s, sample) for s in samples for sample in s.sensed]
+        received += [(samples[-1].time_s, sample) for sample in twin.flush()]
+    return samples, [(at, sample) for at, sample in received if isinstance(sample, JointSample)]
 
 
 @pytest.fixture
@@ -120,14 +120,14 @@ def test_joints_come_back_exactly(session, run, scenario):
     assert states.names == scenario.robot.joint_names
     expected = scenario.epoch_ns + HUNDREDTH_NS * np.arange(61)
     assert all(np.array_equal(t, expected) for t in states.t_ns)
-    truth, told = run[0], [sample for _, sample in run[1]]
+    truth, sensed = run[0], [sample for _, sample in run[1]]
     for topic, field, values in (
         ("/joint_commands", "position", [sample.gait.command for sample in truth]),
         ("/joint_states", "position", [sample.step.body.angle for sample in truth]),
         ("/joint_states", "velocity", [sample.step.body.rate for sample in truth]),
-        ("/joint_states", "effort", [sample.effort for sample in told]),
-        ("/joint_current", "position", [sample.current for sample in told]),
-        ("/joint_voltage", "position", [sample.voltage for sample in told]),
+        ("/joint_states", "effort", [sample.effort for sample in sensed]),
+        ("/joint_current", "position", [sample.current for sample in sensed]),
+        ("/joint_voltage", "position", [sample.voltage for sample in sensed]),
         ("/joint_sample_offset", "position", np.zeros((61, 25))),
     ):
         np.testing.assert_array_equal(columns(session, topic, field), values)
@@ -194,23 +194,23 @@ def test_odometry_twist_is_in_the_heads_frame(tmp_path, make_scenario, make_robo
 
 
 def test_events_tell_the_story(session):
-    said = [message.msg for _, message in session.messages("/rosout")]
-    assert said[0].startswith("start of weak-servo-pi3, seed 1: ")
-    assert said[1:] == ["settled: 0.3 s have passed", "end at 0.6 s"]
+    logs = [message.msg for _, message in session.messages("/rosout")]
+    assert logs[0].startswith("start of weak-servo-pi3, seed 1: ")
+    assert logs[1:] == ["settled: 0.3 s have passed", "end at 0.6 s"]
 
 
-def test_clamps_limits_and_stiff_parts_are_said_once(tmp_path, make_scenario, make_robot, opened):
+def test_clamps_limits_and_stiff_parts_come_once(tmp_path, make_scenario, make_robot, opened):
     stiff = sim.World(ground=sim.Ground(slip_speed=0.001))
     path = tmp_path / "a.mcap"
     scenario = make_scenario(
         make_robot(9, limit=0.1), amplitude=0.4, frequency_hz=2.0, ramp_s=0.0, world=stiff
     )
     sim.record(scenario, path)
-    said = [message.msg for _, message in opened(path).messages("/rosout") if message.level == 30]
-    assert len(said) == len(set(said))
-    assert "horizontal.A clamped to the joint limits" in said
-    assert any("passed its limits -0.1 to 0.1 rad" in text for text in said)
-    assert any("world.ground.slip_speed is too stiff" in text for text in said)
+    logs = [message.msg for _, message in opened(path).messages("/rosout") if message.level == 30]
+    assert len(logs) == len(set(logs))
+    assert "horizontal.A clamped to the joint limits" in logs
+    assert any("passed its limits -0.1 to 0.1 rad" in text for text in logs)
+    assert any("world.ground.slip_speed is too stiff" in text for text in logs)
 
 
 def test_noise_comes_from_the_seed_and_touches_only_reports(tmp_path, scenario, truth):
@@ -264,16 +264,16 @@ def test_a_stopped_run_leaves_a_whole_session(tmp_path, number):
     path = tmp_path / "killed.mcap"
     process = long_run(path)
     process.send_signal(number)
-    told, complained = process.communicate(timeout=60)
+    out, complained = process.communicate(timeout=60)
     assert (process.returncode, complained) == (1, "")
-    assert told.startswith("stopped at ")
+    assert out.startswith("stopped at ")
     with Session.open(path) as session:
         assert (session.warnings, session.verdict) == ([], "degraded")
         states = session.joints("/joint_states", "position")
-        said = [message.msg for _, message in session.messages("/rosout")]
+        logs = [message.msg for _, message in session.messages("/rosout")]
         assert len(states.values[0]) == session.channels["/energy_ledger"].count > 1
-        assert said[-1] == told.split(";")[0]
-    assert f"stopped at {(len(states.values[0]) - 1) / 100:g} s of 3600 s" == said[-1]
+        assert logs[-1] == out.split(";")[0]
+    assert f"stopped at {(len(states.values[0]) - 1) / 100:g} s of 3600 s" == logs[-1]
 
 
 def test_a_stop_request_ends_between_two_samples(tmp_path, scenario):

@@ -26,7 +26,7 @@ def restless(scenario):
 
 @pytest.fixture
 def nudged(make_scenario, make_robot):
-    """A robot that is told to bend each joint a little, each in its own way, and to stay so."""
+    """A robot that bends each joint a little, each in its own way, and stays so."""
 
     def build(links, *, planar=True, rate_hz=1000, world=None, plane=Plane.HORIZONTAL, **servo):
         # Weak and without Coulomb friction: the servos neither hold the motion nor drive it.
@@ -118,9 +118,9 @@ def test_a_ground_that_does_not_carry_a_link_is_named(make_scenario, make_robot)
     heavy = dataclasses.replace(robot.links[2], mass=0.025 * 2000.0 / 9.81 + 0.01)
     links = (*robot.links[:2], heavy, robot.links[3])
     scenario = make_scenario(dataclasses.replace(robot, links=links), physics_rate_hz=4000)
-    said = "link03 is too heavy for world.ground.stiffness: with 5.10684 kg it rests 0.025 m deep"
-    assert warnings(scenario)[-1] == said
-    assert likely_cause(scenario) == f"likely cause: {said}"
+    shown = "link03 is too heavy for world.ground.stiffness: with 5.10684 kg it rests 0.025 m deep"
+    assert warnings(scenario)[-1] == shown
+    assert likely_cause(scenario) == f"likely cause: {shown}"
 
 
 @pytest.mark.parametrize(

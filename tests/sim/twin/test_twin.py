@@ -102,8 +102,8 @@ def test_without_ground_nothing_is_lost_to_it(make_scenario, make_robot):
 
 def test_a_failure_without_a_stiff_part_says_so(make_scenario, make_robot):
     world = World(velocity=(11.0, 0.0, 0.0))
-    said = r"at 0\.000 s: link01 moves at 11 m/s.*look at the gait"
-    with pytest.raises(SimulationError, match=said):
+    shown = r"at 0\.000 s: link01 moves at 11 m/s.*look at the gait"
+    with pytest.raises(SimulationError, match=shown):
         simulate(make_scenario(make_robot(3), amplitude=0.0, world=world))
 
 

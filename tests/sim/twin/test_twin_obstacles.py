@@ -115,7 +115,7 @@ def test_obstacles_out_of_reach_change_nothing(make_scenario, make_robot):
         np.testing.assert_array_equal(one.energy, other.energy)
 
 
-def test_the_command_line_tells_the_time_in_contact(tmp_path, command, report_of):
+def test_the_command_line_shows_the_time_in_contact(tmp_path, command, report_of):
     peg = '[[world.obstacles]]\nshape = "cylinder"\nposition = [-0.12, 0.06]\nradius = 0.03\n'
     text = f"gait.ramp_s = 0.0\n{SNAKE13.replace('2.0', '0.3').replace('0.5', '1.0')}{peg}"
     path, words = tmp_path / "peg.toml", ("-o", tmp_path / "a.mcap", "--force")
@@ -124,7 +124,7 @@ def test_the_command_line_tells_the_time_in_contact(tmp_path, command, report_of
     assert touched
     assert all(0.0 < seconds <= 0.3 for seconds in touched.values())
     longest = max(touched, key=touched.get)
-    said = command("sim", "run", path, *words).out
-    assert f"touched obstacles, {longest} longest: {touched[longest]:.3g} s\n" in said
+    found = command("sim", "run", path, *words).out
+    assert f"touched obstacles, {longest} longest: {touched[longest]:.3g} s\n" in found
     path.write_text(text.replace("0.06]", "2.0]"))
     assert "no link touched an obstacle\n" in command("sim", "run", path, *words).out

@@ -69,7 +69,7 @@ def test_the_matrices_are_those_planted(result):
         assert all(abs(row.total.value - total) < 5 * row.standard_error + 5e-4 for row in rows)
 
 
-def test_a_linear_chain_is_told_as_linear(result):
+def test_a_linear_chain_is_found_linear(result):
     coupling = result.coupling
     assert coupling.nonlinearity.ci95[0] == 0.0 <= coupling.nonlinearity.value < 0.02
     assert coupling.lti.condition_number == pytest.approx(np.linalg.cond(H), rel=0.02)

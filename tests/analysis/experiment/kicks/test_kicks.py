@@ -236,7 +236,7 @@ def test_held_out_patterns_tell_how_far_it_holds():
     assert (valid_to(found[:2]), valid_to([])) == (found[1].size, None)
 
 
-def test_kicks_are_told_from_phasors():
+def test_kicks_are_estimated_from_phasors():
     _, command = planted()
     rng = np.random.default_rng(1)
     kicks = plan()

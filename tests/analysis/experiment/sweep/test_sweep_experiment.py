@@ -133,7 +133,7 @@ def test_h_and_z_are_those_planted(result):
     assert coupling.sideband_energy.ci95[0] == 0.0
 
 
-def test_contact_that_is_not_known_is_said(result):
+def test_contact_that_is_not_known_is_reported(result):
     assert result.coupling.contact is None
     assert "which its sessions don't record" in result.coupling.validity
     assert [one for one in result.warnings if "whether the robot touched anything" in one]
@@ -199,7 +199,7 @@ def test_a_sweep_with_a_run_missing(lag_sweep):
     assert coupling.matrix is None
 
 
-def test_responses_that_drift_are_told(tmp_path):
+def test_responses_that_drift_are_reported(tmp_path):
     result = experiment(sweep(tmp_path, robot=ROBOT, scenario=FREE, drift=2e-3))
     # 0.2 % a second is 0.4 % a cycle.
     assert result.coupling.drift_per_cycle == pytest.approx(4e-3, rel=0.1)
@@ -207,7 +207,7 @@ def test_responses_that_drift_are_told(tmp_path):
     assert result.coupling.contact is False
 
 
-def test_a_multisine_tells_every_tone(tmp_path):
+def test_a_multisine_shows_every_tone(tmp_path):
     omegas = tuple(tones(2 * np.pi * F0, 3))
     scenario = f"physics_rate_hz = 1000000000\n[servo]\ncoulomb_friction = 0.0\n{FREE}"
     result = experiment(sweep(tmp_path, omegas=omegas, robot=ROBOT, scenario=scenario))
@@ -224,7 +224,7 @@ def test_a_multisine_tells_every_tone(tmp_path):
     assert [run.role for run in result.runs] == ["sweep"] * M
 
 
-def test_a_multisine_in_contact_tells_what_is_mixed(tmp_path, opened):
+def test_a_multisine_in_contact_reports_what_is_mixed(tmp_path, opened):
     omegas = tuple(tones(2 * np.pi * F0, 3))
     scenario = 'physics_rate_hz = 1000\n[world]\nsurface = "flat"\n'
     how = {"omegas": omegas, "scenario": scenario, "effort": False, "bend": 400.0}
@@ -236,13 +236,13 @@ def test_a_multisine_in_contact_tells_what_is_mixed(tmp_path, opened):
     assert any(one.startswith("not linear") for one in result.warnings)
     # A record holds two periods of the grid: line k of 0.1 Hz is bin 2 k of its transform.
     lines = np.arange(1, 28)  # to the highest tone and twice the gait's beyond it
-    told = np.isin(lines, [5, 11, 17])
+    found = np.isin(lines, [5, 11, 17])
     beside = at_tones = 0.0
     for path in paths:
         signals = opened(path).joints("/joint_states")
         values = np.stack([signals.signal(name).values for name in NAMES])
         power = np.sum(np.abs(np.fft.rfft(values, axis=1)[:, 2 * lines]) ** 2, axis=0)
-        beside, at_tones = beside + power[~told].sum(), at_tones + power[told].sum()
+        beside, at_tones = beside + power[~found].sum(), at_tones + power[found].sum()
     assert coupling.sideband_energy.value == pytest.approx(beside / at_tones, rel=0.05)
     low, high = coupling.sideband_energy.ci95
     assert 0 < low < beside / at_tones < high

@@ -78,7 +78,7 @@ def test_matrices_and_row_sums_are_those_of_the_result(pages, kicked):
     assert [row[2][0] for row in held] == [100 * one.error for one in coupling.held_out]
 
 
-def test_a_sweep_is_told_tone_by_tone(pages, swept):
+def test_a_sweep_is_shown_tone_by_tone(pages, swept):
     (tone,) = swept.coupling.tones
     (row,) = rows(pages["swept"], "tones")
     assert row[0] == [tone.frequency_hz]
@@ -107,8 +107,8 @@ def test_every_matrix_has_a_picture_and_a_table(pages):
 
 
 def test_tests_answer_in_words(both_ways, kicked, snake):
-    told = {one.question: one for one in experiment_trials(both_ways)}
-    mirror = told["Do the modules mirror, as identical ones do? (H1, reversal)"]
+    trials = {one.question: one for one in experiment_trials(both_ways)}
+    mirror = trials["Do the modules mirror, as identical ones do? (H1, reversal)"]
     assert (mirror.p, mirror.verdict) == (both_ways.reversal.p, "no, modules differ")
     verdicts = [one.verdict for one in experiment_trials(kicked)]
     assert verdicts[:2] == ["as any settled gait's do"] * 2

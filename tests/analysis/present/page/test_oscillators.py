@@ -42,7 +42,7 @@ def test_every_coupling_is_in_the_table(page):
     degrees = np.degrees([0.5, 0.4, 0.6])
     shown = numbers(page, "links")
     np.testing.assert_allclose(shown[0], [2.0, 1.9, 2.1, *degrees])
-    assert shown[1] == [0.01, 0.0, 0.06]  # no lag where K can't be told from 0
+    assert shown[1] == [0.01, 0.0, 0.06]  # no lag where K does not differ from 0
     assert [row[0] for row in numbers(page, "rates")] == [3.1] * 3
 
 

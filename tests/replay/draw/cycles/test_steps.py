@@ -58,13 +58,13 @@ def by_cycle(analysis, snake25):
 
 @pytest.fixture(scope="module")
 def written(session_file, tmp_path_factory, read_back):
-    """Writes the session with an analysis; (what was said, what is in the file)."""
+    """Writes the session with an analysis; (what was reported, what is in the file)."""
 
     def write(analysis, **options):
         path = tmp_path_factory.mktemp("cycles") / "made.rrd"
         with Session.open(session_file) as session:
-            said = write_recording(session, path, analysis=analysis, **options)
-        return said, read_back(path)
+            found = write_recording(session, path, analysis=analysis, **options)
+        return found, read_back(path)
 
     return write
 
@@ -84,9 +84,9 @@ def test_the_numbers_are_the_analysiss(by_cycle):
 
 
 def test_a_step_spans_its_cycle_and_ends_with_it(by_cycle, written):
-    said, recorded = written(by_cycle)
+    found, recorded = written(by_cycle)
     entity = "/cycles/gain_minus_one_percent"
-    keys = [quantity.key for quantity, _ in said.content.cycles]
+    keys = [quantity.key for quantity, _ in found.content.cycles]
     assert keys == ["gain_minus_one_percent", "lag_degrees", "energy_net_joule"]
     rows = np.array(recorded.column(entity, "Scalars:scalars"), dtype=float)
     np.testing.assert_allclose(recorded.times(entity) / 1e9, [0, 1, 2, 3])
@@ -165,8 +165,8 @@ def test_energies_of_a_cycle_stand_beside_bars_of_a_mean_cycle(by_cycle, analysi
 
 
 def test_without_cycles_there_are_no_views_of_them(analysis, written):
-    said, recorded = written(analysis)
-    assert (said.content.cycles, said.content.maps) == ((), ())
+    found, recorded = written(analysis)
+    assert (found.content.cycles, found.content.maps) == ((), ())
     assert not any(path.startswith(("/cycles", "/maps")) for path in recorded.entities)
 
 

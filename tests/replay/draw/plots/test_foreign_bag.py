@@ -70,17 +70,17 @@ def bag(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def shown(bag, tmp_path_factory, read_back):
-    """The bag as a recording, its joints named: (what was said, what is in the file)."""
+    """The bag as a recording, its joints named: (what was reported, what is in the file)."""
     path = tmp_path_factory.mktemp("shown") / "bag.rrd"
-    told = path.with_suffix(".txt")
-    with told.open("w") as out, redirect_stdout(out):
+    found = path.with_suffix(".txt")
+    with found.open("w") as out, redirect_stdout(out):
         assert undulog.run(["view", str(bag), *NAMED, "--save", str(path), "--json"]) == 0
-    return json.loads(told.read_text()), read_back(path)
+    return json.loads(found.read_text()), read_back(path)
 
 
 def test_the_joints_are_shown_under_the_names_that_were_given(shown):
-    said, recorded = shown
-    assert said["joints"] == NAMES
+    written, recorded = shown
+    assert written["joints"] == NAMES
     t = recorded.times("/joints/measured") / 1e9
     angle = np.radians(np.array(recorded.column("/joints/measured", "Angle:degrees")))
     truth = 0.36 * np.sin(OMEGA * t[:, None] - np.arange(3) - 0.2)
@@ -100,7 +100,7 @@ def test_they_are_analysed_and_averaged_too(shown):
 
 
 def test_other_numbers_are_plotted_words_are_events_and_the_rest_is_named(shown):
-    said, recorded = shown
+    written, recorded = shown
     names = recorded.static("/others/imu/data", "SeriesLines:names")
     assert {"angular_velocity.x", "linear_acceleration.z"} <= set(names)
     assert not any("covariance" in name for name in names)
@@ -113,15 +113,15 @@ def test_other_numbers_are_plotted_words_are_events_and_the_rest_is_named(shown)
     assert recorded.column("/events/said", "TextLog:text") == [["/state: go"], ["/state: turn"]]
     np.testing.assert_allclose(recorded.times("/events/said") / 1e9, [0.0, 3.0])
     left_out = "/camera (sensor_msgs/msg/CompressedImage), /tf (tf2_msgs/msg/TFMessage)"
-    assert f"not shown: {left_out}" in said["warnings"]
+    assert f"not shown: {left_out}" in written["warnings"]
 
 
 def test_without_names_the_joints_are_plotted_and_the_notes_say_what_to_do(
     bag, tmp_path, report_of
 ):
-    said = report_of("view", bag, "--save", tmp_path / "a.rrd")
-    assert said["joints"] == []
-    (why,) = [note for note in said["warnings"] if note.startswith("not analysed")]
+    written = report_of("view", bag, "--save", tmp_path / "a.rrd")
+    assert written["joints"] == []
+    (why,) = [note for note in written["warnings"] if note.startswith("not analysed")]
     assert "/snake/encoders, /snake/targets; name them with --command-topic" in why
 
 

@@ -47,6 +47,6 @@ def test_obstacles_and_target_stand_where_the_scenario_has_them(world, recorded,
     np.testing.assert_allclose(np.hypot(*away.T), world.target.radius, rtol=1e-5)
 
 
-def test_a_faulty_scenario_is_said_and_the_rest_drawn(recorded):
+def test_a_faulty_scenario_is_reported_and_the_rest_drawn(recorded):
     recording = recorded(b"[world]\nheading = 'north'\n")
     assert any("obstacles are not drawn: world.heading" in text for text in recording.warnings)
