@@ -7,8 +7,9 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from undulog.analysis import Estimate, render
+from undulog.analysis import Estimate
 from undulog.analysis.present.page.oscillators import chain_view, entrainment_entries
+from undulog.analysis.present.page.page import render
 from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 
 LINKS = (

@@ -8,7 +8,8 @@ from itertools import pairwise
 
 import pytest
 
-from undulog.analysis import Estimate, render
+from undulog.analysis import Estimate
+from undulog.analysis.present.page.page import render
 from undulog.analysis.results.coupling import Coupling
 
 VOID = {"meta", "link", "br", "hr", "img", "input"}
