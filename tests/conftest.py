@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import ctypes.util
+import json
 import os
 import shutil
 import signal
@@ -129,6 +130,34 @@ def webgl_browser(chromium, tmp_path):
     started = Browser(chromium, tmp_path / "chromium", patience_s=120.0, flags=flags)
     yield started
     started.close()
+
+
+@pytest.fixture
+def command(capsys):
+    """Runs a command in this process and checks its exit code; returns its output and errors."""
+    import undulog
+
+    def run(*words, code=0):
+        capsys.readouterr()
+        assert undulog.run([str(word) for word in words]) == code
+        return capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def report_of(command):
+    """Runs a command with ``--json``; returns its report."""
+    return lambda *words, code=0: json.loads(command(*words, "--json", code=code).out)
+
+
+@pytest.fixture
+def opened():
+    """Opens sessions by their paths; closes them after the test."""
+    from undulog.capture import Session
+
+    with contextlib.ExitStack() as stack:
+        yield lambda path: stack.enter_context(Session.open(path))
 
 
 @pytest.fixture

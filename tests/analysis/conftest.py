@@ -6,7 +6,7 @@ import pytest
 from mcap_ros2.writer import Writer
 
 from support import built_results, linear_chain
-from support.analysed import experiment
+from support.analysed import analysed, experiment
 from undulog.capture import SessionWriter
 from zoo.bags import JOINT_STATE
 
@@ -24,27 +24,25 @@ class Bag:
 
     def write(self, topic, t_ns, names, *fields):
         t_ns = int(t_ns)
-        position, velocity, effort = (*fields, (), (), ())[:3]
-        self._writer.write_message(
-            topic,
-            self._schema,
-            {
-                "header": {
-                    "stamp": {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9},
-                    "frame_id": "",
-                },
-                "name": list(names),
-                "position": [float(v) for v in position],
-                "velocity": [float(v) for v in velocity],
-                "effort": [float(v) for v in effort],
-            },
-            log_time=t_ns,
-            publish_time=t_ns,
-        )
+        stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
+        values = zip(("position", "velocity", "effort"), (*fields, (), ()), strict=False)
+        message = {name: [float(v) for v in one] for name, one in values}
+        message |= {"header": {"stamp": stamp, "frame_id": ""}, "name": list(names)}
+        self._writer.write_message(topic, self._schema, message, t_ns, t_ns)
+
+    def write_both(self, t_ns, names, command, *response):
+        """Write a command and the state at the same time."""
+        self.write("/joint_commands", t_ns, names, command)
+        self.write("/joint_states", t_ns, names, *response)
 
     def close(self):
         self._writer.finish()
         self._file.close()
+
+    def analysed(self, options=None):
+        """Close the bag and analyse it."""
+        self.close()
+        return analysed(self.path, options)
 
 
 @pytest.fixture
@@ -75,13 +73,11 @@ class Wave:
         self.gain = rng.uniform(0.85, 1.1, joints)
         self.lag = rng.uniform(0.02, 0.4, joints)
         self.skew_s = np.linspace(0.0, 5e-3, joints)
-        self.ticks_ns = EPOCH_NS + np.rint(np.arange(round(duration * rate)) / rate * 1e9).astype(
-            np.int64
-        )
+        since_ns = np.rint(np.arange(round(duration * rate)) / rate * 1e9)
+        self.ticks_ns = EPOCH_NS + since_ns.astype(np.int64)
 
     def command(self, t_ns):
-        t = (t_ns - EPOCH_NS) * 1e-9
-        return self.amplitude * np.sin(self.omega * t + self.phase) + 0.05
+        return self.amplitude * np.sin(self.omega * ((t_ns - EPOCH_NS) * 1e-9) + self.phase) + 0.05
 
     def response(self, t_ns):
         """At one time a joint."""

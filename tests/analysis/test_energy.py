@@ -27,8 +27,7 @@ def test_positive_and_absolute_parts():
 
 
 def test_uneven_sampling_is_weighted_by_time():
-    rng = np.random.default_rng(1)
-    t = np.arange(3000) / 1000 + rng.uniform(0, 0.9e-3, 3000)
+    t = np.arange(3000) / 1000 + np.random.default_rng(1).uniform(0, 0.9e-3, 3000)
     (energy,) = integrate([Series("q", t, t**2)], 0.0, 3.0)
     assert energy.net_j[0] == pytest.approx(9.0, rel=1e-3)
 
@@ -54,8 +53,7 @@ def test_power_of_signals_sampled_at_other_times():
     current = Signal("q", "A", t, np.full(1000, 2.0))
     shifted = t + 3_000_000
     kept = (shifted < 3 * SECOND) | (shifted > 4 * SECOND)
-    voltage = Signal("q", "V", shifted[kept], shifted[kept] * 1e-9)
-    power = power_of(current, voltage, 0)
+    power = power_of(current, Signal("q", "V", shifted[kept], shifted[kept] * 1e-9), 0)
     np.testing.assert_allclose(power.values, 2 * power.t_s, atol=1e-9)
     # The first current has no voltage yet, and those in the voltage's gap have none.
     assert power.count == 1000 - 1 - np.count_nonzero((t > 2.993e9) & (t < 4.003e9))
@@ -120,5 +118,4 @@ def test_a_lost_message_is_a_gap_of_one_interval():
     np.testing.assert_allclose(energy.net_j, [0.98, 1, 1, 1, 0.99, 1, 1, 1])
     np.testing.assert_allclose(energy.covered, energy.net_j)
     assert energy.coverage == pytest.approx(7.97 / 8)
-    assert add_up(net, lost[1], -3.0, 5.0, 8) is None
-    assert add_up(net, plus, 6.0, 7.0, 1) is None
+    assert (add_up(net, lost[1], -3.0, 5.0, 8), add_up(net, plus, 6.0, 7.0, 1)) == (None, None)

@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-import undulog
 from support import processes
 from support.built_results import around, passive_joint
 from support.written_topics import EPOCH_NS, GAIT, write_topics
 from undulog.analysis.results.analysis import Analysis, GaitFacts, SessionFacts, Window
 from undulog.analysis.results.coupling import Coupling
-from undulog.analysis.results.estimate import Estimate, Provenance
+from undulog.analysis.results.estimate import Provenance
 from undulog.capture import Session, load_robot
 from undulog.capture.robot.model import Plane
 
@@ -150,7 +149,7 @@ def write_long(snake25):
 @pytest.fixture(scope="session")
 def analysis(snake25):
     """An analysis with made-up but distinct numbers a joint."""
-    joints = []
+    joints, lags = [], {"horizontal": -math.pi / 3}
     for i, joint in enumerate(snake25.joints):
         one = replace(passive_joint(joint.name, str(joint.plane)), energy_net_j=0.01 * i - 0.02)
         if joint.plane is Plane.HORIZONTAL:
@@ -159,12 +158,7 @@ def analysis(snake25):
         joints.append(one)
     return Analysis(
         session=SessionFacts("made-for-tests", "made.mcap", "snake25", EPOCH_NS, 3.0, "good"),
-        gait=GaitFacts(
-            Estimate(0.5, (0.49, 0.51)),
-            (Window(0.0, 2.0, 1.0),),
-            "head-to-tail",
-            {"horizontal": -math.pi / 3},
-        ),
+        gait=GaitFacts(around(0.5, 0.01), (Window(0.0, 2.0, 1.0),), "head-to-tail", lags),
         joints=tuple(joints),
         body=None,
         heterogeneity={},
@@ -239,25 +233,13 @@ def read_back():
 
 @pytest.fixture(scope="session")
 def recording(session_file, analysis, tmp_path_factory):
-    """The whole session as a recording: (what was said, what is in the file)."""
+    """The whole session as a recording: (what was reported, what is in the file)."""
     from undulog.replay.feed.recording import write_recording
 
     path = tmp_path_factory.mktemp("recording") / "made.rrd"
     with Session.open(session_file) as session:
         written = write_recording(session, path, analysis=analysis)
     return written, Recorded(path)
-
-
-@pytest.fixture
-def view(capsys):
-    """Runs ``undulog view``; returns exit code, standard output and standard error."""
-
-    def run(*arguments):
-        code = undulog.run(["view", *map(str, arguments)])
-        told = capsys.readouterr()
-        return code, told.out, told.err
-
-    return run
 
 
 @pytest.fixture(scope="session")

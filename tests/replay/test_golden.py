@@ -45,9 +45,8 @@ def worst(viewer, shipped, tmp_path):
         (tmp_path / f"{name}.png").write_bytes(png)  # for who looks at a failure
         with Image.open(io.BytesIO(png)) as picture:
             found = np.asarray(picture.convert("RGB")).astype(int)
-        return golden_pictures.worst_tile(
-            found, golden_pictures.load(golden_pictures.FOLDER / f"{name}.png")
-        )
+        golden = golden_pictures.load(golden_pictures.FOLDER / f"{name}.png")
+        return golden_pictures.worst_tile(found, golden)
 
     return compare
 
@@ -108,8 +107,7 @@ def bent(link, degrees):
         return points.tolist()
 
     def turned(row):
-        pose = Rotation.from_quat(np.array(row))
-        return [*row[:link], *(turn * pose[link:]).as_quat().tolist()]
+        return [*row[:link], *(turn * Rotation.from_quat(np.array(row))[link:]).as_quat().tolist()]
 
     move = changed(BODY, "Capsules3D:translations", moved)
     rotate = changed(BODY, "Capsules3D:quaternions", turned)
@@ -121,22 +119,22 @@ def blue_for_red(row):
     return [(c & 0x00FF00FF) | ((c >> 16) & 0x0000FF00) | ((c << 16) & 0xFF000000) for c in row]
 
 
+def with_joint(component, index, value, entity=ANGLES):
+    """A recording in which one joint's item of each row is another."""
+    return changed(entity, component, with_item(index, value))
+
+
+NAN = float("nan")
+PLACES = "/joints/places/measured"
+FIVE_MORE = with_joint("Angle:degrees", 12, lambda row: row[12] + 5.0)
+OTHER_COLOR = with_joint("SeriesLines:colors", 12, lambda row: row[0])
 WRONG = {
-    "a joint's line has another joint's colour": (
-        "horizontal",
-        changed(ANGLES, "SeriesLines:colors", with_item(12, lambda row: row[0])),
-    ),
-    "a joint's line is missing": (
-        "horizontal",
-        changed(ANGLES, "Angle:degrees", with_item(12, float("nan"))),
-    ),
-    "a joint reads five degrees too much": (
-        "horizontal",
-        changed(ANGLES, "Angle:degrees", with_item(12, lambda row: row[12] + 5.0)),
-    ),
+    "a joint's line has another joint's colour": ("horizontal", OTHER_COLOR),
+    "a joint's line is missing": ("horizontal", with_joint("Angle:degrees", 12, NAN)),
+    "a joint reads five degrees too much": ("horizontal", FIVE_MORE),
     "the middle's line is missing": (
         "head-middle-tail",
-        changed("/joints/places/measured", "Scalars:scalars", with_item(1, float("nan"))),
+        with_joint("Scalars:scalars", 1, NAN, PLACES),
     ),
     "the ghost is missing": ("body", without("/world/snake/commanded")),
     "the trail is missing": ("body", without("/world/trail")),
@@ -144,7 +142,7 @@ WRONG = {
     "the body is missing": ("body", without(BODY)),
     "a link is lost": (
         "body",
-        changed(BODY, "Capsules3D:translations", with_item(13, [0.0, 0.0, -9.0])),
+        with_joint("Capsules3D:translations", 13, [0.0, 0.0, -9.0], BODY),
     ),
     "a joint of the body is bent by five degrees too much": ("body", bent(12, 5.0)),
     "power has the wrong colours": ("body", changed(BODY, "Capsules3D:colors", blue_for_red)),

@@ -51,12 +51,10 @@ def test_the_layout_fits_a_laptop(window, rgb, sizes):
     assert min(width for _, width in shown) > 180
 
 
-def test_a_session_without_a_robot_is_drawn_too(show, rgb, write, tmp_path):
-    with Session.open(write(tmp_path / "a.mcap", robot=False)) as session:
-        write_recording(session, tmp_path / "a.rrd")
+def test_a_session_without_a_robot_is_drawn_too(show, rgb, write, tmp_path, opened):
+    write_recording(opened(write(tmp_path / "a.mcap", robot=False)), tmp_path / "a.rrd")
     window = show(tmp_path / "a.rrd", SECONDS)
     assert window.complaints() == []
     assert not any(name.startswith("Body") for name in window.views)
     picture = rgb(window.picture("Head, middle, tail [°]"))
-    away = np.abs(picture - joint_colors(25)[24, :3]).max(axis=-1)
-    assert (away <= 26).sum() > 100
+    assert (np.abs(picture - joint_colors(25)[24, :3]).max(axis=-1) <= 26).sum() > 100

@@ -19,8 +19,7 @@ def room(tmp_path_factory):
     run = {"duration_s": 5.0, "settle_s": 1.0, "physics_rate_hz": 4000, "gait": {"ramp_s": 0.5}}
     world = wave(**run, horizontal={"lag": 1.0}, noise={"position": 0.001})
     (folder / "wave.toml").write_text(world)
-    words = ["sim", "run", str(folder / "wave.toml"), "-o", str(folder / "run.mcap")]
-    assert front.run(words) == 0
+    assert front.run(["sim", "run", str(folder / "wave.toml"), "-o", str(folder / "run.mcap")]) == 0
     (folder / "chain.toml").unlink()
     return folder
 
@@ -38,48 +37,41 @@ def test_in_its_own_world_a_run_is_the_same_to_the_last_bit(room, tmp_path, caps
     assert "--force" in capsys.readouterr().err
     assert path.read_text() == "mine"
     again(room, path, "--force")
-    told = capsys.readouterr().out.splitlines()
-    assert told[0].startswith(f"{path}: run.mcap again on the twin of chain5 in wave, 5 s")
-    assert told[1].startswith("The same to the last bit: all ")
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].startswith(f"{path}: run.mcap again on the twin of chain5 in wave, 5 s")
+    assert printed[1].startswith("The same to the last bit: all ")
     both = f"{room / 'run.mcap'} {path}"
-    assert told[2:] == [f"Next: undulog view {both}", f"      undulog compare {both}"]
+    assert printed[2:] == [f"Next: undulog view {both}", f"      undulog compare {both}"]
     with Session.open(path) as session, Session.open(room / "run.mcap") as first:
-        facts = session.metadata["undulog"]
-        assert facts["driven.session_id"] == first.session_id
+        assert session.metadata["undulog"]["driven.session_id"] == first.session_id
         assert session.settle_s == first.settle_s == 1.0
         topics = [topic for topic in first.channels if topic != "/rosout"]
         messages = sum(first.channels[topic].count for topic in topics)
     again(room, tmp_path / "b.mcap", "--json")
     report = json.loads(capsys.readouterr().out)
     assert (report["exact"], report["differs_s"], report["one_sided"]) == (True, {}, [])
-    assert f"all {messages} messages on {len(topics)} topics" in told[1]
+    assert f"all {messages} messages on {len(topics)} topics" in printed[1]
 
 
-def test_what_was_changed_is_named_with_intervals(room, tmp_path, capsys):
+def test_what_was_changed_is_named_with_intervals(room, tmp_path, capsys, opened):
     change = "servo_of.joint02.stall_torque=0.1"
     path = again(room, tmp_path / "weak.mcap", "--set", change, "--json")
     report = json.loads(capsys.readouterr().out)
-    assert (report["exact"], report["changes"]) == (
-        False,
-        {"servo_of.joint02.stall_torque": 0.1},
-    )
+    assert not report["exact"]
+    assert report["changes"] == {"servo_of.joint02.stall_torque": 0.1}
     changed = report["comparison"]["changed"]
     expected = {"name": "scenario.toml: servo_of.joint02.stall_torque", "a": None, "b": "0.1"}
     assert expected in changed
-    (lag,) = (
-        one
-        for one in report["comparison"]["differences"]
-        if (one["place"], one["quantity"]) == ("joint02", "lag")
-    )
-    low, high = lag["difference"]["ci95"]
+    differences = report["comparison"]["differences"]
+    found = {(one["place"], one["quantity"]): one["difference"] for one in differences}
+    low, high = found["joint02", "lag"]["ci95"]
     assert 0.0 < low < high  # a weak servo lags
     again(room, tmp_path / "weak.mcap", "--set", change, "--force")
-    told = capsys.readouterr().out
-    assert "Differs: " in told
-    assert "/joint_commands" not in told.partition("\n\n")[0]
-    assert "B differs from A: joint02 most" in told
-    with Session.open(path) as session:
-        assert "servo_of.joint02" in session.attachments["scenario.toml"].decode()
+    printed = capsys.readouterr().out
+    assert "Differs: " in printed
+    assert "/joint_commands" not in printed.partition("\n\n")[0]
+    assert "B differs from A: joint02 most" in printed
+    assert "servo_of.joint02" in opened(path).attachments["scenario.toml"].decode()
 
 
 @pytest.fixture(scope="module")
@@ -91,10 +83,9 @@ def commands(room):
     values = np.array(found.values).T
     altered = values.copy()
     altered[200, 3] += 1e-3
+    facts = {"epoch_ns": int(found.t_ns[0][0]), "robot": robot}
     for name, rows in (("plain", values), ("altered", altered)):
-        with SessionWriter(
-            room / f"{name}.mcap", session_id=name, epoch_ns=int(found.t_ns[0][0]), robot=robot
-        ) as writer:
+        with SessionWriter(room / f"{name}.mcap", session_id=name, **facts) as writer:
             writer.attach("scenario.toml", "application/toml", world)
             channel = writer.joint_state("/joint_commands", found.names, unit="rad")
             for t_ns, row in zip(found.t_ns[0].tolist(), rows, strict=True):
@@ -104,11 +95,10 @@ def commands(room):
 
 def test_one_altered_command_changes_what_comes_after_it_alone(commands, tmp_path, capsys):
     plain = again(commands, tmp_path / "plain.mcap", source="plain.mcap")
-    told = capsys.readouterr().out
-    assert "plain.mcap has commands and no response" in told
-    assert told.endswith(f"\nNext: undulog view {commands / 'plain.mcap'} {plain}\n")
-    altered = again(commands, tmp_path / "altered.mcap", source="altered.mcap")
-    found = compare_logs(plain, altered)
+    printed = capsys.readouterr().out
+    assert "plain.mcap has commands and no response" in printed
+    assert printed.endswith(f"\nNext: undulog view {commands / 'plain.mcap'} {plain}\n")
+    found = compare_logs(plain, again(commands, tmp_path / "altered.mcap", source="altered.mcap"))
     assert found.differs_s["/joint_commands"] == pytest.approx(2.0)
     # The command acts from its tick on; states of that period arrive two ticks later.
     for topic in ("/odom", "/energy_ledger", "/joint_states"):
@@ -122,9 +112,8 @@ def test_one_altered_command_changes_what_comes_after_it_alone(commands, tmp_pat
 def test_a_message_that_only_one_has_is_a_difference(tmp_path):
     for name, count in (("one", 3), ("two", 4)):
         with SessionWriter(tmp_path / f"{name}.mcap", session_id="s", epoch_ns=10**18) as writer:
+            channel = writer.string("/mode")
             for k in range(count):
-                if k == 0:
-                    channel = writer.string("/mode")
                 channel.write(10**18 + k * 10**9, "walk")
     found = compare_logs(tmp_path / "one.mcap", tmp_path / "two.mcap")
     assert (found.exact, found.differs_s, found.messages) == (False, {"/mode": 3.0}, 3)
@@ -136,7 +125,7 @@ def test_a_run_too_short_to_compare_says_so(room, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ("servo.stall_torqe=1", "did you mean stall_torque"),
         ("duration_s.x=1", "duration_s.x: found a part of what is no table"),
@@ -145,14 +134,14 @@ def test_a_run_too_short_to_compare_says_so(room, tmp_path, capsys):
         ("=3", "expected KEY=VALUE"),
     ],
 )
-def test_a_wrong_change_names_the_key(room, tmp_path, capsys, change, told):
-    again(room, tmp_path / "a.mcap", "--set", change, code=2 if "KEY" in told else 1)
-    assert told in capsys.readouterr().err
+def test_a_wrong_change_names_the_key(room, tmp_path, capsys, change, message):
+    again(room, tmp_path / "a.mcap", "--set", change, code=2 if "KEY" in message else 1)
+    assert message in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         ("--on cam:socketcan:can0 -o a.mcap", "expected twin, twin:SCENARIO or can:"),
         ("--on can:virtual:x -o a.mcap --set engine=mujoco", "on a bus the world is as it is"),
@@ -164,6 +153,5 @@ def test_a_wrong_change_names_the_key(room, tmp_path, capsys, change, told):
         ("--on twin -o a.json", "name it"),
     ],
 )
-def test_wrong_usage_says_what_would_be_right(room, capsys, words, told):
-    assert front.run(["replay", str(room / "run.mcap"), *words.split()]) == 2
-    assert told in capsys.readouterr().err
+def test_wrong_usage_says_what_would_be_right(room, words, message, command):
+    assert message in command("replay", room / "run.mcap", *words.split(), code=2).err

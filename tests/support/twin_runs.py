@@ -42,3 +42,8 @@ def energies(last, first=None):
     """Return the ledger at a sample by term, or its change since another one [J]."""
     change = last.energy if first is None else last.energy - first.energy
     return dict(zip(TERMS, change, strict=True))
+
+
+def check_keys(faults, keys):
+    """Check that the faults are of these keys, which are separated by spaces."""
+    assert set(faults) == set(keys.split())

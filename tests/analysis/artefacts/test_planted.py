@@ -96,7 +96,7 @@ def test_a_planted_artefact_is_found_when_it_was_and_nothing_else(plant, tmp_pat
         ]
         (one,) = here
         met.append(overlap(one.spans_s, i / 100, k / 100))
-        # Nothing is said of times far from it: cycle by cycle at most a cycle of 2 s.
+        # Nothing is reported of times far from it: cycle by cycle at most a cycle of 2 s.
         assert min(a for a, _ in one.spans_s) > i / 100 - 2.01, seed
         assert max(b for _, b in one.spans_s) < k / 100 + 2.01, seed
     assert (missed, false) == ([], [])

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from support.paths import ARCSNAKE
-from undulog.analysis.session.analyse import analyse_session
-from undulog.analysis.signals.stretch import Options
+from undulog.analysis import Options, analyse_session
 from undulog.capture import Session, SessionWriter
 
 EPOCH_NS = 1_735_689_600_000_000_000
@@ -22,7 +21,7 @@ RUNS = [
 
 
 def session_of(name, path):
-    """The joint's angle by its motor (wrapped and unwrapped) and as its reader told it."""
+    """The joint's angle by its motor (wrapped and unwrapped) and as its reader gave it."""
     if not ARCSNAKE.exists():
         pytest.skip(f"the ArcSnake data are not at {ARCSNAKE}")
     raw = np.genfromtxt(ARCSNAKE / name, delimiter=",", names=True)
@@ -42,13 +41,12 @@ def session_of(name, path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "period"), RUNS)
-def test_the_fault_of_the_reader_is_the_sensor_s(name, period, tmp_path):
+def test_the_fault_of_the_reader_is_the_sensor_s(name, period, tmp_path, opened):
     path = session_of(name, tmp_path / "joint7.mcap")
 
     def analysed(topic, reference=None):
-        with Session.open(path) as session:
-            options = Options(response_topic=topic, reference_topic=reference)
-            return analyse_session(session, options)
+        options = Options(response_topic=topic, reference_topic=reference)
+        return analyse_session(opened(path), options)
 
     def of_sensors(result):
         return [one for one in result.artefacts if one.about == "sensor"]
@@ -60,11 +58,9 @@ def test_the_fault_of_the_reader_is_the_sensor_s(name, period, tmp_path):
     (found,) = of_sensors(analysed("/reader", "/motor"))
     assert (found.flag, found.quantity) == ("scale_mismatch", "position")
     assert found.topic == "/reader"
-    told = float(found.note.split(" ")[0])
-    assert 0.87 < told < 0.91  # it tells about 10 % too little
+    assert 0.87 < float(found.note.split(" ")[0]) < 0.91  # it tells about 10 % too little
     (first, last) = found.spans_s[0][0], found.spans_s[-1][1]
-    with Session.open(path) as session:
-        assert last - first > 0.95 * session.duration_s
+    assert last - first > 0.95 * opened(path).duration_s
 
     (found,) = of_sensors(analysed("/wrapped"))
     assert (found.flag, found.note) == ("wrapped", "turn of 12.57 rad")

@@ -89,16 +89,14 @@ def test_a_free_chain_keeps_its_momentum_at_zero():
 
 def test_two_free_links_share_the_turn_by_symmetry():
     one = np.ones(2)
-    chain = Chain(one, one, one, one / 12)
-    motion = one_cycle(chain, np.array([[0.5 + 0j]]), np.zeros(1), 2.0)
+    motion = one_cycle(Chain(one, one, one, one / 12), np.array([[0.5 + 0j]]), np.zeros(1), 2.0)
     # Equal links turn by equal and opposite amounts: the head by minus half of the joint angle.
     swing = motion.heading - motion.heading[0]
     np.testing.assert_allclose(swing, -(motion.angles[:, 0] - motion.angles[0, 0]) / 2, atol=1e-12)
 
 
 def test_a_bent_chain_drives_in_a_circle():
-    robot = planar_robot()
-    chain = viscous_chain(robot)
+    chain = viscous_chain(planar_robot())
     motion = one_cycle(chain, wave(12, np.pi / 3, 0.3), np.full(12, 0.05), 3.0)
     assert abs(motion.turn) > 0.01
     # Cycle after cycle the same rigid motion: distances between cycles are all alike.
@@ -129,8 +127,7 @@ def test_amplitude_and_phase_of_the_null_under_viscous_drag():
         points = perfect_tracking(robot, Plane.HORIZONTAL, commands, omega=3.0, cycles=4)["viscous"]
         size = [point.amplitude_m.value for point in points]
         spread.append(max(size) / min(size) - 1)
-        excess = points[1].phase_rad.value + 6 * lag
-        phase.append(abs(np.degrees(np.angle(np.exp(1j * excess)))))
+        phase.append(abs(np.degrees(np.angle(np.exp(1j * (points[1].phase_rad.value + 6 * lag))))))
     assert 0.02 < min(spread) < max(spread) < 0.11
     assert 8 < min(phase) < max(phase) < 20
 
@@ -143,8 +140,7 @@ def world_of(robot, motion, chain, cycles, angle):
     rotation = np.stack(
         [np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, e], -1)], -2
     )
-    position = np.stack([head.real, head.imag, o], axis=-1)
-    return position, quaternion_from_rotation(rotation)
+    return np.stack([head.real, head.imag, o], axis=-1), quaternion_from_rotation(rotation)
 
 
 @pytest.mark.parametrize("name", ["viscous", "free"])
@@ -161,8 +157,7 @@ def test_what_is_seen_of_a_perfect_chain_is_its_null(name):
     t = 2 * np.pi / omega * np.arange(cycles * SAMPLES) / SAMPLES
     angles = np.tile(motion.angles, (cycles, 1))
     joints = [Series(j.name, t, angles[:, i]) for i, j in enumerate(robot.joints)]
-    seen = track(robot, t, position, quaternion, joints)
-    points = observed(robot, Plane.HORIZONTAL, seen, omega)
+    points = observed(robot, Plane.HORIZONTAL, track(robot, t, position, quaternion, joints), omega)
     commands = {int(i): (amplitudes[i], 0.0) for i in yaw}
     null = perfect_tracking(robot, Plane.HORIZONTAL, commands, omega=omega, cycles=cycles)[name]
     for point, expected in zip(points, null, strict=True):
@@ -198,5 +193,4 @@ def test_a_vertical_gait_is_seen_upwards_and_has_no_viscous_null():
 
 
 def test_places():
-    assert place_links(26) == (0, 12, 25)
-    assert place_links(13) == (0, 6, 12)
+    assert (place_links(26), place_links(13)) == ((0, 12, 25), (0, 6, 12))

@@ -7,7 +7,6 @@ from html import unescape
 import numpy as np
 import pytest
 
-import undulog
 from undulog.analysis import Choices, Options, compare_sessions
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError
@@ -33,8 +32,7 @@ def write(bag, wave, epoch_ns):
             size = truth.omega * truth.gain * truth.amplitude
             rate = size * np.cos(truth.omega * t + truth.phase - truth.lag)
             torque = energy * rate / size + rng.normal(0, 0.05, joints)
-            one.write("/joint_commands", t_ns, truth.names, truth.command(own_ns))
-            one.write("/joint_states", t_ns, truth.names, q, rate, torque)
+            one.write_both(t_ns, truth.names, truth.command(own_ns), q, rate, torque)
         one.close()
         return one.path
 
@@ -83,17 +81,13 @@ def test_mean_cycles_differ_as_in_closed_form(write, wave):
         off = np.abs(np.array(one.difference_rad) - (b - a))
         assert np.mean(off <= np.array(one.half_rad)) > 0.9
         np.testing.assert_allclose(one.a_rad, a + 0.04, atol=5 * SIGMA / np.sqrt(7))
-    named = max(result.waveforms, key=lambda one: one.rms_rad)
-    assert named.name == "joint03"
+    assert max(result.waveforms, key=lambda one: one.rms_rad).name == "joint03"
 
 
 def test_two_runs_of_one_truth_are_equivalent(write):
     result = compared(write("a", 5), write("b", 6, late_s=0.5))
-    assert result.verdict == "same"
-    assert result.answer == (
-        "no difference found; gain and lag of all 5 joints are equivalent within 2 % and 1°"
-    )
-    assert result.named == ()
+    alike = "no difference found; gain and lag of all 5 joints are equivalent within 2 % and 1°"
+    assert (result.verdict, result.answer, result.named) == ("same", alike, ())
 
 
 def test_a_session_is_the_same_as_itself(write):
@@ -117,9 +111,8 @@ def test_energy_alone_may_differ(write):
     result = compared(write("a", 10), write("b", 11, energy=1.2))
     assert result.verdict == "small"
     assert "are equivalent within 2 % and 1°; beyond doubt" in result.answer
-    ratios = [
-        one.difference.value / one.a for one in result.differences if one.quantity == "energy_abs"
-    ]
+    energies = [one for one in result.differences if one.quantity == "energy_abs"]
+    ratios = [one.difference.value / one.a for one in energies]
     # E_abs of noisy torque is not quite proportional to it.
     assert ratios == pytest.approx([0.2] * 5, abs=0.01)
 
@@ -149,11 +142,10 @@ def test_other_joints_are_left_out_or_refused(write):
         compared(a, write("c", 18, first=11))
 
 
-def test_the_page_ranks_what_differs_and_holds_every_number(write, tmp_path, capsys):
+def test_the_page_ranks_what_differs_and_holds_every_number(write, tmp_path, command):
     page = tmp_path / "page.html"
     files = [str(write("a", 1)), str(write("b", 2, change=weaken))]
-    assert undulog.run(["compare", *files, "-o", str(page)]) == 0
-    assert capsys.readouterr().out.rstrip().endswith(f"Result: {page}")
+    assert command("compare", *files, "-o", page).out.rstrip().endswith(f"Result: {page}")
     html = page.read_text()
     result = compared(*files)
     heading = re.sub("<[^>]+>", "", re.search(r"<h1.*?</h1>", html, re.DOTALL)[0])
@@ -172,35 +164,31 @@ def test_the_page_ranks_what_differs_and_holds_every_number(write, tmp_path, cap
     assert "Mean cycles by gait phase" in html
 
 
-def test_a_page_is_not_replaced_unasked(write, tmp_path):
+def test_a_page_is_not_replaced_unasked(write, tmp_path, command):
     page = tmp_path / "page.html"
     page.write_text("mine")
-    files = [str(write("a", 1)), str(write("b", 2))]
-    assert undulog.run(["compare", *files, "-o", str(page)]) == 2
+    command("compare", write("a", 1), write("b", 2), "-o", page, code=2)
     assert page.read_text() == "mine"
 
 
-def test_groups_by_the_command_line(write, tmp_path, capsys):
-    a = [str(write(f"a{k}", 20 + k, late_s=0.1 * k)) for k in range(4)]
-    b = [str(write(f"b{k}", 30 + k, late_s=0.3 * k, change=weaken)) for k in range(4)]
+def test_groups_by_the_command_line(write, tmp_path, command, report_of):
+    a = [write(f"a{k}", 20 + k, late_s=0.1 * k) for k in range(4)]
+    b = [write(f"b{k}", 30 + k, late_s=0.3 * k, change=weaken) for k in range(4)]
     out = tmp_path / "result.json"
-    assert undulog.run(["compare", "--a", *a, "--b", *b, "-o", str(out)]) == 0
-    said = capsys.readouterr().out
-    assert said.startswith("B differs from A: joint03 most")
-    assert "What was changed" in said
-    assert said.rstrip().endswith(f"Result: {out}")
+    message = command("compare", "--a", *a, "--b", *b, "-o", out).out
+    assert message.startswith("B differs from A: joint03 most")
+    assert "What was changed" in message
+    assert message.rstrip().endswith(f"Result: {out}")
     assert json.loads(out.read_text())["design"] == "groups"
-    assert undulog.run(["compare", "--a", *a, "--b", *b, "--paired", "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert result["design"] == "pairs"
-    assert result["named"][0]["name"] == "joint03"
+    result = report_of("compare", "--a", *a, "--b", *b, "--paired")
+    assert (result["design"], result["named"][0]["name"]) == ("pairs", "joint03")
     assert " --paired" in result["provenance"]["command"]
-    assert undulog.run(["compare", "--a", a[0], a[0], "--b", *b]) == 1
-    assert "a copy is not a run of its own" in capsys.readouterr().err
+    err = command("compare", "--a", a[0], a[0], "--b", *b, code=1).err
+    assert "a copy is not a run of its own" in err
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ([], "compare needs sessions on both sides"),
         (["x.mcap"], "here are 1"),
@@ -209,6 +197,5 @@ def test_groups_by_the_command_line(write, tmp_path, capsys):
         (["x.mcap", "y.mcap", "--margin-gain", "2"], "--margin-gain lies between"),
     ],
 )
-def test_wrong_usage_exits_2(words, said, capsys):
-    assert undulog.run(["compare", *words]) == 2
-    assert said in capsys.readouterr().err
+def test_wrong_usage_exits_2(words, message, command):
+    assert message in command("compare", *words, code=2).err

@@ -6,8 +6,7 @@ import pytest
 from support import twin_chains
 from undulog.analysis import compare_sessions
 from undulog.capture import Session
-from undulog.sim import load_scenario
-from undulog.sim.twin.recording import record
+from undulog.sim import load_scenario, record
 
 pytestmark = pytest.mark.slow
 
@@ -15,10 +14,7 @@ pytestmark = pytest.mark.slow
 WEAK = {"servo_of": {"joint03": {"stall_torque": 0.2}}}
 
 
-def wave(**tables):
-    return twin_chains.wave(
-        duration_s=7.0, settle_s=3.0, gait={"ramp_s": 0.5}, noise={"position": 0.002}, **tables
-    )
+WAVE = {"duration_s": 7.0, "settle_s": 3.0, "gait": {"ramp_s": 0.5}, "noise": {"position": 0.002}}
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +29,7 @@ def twins(tmp_path_factory):
 
     files = []
     for seed, more in enumerate(({}, {}, WEAK), start=1):
-        (folder / "wave.toml").write_text(wave(**more))
+        (folder / "wave.toml").write_text(twin_chains.wave(**WAVE, **more))
         files.append(folder / f"run{seed}.mcap")
         scenario = load_scenario(folder / "wave.toml").changed(seed=seed)
         record(scenario, files[-1], on_sample=follow if seed == 1 else None)
@@ -59,8 +55,7 @@ def test_the_weak_servo_is_named_first_with_what_was_changed(twins):
 def test_other_noise_makes_no_difference(twins):
     (base, again, _), _ = twins
     result = compared(base, again)
-    assert result.verdict == "same"
-    assert result.changed == ()
+    assert (result.verdict, result.changed) == ("same", ())
 
 
 def test_speed_is_that_of_the_centre_of_mass_in_the_physics(twins):

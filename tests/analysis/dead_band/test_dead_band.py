@@ -24,8 +24,7 @@ def measured(kind, steps, seed=0, joints=JOINTS, **how):
 @settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 10_000), width=st.floats(0.0, 1.5))
 def test_the_operator_is_the_play_operator(seed, width):
-    rng = np.random.default_rng(seed)
-    knots = np.cumsum(rng.normal(size=8))
+    knots = np.cumsum(np.random.default_rng(seed).normal(size=8))
     command = np.interp(np.linspace(0, 7, 200), np.arange(8), knots)
     command[50:60] = command[50]  # a command may stand, too
     start = command[0]

@@ -9,8 +9,7 @@ import pytest
 from support.resting import STEP, found_in
 from undulog.capture import load_robot
 from undulog.capture.robot.model import Plane
-from undulog.sim import PlaneGait, Scenario, Serpentine, World
-from undulog.sim.twin.twin import Twin
+from undulog.sim import PlaneGait, Scenario, Serpentine, Twin, World
 
 
 @dataclasses.dataclass

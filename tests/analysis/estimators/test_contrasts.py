@@ -57,8 +57,7 @@ def test_shared_noise_cancels_or_adds():
     np.testing.assert_allclose(single, noise.level * bins.spread / 2, rtol=1e-3)
     assert gain.variance(np.array([1.0, -1.0, 0.0])) < 1e-9 * single[0]
     # Half a turn apart: the noise that lifts the log gain of one lowers that of the other.
-    apart = gain.variance(np.array([1.0, 0.0, -1.0]))
-    assert apart == pytest.approx(4 * single[0], rel=1e-2)
+    assert gain.variance(np.array([1.0, 0.0, -1.0])) == pytest.approx(4 * single[0], rel=1e-2)
     assert gain.columns.shape[1] == 24
 
 

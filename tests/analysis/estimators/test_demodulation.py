@@ -43,7 +43,7 @@ AMPLITUDE = 0.3 + 0.06 * np.sin(2 * np.pi * T / 29)
 OFFSET = 0.15 * np.sin(2 * np.pi * T / 17)
 
 
-def test_a_steady_wave_is_told_to_rounding():
+def test_a_steady_wave_is_estimated_to_rounding():
     same = np.ones(T.size)
     phi, command, response = wave(np.pi * same, 0.9 * same, 0.3 * same, 0.4 * same)
     found = cycles(phi, command, Series("q", T, response))
@@ -70,9 +70,8 @@ def test_responses_on_their_own_times():
     lagging = np.interp(own, T, phi) - 0.4 - np.interp(own, T, LAG)
     values = np.interp(own, T, GAIN * AMPLITUDE) * np.sin(lagging)
     found = cycles(phi, command, Series("q", own, values))
-    np.testing.assert_allclose(
-        -np.angle(found.ratio), np.interp(middle(found), T, LAG), atol=np.radians(0.4)
-    )
+    lag = np.interp(middle(found), T, LAG)
+    np.testing.assert_allclose(-np.angle(found.ratio), lag, atol=np.radians(0.4))
 
 
 @pytest.mark.slow
@@ -100,15 +99,14 @@ def test_what_a_cycle_cannot_tell_is_missing():
     holed = (found.stop_s > 20) & (found.start_s < 23)
     # Also the neighbours, whose mean over a cycle around each sample reaches in.
     assert np.isnan(found.ratio[holed]).all()
-    far = (found.stop_s < 18) | (found.start_s > 25)
-    assert np.isfinite(found.ratio[far]).all()
+    assert np.isfinite(found.ratio[(found.stop_s < 18) | (found.start_s > 25)]).all()
     still = Series("q", T, np.where(T < 30, 0.0, command.values))
     found = cycles(phi, still, Series("q", T, response))
     assert np.isnan(found.ratio[found.stop_s < 28]).all()
     assert np.isfinite(found.ratio[found.start_s > 32]).all()
 
 
-def test_a_phase_that_does_not_drive_the_command_tells_nothing():
+def test_a_phase_that_does_not_drive_the_command_gives_nothing():
     phi, _, response = wave(OMEGA, GAIN, LAG, AMPLITUDE)
     other = Series("q", T, 0.3 * np.sin(9.0 * T))
     assert np.isnan(cycles(phi, other, Series("q", T, response)).ratio).all()

@@ -16,21 +16,13 @@ GUESS = 2 * np.pi * 1.002  # the truth is 1 Hz
 )
 def test_lag_and_gain_reach_the_bound(rate, cycles, skew_s, lost, sigma):
     """Rife & Boorstyn 1974: at known omega var phase >= 1/(eta N), eta = A^2/(2 sigma^2)."""
-    draws = 3000
-    data = estimator_tables.sampled(
-        np.random.default_rng(7),
-        draws=draws,
-        cycles=cycles,
-        rate=rate,
-        sigma=sigma,
-        skew_s=skew_s,
-        lost=lost,
-    )
+    draws, rng = 3000, np.random.default_rng(7)
+    case = {"cycles": cycles, "rate": rate, "sigma": sigma, "skew_s": skew_s, "lost": lost}
+    data = estimator_tables.sampled(rng, draws=draws, **case)
     lag, gain, _ = estimator_tables.fitted(*data, GUESS)
     samples = round(0.8 * cycles * rate) if lost else round(cycles * rate)
     assert data[3].shape == (draws, samples)
-    amplitude = 0.9 * 0.5
-    bound = (2 * sigma**2 / (amplitude**2 * samples)) ** 0.5
+    bound = (2 * sigma**2 / ((0.9 * 0.5) ** 2 * samples)) ** 0.5
     # 3,000 draws: the ratio's own standard error is 1.3 %; far below the bound is an error, too.
     for errors in (lag, gain):
         assert 0.96 < np.sqrt(np.mean(errors**2)) / bound < 1.05
@@ -50,7 +42,6 @@ def test_intervals_cover(cycles, ar, lost):
 
 def test_common_ways_are_worse():
     """Off a whole number of cycles; the fit alone reaches the bound."""
-    rows = estimator_tables.compared(draws=400)
-    ours, *others = rows.values()
+    ours, *others = estimator_tables.compared(draws=400).values()
     assert ours[2] < 1.1  # RMSE of the lag over its bound; 400 draws: standard error 3.5 %
     assert all(other[2] > 1.5 for other in others)

@@ -58,18 +58,13 @@ class Trials:
                 commands.append(Series(f"c{i}", t, command))
                 responses.append(Series(f"r{i}", own, response))
             channels = commands + responses
-            guess = omega + 2 * np.pi / duration * rng.uniform(-0.2, 0.2)
-            fit = fit_shared(channels, guess)
+            fit = fit_shared(channels, omega + 2 * np.pi / duration * rng.uniform(-0.2, 0.2))
             noise = residual_noise(channels, fit)
             variance, dof = omega_variance(fit, noise)
-            answer = respond(
-                fit.fundamental[:m],
-                part(noise, slice(0, m)),
-                fit.fundamental[m:],
-                part(noise, slice(m, None)),
-                omega_variance=variance,
-                delay_between_s=fit.mean_time_s[m:] - fit.mean_time_s[:m],
-            )
+            sides = [(fit.fundamental[k], part(noise, k)) for k in (np.s_[:m], np.s_[m:])]
+            delay = fit.mean_time_s[m:] - fit.mean_time_s[:m]
+            more = {"omega_variance": variance, "delay_between_s": delay}
+            answer = respond(*sides[0], *sides[1], **more)
             for i in range(m):
                 low, high = lag_estimate(answer, i).ci95
                 self.lag.append(answer.lag_rad[i] - lag[i])
@@ -127,9 +122,8 @@ def test_intervals_hold_in_coloured_noise(noisy_command):
     ("frequency", "duration"), [(1.0, 3.1), (0.97, 4.2), (0.5, 8.0), (0.5, 8.9), (0.5, 30.0)]
 )
 def test_intervals_in_short_and_in_broken_cycles(frequency, duration, correlation):
-    trials = Trials(
-        seed=14, frequency=frequency, duration=duration, correlation=correlation, runs=100
-    )
+    how = {"frequency": frequency, "duration": duration, "correlation": correlation}
+    trials = Trials(seed=14, runs=100, **how)
     assert 0.93 < np.mean(trials.inside) < 0.97
     assert 0.93 < np.mean(trials.gain_inside) < 0.97
 

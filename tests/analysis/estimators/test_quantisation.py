@@ -37,36 +37,33 @@ def test_step_where_no_two_levels_are_neighbours():
 @pytest.mark.parametrize("period", [4, 5, 6, 8, 12, 25, 100, 97.3])
 @pytest.mark.parametrize("phase", [0.0, 0.3])
 def test_no_step_in_values_that_were_not_rounded(period, phase):
-    values = 0.5 * np.sin(2 * np.pi * np.arange(1000) / period + phase)
-    assert lattice_step(values) == 0
+    assert lattice_step(0.5 * np.sin(2 * np.pi * np.arange(1000) / period + phase)) == 0
 
 
 def test_no_step_in_few_levels():
-    assert lattice_step(np.ones(100)) == 0
-    assert lattice_step(np.zeros(0)) == 0
+    assert (lattice_step(np.ones(100)), lattice_step(np.zeros(0))) == (0, 0)
     assert lattice_step(np.sign(turn(1.0))) == 0
 
 
+FEW = {"draws": 500}
+"""The standard error of the coverage is 1 %."""
+
+
 @pytest.mark.parametrize(
-    "name",
+    ("name", "options"),
     [
-        "0.5 Hz at 50 Hz, any mean",
-        "0.5 Hz at 50 Hz, mean zero",
-        "the same, command rounded as well",
-        "the same, noise of 1 step",
+        ("0.5 Hz at 50 Hz, any mean", FEW),
+        ("0.5 Hz at 50 Hz, mean zero", FEW),
+        ("the same, command rounded as well", FEW),
+        ("the same, noise of 1 step", FEW),
+        *(
+            pytest.param(name, {"seed": 2}, marks=pytest.mark.slow)
+            for name in estimator_tables.ROUNDED
+        ),
     ],
 )
-def test_intervals_of_rounded_channels(name):
-    """500 draws: the standard error of the coverage is 1 %."""
-    covered, _, width = estimator_tables.rounded(**estimator_tables.ROUNDED[name], draws=500)
-    assert np.all(covered > 0.91)
-    assert np.all(width < 3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", list(estimator_tables.ROUNDED))
-def test_intervals_of_all_rounded_cases(name):
-    covered, _, width = estimator_tables.rounded(**estimator_tables.ROUNDED[name], seed=2)
+def test_intervals_of_rounded_channels(name, options):
+    covered, _, width = estimator_tables.rounded(**estimator_tables.ROUNDED[name], **options)
     assert np.all(covered > 0.91)
     assert np.all(width < 3)
 
@@ -78,8 +75,7 @@ def test_the_residual_alone_does_not_show_the_error():
 
 def test_noise_that_is_not_rounded_keeps_its_intervals():
     random = np.random.default_rng(3)
-    t = np.arange(1000) / 50
-    series = [Series("q", t, turn(0.5, 1000) + random.normal(0, 1e-3, 1000))]
+    series = [Series("q", np.arange(1000) / 50, turn(0.5, 1000) + random.normal(0, 1e-3, 1000))]
     noise, bins = residual_spectrum(series, fit_at(series, np.pi))
     assert not bins.rounding.any()
     assert noise.dof[0] == 24
@@ -103,8 +99,7 @@ def test_contrasts_of_rounded_joints():
     inside = []
     for run in range(runs):
         own = errors.select(range(run * joints, (run + 1) * joints))
-        values = (found[run].real, found[run].imag)
-        for scatter, value in zip(scatter_of(own), values, strict=True):
+        for scatter, value in zip(scatter_of(own), (found[run].real, found[run].imag), strict=True):
             half = stdtrit(scatter.columns.shape[1], 0.975) * scatter.variance(each) ** 0.5
             inside.append(np.mean(np.abs(each @ value) <= half))
     assert np.mean(inside) > 0.92

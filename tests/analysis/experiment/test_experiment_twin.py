@@ -1,15 +1,12 @@
 """Experiments on recorded twins, a short chain on the ground: six runs each way, and kicks."""
 
-import json
 import math
 
 import pytest
 
-import undulog
 from support import twin_chains
 from support.analysed import experiment
-from undulog.sim import load_scenario
-from undulog.sim.twin.recording import record
+from undulog.sim import load_scenario, record
 
 pytestmark = pytest.mark.slow
 
@@ -21,14 +18,23 @@ WEAK = {"servo_of": {"joint03": {"stall_torque": 0.2}}}
 
 
 def wave(way="head-to-tail", noise=0.005, **tables):
-    return twin_chains.wave(
-        duration_s=8.0,
-        settle_s=4.0,
-        gait={"ramp_s": 1.0},
-        horizontal={"wave": way},
-        noise={"position": noise},
-        **tables,
-    )
+    run = {"duration_s": 8.0, "settle_s": 4.0, "gait": {"ramp_s": 1.0}}
+    tables |= {"horizontal": {"wave": way}, "noise": {"position": noise}}
+    return twin_chains.wave(**run, **tables)
+
+
+@pytest.fixture
+def driven(tmp_path, command):
+    """Drives the commands of a folder on the twin of a world; returns the sessions' paths."""
+
+    def drive(folder, world):
+        paths = [tmp_path / f"{world.stem}-{one.name}" for one in sorted(folder.glob("*.mcap"))]
+        for path in paths:
+            commands = folder / path.name.removeprefix(f"{world.stem}-")
+            command("drive", commands, "--on", f"twin:{world}", "-o", path)
+        return paths
+
+    return drive
 
 
 @pytest.fixture(scope="module")
@@ -74,28 +80,22 @@ def test_the_weak_servo_is_named(answered):
     assert result.reversal.boundary_share.value > result.reversal.module_share.value
 
 
-def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, capsys):
+def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, driven, command, report_of):
     """From a recorded gait to the pair, by the commands, on a floor that falls by 1 degree."""
     (tmp_path / "chain.toml").write_text(ROBOT)
     like, folder = tmp_path / "like.mcap", tmp_path / "plan"
     (tmp_path / "like.toml").write_text(wave())
-    assert undulog.run(["sim", "run", str(tmp_path / "like.toml"), "-o", str(like)]) == 0
-    words = ["--like", str(like), "-o", str(folder), "--settle", "4", "--measure", "4"]
-    assert undulog.run(["plan", "reversal", *words]) == 0
+    command("sim", "run", tmp_path / "like.toml", "-o", like)
+    words = ("--like", like, "-o", folder, "--settle", "4", "--measure", "4")
+    command("plan", "reversal", *words)
     answers = {}
     for name, more in (("sound", {}), ("weak", WEAK)):
         world = tmp_path / f"{name}.toml"
         world.write_text(wave(world={"slope": math.radians(1.0)}, **more))
-        driven = []
-        for commands in sorted(folder.glob("*.mcap")):
-            driven.append(str(tmp_path / f"{name}-{commands.name}"))
-            on = ["--on", f"twin:{world}", "-o", driven[-1]]
-            assert undulog.run(["drive", str(commands), *on]) == 0
-        at_one_heading = [path for path in driven if path.endswith("-0.mcap")]
-        for plan, paths in (("balanced", driven), ("one heading", at_one_heading)):
-            capsys.readouterr()
-            assert undulog.run(["analyse", *paths, "--json"]) == 0
-            answers[name, plan] = json.loads(capsys.readouterr().out)
+        paths = driven(folder, world)
+        at_one_heading = [path for path in paths if path.name.endswith("-0.mcap")]
+        answers[name, "balanced"] = report_of("analyse", *paths)
+        answers[name, "one heading"] = report_of("analyse", *at_one_heading)
     sound, weak = (answers[name, "balanced"] for name in ("sound", "weak"))
     for one in (sound, weak):
         reversal = one["reversal"]
@@ -112,29 +112,24 @@ def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, capsys):
     assert (alone["forward_runs"], alone["reverse_runs"]) == (3, 3)
     tilt = alone["tilt"]
     assert (tilt["headings"], tilt["excluded"]) == ("unbalanced", False)
-    largest = max(abs(one["lag_difference_rad"]["value"]) for one in alone["joints"])
-    assert largest > 5 * max(
-        abs(one["lag_difference_rad"]["value"]) for one in sound["reversal"]["joints"]
+    one, two = (
+        max(abs(joint["lag_difference_rad"]["value"]) for joint in each["joints"])
+        for each in (alone, sound["reversal"])
     )
+    assert one > 5 * two
 
 
-def test_kicks_in_contact_predict_what_was_held_out(tmp_path, capsys):
+def test_kicks_in_contact_predict_what_was_held_out(tmp_path, driven, command, report_of):
     """From a recorded gait to its coupling, by the commands: plan, drive, analyse."""
     (tmp_path / "chain.toml").write_text(ROBOT)
     scenario = tmp_path / "wave.toml"
     scenario.write_text(wave(noise=0.0005))
     like, folder = tmp_path / "like.mcap", tmp_path / "kicks"
-    assert undulog.run(["sim", "run", str(scenario), "-o", str(like)]) == 0
-    words = ["--like", str(like), "-o", str(folder), "--settle", "4", "--measure", "4"]
-    assert undulog.run(["plan", "phase-kicks", *words]) == 0
-    driven = []
-    for k, commands in enumerate(sorted(folder.glob("*.mcap"))):
-        driven.append(str(tmp_path / f"{k:02d}.mcap"))
-        on = ["--on", f"twin:{scenario}", "-o", driven[-1]]
-        assert undulog.run(["drive", str(commands), *on]) == 0
-    capsys.readouterr()
-    assert undulog.run(["analyse", *driven, "--start", "4", "--json"]) == 0
-    coupling = json.loads(capsys.readouterr().out)["coupling"]
+    command("sim", "run", scenario, "-o", like)
+    words = ("--like", like, "-o", folder, "--settle", "4", "--measure", "4")
+    command("plan", "phase-kicks", *words)
+    paths = driven(folder, scenario)
+    coupling = report_of("analyse", *paths, "--start", "4")["coupling"]
     assert (coupling["base_runs"], coupling["kicked_runs"]) == (6, 16)
     # Time shift, whatever the ground does.
     for rows in ("phase_rows", "gain_rows"):

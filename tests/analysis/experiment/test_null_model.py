@@ -74,8 +74,7 @@ def test_it_is_generalised_least_squares():
 
     found = verdict(seen, model)
     free = minimize(q, np.zeros(3), tol=1e-10)
-    assert found.fit == pytest.approx(free.fun, rel=1e-6)
-    assert found.named == (2,)
+    assert (found.fit, found.named) == (pytest.approx(free.fun, rel=1e-6), (2,))
     other = minimize(q, np.zeros(5), args=(2,), tol=1e-10)
     np.testing.assert_allclose(found.x, other.x[:3], atol=1e-4)
     np.testing.assert_allclose(found.deviation[2], other.x[3:], atol=0.01 * found.error[2].max())
@@ -121,9 +120,8 @@ def test_a_weak_module_is_found_and_named(module):
 def test_two_modules_are_named_one_after_the_other():
     model = planted()
     rng = np.random.default_rng(4)
-    seen = answered(
-        rng, model, np.zeros(3), [("stall_torque", 1, np.log(0.7)), ("mass", 5, np.log(3.0))]
-    )
+    changes = [("stall_torque", 1, np.log(0.7)), ("mass", 5, np.log(3.0))]
+    seen = answered(rng, model, np.zeros(3), changes)
     found = verdict(seen, model)
     assert set(found.named[:2]) == {1, 5}
     assert found.rest_p > 0.05
@@ -143,7 +141,6 @@ def test_joints_without_an_answer_are_left_out():
     model = planted()
     seen = answered(np.random.default_rng(6), model, np.zeros(3), [("stall_torque", 4, -0.3)])
     some = np.array([0, 1, 3, 4, 5, 6])
-    found = null_test(seen.select(some), some, model)
-    assert found.named[:1] == (4,)
+    assert null_test(seen.select(some), some, model).named[:1] == (4,)
     with pytest.raises(DataError, match="1 joints with gain and lag are too few"):
         null_test(seen.select([0]), np.array([0]), model)

@@ -23,7 +23,7 @@ def wave(lag, stall, **tables):
 
 
 @pytest.mark.slow
-def test_from_the_twin_to_a_named_module(tmp_path, capsys):
+def test_from_the_twin_to_a_named_module(tmp_path, capsys, command):
     """The middle joint, to which a reversal is blind, from one direction alone."""
     (tmp_path / "chain.toml").write_text(twin_chains.chain(9))
     scenario, model = tmp_path / "wave.toml", tmp_path / "null.json"
@@ -31,8 +31,7 @@ def test_from_the_twin_to_a_named_module(tmp_path, capsys):
     def analysed(text):
         scenario.write_text(text)
         session = tmp_path / "run.mcap"
-        assert undulog.run(["sim", "run", str(scenario), "-o", str(session), "--force"]) == 0
-        capsys.readouterr()
+        command("sim", "run", scenario, "-o", session, "--force")
         code = undulog.run(["analyse", str(session), "--null", str(model), "--json"])
         printed = capsys.readouterr()
         return json.loads(printed.out)["null_model"] if code == 0 else printed.err

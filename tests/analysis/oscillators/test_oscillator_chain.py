@@ -66,10 +66,8 @@ def walk(chains, rng, duration_s, noise, kick, *, every_s=5.0, steps=5):
             state = state + rng.uniform(-kick, kick, state.shape)
         if k % steps == 0:
             found.append(state)
-        ahead = state[:, None, :] - state[:, :, None] - psi
-        rates = omega + np.sum(K * np.sin(ahead), axis=2)
-        dice = rng.standard_normal(state.shape)
-        state = state + h * rates + noise * math.sqrt(h) * dice
+        rates = omega + np.sum(K * np.sin(state[:, None, :] - state[:, :, None] - psi), axis=2)
+        state = state + h * rates + noise * math.sqrt(h) * rng.standard_normal(state.shape)
     return np.stack(found, axis=1)
 
 
@@ -79,10 +77,8 @@ def test_heterogeneous_couplings_are_recovered_from_noisy_kicked_phases():
     chains = [Planted(rng, 7) for _ in range(6)]
     for chain, phases in zip(chains, walk(chains, rng, 60.0, 0.05, 1.0), strict=True):
         coupling = chain.answer(phases)
-        assert coupling.identifiable
-        assert coupling.kicks == 11
+        assert (coupling.identifiable, coupling.kicks, len(coupling.links)) == (True, 11, 12)
         assert coupling.condition_number < MOST_CONDITION
-        assert len(coupling.links) == 12
         errors, held = chain.errors(coupling)
         assert np.median(errors) < 0.05
         off += errors
@@ -90,14 +86,13 @@ def test_heterogeneous_couplings_are_recovered_from_noisy_kicked_phases():
         for rate, omega in zip(coupling.oscillators, chain.omega, strict=True):
             low, high = rate.omega.ci95
             inside.append(low <= omega <= high)
-            assert rate.noise == pytest.approx(0.05, rel=0.15)
-            assert rate.feedback.value is None
+            assert (rate.noise, rate.feedback.value) == (pytest.approx(0.05, rel=0.15), None)
     assert np.median(off) < 0.03
     # 186 intervals of 95 %: 3 standard deviations are 4.8 %.
     assert np.mean(inside) > 0.90
 
 
-def test_couplings_beyond_neighbours_are_told_where_they_are_looked_for():
+def test_couplings_beyond_neighbours_are_found_where_they_are_looked_for():
     rng = np.random.default_rng(3)
     chain = Planted(rng, 5, reach=4)
     coupling = chain.answer(chain.flow(rng, 12, 2.0, 1.0), reach=4)
@@ -109,8 +104,7 @@ def test_couplings_beyond_neighbours_are_told_where_they_are_looked_for():
 def test_without_noise_only_the_sampling_is_left():
     rng = np.random.default_rng(2)
     chain = Planted(rng, 9)
-    coupling = chain.answer(chain.flow(rng, 8, 4.0, 1.0))
-    errors, _ = chain.errors(coupling)
+    errors, _ = chain.errors(chain.answer(chain.flow(rng, 8, 4.0, 1.0)))
     assert max(errors) < 1e-3
 
 
@@ -120,8 +114,7 @@ def test_locked_phases_are_refused(noise):
     chains = [Planted(rng, 7) for _ in range(4)]
     for chain, phases in zip(chains, walk(chains, rng, 65.0, noise, 0.0, steps=2), strict=True):
         coupling = chain.answer(phases[500:])
-        assert not coupling.identifiable
-        assert coupling.links == ()
+        assert (coupling.identifiable, coupling.links) == (False, ())
         assert "locked" in coupling.why
         assert "condition number" in coupling.why
         assert "kicked as it runs" in coupling.record
@@ -130,8 +123,7 @@ def test_locked_phases_are_refused(noise):
 
 
 def test_exactly_constant_differences_are_singular():
-    t = np.arange(2000) * PERIOD_S
-    phases = math.pi * t[:, None] - np.arange(4) * math.pi / 3
+    phases = math.pi * (np.arange(2000) * PERIOD_S)[:, None] - np.arange(4) * math.pi / 3
     coupling = chain_coupling("horizontal", list("abcd"), phases, PERIOD_S)
     assert not coupling.identifiable
     assert coupling.condition_number is None or coupling.condition_number > 1e12
@@ -142,18 +134,14 @@ def test_a_coupling_that_is_not_there_has_an_interval_from_zero():
     chain = Planted(rng, 6)
     chain.K[np.triu_indices(6)] = 0.0  # nothing from behind
     coupling = chain.answer(walk([chain], rng, 60.0, 0.05, 1.0)[0])
-    at_zero = [
-        link.K.ci95[0] == 0.0
-        for link in coupling.links
-        if chain.names.index(link.source) > chain.names.index(link.target)
-    ]
+    # Names are in the order of the chain.
+    at_zero = [link.K.ci95[0] == 0.0 for link in coupling.links if link.source > link.target]
     assert len(at_zero) == 5
     assert sum(at_zero) >= 4
-    forward = [link for link in coupling.links if link.source < link.target]
-    assert all(link.K.ci95[0] > 0.5 for link in forward)
+    assert all(link.K.ci95[0] > 0.5 for link in coupling.links if link.source < link.target)
 
 
-def test_a_known_input_is_told_apart_from_couplings():
+def test_a_known_input_is_separated_from_couplings():
     rng = np.random.default_rng(4)
     chain = Planted(rng, 4)
     gain = np.array([0.3, 0.6, 0.0, 0.9])
@@ -187,5 +175,4 @@ def test_fast_transients_are_no_kicks_and_noise_is_none_either():
     assert not kicked_steps(phases).any()
     phases[150:, 1] += 0.2
     assert np.flatnonzero(kicked_steps(phases)).tolist() == [149]
-    noisy = phases + np.random.default_rng(1).normal(0.0, 0.1, phases.shape)
-    assert not kicked_steps(noisy).any()
+    assert not kicked_steps(phases + np.random.default_rng(1).normal(0.0, 0.1, phases.shape)).any()

@@ -9,13 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from undulog.analysis.estimators.intervals import noise_draws
-from undulog.analysis.oscillators.laplacian import (
-    growth,
-    intervals_of,
-    pseudospectrum,
-    smallest_singular,
-    spectrum,
-)
+from undulog.analysis.oscillators import laplacian
 from undulog.analysis.oscillators.predictions import (
     entrainment,
     explicit_coupling,
@@ -53,17 +47,16 @@ def signed(rng, m, size=0.2):
 def test_a_path_has_the_gap_of_its_closed_form(n):
     K = 0.17
     P = np.eye(n) - K * path_laplacian(n)
-    found = spectrum(P)
+    found = laplacian.spectrum(P)
     expected = 4.0 * K * np.sin(np.arange(1, n) * math.pi / (2 * n)) ** 2
     np.testing.assert_allclose(found.rates, expected, atol=1e-12)
     assert found.gap == pytest.approx(4.0 * K * math.sin(math.pi / (2 * n)) ** 2)
     assert found.strong == np.count_nonzero(expected > 0.1)
     np.testing.assert_allclose(found.sensitivity, 1.0)  # symmetric
     slowest = np.cos((np.arange(n) + 0.5) * math.pi / n)
-    share = abs(found.patterns[:, 0] @ slowest) / np.linalg.norm(slowest)
-    assert share == pytest.approx(1.0)
+    assert abs(found.patterns[:, 0] @ slowest) / np.linalg.norm(slowest) == pytest.approx(1.0)
     # Nothing grows, not even for a while: a symmetric chain's fastest growth is minus its gap.
-    assert growth(P) == pytest.approx(-found.gap)
+    assert laplacian.growth(P) == pytest.approx(-found.gap)
 
 
 @pytest.mark.parametrize("n", [5, 13])
@@ -79,22 +72,22 @@ def test_a_one_way_chain_is_not_normal_and_says_so():
     L = np.diag(np.r_[0.0, np.ones(n - 1)]) - np.diag(np.ones(n - 1), -1)
     slightly = K * L @ np.diag(1.0 + 0.05 * np.arange(n))  # else its eigenvalues are all the same
     slightly -= np.diag(slightly.sum(axis=1))
-    found = spectrum(np.eye(n) - slightly)
+    found = laplacian.spectrum(np.eye(n) - slightly)
     assert found.sensitivity.max() > 100.0
     # sigma_min is never above the distance to the nearest eigenvalue, and far below it here.
     z = complex(np.median(found.rates.real), 0.2)
-    level = smallest_singular(np.eye(n) - slightly, np.array([z.real]), np.array([z.imag]))[0, 0]
-    values = found.rates
-    assert level < 0.2 * np.abs(values - z).min()
+    level = laplacian.smallest_singular(
+        np.eye(n) - slightly, np.array([z.real]), np.array([z.imag])
+    )[0, 0]
+    assert level < 0.2 * np.abs(found.rates - z).min()
 
 
 def test_levels_of_a_normal_matrix_are_distances():
     P = np.eye(5) - path_laplacian(5) * 0.3
-    found = pseudospectrum(noisy(P, 1e-3))
+    found = laplacian.pseudospectrum(noisy(P, 1e-3))
     values = np.linalg.eigvalsh(np.eye(5) - P)[1:]  # all phases together are left out
     z = np.array(found.real)[:, None] + 1j * np.array(found.imag)
-    distance = np.abs(z[..., None] - values).min(axis=-1)
-    np.testing.assert_allclose(found.level, distance, atol=1e-12)
+    np.testing.assert_allclose(found.level, np.abs(z[..., None] - values).min(axis=-1), atol=1e-12)
     # The norm of a 4 x 4 matrix of noise: about 2 sqrt(4) sigma at most.
     assert 2.0e-3 < found.noise < 6.0e-3
 
@@ -103,21 +96,21 @@ def test_levels_of_a_normal_matrix_are_distances():
 def test_intervals_of_rates_hold_the_truth():
     rng = np.random.default_rng(7)
     P = signed(rng, 6)
-    truth = spectrum(P)
+    truth = laplacian.spectrum(P)
     assert truth.sensitivity.max() > 1.2
     held = []
     for _ in range(60):
         table = noisy(P, 0.01, rng)
-        found = spectrum(table.value)
-        said = intervals_of(table.value, table.value + noise_draws(table, 21))
+        found = laplacian.spectrum(table.value)
+        shown = laplacian.intervals_of(table.value, table.value + noise_draws(table, 21))
         order = [int(np.argmin(np.abs(found.rates - rate))) for rate in truth.rates]
         for rate, k in zip(truth.rates, order, strict=True):
-            held.append(said.real[k, 0] <= rate.real <= said.real[k, 1])
+            held.append(shown.real[k, 0] <= rate.real <= shown.real[k, 1])
             if abs(rate.imag) > 0.1:  # of a real eigenvalue the imaginary part is exactly zero
-                held.append(said.imag[k, 0] <= rate.imag <= said.imag[k, 1])
-        held.append(said.gap.ci95[0] <= truth.gap <= said.gap.ci95[1])
-        held.append(said.growth.ci95[0] <= growth(P) <= said.growth.ci95[1])
-        held.append(said.strong.ci95[0] <= truth.strong <= said.strong.ci95[1])
+                held.append(shown.imag[k, 0] <= rate.imag <= shown.imag[k, 1])
+        held.append(shown.gap.ci95[0] <= truth.gap <= shown.gap.ci95[1])
+        held.append(shown.growth.ci95[0] <= laplacian.growth(P) <= shown.growth.ci95[1])
+        held.append(shown.strong.ci95[0] <= truth.strong <= shown.strong.ci95[1])
     assert np.mean(held) > 0.92
 
 

@@ -1,13 +1,11 @@
 """Sessions whose generator logged its phases, analysed by the command."""
 
 import dataclasses
-import json
 import math
 
 import numpy as np
 import pytest
 
-import undulog
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.robot.model import Plane
 from undulog.sim import Readings
@@ -25,14 +23,11 @@ LAG = math.pi / 3
 
 def write(path, seconds, **fields):
     """The generator's own log, its joints following with a gain and a lag."""
-    chain = OscillatorChain(
-        amplitude=0.4, frequency_hz=0.5, lag=LAG, forward=FORWARD, backward=BACKWARD, **fields
-    )
+    chain = OscillatorChain(0.4, 0.5, LAG, forward=FORWARD, backward=BACKWARD, **fields)
     gait = OscillatorGait(OscillatorChains({Plane.HORIZONTAL: chain}), ROBOT)
-    unknown = np.full(len(ROBOT.joints), np.nan)
-    readings = Readings(unknown, unknown)
+    readings = Readings.nothing(ROBOT)
     with SessionWriter(path, session_id=path.stem, epoch_ns=EPOCH_NS, robot=ROBOT) as writer:
-        told = writer.joint_state("/gait", gait.names, unit="rad, omega in rad/s")
+        found = writer.joint_state("/gait", gait.names, unit="rad, omega in rad/s")
         commands = writer.joint_state("/joint_commands", ROBOT.joint_names, unit="rad")
         states = writer.joint_state("/joint_states", ROBOT.joint_names, unit="rad")
         before = np.zeros(len(ROBOT.joints))
@@ -40,7 +35,7 @@ def write(path, seconds, **fields):
             t_ns = EPOCH_NS + k * 10_000_000
             tick = gait.step(k / 100, readings)
             angle = before + 0.2 * (tick.command - before)
-            told.write(t_ns, tick.values)
+            found.write(t_ns, tick.values)
             commands.write(t_ns, tick.command)
             states.write(t_ns, before)
             # What a sample tells is known a period later.
@@ -49,23 +44,16 @@ def write(path, seconds, **fields):
     return path
 
 
-def analysed(path, capsys):
-    assert undulog.run(["analyse", str(path), "--json"]) == 0
-    (chain,) = json.loads(capsys.readouterr().out)["oscillators"]
-    return chain
-
-
 def planted(link):
     i, j = NAMES.index(link["target"]), NAMES.index(link["source"])
     return FORWARD[j] if j < i else BACKWARD[i]
 
 
 @pytest.mark.parametrize("feedback", [0.0, 0.6])
-def test_a_kicked_session_tells_its_couplings(tmp_path, capsys, feedback):
+def test_a_kicked_session_gives_its_couplings(tmp_path, feedback, command, report_of):
     path = write(tmp_path / "run.mcap", 29.0, kick_every_s=3.0, kick_size=1.0, feedback=feedback)
-    chain = analysed(path, capsys)
-    assert chain["identifiable"] is True
-    assert (chain["plane"], chain["kicks"]) == ("horizontal", 9)
+    (chain,) = report_of("analyse", path)["oscillators"]
+    assert (chain["identifiable"], chain["plane"], chain["kicks"]) == (True, "horizontal", 9)
     assert len(chain["links"]) == 2 * PAIRS
     errors = [abs(link["K"]["value"] / planted(link) - 1) for link in chain["links"]]
     assert np.median(errors) < 0.05
@@ -75,17 +63,14 @@ def test_a_kicked_session_tells_its_couplings(tmp_path, capsys, feedback):
         assert link["lag_rad"]["value"] == pytest.approx(-ahead * LAG, abs=0.1)
     for one in chain["oscillators"]:
         assert one["feedback"]["value"] == pytest.approx(feedback, abs=0.06)
-    assert undulog.run(["analyse", str(path)]) == 0
-    out = capsys.readouterr().out
+    out = command("analyse", path).out
     assert "Oscillators, horizontal: 10 couplings identified (condition number" in out
 
 
-def test_a_locked_session_is_refused(tmp_path, capsys):
+def test_a_locked_session_is_refused(tmp_path, command, report_of):
     path = write(tmp_path / "locked.mcap", 10.0)
-    chain = analysed(path, capsys)
-    assert chain["identifiable"] is False
-    assert chain["links"] == []
+    (chain,) = report_of("analyse", path)["oscillators"]
+    assert (chain["identifiable"], chain["links"]) == (False, [])
     assert "locked" in chain["why"]
     assert "kick_every_s" in chain["record"]
-    assert undulog.run(["analyse", str(path)]) == 0
-    assert "coupling not identifiable: the phases are locked" in capsys.readouterr().out
+    assert "coupling not identifiable: the phases are locked" in command("analyse", path).out

@@ -27,29 +27,20 @@ EPS = 0.3
 def measured(random=None, scatter_deg=0.0, m=5):
     """A kick experiment on a linear chain, analysed."""
     H, c = kick_tables.chain(m)
-    experiment = kicked(
-        random or np.random.default_rng(1),
-        H,
-        c,
-        kick_tables.plan(m),
-        math.radians(scatter_deg),
-        noise=1e-6 if scatter_deg == 0.0 else None,
-    )
+    random = random or np.random.default_rng(1)
+    noise = 1e-6 if scatter_deg == 0.0 else None
+    scatter = math.radians(scatter_deg)
+    experiment = kicked(random, H, c, kick_tables.plan(m), scatter, noise=noise)
     return H, c, kick_coupling(experiment, lambda _: None)
 
 
 def exact(P, R, gain=1.0, lag=0.0):
     """A coupling that is known without error."""
     m = len(P)
-    zero = np.zeros((m, m))
-
-    def matrix(value):
-        return Matrix(rows_of(value), rows_of(zero), rows_of(zero))
-
-    _, _, like = measured(m=m)
-    nothing = tuple([0.0] * m)
-    base = BaseResponse(0.5, tuple([gain] * m), tuple([lag] * m), nothing, nothing)
-    return dataclasses.replace(like, P=matrix(P), R=matrix(R), base=base)
+    zero, nothing = rows_of(np.zeros((m, m))), (0.0,) * m
+    base = BaseResponse(0.5, (gain,) * m, (lag,) * m, nothing, nothing)
+    P, R = (Matrix(rows_of(value), zero, zero) for value in (P, R))
+    return dataclasses.replace(measured(m=m)[2], P=P, R=R, base=base)
 
 
 @pytest.mark.parametrize("m", [4, 7])
@@ -90,14 +81,11 @@ def test_integrated_oscillators_do_what_is_predicted():
 
     def rate(_, d):
         c_now = A * np.exp(1j * (phase + d))
-        ratio = (H @ c_now) / c_now
-        return EPS * (ratio.imag - bias)
+        return EPS * (((H @ c_now) / c_now).imag - bias)
 
-    times = found.relaxation.times_s
-    done = solve_ivp(rate, (0.0, 20.0), off, t_eval=times, rtol=1e-9, atol=1e-12)
+    done = solve_ivp(rate, (0.0, 20.0), off, t_eval=found.relaxation.times_s, rtol=1e-9, atol=1e-12)
     error = np.linalg.norm(np.array(found.relaxation.phase_rad) - done.y.T, axis=1)
-    moved = np.linalg.norm(done.y.T[-1] - off)
-    assert moved > 0.3 * np.linalg.norm(off)
+    assert np.linalg.norm(done.y.T[-1] - off) > 0.3 * np.linalg.norm(off)
     assert error.max() < 0.03 * np.linalg.norm(off)  # second order in a kick of 0.03 rad
 
 
@@ -114,8 +102,7 @@ def test_intervals_of_rates_hold_under_scatter():
     random = np.random.default_rng(3)
     inside = []
     for _ in range(20):
-        found = closed_loop(measured(random, 0.1)[2], EPS)
-        ends = [one.rate.ci95 for one in found.modes]
+        ends = [one.rate.ci95 for one in closed_loop(measured(random, 0.1)[2], EPS).modes]
         # Of the sums: rates that lie close together change places.
         inside += [low <= t <= high for (low, high), t in zip(ends, truth, strict=True)]
     assert np.mean(inside) >= 0.91
@@ -139,13 +126,12 @@ def test_what_is_left_of_a_kick_has_an_interval():
 def test_the_limits_are_stated():
     coupling = measured()[2]
     known = dataclasses.replace(coupling, valid_to=0.1)
-    failed = dataclasses.replace(known, checks_pass=False)
     for given, eps, kick, limit in (
         (coupling, EPS, None, "isn't known"),
         (known, EPS, {"j1": 0.2}, "beyond 0.1 rad"),
         (known, EPS, None, "holds for deviations up to 0.1 rad"),
         (known, 20.0, None, "take a smaller eps"),
-        (failed, EPS, None, "the prediction is doubtful"),
+        (dataclasses.replace(known, checks_pass=False), EPS, None, "the prediction is doubtful"),
     ):
         assert limit in closed_loop(given, eps, kick=kick).limits[0]
 
@@ -165,34 +151,27 @@ def result(tmp_path_factory):
     """The result file of a kick experiment, and one of its sessions."""
     folder = tmp_path_factory.mktemp("kicked")
     files = linear_chain.kicked(folder)
-    words = ["analyse", *map(str, files), "-o", str(folder / "kicks.json")]
-    assert undulog.run(words) == 0
+    assert undulog.run(["analyse", *map(str, files), "-o", str(folder / "kicks.json")]) == 0
     return folder / "kicks.json", files
 
 
-def test_the_verb_takes_sessions_or_their_result(result, tmp_path, capsys):
+def test_the_verb_takes_sessions_or_their_result(result, tmp_path, command, report_of):
     file, sessions = result
-    capsys.readouterr()
-    assert undulog.run(["predict", str(file), "--eps", "0.3", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert undulog.run(["predict", *map(str, sessions), "--eps", "0.3", "--json"]) == 0
-    again = json.loads(capsys.readouterr().out)
-    np.testing.assert_allclose(found["J"], again["J"], atol=1e-12)
-    np.testing.assert_allclose(found["J"], rates_of(CHAIN, WAVE), atol=0.02)
+    found, direct = (report_of("predict", *one, "--eps", "0.3")["J"] for one in ([file], sessions))
+    np.testing.assert_allclose(found, direct, atol=1e-12)
+    np.testing.assert_allclose(found, rates_of(CHAIN, WAVE), atol=0.02)
     output = tmp_path / "predicted.json"
-    words = ["predict", str(file), "--eps", "0.3", "--kick", "j2=0.05", "-o", str(output)]
-    assert undulog.run(words) == 0
-    text = capsys.readouterr().out
+    words = ("predict", file, "--eps", "0.3", "--kick", "j2=0.05", "-o", output)
+    text = command(*words).out
     assert text.startswith("With feedback of 0.3 1/s and the body as the only coupling, of 4")
     assert "Of the kick" in text
     assert json.loads(output.read_text())["relaxation"]["times_s"][0] == 0.0
-    assert undulog.run(words) == 2  # it is there
-    assert "--force" in capsys.readouterr().err
-    assert undulog.run([*words, "--force"]) == 0
+    assert "--force" in command(*words, code=2).err  # it is there
+    command(*words, "--force")
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "told"),
+    ("words", "code", "message"),
     [
         ("--eps -1", 2, "--eps -1"),
         ("--eps 0.3 --kick j2", 2, "expected JOINT=RAD"),
@@ -201,16 +180,14 @@ def test_the_verb_takes_sessions_or_their_result(result, tmp_path, capsys):
         ("--eps 0.3 --age -1", 2, "--age is at least 0"),
     ],
 )
-def test_wrong_usage(result, capsys, words, code, told):
-    assert undulog.run(["predict", str(result[0]), *words.split()]) == code
-    assert told in capsys.readouterr().err
+def test_wrong_usage(result, words, code, message, command):
+    assert message in command("predict", result[0], *words.split(), code=code).err
 
 
-def test_sessions_without_kicks_fail_and_say_what_to_record(result, capsys):
-    _, sessions = result
-    assert undulog.run(["predict", str(sessions[0]), "--eps", "0.3"]) == 1
-    assert "phase-kicks around this gait" in capsys.readouterr().err
-    assert undulog.run(["predict"]) == 2
+def test_sessions_without_kicks_fail_and_say_what_to_record(result, command):
+    words = ("predict", result[1][0], "--eps", "0.3")
+    assert "phase-kicks around this gait" in command(*words, code=1).err
+    command("predict", code=2)
 
 
 def test_a_result_of_kicks_reads_back(result):

@@ -1,13 +1,11 @@
 """Plans: the commands that are written, read back as the experiment they are for."""
 
 import dataclasses
-import json
 import subprocess
 
 import numpy as np
 import pytest
 
-import undulog
 from support.joint_runs import turns, write_joints
 from undulog.analysis.experiment.kicks.runs import Kind, missing_kicks, sort_kicks
 from undulog.analysis.plan.designs import reversal, tones
@@ -45,15 +43,9 @@ def like(tmp_path_factory):
     return write_gait(tmp_path_factory.mktemp("like") / "like.mcap")
 
 
-def planned(capsys, *words):
-    capsys.readouterr()
-    assert undulog.run(["plan", *map(str, words), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def test_kicks_read_back_as_kicks(like, tmp_path, capsys):
+def test_kicks_read_back_as_kicks(like, tmp_path, report_of):
     words = ("--like", like, "-o", tmp_path / "kicks", "--settle", 3, "--measure", 5)
-    files = planned(capsys, "phase-kicks", *words)["files"]
+    files = report_of("plan", "phase-kicks", *words)["files"]
     assert len(files) == 4 * 4 + 6 + 3
     found = [phasors(file, 3.0) for file in files]
     command = np.stack([one[0][0, YAW] for one in found])
@@ -74,27 +66,23 @@ def test_kicks_read_back_as_kicks(like, tmp_path, capsys):
         np.testing.assert_allclose(offset, np.linspace(-0.1, 0.1, 25), atol=1e-5)
 
 
-def test_names_of_joints_lead_out_of_no_folder(tmp_path, capsys):
+def test_names_of_joints_lead_out_of_no_folder(tmp_path, report_of, opened):
     names = ["../up", "/etc/x", "nul\0", "l" * 300]
     asked = np.real(BASE * turns(0.8, 300))
     like = write_joints(tmp_path / "like.mcap", names, asked, [asked])
     folder = tmp_path / "deep" / "kicks"
     words = ("--like", like, "-o", folder, "--settle", 3, "--measure", 5)
-    files = planned(capsys, "phase-kicks", *words)["files"]
+    files = report_of("plan", "phase-kicks", *words)["files"]
     assert len(set(files)) == len(list(folder.iterdir())) == 4 * 4 + 6 + 3
-    kicked = set()
-    for file in files:
-        with Session.open(file) as session:
-            kicked.add(session.metadata["undulog.plan"].get("joint"))
+    kicked = {opened(file).metadata["undulog.plan"].get("joint") for file in files}
     assert set(names) <= kicked
 
 
-def test_a_reversal_alternates(like, tmp_path, capsys):
+def test_a_reversal_alternates(like, tmp_path, report_of):
     words = ("--like", like, "-o", tmp_path / "both", "--runs", 2, "--settle", 2, "--measure", 5)
-    files = planned(capsys, "reversal", *words)["files"]
+    files = report_of("plan", "reversal", *words)["files"]
     assert len(files) == 4
-    command = [phasors(file, 2.0)[0][0, YAW] for file in files]
-    step = np.angle([one[1] / one[0] for one in command])
+    step = np.angle([one[1] / one[0] for one in [phasors(file, 2.0)[0][0, YAW] for file in files]])
     np.testing.assert_allclose(step, np.array([-1, 1, -1, 1]) * np.pi / 3, atol=1e-5)
     plans = [phasors(file, 2.0)[2] for file in files]
     assert [float(one["heading_rad"]) for one in plans] == pytest.approx([0, np.pi, np.pi, 0])
@@ -116,47 +104,42 @@ def test_half_of_each_direction_is_turned_and_drift_cancels(each):
     assert (np.diff(turn) != 0).sum() <= each
 
 
-def test_what_is_refused(like, tmp_path, capsys):
+def test_what_is_refused(like, tmp_path, command):
     folder = tmp_path / "kicks"
-    words = ["plan", "phase-kicks", "-o", str(folder), "--like"]
-    assert undulog.run([*words, str(like), "--runs", "0"]) == 2
+    words = ("plan", "phase-kicks", "-o", folder, "--like")
+    command(*words, like, "--runs", "0", code=2)
     high = write_gait(tmp_path / "high.mcap", amplitude=BASE * 1.65)
-    assert undulog.run([*words, str(high)]) == 2
-    assert "its limits are" in capsys.readouterr().err
+    assert "its limits are" in command(*words, high, code=2).err
     odd = write_gait(tmp_path / "odd.mcap", overtone=0.1)
-    assert undulog.run([*words, str(odd)]) == 2
-    assert "is no sine" in capsys.readouterr().err
+    assert "is no sine" in command(*words, odd, code=2).err
     assert not folder.exists()
-    short = [str(like), "--settle", "1", "--measure", "1"]
-    assert undulog.run([*words, *short]) == 0
-    assert capsys.readouterr().out.startswith(f"{folder}: phase-kicks, 25 runs of 2 s")
-    assert undulog.run([*words, *short]) != 0
-    assert "exists" in capsys.readouterr().err
+    short = (like, "--settle", "1", "--measure", "1")
+    assert command(*words, *short).out.startswith(f"{folder}: phase-kicks, 25 runs of 2 s")
+    assert "exists" in command(*words, *short, code=2).err
 
 
-def test_a_folder_that_can_not_be_written_is_an_error(like, tmp_path, disk_of, capsys):
-    words = ["plan", "phase-kicks", "--like", str(like), "--settle", "1", "--measure", "1", "-o"]
+def test_a_folder_that_can_not_be_written_is_an_error(like, tmp_path, disk_of, command):
+    words = ("plan", "phase-kicks", "--like", like, "--settle", "1", "--measure", "1", "-o")
     (tmp_path / "file").write_text("")
     disk = disk_of("1m")
     subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
     for folder in (tmp_path / "file", tmp_path / "file" / "below", disk, disk / "below"):
-        assert undulog.run([*words, str(folder)]) == 1
-        complaint = capsys.readouterr().err
+        complaint = command(*words, folder, code=1).err
         assert complaint.startswith(f"error: {folder}")
         assert "can't be written" in complaint or "no folder for the plan" in complaint
 
 
-def test_a_full_disk_ends_a_plan(like, disk_of, capsys):
+def test_a_full_disk_ends_a_plan(like, disk_of, command):
     disk = disk_of("200k")
-    assert undulog.run(["plan", "phase-kicks", "--like", str(like), "-o", str(disk)]) == 1
-    assert "No space left" in capsys.readouterr().err
+    assert "No space left" in command("plan", "phase-kicks", "--like", like, "-o", disk, code=1).err
     assert not list(disk.glob("*.part"))
 
 
-def test_a_lag_sweep_is_a_dft(like, tmp_path, capsys):
-    told = planned(capsys, "lag-sweep", "--like", like, "-o", tmp_path / "s", "--amplitude", 0.03)
-    assert len(told["files"]) == 4
-    found = [phasors(file, told["settle_s"], 10.0, 0.8) for file in told["files"]]
+def test_a_lag_sweep_is_a_dft(like, tmp_path, report_of):
+    words = ("--like", like, "-o", tmp_path / "s", "--amplitude", 0.03)
+    plan = report_of("plan", "lag-sweep", *words)
+    assert len(plan["files"]) == 4
+    found = [phasors(file, plan["settle_s"], 10.0, 0.8) for file in plan["files"]]
     C = np.stack([one[0][0, YAW] for one in found], axis=1)
     np.testing.assert_allclose(np.abs(C), 0.03, rtol=1e-6)
     assert np.linalg.cond(C) == pytest.approx(1.0, abs=1e-6)
@@ -166,19 +149,20 @@ def test_a_lag_sweep_is_a_dft(like, tmp_path, capsys):
     assert sorted(plan["run"] for _, _, plan in found) == ["0", "1", "2", "3"]
 
 
-def test_settling_is_told_by_the_slowest_body_mode(like, tmp_path, capsys):
-    told = planned(capsys, "lag-sweep", "--like", like, "-o", tmp_path / "s")
-    plan = phasors(told["files"][0], 0.0)[2]
+def test_settling_follows_from_the_slowest_body_mode(like, tmp_path, report_of):
+    report = report_of("plan", "lag-sweep", "--like", like, "-o", tmp_path / "s")
+    plan = phasors(report["files"][0], 0.0)[2]
     tau_s = float(plan["mode_tau_s"])
     assert tau_s == pytest.approx(1.845, rel=1e-3)
-    assert told["settle_s"] == float(plan["settle_s"]) >= 5 * tau_s
+    assert report["settle_s"] == float(plan["settle_s"]) >= 5 * tau_s
     assert (plan["measure_s"], plan["amplitude_rad"]) == ("10", "0.02")
 
 
-def test_every_tone_of_a_multisine_is_a_dft(like, tmp_path, capsys):
-    told = planned(capsys, "multisine", "--like", like, "-o", tmp_path / "m", "--measure", 12)
+def test_every_tone_of_a_multisine_is_a_dft(like, tmp_path, report_of):
+    words = ("--like", like, "-o", tmp_path / "m", "--measure", 12)
+    plan = report_of("plan", "multisine", *words)
     omega = tones(2 * np.pi * 0.8, 3)
-    found = [phasors(file, told["settle_s"], 12.5, omega / (2 * np.pi)) for file in told["files"]]
+    found = [phasors(file, plan["settle_s"], 12.5, omega / (2 * np.pi)) for file in plan["files"]]
     assert omega[0] == 2 * np.pi * 0.8
     assert found[0][2]["measure_s"] == "12.5"  # two whole periods
     for tone in range(3):
@@ -199,20 +183,10 @@ def test_no_tone_is_another_plus_gait_frequencies(count):
             assert off.min() > 0.5 / (2 * count - 1)
 
 
-def weak(stall_torque):
-    return dataclasses.replace(
-        ROBOT,
-        joints=tuple(
-            dataclasses.replace(
-                joint, servo=dataclasses.replace(joint.servo, stall_torque=stall_torque)
-            )
-            for joint in ROBOT.joints
-        ),
-    )
-
-
 def test_the_weak_chain_rings_for_seconds():
-    mode = slowest_mode(weak(0.25), ["joint01"])
+    servo = dataclasses.replace(ROBOT.joints[0].servo, stall_torque=0.25)
+    joints = tuple(dataclasses.replace(joint, servo=servo) for joint in ROBOT.joints)
+    mode = slowest_mode(dataclasses.replace(ROBOT, joints=joints), ["joint01"])
     # Measured on a prototype that shares nothing with this code: 0.551 Hz, 3.8 %, 7.5 s.
     assert mode.frequency_hz == pytest.approx(0.551, abs=2e-3)
     assert mode.damping == pytest.approx(0.038, abs=1e-3)
@@ -221,22 +195,19 @@ def test_the_weak_chain_rings_for_seconds():
 
 def test_two_rods_have_their_textbook_inertia():
     """Two free uniform rods on one hinge: bending by q takes m l^2/24 q''^2/2 (thin rods)."""
-    link = dataclasses.replace(
-        ROBOT.links[0], length=0.3, mass=0.2, inertia=(0.0, 0.0, 0.2 * 0.3**2 / 12)
-    )
+    rod = {"length": 0.3, "mass": 0.2, "inertia": (0.0, 0.0, 0.2 * 0.3**2 / 12)}
+    link = dataclasses.replace(ROBOT.links[0], **rod)
     robot = dataclasses.replace(ROBOT, links=(link, link), joints=ROBOT.joints[:1])
     inertia = transverse_mass(robot, Plane.HORIZONTAL)
     # Mirror symmetry: each rod turns by q/2, its centre moves q l/8 against the hinge's q l/8.
     np.testing.assert_allclose(inertia, [[0.2 * 0.3**2 / 24]], rtol=1e-12)
 
 
-def test_sweeps_that_are_refused(like, tmp_path, capsys):
+def test_sweeps_that_are_refused(like, tmp_path, command):
     words = ["plan", "lag-sweep", "--like", str(like), "-o", str(tmp_path / "x")]
-    assert undulog.run([*words, "--amplitude", "0.2"]) == 2
-    assert "would saturate" in capsys.readouterr().err
-    assert undulog.run([*words, "--amplitude", "0.6"]) == 2
-    assert undulog.run([*words, "--amplitude", "0"]) == 2
-    assert undulog.run(["plan", "multisine", *words[2:], "--tones", "1"]) == 2
+    assert "would saturate" in command(*words, "--amplitude", "0.2", code=2).err
+    command(*words, "--amplitude", "0.6", code=2)
+    command(*words, "--amplitude", "0", code=2)
+    command("plan", "multisine", *words[2:], "--tones", "1", code=2)
     assert not (tmp_path / "x").exists()
-    assert undulog.run([*words, "--settle", "2"]) == 0
-    assert "Warning: it needs 12 s to settle; 2 s is less" in capsys.readouterr().out
+    assert "Warning: it needs 12 s to settle; 2 s is less" in command(*words, "--settle", "2").out

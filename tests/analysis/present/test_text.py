@@ -25,8 +25,7 @@ def test_a_pipe_gets_the_answer_first_every_column_and_the_method_last(snake):
             continue
         gain, lag = re.findall(r"(\S+) \[", rows[0].replace("−", "-"))
         for shown, exact in ((gain, joint.gain.value), (lag, math.degrees(joint.lag_rad.value))):
-            decimals = len(shown.partition(".")[2])
-            assert abs(float(shown) - exact) <= 0.5000001 * 10**-decimals
+            assert abs(float(shown) - exact) <= 0.5000001 * 10 ** -len(shown.partition(".")[2])
 
 
 @pytest.mark.parametrize("width", [80, 100, 200])
@@ -37,8 +36,8 @@ def test_nothing_is_wider_than_the_terminal(snake, width):
     left_out = [line for line in lines if line.startswith("Without ")]
     assert bool(left_out) == (width < 120)
     heading = next(line for line in lines if line.startswith("joint "))
-    told = left_out[0].partition(":")[0].removeprefix("Without ") if left_out else ""
-    assert not [name for name in told.split(", ") if name and name in heading]
+    missing = left_out[0].partition(":")[0].removeprefix("Without ") if left_out else ""
+    assert not [name for name in missing.split(", ") if name and name in heading]
 
 
 def test_nulls_are_dashes_and_every_joint_stays_when_none_was_driven(still):

@@ -1,5 +1,7 @@
 """Is there a gait, where is it steady, and when has it settled?"""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -48,16 +50,15 @@ def test_what_is_no_gait():
         lambda t, i: np.zeros_like(t),
         lambda t, i: np.sin(2 * np.pi * 0.2 * t),
     ):
-        said = []
+        notes = []
         named = {one.name: one for one in channels(make)}
-        assert fit_gait(named, named, 10.0, said.append) is None
-        assert said[0].startswith("no gait")
+        assert fit_gait(named, named, 10.0, notes.append) is None
+        assert notes[0].startswith("no gait")
 
 
 def test_a_strong_second_harmonic_is_not_taken_for_the_gait():
-    rhythm = find_rhythm(
-        channels(lambda t, i: 0.6 * np.sin(5 * t - i) + np.sin(2 * (5 * t - i))), 10.0
-    )
+    waves = channels(lambda t, i: 0.6 * np.sin(5 * t - i) + np.sin(2 * (5 * t - i)))
+    rhythm = find_rhythm(waves, 10.0)
     assert rhythm.omega == pytest.approx(5.0, rel=1e-9)
 
 
@@ -75,8 +76,7 @@ def test_direction_of_the_wave():
     # Eq. 2 with a negative lag: crests move towards the high indices, the tail.
     step = phase_step(0.4 * np.exp(-1j * np.pi / 3 * np.arange(12)))
     assert step == pytest.approx(-np.pi / 3)
-    assert wave_name(step) == "head-to-tail"
-    assert wave_name(-step) == "tail-to-head"
+    assert (wave_name(step), wave_name(-step)) == ("head-to-tail", "tail-to-head")
     assert wave_name(0.0) == wave_name(np.pi) == "standing"
 
 
@@ -84,14 +84,12 @@ def test_planes_with_different_frequencies_are_not_averaged():
     t = np.arange(1000) / 100
     named = {f"h{i}": Series(f"h{i}", t, 0.4 * np.sin(3 * t - i)) for i in range(5)}
     named |= {f"v{i}": Series(f"v{i}", t, 0.1 * np.sin(4.3 * t - i)) for i in range(2)}
-    said = []
-    fit = fit_gait(named, named, 10.0, said.append)
-    assert [group.driven for group in fit.groups] == [
-        tuple(f"h{i}" for i in range(5)),
-        ("v0", "v1"),
-    ]
+    notes = []
+    fit = fit_gait(named, named, 10.0, notes.append)
+    driven_joints = [group.driven for group in fit.groups]
+    assert driven_joints == [tuple(f"h{i}" for i in range(5)), ("v0", "v1")]
     assert [group.fit.omega for group in fit.groups] == pytest.approx([3.0, 4.3], rel=1e-9)
-    assert not any("commanded something else" in text for text in said)
+    assert not any("commanded something else" in text for text in notes)
 
 
 def test_steady_runs_of_the_logged_gait():
@@ -103,11 +101,8 @@ def test_steady_runs_of_the_logged_gait():
     values[60:, 1] = 4.0
     values[80:, 3] = 0.1
     runs = steady_runs(t_ns, names, values)
-    assert runs[-3:] == [
-        Stretch(190_000_000, 600_000_000),
-        Stretch(600_000_000, 800_000_000),
-        Stretch(800_000_000, 1_000_000_000),
-    ]
+    edges_ns = np.array([190, 600, 800, 1000]) * 1_000_000
+    assert runs[-3:] == [Stretch(*pair) for pair in pairwise(edges_ns.tolist())]
     assert steady_runs(t_ns, names, values, ("offset",))[-1] == Stretch(600_000_000, 10**9)
     assert steady_runs(t_ns[:0], names, values[:0]) == []
     long = [run for run in runs if run.duration_s >= 0.2]
@@ -117,10 +112,8 @@ def test_steady_runs_of_the_logged_gait():
 
 def test_settling_time_counts_from_the_start_or_from_the_change():
     second = 10**9
-    ramped = settled(Stretch(2 * second, 16 * second), 0, 8.0)
-    assert ramped == Stretch(8 * second, 16 * second)
-    changed = settled(Stretch(20 * second, 40 * second), 0, 8.0)
-    assert changed == Stretch(28 * second, 40 * second)
+    assert settled(Stretch(2 * second, 16 * second), 0, 8.0) == Stretch(8 * second, 16 * second)
+    assert settled(Stretch(20 * second, 40 * second), 0, 8.0) == Stretch(28 * second, 40 * second)
     assert settled(Stretch(0, 5 * second), 0, 8.0).duration_s == 0
 
 
@@ -141,26 +134,16 @@ def test_a_decaying_mode_is_reported_as_drift():
     rng = np.random.default_rng(3)
     omega = np.pi
 
-    def joints(mode, count=8, duration=12.0):
-        return channels(
-            lambda t, i: (
-                0.4 * np.sin(omega * t - i)
-                + mode * np.exp(-t / 7.5) * np.sin(3.46 * t - 0.4 * i)
-                + rng.normal(0, 1e-3, t.size)
-            ),
-            count,
-            duration,
-        )
+    def drifts(mode, duration=12.0):
+        def angle(t, i):
+            bending = mode * np.exp(-t / 7.5) * np.sin(3.46 * t - 0.4 * i)
+            return 0.4 * np.sin(omega * t - i) + bending + rng.normal(0, 1e-3, t.size)
 
-    for duration in (8.0, 12.0, 20.0):
-        for mode in (0.02, 0.002):
-            series = joints(mode, duration=duration)
-            assert worst_drift(series, fit_shared(series, omega), list(range(8))) is not None
-    false_alarms = 0
-    for _ in range(200):
-        series = joints(0.0)
-        false_alarms += worst_drift(series, fit_shared(series, omega), list(range(8))) is not None
-    assert false_alarms <= 5
+        series = channels(angle, 8, duration)
+        return worst_drift(series, fit_shared(series, omega), list(range(8))) is not None
+
+    assert all(drifts(mode, duration) for duration in (8.0, 12.0, 20.0) for mode in (0.02, 0.002))
+    assert sum(drifts(0.0) for _ in range(200)) <= 5
 
 
 def test_the_size_of_a_drift():

@@ -39,8 +39,7 @@ def test_odd_and_even_joints_at_two_frequencies(ratio):
     )
     for group in gait.groups:
         own = snake.omega[snake.names.index(group.driven[0]) % 2]
-        assert group.fit.omega == pytest.approx(own, rel=1e-9)
-        assert group.answered == group.driven
+        assert (group.fit.omega, group.answered) == (pytest.approx(own, rel=1e-9), group.driven)
     # A dense least-squares fit of everything, at the true frequencies, is the reference.
     t = snake.t + snake.skew_s
     rows = [np.ones_like(t)]
@@ -64,8 +63,7 @@ def test_odd_and_even_joints_at_two_frequencies(ratio):
 def test_one_frequency_is_one_group_with_the_numbers_of_the_plain_fit():
     snake = Snake(1.0)
     gait = snake.fit()
-    assert gait.others == ()
-    assert gait.driven == tuple(snake.names)
+    assert (gait.others, gait.driven) == ((), tuple(snake.names))
     assert gait.fit.model == HarmonicModel()
 
 
@@ -73,21 +71,18 @@ def test_a_group_of_one_and_a_joint_that_follows_nothing():
     snake = Snake(1.5, joints=9)
     rng = np.random.default_rng(1)
     snake.group[:] = 1
-    slow = 2 * np.pi * 0.954
-    snake.command[:] = 0.4 * np.sin(slow * snake.t - np.arange(9)[:, None])
+    snake.command[:] = 0.4 * np.sin((2 * np.pi * 0.954) * snake.t - np.arange(9)[:, None])
     snake.command[4] = 0.2 * np.sin(2 * np.pi * 0.4 * snake.t)
     snake.command[7] = 0.2 * rng.normal(size=snake.t.size)
     snake.command[8] = 0.0
     snake.response = 0.9 * snake.command
-    said = []
-    gait = snake.fit(warn=said.append)
-    assert [group.driven for group in gait.groups] == [
-        tuple(snake.names[k] for k in (0, 1, 2, 3, 5, 6)),
-        (snake.names[4],),
-    ]
+    notes = []
+    gait = snake.fit(warn=notes.append)
+    most = tuple(snake.names[k] for k in (0, 1, 2, 3, 5, 6))
+    assert [group.driven for group in gait.groups] == [most, (snake.names[4],)]
     assert gait.group_of(snake.names[7]) is None
-    assert any("joint08" in text and "commanded something else" in text for text in said)
-    assert any("joint09" in text and "held still" in text for text in said)
+    assert any("joint08" in text and "commanded something else" in text for text in notes)
+    assert any("joint09" in text and "held still" in text for text in notes)
 
 
 def test_commands_with_the_tones_of_both_groups_go_where_their_own_is_largest():
@@ -105,38 +100,37 @@ def test_frequencies_that_the_record_does_not_resolve():
     """0.2 cycles apart over the record one frequency fits all; 1.2 apart it doesn't."""
     for apart, others_null in ((0.2, False), (1.2, True)):
         snake = Snake(1 + apart / 12.0 / 0.954)
-        said = []
-        gait = snake.fit(warn=said.append)
-        (text,) = [text for text in said if "one group or two can't be decided" in text]
+        notes = []
+        gait = snake.fit(warn=notes.append)
+        (text,) = [text for text in notes if "one group or two can't be decided" in text]
         assert gait.others == ()
         assert len(gait.driven) == (8 if others_null else 16)
         assert ("gain and lag of" in text) == others_null
         assert f"record {1.5 * 12 / apart:.3g} s or more" in text
-    said = []
-    assert len(Snake(1 + 1.7 / 12.0 / 0.954).fit(warn=said.append).groups) == 2
-    assert not any("can't be decided" in text for text in said)
+    notes = []
+    assert len(Snake(1 + 1.7 / 12.0 / 0.954).fit(warn=notes.append).groups) == 2
+    assert not any("can't be decided" in text for text in notes)
 
 
 def test_what_falls_on_a_groups_own_tone_is_named():
-    said = []
-    Snake(1.5).fit(warn=said.append)
-    (text,) = [text for text in said if "commensurate" in text]
+    notes = []
+    Snake(1.5).fit(warn=notes.append)
+    (text,) = [text for text in notes if "commensurate" in text]
     assert "3 x 0.954 Hz - 1.431 Hz falls on 1.431 Hz" in text
     assert "2 x 1.431 Hz - 2 x 0.954 Hz falls on 0.954 Hz" in text
-    said = []
-    Snake(GOLDEN).fit(warn=said.append)
-    assert said == []
+    notes = []
+    Snake(GOLDEN).fit(warn=notes.append)
+    assert notes == []
 
 
 def test_mixed_tones_of_lowest_order():
-    tones = mixed_tones([3.0, 2.0], 2 * np.pi * 100)
-    assert [(one.group, dict(one.factors)) for one in tones] == [
-        (0, {0: -1, 1: 3}),
-        (1, {0: 2, 1: -2}),
-    ]
-    tones = mixed_tones([1.0, 2.0], 2 * np.pi * 100)
-    assert [(one.group, dict(one.factors)) for one in tones] == [(0, {0: -1, 1: 1}), (1, {0: 2})]
-    assert mixed_tones([GOLDEN, 1.0], 2 * np.pi * 100) == []
+    for omegas, expected in (
+        ([3.0, 2.0], [(0, {0: -1, 1: 3}), (1, {0: 2, 1: -2})]),
+        ([1.0, 2.0], [(0, {0: -1, 1: 1}), (1, {0: 2})]),
+        ([GOLDEN, 1.0], []),
+    ):
+        tones = mixed_tones(omegas, 2 * np.pi * 100)
+        assert [(one.group, dict(one.factors)) for one in tones] == expected
 
 
 def test_lines_of_the_other_groups_are_distinct():
@@ -173,16 +167,13 @@ def test_a_fit_with_further_lines_is_least_squares():
     rng = np.random.default_rng(2)
     t = np.sort(rng.uniform(-5, 5, 400))
     y = np.sin(3 * t) + 0.3 * np.cos(2 * t) + 0.1 * rng.normal(size=t.size)
-    model = HarmonicModel(harmonics=2, trend=1, lines=(2.0, 4.5))
-    fit = fit_at([Series("q", t, y)], 3.0, model)
+    fit = fit_at([Series("q", t, y)], 3.0, HarmonicModel(harmonics=2, trend=1, lines=(2.0, 4.5)))
     rows = [np.ones_like(t), t]
     for line in (2.0, 4.5, 3.0, 6.0):
         rows += [np.cos(line * t), -np.sin(line * t)]
     theta, (rss,), *_ = np.linalg.lstsq(np.stack(rows).T, y, rcond=None)
-    ours = [
-        *fit.trend[0],
-        *np.ravel([(a.real, a.imag) for a in (*fit.lines[0], *fit.amplitudes[0])]),
-    ]
+    parts = np.array([*fit.lines[0], *fit.amplitudes[0]])
+    ours = [*fit.trend[0], *np.ravel([parts.real, parts.imag], order="F")]
     np.testing.assert_allclose(ours, theta, rtol=0, atol=1e-10)
     assert fit.rss[0] == pytest.approx(rss)
     np.testing.assert_allclose(fit.predict(0, t), np.stack(rows).T @ theta, atol=1e-10)
@@ -193,15 +184,9 @@ def test_the_noise_beside_a_tone_leaves_out_the_other_groups_lines():
     rng = np.random.default_rng(3)
     t = np.arange(2000) / 100 - 10
     level = []
+    wave = np.sin(2 * np.pi * t) + 0.05 * np.sin(2 * np.pi * 1.2 * t + 1)
     for lines in ((), (2 * np.pi * 1.2,)):
-        draws = [
-            Series(
-                "q",
-                t,
-                np.sin(2 * np.pi * t) + 0.05 * np.sin(2 * np.pi * 1.2 * t + 1) + 0.01 * noise,
-            )
-            for noise in rng.normal(size=(200, t.size))
-        ]
+        draws = [Series("q", t, wave + 0.01 * n) for n in rng.normal(size=(200, t.size))]
         fit = fit_at(draws, 2 * np.pi, HarmonicModel(lines=lines))
         level.append(residual_noise(draws, fit).level.mean())
     assert level[0] > 10 * level[1]
@@ -223,23 +208,20 @@ def test_one_gait_is_not_split_by_noise_modulation_or_harmonics(seed):
         np.sin(omega * t + 0.5 * np.sin(0.5 * t) - k),
         0.6 * wave + np.sin(2 * (omega * t - k)) * (k < 4),
     ):
-        named = [Series(f"j{i}", t, one) for i, one in enumerate(commands)]
-        found = find_groups(named, 15.0)
-        assert len(found.rhythms) == 1
-        assert found.unresolved == ()
+        found = find_groups([Series(f"j{i}", t, one) for i, one in enumerate(commands)], 15.0)
+        assert (len(found.rhythms), found.unresolved) == (1, ())
 
 
 def test_too_slow_or_too_few_samples_for_a_group_are_reported():
     snake = Snake(1.5, joints=6)
-    commands = {n: Series(n, snake.t, v) for n, v in zip(snake.names, snake.command, strict=True)}
-    few = slice(None, None, 60)
-    responses = {
-        n: Series(n, snake.t[few], v[few]) for n, v in zip(snake.names, snake.response, strict=True)
-    }
-    said = []
-    gait = fit_gait(commands, responses, snake.seconds, said.append)
+    commands, responses = (
+        {n: Series(n, snake.t[::step], v[::step]) for n, v in zip(snake.names, rows, strict=True)}
+        for rows, step in ((snake.command, 1), (snake.response, 60))
+    )
+    notes = []
+    gait = fit_gait(commands, responses, snake.seconds, notes.append)
     assert all(group.answered == () for group in gait.groups)
-    assert any("too few response samples" in text for text in said)
+    assert any("too few response samples" in text for text in notes)
 
 
 def test_the_shared_frequencies_have_intervals_that_hold():

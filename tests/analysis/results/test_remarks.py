@@ -5,11 +5,9 @@ import json
 import numpy as np
 import pytest
 
-import undulog
 from support.joint_runs import write_joints
 from undulog.analysis import analyse_session
 from undulog.analysis.results.answer import Lacking, Note, Remarks
-from undulog.capture import Session
 
 NAMES = tuple(f"j{k}" for k in range(8))
 
@@ -18,10 +16,8 @@ def write(path, *, moving=True):
     """20 s of eight joints that follow 0.5 Hz: positions only."""
     noise = np.random.default_rng(1).normal(0, 1e-3, (2000, len(NAMES)))
     phase = np.pi * 0.01 * np.arange(2000)[:, None] - np.arange(len(NAMES))
-    commands = 0.4 * np.sin(phase) * moving
-    return write_joints(
-        path, NAMES, commands, [0.38 * np.sin(phase - 0.1) + noise], rate_hz=100, session_id="s"
-    )
+    commands, states = 0.4 * np.sin(phase) * moving, [0.38 * np.sin(phase - 0.1) + noise]
+    return write_joints(path, NAMES, commands, states, rate_hz=100, session_id="s")
 
 
 def test_worst_first_and_each_once():
@@ -34,26 +30,24 @@ def test_worst_first_and_each_once():
     assert {type(one) for one in (*remarks.warnings(), *remarks.notes)} == {str}
 
 
-def test_topics_that_were_not_recorded_are_no_warnings(tmp_path):
-    with Session.open(write(tmp_path / "s.mcap")) as session:
-        found = analyse_session(session)
+def test_topics_that_were_not_recorded_are_no_warnings(tmp_path, opened):
+    found = analyse_session(opened(write(tmp_path / "s.mcap")))
     assert found.warnings == ()
     for lacking in ("effort and velocity", "/joint_current and no /joint_voltage", "/gait"):
         assert any(lacking in note for note in found.notes), lacking
-    told = found.to_dict()
-    assert (told["warnings"], told["notes"]) == ([], list(found.notes))
+    shown = found.to_dict()
+    assert (shown["warnings"], shown["notes"]) == ([], list(found.notes))
 
 
 @pytest.mark.parametrize("kind", ["text", "page"])
-def test_notes_stand_after_the_method_or_under_details(kind, tmp_path, capsys):
+def test_notes_stand_after_the_method_or_under_details(kind, tmp_path, command):
     path = write(tmp_path / "s.mcap")
     if kind == "text":
-        assert undulog.run(["analyse", str(path)]) == 0
-        text = capsys.readouterr().out
+        text = command("analyse", path).out
         assert "Warning:" not in text
         assert text.index("Method:") < text.index("Note: no /joint_current and no /joint_voltage")
         return
-    assert undulog.run(["report", str(path), "-o", str(tmp_path / "page.html")]) == 0
+    command("report", path, "-o", tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
     assert '<div class="notice">' not in page
     assert "<p>No warnings.</p>" in page
@@ -61,8 +55,7 @@ def test_notes_stand_after_the_method_or_under_details(kind, tmp_path, capsys):
     assert "/joint_current" in details[: details.index("</details>")]
 
 
-def test_that_there_is_no_gait_comes_first(tmp_path):
-    with Session.open(write(tmp_path / "s.mcap", moving=False)) as session:
-        found = analyse_session(session)
+def test_that_there_is_no_gait_comes_first(tmp_path, opened):
+    found = analyse_session(opened(write(tmp_path / "s.mcap", moving=False)))
     assert found.warnings[0].startswith("no gait: the commands never move")
     assert any(note.startswith("no joint's gain and lag are known") for note in found.notes)

@@ -12,6 +12,5 @@ from undulog.analysis.segments.session import Following, not_following
 def test_a_joint_whose_values_are_old_is_named(span_s, since_s, until_s):
     old = Artefact("j2", "/joint_states", "position", "stale", (span_s,))
     (found,) = not_following(Following((), {}, {}), [old], ("j1", "j2"), 10.0)
-    assert found.joint == "j2"
-    assert set(found.kinds) == {"stale_sensor", "lost_samples"}
+    assert (found.joint, set(found.kinds)) == ("j2", {"stale_sensor", "lost_samples"})
     assert (found.since_s, found.until_s) == (since_s, until_s)

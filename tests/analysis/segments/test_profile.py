@@ -33,21 +33,19 @@ def profile(rng, values, margin=0.0, shared=0.0):
 
 
 def test_one_contrast_of_known_error_has_student_s_quantile():
-    rng = np.random.default_rng(1)
-    many = Scatter(rng.standard_normal((1, COLUMNS)), np.zeros(1), np.zeros(1))
+    many = Scatter(np.random.default_rng(1).standard_normal((1, COLUMNS)), np.zeros(1), np.zeros(1))
     found = critical_value([Member(np.ones((1, 1)), many)], draws=40_000)
     assert found == pytest.approx(2.064, abs=0.05)  # t with 24 degrees of freedom
 
 
 def test_many_independent_contrasts_have_the_quantile_of_their_largest():
-    rng = np.random.default_rng(2)
-    many = Scatter(rng.standard_normal((10, 100)), np.zeros(10), np.zeros(10))
+    many = Scatter(np.random.default_rng(2).standard_normal((10, 100)), np.zeros(10), np.zeros(10))
     found = critical_value([Member(np.eye(10), many)], draws=2000)
     assert found == pytest.approx(2.87, abs=0.12)  # Student's t with 100 at 1 - 0.05 / 20
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.8])
-def test_identical_joints_are_rarely_told_apart(shared):
+def test_identical_joints_rarely_differ(shared):
     rng = np.random.default_rng(3)
     wrong = 0
     for _ in range(200):
@@ -66,8 +64,7 @@ def test_a_joint_that_is_off_is_named_wherever_it_is(joint):
         values[joint] += 15 * SIGMA
         one = profile(rng, values)
         found = standing_out(one, critical_value([family_of(one)], draws=2000))[0]
-        assert found.joint == joint
-        assert found.value == pytest.approx(15 * SIGMA, abs=5 * SIGMA)
+        assert (found.joint, found.value) == (joint, pytest.approx(15 * SIGMA, abs=5 * SIGMA))
 
 
 def test_two_that_are_off_do_not_hide_each_other():
@@ -96,8 +93,7 @@ def test_below_the_margin_nobody_is_named():
     ],
 )
 def test_a_smooth_profile_is_a_shape_and_names_nobody(shape, kind):
-    rng = np.random.default_rng(7)
-    one = profile(rng, 0.5 + shape(np.linspace(-1, 1, 13)))
+    one = profile(np.random.default_rng(7), 0.5 + shape(np.linspace(-1, 1, 13)))
     critical = critical_value([family_of(one)], draws=300)
     assert standing_out(one, critical) == []
     found = {each.kind: each for each in contrasts(one, np.ones(13, bool))}
@@ -110,5 +106,4 @@ def test_a_joint_stands_out_of_a_profile_too():
     values[5] -= 0.05
     one = profile(rng, values)
     (found,) = standing_out(one, critical_value([family_of(one)], draws=300))
-    assert found.joint == 5
-    assert found.value == pytest.approx(-0.05, abs=0.01)
+    assert (found.joint, found.value) == (5, pytest.approx(-0.05, abs=0.01))

@@ -42,28 +42,22 @@ def maps(tmp_path_factory):
         return cycle_maps(measure_session(session))
 
 
-def test_each_cycle_tells_its_own_gain_and_lag(maps):
-    assert maps.driven == NAMES
-    assert maps.start_s.size == CYCLES
+def test_each_cycle_has_its_own_gain_and_lag(maps):
+    assert (maps.driven, maps.start_s.size) == (NAMES, CYCLES)
     assert maps.period_s == pytest.approx(1.0, abs=1e-5)
     known = np.arange(CYCLES) != 5
     truth = np.array([gains(cycle) for cycle in range(CYCLES)]).T
-    # The period is told from the responses, too, whose steps move it by 1e-6; the limits of the
+    # The period comes from the responses, too, whose steps move it by 1e-6; the limits of the
     # cycles move with it.
     np.testing.assert_allclose(maps.gain[:, known], truth[:, known], atol=1e-4)
-    np.testing.assert_allclose(
-        maps.lag_rad[:, known], np.tile(LAG[:, None], CYCLES)[:, known], atol=1e-3
-    )
+    expected = np.tile(LAG[:, None], CYCLES)[:, known]
+    np.testing.assert_allclose(maps.lag_rad[:, known], expected, atol=1e-3)
 
 
 def test_power_is_torque_times_velocity_with_its_sign(maps):
     # Mean of drag v^2 is drag (2 pi f A)^2 / 2.
-    truth = np.array(
-        [
-            np.array([0.5, -0.2, 0.1]) * (2 * np.pi * AMPLITUDE * gains(cycle)) ** 2 / 2
-            for cycle in range(CYCLES)
-        ]
-    ).T
+    peak = 2 * np.pi * AMPLITUDE * np.array([gains(cycle) for cycle in range(CYCLES)]).T
+    truth = np.array([[0.5], [-0.2], [0.1]]) * peak**2 / 2
     known = np.arange(CYCLES) != 5
     assert maps.powered == NAMES
     np.testing.assert_allclose(maps.power_w[:, known], truth[:, known], rtol=0.02)
@@ -76,8 +70,7 @@ def test_a_cycle_without_samples_is_missing_not_zero(maps):
 
 
 def test_amplitudes_are_exact_on_uneven_times():
-    rng = np.random.default_rng(2)
-    t_s = np.sort(rng.uniform(0.0, 3.0, 240))
+    t_s = np.sort(np.random.default_rng(2).uniform(0.0, 3.0, 240))
     values = 0.3 + np.real(0.7 * np.exp(0.4j) * np.exp(2j * np.pi * t_s))
     found = amplitudes(Series("x", t_s, values), starts_of(t_s, np.arange(4.0)), 2 * np.pi)
     np.testing.assert_allclose(found, 0.7 * np.exp(0.4j), atol=1e-12)

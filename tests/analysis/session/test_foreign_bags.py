@@ -1,13 +1,9 @@
 """A bag of another make, written by rosbags: commands and states on topics of its own names."""
 
-import json
-
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
-
-import undulog
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = ["front_yaw", "mid_yaw", "rear_yaw"]
@@ -30,17 +26,10 @@ def bag(tmp_path_factory):
         }
 
         def write(topic, t_ns, position):
-            empty = np.zeros(0)
-            sent = stamp(sec=t_ns // 10**9, nanosec=t_ns % 10**9)
-            message = state(
-                header=header(stamp=sent, frame_id=""),
-                name=NAMES,
-                position=position,
-                velocity=empty,
-                effort=empty,
-            )
-            data = store.serialize_cdr(message, state.__msgtype__)
-            writer.write(topics[topic], t_ns, data)
+            head = header(stamp=stamp(sec=t_ns // 10**9, nanosec=t_ns % 10**9), frame_id="")
+            lacking = {"velocity": np.zeros(0), "effort": np.zeros(0)}
+            message = state(header=head, name=NAMES, position=position, **lacking)
+            writer.write(topics[topic], t_ns, store.serialize_cdr(message, state.__msgtype__))
 
         rng = np.random.default_rng(3)
         for tick in range(1000):
@@ -53,40 +42,33 @@ def bag(tmp_path_factory):
     return file
 
 
-def test_naming_the_topics_is_enough(bag, capsys):
+def test_naming_the_topics_is_enough(bag, report_of):
     topics = ["--command-topic", "/snake/targets", "--response-topic", "/snake/encoders"]
-    assert undulog.run(["analyse", str(bag), *topics, "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = report_of("analyse", bag, *topics)
     assert result["gait"]["frequency_hz"] == pytest.approx(0.8, abs=1e-3)
     assert [joint["name"] for joint in result["joints"]] == NAMES
     assert [joint["gain"] for joint in result["joints"]] == pytest.approx(GAIN, abs=5e-4)
     assert [joint["lag_rad"] for joint in result["joints"]] == pytest.approx(LAG, abs=5e-4)
     assert result["artefacts"] == []
-    # Its limits, said one by one: no torque, no current, no robot, no phase.
+    # Its limits, one by one: no torque, no current, no robot, no phase.
     for joint in result["joints"]:
-        assert joint["energy_net_j"] is None
-        assert joint["energy_el_j"] is None
-        assert joint["plane"] is None
-    assert result["over_time"] is None
-    assert result["energy"]["electrical"] is None
-    assert result["energy"]["closure"] is None
-    assert result["energy"]["transport"]["abs"] is None
-    said = " ".join(result["notes"])
-    assert "/snake/encoders carries no effort and velocity: mechanical energies are null" in said
-    assert "no /joint_current and no /joint_voltage: electrical energies are null" in said
-    assert "cost of transport is not applicable: " in said
-    assert "gain and lag over time are null: the session has no /gait" in said
+        assert {joint[key] for key in ("energy_net_j", "energy_el_j", "plane")} == {None}
+    assert (result["over_time"], result["energy"]["electrical"]) == (None, None)
+    assert (result["energy"]["closure"], result["energy"]["transport"]["abs"]) == (None, None)
+    found = " ".join(result["notes"])
+    for note in (
+        "/snake/encoders carries no effort and velocity: mechanical energies are null",
+        "no /joint_current and no /joint_voltage: electrical energies are null",
+        "cost of transport is not applicable: ",
+        "gain and lag over time are null: the session has no /gait",
+    ):
+        assert note in found
     assert f"{topics[0]} {topics[1]}" in result["provenance"]["command"]
 
 
-def test_topics_that_are_not_named_are_listed(bag, capsys):
-    assert undulog.run(["analyse", str(bag)]) == 1
-    assert "it has /snake/encoders, /snake/targets" in capsys.readouterr().err
-    assert undulog.run(["analyse", str(bag), "--response-topic", "/snake/encoders", "--json"]) == 0
-    (said,) = [
-        text
-        for text in json.loads(capsys.readouterr().out)["warnings"]
-        if text.startswith("no commands on /joint_commands")
-    ]
-    assert said.endswith("(other JointStates: /snake/targets; choose with --command-topic)")
-    assert undulog.run(["analyse", str(bag), "--reference-topic", "/none"]) == 1
+def test_topics_that_are_not_named_are_listed(bag, command, report_of):
+    assert "it has /snake/encoders, /snake/targets" in command("analyse", bag, code=1).err
+    warnings = report_of("analyse", bag, "--response-topic", "/snake/encoders")["warnings"]
+    (found,) = [text for text in warnings if text.startswith("no commands on /joint_commands")]
+    assert found.endswith("(other JointStates: /snake/targets; choose with --command-topic)")
+    command("analyse", bag, "--reference-topic", "/none", code=1)

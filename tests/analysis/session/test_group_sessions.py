@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-import undulog
 from support.analysed import analysed, experiment
 from undulog.analysis.present.notebook.files import load
 from undulog.capture import SessionWriter
@@ -41,8 +40,7 @@ def slither(tmp_path_factory):
     path = tmp_path_factory.mktemp("slither") / "slither.mcap"
     group = np.arange(16) % 2
     waves = 0.4 * np.exp(-0.8j * np.arange(16))
-    omegas = 2 * np.pi * np.array([1.432, 0.954])
-    return write(path, omegas, group, waves, np.ones(16))
+    return write(path, 2 * np.pi * np.array([1.432, 0.954]), group, waves, np.ones(16))
 
 
 def test_every_joint_is_compared_at_its_own_frequency(slither):
@@ -53,8 +51,7 @@ def test_every_joint_is_compared_at_its_own_frequency(slither):
         group = found[joint]
         assert group.frequency_hz.value == pytest.approx(frequency, rel=1e-9)
         (window,) = group.windows
-        assert window.cycles == np.floor(15.0 * frequency)
-        assert group.wave == "head-to-tail"
+        assert (window.cycles, group.wave) == (np.floor(15.0 * frequency), "head-to-tail")
         assert group.lag_per_joint_rad == {"chain": pytest.approx(-1.6)}
     assert result.gait.frequency_hz == result.gait.groups[0].frequency_hz
     for joint in result.joints:
@@ -74,15 +71,12 @@ def test_every_joint_is_compared_at_its_own_frequency(slither):
     )
 
 
-def test_text_json_page_and_file_carry_the_groups(slither, tmp_path, capsys):
-    assert undulog.run(["analyse", str(slither)]) == 0
-    text = capsys.readouterr().out
-    assert "1.432" in text
-    assert "0.954" in text
-    assert "(8 joints)" in text
-    assert "falls on" in text  # 3 x 0.954 Hz - 1.432 Hz within 1.5/T of 1.432 Hz
+def test_text_json_page_and_file_carry_the_groups(slither, tmp_path, command):
+    text = command("analyse", slither).out
+    # 3 x 0.954 Hz - 1.432 Hz falls within 1.5/T of 1.432 Hz.
+    assert all(part in text for part in ("1.432", "0.954", "(8 joints)", "falls on"))
     file = tmp_path / "result.json"
-    assert undulog.run(["analyse", str(slither), "-o", str(file)]) == 0
+    command("analyse", slither, "-o", file)
     data = json.loads(file.read_text())
     first = data["gait"]["groups"][0]
     assert first["frequency_hz"] == data["gait"]["frequency_hz"]
@@ -90,11 +84,8 @@ def test_text_json_page_and_file_carry_the_groups(slither, tmp_path, capsys):
     assert {joint["group"] for joint in data["joints"]} == {0, 1}
     assert load(file).gait == analysed(slither).gait
     page = tmp_path / "page.html"
-    capsys.readouterr()
-    assert undulog.run(["report", str(slither), "-o", str(page)]) == 0
-    html = page.read_text()
-    assert "frequency [Hz]" in html
-    assert "(8 joints)" in html
+    command("report", slither, "-o", page)
+    assert all(part in page.read_text() for part in ("frequency [Hz]", "(8 joints)"))
 
 
 def runs(folder, *, weak, apart=False):
@@ -130,16 +121,13 @@ def test_a_reversal_of_one_group_only_is_none(tmp_path):
     assert any("in some groups only" in text for text in result.warnings)
 
 
-def test_compared_at_their_own_frequencies(tmp_path, capsys):
+def test_compared_at_their_own_frequencies(tmp_path, command):
     group = np.arange(8) // 4
     omegas = 2 * np.pi * np.array([0.8, 0.5])
     waves = 0.4 * np.exp(-0.8j * np.arange(8))
     weak = np.where(np.arange(8) == 6, 0.8, 1.0)
     a = write(tmp_path / "a.mcap", omegas, group, waves, np.ones(8), seed=1)
     b = write(tmp_path / "b.mcap", omegas, group, waves * np.where(group, 1j, 1), weak, seed=2)
-    file = tmp_path / "c.json"
-    assert undulog.run(["compare", str(a), str(b), "-o", str(file)]) == 0
-    assert "joint07" in capsys.readouterr().out
+    assert "joint07" in command("compare", a, b, "-o", tmp_path / "c.json").out
     slow = write(tmp_path / "slow.mcap", 0.99 * omegas, group, waves, weak, seed=3)
-    assert undulog.run(["compare", str(a), str(slow)]) == 1
-    assert "Hz" in capsys.readouterr().err
+    assert "Hz" in command("compare", a, slow, code=1).err

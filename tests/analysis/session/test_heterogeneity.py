@@ -62,9 +62,8 @@ def test_unlike_joints(size):
 
 def test_exact_measurements_give_exact_indices():
     gain, lag = np.linspace(0.9, 1.1, 7), np.linspace(0.1, 0.3, 7)
-    found = response_indices(
-        Response(gain * np.exp(-1j * lag), *np.full((2, 7), 1e-20), np.full(7, 8.0))
-    )
+    exact = Response(gain * np.exp(-1j * lag), *np.full((2, 7), 1e-20), np.full(7, 8.0))
+    found = response_indices(exact)
     assert found["gain_cv"].value == pytest.approx(gain.std() / gain.mean(), rel=1e-9)
     # For a small spread the circular standard deviation is the ordinary one.
     assert found["lag_sd"].value == pytest.approx(lag.std(), rel=2e-3)
@@ -75,9 +74,9 @@ def test_exact_measurements_give_exact_indices():
 
 def test_circular_sd_does_not_break_at_pi():
     lag = np.pi + np.array([-0.1, 0.0, 0.1, 0.05])
-    here = response_indices(Response(np.exp(-1j * lag), *np.full((2, 4), 1e-12), np.full(4, 8.0)))
-    there = response_indices(
-        Response(np.exp(-1j * (lag - 1)), *np.full((2, 4), 1e-12), np.full(4, 8.0))
+    here, there = (
+        response_indices(Response(np.exp(-1j * one), *np.full((2, 4), 1e-12), np.full(4, 8.0)))
+        for one in (lag, lag - 1)
     )
     assert here["lag_sd"].value == pytest.approx(there["lag_sd"].value, rel=1e-9)
     assert "boundary_contrast_lag" not in here  # four joints have no middle five
@@ -124,8 +123,7 @@ def test_fewer_than_two_joints_have_no_spread():
 def test_box_degrees_of_freedom():
     values = np.array([1.0, 2.0, 4.0])
     equal = spread(values, np.full(3, 0.5), np.full(3, 1e12))
-    assert equal.dof == pytest.approx(2.0)
-    assert equal.expected == pytest.approx(1.0)
+    assert (equal.dof, equal.expected) == (pytest.approx(2.0), pytest.approx(1.0))
     # One joint far noisier than the others: one degree of freedom is left.
     assert spread(values, np.array([1.0, 1e-9, 1e-9]), np.full(3, 1e12)).dof == pytest.approx(1.0)
 
@@ -139,9 +137,7 @@ def test_welch_satterthwaite():
 
 def test_one_gait_never_identifies_the_coupling():
     coupling = coupling_of_one_gait(13)
-    assert coupling.identifiable is False
-    assert coupling.matrix is None
+    assert (coupling.identifiable, coupling.matrix) == (False, None)
     assert coupling.why == "one gait gives 13 complex numbers for 169 unknown couplings"
-    assert "phase-kicks" in coupling.record
-    assert "52 runs" in coupling.record
+    assert all(part in coupling.record for part in ("phase-kicks", "52 runs"))
     assert coupling_of_one_gait(1).identifiable is coupling_of_one_gait(0).identifiable is False

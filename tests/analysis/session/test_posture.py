@@ -50,12 +50,9 @@ def test_the_heading_is_the_plans_then_the_sessions_then_the_scenarios(tmp_path)
         assert read(lying(tmp_path / f"{k}.mcap", **given)).heading_rad == heading
         given.pop(next(iter(given)))
     assert math.isnan(read(lying(tmp_path / "none.mcap")).heading_rad)
-    odd = lying(tmp_path / "odd.mcap", plan={"heading_rad": "north"})
-    assert math.isnan(read(odd).heading_rad)
+    assert math.isnan(read(lying(tmp_path / "odd.mcap", plan={"heading_rad": "north"})).heading_rad)
 
 
-def test_without_a_robot_or_a_gait_no_lean_is_known(tmp_path):
-    path = lying(tmp_path / "a.mcap", robot=None)
-    assert math.isnan(read(path).lean_rad)
-    with Session.open(lying(tmp_path / "b.mcap")) as session:
-        assert math.isnan(posture(session, ()).lean_rad)
+def test_without_a_robot_or_a_gait_no_lean_is_known(tmp_path, opened):
+    assert math.isnan(read(lying(tmp_path / "a.mcap", robot=None)).lean_rad)
+    assert math.isnan(posture(opened(lying(tmp_path / "b.mcap")), ()).lean_rad)

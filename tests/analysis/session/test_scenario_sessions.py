@@ -10,9 +10,8 @@ import pytest
 from support.paths import DOCS
 from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
-from undulog.sim import load_scenario, scenario_names
+from undulog.sim import load_scenario, record, scenario_names
 from undulog.sim.scenario.scenario import EngineKind, Kernels
-from undulog.sim.twin.recording import record
 
 STEADY = [
     *("caterpillar", "caterpillar-pi2", "combined", "delay-blocks", "flat", "horizontal"),
@@ -68,8 +67,7 @@ def test_energies_are_those_of_the_ledger(name, engine, kernels, tmp_path):
 
 
 def test_the_page_has_every_scenario_within_the_bar():
-    page = (DOCS / "energy.md").read_text()
-    rows = re.findall(r"^\| `([\w-]+)` \|(.*)\|$", page, re.MULTILINE)
+    rows = re.findall(r"^\| `([\w-]+)` \|(.*)\|$", (DOCS / "energy.md").read_text(), re.MULTILINE)
     assert [name for name, _ in rows] == list(scenario_names())
     for _, cells in rows:
         assert float(cells.split("|")[len(energy_tables.TITLES)]) <= 100 * energy_tables.BAR
@@ -114,10 +112,10 @@ def test_an_adaptive_scenario_gives_sense_over_time(name, tmp_path):
         gain = np.array(joint.gain, dtype=float)
         lag = np.array(joint.lag_rad, dtype=float)
         assert gain.size >= 6
-        told = ~np.isnan(gain)  # one that couldn't be told in a cycle is null, and so is its lag
-        assert told.sum() >= gain.size - 1
-        np.testing.assert_array_equal(np.isnan(lag), ~told)
-        gain, lag = gain[told], lag[told]
+        found = ~np.isnan(gain)  # what could not be estimated in a cycle is null, and so is its lag
+        assert found.sum() >= gain.size - 1
+        np.testing.assert_array_equal(np.isnan(lag), ~found)
+        gain, lag = gain[found], lag[found]
         assert ((gain > 0.7) & (gain < 1.3)).all()
         assert ((lag > 0.0) & (lag < 0.7)).all()
         intervals = [ends for ends in joint.gain_ci95 if ends is not None]

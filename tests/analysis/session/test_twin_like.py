@@ -5,11 +5,10 @@ import json
 import numpy as np
 import pytest
 
-import undulog
 from support.analysed import analysed
 from undulog.analysis.body.null import SAMPLES, one_cycle, places, viscous_chain
 from undulog.analysis.signals.stretch import Options
-from undulog.capture import Session, SessionWriter, load_robot
+from undulog.capture import SessionWriter, load_robot
 from undulog.capture.robot.model import Plane
 
 EPOCH_NS = 1_735_689_600_000_000_000
@@ -50,15 +49,10 @@ def write_twin(
     phase = np.arange(head.size) * 200 / SAMPLES
     ticks = np.arange(round(duration * 100) + 1)
     x, y = np.interp(ticks, phase, head.real), np.interp(ticks, phase, head.imag)
-    yaw = np.interp(
-        ticks % 200,
-        np.arange(SAMPLES + 1) * 200 / SAMPLES,
-        np.append(motion.heading, motion.heading[0]),
-    )
-    facts = {"settle_s": repr(settle_s), "scenario": "test"}
-    with SessionWriter(
-        path, session_id="twin-like", epoch_ns=EPOCH_NS, robot=robot, metadata=facts
-    ) as w:
+    one_turn = np.arange(SAMPLES + 1) * 200 / SAMPLES
+    yaw = np.interp(ticks % 200, one_turn, np.append(motion.heading, motion.heading[0]))
+    facts = {"metadata": {"settle_s": repr(settle_s), "scenario": "test"}, "robot": robot}
+    with SessionWriter(path, session_id="twin-like", epoch_ns=EPOCH_NS, **facts) as w:
         w.attach("scenario.toml", "application/toml", SCENARIO)
         commands = w.joint_state("/joint_commands", names, unit="rad")
         states = w.joint_state("/joint_states", names, unit="rad", velocity=True, effort=True)
@@ -84,18 +78,16 @@ def write_twin(
             states.write(t_ns, seen + rng.normal(0, 1e-4, 25), rate, 0.5 * rate)
             current.write(t_ns, np.full(25, 0.5))
             voltage.write(t_ns, np.full(25, 2.0))
-            gait.write(
-                t_ns, np.tile([0.3 * ramp, OMEGA, -np.pi / 3, 0.0, OMEGA * k / 100], len(planes))
-            )
+            wave = [0.3 * ramp, OMEGA, -np.pi / 3, 0.0, OMEGA * k / 100]
+            gait.write(t_ns, np.tile(wave, len(planes)))
             for name, channel in accumulated.items():
                 channel.write(t_ns + TICK_NS // 2, np.full(25, powers[name]))
             if booked is not None:
                 booked.write(t_ns, np.array(ledger) * k / 100)
             if odometry is not None:
                 quaternion = np.array([0, 0, np.sin(yaw[k] / 2), np.cos(yaw[k] / 2)])
-                odometry.write(
-                    t_ns, np.array([x[k], y[k], 0.02]), quaternion, np.zeros(3), np.zeros(3)
-                )
+                position = np.array([x[k], y[k], 0.02])
+                odometry.write(t_ns, position, quaternion, np.zeros(3), np.zeros(3))
         w.set_verdict("good")
     return path
 
@@ -112,15 +104,13 @@ def result(twin):
 
 def test_the_settled_whole_cycles_are_analysed(result):
     (window,) = result.gait.windows
-    assert (window.start_s, window.stop_s) == (pytest.approx(2.0), pytest.approx(14.0))
-    assert window.cycles == 6
+    assert (window.start_s, window.stop_s, window.cycles) == pytest.approx((2.0, 14.0, 6))
     assert result.gait.fitted.start_s == pytest.approx(2.0)
     assert result.gait.frequency_hz.value == pytest.approx(0.5, abs=1e-9)
     assert result.gait.wave == "head-to-tail"
     assert result.gait.lag_per_joint_rad == {"horizontal": pytest.approx(-np.pi / 3)}
     assert {joint.samples for joint in result.joints} == {1200}  # 12 s at 100 Hz, half-open
-    assert result.session.verdict == "good"
-    assert result.session.robot == "snake25"
+    assert (result.session.verdict, result.session.robot) == ("good", "snake25")
 
 
 def test_energies_and_their_units(result):
@@ -162,8 +152,7 @@ def test_perfect_joints_show_no_heterogeneity(result):
 def test_weaker_middle_joints_show(tmp_path):
     robot = load_robot("snake25")
     place = np.abs(np.arange(25) - 12) / 12
-    path = write_twin(tmp_path / "weak.mcap", lag=0.25 - 0.1 * place, odometry=False)
-    result = analysed(path)
+    result = analysed(write_twin(tmp_path / "weak.mcap", lag=0.25 - 0.1 * place, odometry=False))
     contrast = result.heterogeneity["boundary_contrast_lag"]
     # The first and last joint lag by 0.15; the middle five yaw joints are 0, 2 and 4 from joint 13.
     middle = 0.25 - 0.1 * np.mean([4, 2, 0, 2, 4]) / 12
@@ -179,9 +168,8 @@ def test_the_twins_own_ledger_is_the_judge(tmp_path):
     # 13 joints of 0.25 (A omega)^2 W each, and 25 W electrical, which the ledger books as 20 W.
     mechanical = 13 * 0.25 * (0.3 * OMEGA) ** 2
     path = write_twin(tmp_path / "booked.mcap", ledger=(mechanical, 20.0), odometry=False)
-    said = [text for text in analysed(path).warnings if "ledger" in text]
-    assert len(said) == 1
-    assert said[0].startswith("electrical energy is 300 J from the samples but 240 J")
+    (found,) = [text for text in analysed(path).warnings if "ledger" in text]
+    assert found.startswith("electrical energy is 300 J from the samples but 240 J")
 
 
 def test_accumulated_powers_are_preferred_and_their_absence_is_stated_once(tmp_path, result):
@@ -195,10 +183,8 @@ def test_accumulated_powers_are_preferred_and_their_absence_is_stated_once(tmp_p
     result = analysed(write_twin(tmp_path / "m.mcap", powers=mechanical, odometry=False))
     assert "mechanical energies" not in result.energy.unknown
     for joint in result.joints:
-        assert joint.energy_net_j == pytest.approx(-6.0)
-        assert joint.energy_plus_j == pytest.approx(3.0)
-        assert joint.energy_abs_j == pytest.approx(12.0)
-        assert joint.energy_el_j == pytest.approx(12.0)  # 0.5 A at 2 V
+        energies = joint.energy_net_j, joint.energy_plus_j, joint.energy_abs_j, joint.energy_el_j
+        assert energies == pytest.approx((-6.0, 3.0, 12.0, 12.0))  # 0.5 A at 2 V
     both = mechanical | {"electrical": 1.5, "electrical_plus": 1.75}
     result = analysed(write_twin(tmp_path / "b.mcap", powers=both, odometry=False))
     assert result.energy.unknown is None
@@ -220,8 +206,7 @@ def test_a_change_of_gait_splits_the_session(tmp_path):
 
 
 def test_two_driven_planes(tmp_path):
-    path = write_twin(tmp_path / "both.mcap", planes=(Plane.HORIZONTAL, Plane.VERTICAL))
-    result = analysed(path)
+    result = analysed(write_twin(tmp_path / "both.mcap", planes=(Plane.HORIZONTAL, Plane.VERTICAL)))
     assert all(joint.gain.value == pytest.approx(1.0, abs=1e-3) for joint in result.joints)
     assert {"gain_cv_horizontal", "gain_cv_vertical"} <= set(result.heterogeneity)
     assert set(result.gait.lag_per_joint_rad) == {"horizontal", "vertical"}
@@ -229,9 +214,8 @@ def test_two_driven_planes(tmp_path):
     assert any("both planes are driven" in text for text in result.notes)
 
 
-def test_the_json_object(twin, capsys):
-    assert undulog.run(["analyse", str(twin), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
+def test_the_json_object(twin, report_of):
+    printed = report_of("analyse", twin)
     parts = {"session", "gait", "joints", "body", "heterogeneity", "coupling", "warnings"}
     assert parts <= set(printed)
     assert {"id", "robot", "duration_s", "verdict"} <= set(printed["session"])
@@ -243,57 +227,42 @@ def test_the_json_object(twin, capsys):
     driven = printed["joints"][0]
     assert driven["gain_ci95"][0] < driven["gain"] < driven["gain_ci95"][1]
     assert driven["lag_ci95"][0] < driven["lag_rad"] < driven["lag_ci95"][1]
-    assert printed["joints"][1]["gain"] is None
-    assert printed["joints"][1]["gain_ci95"] is None
+    assert (printed["joints"][1]["gain"], printed["joints"][1]["gain_ci95"]) == (None, None)
     assert {"value", "ci95", "p"} <= set(printed["heterogeneity"]["gain_cv"])
     assert printed["coupling"]["identifiable"] is False
     assert len(printed["provenance"]["inputs"][str(twin)]) == 64
 
 
-def test_the_first_line_is_the_answer_and_the_last_the_method(twin, capsys):
-    assert undulog.run(["analyse", str(twin)]) == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_the_first_line_is_the_answer_and_the_last_the_method(twin, command):
+    lines = command("analyse", twin).out.splitlines()
     assert lines[0].startswith("twin.mcap: The segments move alike: all 13 joints are within 2 %")
     assert lines[1].startswith("13 of 25 joints respond to a gait of 0.5")
     assert any(line.startswith("joint25  horizontal") for line in lines)
     assert "Method: harmonic least squares" in "\n".join(lines[-4:])
 
 
-def test_files_and_options_of_the_verb(twin, tmp_path, capsys):
+def test_files_and_options_of_the_verb(twin, tmp_path, command):
     out = tmp_path / "result.json"
-    assert undulog.run(["analyse", str(twin), str(twin), "-o", str(out)]) == 0
+    assert f"Result: {out}" in command("analyse", twin, twin, "-o", out).out
     assert len(json.loads(out.read_text())["sessions"]) == 2
-    assert f"Result: {out}" in capsys.readouterr().out
-    assert undulog.run(["analyse", str(twin), "-o", str(out)]) == 2
-    assert "exists already" in capsys.readouterr().err
-    assert undulog.run(["analyse", str(twin), "-o", str(out), "--force", "--stop", "9"]) == 0
+    assert "exists already" in command("analyse", twin, "-o", out, code=2).err
+    command("analyse", twin, "-o", out, "--force", "--stop", "9")
     assert json.loads(out.read_text())["gait"]["fitted"]["stop_s"] == pytest.approx(9.0)
     assert list(tmp_path.iterdir()) == [out]
-    capsys.readouterr()
     for wrong, why in (
-        (["analyse"], "needs at least one session"),
-        (["analyse", str(twin), "--start", "5", "--stop", "4"], "--stop 4 is not after --start 5"),
-        (["analyse", str(twin), "-o", str(tmp_path / "x.txt")], "end its name in .json"),
-        (["analyse", str(twin), "--start", "400"], "nothing between --start and --stop"),
+        ((), "needs at least one session"),
+        ((twin, "-o", tmp_path / "x.txt"), "end its name in .json"),
+        ((twin, "--start", "400"), "nothing between --start and --stop"),
     ):
-        assert undulog.run(wrong) == 2
-        assert why in capsys.readouterr().err
-    assert (
-        undulog.run(["analyse", str(twin), "--command-topic", "/a", "--response-topic", "/b"]) == 1
-    )
-    assert "it has /gait, /joint_commands" in capsys.readouterr().err
+        assert why in command("analyse", *wrong, code=2).err
+    topics = ("--command-topic", "/a", "--response-topic", "/b")
+    assert "it has /gait, /joint_commands" in command("analyse", twin, *topics, code=1).err
 
 
-def test_help_has_an_example(capsys):
-    undulog.run(["analyse", "--help"])
-    assert "undulog analyse run.mcap --json" in capsys.readouterr().out
-
-
-def test_a_session_cut_before_it_settled_is_answered_with_a_warning(twin, tmp_path, capsys):
-    with Session.open(twin) as session:
-        settle_s = float(session.metadata["undulog"]["settle_s"])
-        stop = settle_s + 5.5  # 2.75 cycles, of 3.75 in all
-    assert undulog.run(["analyse", str(twin), "--stop", str(stop), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+def test_a_session_cut_before_it_settled_is_answered_with_a_warning(
+    twin, tmp_path, report_of, opened
+):
+    stop = float(opened(twin).metadata["undulog"]["settle_s"]) + 5.5  # 2.75 cycles, of 3.75 in all
+    result = report_of("analyse", twin, "--stop", stop)
     assert result["gait"]["frequency_hz"] == pytest.approx(0.5, abs=1e-3)
     assert any("before it has settled" in warning for warning in result["warnings"])

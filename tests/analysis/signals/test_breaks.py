@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from hostile_logs import gait
 
-from undulog.analysis import analyse_session
-from undulog.analysis.signals.stretch import Options
+from undulog.analysis import Options, analyse_session
 from undulog.capture import Session
 from undulog.capture.following.session import faults_in_session
 from undulog.capture.log.read.sample_times import BREAK_S, longest_unbroken
@@ -39,35 +38,31 @@ def test_the_longest_unbroken_stretch_gives_the_numbers(
         assert joint.lag_rad.value == pytest.approx(0.3, abs=2e-3)
         assert joint.coverage == pytest.approx(1.0, abs=1e-2)
     assert length(found) == pytest.approx(12.0, abs=0.05)
-    said = "longest unbroken stretch, 12.0 s, is analysed, 1 other stretch of 8.0 s altogether"
-    assert said in found.answer.sentence
-    assert any(said in text for text in found.warnings)
+    shown = "longest unbroken stretch, 12.0 s, is analysed, 1 other stretch of 8.0 s altogether"
+    assert shown in found.answer.sentence
+    assert any(shown in text for text in found.warnings)
 
 
-def test_start_and_stop_choose_another_stretch(tmp_path: Path) -> None:
+def test_start_and_stop_choose_another_stretch(tmp_path: Path, opened) -> None:
     path = gait(tmp_path / "run.mcap", jumps={1200: HOUR})
-    with Session.open(path) as session:
-        found = analyse_session(session, Options(start_s=3000.0))
+    found = analyse_session(opened(path), Options(start_s=3000.0))
     assert length(found) == pytest.approx(8.0, abs=0.05)
     assert found.joints[0].gain.value == pytest.approx(0.9, abs=2e-3)
     assert not any("unbroken" in text for text in found.warnings)
     assert "unbroken" not in found.answer.sentence
 
 
-def test_a_loss_of_some_seconds_breaks_nothing(tmp_path: Path) -> None:
+def test_a_loss_of_some_seconds_breaks_nothing(tmp_path: Path, opened) -> None:
     path = gait(tmp_path / "run.mcap", jumps={1200: 4 * NS})  # four whole cycles
-    with Session.open(path) as session:
-        found = analyse_session(session)
+    found = analyse_session(opened(path))
     assert "unbroken" not in found.answer.sentence
     assert length(found) == pytest.approx(24.0, abs=0.05)
 
 
-def test_every_other_sample_apart_by_years_takes_no_memory(tmp_path: Path) -> None:
+def test_every_other_sample_apart_by_years_takes_no_memory(tmp_path: Path, opened) -> None:
     """Clocks that jump to and fro leave stretches of a few samples: no gait, and no grid."""
     jumps = {tick: (9 if tick % 40 else 90 * DAY // NS) * NS for tick in range(0, 2000, 20)}
-    path = gait(tmp_path / "run.mcap", jumps=jumps)
-    with Session.open(path) as session:
-        found = analyse_session(session)
+    found = analyse_session(opened(gait(tmp_path / "run.mcap", jumps=jumps)))
     assert found.gait.frequency_hz.value is None
 
 

@@ -16,14 +16,8 @@ def joints(envelope, *, omega=OMEGA, noise=0.0, phase=None, count=9, rate=50):
     rng = np.random.default_rng(0)
     t = np.arange(round(SECONDS * rate)) / rate
     turn = omega * t if phase is None else phase(t)
-    return [
-        Series(
-            f"j{k}",
-            t,
-            0.5 * envelope(t) * np.sin(turn - k) + 0.1 * (k % 3) + noise * rng.normal(size=t.size),
-        )
-        for k in range(count)
-    ]
+    waves = [0.5 * envelope(t) * np.sin(turn - k) + 0.1 * (k % 3) for k in range(count)]
+    return [Series(f"j{k}", t, q + noise * rng.normal(size=t.size)) for k, q in enumerate(waves)]
 
 
 def part(series):

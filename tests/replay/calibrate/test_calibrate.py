@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import undulog as front
 from support.paths import TRACE
 from support.twin_fits import colored, fitted, rewritten, room_for
 from undulog.capture import load_robot
@@ -54,8 +53,7 @@ TWO = ("--only", "stall_torque", "--only", "coulomb_friction", "--within", "0.03
 def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, capsys):
     output, world = tmp_path / "fitted.toml", tmp_path / "world.toml"
     report, found = fitted(small, capsys, *TWO, "-o", str(output), "--scenario", str(world))
-    truth = {("stall_torque", None): 0.33, ("coulomb_friction", None): 0.025}
-    assert_true_or_open(found, truth)
+    assert_true_or_open(found, {("stall_torque", None): 0.33, ("coulomb_friction", None): 0.025})
     assert found["stall_torque", None]["determined"]
     assert report["converged"]
     assert report["rms_rad"]["after"] == pytest.approx(0.001, rel=0.05)  # the encoders' noise
@@ -66,11 +64,10 @@ def test_hidden_parameters_of_three_joints_come_out(small, tmp_path, capsys):
     assert servo.gear_stiffness == 12.0  # what wasn't fitted stays
     assert "[defaults.servo]  # of the data sheet\n" in output.read_text()
     again = load_scenario(str(world))
-    assert again.robot.joints[0].servo == servo
-    assert again.duration_s == pytest.approx(4.5)
+    assert (again.robot.joints[0].servo, again.duration_s) == (servo, pytest.approx(4.5))
 
 
-def test_a_dead_time_is_told_and_not_written(small, tmp_path, capsys):
+def test_a_dead_time_is_reported_and_not_written(small, tmp_path, capsys):
     late_s = 0.012
     late_ns = round(late_s * 1e9)
     rewritten(small / "run.mcap", tmp_path / "late.mcap", lambda t, rows: (t + late_ns, rows))
@@ -84,7 +81,7 @@ def test_a_dead_time_is_told_and_not_written(small, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         ("-o a.json", "end its name in .toml"),
         ("-o a.toml --scenario a.toml", "that is the robot's file"),
@@ -98,18 +95,16 @@ def test_a_dead_time_is_told_and_not_written(small, tmp_path, capsys):
         ("-o a.mine.toml", "--force"),
     ],
 )
-def test_wrong_usage_says_what_would_be_right(small, tmp_path, capsys, words, told):
+def test_wrong_usage_says_what_would_be_right(small, tmp_path, words, message, command):
     mine = tmp_path / "a.mine.toml"
     mine.write_text("mine")
     words = words.replace("a.", f"{tmp_path}/a.").split()
     code = 1 if "--settle" in words else 2
-    assert front.run(["sim", "fit", str(small / "run.mcap"), *words]) == code
-    assert told in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == [mine]
-    assert mine.read_text() == "mine"
+    assert message in command("sim", "fit", small / "run.mcap", *words, code=code).err
+    assert (list(tmp_path.iterdir()), mine.read_text()) == ([mine], "mine")
 
 
-def test_an_interrupted_fit_leaves_nothing(small, tmp_path, capsys, monkeypatch):
+def test_an_interrupted_fit_leaves_nothing(small, tmp_path, monkeypatch, command):
     @contextmanager
     def interrupted():
         request = StopRequest()
@@ -117,9 +112,8 @@ def test_an_interrupted_fit_leaves_nothing(small, tmp_path, capsys, monkeypatch)
         yield request
 
     monkeypatch.setattr(cli, "interruptible", interrupted)
-    words = ["sim", "fit", str(small / "run.mcap"), "-o", str(tmp_path / "a.toml")]
-    assert front.run(words) == 1
-    assert "nothing is written" in capsys.readouterr().err
+    words = ("sim", "fit", small / "run.mcap", "-o", tmp_path / "a.toml")
+    assert "nothing is written" in command(*words, code=1).err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -139,20 +133,12 @@ mu_normal = 0.42
     world = tmp_path / "fitted-world.toml"
     words = ["--modules", "--within", "0.03", "--scenario", str(world)]
     report, found = fitted(room, capsys, *words, "-o", str(tmp_path / "fitted.toml"))
-    assert report["search"]["named"]
-    assert report["search"]["module"] == "joint04"
-    truth = {
-        ("stall_torque", None): 0.345,
-        ("proportional_gain", None): 6.8,
-        ("coulomb_friction", None): 0.024,
-        ("viscous_friction", None): 0.005,
-        ("gear_stiffness", None): 12.0,
-        ("gear_damping", None): 0.008,
-        ("mu_tangential", None): 0.06,
-        ("mu_normal", None): 0.42,
-        ("stall_torque", "joint04"): 0.8,
-    }
-    assert_true_or_open(found, truth)
+    assert (report["search"]["named"], report["search"]["module"]) == (True, "joint04")
+    truth = {"stall_torque": 0.345, "proportional_gain": 6.8, "coulomb_friction": 0.024}
+    truth |= {"viscous_friction": 0.005, "gear_stiffness": 12.0, "gear_damping": 0.008}
+    truth |= {"mu_tangential": 0.06, "mu_normal": 0.42}
+    assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
+    assert_true_or_open(found, {("stall_torque", "joint04"): 0.8})
     # Short of full voltage a servo's viscous friction acts as its back EMF does.
     ridge = next(one["factors"] for one in report["ridges"] if "stall torque" in one["factors"])
     assert "viscous friction" in ridge
@@ -191,9 +177,8 @@ mu_normal = 0.56
     room = room_for(tmp_path, 5, 14.0, hidden, seed=0)
     names = ("stall_torque", "proportional_gain", "coulomb_friction", "mu_tangential", "mu_normal")
     words = [word for name in names for word in ("--only", name)]
-    report, found = fitted(
-        room, capsys, *words, "--modules", "--within", "0.03", "-o", str(tmp_path / "fitted.toml")
-    )
+    words += ["--modules", "--within", "0.03", "-o", str(tmp_path / "fitted.toml")]
+    report, found = fitted(room, capsys, *words)
     assert not report["search"]["named"]  # no module differs
     truth = dict(zip(names, (0.27, 9.0, 0.035, 0.045, 0.56), strict=True))
     assert_true_or_open(found, {(name, None): value for name, value in truth.items()})
@@ -202,23 +187,19 @@ mu_normal = 0.56
 
 
 @pytest.mark.slow
-def test_a_real_ramp_tells_a_lag_and_no_servo(tmp_path, capsys):
+def test_a_real_ramp_gives_a_lag_and_no_servo(tmp_path, capsys, command):
     """A motor at constant speed, in the air: one lag for six parameters."""
     if not TRACE.is_file():
         pytest.skip(f"the real recording {TRACE.name} is not beside this checkout")
-    session = tmp_path / "arc.mcap"
-    words = ["import", str(TRACE), "--robot", "arcsnake-joint", "-o", str(session)]
-    assert front.run(words) == 0
+    command("import", TRACE, "--robot", "arcsnake-joint", "-o", tmp_path / "arc.mcap")
     (tmp_path / "nominal.toml").write_text(AIR)
-    report, found = fitted(
-        tmp_path, capsys, "--settle", "1", "-o", str(tmp_path / "f.toml"), source="arc.mcap"
-    )
+    words = ("--settle", "1", "-o", str(tmp_path / "f.toml"))
+    report, found = fitted(tmp_path, capsys, *words, source="arc.mcap")
     assert not any(one["determined"] for one in found.values())
     assert report["rms_rad"]["after"] < report["rms_rad"]["before"]
     assert report["rms_rad"]["after"] < 0.005  # of a way of 17 rad
     assert report["residual_memory_samples"] > 3.0  # the twin isn't this servo
-    fitted_robot = load_robot(tmp_path / "f.toml")  # its DBC files lie beside it
-    assert fitted_robot.bus is not None
+    assert load_robot(tmp_path / "f.toml").bus is not None  # its DBC files lie beside it
 
 
 def test_the_memory_of_noise_is_that_of_its_closed_form():
@@ -236,8 +217,7 @@ def test_scores_of_coloured_noise_vary_as_its_spectrum_says(rho):
     """J = cos(w t): the sum of n samples varies by n/2 times the spectrum at w."""
     n, w = 40000, 2 * np.pi * 0.01
     noise = colored(np.random.default_rng(4), rho, n)
-    column = np.cos(w * np.arange(n))[:, None]
-    got = score_covariance([column], [noise], np.ones(1), np.ones(1))
+    got = score_covariance([np.cos(w * np.arange(n))[:, None]], [noise], np.ones(1), np.ones(1))
     spectrum = (1 - rho**2) / abs(1 - rho * np.exp(-1j * w)) ** 2
     assert got[0, 0] == pytest.approx(n / 2 * spectrum, rel=0.1)
 
@@ -279,11 +259,10 @@ def solve_linear(columns, measured, prior):
     return found.x, found.covariance
 
 
-def test_a_ridge_is_the_direction_that_keeps_what_is_told():
+def test_a_ridge_is_the_direction_that_keeps_the_outputs():
     """Only the product of two parameters is known."""
     pair = [Unknown(name, "1", 2.0, 0.5) for name in ("stall_torque", "proportional_gain")]
-    precise = 1e6 * np.ones((2, 2)) + np.eye(2) / 0.25
-    (ridge,) = ridges(pair, np.linalg.inv(precise))
+    (ridge,) = ridges(pair, np.linalg.inv(1e6 * np.ones((2, 2)) + np.eye(2) / 0.25))
     up, down = ridge.factors.values()
     assert up * down == pytest.approx(1.0)
     assert math.log(max(up, down)) == pytest.approx(0.5 / math.sqrt(2))

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import undulog as front
 from support import twin_fits
 from support.twin_fits import colored
 from undulog.replay.calibrate.identifiability import play_direction
@@ -142,11 +141,9 @@ def test_the_level_is_of_all_joints_and_checks_together():
 
 
 def test_joints_without_enough_cycles_are_tested_for_memory():
-    random = np.random.default_rng(7)
-    rest = SIGMA * random.standard_normal(200)
+    rest = SIGMA * np.random.default_rng(7).standard_normal(200)
     measured = Measured(("a",), (T[:200],), (rest,))
-    found = lack_of_fit(measured, [rest], OMEGA, None)
-    assert found.joints["a"].periodic_rad is None
+    assert lack_of_fit(measured, [rest], OMEGA, None).joints["a"].periodic_rad is None
     assert lack_of_fit(measured, [rest], 4 * OMEGA, None).joints["a"].periodic_rad is not None
 
 
@@ -155,9 +152,8 @@ ONLY = ("stall_torque", "coulomb_friction", "mu_tangential", "mu_normal")
 
 def fitted(folder, capsys, only, *, source="run.mcap", more=()):
     words = [word for name in only for word in ("--only", name)]
-    report, found = twin_fits.fitted(
-        folder, capsys, *words, *more, "-o", str(folder / "f.toml"), source=source
-    )
+    words += [*more, "-o", str(folder / "f.toml")]
+    report, found = twin_fits.fitted(folder, capsys, *words, source=source)
     return report, {name: one for (name, _), one in found.items()}
 
 
@@ -167,11 +163,9 @@ def test_another_friction_law_excludes_no_truth(tmp_path, capsys):
     hidden = '[servo]\nstall_torque = 0.315\n[world.ground]\nlaw = "transeth"\n'
     twin_fits.room_for(tmp_path, 5, 8.0, hidden)
     report, found = fitted(tmp_path, capsys, ONLY)
-    truth = dict(zip(ONLY, (0.315, 0.03, 0.05, 0.5), strict=True))
-    for name, value in truth.items():
-        one = found[name]
-        ends = one["ci95"]
-        assert ends is None or ends[0] <= value <= ends[1], one
+    for name, value in zip(ONLY, (0.315, 0.03, 0.05, 0.5), strict=True):
+        ends = found[name]["ci95"]
+        assert ends is None or ends[0] <= value <= ends[1], found[name]
     # What the ground's law moves by a third is never called determined.
     assert not found["mu_normal"]["determined"]
     laws = {one["label"]: one for one in report["lack_of_fit"]["alternatives"]}
@@ -180,15 +174,11 @@ def test_another_friction_law_excludes_no_truth(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_another_friction_law_is_the_first_line_where_the_session_shows_it(tmp_path, capsys):
-    hidden = '[world.ground]\nlaw = "transeth"\n'
-    twin_fits.room_for(tmp_path, 4, 6.0, hidden, noise=0.001)
+def test_another_friction_law_is_the_first_line_where_the_session_shows_it(tmp_path, command):
+    twin_fits.room_for(tmp_path, 4, 6.0, '[world.ground]\nlaw = "transeth"\n', noise=0.001)
     words = [word for name in ONLY for word in ("--only", name)]
-    command = ["sim", "fit", str(tmp_path / "run.mcap"), "-o", str(tmp_path / "f.toml")]
-    capsys.readouterr()
-    on = f"twin:{tmp_path / 'nominal.toml'}"
-    assert front.run([*command, "--on", on, *words]) == 0
-    text = capsys.readouterr().out
+    words += ["-o", tmp_path / "f.toml", "--on", f"twin:{tmp_path / 'nominal.toml'}"]
+    text = command("sim", "fit", tmp_path / "run.mcap", *words).out
     assert text.startswith("The twin doesn't fit this session (p < 0.001): ")
     assert "Parameters (no interval; before):" in text
     assert "The twin does not fit that session" in (tmp_path / "f.toml").read_text()
@@ -222,8 +212,7 @@ def with_play(source, target, width):
 
 @pytest.mark.slow
 def test_the_right_law_is_left_alone(tmp_path, capsys):
-    hidden = "[servo]\nstall_torque = 0.33\n"
-    twin_fits.room_for(tmp_path, 4, 6.0, hidden)
+    twin_fits.room_for(tmp_path, 4, 6.0, "[servo]\nstall_torque = 0.33\n")
     report, found = fitted(tmp_path, capsys, ONLY)
     assert report["fits"]
     assert found["stall_torque"]["ci95"][0] <= 0.33 <= found["stall_torque"]["ci95"][1]

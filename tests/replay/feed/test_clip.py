@@ -1,19 +1,17 @@
 """Clips as others read them: Pillow reads the GIF, Chromium plays the MP4."""
 
 import base64
+import contextlib
 import io
-import json
 import os
 import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from support import golden_pictures, processes
+from support import golden_pictures
+from support.processes import UNDULOG, process, undulog, wait_for
 from undulog.capture.common.errors import UsageError
 from undulog.replay.feed.film import Shot, open_film
 
@@ -57,8 +55,7 @@ def gif_frames(path):
 
 class TestShot:
     def test_frames_stand_at_equal_steps_and_end_before_the_end(self):
-        times = Shot(2.0, 3.0, fps=10).times_s
-        assert np.allclose(times, 2.0 + 0.1 * np.arange(10), atol=1e-12)
+        assert np.allclose(Shot(2.0, 3.0, fps=10).times_s, 2.0 + 0.1 * np.arange(10), atol=1e-12)
         assert len(Shot(0.0, 2.0, fps=25, speed=0.25).times_s) == 200  # slow motion
         assert Shot(1.0, 1.001).times_s.tolist() == [1.0]
 
@@ -114,9 +111,8 @@ def played(browser, path, seconds):
             clip.src = 'data:video/mp4;base64,{data}';
         }}).then(() => true)"""
     )
-    facts = browser.evaluate(
-        "({width: clip.videoWidth, height: clip.videoHeight, duration: clip.duration})"
-    )
+    size = "width: clip.videoWidth, height: clip.videoHeight"
+    facts = browser.evaluate(f"({{{size}, duration: clip.duration}})")
     shot = browser.evaluate(
         """(() => {
             const canvas = document.createElement('canvas');
@@ -142,49 +138,34 @@ def played(browser, path, seconds):
         (["--from", "0", "--size", "640x480"], "--from, --size"),
     ],
 )
-def test_wrong_usage_is_explained(session_file, view, empty_folder, arguments, complaint):
-    code, _, err = view(session_file, *arguments)
-    assert code == 2
-    assert complaint in err
-    assert list(empty_folder.iterdir()) == []
+def test_wrong_usage_is_explained(session_file, tmp_path, arguments, complaint, command):
+    with contextlib.chdir(tmp_path):
+        assert complaint in command("view", session_file, *arguments, code=2).err
+    assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture
-def empty_folder(tmp_path, monkeypatch):
-    """The folder that the command runs in."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+def test_nothing_is_overwritten_without_force(session_file, command, tmp_path):
+    clip = tmp_path / "a.gif"
+    clip.write_bytes(b"mine")
+    assert "--force" in command("view", session_file, "--clip", clip, code=2).err
+    assert clip.read_bytes() == b"mine"
 
 
-def test_nothing_is_overwritten_without_force(session_file, view, tmp_path):
-    (tmp_path / "a.gif").write_bytes(b"mine")
-    code, _, err = view(session_file, "--clip", tmp_path / "a.gif")
-    assert (code, (tmp_path / "a.gif").read_bytes()) == (2, b"mine")
-    assert "--force" in err
-
-
-def test_a_session_without_a_body_says_what_it_takes(write, view, tmp_path):
-    session = write(tmp_path / "a.mcap", robot=False)
-    code, _, err = view(session, "--clip", tmp_path / "a.gif")
-    assert code == 1
-    assert "robot description" in err
+def test_a_session_without_a_body_says_what_it_takes(write, command, tmp_path):
+    words = (write(tmp_path / "a.mcap", robot=False), "--clip", tmp_path / "a.gif")
+    assert "robot description" in command("view", *words, code=1).err
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
 @pytest.mark.slow
-def test_a_gif_shows_the_gait(session_file, vulkan, view, tmp_path):
-    code, out, _ = view(
-        *(session_file, "--clip", tmp_path / "a.gif", "--json"),
-        *("--from", 0.4, "--to", 2.8, "--fps", 5, "--size", "480x300"),
-    )
-    told = json.loads(out)
-    frames, shown_ms = gif_frames(tmp_path / "a.gif")
-    assert code == 0
-    assert told["bytes"] == (tmp_path / "a.gif").stat().st_size
-    assert (told["frames"], told["duration_s"], told["size"]) == (12, 2.4, [480, 300])
-    assert len(frames) == 12
-    assert sum(shown_ms) == 2400
-    assert {frame.size for frame in frames} == {(480, 300)}
+def test_a_gif_shows_the_gait(session_file, vulkan, report_of, tmp_path):
+    clip = tmp_path / "a.gif"
+    part = ("--from", 0.4, "--to", 2.8, "--fps", 5, "--size", "480x300")
+    report = report_of("view", session_file, "--clip", clip, *part)
+    frames, shown_ms = gif_frames(clip)
+    assert report["bytes"] == clip.stat().st_size
+    assert (report["frames"], report["duration_s"], report["size"]) == (12, 2.4, [480, 300])
+    assert ([frame.size for frame in frames], sum(shown_ms)) == ([(480, 300)] * 12, 2400)
     # The camera goes with the body, and the gait's period is 2 s: ten frames.
     now, later, half = (glowing(frames[number]) for number in (0, 10, 5))
     assert now.sum() > 300
@@ -198,24 +179,19 @@ def shared(one, other):
 
 
 @pytest.mark.slow
-def test_an_mp4_of_the_body_plays_in_chromium(session_file, vulkan, browser, view, tmp_path):
-    code, out, _ = view(
-        *(session_file, "--clip", tmp_path / "a.mp4"),
-        *("--to", 1, "--fps", 10, "--speed", 0.5, "--size", "640x360"),
-    )
+def test_an_mp4_of_the_body_plays_in_chromium(session_file, vulkan, browser, command, tmp_path):
+    part = ("--to", 1, "--fps", 10, "--speed", 0.5, "--size", "640x360")
+    found = command("view", session_file, "--clip", tmp_path / "a.mp4", *part).out
     facts, frame = played(browser, tmp_path / "a.mp4", 1.0)
-    assert code == 0
-    assert "20 frames of 640x360" in out
+    assert "20 frames of 640x360" in found
     assert facts == {"width": 640, "height": 360, "duration": 2.0}
     assert glowing(frame).sum() > 500
 
 
 @pytest.mark.slow
 def test_without_a_vulkan_driver_the_packages_are_named(session_file, tmp_path):
-    nowhere = {"VK_DRIVER_FILES": "/nonexistent", "VK_ICD_FILENAMES": "/nonexistent"}
-    done = processes.undulog(
-        "view", session_file, "--clip", tmp_path / "a.mp4", env={**os.environ, **nowhere}
-    )
+    env = os.environ | dict.fromkeys(("VK_DRIVER_FILES", "VK_ICD_FILENAMES"), "/nonexistent")
+    done = undulog("view", session_file, "--clip", tmp_path / "a.mp4", env=env)
     assert done.returncode == 1
     assert "mesa-vulkan-drivers" in done.stderr
     assert "Traceback" not in done.stderr
@@ -226,29 +202,12 @@ def test_without_a_vulkan_driver_the_packages_are_named(session_file, tmp_path):
 def test_ctrl_c_leaves_nothing_behind(session_file, vulkan, tmp_path):
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    clip = tmp_path / "a.mp4"
-    process = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "undulog", "view", session_file),
-            *("--clip", clip, "--speed", "0.01", "--size", "320x180"),
-        ],
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        env={**os.environ, "TMPDIR": str(scratch)},
-    )
-    try:
-        part = tmp_path / "a.mp4.part"
-        while not part.exists():
-            assert process.poll() is None
-            time.sleep(0.05)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to all in front
-        _, err = process.communicate(timeout=60)
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
-    assert process.returncode == 1
+    words = ("--clip", tmp_path / "a.mp4", "--speed", "0.01", "--size", "320x180")
+    options = {"start_new_session": True, "env": os.environ | {"TMPDIR": str(scratch)}}
+    with process(*UNDULOG, "view", session_file, *words, **options) as running:
+        wait_for((tmp_path / "a.mp4.part").exists, "the clip", alive=[running])
+        os.killpg(running.pid, signal.SIGINT)  # as a terminal does, to all in front
+        _, err = running.communicate(timeout=60)
+    assert running.returncode == 1
     assert "stopped on request" in err
-    assert list(scratch.iterdir()) == []
-    assert list(tmp_path.iterdir()) == [scratch]
+    assert (list(scratch.iterdir()), list(tmp_path.iterdir())) == ([], [scratch])

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-import undulog
 from undulog.analysis.results.comparison import Comparison, NamedJoint
 from undulog.analysis.results.coupling import Coupling
 from undulog.analysis.results.estimate import Estimate, Provenance
@@ -18,7 +17,6 @@ from undulog.analysis.results.experiment import (
     Run,
 )
 from undulog.analysis.results.null_model import ModelledAnalysis, ModuleDeviation, NullModelResult
-from undulog.capture import Session
 from undulog.capture.common.errors import DataError
 from undulog.capture.robot.kinematics import link_poses
 from undulog.replay.feed.numbers import saved
@@ -29,10 +27,12 @@ MADE = Provenance("", {}, {}, {})
 
 
 @pytest.fixture
-def session(session_file):
-    """The whole session, open."""
-    with Session.open(session_file) as opened:
-        yield opened
+def session(session_file, opened):
+    return opened(session_file)
+
+
+def names_and_reasons(layer):
+    return [(one.joint, one.why) for one in layer.named]
 
 
 @pytest.fixture
@@ -40,22 +40,10 @@ def comparison(analysis):
     """A comparison of the session with another one that names two joints, one beyond margins."""
     other = dataclasses.replace(analysis.session, id="another")
     named = (NamedJoint("joint05", 2.1, 0.0004), NamedJoint("joint07", 0.6, 0.01))
-    return Comparison(
-        "B differs from A",
-        "different",
-        "sessions",
-        a=(other,),
-        b=(analysis.session,),
-        partial=None,
-        changed=(),
-        named=named,
-        differences=(),
-        equivalence=(),
-        phase_rad=(),
-        waveforms=(),
-        warnings=(),
-        provenance=MADE,
-    )
+    sides = {"a": (other,), "b": (analysis.session,), "partial": None, "named": named}
+    empty = ("changed", "differences", "equivalence", "phase_rad", "waveforms", "warnings")
+    answer = ("B differs from A", "different", "sessions")
+    return Comparison(*answer, **sides, **dict.fromkeys(empty, ()), provenance=MADE)
 
 
 @pytest.fixture
@@ -63,48 +51,27 @@ def experiment(analysis):
     """An experiment of the session and its reverse, that names the joint it finds weak."""
     pair = OrderedPair("joint03", "joint23", "lag", Estimate(-0.01), Estimate(0.03), 0.002)
     nothing = Estimate()
-    reversal = Reversal(
-        forward_runs=6,
-        reverse_runs=6,
-        statistic=9.0,
-        p=0.002,
-        p_floor=0.001,
-        labellings=924,
-        labellings_tried=924,
-        joints=(),
-        pairs=(pair,),
-        gain_bound=0.1,
-        lag_bound_rad=0.1,
-        equivalence_gain_p=1.0,
-        equivalence_lag_p=1.0,
-        module_variance=nothing,
-        boundary_variance=nothing,
-        noise_variance=0.0,
-        module_share=nothing,
-        boundary_share=nothing,
-        tilt=FloorTilt(Headings.BALANCED, 2, nothing, None, nothing, excluded=True),
-    )
+    test = {"statistic": 9.0, "p": 0.002, "p_floor": 0.001}
+    counts = {"forward_runs": 6, "reverse_runs": 6, "labellings": 924, "labellings_tried": 924}
+    bounds = {"gain_bound": 0.1, "lag_bound_rad": 0.1}
+    bounds |= {"equivalence_gain_p": 1.0, "equivalence_lag_p": 1.0, "noise_variance": 0.0}
+    shares = ("module_variance", "boundary_variance", "module_share", "boundary_share")
+    tilt = FloorTilt(Headings.BALANCED, 2, nothing, None, nothing, excluded=True)
+    parts = test | counts | bounds | dict.fromkeys(shares, nothing)
+    reversal = Reversal(**parts, joints=(), pairs=(pair,), tilt=tilt)
     one = dataclasses.replace(analysis, session=dataclasses.replace(analysis.session, id="reverse"))
     runs = (
         Run("reverse", "reverse.mcap", "tail-to-head", "reverse"),
         Run("made-for-tests", "made.mcap", "head-to-tail", "forward"),
     )
-    return Experiment(
-        answer="joint03 is weak",
-        sessions=(one, analysis),
-        runs=runs,
-        heterogeneity={},
-        reversal=reversal,
-        coupling=NO_COUPLING,
-        warnings=(),
-        provenance=MADE,
-    )
+    sides = {"answer": "joint03 is weak", "sessions": (one, analysis), "runs": runs}
+    found = {"heterogeneity": {}, "reversal": reversal, "coupling": NO_COUPLING}
+    return Experiment(**sides, **found, warnings=(), provenance=MADE)
 
 
 def test_the_numbers_shown_are_the_saved_ones(session, analysis, tmp_path):
     layer = saved(session, [analysis.save(tmp_path / "made.json")])
-    assert layer.analysis == analysis
-    assert layer.named == ()
+    assert (layer.analysis, layer.named) == (analysis, ())
     assert layer.notes == ("gain, lag and energy are those of made.json",)
 
 
@@ -113,20 +80,21 @@ def test_an_experiment_gives_the_sessions_own_numbers_and_its_weak_module(
 ):
     layer = saved(session, [experiment.save(tmp_path / "both.json")])
     assert layer.analysis == analysis
-    (weak,) = layer.named
-    assert weak.joint == "joint03"
-    assert weak.why == "more lag than its mirror joint joint23, p = 0.002 (both.json)"
+    why = "more lag than its mirror joint joint23, p = 0.002 (both.json)"
+    assert names_and_reasons(layer) == [("joint03", why)]
 
 
-def test_a_comparison_names_what_differs_by_more_than_its_margins(
-    session, analysis, comparison, tmp_path
-):
-    paths = [analysis.save(tmp_path / "made.json"), comparison.save(tmp_path / "two.json")]
-    layer = saved(session, paths)
+@pytest.fixture
+def results(analysis, comparison, tmp_path):
+    """Files of the session's analysis and of the comparison."""
+    return [analysis.save(tmp_path / "made.json"), comparison.save(tmp_path / "two.json")]
+
+
+def test_a_comparison_names_what_differs_by_more_than_its_margins(session, analysis, results):
+    layer = saved(session, results)
     assert layer.analysis == analysis
-    assert [(one.joint, one.why) for one in layer.named] == [
-        ("joint05", "answers differently in A and B, p < 0.001 (two.json)")
-    ]
+    why = "answers differently in A and B, p < 0.001 (two.json)"
+    assert names_and_reasons(layer) == [("joint05", why)]
 
 
 def test_a_session_held_to_a_model_names_the_module_that_deviates(session, analysis, tmp_path):
@@ -152,9 +120,8 @@ def test_a_session_held_to_a_model_names_the_module_that_deviates(session, analy
     modelled = ModelledAnalysis(**values, null_model=test)
     layer = saved(session, [modelled.save(tmp_path / "held.json")])
     assert layer.analysis == modelled
-    assert [(one.joint, one.why) for one in layer.named] == [
-        ("joint09", "deviates from the others' model, p < 0.001 (held.json)")
-    ]
+    why = "deviates from the others' model, p < 0.001 (held.json)"
+    assert names_and_reasons(layer) == [("joint09", why)]
 
 
 def test_with_a_comparison_alone_the_session_is_analysed(session, comparison, tmp_path):
@@ -178,12 +145,10 @@ def test_results_that_do_not_fit_the_session_are_refused(session, analysis, expe
 
 
 @pytest.fixture
-def marked(session_file, analysis, comparison, tmp_path, read_back):
+def marked(session_file, results, tmp_path, read_back, command):
     """The session's recording with a comparison that names joint 5."""
-    paths = [analysis.save(tmp_path / "made.json"), comparison.save(tmp_path / "two.json")]
-    results = [str(word) for path in paths for word in ("--result", path)]
-    words = ["view", str(session_file), *results, "--save", str(tmp_path / "a.rrd")]
-    assert undulog.run(words) == 0
+    words = [word for path in results for word in ("--result", path)]
+    command("view", session_file, *words, "--save", tmp_path / "a.rrd")
     return read_back(tmp_path / "a.rrd")
 
 
@@ -207,13 +172,11 @@ def test_named_modules_are_marked_at_their_bars_and_in_words(marked):
     assert "- gain, lag and energy are those of made.json" in words
 
 
-def test_results_and_tabs_are_of_one_session(session_file, tmp_path, view):
+def test_results_and_tabs_are_of_one_session(session_file, tmp_path, command):
     missing, output = tmp_path / "nowhere.json", tmp_path / "a.rrd"
     for words in (["--result", missing], ["--tab", "cycles"]):
-        code, _, err = view(session_file, session_file, *words)
-        assert code == 2
+        err = command("view", session_file, session_file, *words, code=2).err
         assert f"{words[0]}: needs one session" in err
-    code, _, err = view(session_file, "--result", missing, "--save", output)
-    assert code == 1
-    assert "nowhere.json" in err
+    words = ("view", session_file, "--result", missing, "--save", output)
+    assert "nowhere.json" in command(*words, code=1).err
     assert not output.exists()

@@ -13,14 +13,14 @@ from undulog.replay.feed.recording import recording_id, write_recording
 
 
 def converted(file, path, **options):
-    """Convert a session; what was said."""
+    """Convert a session; what was reported."""
     with Session.open(file) as session:
         return write_recording(session, path, **options)
 
 
 @pytest.fixture
 def made(write, tmp_path, read_back):
-    """Writes and converts the session without some parts: what was said, what is in the file."""
+    """Writes and converts the session without some parts: report, file."""
 
     def make(**parts):
         written = converted(write(tmp_path / "a.mcap", **parts), tmp_path / "a.rrd")
@@ -57,16 +57,14 @@ def test_all_entities_are_there_by_name(recording):
 def test_what_is_drawn_follows_from_the_columns(recording, truth):
     _, found = recording
     power = truth.effort * truth.velocity
-    total = power.sum(axis=1, keepdims=True)
-    electrical = 6.0 * truth.effort.sum(axis=1, keepdims=True)
     for entity, values in {
         "/joints/measured": np.degrees(truth.position),
         "/joints/commanded": np.degrees(truth.command),
         "/joints/error": np.degrees(truth.position - truth.command),
         "/joints/places/measured": np.degrees(truth.position[:, [0, 12, 24]]),
         "/power/mechanical": power,
-        "/power/total/mechanical": total,
-        "/power/total/electrical": electrical,
+        "/power/total/mechanical": power.sum(axis=1, keepdims=True),
+        "/power/total/electrical": 6.0 * truth.effort.sum(axis=1, keepdims=True),
         "/signals/joint_current": truth.effort,  # in its own unit
     }.items():
         is_angle = entity.startswith("/joints") and "places" not in entity
@@ -134,8 +132,7 @@ def test_a_recording_is_replaced_by_a_whole_one_only(session_file, tmp_path):
 
     with pytest.raises(RuntimeError, match="no layout"):
         converted(session_file, path, layout=fail)
-    assert path.read_bytes() == b"the former one"
-    assert list(tmp_path.iterdir()) == [path]
+    assert (path.read_bytes(), list(tmp_path.iterdir())) == (b"the former one", [path])
 
 
 def test_a_folder_that_is_not_there_is_an_error(session_file, tmp_path):
@@ -146,8 +143,8 @@ def test_a_folder_that_is_not_there_is_an_error(session_file, tmp_path):
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_full_disk_is_an_error_and_leaves_nothing(session_file, disk_of):
     disk = disk_of("64k")
-    with Session.open(session_file) as session, pytest.raises(LogWriteError, match="can't be wr"):
-        write_recording(session, disk / "run.rrd")
+    with pytest.raises(LogWriteError, match="can't be written"):
+        converted(session_file, disk / "run.rrd")
     assert list(disk.iterdir()) == []
 
 
@@ -231,8 +228,7 @@ def test_servos_polled_in_turn_are_drawn_where_they_were_at_the_first_ones_times
     np.testing.assert_array_equal(found.times("/joints/measured"), t - START)
     shown = np.radians(rows(found.column("/joints/measured", "Angle:degrees")))
     assert np.isnan(shown[0, 1:]).all()  # none of them was sampled before
-    line = np.broadcast_to((t - START)[1:, None] * 1e-9, (49, 25))
-    assert_drawn(shown[1:], line)
+    assert_drawn(shown[1:], np.broadcast_to((t - START)[1:, None] * 1e-9, (49, 25)))
 
 
 def test_a_foreign_bag_with_a_message_a_servo_shows_every_servo(read_back, tmp_path):
@@ -269,6 +265,5 @@ def test_rerun_opens_our_sessions_itself_with_the_joints_named(
     assert ", ".join(names[:10]) in printed  # it cuts long lists short
     found = read_back(path)
     assert found.column("/joint_states/position", "SeriesLines:names")[0] == names
-    np.testing.assert_array_equal(
-        rows(found.column("/joint_states/position", "Scalars:scalars")), truth.position
-    )
+    shown = rows(found.column("/joint_states/position", "Scalars:scalars"))
+    np.testing.assert_array_equal(shown, truth.position)

@@ -13,14 +13,8 @@ from undulog.capture import Session
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.process import StopRequest
 from undulog.replay.draw.drawing import clock_of
+from undulog.replay.feed import progressive
 from undulog.replay.feed.numbers import Analysing, computed
-from undulog.replay.feed.progressive import (
-    NoLongerWantedError,
-    Task,
-    predict_layout,
-    same_arrangement,
-    show_session,
-)
 from undulog.replay.feed.recording import recording_id, write_recording
 from undulog.replay.samples.content import Layer
 from undulog.replay.viewer.viewer import Viewer
@@ -36,10 +30,10 @@ class Told:
     """Hears how far it is; asks for an end as soon as the first picture is out, if wanted."""
 
     def __init__(self, stop=None):
-        self.heard, self.stop = [], stop
+        self.calls, self.stop = [], stop
 
     def update(self, done, note=""):
-        self.heard.append((done, note))
+        self.calls.append((done, note))
         if self.stop is not None:
             self.stop.signal = signal.SIGINT
 
@@ -54,7 +48,7 @@ def streaming(file, path):
     ):
 
         def task_of(bar, known=None):
-            return Task(session, known or Layer(None), analysing, "session", bar)
+            return progressive.Task(session, known or Layer(None), analysing, "session", bar)
 
         yield viewer, task_of
 
@@ -66,7 +60,7 @@ def receive(tmp_path, read_back):
     def stream(file, known=None, identity=None):
         path = tmp_path / "received.rrd"
         with streaming(file, path) as (viewer, task_of):
-            notes = show_session(task_of(Told(), known), viewer, StopRequest())
+            notes = progressive.show_session(task_of(Told(), known), viewer, StopRequest())
         return notes, read_back(path, identity)
 
     return stream
@@ -118,17 +112,15 @@ def test_a_long_session_arrives_whole_after_a_brief_survey(receive, long_file, t
     with Session.open(long_file) as session:
         layer = computed(session)
         path = tmp_path / "saved.rrd"
-        written = write_recording(
-            session, path, analysis=layer.analysis, steady=layer.steady, notes=layer.notes
-        )
+        shown = {"analysis": layer.analysis, "steady": layer.steady, "notes": layer.notes}
+        written = write_recording(session, path, **shown)
     saved = read_back(path)
     assert notes == written.warnings
     assert drawn(received) == drawn(saved)
     for entity in drawn(saved):
         # Once each, at its own time, beginning and rest joined without a seam.
-        np.testing.assert_array_equal(
-            np.sort(received.times(entity)), np.sort(saved.times(entity)), entity
-        )
+        ours, theirs = (np.sort(one.times(entity)) for one in (received, saved))
+        np.testing.assert_array_equal(ours, theirs, entity)
     for entity in ("/joints/measured", "/power/mechanical", "/joints/places/commanded"):
         for component, rows in rows_of(saved, entity).items():
             ours = np.array([row for _, row in rows_of(received, entity)[component]], dtype=float)
@@ -152,8 +144,7 @@ def test_what_a_brief_survey_missed_makes_a_second_recording(receive, write_long
     assert any("drawn anew" in note and "/joint_temperature" in note for note in notes)
     ids = {identity for _, identity in received.stores}
     assert ids == {recording_id("long"), recording_id("long/anew")}
-    entities = {one for one in received.entities if one.startswith("/signals/joint_temperature")}
-    last = max(entities)
+    last = max({one for one in received.entities if one.startswith("/signals/joint_temperature")})
     names = received.static(last, "SeriesLines:names")
     assert "joint25" in names
     at_s = received.times(last) / NS
@@ -163,43 +154,43 @@ def test_what_a_brief_survey_missed_makes_a_second_recording(receive, write_long
 
 
 @pytest.mark.slow
-def test_without_odometry_the_body_is_drawn_throughout(receive, write_long, tmp_path, read_back):
+def test_without_odometry_the_body_is_drawn_throughout(
+    receive, write_long, tmp_path, read_back, opened
+):
     file = write_long(tmp_path / "still.mcap", odometry=False)
     notes, received = receive(file)
-    with Session.open(file) as session:
-        write_recording(session, tmp_path / "saved.rrd")
+    write_recording(opened(file), tmp_path / "saved.rrd")
     saved = read_back(tmp_path / "saved.rrd")
     assert "no /odom in the session: the head is held at the origin" in notes
     for entity in ("/world/snake/measured", "/world/snake/commanded"):
-        np.testing.assert_array_equal(
-            np.sort(received.times(entity)), np.sort(saved.times(entity)), entity
-        )
+        ours, theirs = (np.sort(one.times(entity)) for one in (received, saved))
+        np.testing.assert_array_equal(ours, theirs, entity)
 
 
 def test_the_layout_foreseen_is_that_of_the_analysed_session(tmp_path):
     with Session.open(golden_pictures.SESSION) as session:
-        layer = computed(session)
-        written = write_recording(session, tmp_path / "a.rrd", analysis=layer.analysis)
+        written = write_recording(session, tmp_path / "a.rrd", analysis=computed(session).analysis)
         rhythm = clock_of(session).rhythm
     content = written.content
     before = replace(content, charts=(), cycles=(), maps=(), mean=None)
-    assert same_arrangement(predict_layout(before, rhythm), content)
-    assert not same_arrangement(predict_layout(before, None), content)
-    assert not same_arrangement(before, content)
-    assert predict_layout(replace(before, commanded=()), rhythm) == replace(before, commanded=())
+    assert progressive.same_arrangement(progressive.predict_layout(before, rhythm), content)
+    assert not progressive.same_arrangement(progressive.predict_layout(before, None), content)
+    assert not progressive.same_arrangement(before, content)
+    silent = replace(before, commanded=())
+    assert progressive.predict_layout(silent, rhythm) == silent
 
 
 def test_an_end_that_is_asked_for_comes_soon_and_ends_the_viewer(long_file, tmp_path):
     stop = StopRequest()
     bar = Told(stop)
     with streaming(long_file, tmp_path / "a.rrd") as (viewer, task_of):
-        with pytest.raises(NoLongerWantedError):
-            show_session(task_of(bar), viewer, stop)
+        with pytest.raises(progressive.NoLongerWantedError):
+            progressive.show_session(task_of(bar), viewer, stop)
         assert viewer.ended
-    assert len(bar.heard) == 1
+    assert len(bar.calls) == 1
 
 
-def test_a_viewer_that_dies_is_told(long_file, tmp_path):
+def test_a_viewer_that_dies_is_reported(long_file, tmp_path):
     with streaming(long_file, tmp_path / "a.rrd") as (viewer, task_of):
 
         class Killing(Told):
@@ -207,7 +198,7 @@ def test_a_viewer_that_dies_is_told(long_file, tmp_path):
                 viewer._process.kill()
 
         with pytest.raises(UndulogError, match="viewer was ended by signal 9"):
-            show_session(task_of(Killing()), viewer, StopRequest())
+            progressive.show_session(task_of(Killing()), viewer, StopRequest())
 
 
 def test_an_analysis_that_dies_is_a_note(tmp_path):

@@ -45,15 +45,8 @@ class Shown:
 
     def __init__(self, file, scratch, *options):
         self.scratch = scratch
-        self.process = processes.start(
-            sys.executable,
-            "-c",
-            HEADLESS,
-            "view",
-            file,
-            *options,
-            env={**os.environ, "TMPDIR": str(scratch)},
-        )
+        words, env = (sys.executable, "-c", HEADLESS, "view", file), {"TMPDIR": str(scratch)}
+        self.process = processes.start(*words, *options, env=os.environ | env)
         address = self.process.stdout.readline().strip()
         page, _, query = address.partition("/?url=")
         self.page, self.address = page, unquote(query) if query else address
@@ -139,10 +132,8 @@ def test_the_body_comes_first_and_whoever_looks_keeps_his_place(view, long_file,
     lag = rgb(shown.client.take_screenshot(ids["Lag [°]"]))
     line = until(shown.process.stdout.readline)
     assert line == f"{long_file}: {LONG_S - 0.2:.1f} s, all of it in the viewer\n"
-    assert shown.at_s == 12.5
-    assert shown.views == ids
-    filled = until(lambda: np.abs(shown.picture(rgb, "Lag [°]") - lag).max() > 60)
-    assert filled
+    assert (shown.at_s, shown.views) == (12.5, ids)
+    assert until(lambda: np.abs(shown.picture(rgb, "Lag [°]") - lag).max() > 60)
     shown.client.set_time("session_time", duration=LONG_S - 5.0, play_state="paused")
     until(lambda: glows(shown.picture(rgb, body)) > 300)
     assert [one.reports for one in shown.client.get_state().views if one.reports] == []
@@ -178,13 +169,12 @@ def test_an_interrupt_while_it_is_converted_ends_the_command(view, long_file, rg
     assert not Path(f"/proc/{viewer}").exists()
 
 
-def test_a_viewer_that_is_killed_is_told(view, long_file, rgb):
+def test_a_viewer_that_is_killed_is_reported(view, long_file, rgb):
     shown = view(long_file)
     until_the_body_stands(shown, rgb)
     os.kill(viewer_of(shown), signal.SIGKILL)
     code, out, err = shown.finish()
-    assert (code, out) == (1, "")
-    assert err == "error: the Rerun viewer was ended by signal 9\n"
+    assert (code, out, err) == (1, "", "error: the Rerun viewer was ended by signal 9\n")
 
 
 def test_a_frozen_viewer_takes_no_memory_and_can_be_ended(view, long_file, rgb):

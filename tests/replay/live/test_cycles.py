@@ -1,14 +1,13 @@
 """Cycles computed while a session comes in are those of its analysis."""
 
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
 from support.live_stage import EPOCH_NS, WAIT_S, Relay, seen_live
+from support.processes import UNDULOG, process
 from support.written_topics import write_topics
 from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
@@ -87,11 +86,11 @@ def test_cycles_are_those_of_the_analysis_however_they_come_in(walk, length_ns):
         start_ns = session.start_ns
     found = measured_in_batches(walk, length_ns)
     assert len({cycle.start_ns for cycle in found}) == len(found)  # each once
-    told = {}
+    given = {}
     for cycle in found:
         for name, gain, lag in zip(cycle.names, cycle.gain, cycle.lag_rad, strict=True):
             if np.isfinite(gain):
-                told[name, round((cycle.start_ns - start_ns) * 1e-6)] = gain, lag
+                given[name, round((cycle.start_ns - start_ns) * 1e-6)] = gain, lag
     expected = {
         (name, round(start_s * 1e3)): (gain, lag)
         for name, one in joints.items()
@@ -99,10 +98,9 @@ def test_cycles_are_those_of_the_analysis_however_they_come_in(walk, length_ns):
         if gain is not None
     }
     assert len(expected) == 13 * 4  # two whole cycles and their surroundings in either run
-    assert told.keys() == expected.keys()
-    np.testing.assert_allclose(
-        [told[key] for key in expected], [*expected.values()], rtol=0, atol=1e-9
-    )
+    assert given.keys() == expected.keys()
+    ours = [given[key] for key in expected]
+    np.testing.assert_allclose(ours, [*expected.values()], rtol=0, atol=1e-9)
 
 
 def test_gain_lag_and_power_are_those_that_were_written(walk, snake25):
@@ -114,8 +112,7 @@ def test_gain_lag_and_power_are_those_that_were_written(walk, snake25):
         np.testing.assert_allclose(cycle.lag_rad[yaw], 0.1 + 0.02 * np.arange(13), atol=2e-3)
         np.testing.assert_allclose(cycle.power_w[yaw], TORQUE * SPEED / 2, rtol=0.01)
         assert np.isnan(np.delete(cycle.gain, yaw)).all()  # held still
-        period_s = (cycle.stop_ns - cycle.start_ns) * 1e-9
-        assert period_s == pytest.approx(1 / FREQUENCY_HZ, abs=1e-6)
+        assert (cycle.stop_ns - cycle.start_ns) * 1e-9 == pytest.approx(1 / FREQUENCY_HZ, abs=1e-6)
 
 
 def test_without_a_logged_phase_there_are_no_cycles(write, tmp_path):
@@ -141,40 +138,35 @@ def test_the_live_view_draws_bars_and_steps_of_each_cycle(walk, snake25, tmp_pat
             bar = f"/segments/{key}/estimate/{snake25.joint_names[i]}"
             assert drawn.times(bar).tolist() == starts
             heights = [row[0]["buffer"] for row in drawn.column(bar, "BarChart:values")]
-            np.testing.assert_allclose(
-                np.ravel(heights).astype(float), [of(cycle)[i] for cycle in expected], atol=1e-4
-            )
+            own = [of(cycle)[i] for cycle in expected]
+            np.testing.assert_allclose(np.ravel(heights).astype(float), own, atol=1e-4)
 
 
 @pytest.mark.slow
-def test_a_real_recording_is_seen_as_it_is_analysed_afterwards(tmp_path, read_back):
+def test_a_real_recording_is_seen_as_it_is_analysed_afterwards(tmp_path, read_back, opened):
     """A recorder of the twin in real time, and a relay: two processes."""
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
     environment.pop("RUNTIME_DIRECTORY", None)
     session_file, sockets = tmp_path / "run.mcap", tmp_path / "undulog"
     sockets.mkdir(mode=0o700)
     relay = Relay(sockets / "run.live", tmp_path / "live.rrd")
-    words = ["record", "twin:weak-servo-pi3", "-o", str(session_file), "--duration", "9s"]
-    recorder = subprocess.Popen(
-        [sys.executable, "-m", "undulog", *words, "--quiet"], env=environment
-    )
+    words = ("record", "twin:weak-servo-pi3", "-o", session_file, "--duration", "9s", "--quiet")
     try:
-        report = relay.finish()
-        assert recorder.wait(WAIT_S) == 0
+        with process(*UNDULOG, *words, env=environment) as recorder:
+            report = relay.finish()
+            assert recorder.wait(WAIT_S) == 0
     finally:
-        for process in (recorder, relay.process):
-            process.kill()
-            process.wait()
+        relay.process.kill()
+        relay.process.wait()
     assert report["dropped"] == report["unread"] == 0
     drawn = read_back(tmp_path / "live.rrd")
-    with Session.open(session_file) as session:
-        joints = {one.name: one for one in analyse_session(session).over_time.joints}
+    joints = {one.name: one for one in analyse_session(opened(session_file)).over_time.joints}
     names = drawn.static("/cycles/lag_degrees", "SeriesLines:names")
     rows = drawn.column("/cycles/lag_degrees", "Scalars:scalars")
     assert len(rows) >= 2
     # The feed found its relay a moment after the gait began, so the cycles are not the same ones;
     # once the gait has settled they are alike.
-    told = {name: lag for name, lag in zip(names, rows[-1], strict=True) if np.isfinite(lag)}
-    assert len(told) == 13
-    for name, lag in told.items():
+    given = {name: lag for name, lag in zip(names, rows[-1], strict=True) if np.isfinite(lag)}
+    assert len(given) == 13
+    for name, lag in given.items():
         assert lag == pytest.approx(np.degrees(joints[name].lag_rad[-1]), abs=0.05)

@@ -24,10 +24,9 @@ def replay(session_file, tmp_path_factory, read_back):
     return read_back(path)
 
 
-def test_every_message_is_shown(live, session_file):
+def test_every_message_is_shown(live, session_file, opened):
     report, _ = live
-    with Session.open(session_file) as session:
-        count = sum(channel.count for channel in session.channels.values())
+    count = sum(channel.count for channel in opened(session_file).channels.values())
     assert report["sessions"] == ["made-for-tests"]
     assert (report["shown"], report["dropped"], report["unread"]) == (count, 0, 0)
     assert report["lag_s"]["p50"] > 0
@@ -35,17 +34,13 @@ def test_every_message_is_shown(live, session_file):
 
 def test_angles_and_power_are_those_that_were_measured(live, truth):
     _, drawn = live
+    angle, scalar = "Angle:degrees", "Scalars:scalars"
     for entity, component, values, atol in (
-        ("/joints/measured", "Angle:degrees", np.degrees(truth.position), 2e-6),
-        ("/joints/commanded", "Angle:degrees", np.degrees(truth.command), 2e-6),
-        ("/joints/error", "Angle:degrees", np.degrees(truth.position - truth.command), 2e-6),
-        ("/power/mechanical", "Scalars:scalars", truth.effort * truth.velocity, 1e-8),
-        (
-            "/power/total/electrical",
-            "Scalars:scalars",
-            6.0 * truth.effort.sum(axis=1)[:, None],
-            1e-6,
-        ),
+        ("/joints/measured", angle, np.degrees(truth.position), 2e-6),
+        ("/joints/commanded", angle, np.degrees(truth.command), 2e-6),
+        ("/joints/error", angle, np.degrees(truth.position - truth.command), 2e-6),
+        ("/power/mechanical", scalar, truth.effort * truth.velocity, 1e-8),
+        ("/power/total/electrical", scalar, 6.0 * truth.effort.sum(axis=1)[:, None], 1e-6),
     ):
         found = drawn.rows(entity, component)
         assert list(found) == (truth.t_ns - EPOCH_NS).tolist()
@@ -83,7 +78,7 @@ def test_live_and_replay_draw_the_same(live, replay, entity, component):
             assert np.allclose(one, other, atol=atol, equal_nan=True)
 
 
-def test_entities_names_and_colours_are_the_replays_and_said_once(live, replay):
+def test_entities_names_and_colours_are_the_replays_and_sent_once(live, replay):
     _, drawn = live
     assert {entity for entity in drawn.entities if not entity.startswith("/__")} <= replay.entities
     for entity in ("/joints/measured", "/joints/commanded", "/power/total/mechanical"):

@@ -24,14 +24,12 @@ def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back)
     recorder.connect()
     recorder.send(1.5)
     recorder.feed.close()
-    report = relay.finish()
-    assert report["dropped"] == 0
+    assert relay.finish()["dropped"] == 0
     drawn = read_back(relay.output)
     found = drawn.rows("/joints/measured", "Angle:degrees")
     assert list(found) == (truth.t_ns - EPOCH_NS)[150:].tolist()
-    expected = np.degrees(truth.position[150:])
-    np.testing.assert_allclose(list(found.values()), expected, atol=2e-6)
-    # The mode was said before, and still holds.
+    np.testing.assert_allclose(list(found.values()), np.degrees(truth.position[150:]), atol=2e-6)
+    # The mode was sent before, and still holds.
     assert drawn.rows("/gait/mode", "StateChange:state") == {1_000_000_000: ["avoid"]}
 
 
@@ -56,8 +54,7 @@ def test_frozen_relay_holds_nothing_up_and_goes_on(stage, read_back, monkeypatch
     recorder.send(0.0, 0.5)
     freeze(relay.process.pid)
     recorder.feed._max_messages = 50
-    ticks = recorder.send(0.5, 2.5, wait=False)
-    assert ticks == 100
+    assert recorder.send(0.5, 2.5, wait=False) == 100
     assert recorder.feed.counts.dropped > 0
     os.kill(relay.process.pid, signal.SIGCONT)
     recorder.send(2.5)
@@ -120,8 +117,7 @@ def test_noise_on_the_socket_is_counted_and_borne(stage):
         link.send(pack_datagram(DatagramHead(Kind.MESSAGES, 1, 1, 0), [b"\x05\0\0\0cut"]))
     recorder.send_all()
     report = relay.finish()
-    assert report["unread"] == 3
-    assert report["sessions"] == ["made-for-tests"]
+    assert (report["unread"], report["sessions"]) == (3, ["made-for-tests"])
 
 
 def test_interrupted_relay_leaves_a_whole_file_and_no_socket(stage, read_back):
@@ -130,8 +126,7 @@ def test_interrupted_relay_leaves_a_whole_file_and_no_socket(stage, read_back):
     recorder.send(0.0, 1.0)
     wait_for(lambda: recorder.feed.counts.sent > 0, each=recorder.feed.pump)
     relay.process.send_signal(signal.SIGINT)
-    report = relay.finish()
-    assert report["shown"] == recorder.feed.counts.sent
+    assert relay.finish()["shown"] == recorder.feed.counts.sent
     assert "/joints/measured" in read_back(relay.output).entities
     assert not stage.path.exists()
     nothing = stage.relay("nothing.rrd")
@@ -168,14 +163,13 @@ def test_inbox_drops_the_oldest_and_keeps_what_explains_the_rest(tmp_path, sessi
 
         wait_for(end_has_come)
         taken = inbox.take()
-        shown = sum(one.head.messages for one in taken)
-        assert shown + inbox.dropped == recorder.feed.counts.sent
+        assert sum(one.head.messages for one in taken) + inbox.dropped == recorder.feed.counts.sent
         assert inbox.dropped > 0
         assert taken[0].head.kind is Kind.DEFINITIONS
         assert sum(len(one.data) for one in taken) <= 150_000
 
 
-def test_spawned_relay_is_in_a_session_of_its_own_and_ends_when_told(stage, tmp_path):
+def test_spawned_relay_is_in_a_session_of_its_own_and_ends_on_request(stage, tmp_path):
     output = tmp_path / "spawned.rrd"
     relay = spawn_relay(stage.path, ["--save", str(output)])
     try:

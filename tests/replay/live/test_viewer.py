@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-import undulog
 from support.live_stage import WAIT_S
 from support.processes import freeze, listening
 from undulog.replay.viewer.viewer import free_ports, viewer_binary
@@ -38,8 +37,7 @@ def test_frozen_and_killed_viewer_costs_the_feed_nothing(stage, server):
     assert recorder.send(1.0, 2.0) == 50
     process.kill()
     assert recorder.send(2.0) >= 49
-    assert recorder.feed.counts.dropped == 0
-    assert relay.process.poll() is None
+    assert (recorder.feed.counts.dropped, relay.process.poll()) == (0, None)
     relay.process.send_signal(signal.SIGTERM)
     relay.process.communicate(timeout=WAIT_S)
     assert not stage.path.exists()
@@ -75,8 +73,7 @@ def test_web_serves_this_machine_only_and_leaves_nothing(stage):
         Path(f"/proc/{relay.process.pid}/task/{relay.process.pid}/children").read_text().split()
     )
     ports = {int(text) for text in re.findall(r"(?:127.0.0.1:|127.0.0.1%3A)(\d+)", page)}
-    assert len(ports) == 2
-    assert listening(*ports) == {("0100007F", port) for port in ports}
+    assert (len(ports), listening(*ports)) == (2, {("0100007F", port) for port in ports})
     relay.process.send_signal(signal.SIGINT)
     relay.process.communicate(timeout=WAIT_S)
     assert relay.process.returncode == 0
@@ -93,13 +90,11 @@ def test_web_serves_this_machine_only_and_leaves_nothing(stage):
         (["--live", "s", "--connect", "x", "--web"], "without --web"),
     ],
 )
-def test_wrong_usage_is_told(arguments, why, capsys):
-    assert undulog.run(["view", *arguments]) == 2
-    assert why in capsys.readouterr().err
+def test_wrong_usage_is_refused(arguments, why, command):
+    assert why in command("view", *arguments, code=2).err
 
 
-def test_window_without_a_display_is_refused_at_once(monkeypatch, tmp_path, capsys):
+def test_window_without_a_display_is_refused_at_once(monkeypatch, tmp_path, command):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
-    assert undulog.run(["view", "--live", str(tmp_path / "s")]) == 2
-    assert "no display" in capsys.readouterr().err
+    assert "no display" in command("view", "--live", tmp_path / "s", code=2).err

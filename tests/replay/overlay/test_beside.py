@@ -1,6 +1,5 @@
 """Sessions side by side, read back with Rerun's own reader and held against closed forms."""
 
-import json
 import math
 import signal
 from contextlib import ExitStack
@@ -60,11 +59,8 @@ class Wave:
     def head(self, t):
         """Where the head is in the world of this session [m], shape (n, 3)."""
         x, y = 0.2 * t, 0.03 * np.sin(2 * np.pi * self.frequency_hz * t)
-        cos, sin = math.cos(self.turn), math.sin(self.turn)
-        return np.stack(
-            [cos * x - sin * y + self.step[0], sin * x + cos * y + self.step[1], 0.025 + 0 * t],
-            axis=-1,
-        )
+        turned = (x + 1j * y) * np.exp(1j * self.turn) + complex(*self.step)
+        return np.stack([turned.real, turned.imag, np.full_like(t, 0.025)], axis=-1)
 
 
 @pytest.fixture(scope="module")
@@ -99,11 +95,14 @@ def make(chain):
             "/joint_states": (names, "rad", noisy, speed, 0.1 * speed),
             "/gait": (GAIT, "rad", np.hstack([np.full_like(wrapped, 0.4), wrapped])),
         }
-        left_out = [*([] if polled_s else ["/joint_sample_offset"]), *([] if gait else ["/gait"])]
+        if not polled_s:
+            del topics["/joint_sample_offset"]
+        if not gait:
+            del topics["/gait"]
         return write_topics(
             path,
             wave.epoch_ns + np.round(t * 1e9).astype(np.int64),
-            {topic: one for topic, one in topics.items() if topic not in left_out},
+            topics,
             head=wave.head(t),
             turn=np.array([0.0, 0.0, math.sin(wave.turn / 2), math.cos(wave.turn / 2)]),
             epoch_ns=wave.epoch_ns,
@@ -114,21 +113,13 @@ def make(chain):
     return write
 
 
-def view(capsys, *words, code=0):
-    """Runs the command; returns its standard output, or its complaint."""
-    got = undulog.run(["view", *map(str, words)])
-    told = capsys.readouterr()
-    assert got == code, told.err
-    return told.out if code == 0 else told.err
-
-
 @pytest.fixture
-def overlaid(capsys, tmp_path, read_back):
+def overlaid(command, tmp_path, read_back):
     """Puts sessions side by side: standard output, and what is in the file."""
 
     def save(*words):
-        out = view(capsys, *words, "--save", tmp_path / "x.rrd")
-        return out, read_back(tmp_path / "x.rrd")
+        path = tmp_path / "x.rrd"
+        return command("view", *words, "--save", path).out, read_back(path)
 
     return save
 
@@ -139,17 +130,9 @@ def degrees(found, entity):
 
 
 ROBOT = Wave()
-TWIN = Wave(
-    amplitude=0.35,
-    frequency_hz=0.8,
-    phase=5.3,
-    delay=0.25,
-    seconds=8.0,
-    rate_hz=90.0,
-    epoch_ns=EPOCH_NS + 86_400_000_000_000,
-    turn=math.radians(140.0),
-    step=(3.0, -2.0),
-)
+PLACE = {"turn": math.radians(140.0), "step": (3.0, -2.0)}
+TIMES = {"seconds": 8.0, "rate_hz": 90.0, "epoch_ns": EPOCH_NS + 86_400_000_000_000}
+TWIN = Wave(amplitude=0.35, frequency_hz=0.8, phase=5.3, delay=0.25, **TIMES, **PLACE)
 
 
 @pytest.fixture(scope="module")
@@ -172,9 +155,11 @@ def beside(files, read_back, tmp_path_factory):
     return found
 
 
-def test_every_session_keeps_its_entities_under_its_own_name(files, beside, read_back, tmp_path):
+def test_every_session_keeps_its_entities_under_its_own_name(
+    files, beside, read_back, tmp_path, command
+):
     for name, file in zip(("robot", "twin"), files, strict=True):
-        assert undulog.run(["view", str(file), "--save", str(tmp_path / f"{name}.rrd")]) == 0
+        command("view", file, "--save", tmp_path / f"{name}.rrd")
         alone = {e for e in read_back(tmp_path / f"{name}.rrd").entities if "__" not in e}
         assert {f"/{name}{entity}" for entity in alone} <= beside["time"].entities
     assert len(beside["time"].stores) == 1
@@ -233,17 +218,16 @@ def test_the_twin_is_laid_on_the_robot_where_both_begin(beside):
     assert apart[0] < 1e-6
     at = found.times("/compared/twin/head_distance") * 1e-9
     own = TWIN.head(at)[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + moved[:2]
-    np.testing.assert_allclose(
-        apart, np.linalg.norm(own - ROBOT.head(at)[:, :2], axis=1), atol=1e-4
-    )
+    expected = np.linalg.norm(own - ROBOT.head(at)[:, :2], axis=1)
+    np.testing.assert_allclose(apart, expected, atol=1e-4)
 
 
 @pytest.mark.slow
-def test_in_the_sessions_own_worlds_nothing_is_moved(files, read_back, tmp_path, capsys):
+def test_in_the_sessions_own_worlds_nothing_is_moved(files, read_back, tmp_path, report_of):
     path = tmp_path / "w.rrd"
-    told = json.loads(view(capsys, *files, "--place", "world", "--save", path, "--json"))
-    assert told["sessions"][1]["placed"] is None
-    assert "every body is drawn at the pose of its own session" in told["warnings"]
+    report = report_of("view", *files, "--place", "world", "--save", path)
+    assert report["sessions"][1]["placed"] is None
+    assert "every body is drawn at the pose of its own session" in report["warnings"]
     assert read_back(path).statics("/b/world", "Transform3D:translation") == []
 
 
@@ -251,9 +235,7 @@ def test_bodies_have_their_look_and_name_and_leave_when_their_session_ends(besid
     found = beside["time"]
     solid, wires = 3, 1
     for name, mode in (("robot", solid), ("twin", wires)):
-        modes = found.statics(f"/{name}/world/snake/measured", "Capsules3D:fill_mode")
-        assert [mode] in modes
-    for name in ("robot", "twin"):
+        assert [mode] in found.statics(f"/{name}/world/snake/measured", "Capsules3D:fill_mode")
         labels = found.column(f"/{name}/world/snake/name", "Points3D:labels")
         assert {label for row in labels for label in row} == {name}
     cleared = "/robot/world/snake"
@@ -262,28 +244,28 @@ def test_bodies_have_their_look_and_name_and_leave_when_their_session_ends(besid
     assert found.times("/twin/world/snake").size == 0
 
 
-def test_bars_and_their_differences_are_those_of_compare(make, tmp_path, overlaid):
+BAR_VALUES = "BarChart:values"
+
+
+def test_bars_and_their_differences_are_those_of_compare(make, tmp_path, overlaid, opened):
     slow = Wave(amplitude=0.36, delay=0.2)
     files = make(tmp_path / "a.mcap", ROBOT), make(tmp_path / "b.mcap", slow)
     _, found = overlaid(*files)
 
     def bar(entity, joint):
-        (drawn,) = found.static(f"{entity}/{joint}", "BarChart:values")
-        (height,) = drawn["buffer"]
+        ((height,),) = (one["buffer"] for one in found.static(f"{entity}/{joint}", BAR_VALUES))
         return height
 
-    with Session.open(files[0]) as a, Session.open(files[1]) as b:
-        comparison = compare_sessions(a, b, Choices(any_gait=True))
-    said = {(one.quantity, one.place): one for one in comparison.differences}
+    comparison = compare_sessions(*map(opened, files), Choices(any_gait=True))
+    noted = {(one.quantity, one.place): one for one in comparison.differences}
     for joint in NAMES:
         gain = bar("/compared/b/segments/gain/estimate", joint)
         lag = bar("/compared/b/segments/lag/estimate", joint)
         assert abs(gain - 100 * (0.36 / 0.4 - 1)) < 0.05
         assert abs(lag - math.degrees(0.1)) < 0.05
-        assert gain == pytest.approx(100 * said["gain", joint].difference.value)
-        assert lag == pytest.approx(math.degrees(said["lag", joint].difference.value))
-        own = bar("/compared/segments/gain/b/estimate", joint)
-        assert abs(own - 100 * (0.36 / 0.4 - 1)) < 0.05
+        assert gain == pytest.approx(100 * noted["gain", joint].difference.value)
+        assert lag == pytest.approx(math.degrees(noted["lag", joint].difference.value))
+        assert abs(bar("/compared/segments/gain/b/estimate", joint) - 100 * (0.36 / 0.4 - 1)) < 0.05
     facts = found.static("/compared/facts", "TextDocument:text")[0]
     said_first = facts.splitlines()[0].replace("\\", "")  # what Markdown would mark up is escaped
     assert said_first == f"**b (B) against a (A): {comparison.answer}.**"
@@ -295,22 +277,22 @@ def still(make, tmp_path_factory):
     return make(tmp_path_factory.mktemp("still") / "still.mcap", Wave(seconds=2.0), gait=False)
 
 
-def test_without_a_gait_phases_are_refused_and_times_are_not(files, still, make, tmp_path, capsys):
+def test_without_a_gait_phases_are_refused_and_times_are_not(files, still, make, tmp_path, command):
     back = make(tmp_path / "back.mcap", Wave(frequency_hz=-1.0, seconds=2.0))
     none = "no phase of a gait was logged (/gait) in still; align by --align time"
+    save = ("--save", tmp_path / "x.rrd")
     for how, other, why in (
         ("phase", still, none),
         ("gait", still, none),
         ("phase", back, "runs backwards in back"),
     ):
-        save = ("--save", tmp_path / "x.rrd")
-        assert why in view(capsys, files[0], other, "--align", how, *save, code=2)
+        assert why in command("view", files[0], other, "--align", how, *save, code=2).err
     assert not (tmp_path / "x.rrd").exists()
-    view(capsys, files[0], still, "--save", tmp_path / "x.rrd")
+    command("view", files[0], still, *save)
 
 
 def test_a_phase_is_found_where_it_was_first_reached():
-    """A gait at 1 Hz that rests from 2 s to 3 s, and is not heard of from 5 s to 6 s."""
+    """A gait at 1 Hz that rests from 2 s to 3 s, and is missing from 5 s to 6 s."""
     t = np.round(np.concatenate([np.arange(0, 5.005, 0.01), np.arange(6, 8.005, 0.01)]), 2)
     cycles = np.where(t < 2, t, np.where(t < 3, 2.0, t - 1.0))
     rhythm = Rhythm(np.round(t * 1e9).astype(np.int64), cycles)
@@ -321,11 +303,11 @@ def test_a_phase_is_found_where_it_was_first_reached():
     np.testing.assert_allclose(found[known] * 1e-9, np.array(expected)[known], atol=1e-8)
 
 
-def test_without_a_robot_the_other_body_stands_alone(files, make, read_back, tmp_path, capsys):
+def test_without_a_robot_the_other_body_stands_alone(files, make, read_back, tmp_path, report_of):
     bare = make(tmp_path / "bare.mcap", Wave(seconds=2.0), robot=False)
     for pair in ((files[0], bare), (bare, files[0])):
-        told = view(capsys, *pair, "--save", tmp_path / "x.rrd", "--force", "--json")
-        bodies = {one["name"]: one["body"] for one in json.loads(told)["sessions"]}
+        report = report_of("view", *pair, "--save", tmp_path / "x.rrd", "--force")
+        bodies = {one["name"]: one["body"] for one in report["sessions"]}
         assert bodies == {"a": True, "bare": False}
         found = read_back(tmp_path / "x.rrd")
         assert degrees(found, f"/compared/{pair[1].stem}/angles").shape[1] == len(NAMES)
@@ -339,9 +321,8 @@ def test_sessions_without_measured_angles_are_seen_too(chain, files, tmp_path, o
     out, found = overlaid(tmp_path / "c.mcap", files[0])
     assert "note: c: no measured joint angles on /joint_states" in out
     assert found.times("/c/joints/commanded").size == 100
-    assert {e for e in found.entities if e.startswith("/compared/places")} == {
-        f"/compared/places/a/{label}" for label in ("head", "middle", "tail")
-    }
+    places = {e for e in found.entities if e.startswith("/compared/places")}
+    assert places == {f"/compared/places/a/{label}" for label in ("head", "middle", "tail")}
     assert "/compared/a/angles" not in found.entities
 
 
@@ -351,8 +332,7 @@ def test_joints_in_common_are_compared_and_without_one_nothing_is(make, tmp_path
     other = make(tmp_path / "other.mcap", ROBOT, robot=False, names=("left", "right"))
     out, found = overlaid(long, short, other)
     assert found.static("/compared/short/angles", "SeriesLines:names") == list(NAMES[:3])
-    facts = found.static("/compared/facts", "TextDocument:text")[0]
-    assert "robot: chain5 → chain3" in facts
+    assert "robot: chain5 → chain3" in found.static("/compared/facts", "TextDocument:text")[0]
     assert "\nother (B) against long (A): not compared: no joint" in out
     assert "/compared/other/angles" not in found.entities
 
@@ -386,15 +366,12 @@ def test_from_the_start_of_the_gait_what_came_before_has_negative_times(
 def test_servos_polled_in_turn_differ_at_times_of_the_first(make, tmp_path, overlaid):
     wave = Wave(amplitude=0.3, frequency_hz=0.9, seconds=3.0)
     a = make(tmp_path / "a.mcap", Wave(seconds=3.0), noise=0.0, polled_s=1e-3)
-    b = make(tmp_path / "b.mcap", wave, noise=0.0, polled_s=1.5e-3)
-    _, found = overlaid(a, b)
+    _, found = overlaid(a, make(tmp_path / "b.mcap", wave, noise=0.0, polled_s=1.5e-3))
     entity, joints = "/compared/b/angles", np.arange(5)
     at = found.times(entity) * 1e-9
     np.testing.assert_array_equal(found.times(entity), found.times("/a/joints/measured"))
-    truth = np.rad2deg(
-        wave.angle(joints, wave.cycles(at)[:, None])
-        - ROBOT.angle(joints, ROBOT.cycles(at)[:, None])
-    )
+    own, first = (one.angle(joints, one.cycles(at)[:, None]) for one in (wave, ROBOT))
+    truth = np.rad2deg(own - first)
     inner = slice(2, -1)  # b begins later: nothing to subtract, and no line to the next sample
     away = np.abs(degrees(found, entity) - truth)[inner].max()
     assert away < chord(wave, 0.01) + chord(ROBOT, 0.01)
@@ -410,18 +387,18 @@ def test_servos_polled_in_turn_differ_at_times_of_the_first(make, tmp_path, over
         (["--json"], "--save"),
     ],
 )
-def test_wrong_usage_is_explained(files, tmp_path, capsys, words, complaint):
-    assert complaint in view(capsys, *files, *words, code=2)
-    said = view(capsys, files[0], "--align", "phase", "--save", tmp_path / "x.rrd", code=2)
-    assert "--align: needs two sessions or more" in said
+def test_wrong_usage_is_explained(files, tmp_path, command, words, complaint):
+    assert complaint in command("view", *files, *words, code=2).err
+    alone = ("view", files[0], "--align", "phase", "--save", tmp_path / "x.rrd")
+    assert "--align: needs two sessions or more" in command(*alone, code=2).err
 
 
 @pytest.mark.slow
-def test_files_of_one_name_are_told_apart(files, tmp_path, capsys):
-    told = json.loads(view(capsys, files[0], files[0], "--save", tmp_path / "x.rrd", "--json"))
-    assert [one["name"] for one in told["sessions"]] == ["a 1", "a 2"]
-    assert any("same content" in warning for warning in told["warnings"])
-    assert told["sessions"][1]["verdict"] == "same"
+def test_files_of_one_name_are_kept_apart(files, tmp_path, report_of):
+    report = report_of("view", files[0], files[0], "--save", tmp_path / "x.rrd")
+    assert [one["name"] for one in report["sessions"]] == ["a 1", "a 2"]
+    assert any("same content" in warning for warning in report["warnings"])
+    assert report["sessions"][1]["verdict"] == "same"
 
 
 @pytest.fixture(scope="module")
@@ -430,9 +407,7 @@ def converted(files, tmp_path_factory):
     folder = tmp_path_factory.mktemp("converted")
     with ExitStack() as stack:
         sessions = [stack.enter_context(Session.open(file)) for file in files]
-        sides = [
-            read_side(one, name) for one, name in zip(sessions, ("robot", "twin"), strict=True)
-        ]
+        sides = list(map(read_side, sessions, ("robot", "twin")))
         return [
             Converted(one, *convert(session, folder / f"{one.name}.rrd"))
             for one, session in zip(align(sides, Align.TIME), sessions, strict=True)
@@ -446,25 +421,23 @@ def test_an_end_that_is_asked_for_leaves_what_was_there(converted, tmp_path):
     stop.signal = signal.SIGTERM
     with pytest.raises(LogWriteError, match="stopped on request"):
         write_overlay(converted, path, Align.TIME, stop=stop)
-    assert path.read_bytes() == b"mine"
-    assert list(tmp_path.iterdir()) == [path]
+    assert (path.read_bytes(), list(tmp_path.iterdir())) == (b"mine", [path])
 
 
-def test_an_end_that_is_asked_for_is_noticed_while_a_session_is_read(files, tmp_path):
+def test_an_end_that_is_asked_for_is_noticed_while_a_session_is_read(files, tmp_path, opened):
     path, stop, steps = tmp_path / "x.rrd", StopRequest(), []
-    with Session.open(files[0]) as opened:
-        session = opened.view(on_read=partial(check_stop, path, stop))
-        assert session.joints("/joint_states").names
-        stop.signal = signal.SIGTERM
-        for read in (
-            lambda: next(session.messages("/joint_states")),
-            lambda: session.joints("/joint_states"),
-            lambda: session.table("/joint_states"),
-            lambda: session.columns({"/joint_states": ["position"]}, {}),
-            session.forget,
-        ):
-            with pytest.raises(LogWriteError, match="stopped on request"):
-                read()
+    session = opened(files[0]).view(on_read=partial(check_stop, path, stop))
+    assert session.joints("/joint_states").names
+    stop.signal = signal.SIGTERM
+    for read in (
+        lambda: next(session.messages("/joint_states")),
+        lambda: session.joints("/joint_states"),
+        lambda: session.table("/joint_states"),
+        lambda: session.columns({"/joint_states": ["position"]}, {}),
+        session.forget,
+    ):
+        with pytest.raises(LogWriteError, match="stopped on request"):
+            read()
 
     stop.signal = None
 
@@ -474,8 +447,7 @@ def test_an_end_that_is_asked_for_is_noticed_while_a_session_is_read(files, tmp_
 
     with pytest.raises(LogWriteError, match="stopped on request"):
         combine_sessions(files, path, stop=stop, on_step=at_the_first_recording)
-    assert steps[0] == "angles"
-    assert len(steps) == 2
+    assert (steps[0], len(steps)) == ("angles", 2)
     assert not list(tmp_path.iterdir())
 
 

@@ -107,13 +107,11 @@ def test_every_sample_is_in_one_stretch(session_file, monkeypatch):
 
 def test_a_span_is_half_open():
     t_ns = np.arange(10, dtype=np.int64)
-    assert Span(2, 5).rows(t_ns) == slice(2, 5)
-    assert Span().rows(t_ns) == slice(0, 10)
+    assert (Span(2, 5).rows(t_ns), Span().rows(t_ns)) == (slice(2, 5), slice(0, 10))
 
 
-def test_a_survey_finds_lines_parts_and_how_far_to_look(session_file, snake25):
-    with Session.open(session_file) as session:
-        found = survey(session, 50.0)
+def test_a_survey_finds_lines_parts_and_how_far_to_look(session_file, snake25, opened):
+    found = survey(opened(session_file), 50.0)
     assert found.parts["/joints/measured"] == (snake25.joint_names,)  # in turn: drawn together
     assert [one.name for one in found.samples["/joints/measured"]] == list(snake25.joint_names)
     assert found.wanted["/joint_states"] == ["position", "velocity", "effort"]

@@ -5,84 +5,66 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from undulog.replay.samples.tracks import (
-    LEVELS,
-    Track,
-    decimate,
-    gaps,
-    hold,
-    in_turn,
-    interpolate,
-    join_tracks,
-    mark_gaps,
-    ordered,
-    plot_step,
-    resampled,
-    rounded,
-    tables,
-    typical_step_ns,
-    without_filler,
-)
+from undulog.replay.samples import tracks
 
 T = np.arange(5, dtype=np.int64) * 10
 
 
 def track(name, t_ns=T, values=None):
-    return Track(name, t_ns, np.arange(len(t_ns), dtype=float) if values is None else values)
+    return tracks.Track(name, t_ns, np.arange(len(t_ns), dtype=float) if values is None else values)
 
 
 def test_joints_with_the_same_times_share_one_table():
-    (table,) = tables([track("a"), track("b", T.copy(), 2.0 * np.arange(5))])
+    (table,) = tracks.tables([track("a"), track("b", T.copy(), 2.0 * np.arange(5))])
     assert table.names == ("a", "b")
     np.testing.assert_array_equal(table.values, np.stack([np.arange(5), 2 * np.arange(5)], axis=1))
 
 
 def test_joints_with_times_of_their_own_keep_them():
-    found = tables([track("a"), track("b", T + 3), track("c")])
+    found = tracks.tables([track("a"), track("b", T + 3), track("c")])
     assert [table.names for table in found] == [("a", "c"), ("b",)]
     np.testing.assert_array_equal(found[1].t_ns, T + 3)
 
 
 def test_nan_that_fills_up_foreign_messages_is_left_out():
-    values = np.array([0.0, np.nan, np.nan, np.nan, 4.0])
-    found = without_filler(track("a", T, values))
+    found = tracks.without_filler(track("a", T, np.array([0.0, np.nan, np.nan, np.nan, 4.0])))
     np.testing.assert_array_equal(found.t_ns, [0, 40])
     np.testing.assert_array_equal(found.values, [0.0, 4.0])
 
 
 def test_a_lost_sample_stays_a_hole():
     lossy = track("a", T, np.array([0.0, 1.0, np.nan, 3.0, 4.0]))
-    assert without_filler(lossy) is lossy
+    assert tracks.without_filler(lossy) is lossy
 
 
 def test_resampling_puts_columns_in_order_and_leaves_unknown_joints_nan():
-    found = resampled([track("b", T + 5), track("a")], ("a", "x", "b"), T[1:3], interpolate)
+    b = track("b", T + 5)
+    found = tracks.resampled([b, track("a")], ("a", "x", "b"), T[1:3], tracks.interpolate)
     np.testing.assert_allclose(found[:, [0, 2]], [[1.0, 0.5], [2.0, 1.5]])
     assert np.isnan(found[:, 1]).all()
-    np.testing.assert_array_equal(
-        resampled([track("b", T + 5)], ("b",), T[1:3], hold), [[0.0], [1.0]]
-    )
+    held = tracks.resampled([b], ("b",), T[1:3], tracks.hold)
+    np.testing.assert_array_equal(held, [[0.0], [1.0]])
 
 
 def test_joints_in_turn_have_one_sample_between_two_of_the_first():
     t = 10 * np.arange(5, dtype=np.int64)
-    assert in_turn(t, t + 3)
-    assert in_turn(t, t - 3)
-    assert in_turn(t[[0, 1, 3, 4]], t[[0, 1, 3, 4]] + 3)  # a pause of both
-    assert not in_turn(t, t[::2] + 3)
-    assert not in_turn(t, np.sort(np.concatenate([t + 3, t + 6])))
-    assert not in_turn(t, t[:0])
+    assert tracks.in_turn(t, t + 3)
+    assert tracks.in_turn(t, t - 3)
+    assert tracks.in_turn(t[[0, 1, 3, 4]], t[[0, 1, 3, 4]] + 3)  # a pause of both
+    assert not tracks.in_turn(t, t[::2] + 3)
+    assert not tracks.in_turn(t, np.sort(np.concatenate([t + 3, t + 6])))
+    assert not tracks.in_turn(t, t[:0])
 
 
 def test_joints_in_turn_are_brought_to_the_first_ones_times():
-    table = join_tracks([track("a"), track("b", T - 4, 0.1 * (T - 4))])
+    table = tracks.join_tracks([track("a"), track("b", T - 4, 0.1 * (T - 4))])
     assert table.names == ("a", "b")
     np.testing.assert_array_equal(table.t_ns, T)
     np.testing.assert_allclose(table.values[:-1, 1], 0.1 * T[:-1], atol=1e-12)
     assert np.isnan(table.values[-1, 1])  # nothing comes after it
 
 
-MS = 1_000_000
+MS, NAN = 1_000_000, np.nan
 
 
 def ticks(*milliseconds):
@@ -91,11 +73,11 @@ def ticks(*milliseconds):
 
 def test_a_rate_keeps_at_most_that_many_samples_a_second():
     t = np.arange(1000, dtype=np.int64) * 10 * MS
-    np.testing.assert_array_equal(decimate(t, 50.0), np.arange(0, 1000, 2))
+    np.testing.assert_array_equal(tracks.decimate(t, 50.0), np.arange(0, 1000, 2))
     jittered = t + np.random.default_rng(1).integers(-2 * MS, 2 * MS, 1000)
-    assert np.array_equal(decimate(jittered, 50.0) % 2, np.zeros(500))
-    assert len(decimate(10 * t[:20], 50.0)) == 20
-    assert decimate(ticks(), 50.0).size == 0
+    assert np.array_equal(tracks.decimate(jittered, 50.0) % 2, np.zeros(500))
+    assert len(tracks.decimate(10 * t[:20], 50.0)) == 20
+    assert tracks.decimate(ticks(), 50.0).size == 0
 
 
 @given(
@@ -107,7 +89,7 @@ def test_a_rate_keeps_at_most_that_many_samples_a_second():
 def test_a_straight_line_is_interpolated_exactly_or_not_at_all(steps, slope, offset, wanted):
     t = np.cumsum(np.array(steps, dtype=np.int64)) * MS
     at = np.array(wanted, dtype=np.int64) * MS
-    found = interpolate(t, slope * t / MS + offset, at)
+    found = tracks.interpolate(t, slope * t / MS + offset, at)
     known = np.isfinite(found)
     np.testing.assert_allclose(found[known], (slope * at / MS + offset)[known], atol=1e-9)
     assert not known[(at < t[0]) | (at > t[-1])].any()
@@ -116,58 +98,52 @@ def test_a_straight_line_is_interpolated_exactly_or_not_at_all(steps, slope, off
 
 def test_nothing_is_drawn_across_a_gap():
     t = ticks(0, 10, 20, 30, 200, 210)
-    assert gaps(t).tolist() == [False, False, False, True, False]
-    found = interpolate(t, np.arange(6.0), ticks(25, 30, 35, 100, 200, 205))
+    assert tracks.gaps(t).tolist() == [False, False, False, True, False]
+    found = tracks.interpolate(t, np.arange(6.0), ticks(25, 30, 35, 100, 200, 205))
     np.testing.assert_array_equal(found, [2.5, 3.0, np.nan, np.nan, 4.0, 4.5])
 
 
 @pytest.mark.parametrize(
     ("t", "values", "at", "expected"),
     [
-        (
-            (0, 10, 20, 30),
-            [0.0, np.nan, 2.0, 3.0],
-            (0, 5, 10, 15, 20, 25),
-            [0, *[np.nan] * 3, 2, 2.5],
-        ),
+        ((0, 10, 20, 30), [0, NAN, 2, 3], (0, 5, 10, 15, 20, 25), [0, NAN, NAN, NAN, 2, 2.5]),
         ((0, 10), [[0.0, 10.0], [1.0, 20.0]], (5,), [[0.5, 15.0]]),
     ],
 )
 def test_a_missing_sample_spoils_its_neighbourhood_only(t, values, at, expected):
-    found = interpolate(ticks(*t), np.array(values), ticks(*at))
+    found = tracks.interpolate(ticks(*t), np.array(values), ticks(*at))
     np.testing.assert_array_equal(found, expected)
 
 
 def test_a_command_is_held_until_the_next():
-    t = ticks(0, 10, 20)
-    found = hold(t, np.array([1.0, 2.0, 3.0]), ticks(-1, 0, 9, 10, 19, 69, 71))
+    at = ticks(-1, 0, 9, 10, 19, 69, 71)
+    found = tracks.hold(ticks(0, 10, 20), np.array([1.0, 2.0, 3.0]), at)
     np.testing.assert_array_equal(found, [np.nan, 1.0, 1.0, 2.0, 2.0, 3.0, np.nan])
 
 
 def test_without_samples_nothing_is_known():
-    assert np.isnan(interpolate(ticks(), np.zeros(0), ticks(1))).all()
-    assert np.isnan(hold(ticks(), np.zeros(0), ticks(1))).all()
-    assert typical_step_ns(ticks(5)) == 0
+    assert np.isnan(tracks.interpolate(ticks(), np.zeros(0), ticks(1))).all()
+    assert np.isnan(tracks.hold(ticks(), np.zeros(0), ticks(1))).all()
+    assert tracks.typical_step_ns(ticks(5)) == 0
 
 
 def test_a_gap_gets_one_row_of_nan_a_step_after_its_last_sample():
-    t, values = mark_gaps(ticks(0, 10, 20, 100, 110), np.arange(5.0)[:, None])
+    t, values = tracks.mark_gaps(ticks(0, 10, 20, 100, 110), np.arange(5.0)[:, None])
     np.testing.assert_array_equal(t, ticks(0, 10, 20, 30, 100, 110))
     np.testing.assert_array_equal(values[:, 0], [0, 1, 2, np.nan, 3, 4])
 
 
 def test_silence_before_the_end_is_a_gap():
     t, values = ticks(0, 10, 20), np.zeros((3, 2))
-    found = mark_gaps(t, values, end_ns=100 * MS)
+    found = tracks.mark_gaps(t, values, end_ns=100 * MS)
     np.testing.assert_array_equal(found[0], ticks(0, 10, 20, 30))
     assert np.isnan(found[1][-1]).all()
-    whole = mark_gaps(t, values, end_ns=40 * MS)
-    assert whole[0] is t
-    assert whole[1] is values
+    whole = tracks.mark_gaps(t, values, end_ns=40 * MS)
+    assert all(one is given for one, given in zip(whole, (t, values), strict=True))
 
 
 def test_samples_out_of_order_are_sorted():
-    t, values = ordered(ticks(10, 0, 20), np.array([1.0, 0.0, 2.0]))
+    t, values = tracks.ordered(ticks(10, 0, 20), np.array([1.0, 0.0, 2.0]))
     np.testing.assert_array_equal(t, ticks(0, 10, 20))
     np.testing.assert_array_equal(values, [0.0, 1.0, 2.0])
 
@@ -175,35 +151,33 @@ def test_samples_out_of_order_are_sorted():
 @pytest.mark.parametrize("count", [0, 1])
 def test_too_few_samples_have_no_gaps(count):
     t = ticks(*range(count))
-    assert gaps(t).size == 0
-    assert mark_gaps(t, np.zeros((count, 1)))[0].size == count
+    assert tracks.gaps(t).size == 0
+    assert tracks.mark_gaps(t, np.zeros((count, 1)))[0].size == count
 
 
 @pytest.mark.parametrize("size", [1e-6, 0.3, 45.0, 1e5])
 def test_a_step_is_a_power_of_two_below_a_five_hundredth_of_the_range(size):
     values = size * np.sin(np.linspace(0.0, 20.0, 5000))
-    step = plot_step(values)
+    step = tracks.plot_step(values)
     assert np.log2(step) == np.round(np.log2(step))
     room = np.ptp(np.quantile(values, [0.01, 0.99]))
-    assert room / LEVELS / 2 < step <= room / LEVELS
-    apart = np.abs(rounded(values[:, None], [step])[:, 0] - values)
-    assert apart.max() <= room / 1000
+    assert room / tracks.LEVELS / 2 < step <= room / tracks.LEVELS
+    assert np.abs(tracks.rounded(values[:, None], [step])[:, 0] - values).max() <= room / 1000
 
 
 def test_a_step_follows_the_range_of_nearly_all_samples():
     values = np.sin(np.linspace(0.0, 20.0, 5000))
     spiky = values.copy()
     spiky[::500] = 1e6
-    assert plot_step(spiky) == plot_step(values)
+    assert tracks.plot_step(spiky) == tracks.plot_step(values)
     still = np.zeros(5000)
     still[100:110] = 1.0
-    assert plot_step(still) == 2.0**-9  # of its whole range
+    assert tracks.plot_step(still) == 2.0**-9  # of its whole range
 
 
 def test_a_flat_line_and_no_line_are_left_alone():
-    assert (
-        plot_step(np.full(10, 3.3)) == plot_step(np.zeros(0)) == plot_step(np.full(3, np.nan)) == 0
-    )
+    flat = (np.full(10, 3.3), np.zeros(0), np.full(3, np.nan))
+    assert [tracks.plot_step(one) for one in flat] == [0, 0, 0]
     values = np.array([[0.1, 0.1], [np.nan, 0.3]])
-    np.testing.assert_array_equal(rounded(values, [0.0, 0.0]), values)
-    np.testing.assert_array_equal(rounded(values, [0.25, 0.0]), [[0.0, 0.1], [np.nan, 0.3]])
+    np.testing.assert_array_equal(tracks.rounded(values, [0.0, 0.0]), values)
+    np.testing.assert_array_equal(tracks.rounded(values, [0.25, 0.0]), [[0.0, 0.1], [np.nan, 0.3]])

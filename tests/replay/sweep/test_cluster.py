@@ -5,12 +5,11 @@ import os
 import signal
 import socket
 import sys
-import time
 from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from support.processes import UNDULOG, process, undulog
+from support.processes import UNDULOG, listening, process, undulog, wait_for
 from support.sweep_plans import comparable, write_plan
 from undulog.replay.sweep.rows import RowStore
 
@@ -26,13 +25,7 @@ def free_port():
 def scheduler(port):
     words = (sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1")
     with process(*words, "--port", port, "--no-dashboard", "--no-jupyter") as running:
-        until = time.monotonic() + 60
-        while time.monotonic() < until:
-            try:
-                socket.create_connection(("127.0.0.1", port), 1).close()
-                break
-            except OSError:
-                time.sleep(0.05)
+        wait_for(lambda: listening(port), "the scheduler", alive=[running])
         yield running
 
 
@@ -48,19 +41,15 @@ def rows_of(output):
     return comparable(RowStore(str(output)).rows())
 
 
-def wait_for(output, rows):
-    until = time.monotonic() + 200
-    while len(list(output.glob("pending/*.json"))) < rows:
-        assert time.monotonic() < until
-        time.sleep(0.01)
+def wait_for_rows(output, rows):
+    wait_for(lambda: len(list(output.glob("pending/*.json"))) >= rows, "rows", 200)
 
 
 @pytest.fixture(scope="module")
 def local(tmp_path_factory):
     """The same sweep on the processes of this computer."""
     folder = tmp_path_factory.mktemp("local")
-    plan = write_plan(folder, STRENGTHS)
-    assert undulog("sweep", plan, "-o", folder / "rows").returncode == 0
+    assert undulog("sweep", write_plan(folder, STRENGTHS), "-o", folder / "rows").returncode == 0
     return rows_of(folder / "rows")
 
 
@@ -73,11 +62,11 @@ def test_rows_are_the_same_though_worker_and_scheduler_are_killed(local, tmp_pat
         first = stack.enter_context(scheduler(port))
         stack.enter_context(workers(port, tmp_path / "dask1"))
         sweep = stack.enter_context(process(*words))
-        wait_for(output, 2)
+        wait_for_rows(output, 2)
         names = [json.loads(p.read_text())["worker"] for p in output.glob("pending/*.json")]
 
         os.kill(int(names[0].rpartition(":")[2]), signal.SIGKILL)
-        wait_for(output, 6)
+        wait_for_rows(output, 6)
         first.kill()
         first.wait()
         stack.enter_context(scheduler(port))
@@ -95,16 +84,11 @@ def test_a_sweep_on_a_cluster_can_be_interrupted_and_goes_on_here(local, tmp_pat
     plan, output, port = write_plan(tmp_path, STRENGTHS), tmp_path / "rows", free_port()
     words = (*UNDULOG, "sweep", plan, "-o", output, "--json")
     cluster = ("--cluster", f"tcp://127.0.0.1:{port}")
-    with (
-        scheduler(port),
-        workers(port, tmp_path / "dask"),
-        process(*words, *cluster) as sweep,
-    ):
-        wait_for(output, 3)
+    with scheduler(port), workers(port, tmp_path / "dask"), process(*words, *cluster) as sweep:
+        wait_for_rows(output, 3)
         sweep.send_signal(signal.SIGINT)
         out, _ = sweep.communicate(timeout=60)
-    report = json.loads(out)
-    assert report["complete"] is False
+    assert json.loads(out)["complete"] is False
     there = len(rows_of(output))
     rest = json.loads(undulog(*words[3:]).stdout)
     assert (rest["there_before"], rest["run"]) == (there, 20 - there)
@@ -113,8 +97,7 @@ def test_a_sweep_on_a_cluster_can_be_interrupted_and_goes_on_here(local, tmp_pat
 
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path):
     address = f"tcp://127.0.0.1:{free_port()}"
-    plan = write_plan(tmp_path)
-    done = undulog("sweep", plan, "-o", tmp_path / "rows", "--cluster", address)
+    done = undulog("sweep", write_plan(tmp_path), "-o", tmp_path / "rows", "--cluster", address)
     assert done.returncode == 1
     assert f"{address}: no Dask scheduler answers" in done.stderr
     assert "Traceback" not in done.stderr

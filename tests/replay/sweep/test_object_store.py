@@ -8,7 +8,6 @@ import pytest
 from support.bucket import s3_bucket
 from support.processes import undulog
 from support.sweep_plans import comparable, write_plan
-from undulog.capture import Session
 from undulog.replay.sweep.rows import RowStore
 
 
@@ -19,7 +18,7 @@ def bucket(monkeypatch):
 
 
 @pytest.mark.slow
-def test_rows_in_a_bucket_are_those_of_a_folder(bucket, tmp_path):
+def test_rows_in_a_bucket_are_those_of_a_folder(bucket, tmp_path, opened):
     plan, url = write_plan(tmp_path, (0.1, 0.2), top="sessions = true"), "s3://robots/strength"
     assert undulog("sweep", plan, "-o", tmp_path / "rows").returncode == 0
     done = undulog("sweep", plan, "-o", url, "--json")
@@ -35,8 +34,7 @@ def test_rows_in_a_bucket_are_those_of_a_folder(bucket, tmp_path):
     bucket.download_file("robots", names[0], str(tmp_path / "rows.parquet"))
     assert pd.read_parquet(tmp_path / "rows.parquet").status.to_list() == ["done", "done"]
     bucket.download_file("robots", names[1], str(tmp_path / "run.mcap"))
-    with Session.open(tmp_path / "run.mcap") as session:
-        assert session.session_id in {row["session_id"] for row in rows}
+    assert opened(tmp_path / "run.mcap").session_id in {row["session_id"] for row in rows}
 
 
 @pytest.mark.slow

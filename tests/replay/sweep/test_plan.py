@@ -27,8 +27,7 @@ def test_a_grid_has_every_combination_once_and_each_seed(tmp_path):
     path = write_plan(tmp_path, (0.1, 0.2, 0.3), seeds=2, top="first_seed = 7")
     path.write_text(path.read_text() + '[parameters."noise.position"]\nvalues = [0.0, 0.01]\n')
     runs = list(runs_of(read_plan(path)))
-    assert len(runs) == 12
-    assert {seed for _, seed in runs} == {7, 8}
+    assert (len(runs), {seed for _, seed in runs}) == (12, {7, 8})
     pairs = {(one["servo.stall_torque"], one["noise.position"]) for one, _ in runs}
     assert pairs == {(a, b) for a in (0.1, 0.2, 0.3) for b in (0.0, 0.01)}
 
@@ -61,7 +60,7 @@ def test_a_sobol_design_covers_better_than_chance():
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("[", "syntax"),
         ('scenario = "flat"', "parameters"),
@@ -70,20 +69,17 @@ def test_a_sobol_design_covers_better_than_chance():
         ('scenario = "flat"\n[parameters.x]\nlow = 1\nhigh = 2', "random or sobol"),
         ('scenario = "flat"\npoints = 2\n[parameters.x]\nvalues = [1]', "none for grid"),
         ('scenario = "flat"\ndesign = "sobol"\n[parameters.x]\nlow = 1\nhigh = 2', "points"),
-        (
-            RANGE + "low = -1\nhigh = 2\nlog = true",
-            "above 0",
-        ),
+        (f"{RANGE}low = -1\nhigh = 2\nlog = true", "above 0"),
         ('scenario = "flat"\n[parameters.seed]\nvalues = [1]', "first_seed"),
         ('scenario = "flat"\nseeds = 2000000\n[parameters.x]\nvalues = [1]', "at most 1000000"),
         ('scenario = "flat"\nfoo = 1\n[parameters.x]\nvalues = [1]', "foo"),
         ('scenario = "flat"\nduration_s = 1\n[parameters.duration_s]\nvalues = [1]', "left out"),
     ],
 )
-def test_what_can_not_be_meant_is_refused_with_the_key(text, said, tmp_path):
+def test_what_can_not_be_meant_is_refused_with_the_key(text, message, tmp_path):
     path = tmp_path / "plan.toml"
     path.write_text(text)
-    with pytest.raises(PlanError, match=said):
+    with pytest.raises(PlanError, match=message):
         read_plan(path)
 
 
@@ -92,5 +88,4 @@ def test_the_plan_of_the_manual_is_one(tmp_path):
     path = tmp_path / "strength.toml"
     path.write_text(page.split("```toml\n")[1].split("```")[0])
     sweep = prepare(read_plan(path), tmp_path, str(tmp_path / "strength"))
-    assert len(sweep.jobs) == 16
-    assert sweep.simulated_s == 16.0
+    assert (len(sweep.jobs), sweep.simulated_s) == (16, 16.0)

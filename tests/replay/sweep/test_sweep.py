@@ -3,13 +3,12 @@
 import json
 import os
 import signal
-import time
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from support.processes import UNDULOG, process, run, undulog
+from support.processes import UNDULOG, process, run, undulog, wait_for
 from support.sweep_plans import comparable, write_plan
 from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
@@ -77,9 +76,7 @@ def test_a_dry_run_runs_nothing(reference, tmp_path):
     assert "10 runs of 2 s: 5 points of a grid design, 2 seeds each" in done.stdout
     assert "to run: 10" in done.stdout
     assert not (tmp_path / "rows").exists()
-    there = json.loads(
-        undulog("sweep", plan, "-o", reference / "rows", "--dry-run", "--json").stdout
-    )
+    there, _ = swept(plan, reference / "rows", "--dry-run")
     assert (there["to_run"], there["estimated_s"]) == (0, 0)
 
 
@@ -115,7 +112,7 @@ def test_parameters_of_robot_and_analysis(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (("servo.stall_torque", "servo.stal_torque"), "stal_torque"),
         (("servo.stall_torque", "robot.chian.joints"), "chian"),
@@ -123,27 +120,23 @@ def test_parameters_of_robot_and_analysis(tmp_path):
         (('"wave.toml"', '"wvae"'), "wvae"),
     ],
 )
-def test_a_key_that_is_none_is_refused_before_anything_runs(change, said, tmp_path):
+def test_a_key_that_is_none_is_refused_before_anything_runs(change, message, tmp_path):
     plan = write_plan(tmp_path)
     plan.write_text(plan.read_text().replace(*change))
     done = undulog("sweep", plan, "-o", tmp_path / "rows")
     assert done.returncode in (1, 2)
-    assert said in done.stderr
+    assert message in done.stderr
     assert not (tmp_path / "rows").exists()
 
 
-def _begun(output, rows):
-    """Wait until so many rows are there."""
-    until = time.monotonic() + 120
-    while len(list(Path(output).glob("pending/*.json"))) < rows:
-        assert time.monotonic() < until
-        time.sleep(0.01)
+def _begun(output):
+    """Wait until a row is there."""
+    wait_for(lambda: list(output.glob("pending/*.json")), "a row", 120)
 
 
 def _workers(parent):
     """Processes that work for a sweep, by id; the tracker of resources is none."""
-    found = run("pgrep", "-P", parent, "-f", "spawn_main").stdout.split()
-    return [int(word) for word in found]
+    return [int(word) for word in run("pgrep", "-P", parent, "-f", "spawn_main").stdout.split()]
 
 
 def _alive(worker):
@@ -159,7 +152,7 @@ def test_an_interrupted_sweep_goes_on_where_it_stopped(number, reference, tmp_pa
     plan = write_plan(tmp_path, STRENGTHS, seeds=2, top="sessions = true")
     words = (*UNDULOG, "sweep", plan, "-o", tmp_path / "rows", "--workers", "2", "--json")
     with process(*words) as sweep:
-        _begun(tmp_path / "rows", 1)
+        _begun(tmp_path / "rows")
         workers = _workers(sweep.pid)
         assert len(workers) == 2
         sweep.send_signal(number)
@@ -169,10 +162,7 @@ def test_an_interrupted_sweep_goes_on_where_it_stopped(number, reference, tmp_pa
     if number != signal.SIGKILL:
         report = json.loads(out)
         assert (report["run"], report["complete"], sweep.returncode) == (there, False, 1)
-    until = time.monotonic() + 20
-    while any(_alive(worker) for worker in workers):
-        assert time.monotonic() < until  # workers end with their coordinator
-        time.sleep(0.05)
+    wait_for(lambda: not any(map(_alive, workers)), "workers end with their coordinator", 20)
     rest, code = swept(plan, tmp_path / "rows")
     assert (rest["there_before"], rest["run"], code) == (there, 10 - there, 0)
     assert rows_of(tmp_path / "rows") == rows_of(reference / "rows")
@@ -183,7 +173,7 @@ def test_a_worker_that_is_killed_takes_no_row_with_it(reference, tmp_path):
     plan = write_plan(tmp_path, STRENGTHS, seeds=2, top="sessions = true")
     words = (*UNDULOG, "sweep", plan, "-o", tmp_path / "rows", "--workers", "2", "--json")
     with process(*words) as sweep:
-        _begun(tmp_path / "rows", 1)
+        _begun(tmp_path / "rows")
         os.kill(_workers(sweep.pid)[0], signal.SIGKILL)
         out, err = sweep.communicate(timeout=120)
     report = json.loads(out)

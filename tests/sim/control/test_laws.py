@@ -7,14 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from undulog.sim.control.filters import (
-    BodyWave,
-    LowPass,
-    NearMemory,
-    PathHeading,
-    PhaseHistory,
-    SideLatch,
-)
+from undulog.sim.control import filters
 from undulog.sim.control.reactions import amplitude, bend, frequency
 
 DISTANCES = np.linspace(0.0, 3.0, 31)
@@ -41,14 +34,13 @@ def test_amplitude_falls_smoothly_from_far_to_contact():
 
 
 def test_frequency_is_bounded():
-    assert frequency(0.0, 0.5, 2.0) == 1.5
-    assert frequency(math.inf, 0.5, 2.0) == 1.0
+    assert (frequency(0.0, 0.5, 2.0), frequency(math.inf, 0.5, 2.0)) == (1.5, 1.0)
     assert frequency(0.5, 0.5, 2.0) == pytest.approx(1.0 + 0.5 / math.e)
 
 
 @given(st.floats(0.0, 3.0), st.floats(-5, 5), st.floats(0.01, 2.0))
 def test_low_pass_is_the_exact_step_response_however_it_is_cut(time_s, height, time_constant_s):
-    cut = LowPass(time_constant_s, 0.0)
+    cut = filters.LowPass(time_constant_s, 0.0)
     for _ in range(7):
         cut.step(time_s / 7, height)
     whole = height * (1.0 - math.exp(-time_s / time_constant_s))
@@ -56,17 +48,16 @@ def test_low_pass_is_the_exact_step_response_however_it_is_cut(time_s, height, t
 
 
 def test_low_pass_without_time_constant_passes_arrays():
-    np.testing.assert_array_equal(LowPass(0.0, np.zeros(2)).step(0.01, np.ones(2)), [1, 1])
+    np.testing.assert_array_equal(filters.LowPass(0.0, np.zeros(2)).step(0.01, np.ones(2)), [1, 1])
 
 
 def test_the_freer_side_is_latched():
-    latch = SideLatch(margin_m=0.05, hold_s=1.0)
+    latch = filters.SideLatch(margin_m=0.05, hold_s=1.0)
     inf = math.inf
     assert latch.step(0.0, inf, inf) == 1  # a tie: at first to the right
     assert latch.step(0.1, inf, 0.5) == -1  # the left is free
     assert latch.step(0.5, 0.3, inf) == -1  # held for a second
-    assert latch.step(1.09, 0.3, inf) == -1
-    assert latch.step(1.1, 0.3, inf) == 1
+    assert (latch.step(1.09, 0.3, inf), latch.step(1.1, 0.3, inf)) == (-1, 1)
     assert latch.step(9.0, 0.52, 0.5) == 1  # within the margin
     assert latch.step(9.1, inf, inf) == 1  # a tie: the last one
     assert latch.step(9.2, 0.56, 0.5) == -1
@@ -74,7 +65,7 @@ def test_the_freer_side_is_latched():
 
 def test_a_head_between_two_walls_changes_sides_at_most_once_a_second():
     random = np.random.default_rng(3)
-    latch = SideLatch(0.02, 1.0)
+    latch = filters.SideLatch(0.02, 1.0)
     sides = [latch.step(t / 100, *random.uniform(0.2, 1.0, 2)) for t in range(2000)]
     changes = np.flatnonzero(np.diff(sides))
     assert len(changes) > 15
@@ -91,7 +82,7 @@ def sharp(distance_m):
 def test_a_wall_that_comes_nearer_than_the_sensor_can_tell_stays_near():
     times = np.arange(0.0, 4.0, 0.01)
     true = 0.10 + 0.4 * np.abs(times - 2.0) / 2.0  # 0.5 m, in to 0.10 m, out again
-    memory = NearMemory(np.array([0.2]), 1.0)
+    memory = filters.NearMemory(np.array([0.2]), 1.0)
     believed = np.array([memory.step(t, sharp(d)[None])[0] for t, d in zip(times, true, strict=1)])
     near = true < 0.15
     assert sharp(true)[near].max() > 0.2  # read farther than it is
@@ -101,14 +92,14 @@ def test_a_wall_that_comes_nearer_than_the_sensor_can_tell_stays_near():
 
 
 def test_a_sensor_without_fold_has_no_memory():
-    memory = NearMemory(np.array([0.0]), 1.0)
+    memory = filters.NearMemory(np.array([0.0]), 1.0)
     read = np.array([0.1, 0.5, math.inf])
     assert [memory.step(0.01 * i, d[None])[0] for i, d in enumerate(read)] == list(read)
 
 
 @given(st.lists(st.floats(0.01, 0.5), min_size=2, max_size=60), st.floats(0.0, 3.0))
 def test_phase_history_gives_back_a_linear_function_exactly(steps, back):
-    history = PhaseHistory(3.0)
+    history = filters.PhaseHistory(3.0)
     phases = np.cumsum(steps)
     for phase in phases:
         history.add(phase, np.array([2.0 * phase - 1.0, -phase]))
@@ -119,33 +110,33 @@ def test_phase_history_gives_back_a_linear_function_exactly(steps, back):
 
 def swing(turn_rate, periods=6, gain=1.6):
     """Headings of a head that swings by 0.6 rad while its path turns, and what is made of them."""
-    path, rows = PathHeading(gain), []
+    path, rows = filters.PathHeading(gain), []
     for phase in np.arange(0.0, periods * math.tau, 0.03):
         bent = 0.0 if phase < 2 * math.tau else -turn_rate / gain
         way = math.pi + turn_rate * max(phase - 2 * math.tau, 0.0)
-        told = math.remainder(way + 0.6 * math.sin(phase), math.tau)
-        rows.append((phase, way, path.step(phase, told, bent)))
+        measured = math.remainder(way + 0.6 * math.sin(phase), math.tau)
+        rows.append((phase, way, path.step(phase, measured, bent)))
     return np.array(rows).T
 
 
 @pytest.mark.parametrize("turn_rate", [0.0, 0.2, -0.3])
 def test_path_heading_has_neither_the_swing_nor_half_a_period_of_delay(turn_rate):
     """Across the cut at pi, and while a turn begins: without the model it would be pi c Y late."""
-    phase, way, told = swing(turn_rate)
-    error = np.abs([math.remainder(e, math.tau) for e in told - way])
-    assert error[phase > math.tau].max() < 0.005  # the trapezoidal rule, and a sample more or less
+    phase, way, measured = swing(turn_rate)
+    error = np.abs([math.remainder(e, math.tau) for e in measured - way])
+    # The trapezoidal rule, and a sample more or less:
+    assert error[phase > math.tau].max() < 0.005
     assert error[phase < math.tau].max() > 0.1  # not yet a period
 
 
 def test_path_heading_goes_on_over_a_full_turn():
-    phase, way, told = swing(0.3, periods=12)
+    phase, way, measured = swing(0.3, periods=12)
     assert way[-1] - way[0] > 2 * math.tau
-    steps = np.diff(told[phase > math.tau])
-    assert np.abs(steps).max() < 0.05
+    assert np.abs(np.diff(measured[phase > math.tau])).max() < 0.05
 
 
 def test_path_heading_waits_for_a_heading_and_outlasts_it():
-    path = PathHeading(1.6)
+    path = filters.PathHeading(1.6)
     assert math.isnan(path.step(0.0, math.nan, 0.0))
     assert path.step(0.1, 0.7, 0.0) == pytest.approx(0.7)
     assert path.step(0.2, math.nan, 0.0) == pytest.approx(0.7)
@@ -153,19 +144,18 @@ def test_path_heading_waits_for_a_heading_and_outlasts_it():
 
 @given(st.lists(st.floats(0.05, 0.5), min_size=2, max_size=60), st.floats(0.5, 3.0))
 def test_least_is_the_least_within_the_span(steps, span):
-    history, random = PhaseHistory(span), np.random.default_rng(1)
+    history, random = filters.PhaseHistory(span), np.random.default_rng(1)
     phases = np.cumsum(steps)
     values = random.uniform(0, 1, (len(phases), 3))
     for phase, value in zip(phases, values, strict=True):
         history.add(phase, value)
-    recent = phases >= phases[-1] - span
-    np.testing.assert_array_equal(history.least(), values[recent].min(axis=0))
+    np.testing.assert_array_equal(history.least(), values[phases >= phases[-1] - span].min(axis=0))
 
 
 def test_the_body_bends_where_the_head_did_also_when_omega_changes():
     """Y(t) = sin of the phase: joint i must show it (i - 1) |lag| of phase later, exactly so."""
     lag, phase = -math.pi / 6, 0.0
-    wave = BodyWave(13, lag)
+    wave = filters.BodyWave(13, lag)
     for tick in range(900):
         phase += 0.01 * math.pi * (1.0 if tick < 700 else 1.3)
         bent = wave.step(phase, math.sin(phase))
@@ -174,7 +164,7 @@ def test_the_body_bends_where_the_head_did_also_when_omega_changes():
 
 
 def test_the_body_is_straight_until_the_wave_comes():
-    wave = BodyWave(4, 1.0)
+    wave = filters.BodyWave(4, 1.0)
     wave.step(0.0, 0.0)
     for k in range(1, 16):
         bent = wave.step(0.1 * k, 0.2)

@@ -63,15 +63,13 @@ def driven(gait, seconds, ranges):
 
 def test_every_sensor_of_the_shipped_robot_has_its_role():
     roles = layout(SNAKE)
-    assert roles.head == ("ir01", "ir02", "ir03", "sonar")
-    assert roles.tail == ("ir14", "ir15")
+    assert (roles.head, roles.tail) == (("ir01", "ir02", "ir03", "sonar"), ("ir14", "ir15"))
     beside = {side.name: (np.flatnonzero(side.beside) + 1).tolist() for side in roles.sides}
     # Every fourth link has a pair; the joints go to the nearest, two links and a half at most.
     for k, pair in enumerate(zip(range(4, 14, 2), range(5, 15, 2), strict=True)):
         for number in pair:
             assert beside[f"ir{number:02d}"] == [4 * k + i for i in (3, 4, 5, 6)]
-    assert roles.fold_m["ir01"] == 0.2
-    assert roles.fold_m["sonar"] == 0.0
+    assert (roles.fold_m["ir01"], roles.fold_m["sonar"]) == (0.2, 0.0)
 
 
 def test_roles_follow_from_the_description_of_any_robot(make_robot):
@@ -92,8 +90,7 @@ def test_roles_follow_from_the_description_of_any_robot(make_robot):
         ),
     )
     roles = layout(robot)
-    assert roles.head == ("ir01",)
-    assert roles.tail == ("ir07",)
+    assert (roles.head, roles.tail) == (("ir01",), ("ir07",))
     beside = {side.name: (np.flatnonzero(side.beside) + 1).tolist() for side in roles.sides}
     # Noses at 0: ir03 at 0.03 m, ir04 at 0.31 m, half their gap 0.14 m; joint i at 0.06 i m.
     assert beside == {"ir03": [1, 2], "ir04": [3, 4, 5, 6, 7], "ir05": [1, 2, 3, 4, 5, 6, 7]}
@@ -103,8 +100,7 @@ def test_distances_bear_what_sensors_may_tell():
     distances = Distances({"ir01": 0.2, "ir02": 0.2, "sonar": 0.0}, 1.0)
     distances.step(0.0, {"ir01": math.nan, "sonar": -math.inf})
     assert distances.nearest(["ir01", "ir02"]) == math.inf
-    assert distances.nearest(["sonar"]) == 0.0
-    assert distances.nearest([]) == math.inf
+    assert (distances.nearest(["sonar"]), distances.nearest([])) == (0.0, math.inf)
     distances.step(0.1, {"ir01": 0.2})
     distances.step(0.2, {"ir01": 0.6})  # no obstacle moves so fast: it came too near
     assert distances.nearest(["ir01"]) == 0.2
@@ -127,13 +123,10 @@ def test_the_head_bends_by_the_papers_law_and_the_body_follows(d):
 
 def seen(heading, ranges, place=(0.0, 0.0), time_s=0.0, lookout=None):
     """What is in the way of a robot that goes along x while its head looks elsewhere."""
-    lookout = lookout or ObstacleMonitor(
-        LookoutParameters(half_width_m=0.3, memory_s=2.0), ROLES, SNAKE
-    )
-    pose = Pose(np.array(place), heading, 0.0)
-    return lookout.step(
-        ControlInput(time_s, 0.01, 0.0, pose, Readings(STILL, STILL, ranges))
-    ), lookout
+    parameters = LookoutParameters(half_width_m=0.3, memory_s=2.0)
+    lookout = lookout or ObstacleMonitor(parameters, ROLES, SNAKE)
+    pose, readings = Pose(np.array(place), heading, 0.0), Readings(STILL, STILL, ranges)
+    return lookout.step(ControlInput(time_s, 0.01, 0.0, pose, readings)), lookout
 
 
 def test_a_swinging_head_sees_what_is_in_the_way_and_on_which_side():
@@ -236,9 +229,8 @@ def north_at(angle):
 @pytest.mark.parametrize("start", [0.0, 0.7, -2.5])
 def test_the_course_points_to_the_target_from_wherever_the_robot_started_to_look(start):
     """Whatever way the head looked at first, and however far it has come since."""
-    law = TargetHeading(gain=0.35, largest=0.2)
-    course = TargetHeadingPolicy(law, (3.0, 1.0), 0.3, 0.4, SNAKE)
-    assert course.step(moment(0.0)) == 0.0  # the compass has not told anything yet
+    course = TargetHeadingPolicy(TargetHeading(gain=0.35, largest=0.2), (3.0, 1.0), 0.3, 0.4, SNAKE)
+    assert course.step(moment(0.0)) == 0.0  # the compass has not measured anything yet
     course.step(moment(0.01, field=north_at(start)))
     turn = 0.2
     offset = course.step(moment(0.02, (0.5, 0.1), turn, north_at(start + turn)))
@@ -263,8 +255,7 @@ def test_the_course_turns_the_body():
     field = {"compass": np.array(north_at(0.0))}
     ticks = [gait.step(k / 100, Readings(STILL, STILL, {}, {}, field)) for k in range(150)]
     values = dict(zip(gait.names, ticks[-1].values, strict=True))
-    assert values["steer.offset"] == pytest.approx(0.2, abs=2e-3)
-    assert ticks[-1].mode == TURN
+    assert (values["steer.offset"], ticks[-1].mode) == (pytest.approx(0.2, abs=2e-3), TURN)
 
 
 def gliding(robot: Robot, speed, curve, time_s):
@@ -291,8 +282,8 @@ def test_odometry_of_a_chain_that_follows_its_path(make_robot, curve):
     cos, sin = math.cos(heading_now), math.sin(heading_now)
     truth = [cos * step[0] + sin * step[1], cos * step[1] - sin * step[0]]
     truth.append((turned - heading) / (2 * dt))
-    told = SlipOdometry(robot, 1e6).velocity(angle, (after - before) / (2 * dt))
-    np.testing.assert_allclose(told, truth, atol=0.02 * speed)
+    found = SlipOdometry(robot, 1e6).velocity(angle, (after - before) / (2 * dt))
+    np.testing.assert_allclose(found, truth, atol=0.02 * speed)
 
 
 def test_odometry_of_a_body_that_holds_its_shape(make_robot):

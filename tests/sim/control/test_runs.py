@@ -9,10 +9,7 @@ import pytest
 
 from support.paths import ROOT
 from undulog.capture import Session
-from undulog.sim import load_scenario
-from undulog.sim.scenario.obstacles import Target
-from undulog.sim.twin.recording import record
-from undulog.sim.twin.twin import Twin
+from undulog.sim import Target, Twin, load_scenario, record
 
 PERIOD = 200
 """Ticks of a gait period at 0.5 Hz."""
@@ -66,8 +63,7 @@ def test_joints_beside_a_wall_swing_less_and_recover(recorded):
     beside = [f"joint{number:02d}" for number in range(3, 22, 2)]
     free = [log.swing(joint, 14) for joint in beside]
     np.testing.assert_allclose(free, 0.3, atol=0.03)
-    near = [log.swing(joint, 8) for joint in beside]
-    assert (np.divide(near, free) < 0.85).all()
+    assert (np.divide([log.swing(joint, 8) for joint in beside], free) < 0.85).all()
     for joint in ("joint01", "joint25"):  # no sensor is beside them
         assert log.swing(joint, 8) == pytest.approx(log.swing(joint, 14), rel=0.05)
     half = [np.flatnonzero(log.gait[f"shrink.{joint}"] < 0.85)[0] for joint in beside]
@@ -89,14 +85,12 @@ def test_avoidance_goes_through_its_modes_and_touches_nothing(recorded):
     omega = log.gait["horizontal.omega"]
     assert math.pi == pytest.approx(omega[:300].max())
     assert 1.2 * math.pi < omega.max() < 1.5 * math.pi
-    tail = log.gait["haste.distance"]
-    assert (tail[omega > 1.2 * math.pi] <= 0.4).all()
+    assert (log.gait["haste.distance"][omega > 1.2 * math.pi] <= 0.4).all()
     factor = log.gait["shrink.joint03"]
     assert factor.min() < 0.65
     assert factor[-1] > 0.98
     # Past the cylinder at x = 4, and not through it.
-    passed = np.argmax(log.x > 4.0)
-    assert abs(log.y[passed]) > 0.15 + 0.025
+    assert abs(log.y[np.argmax(log.x > 4.0)]) > 0.15 + 0.025
 
 
 @pytest.mark.slow
@@ -131,10 +125,10 @@ def test_reckoning_and_course_lead_to_a_target_on_free_ground():
                 break
     true = np.array([sample.step.body.position[:2, 0] for sample in samples])
     values = np.array([sample.gait.values for sample in samples])
-    told = values[:, [names.index("course.x"), names.index("course.y")]]
+    found = values[:, [names.index("course.x"), names.index("course.y")]]
     way = np.hypot(*np.diff(true, axis=0).T).sum()
     assert samples[-1].time_s < 11.0
-    assert np.nanmax(np.hypot(*(told - true).T)) < 0.05 * way
+    assert np.nanmax(np.hypot(*(found - true).T)) < 0.05 * way
 
 
 @pytest.fixture
@@ -161,8 +155,7 @@ def test_the_median_interval_covers_as_often_as_it_says(study):
 def test_following_beats_walking_at_random_on_fresh_seeds(study):
     """Six of the study's thirty seeds; walks are cut at 30 s, so the ratios are lower bounds."""
     limits_s = {"target-following": 90.0, "random-walk": 30.0}
-    results = study.study(list(range(101, 107)), limits_s, 2, "numpy", None)
-    told = study.summary(results)
-    assert told["target-following"]["met"] == 6
-    assert told["time_s_ratio"][0] > 3.0
-    assert told["electrical_j_ratio"][0] > 3.0
+    found = study.summary(study.study(list(range(101, 107)), limits_s, 2, "numpy", None))
+    assert found["target-following"]["met"] == 6
+    assert found["time_s_ratio"][0] > 3.0
+    assert found["electrical_j_ratio"][0] > 3.0

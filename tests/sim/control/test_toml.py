@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from support.twin_runs import SNAKE13, SNAKE25, faults_of
+from support.twin_runs import SNAKE13, SNAKE25, check_keys, faults_of
 from undulog.sim import Readings, load_scenario, parse_scenario
 from undulog.sim.control.adaptive import build_gait
 from undulog.sim.scenario.controllers import (
@@ -83,32 +83,22 @@ def controllers(draw):
 def test_what_is_written_reads_the_same(controller):
     scenario = dataclasses.replace(parsed(""), controller=controller)
     again = parse_scenario(scenario.toml(), "x.toml")
-    assert again == scenario
-    assert again.session_id == scenario.session_id
+    assert (again, again.session_id) == (scenario, scenario.session_id)
     assert again.session_id != parsed("").session_id
 
 
 def test_all_faults_are_listed_at_once():
-    found = faults_of(
-        f"""{BASE}
+    text = """
 [controller]
 kind = "random-walk"
 near_hold = 1.0
-[controller.head]
-k = -1.0
-[controller.lookout]
-half_width_m = 0.0
-[controller.course]
-shortest_s = 3.0
-longest_s = 2.0
+head.k = -1.0
+lookout.half_width_m = 0.0
+course = { shortest_s = 3.0, longest_s = 2.0 }
 """
-    )
-    assert found.keys() == {
-        "controller.near_hold",
-        "controller.head.k",
-        "controller.lookout.half_width_m",
-        "controller.course.longest_s",
-    }
+    found = faults_of(BASE + text)
+    keys = "near_hold head.k lookout.half_width_m course.longest_s"
+    check_keys(found, " ".join(f"controller.{key}" for key in keys.split()))
     assert "did you mean near_hold_s?" in found["controller.near_hold"]
     assert "at least shortest_s = 3" in found["controller.course.longest_s"]
     assert "random-walk" in faults_of(f'{BASE}[controller]\nkind = "random"')["controller.kind"]
@@ -119,8 +109,8 @@ def test_a_controller_needs_its_sensors_its_target_and_a_horizontal_gait():
     assert "[world.target]" in faults_of(SNAKE25 + follow)["controller.kind"]
     vertical = BASE.replace("gait.horizontal", "gait.vertical")
     assert "horizontal" in faults_of(vertical + follow)["controller.kind"]
-    told = faults_of(f'{SNAKE13}{TARGET}[controller]\nkind = "avoidance"')["controller.kind"]
-    assert all(part in told for part in ("looks ahead", "looks sideways", "snake13"))
+    shown = faults_of(f'{SNAKE13}{TARGET}[controller]\nkind = "avoidance"')["controller.kind"]
+    assert all(part in shown for part in ("looks ahead", "looks sideways", "snake13"))
 
 
 @pytest.mark.parametrize("gait", ["flat", "delay-blocks", "oscillators"])
@@ -133,13 +123,12 @@ def test_every_controller_wraps_every_generator(gait, kind):
     nothing = Readings.nothing(scenario.robot)
     for k in range(5):
         tick = one.step(k / 100, nothing)
-        again = two.step(k / 100, nothing)
-        np.testing.assert_array_equal(tick.values, again.values)
+        np.testing.assert_array_equal(tick.values, two.step(k / 100, nothing).values)
         assert len(tick.values) == len(one.names)
     assert "steer.offset" in one.names
 
 
-def test_the_target_is_told_from_magnetic_north():
+def test_the_target_is_measured_from_magnetic_north():
     """North a quarter turn to the left of x: a target ahead lies to the right of north."""
     text = '[controller]\nkind = "target-following"\n[sensing.compass]\nnorth = 1.5707963267948966'
     gait = build_gait(parsed(text))
@@ -160,6 +149,5 @@ def test_shipped_controllers_of_the_paper():
     }
     assert kinds == {name: name for name in kinds}
     follow, walk = load_scenario("target-following"), load_scenario("random-walk")
-    assert follow.world == walk.world
-    assert follow.gait == walk.gait
+    assert (follow.world, follow.gait) == (walk.world, walk.gait)
     assert len(follow.world.obstacles) == 4 + 10

@@ -1,7 +1,6 @@
 """The control loop over a bus, against the virtual robot of ``sim serve`` and a plain server."""
 
 import dataclasses
-import json
 import signal
 import socket
 import threading
@@ -12,7 +11,7 @@ import can
 import numpy as np
 import pytest
 
-import undulog as front
+from support.can_messages import can_message
 from support.processes import wait_for
 from support.twin_runs import sensed, simulate
 from support.written_sessions import write_commands
@@ -81,25 +80,25 @@ def weak(duration_s):
     return load_scenario("weak-servo-pi3").changed(duration_s=duration_s)
 
 
-TOPICS = {topic: topic for topic in ("/joint_commands", "/gait")} | {
-    "/gate/wanted": "/joint_commands"
+TOPICS = {
+    "/joint_commands": "/joint_commands",
+    "/gait": "/gait",
+    "/gate/wanted": "/joint_commands",
 }
 
 
-def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, capsys):
+def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, command, report_of):
     path, direct = tmp_path / "bus.mcap", tmp_path / "direct.mcap"
     words = ["drive", "weak-servo-pi3", "--duration", "0.3"]
     with alive(weak(0.3)) as (on, served):
-        assert front.run([*words, "--on", on, "--arm", "-o", str(path), "--json"]) == 0
+        report = report_of(*words, "--on", on, "--arm", "-o", path)
         wait_for(lambda: served, "the robot goes on")  # it has its last tick still to do
-    report = json.loads(capsys.readouterr().out)
     assert (report["pace"], report["ticks"], report["overruns"]) == ("lockstep", 31, 0)
     assert (report["sent"], report["complete"], report["outcome"]) == (31 * 25, True, "complete")
     assert (report["approach_s"], report["lateness"]) == (0.0, None)  # it stands straight already
     assert report["decoded"] == report["received"] > 25 * 20
-    assert served[0].complete
-    assert served[0].commands == 31 * 25
-    assert front.run([*words, "--on", "twin", "-o", str(direct)]) == 0
+    assert (served[0].complete, served[0].commands) == (True, 31 * 25)
+    command(*words, "--on", "twin", "-o", direct)
     with Session.open(path) as over_bus, Session.open(direct) as in_process:
         for topic, like in TOPICS.items():
             found, expected = over_bus.joints(topic), in_process.joints(like)
@@ -110,12 +109,10 @@ def test_in_lockstep_the_robot_gets_the_gaits_commands_tick_by_tick(tmp_path, ca
         assert (facts["driven"], facts["armed"], facts["source.can0"]) == ("gait", "yes", on)
         assert over_bus.robot == load_robot("snake25")
         measured = over_bus.joints("/joint_states")
-        frames = over_bus.frames("/can/can0")
-        assert (frames["dir"] == DIR_TX).sum() == 31 * 25
+        assert (over_bus.frames("/can/can0")["dir"] == DIR_TX).sum() == 31 * 25
         assert over_bus.metadata["undulog.gate"]["rate"] == "4.0"
-        phases = [message.data for _, message in over_bus.messages("/gate/phase")]
-        assert phases == ["run"]
-    # The robot did what the twin does with commands rounded to the bus, and said so, rounded.
+        assert [message.data for _, message in over_bus.messages("/gate/phase")] == ["run"]
+    # The robot did what the twin does with commands rounded to the bus, and reported it, rounded.
     samples = sensed(weak(0.3), Rounded(build_gait(weak(0.3))))
     cycles = np.array([one.position for one in samples if isinstance(one, JointSample)])[:-2]
     found = np.array(measured.values)
@@ -148,8 +145,7 @@ def test_in_real_time_the_loop_keeps_to_the_clock(tmp_path):
     path = tmp_path / "a.mcap"
     with alive(load_scenario("flat").changed(duration_s=30.0), lockstep=False) as (on, _):
         report = drive_bus(planned("flat", on, path, duration_s=0.5), stop=StopRequest())
-    assert report.outcome.how is DriveEnding.COMPLETE
-    assert report.gait_s == 0.5
+    assert (report.outcome.how, report.gait_s) == (DriveEnding.COMPLETE, 0.5)
     assert report.ticks <= 51 <= report.ticks + report.tally.overruns
     assert report.wall_s >= 0.5
     assert report.tally.sent == 25 * report.ticks
@@ -184,7 +180,7 @@ def test_asked_to_stop_it_ends_as_the_robots_file_says(tmp_path, how):
     assert report.outcome.why == "stop requested (Ctrl-C)"
     with Session.open(path) as session:
         commands = np.array(session.joints("/joint_commands").values)
-        said = [message.msg for _, message in session.messages("/rosout")]
+        notes = [message.msg for _, message in session.messages("/rosout")]
         phases = [message.data for _, message in session.messages("/gate/phase")]
         assert session.verdict == "good"
     assert phases == ["run", "ending"]
@@ -198,7 +194,12 @@ def test_asked_to_stop_it_ends_as_the_robots_file_says(tmp_path, how):
         assert not ending[:, -1].any()
         assert np.abs(np.diff(commands[:, 80:])).max() <= 0.5 * 0.01 * (1 + 1e-9)
         assert ending.shape[1] == pytest.approx(100 * (1.5 * np.abs(held).max() / 0.5 + 0.2), abs=1)
-    assert said[-1].startswith("stopped: stop requested (Ctrl-C); the joints were ")
+    assert notes[-1].startswith("stopped: stop requested (Ctrl-C); the joints were ")
+
+
+def angles_of(received):
+    """Return the raw angles in the commands of each joint, by identifier."""
+    return np.array([np.frombuffer(b"".join(data), "<i2") for _, data in sorted(received.items())])
 
 
 def test_a_session_that_can_not_be_written_brings_the_robot_to_rest_first(tmp_path):
@@ -213,14 +214,14 @@ def test_a_session_that_can_not_be_written_brings_the_robot_to_rest_first(tmp_pa
         listener = can.Bus(interface="socketcand", host="127.0.0.1", port=port, channel="can0")
         plan = planned("weak-servo-pi3", on, path, duration_s=9.0)
         with listener:
-            said = "the joints were brought straight .* the last 1?[0-9]{2} control ticks are"
-            with pytest.raises(LogWriteError, match=f"no space left on device; {said}"):
+            reason = "the joints were brought straight .* the last 1?[0-9]{2} control ticks are"
+            with pytest.raises(LogWriteError, match=f"no space left on device; {reason}"):
                 drive_bus(plan, stop=StopRequest(), on_tick=full)
-            heard = {}
+            taken = {}
             while (message := listener.recv(0.2)) is not None:
                 if 0x101 <= message.arbitration_id <= 0x119:
-                    heard.setdefault(message.arbitration_id, []).append(bytes(message.data))
-    raw = np.array([[int.from_bytes(d, "little", signed=True) for d in v] for v in heard.values()])
+                    taken.setdefault(message.arbitration_id, []).append(bytes(message.data))
+    raw = angles_of(taken)
     assert raw.shape[0] == 25
     assert raw.shape[1] > 41 + 20
     assert np.abs(raw[:, 40]).max() > 0
@@ -237,8 +238,7 @@ def test_a_pose_elsewhere_is_left_by_a_ramp_and_the_gait_begins_then(tmp_path):
     with alive(weak(9.0)) as (on, _):
         report = drive_bus(planned(str(recorded), on, path, duration_s=0.3), stop=StopRequest())
     assert report.outcome.how is DriveEnding.COMPLETE
-    way_s = 1.5 * 0.2 / 0.5
-    assert report.approach_s == pytest.approx(way_s, abs=0.011)
+    assert report.approach_s == pytest.approx(1.5 * 0.2 / 0.5, abs=0.011)
     with Session.open(path) as session:
         given = np.array(session.joints("/joint_commands").values)
         assert session.metadata["undulog"]["driven.session_id"] == "commands"
@@ -250,17 +250,15 @@ def test_a_pose_elsewhere_is_left_by_a_ramp_and_the_gait_begins_then(tmp_path):
     assert np.abs(run[:, 0] - approach[:, -1]).max() <= 0.5 * 0.01
 
 
-def test_a_robot_that_goes_away_is_told_by_its_bus(tmp_path, capsys):
+def test_a_robot_that_goes_away_is_reported_with_its_bus(tmp_path, command):
     path = tmp_path / "a.mcap"
     with alive(weak(0.1)) as (on, _):
-        words = ["drive", "weak-servo-pi3", "--on", on, "--arm", "-o", str(path)]
-        assert front.run([*words, "--duration", "5"]) == 1
-    told = capsys.readouterr()
-    assert f"error: {on}: the robot closed the connection; nothing more was sent" in told.err
-    assert told.out.startswith(f"{on}: stopped at 0.1 s of 5 s: ")
+        words = ("drive", "weak-servo-pi3", "--on", on, "--arm", "-o", path, "--duration", "5")
+        out, err = command(*words, code=1)
+    assert f"error: {on}: the robot closed the connection; nothing more was sent" in err
+    assert out.startswith(f"{on}: stopped at 0.1 s of 5 s: ")
     with Session.open(path) as session:
-        assert session.verdict == "bad"
-        assert session.channels["/joint_commands"].count == 11
+        assert (session.verdict, session.channels["/joint_commands"].count) == ("bad", 11)
 
 
 def test_any_bus_of_python_can_will_do(tmp_path):
@@ -268,34 +266,28 @@ def test_any_bus_of_python_can_will_do(tmp_path):
     robot = load_robot("snake25")
     reply = BusEncoder(robot, Direction.RX)
     pose = np.linspace(-0.1, 0.1, 25)
-    heard = {}
+    taken = {}
 
     def answer(bus):
-        """A robot that is where it was told to be."""
+        """A robot that is where it was commanded to be."""
         while (message := bus.recv(0)) is not None:
-            heard.setdefault(message.arbitration_id, []).append(bytes(message.data))
+            taken.setdefault(message.arbitration_id, []).append(bytes(message.data))
             angle = int.from_bytes(message.data[:2], "little", signed=True) * STEP
             pose[message.arbitration_id - 0x101] = angle
         keys = [(name, Quantity.POSITION, "") for name in robot.joint_names]
         for frame in reply.encode(dict(zip(keys, pose.tolist(), strict=True))):
-            bus.send(message_of(frame))
+            bus.send(can_message(frame))
 
     with speaking("gate-any", answer):
         plan = planned("flat", "can:virtual:gate-any", tmp_path / "a.mcap", duration_s=0.3)
         report = drive_bus(plan, stop=StopRequest())
     assert report.outcome.how is DriveEnding.COMPLETE, report.outcome
     assert report.approach_s >= LISTEN_S + 1.5 * 0.1 / 0.5 - 0.02
-    assert {len(each) for each in heard.values()} == {report.tally.sent // 25}
-    raw = np.array(
-        [
-            [int.from_bytes(d[:2], "little", signed=True) for d in v]
-            for _, v in sorted(heard.items())
-        ]
-    )
+    assert {len(each) for each in taken.values()} == {report.tally.sent // 25}
+    raw = angles_of(taken)
     assert np.abs(np.diff(raw)).max() * STEP <= 4.0 * 0.01 + STEP  # also where ticks were late
     with Session.open(tmp_path / "a.mcap") as session:
-        frames = session.frames("/can/gate_any")
-        assert (frames["dir"] == DIR_TX).sum() == report.tally.sent
+        assert (session.frames("/can/gate_any")["dir"] == DIR_TX).sum() == report.tally.sent
         sent = np.array(session.joints("/joint_commands").values)
     assert np.abs(raw * STEP - sent).max() <= STEP / 2 * (1 + 1e-6)
 
@@ -319,41 +311,24 @@ def speaking(channel, each):
             talker.join()
 
 
-def message_of(frame):
-    return can.Message(
-        arbitration_id=int(frame["id_flags"]),
-        data=frame["data"][: frame["dlc"]].tobytes(),
-        is_extended_id=False,
-    )
-
-
-def refused(channel, each, capsys, tmp_path, *words):
-    """Exit code and what was said of a drive on a bus on which somebody speaks."""
-    with speaking(channel, each) as other:
-        path = tmp_path / "a.mcap"
-        on = ("--on", f"can:virtual:{channel}", "--arm", "-o", str(path))
-        code = front.run(["drive", "flat", *on, *words])
+def test_another_controller_on_the_bus_is_not_joined(command, tmp_path):
+    frame = can.Message(arbitration_id=0x103, data=bytes(2), is_extended_id=False)
+    path, why = tmp_path / "a.mcap", "another controller commands snake25 on this bus: frame 103"
+    with speaking("gate-two", lambda bus: bus.send(frame)) as other:
+        on = ("--on", "can:virtual:gate-two", "--arm", "-o", path)
+        assert f"no command was sent: {why}" in command("drive", "flat", *on, code=1).err
         assert other.recv(0.1) is None, "something was sent"
     with Session.open(path) as session:
         assert session.verdict == "bad"
-        assert "/joint_commands" not in session.channels or (
-            not session.channels["/joint_commands"].count
-        )
-    return code, capsys.readouterr().err
-
-
-def test_somebody_who_commands_already_is_not_joined(capsys, tmp_path):
-    frame = can.Message(arbitration_id=0x103, data=bytes(2), is_extended_id=False)
-    code, said = refused("gate-two", lambda bus: bus.send(frame), capsys, tmp_path)
-    assert code == 1
-    assert "no command was sent: another controller commands snake25 on this bus: frame 103" in said
+        commands = session.channels.get("/joint_commands")
+        assert commands is None or commands.count == 0
 
 
 @contextmanager
 def plain_server(answers, stream=()):
     """A server of one client: answers each message by its first word, then sends a stream."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        heard = []
+        taken = []
 
         def serve():
             client, _ = listener.accept()
@@ -362,9 +337,9 @@ def plain_server(answers, stream=()):
                 while chunk := client.recv(65536):
                     for message in chunk.decode().split(">")[:-1]:
                         word = message.strip(" <").split()[0]
-                        heard.append(word)
+                        taken.append(word)
                         client.sendall(answers.get(word, b""))
-                    if heard[-1] == "rawmode":
+                    if taken[-1] == "rawmode":
                         time.sleep(0.2)  # python-can takes what comes with "ok" for a refusal
                         for piece in stream:
                             client.sendall(piece)
@@ -373,7 +348,7 @@ def plain_server(answers, stream=()):
         thread = threading.Thread(target=serve)
         thread.start()
         port = listener.getsockname()[1]
-        yield f"can:socketcand:can0?host=127.0.0.1&port={port}", heard
+        yield f"can:socketcand:can0?host=127.0.0.1&port={port}", taken
         thread.join()
 
 
@@ -384,30 +359,38 @@ SOCKETCAND = {
 }
 
 
+ARMED = "flat --arm -o a.mcap --on"
+
+
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "complaint"),
     [
-        (("--on", "can:virtual:bus", "--arm"), "name the session with -o"),
-        (("--on", "can:socketcand", "--arm", "-o", "a.mcap"), "no channel"),
-        (("--on", "can:virtual:bus?host=x", "--arm", "-o", "a.mcap"), "no option 'host'"),
-        (("--on", "unix:/tmp/a.sock"), "expected twin, twin:SCENARIO or can:"),
-        (("--on", "can:nothing:x", "--arm", "-o", "a.mcap"), "no CAN interface 'nothing'"),
-        (("--on", "can:virtual:bus", "--arm", "-o", "a.mcap", "--duration", "0"), "of 0 s"),
-        (("--on", "can:virtual:bus", "--arm", "-o", "a.mcap", "--duration", "nan"), "of nan s"),
-        (("--on", "can:virtual:bus", "--recorder", "x"), "--recorder is for --arm"),
-        (("--on", "can:virtual:bus", "--arm", "-o", "a.mcap", "--robot", "snake13"), "no bus map"),
-        (("--on", "twin:"), "names no scenario"),
-        (("--on", "twin", "--arm", "-o", "a.mcap"), "are for a bus"),
+        ("flat --on can:virtual:bus --arm", "name the session with -o"),
+        (f"{ARMED} can:socketcand", "no channel"),
+        (f"{ARMED} can:virtual:bus?host=x", "no option 'host'"),
+        ("flat --on unix:/tmp/a.sock", "expected twin, twin:SCENARIO or can:"),
+        (f"{ARMED} can:nothing:x", "no CAN interface 'nothing'"),
+        (f"{ARMED} can:virtual:bus --duration 0", "of 0 s"),
+        (f"{ARMED} can:virtual:bus --duration nan", "of nan s"),
+        ("flat --on can:virtual:bus --recorder x", "--recorder is for --arm"),
+        (f"{ARMED} can:virtual:bus --robot snake13", "no bus map"),
         (
-            ("--on", "can:virtual:bus", "--arm", "-o", "a.mcap", "--robot", "arcsnake-joint"),
+            f"{ARMED} can:virtual:bus --robot arcsnake-joint",
             "arcsnake-joint can't be armed: its description lacks max_rate",
         ),
+        ("flat --on twin:", "names no scenario"),
+        (f"{ARMED} twin", "are for a bus"),
+        ("flt --on twin -o a.mcap", "did you mean flat?"),
+        ("flat --on twin", "name the session with -o"),
+        ("vertical --on twin:snake13-planar-pi2 -o a.mcap", "vertical joints and"),
+        ("flat --on twin -o a.csv", "name it a.mcap"),
+        ("flat --on twins -o a.mcap", "expected twin"),
+        ("flat --on twin -o a.mcap --duration 0", "a duration of 0 s"),
     ],
 )
-def test_wrong_usage_exits_2(words, told, capsys, tmp_path, monkeypatch):
+def test_wrong_usage_exits_2_and_writes_nothing(words, complaint, tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
-    assert front.run(["drive", "flat", *words]) == 2
-    assert told in capsys.readouterr().err
+    assert complaint in command("drive", *words.split(), code=2).err
     assert not list(tmp_path.iterdir())
 
 
@@ -420,21 +403,20 @@ def test_a_gait_for_another_robot_is_refused(tmp_path):
     assert not (tmp_path / "a.mcap").exists()
 
 
-def test_nobody_there_exits_1(capsys, tmp_path):
+def test_nobody_there_exits_1(tmp_path, command):
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     on = f"can:socketcand:can0?host=127.0.0.1&port={port}"
     words = ("--arm", "-o", str(tmp_path / "a.mcap"), "--duration", "0.1")
-    assert front.run(["drive", "flat", "--on", on, *words]) == 1
-    assert "refused" in capsys.readouterr().err
+    assert "refused" in command("drive", "flat", "--on", on, *words, code=1).err
 
 
 def test_a_robot_that_says_nothing_is_sent_nothing(tmp_path):
     answers = SOCKETCAND | {"undulog": b"< undulog virtual-robot snake25 paced >"}
     silent = pytest.raises(SourceError, match=r"no command was sent: the pose is not known, all 25")
-    with plain_server(answers) as (on, heard), silent:
+    with plain_server(answers) as (on, taken), silent:
         drive_bus(planned("flat", on, tmp_path / "a.mcap", duration_s=5.0), stop=StopRequest())
-    assert heard == ["undulog", "open", "rawmode"]
+    assert taken == ["undulog", "open", "rawmode"]
 
 
 @pytest.mark.parametrize("cut", [3, 12, 40, 60, 100, 120])
@@ -451,8 +433,7 @@ def test_ticks_and_frames_stay_in_order_however_the_stream_is_cut(cut):
             found = [link.wait_tick(5.0) for _ in range(3)]
             assert [tick for tick, _ in found] == [0, 1, 2]
             assert [identifiers(frames) for _, frames in found] == [[], [], [0x201, 0x202]]
-            assert link.wait_tick(0.05) is None
-            assert identifiers(link.receive()) == [0x203]
+            assert (link.wait_tick(0.05), identifiers(link.receive())) == (None, [0x203])
         finally:
             link.close()
 
@@ -466,14 +447,13 @@ def test_what_python_can_can_not_read_is_counted_and_nothing_is_printed(capfd):
     tally = Tally(time.time_ns)
     with plain_server(SOCKETCAND, stream) as (on, _):
         bus = open_link(parse_address(f"{on}&plain=yes"), tally)
-        heard, deadline = [], time.monotonic() + 20
-        while 0x203 not in heard:
-            assert time.monotonic() < deadline, heard
-            heard += identifiers(bus.receive())
+        taken, deadline = [], time.monotonic() + 20
+        while 0x203 not in taken:
+            assert time.monotonic() < deadline, taken
+            taken += identifiers(bus.receive())
             time.sleep(0.01)
         bus.close()
-    assert heard == [0x201, 0x202, 0x203]
-    assert tally.counts.malformed == 1
+    assert (taken, tally.counts.malformed) == ([0x201, 0x202, 0x203], 1)
     assert [event.text for event in tally.events.flush()] == ["malformed message"]
     assert capfd.readouterr() == ("", "")
 

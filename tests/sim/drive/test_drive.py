@@ -1,7 +1,6 @@
 """Driving the twin in process: gaits, plans, recorded commands, and the end on request."""
 
 import dataclasses
-import json
 import signal
 import time
 from collections import defaultdict
@@ -13,24 +12,17 @@ from mcap.reader import make_reader
 import undulog as front
 from support.processes import UNDULOG, start, wait_for
 from support.written_sessions import write_commands
+from undulog import sim
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError
 from undulog.capture.robot.model import Plane
-from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait
 from undulog.sim.drive.in_process import FadingGait
 from undulog.sim.drive.motion import CommandReplay, RecordedCommands
-from undulog.sim.gait.contract import GaitTick
-from undulog.sim.scenario.scenario_file import load_scenario, parse_scenario, scenario_names
 
+TOPICS = ("/joint_commands", "/joint_current", "/joint_voltage", "/gait", "/energy_ledger")
 COLUMNS = (
-    ("/joint_commands", "position"),
-    ("/joint_states", "position"),
-    ("/joint_states", "velocity"),
-    ("/joint_states", "effort"),
-    ("/joint_current", "position"),
-    ("/joint_voltage", "position"),
-    ("/gait", "position"),
-    ("/energy_ledger", "position"),
+    *(("/joint_states", field) for field in ("position", "velocity", "effort")),
+    *((topic, "position") for topic in TOPICS),
 )
 
 
@@ -53,34 +45,31 @@ def plain(tmp_path_factory):
     return path
 
 
-def test_driving_a_scenarios_gait_is_running_the_scenario(plain, tmp_path, capsys):
+def test_driving_a_scenarios_gait_is_running_the_scenario(plain, tmp_path, report_of):
     path = tmp_path / "driven.mcap"
-    words = ["drive", "weak-servo-pi3", "--on", "twin", "-o", str(path), "--duration", "0.6"]
-    assert front.run([*words, "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    words = ("drive", "weak-servo-pi3", "--on", "twin", "--duration", "0.6")
+    report = report_of(*words, "-o", path)
     assert (report["kind"], report["on"]) == ("gait", "twin:weak-servo-pi3")
     assert (report["complete"], report["ticks"], report["duration_s"]) == (True, 61, 0.6)
     assert column_bytes(path) == column_bytes(plain)
     with Session.open(path) as session, Session.open(plain) as own:
         assert set(session.channels) == set(own.channels)
         assert session.session_id == report["session_id"] != own.session_id
-        assert session.metadata["undulog"]["driven"] == "gait"
-        assert session.verdict == "good"
+        assert (session.metadata["undulog"]["driven"], session.verdict) == ("gait", "good")
         assert session.warnings == []
 
 
-def test_recorded_commands_drive_the_same_run_bit_by_bit(plain, tmp_path, capsys):
+def test_recorded_commands_drive_the_same_run_bit_by_bit(plain, tmp_path, command):
     path = tmp_path / "again.mcap"
-    assert front.run(["drive", str(plain), "--on", "twin", "-o", str(path)]) == 0
-    assert f"{path}: drove plain.mcap for 0.6 s" in capsys.readouterr().out
+    words = ("drive", plain, "--on", "twin", "-o", path)
+    assert f"{path}: drove plain.mcap for 0.6 s" in command(*words).out
     assert column_bytes(path) == column_bytes(plain)
     with Session.open(path) as session, Session.open(plain) as own:
         facts = session.metadata["undulog"]
-        assert facts["driven"] == "commands"
-        assert facts["driven.session_id"] == own.session_id
+        assert (facts["driven"], facts["driven.session_id"]) == ("commands", own.session_id)
         assert [m.data for _, m in session.messages("/gait/mode")] == ["walk"]
     first = path.read_bytes()
-    assert front.run(["drive", str(plain), "--on", "twin", "-o", str(path), "--force"]) == 0
+    command(*words, "--force")
     assert path.read_bytes() == first
 
 
@@ -94,19 +83,18 @@ def everything(path):
     return found
 
 
-# In what it tells of its gait, target following has values that nobody knows yet.
+# Among its logged values, target following has some that are not known yet.
 @pytest.mark.parametrize(
     "name",
     [
         pytest.param(name, marks=[] if name == "target-following" else pytest.mark.slow)
-        for name in scenario_names()
+        for name in sim.scenario_names()
     ],
 )
-def test_what_a_shipped_scenario_commanded_drives_it_again_bit_by_bit(name, tmp_path):
+def test_what_a_shipped_scenario_commanded_drives_it_again_bit_by_bit(name, tmp_path, command):
     path, again = tmp_path / "run.mcap", tmp_path / "again.mcap"
-    words = ["sim", "run", name, "-o", str(path), "--duration", "0.5"]
-    assert front.run(words) == 0
-    assert front.run(["drive", str(path), "--on", "twin", "-o", str(again)]) == 0
+    command("sim", "run", name, "-o", path, "--duration", "0.5")
+    command("drive", path, "--on", "twin", "-o", again)
     assert everything(again) == everything(path)
 
 
@@ -123,58 +111,38 @@ horizontal = { offset = 0.1, frequency_hz = 1.0 }
 """
 
 
-def test_a_plan_is_driven_and_kept_in_the_session(tmp_path, capsys):
+def test_a_plan_is_driven_and_kept_in_the_session(tmp_path, command, opened):
     plan, path = tmp_path / "bend.toml", tmp_path / "bend.mcap"
     plan.write_text(PLAN)
-    assert front.run(["drive", str(plan), "--on", "twin", "-o", str(path)]) == 0
-    told = capsys.readouterr().out.splitlines()
-    assert told[0] == f"{path}: drove bend for 0.7 s"
-    assert told[1].startswith("plan on the twin of snake25 in flat, 71 ticks")
+    shown = command("drive", plan, "--on", "twin", "-o", path).out.splitlines()
+    assert shown[0] == f"{path}: drove bend for 0.7 s"
+    assert shown[1].startswith("plan on the twin of snake25 in flat, 71 ticks")
     with Session.open(path) as session:
         assert session.attachments["plan.toml"].decode() == PLAN
         facts = session.metadata["undulog"]
         assert (facts["driven"], facts["driven.by"]) == ("plan", "bend")
-        gait = session.joints("/gait")
-        omega = gait.signal("horizontal.omega").values
+        omega = session.joints("/gait").signal("horizontal.omega").values
         assert omega[[0, 29, 50, 70]] == pytest.approx([np.pi, np.pi, 2 * np.pi, 2 * np.pi])
         modes = [(t_ns - session.start_ns, m.data) for t_ns, m in session.messages("/gait/mode")]
         assert modes == [(0, "walk"), (300_000_000, "turn")]
     again = tmp_path / "again.mcap"
-    assert front.run(["drive", str(path), "--on", "twin", "-o", str(again)]) == 0
+    command("drive", path, "--on", "twin", "-o", again)
     assert column_bytes(again) == column_bytes(path)
-    with Session.open(again) as session:
-        assert session.attachments["plan.toml"].decode() == PLAN  # what the commands were made from
+    # What the commands were made from:
+    assert opened(again).attachments["plan.toml"].decode() == PLAN
 
 
-def test_a_gait_can_be_driven_in_another_world(tmp_path, capsys):
+def test_a_gait_can_be_driven_in_another_world(tmp_path, command):
     path = tmp_path / "a.mcap"
     words = ["drive", "flat", "--on", "twin:weak-servo-pi3", "-o", str(path), "--duration", "0.1"]
-    assert front.run(words) == 0
+    command(*words)
     with Session.open(path) as session:
         assert "stall_torque = 0.25" in session.attachments["scenario.toml"].decode()
         assert session.metadata["undulog"]["driven.by"] == "flat"
     vertical = ["drive", "snake13-vertical-pi3", "--on", "twin:flat", "--duration", "0.1"]
-    assert front.run([*vertical, "-o", str(tmp_path / "b.mcap")]) == 0
+    command(*vertical, "-o", tmp_path / "b.mcap")
     words = ["drive", "flat", "--on", "twin:nowhere", "-o", str(tmp_path / "c.mcap")]
-    assert front.run(words) == 2
-    assert "no scenario 'nowhere'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("flt", "--on", "twin", "-o", "a.mcap"), "did you mean flat?"),
-        (("flat", "--on", "twin"), "name the session with -o"),
-        (("vertical", "--on", "twin:snake13-planar-pi2", "-o", "a.mcap"), "vertical joints and"),
-        (("flat", "--on", "twin", "-o", "a.csv"), "name it a.mcap"),
-        (("flat", "--on", "twins", "-o", "a.mcap"), "expected twin"),
-        (("flat", "--on", "twin", "-o", "a.mcap", "--duration", "0"), "a duration of 0 s"),
-    ],
-)
-def test_wrong_usage_says_what_would_be_right(words, told, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert front.run(["drive", *words]) == 2
-    assert told in capsys.readouterr().err
+    assert "no scenario 'nowhere'" in command(*words, code=2).err
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -186,15 +154,15 @@ def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number, request):
     wait_for(lambda: unfinished.exists() and unfinished.stat().st_size > 0, alive=[process])
     time.sleep(1.0)
     process.send_signal(number)
-    told, complained = process.communicate(timeout=60)
+    shown, complained = process.communicate(timeout=60)
     assert (process.returncode, complained) == (0, "")
-    assert told.startswith("stopped at rest at ")
+    assert shown.startswith("stopped at rest at ")
     with Session.open(path) as session:
         assert (session.verdict, session.warnings) == ("good", [])
         commands = np.array(session.joints("/joint_commands").values)
         modes = [(t_ns - session.start_ns, m.data) for t_ns, m in session.messages("/gait/mode")]
-        said = [message.msg for _, message in session.messages("/rosout")]
-    assert said[-1].endswith("of 3600 s: it was stopped")
+        notes = [message.msg for _, message in session.messages("/rosout")]
+    assert notes[-1].endswith("of 3600 s: it was stopped")
     assert [mode for _, mode in modes] == ["walk", "stop"]
     assert not commands[:, -1].any()
     begun = modes[1][0] // 10_000_000
@@ -205,11 +173,14 @@ def test_asked_to_stop_it_comes_to_rest_first(tmp_path, number, request):
 
 def test_fading_shrinks_amplitude_and_offset_and_leaves_the_phase(make_robot):
     robot = make_robot(5, planar=True)
-    wave = Serpentine({Plane.HORIZONTAL: PlaneGait(0.3, 1.0, 0.5, offset=0.1)}, ramp_s=0.0)
-    own, faded = SerpentineGait(wave, robot), FadingGait(SerpentineGait(wave, robot), robot, 0.5)
-    knows = Readings.nothing(robot)
+    wave = sim.Serpentine({Plane.HORIZONTAL: sim.PlaneGait(0.3, 1.0, 0.5, offset=0.1)}, ramp_s=0.0)
+    own, faded = (
+        sim.SerpentineGait(wave, robot),
+        FadingGait(sim.SerpentineGait(wave, robot), robot, 0.5),
+    )
+    nothing = sim.Readings.nothing(robot)
     for k in range(160):  # whatever the rounding of times: 0.5 s are 50 ticks
-        expected, tick = own.step(k / 100, knows), faded.step(k / 100, knows)
+        expected, tick = own.step(k / 100, nothing), faded.step(k / 100, nothing)
         if k == 99:
             faded.begin()
         x = min(max((k - 100) / 50, 0.0), 1.0)
@@ -222,21 +193,21 @@ def test_fading_shrinks_amplitude_and_offset_and_leaves_the_phase(make_robot):
         assert faded.at_rest == (k >= 150)
 
 
-class Told:
-    """A gait that tells what a controller may: values of joints, and infinity."""
+class Adaptive:
+    """A gait that reports what a controller may: values of joints, and infinity."""
 
     names = ("horizontal.A", "joint02.offset", "joint02.phase", "steer.offset", "steer.distance")
 
     def step(self, time_s, readings):
         del time_s, readings
-        return GaitTick(np.full(4, 0.2), np.array([0.4, 0.1, 2.0, 0.3, np.inf]), "avoid", ())
+        return sim.GaitTick(np.full(4, 0.2), np.array([0.4, 0.1, 2.0, 0.3, np.inf]), "avoid", ())
 
 
-def test_fading_leaves_what_a_controller_tells_of_itself(make_robot):
+def test_fading_leaves_what_a_controller_reports_of_itself(make_robot):
     robot = make_robot(5)
-    gait = FadingGait(Told(), robot)
+    gait = FadingGait(Adaptive(), robot)
     gait.begin()
-    first, half, last = (gait.step(t, Readings.nothing(robot)) for t in (0.0, 0.5, 1.0))
+    first, half, last = (gait.step(t, sim.Readings.nothing(robot)) for t in (0.0, 0.5, 1.0))
     assert first.values.tolist() == [0.4, 0.1, 2.0, 0.3, np.inf]
     assert half.values == pytest.approx([0.2, 0.05, 2.0, 0.3, np.inf])
     assert last.values.tolist() == [0.0, 0.0, 2.0, 0.3, np.inf]
@@ -260,9 +231,8 @@ def test_each_joint_holds_its_newest_command(tmp_path, make_robot):
         (25_000_000, (-0.1, np.nan)),
     ]
     replay = CommandReplay(written(tmp_path / "a.mcap", rows), robot)
-    assert replay.names == ()
-    assert replay.duration_s == 0.03
-    ticks = [replay.step(k / 100, Readings.nothing(robot)) for k in range(5)]
+    assert (replay.names, replay.duration_s) == ((), 0.03)
+    ticks = [replay.step(k / 100, sim.Readings.nothing(robot)) for k in range(5)]
     limit = robot.joints[1].upper
     assert [tick.command.tolist() for tick in ticks] == [
         [0.2, 0.1, 0.0],  # a joint without a command yet has its first one
@@ -275,30 +245,26 @@ def test_each_joint_holds_its_newest_command(tmp_path, make_robot):
     assert {tick.mode for tick in ticks} == {"replay"}
 
 
-def test_commands_without_a_gait_give_a_session_without_one(tmp_path, capsys):
+def test_commands_without_a_gait_give_a_session_without_one(tmp_path, command):
     source = tmp_path / "given.mcap"
     written(source, [(0, (0.0, 0.0)), (50_000_000, (0.1, 0.0))])
-    path = tmp_path / "a.mcap"
-    assert front.run(["drive", str(source), "--on", "twin", "-o", str(path)]) == 1
-    assert "name one by its world" in capsys.readouterr().err
-    assert front.run(["drive", str(source), "--on", "twin:flat", "-o", str(path)]) == 0
-    with Session.open(path) as session:
+    words = ("drive", source, "-o", tmp_path / "a.mcap", "--on")
+    assert "name one by its world" in command(*words, "twin", code=1).err
+    command(*words, "twin:flat")
+    with Session.open(tmp_path / "a.mcap") as session:
         assert "/gait" not in session.channels
         given = session.joints("/joint_commands").signal("joint01").values.tolist()
         assert given == [*[0.0] * 5, 0.1]
 
 
-def test_what_planned_commands_are_for_goes_on_to_the_run(tmp_path):
-    names, plan = ("joint01", "joint02"), {"plan": "phase-kicks", "run": "3"}
+def test_what_planned_commands_are_for_goes_on_to_the_run(tmp_path, command):
+    plan, commands = {"plan": "phase-kicks", "run": "3"}, [(0.01 * k,) for k in range(11)]
     source, path = tmp_path / "planned.mcap", tmp_path / "run.mcap"
-    commands = [(0.01 * k, 0.0) for k in range(11)]
-    write_commands(source, names, commands, plan=plan, metadata={"settle_s": "0.04"})
-    assert front.run(["drive", str(source), "--on", "twin:flat", "-o", str(path)]) == 0
+    write_commands(source, ["joint01"], commands, plan=plan, metadata={"settle_s": "0.04"})
+    command("drive", source, "--on", "twin:flat", "-o", path)
     with Session.open(path) as session:
-        assert session.metadata["undulog.plan"] == plan
-        assert session.settle_s == 0.04
-        said = [m.msg for _, m in session.messages("/rosout")]
-        assert "settled: 0.04 s have passed" in said
+        assert (session.metadata["undulog.plan"], session.settle_s) == (plan, 0.04)
+        assert "settled: 0.04 s have passed" in [m.msg for _, m in session.messages("/rosout")]
 
 
 def planned_commands(path, **plan):
@@ -306,27 +272,28 @@ def planned_commands(path, **plan):
     return write_commands(path, ("joint01",), commands, plan={"plan": "reversal", **plan})
 
 
-def test_a_plan_turns_the_robot_and_gives_each_run_noise_of_its_own(tmp_path):
+def test_a_plan_turns_the_robot_and_gives_each_run_noise_of_its_own(tmp_path, command):
     source = planned_commands(tmp_path / "planned.mcap", run="3", heading_rad="3.141593")
     world = tmp_path / "sloping.toml"
-    flat = load_scenario("flat", {"world.slope": 0.02, "world.heading": 0.5})
+    flat = sim.load_scenario("flat", {"world.slope": 0.02, "world.heading": 0.5})
     flat = dataclasses.replace(flat, world=dataclasses.replace(flat.world, velocity=(0.1, 0.2, 0)))
     world.write_text(flat.toml())
     path, again = tmp_path / "run.mcap", tmp_path / "again.mcap"
-    assert front.run(["drive", str(source), "--on", f"twin:{world}", "-o", str(path)]) == 0
+    command("drive", source, "--on", f"twin:{world}", "-o", path)
     # Driven again in the world of the run, which is turned already.
-    assert front.run(["drive", str(path), "--on", "twin", "-o", str(again)]) == 0
+    command("drive", path, "--on", "twin", "-o", again)
     positions = []
     for one in (path, again):
         with Session.open(one) as session:
-            ran = parse_scenario(session.attachments["scenario.toml"].decode(), "s", session.robot)
+            ran = sim.parse_scenario(
+                session.attachments["scenario.toml"].decode(), "s", session.robot
+            )
             assert session.metadata["undulog.plan"]["heading_rad"] == "3.141593"
             pose = session.table("/odom").iloc[0]
             positions.append(session.joints("/joint_states").signal("joint01").values)
         assert ran.world.heading == pytest.approx(0.5 + np.pi, abs=1e-6)
         assert ran.world.velocity == pytest.approx((-0.1, -0.2, 0), abs=1e-6)
-        assert ran.world.gravity == flat.world.gravity
-        assert ran.seed == flat.seed + 3
+        assert (ran.world.gravity, ran.seed) == (flat.world.gravity, flat.seed + 3)
         yaw = 2 * np.arctan2(pose["pose.pose.orientation.z"], pose["pose.pose.orientation.w"])
         assert np.exp(1j * yaw) == pytest.approx(np.exp(1j * (0.5 + np.pi)), abs=1e-6)
     np.testing.assert_array_equal(*positions)
@@ -341,26 +308,24 @@ def test_a_senseless_plan_is_refused(tmp_path, capsys, key, value):
     assert not path.exists()
 
 
-def test_a_slope_can_be_set(tmp_path):
+def test_a_slope_can_be_set(tmp_path, command, opened):
     path = tmp_path / "run.mcap"
     words = ["sim", "run", "weak-servo-pi3", "-o", str(path), "--duration", "0.02"]
-    assert front.run([*words, "--set", "world.slope=0.1", "--set", "world.heading=1.5"]) == 0
-    with Session.open(path) as session:
-        text = session.attachments["scenario.toml"].decode()
+    command(*words, "--set", "world.slope=0.1", "--set", "world.heading=1.5")
+    text = opened(path).attachments["scenario.toml"].decode()
     # The run's scenario has its gravity written out; a slope takes its place.
     for changes, fall in (({}, 0.1), ({"world.slope": 0.2}, 0.2)):
-        world = parse_scenario(text, "s", changes=changes).world
+        world = sim.parse_scenario(text, "s", changes=changes).world
         assert world.gravity == pytest.approx((9.81 * np.sin(fall), 0, -9.81 * np.cos(fall)))
         assert world.heading == 1.5
-    assert front.run([*words, "--force", "--set", "world.slope"]) == 2
+    command(*words, "--force", "--set", "world.slope", code=2)
 
 
 @pytest.mark.parametrize("stated", ["soon", "-1", "inf", "nan"])
-def test_a_senseless_settling_time_is_none(tmp_path, stated):
+def test_a_senseless_settling_time_is_none(tmp_path, stated, opened):
     facts = {"settle_s": stated}
     path = write_commands(tmp_path / "a.mcap", ("joint01",), [(0.0,)], metadata=facts)
-    with Session.open(path) as session:
-        assert session.settle_s is None
+    assert opened(path).settle_s is None
 
 
 def test_commands_of_another_robot_are_refused(tmp_path, make_robot):

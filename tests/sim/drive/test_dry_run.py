@@ -8,7 +8,8 @@ import socket
 import numpy as np
 import pytest
 
-import undulog as front
+from support import twin_chains
+from support.twin_runs import SNAKE25
 from support.written_sessions import write_commands
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import SimulationError
@@ -22,39 +23,17 @@ WIDE = 10_000
 STEP = 1e-9
 
 
-ROBOT = """
-name = "short"
-clock = "device"
-joints = [
-  { name = "joint01", plane = "horizontal" },
-  { name = "joint02", plane = "vertical" },
-  { name = "joint03", plane = "horizontal" },
-  { name = "joint04", plane = "vertical" },
-]
-[defaults.link]
-length = 0.06
-radius = 0.025
-mass = 0.1
-inertia = [4e-5, 5e-5, 5e-5]
-[safety]
-max_rate = 4.0
-ramp_rate = 0.5
-max_tracking_error = 0.35
-max_current = 1.4
-reply_timeout_s = 0.25
-max_late_s = 0.2
-"""
-
-
 @pytest.fixture(scope="module")
 def robot():
-    return parse_robot(ROBOT, "short.toml", {})
+    text = twin_chains.chain(4).replace('"simulated"', '"device"').replace('"chain4"', '"short"')
+    limits = {"max_rate": 4.0, "ramp_rate": 0.5, "max_tracking_error": 0.35, "max_current": 1.4}
+    limits |= {"reply_timeout_s": 0.25, "max_late_s": 0.2}
+    return parse_robot(text + twin_chains.toml({"safety": limits}), "short.toml", {})
 
 
 def recorded(path, robot, commands):
     """Commands of a session, rows at 100 Hz, to be driven."""
-    clock = {"computer": "host"}
-    write_commands(path, robot.joint_names, commands, robot=robot, clock=clock)
+    write_commands(path, robot.joint_names, commands, robot=robot, clock={"computer": "host"})
     return find_motion(str(path))
 
 
@@ -69,9 +48,8 @@ def waved(robot, tmp_path_factory):
     """A wave of 1.5 s, run dry, and the twin's session of it."""
     folder = tmp_path_factory.mktemp("dry")
     commands = wave(robot, 1.5)
-    driven = recorded(folder / "wave.mcap", robot, commands)
     path = folder / "twin.mcap"
-    return commands, dry_run(driven, output=path), path
+    return commands, dry_run(recorded(folder / "wave.mcap", robot, commands), output=path), path
 
 
 def test_ranges_rates_and_accelerations_are_those_of_the_commands(waved, robot):
@@ -93,8 +71,7 @@ def test_ranges_rates_and_accelerations_are_those_of_the_commands(waved, robot):
 
 def test_it_would_run_and_the_first_line_says_so(waved):
     _, run, _ = waved
-    assert run.verdict is Verdict.RUNS
-    assert run.verdict.fit
+    assert (run.verdict, run.verdict.fit) == (Verdict.RUNS, True)
     assert (run.duration_s, run.scenario.duration_s, run.missing, run.fault) == (1.5, 1.5, (), None)
     lines = list(summary_lines(run, WIDE))
     assert lines[0].startswith("wave.mcap on short would run as it is; closest to a limit")
@@ -114,8 +91,7 @@ def test_the_table_is_aligned_and_narrow_terminals_go_without_columns(waved, wid
     assert [line.split()[0] for line in lines[head + 1 :]] == [one.name for one in run.joints]
     assert len({len(line) for line in lines[head:]}) == 1  # numbers end at one column
     assert len(lines[head]) <= width
-    shares = [k for k, title in enumerate(lines[head].split()) if title == "%"]
-    assert len(shares) == 5  # they stay
+    assert len([k for k, title in enumerate(lines[head].split()) if title == "%"]) == 5  # they stay
     assert ("too narrow" in lines[head - 1]) is (width < 110)
 
 
@@ -123,23 +99,21 @@ def test_the_ramp_to_the_first_pose_is_as_long_as_its_peak_rate_allows(waved, ro
     commands, run, _ = waved
     np.testing.assert_allclose(run.first_pose, commands[0], atol=STEP)
     # 3 x^2 - 2 x^3 is steepest in its middle, with a slope of 1.5.
-    expected_s = 1.5 * np.abs(commands[0]).max() / robot.safety.ramp_rate
-    assert run.approach_s == pytest.approx(expected_s)
+    assert run.approach_s == pytest.approx(1.5 * np.abs(commands[0]).max() / robot.safety.ramp_rate)
 
 
 def test_torque_current_and_energy_are_those_of_the_session_of_that_run(waved):
     _, run, path = waved
     with Session.open(path) as session:
-        assert session.verdict == "good"
-        assert session.warnings == []
+        assert (session.verdict, session.warnings) == ("good", [])
         modes = [(t_ns, m.data) for t_ns, m in session.messages("/gait/mode")]
-        said = [m.msg for _, m in session.messages("/rosout")]
+        notes = [m.msg for _, m in session.messages("/rosout")]
         effort = session.joints("/joint_states", "effort")
         current = session.joints("/joint_current")
         ledger = session.joints("/energy_ledger")
         commands = session.joints("/joint_commands")
     assert [mode for _, mode in modes] == ["reading the pose", "approach", "replay"]
-    assert "gate: run" in said
+    assert "gate: run" in notes
     begin_ns = modes[-1][0]
     end_ns = begin_ns + round(1.5e9)
     rows = np.array(commands.values)[:, commands.t_ns[0] >= begin_ns]
@@ -148,10 +122,10 @@ def test_torque_current_and_energy_are_those_of_the_session_of_that_run(waved):
     ):
         assert given.max() == pytest.approx(joint.greatest, abs=STEP)
         # What the servos tell comes two ticks late: those of the last two are not in it.
-        heard = (effort.t_ns[0] >= begin_ns - 10_000_000) & (effort.t_ns[0] <= end_ns - 20_000_000)
-        assert np.abs(torques[heard]).max() == pytest.approx(joint.torque_peak, rel=1e-12)
-        assert np.sqrt(np.mean(torques[heard] ** 2)) == pytest.approx(joint.torque_rms, rel=1e-12)
-        assert np.abs(currents[heard]).max() == pytest.approx(joint.current_peak, rel=1e-12)
+        span = (effort.t_ns[0] >= begin_ns - 10_000_000) & (effort.t_ns[0] <= end_ns - 20_000_000)
+        assert np.abs(torques[span]).max() == pytest.approx(joint.torque_peak, rel=1e-12)
+        assert np.sqrt(np.mean(torques[span] ** 2)) == pytest.approx(joint.torque_rms, rel=1e-12)
+        assert np.abs(currents[span]).max() == pytest.approx(joint.current_peak, rel=1e-12)
     window = (ledger.t_ns[0] >= begin_ns) & (ledger.t_ns[0] <= end_ns)
     names = ("mechanical_net", "mechanical_abs", "electrical_net")
     for name, value in zip(names, run.energy_j, strict=True):
@@ -171,18 +145,14 @@ def test_json_has_si_units_and_nothing_that_is_no_number(waved):
     assert found["stop"] is None
 
 
-def test_a_step_would_be_clamped_to_the_greatest_rate(robot, tmp_path):
+def test_a_step_would_be_clamped_to_the_greatest_rate(robot, tmp_path, opened):
     commands = np.zeros((60, len(robot.joints)))
     commands[20:, 2] = 0.3
-    driven = recorded(tmp_path / "step.mcap", robot, commands)
     path = tmp_path / "twin.mcap"
-    run = dry_run(driven, output=path)
-    assert run.verdict is Verdict.CLAMPED
-    assert run.verdict.fit
+    run = dry_run(recorded(tmp_path / "step.mcap", robot, commands), output=path)
+    assert (run.verdict, run.verdict.fit) == (Verdict.CLAMPED, True)
     assert run.joints[2].rate == pytest.approx(30.0)
-    with Session.open(path) as session:
-        given = session.joints("/joint_commands").signal("joint03").values
-    steps = np.diff(given)
+    steps = np.diff(opened(path).joints("/joint_commands").signal("joint03").values)
     assert steps.max() == pytest.approx(4.0 / RATE_HZ)  # of [safety] max_rate
     assert (steps > STEP).sum() == 8  # 0.3 rad by 0.04 rad a tick
     # Where it holds back: in seven of sixty ticks, the eighth step is there.
@@ -201,10 +171,8 @@ def test_a_servo_that_is_too_weak_would_stop_the_drive(robot, tmp_path):
     joints[2] = dataclasses.replace(joints[2], servo=weak)
     world = dataclasses.replace(world, robot=dataclasses.replace(robot, joints=tuple(joints)))
     run = dry_run(driven, world=world)
-    assert run.verdict is Verdict.STOPS
-    assert not run.verdict.fit
-    assert (run.fault.kind, run.fault.joint) == ("tracking", "joint03")
-    assert run.fault.limit == 0.35
+    assert (run.verdict, run.verdict.fit) == (Verdict.STOPS, False)
+    assert (run.fault.kind, run.fault.joint, run.fault.limit) == ("tracking", "joint03", 0.35)
     assert 0.0 <= run.duration_s < 3.0
     first = next(summary_lines(run, WIDE))
     assert "wave.mcap on short would stop " in first
@@ -215,8 +183,7 @@ def test_a_servo_that_is_too_weak_would_stop_the_drive(robot, tmp_path):
 
 def test_limits_that_are_missing_are_named_and_the_numbers_are_there_all_the_same(robot, tmp_path):
     bare = dataclasses.replace(robot, safety=Safety(max_rate=4.0))
-    driven = recorded(tmp_path / "wave.mcap", robot, wave(robot, 0.5))
-    run = dry_run(driven, robot=bare)
+    run = dry_run(recorded(tmp_path / "wave.mcap", robot, wave(robot, 0.5)), robot=bare)
     assert run.verdict is Verdict.REFUSED
     assert run.missing == ("ramp_rate", "max_tracking_error", "reply_timeout_s", "max_late_s")
     assert math.isnan(run.approach_s)
@@ -227,50 +194,42 @@ def test_limits_that_are_missing_are_named_and_the_numbers_are_there_all_the_sam
     assert reported(run)["approach_s"] is None
 
 
-def test_on_the_command_line_nothing_is_opened(tmp_path, capsys):
+def test_on_the_command_line_nothing_is_opened(tmp_path, command, report_of, opened):
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.setblocking(False)
         on = f"can:socketcand:can0?host=127.0.0.1&port={server.getsockname()[1]}"
         words = ["drive", "weak-servo-pi3", "--on", on, "--duration", "0.3"]
-        assert front.run(words) == 0
-        text = capsys.readouterr().out
+        text = command(*words).out
         assert text.startswith("weak-servo-pi3 on snake25 would run as it is; closest")
         assert "nothing was sent, and no bus opened" in text
         path = tmp_path / "dry.mcap"
-        assert front.run([*words, "--json", "-o", str(path)]) == 0
-        found = json.loads(capsys.readouterr().out)
+        found = report_of(*words, "-o", path)
         assert (found["on"], found["would_run"], found["path"]) == (on, True, str(path))
         with pytest.raises(BlockingIOError):
             server.accept()
-    with Session.open(path) as session:
-        assert session.metadata["undulog"]["dry_run"] == "yes"
-    assert front.run([*words, "-o", str(path)]) == 2  # it is there
+    assert opened(path).metadata["undulog"]["dry_run"] == "yes"
+    command(*words, "-o", path, code=2)  # it is there
 
 
-def test_the_exit_code_says_that_it_would_not_run(tmp_path, capsys):
+def test_the_exit_code_says_that_it_would_not_run(tmp_path, command):
     scenario = tmp_path / "weak.toml"
-    scenario.write_text(
-        'description = "weak"\nrobot = "snake25"\nduration_s = 2.0\n'
-        "[servo]\nstall_torque = 0.02\n"
-        "[gait.horizontal]\namplitude = 0.5\nfrequency_hz = 0.5\nlag = 0.5\n"
+    text = SNAKE25.replace("amplitude = 0.3", "amplitude = 0.5")
+    scenario.write_text(f"{text}[servo]\nstall_torque = 0.02\n")
+    assert command("drive", scenario, "--on", "can:socketcand:can0", code=1).out.startswith(
+        "weak on snake25 would stop "
     )
-    assert front.run(["drive", str(scenario), "--on", "can:socketcand:can0"]) == 1
-    assert capsys.readouterr().out.startswith("weak on snake25 would stop ")
-    assert front.run(["drive", str(scenario), "--on", "can"]) == 2
+    command("drive", scenario, "--on", "can", code=2)
 
 
-def test_what_arming_would_refuse_the_dry_run_refuses_too(tmp_path, capsys):
+def test_what_arming_would_refuse_the_dry_run_refuses_too(tmp_path, command):
     on = ("--on", "can:socketcand:can0")
-    assert front.run(["drive", "snake13-horizontal-pi3", *on]) == 2
-    assert "snake13 has no bus map" in capsys.readouterr().err
+    assert "snake13 has no bus map" in command("drive", "snake13-horizontal-pi3", *on, code=2).err
     whole = load_robot("snake25")
     few = tmp_path / "few.mcap"
-    joints = ("joint01", "joint02")
-    write_commands(few, joints, [np.zeros(2)], robot=whole, clock={"c": "host"})
-    assert front.run(["drive", str(few), *on]) == 2
-    said = capsys.readouterr().err
-    assert "it commands 2 joints: joint01, joint02" in said
-    assert "snake25 has 25: joint01, joint02, joint03" in said
+    write_commands(few, ("joint01", "joint02"), [np.zeros(2)], robot=whole, clock={"c": "host"})
+    err = command("drive", few, *on, code=2).err
+    assert "it commands 2 joints: joint01, joint02" in err
+    assert "snake25 has 25: joint01, joint02, joint03" in err
 
 
 def test_a_twin_that_fails_leaves_a_session_that_says_so(robot, tmp_path):

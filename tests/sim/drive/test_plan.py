@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from support.paths import DOCS
+from support.twin_runs import check_keys
 from undulog.capture.common.errors import PlanError
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, SerpentineGait, load_scenario
@@ -36,11 +37,10 @@ def ran(gait, robot, seconds):
 def test_a_plan_that_changes_nothing_is_the_gait_itself(make_plan, make_robot):
     robot = make_robot()
     planes = {H: SLOW, V: PlaneGait(0.1, 0.7, 0.3, offset=0.05, phase=1.0)}
-    same = {plane: planes[plane] for plane in planes}
-    plan = make_plan(Segment(1.0, same), Segment(2.0, same), start=planes, ramp_s=2.0)
-    gait = SerpentineGait(Serpentine(planes, 2.0), robot)
-    _, planned, _, _ = ran(PlanGait(plan, robot), robot, 3.5)
-    _, expected, _, _ = ran(gait, robot, 3.5)
+    same = Segment(1.0, {**planes}), Segment(2.0, {**planes})
+    plan = PlanGait(make_plan(*same, start=planes, ramp_s=2.0), robot)
+    _, planned, _, _ = ran(plan, robot, 3.5)
+    _, expected, _, _ = ran(SerpentineGait(Serpentine(planes, 2.0), robot), robot, 3.5)
     np.testing.assert_array_equal(planned, expected)
 
 
@@ -51,12 +51,8 @@ def test_values_follow_the_smooth_step(make_plan, make_robot):
     times, _, values, modes = ran(PlanGait(plan, robot), robot, 5.0)
     x = np.clip((times - 1.0) / 2.0, 0.0, 1.0)
     share = 3 * x**2 - 2 * x**3
-    for name, before, then in (
-        ("A", 0.2, 0.4),
-        ("omega", np.pi, 3 * np.pi),
-        ("lag", -0.6, 0.2),
-        ("offset", 0.0, 0.1),
-    ):
+    changes = {"A": (0.2, 0.4), "omega": (np.pi, 3 * np.pi), "lag": (-0.6, 0.2)}
+    for name, (before, then) in {**changes, "offset": (0.0, 0.1)}.items():
         expected = before + (then - before) * share
         np.testing.assert_allclose(values[f"horizontal.{name}"], expected, atol=1e-12)
     assert modes == ["walk"] * 100 + ["turn"] * 401
@@ -64,15 +60,13 @@ def test_values_follow_the_smooth_step(make_plan, make_robot):
 
 def test_the_phase_is_the_integral_of_omega_and_never_jumps(make_plan, make_robot):
     robot = make_robot()
-    fast = PlaneGait(0.2, 1.5, 0.6)
-    plan = make_plan(Segment(1.0, {H: SLOW}), Segment(3.0, {H: fast}, 2.0))
+    plan = make_plan(Segment(1.0, {H: SLOW}), Segment(3.0, {H: PlaneGait(0.2, 1.5, 0.6)}, 2.0))
     times, _, values, _ = ran(PlanGait(plan, robot), robot, 4.0)
     phase = values["horizontal.phase"]
     # Integral of S is x^3 - x^4 / 2. Held from tick to tick, omega is the left Riemann sum: with
     # S(x) + S(1 - x) = 1 that falls short of the integral by half a tick of the change in all.
     x = np.clip((times - 1.0) / 2.0, 0.0, 1.0)
-    after = np.maximum(times - 3.0, 0.0)
-    closed = np.pi * times + 2 * np.pi * (2.0 * (x**3 - x**4 / 2) + after)
+    closed = np.pi * times + 2 * np.pi * (2.0 * (x**3 - x**4 / 2) + np.maximum(times - 3.0, 0.0))
     short = 2 * np.pi * 0.005
     assert phase[-1] == pytest.approx(closed[-1] - short, abs=1e-9)
     assert np.abs(phase - closed).max() <= short * (1 + 1e-9)
@@ -149,7 +143,7 @@ def test_without_a_gait_of_its_own_a_plan_starts_from_its_scenarios():
     assert (dict(plan.start), plan.ramp_s) == (flat.planes, flat.ramp_s)
 
 
-def test_all_faults_of_a_plan_are_told_at_once():
+def test_all_faults_of_a_plan_are_reported_at_once():
     text = """
 scenario = "flt"
 speed = 3
@@ -168,20 +162,12 @@ lag = 0.5
 """
     with pytest.raises(PlanError) as caught:
         parse_plan(text, Path("bad.toml"))
-    told = {fault.key for fault in caught.value.faults}
-    assert told == {
-        "description",
-        "scenario",
-        "speed",
-        "segments[0].transition_s",
-        "segments[0].mode",
-        "segments[0].vertical",
-        "segments[0].horizontal.amplitude",
-        "segments[0].horizontal.wave",
-        "segments[0].horizontal.phase",
-        "segments[1].duration_s",
-        "segments[1].horizontal.frequency_hz",
-    }
+    check_keys(
+        (fault.key for fault in caught.value.faults),
+        "description scenario speed segments[0].transition_s segments[0].mode segments[0].vertical "
+        "segments[0].horizontal.amplitude segments[0].horizontal.wave "
+        "segments[0].horizontal.phase segments[1].duration_s segments[1].horizontal.frequency_hz",
+    )
     assert "bad.toml: 11 faults in this plan" in str(caught.value)
     assert "did you mean flat?" in str(caught.value)
 
@@ -198,7 +184,7 @@ duration_s = 1.0
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("segments = 3", "an array of tables"),
         ('description = "d"\nscenario = "flat"\nsegments = []', "at least one table"),
@@ -206,8 +192,8 @@ duration_s = 1.0
         (DELAY_PLAN, "a serpentine gait"),
     ],
 )
-def test_what_is_no_plan_says_why(text, told):
-    with pytest.raises(PlanError, match=told):
+def test_what_is_no_plan_says_why(text, message):
+    with pytest.raises(PlanError, match=message):
         parse_plan(text, Path("p.toml"))
 
 
@@ -221,8 +207,7 @@ def test_a_lag_may_turn_round_through_zero(make_plan, make_robot):
 
 
 def test_the_manuals_plan_is_one():
-    page = (DOCS / "driving.md").read_text()
-    text = page.split("```toml\n")[1].split("```")[0]
+    text = (DOCS / "driving.md").read_text().split("```toml\n")[1].split("```")[0]
     assert is_plan(text)
     plan = parse_plan(text, Path("turn.toml"))
     assert plan.duration_s == 26.0

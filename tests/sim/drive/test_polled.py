@@ -9,27 +9,17 @@ import can
 import numpy as np
 import pytest
 
+from support.arm_limits import ARM_LIMITS
 from support.written_sessions import write_commands
-from undulog.capture import Session
+from undulog.capture import Session, load_robot
 from undulog.capture.bus.encoding import poll_frames
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import DIR_RX, DIR_TX
-from undulog.capture.robot.description import load_robot
 from undulog.sim.drive.motion import find_motion
 from undulog.sim.drive.over_bus import bus_plan, drive_bus
 from undulog.sim.gate.outcome import DriveEnding
 
 SHIPPED = load_robot("arcsnake-joint")
-SAFETY = """
-[safety]
-max_rate = 4.0
-ramp_rate = 1.0
-max_tracking_error = 0.5
-max_current = 5.0
-max_temperature = 60.0
-reply_timeout_s = 0.25
-max_late_s = 0.5
-"""
 ADDRESS = 0x14B
 
 
@@ -38,7 +28,7 @@ class Servo(threading.Thread):
 
     def __init__(self, channel, degrees):
         super().__init__()
-        self.degrees, self.temperature, self.heard = degrees, 30, []
+        self.degrees, self.temperature, self.received = degrees, 30, []
         self.ended = threading.Event()
         self.bus = can.Bus(interface="virtual", channel=channel)
 
@@ -49,10 +39,9 @@ class Servo(threading.Thread):
                     self.answer(bytes(message.data))
 
     def answer(self, data):
-        self.heard.append(data)
+        self.received.append(data)
         if data[0] == 0x92:
-            raw = round(self.degrees * 100)
-            reply = bytes([0x92]) + raw.to_bytes(7, "little", signed=True)
+            reply = bytes([0x92]) + round(self.degrees * 100).to_bytes(7, "little", signed=True)
         elif data[0] == 0xA4:
             self.degrees = struct.unpack("<i", data[4:])[0] / 100
             reply = struct.pack("<BbhhH", 0xA4, self.temperature, 10, 0, 0)
@@ -76,7 +65,7 @@ def servo(channel, degrees):
 def robot(tmp_path):
     """The shipped joint, with limits."""
     path = tmp_path / "arm.toml"
-    path.write_text(SHIPPED.toml + SAFETY)
+    path.write_text(SHIPPED.toml + ARM_LIMITS)
     for name, text in SHIPPED.databases:
         (tmp_path / name).write_text(text)
     return load_robot(path)
@@ -101,20 +90,19 @@ def test_it_is_asked_where_it_is_and_driven_from_there(tmp_path, robot):
     with servo("polled", math.degrees(0.3)) as one:
         report = drive_bus(planned(tmp_path, robot, "polled", angles), stop=StopRequest())
     assert report.outcome.how is DriveEnding.COMPLETE, report.outcome
-    requests = [data for data in one.heard if data[0] == 0x92]
-    commands = [data for data in one.heard if data[0] == 0xA4]
-    assert len(requests) + len(commands) == report.tally.sent == len(one.heard)
-    assert one.heard[:40] == [bytes([0x92]) + bytes(7)] * 40  # it listens before it commands
+    requests = [data for data in one.received if data[0] == 0x92]
+    commands = [data for data in one.received if data[0] == 0xA4]
+    assert len(requests) + len(commands) == report.tally.sent == len(one.received)
+    assert one.received[:40] == [bytes([0x92]) + bytes(7)] * 40  # it listens before it commands
     given = np.radians([struct.unpack("<i", data[4:])[0] / 100 for data in commands])
     assert given[0] == pytest.approx(0.3, abs=0.011)
     assert np.abs(np.diff(given)).max() <= 4.0 * 0.01 + 2e-4
     assert given[-1] == pytest.approx(angles[-1], abs=1e-4)
     with Session.open(tmp_path / "a.mcap") as session:
         frames = session.frames("/can/polled")
-        assert (frames["dir"] == DIR_TX).sum() == len(one.heard)
+        assert (frames["dir"] == DIR_TX).sum() == len(one.received)
         assert (frames["dir"] == DIR_RX).sum() > 0
-        measured = session.joints("/joint_states").values[0]
-        assert np.nanmax(np.abs(measured - 0.3)) < 0.5
+        assert np.nanmax(np.abs(session.joints("/joint_states").values[0] - 0.3)) < 0.5
 
 
 @pytest.mark.slow
@@ -123,6 +111,5 @@ def test_its_temperature_ends_the_drive(tmp_path, robot):
         one.temperature = 61
         plan = planned(tmp_path, robot, "polled-hot", np.full(200, 0.5))
         report = drive_bus(plan, stop=StopRequest())
-    told = "joint01: temperature 61 degC, more than 60 degC for 0.3"
-    assert report.outcome.why.startswith(told)
+    assert report.outcome.why.startswith("joint01: temperature 61 degC, more than 60 degC for 0.3")
     assert abs(one.degrees) <= 0.005

@@ -50,7 +50,7 @@ def alone(tmp_path):
     return os.environ | {"XDG_RUNTIME_DIR": str(runtime)}
 
 
-def test_a_recorder_is_told_the_gait_through_its_control_socket(tmp_path, alone):
+def test_a_recorder_gets_the_gait_through_its_control_socket(tmp_path, alone):
     path = tmp_path / "recorded.mcap"
     with served("weak-servo-pi3", "--duration", "60") as (on, _), recorded(on, path, alone):
         words = ["drive", "weak-servo-pi3", "--on", on, "--arm", "--duration", "2", "--json"]
@@ -58,21 +58,19 @@ def test_a_recorder_is_told_the_gait_through_its_control_socket(tmp_path, alone)
         drove = undulog(*words, env=alone)
         assert drove.returncode == 0, drove.stderr
         report = json.loads(drove.stdout)
-        assert report["gait_not_told"] is None
-        assert report["gait_told"] == report["ticks"]
+        assert (report["gait_not_told"], report["gait_told"]) == (None, report["ticks"])
         stopped = undulog("record", "stop", "--wait", env=alone)
         assert stopped.returncode == 0, stopped.stderr
     with Session.open(path) as session:
         gait = session.joints("/gait")
-        said = [message.msg for _, message in session.messages("/rosout")]
+        notes = [message.msg for _, message in session.messages("/rosout")]
         modes = [message.data for _, message in session.messages("/gait/mode")]
         commands = session.joints("/joint_commands")
         states = session.joints("/joint_states")
         assert session.robot.name == "snake25"
-    assert len(gait.t_ns[0]) == report["ticks"]
-    assert modes == ["walk"]
-    assert any(text.startswith("drives weak-servo-pi3 (gait) on can:") for text in said)
-    assert any(text.startswith("drove weak-servo-pi3 for 2 s") for text in said)
+    assert (len(gait.t_ns[0]), modes) == (report["ticks"], ["walk"])
+    assert any(text.startswith("drives weak-servo-pi3 (gait) on can:") for text in notes)
+    assert any(text.startswith("drove weak-servo-pi3 for 2 s") for text in notes)
     assert len(states.t_ns[0]) > 50
     # Commands on the bus and gait by the control socket tell the same story: what a joint got is
     # what the gait meant in the same tick, rounded to the bus.
@@ -104,7 +102,7 @@ def test_the_virtual_robot_is_driven_as_any_other_through_python_can(tmp_path, a
     assert (drove.returncode, drove.stderr) == (0, "")
     report = json.loads(drove.stdout)
     assert report["outcome"] == "complete"
-    assert report["approach_s"] >= 0.5  # whose bus it is has to be heard
+    assert report["approach_s"] >= 0.5  # whose bus it is has to be read from it
     assert report["lateness"]["ticks"] >= 100
     with Session.open(path) as session:
         sent = session.frames("/can/can0")
@@ -113,7 +111,7 @@ def test_the_virtual_robot_is_driven_as_any_other_through_python_can(tmp_path, a
         assert session.metadata["undulog"]["clock.can0"] == "host"
 
 
-def test_several_recorders_have_to_be_told_apart(tmp_path, alone):
+def test_of_several_recorders_one_has_to_be_chosen(tmp_path, alone):
     first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
     with (
         served("flat", "--duration", "60") as (on, _),
@@ -142,7 +140,7 @@ def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
             wait_for(lambda: path.exists() and path.stat().st_size > 0, alive=[driving])
             time.sleep(1.0)
             driving.send_signal(number)
-            told, complained = driving.communicate(timeout=60)
+            shown, complained = driving.communicate(timeout=60)
     assert driving.returncode == 1
     why = {
         signal.SIGTERM: "stop requested (SIGTERM)",
@@ -150,8 +148,8 @@ def test_a_signal_brings_the_robot_to_rest(tmp_path, number, alone):
         signal.SIGHUP: "the console is gone",
     }[number]
     assert complained.startswith(f"error: {why}; the joints were brought straight within ")
-    assert told.startswith(f"{on}: stopped at ")
-    assert told.splitlines()[0].endswith(why)
+    assert shown.startswith(f"{on}: stopped at ")
+    assert shown.splitlines()[0].endswith(why)
     with Session.open(path) as session:
         commands = np.array(session.joints("/joint_commands").values)
         assert (session.verdict, session.warnings) == ("good", [])

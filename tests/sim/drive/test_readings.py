@@ -1,4 +1,4 @@
-"""Readings from the bus: frames that the shared encoder packs, decoded into what a gait is told."""
+"""Readings from the bus: frames that the shared encoder packs, decoded for a gait."""
 
 import math
 
@@ -11,23 +11,20 @@ from undulog.capture.log.messages.frames import DIR_TX, empty_frames
 from undulog.capture.robot.model import Direction, Quantity
 from undulog.sim.drive.links import BusReadings
 
-
-@pytest.fixture
-def robot():
-    return load_robot("snake25")
+ROBOT = load_robot("snake25")
+encode = BusEncoder(ROBOT, Direction.RX).encode
 
 
 @pytest.fixture
-def encode(robot):
-    return BusEncoder(robot, Direction.RX).encode
+def known():
+    return BusReadings(ROBOT)
 
 
 def joint(quantity, value, name="joint03"):
     return {(name, quantity, ""): value}
 
 
-def test_nothing_is_known_before_the_first_frame(robot):
-    known = BusReadings(robot)
+def test_nothing_is_known_before_the_first_frame(known):
     readings = known.readings(0.0)
     assert np.isnan(readings.angle).all()
     assert np.isnan(readings.velocity).all()
@@ -35,8 +32,7 @@ def test_nothing_is_known_before_the_first_frame(robot):
     assert (known.status(3.0).silence_s == math.inf).all()
 
 
-def test_each_sensor_has_its_newest_value(robot, encode):
-    known = BusReadings(robot)
+def test_each_sensor_has_its_newest_value(known):
     first = joint(Quantity.POSITION, 0.1) | joint(Quantity.VELOCITY, -1.0)
     first |= {("ir01", Quantity.RANGE, ""): 0.5, ("sonar", Quantity.RANGE, ""): 2.0}
     for axis, specific_force in (("x", 1.0), ("y", 2.0), ("z", 9.0)):
@@ -60,8 +56,7 @@ def test_each_sensor_has_its_newest_value(robot, encode):
     assert known.tally.decoded == 6
 
 
-def test_the_gate_is_told_what_the_servos_tell_of_themselves(robot, encode):
-    known = BusReadings(robot)
+def test_the_gate_gets_what_the_servos_report_of_themselves(known):
     values = joint(Quantity.POSITION, 0.1) | joint(Quantity.CURRENT, -1.2)
     known.add(encode(values | joint(Quantity.TEMPERATURE, 41.0)), 0.0)
     known.add(encode(joint(Quantity.POSITION, 0.2) | joint(Quantity.CURRENT, 0.7)), 0.01)
@@ -74,26 +69,23 @@ def test_the_gate_is_told_what_the_servos_tell_of_themselves(robot, encode):
     assert np.isnan(known.status(0.6).current).all()
 
 
-def test_nothing_in_range_is_infinitely_far_and_unknown_is_not_a_value(robot, encode):
-    known = BusReadings(robot)
+def test_nothing_in_range_is_infinitely_far_and_unknown_is_not_a_value(known):
     known.add(encode({("ir01", Quantity.RANGE, ""): 0.5}), 0.0)
     known.add(encode({("ir02", Quantity.RANGE, ""): math.inf}), 0.1)  # shares a frame with ir01
     assert known.readings(0.1).ranges == {"ir01": pytest.approx(0.5), "ir02": math.inf}
 
 
-def test_what_has_not_come_for_long_is_unknown_again(robot, encode):
-    known = BusReadings(robot, oldest_s=0.3)
+def test_what_has_not_come_for_long_is_unknown_again():
+    known = BusReadings(ROBOT, oldest_s=0.3)
     known.add(encode(joint(Quantity.POSITION, 0.1) | {("ir01", Quantity.RANGE, ""): 0.5}), 0.0)
     known.add(encode(joint(Quantity.POSITION, 0.3, "joint04")), 0.2)
     assert not math.isnan(known.readings(0.3).angle[2])
     later = known.readings(0.31)
     assert math.isnan(later.angle[2])
-    assert later.angle[3] == pytest.approx(0.3, abs=1e-4)
-    assert later.ranges == {}
+    assert (later.angle[3], later.ranges) == (pytest.approx(0.3, abs=1e-4), {})
 
 
-def test_what_was_handed_out_does_not_change_later(robot, encode):
-    known = BusReadings(robot)
+def test_what_was_handed_out_does_not_change_later(known):
     values = {("accelerometer", Quantity.ACCELERATION, "x"): 1.0}
     known.add(encode(values | joint(Quantity.POSITION, 0.1)), 0.0)
     before = known.readings(0.0)
@@ -104,12 +96,10 @@ def test_what_was_handed_out_does_not_change_later(robot, encode):
         before.angle[2] = 0.0
 
 
-def test_frames_of_others_are_counted_and_say_nothing(robot):
+def test_frames_of_others_are_counted_and_give_no_reading(known):
     frames = empty_frames(2)
-    frames["id_flags"] = [0x101, 0x7FF]  # a command, and an identifier that nobody knows
-    frames["dlc"] = 2
-    frames["dir"] = [0, DIR_TX]
-    known = BusReadings(robot)
+    frames["id_flags"] = [0x101, 0x7FF]  # a command, and an unknown identifier
+    frames["dlc"], frames["dir"] = 2, [0, DIR_TX]
     known.add(frames, 0.0)
     assert (known.status(1.0).silence_s == math.inf).all()
     assert (known.tally.frames, known.tally.decoded) == (2, 0)

@@ -22,10 +22,10 @@ def tick(k, mode="walk", count=5):
 @contextmanager
 def control_socket(path, refuse=()):
     """A recorder's control socket that keeps the requests."""
-    heard = []
+    received = []
 
     def handle(request):
-        heard.append(dict(request))
+        received.append(dict(request))
         if request["do"] in refuse:
             raise ControlError("a source writes that topic")
         return {}
@@ -33,24 +33,30 @@ def control_socket(path, refuse=()):
     server = ControlServer(path, handle)
     try:
         with polled(server):
-            yield heard
+            yield received
     finally:
         server.close()
 
 
-def test_everything_is_told_in_order(tmp_path):
-    with control_socket(tmp_path / "a.sock") as heard:
-        teller = GaitPublisher(tmp_path / "a.sock", NAMES)
+@contextmanager
+def publishing(path, names=NAMES, **options):
+    """A publisher of a gait and the requests that its recorder received."""
+    with control_socket(path, **options) as received:
+        teller = GaitPublisher(path, names)
+        yield teller, received
+        teller.close()
+
+
+def test_everything_is_published_in_order(tmp_path):
+    with publishing(tmp_path / "a.sock") as (teller, received):
         teller.note("drives")
         for k in range(300):
             teller.publish(tick(k, "walk" if k < 200 else "avoid"), 10**18 + k)
-        teller.close()
     assert (teller.taken, teller.dropped, teller.error) == (300, 0, None)
-    gait = [request for request in heard if request["do"] == "gait"]
+    gait = [request for request in received if request["do"] == "gait"]
     assert [request["t_ns"] - 10**18 for request in gait] == list(range(300))
     assert gait[7]["values"] == dict(zip(NAMES, [7.0, 8.0, 9.0, 10.0, 11.0], strict=True))
-    others = [(heard.index(one), one) for one in heard if one["do"] != "gait"]
-    assert others == [
+    assert [(received.index(one), one) for one in received if one["do"] != "gait"] == [
         (0, {"do": "note", "text": "drives", "level": "info"}),
         (1, {"do": "mode", "text": "walk"}),
         (202, {"do": "mode", "text": "avoid"}),
@@ -60,24 +66,19 @@ def test_everything_is_told_in_order(tmp_path):
 def test_what_json_has_no_number_for_is_null(tmp_path):
     names = (*NAMES, "joint01.A", "steer.distance")
     values = np.array([1.0, 2.0, 3.0, 4.0, 5.0, np.nan, np.inf])
-    with control_socket(tmp_path / "a.sock") as heard:
-        teller = GaitPublisher(tmp_path / "a.sock", names)
+    with publishing(tmp_path / "a.sock", names) as (teller, received):
         teller.publish(GaitTick(np.zeros(25), values, "walk", ()), 1)
-        teller.close()
-    told = [1.0, 2.0, 3.0, 4.0, 5.0, None, None]
-    assert heard[-1]["values"] == dict(zip(names, told, strict=True))
+    expected = [1.0, 2.0, 3.0, 4.0, 5.0, None, None]
+    assert received[-1]["values"] == dict(zip(names, expected, strict=True))
 
 
-def test_commands_without_a_gait_tell_their_mode_only(tmp_path):
-    with control_socket(tmp_path / "a.sock") as heard:
-        teller = GaitPublisher(tmp_path / "a.sock", ())
+def test_commands_without_a_gait_publish_their_mode_only(tmp_path):
+    with publishing(tmp_path / "a.sock", ()) as (teller, received):
         teller.publish(tick(0, "replay", count=0), 1)
-        teller.close()
-    assert heard == [{"do": "mode", "text": "replay"}]
-    assert teller.taken == 0
+    assert (received, teller.taken) == ([{"do": "mode", "text": "replay"}], 0)
 
 
-def test_a_recorder_that_goes_or_refuses_is_told_nothing_more(tmp_path):
+def test_a_recorder_that_goes_or_refuses_is_sent_nothing_more(tmp_path):
     with control_socket(tmp_path / "a.sock"):
         teller = GaitPublisher(tmp_path / "a.sock", NAMES)
         teller.publish(tick(0), 1)
@@ -87,10 +88,8 @@ def test_a_recorder_that_goes_or_refuses_is_told_nothing_more(tmp_path):
     teller.close()
     assert teller.taken == 1
     assert "went" in teller.error
-    with control_socket(tmp_path / "b.sock", refuse=("gait",)):
-        teller = GaitPublisher(tmp_path / "b.sock", NAMES)
+    with publishing(tmp_path / "b.sock", refuse=("gait",)) as (teller, _):
         teller.publish(tick(0), 1)
-        teller.close()
     assert (teller.taken, teller.error) == (0, "a source writes that topic")
 
 

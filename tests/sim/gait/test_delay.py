@@ -52,10 +52,8 @@ def test_before_its_delay_is_over_a_joint_rests(make_robot):
 
 def test_the_ramp_goes_down_the_line(make_robot):
     gait = build(make_robot(), ramp_s=1.0)
-    values = np.array([gait.step(k / 100, NOTHING).values for k in range(400)])
-    amplitude = values[:, 5:18]
-    t = np.arange(400)[:, None] / 100 - TAU * np.arange(13)
-    x = np.clip(t, 0.0, 1.0)
+    amplitude = np.array([gait.step(k / 100, NOTHING).values for k in range(400)])[:, 5:18]
+    x = np.clip(np.arange(400)[:, None] / 100 - TAU * np.arange(13), 0.0, 1.0)
     np.testing.assert_allclose(amplitude, 0.3 * (3 * x**2 - 2 * x**3), atol=1e-12)
 
 
@@ -82,8 +80,7 @@ def test_a_change_of_omega_arrives_late_where_equation_2_changes_at_once(make_ro
     assert differences[:, 0].max() < 1e-12  # the master itself is Eq. 2 always
     # When the change has reached the whole body the lag is 2 pi / 6 and no more pi / 6.
     t = 8.0
-    i = np.arange(13)
-    expected = 0.3 * np.sin(OMEGA * (2 * t - 4.0) - i * 2 * OMEGA * TAU)
+    expected = 0.3 * np.sin(OMEGA * (2 * t - 4.0) - np.arange(13) * 2 * OMEGA * TAU)
     np.testing.assert_allclose(one, expected, atol=1e-12)
     assert differences[-1].max() > 0.2
 
@@ -114,8 +111,7 @@ def test_the_phase_is_remembered_exactly_however_long_it_runs():
 
 
 def test_a_controller_acts_at_the_joint_behind_its_delay(make_robot):
-    robot = make_robot()
-    gait = build(robot)
+    gait = build(make_robot())
     factors, offsets = np.ones(25), np.zeros(25)
     factors[24], offsets[24] = 0.5, 0.1
     for k in range(300):

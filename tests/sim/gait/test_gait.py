@@ -56,16 +56,13 @@ def test_the_logged_values_give_the_commands_back(make_robot):
     }
     gait = SerpentineGait(Serpentine(planes), make_robot())
     commands, values, _ = run(gait, 3.0)
-    assert gait.names[:6] == (
-        *(f"horizontal.{name}" for name in ("A", "omega", "lag", "offset", "phase")),
-        "vertical.A",
-    )
+    parts = ("A", "omega", "lag", "offset", "phase")
+    assert gait.names[:6] == (*(f"horizontal.{name}" for name in parts), "vertical.A")
     for start, columns in ((0, slice(0, None, 2)), (5, slice(1, None, 2))):
         A, _, lag, offset, phase = (values[:, start + k, None] for k in range(5))
-        i = np.arange(commands[:, columns].shape[1])
-        np.testing.assert_allclose(
-            commands[:, columns], A * np.sin(phase + i * lag) + offset, atol=1e-14
-        )
+        own = commands[:, columns]
+        expected = A * np.sin(phase + np.arange(own.shape[1]) * lag) + offset
+        np.testing.assert_allclose(own, expected, atol=1e-14)
 
 
 def test_the_start_is_smooth(make_robot):

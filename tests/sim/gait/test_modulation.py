@@ -42,24 +42,13 @@ GAITS = {
     ),
 }
 
-finite = st.floats(-1e3, 1e3)
-modulations = st.builds(
-    Modulation,
-    st.lists(finite, min_size=7, max_size=7).map(np.array),
-    st.lists(finite, min_size=7, max_size=7).map(np.array),
-    st.floats(-10.0, 10.0),
-)
-some_limits = st.lists(
-    st.tuples(st.floats(-3.0, 0.0), st.floats(0.0, 3.0)), min_size=7, max_size=7
-).map(tuple)
+seven = st.lists(st.floats(-1e3, 1e3), min_size=7, max_size=7).map(np.array)
+modulations = st.builds(Modulation, seven, seven, st.floats(-10.0, 10.0))
+some_limits = st.tuples(*[st.tuples(st.floats(-3.0, 0.0), st.floats(0.0, 3.0))] * 7)
 
 
 @pytest.mark.parametrize("kind", GAITS)
-@given(
-    limits=some_limits,
-    changes=st.lists(modulations, min_size=1, max_size=8),
-    seed=st.integers(0, 9),
-)
+@given(some_limits, st.lists(modulations, min_size=1, max_size=8), st.integers(0, 9))
 @settings(max_examples=40, deadline=None)
 def test_no_modulation_passes_a_limit(kind, limits, changes, seed):
     robot = snake(limits)
@@ -81,11 +70,6 @@ def test_what_jumps_is_amplitude_and_offset_never_the_phase(kind, seed):
     # |A' sin(p') + Y' - A sin(p) - Y| <= A |p' - p| + |A' - A| + |Y' - Y|, and p' - p = omega dt.
     robot = snake()
     gait = generator(GAITS[kind], robot, per_joint=True)
-    names = gait.names
-    at = {
-        key: [names.index(f"{joint}.{key}") for joint in robot.joint_names]
-        for key in ("A", "offset", "phase")
-    }
     random = np.random.default_rng(seed)
     pull = 0.0 if kind in ("serpentine", "delay-blocks", "tail-to-head") else 2 * 5.0 * 2.0
     ticks = []
@@ -94,7 +78,10 @@ def test_what_jumps_is_amplitude_and_offset_never_the_phase(kind, seed):
         gait.modulate(Modulation(factors, offsets, random.uniform(0.0, 3.0)))
         ticks.append(gait.step(k * STEP_S, NOTHING))
     values = np.array([tick.values for tick in ticks])
-    amplitude, offset, phase = (values[:, at[key]] for key in ("A", "offset", "phase"))
+    amplitude, offset, phase = (
+        values[:, [gait.names.index(f"{joint}.{key}") for joint in robot.joint_names]]
+        for key in ("A", "offset", "phase")
+    )
     command = np.array([tick.command for tick in ticks])
     np.testing.assert_allclose(command, amplitude * np.sin(phase) + offset, atol=1e-12)
     turn = np.abs(np.diff(phase, axis=0))
@@ -111,9 +98,8 @@ def test_the_logged_omega_integrates_to_the_logged_phase(kind):
     times = np.cumsum(random.uniform(0.0, 0.03, 400))
     rows = []
     for time_s in times:
-        gait.modulate(
-            dataclasses.replace(Modulation.none(7), frequency_factor=random.uniform(0, 3))
-        )
+        factor = random.uniform(0, 3)
+        gait.modulate(dataclasses.replace(Modulation.none(7), frequency_factor=factor))
         rows.append(gait.step(time_s, NOTHING).values)
     omega, phase = np.array(rows)[:, 1], np.array(rows)[:, 4]
     summed = phase[0] + np.cumsum(omega[:-1] * np.diff(times))
@@ -130,15 +116,12 @@ def test_a_modulation_acts_on_its_own_joint_from_the_next_step_on():
     factors[2], offsets[5] = 0.5, 0.1
     gait.modulate(Modulation(factors, offsets))
     moved, still = (one.step(0.4, NOTHING).command for one in (gait, plain))
-    expected = still * factors + offsets
-    np.testing.assert_allclose(moved, expected, atol=1e-15)
+    np.testing.assert_allclose(moved, still * factors + offsets, atol=1e-15)
 
 
 def test_where_all_joints_are_cut_the_plane_is_named_else_the_joints():
-    robot = snake()
-    gait = generator(GAITS["tail-to-head"], robot, per_joint=True)
-    factors, offsets = np.full(7, 2.0), np.zeros(7)
-    gait.modulate(Modulation(factors, offsets))
+    gait = generator(GAITS["tail-to-head"], snake(), per_joint=True)
+    gait.modulate(Modulation(np.full(7, 2.0), np.zeros(7)))
     assert gait.step(0.0, NOTHING).clamped == ("horizontal.A", "vertical.A")
     factors, offsets = np.ones(7), np.zeros(7)
     factors[3], offsets[4] = 2.0, 1.0
@@ -149,14 +132,14 @@ def test_where_all_joints_are_cut_the_plane_is_named_else_the_joints():
     assert tick.command[4] == math.pi / 6
 
 
-def test_unlike_limits_cut_each_joint_by_its_own_and_are_told():
+def test_unlike_limits_cut_each_joint_by_its_own_and_are_reported():
     limits = ((-0.1, 0.3), (-0.5, 0.5), (-0.5, 0.5), *(((-0.5, 0.5),) * 4))
     gait = generator(Serpentine({Plane.HORIZONTAL: PlaneGait(0.4, 0.5, 0.8)}, 0.0), snake(limits))
     tick = gait.step(0.0, NOTHING)
-    told = dict(zip(gait.names, tick.values, strict=True))
+    found = dict(zip(gait.names, tick.values, strict=True))
     assert tick.clamped == ("joint01.A",)
-    assert [told[f"joint0{i}.A"] for i in (1, 3, 5, 7)] == [0.1, 0.4, 0.4, 0.4]
-    assert "joint02.A" not in told  # its plane is not driven
+    assert [found[f"joint0{i}.A"] for i in (1, 3, 5, 7)] == [0.1, 0.4, 0.4, 0.4]
+    assert "joint02.A" not in found  # its plane is not driven
 
 
 @pytest.mark.parametrize(

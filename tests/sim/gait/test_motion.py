@@ -13,10 +13,8 @@ import pytest
 
 from undulog.capture import Session
 from undulog.capture.robot.model import Plane
-from undulog.sim import Readings, load_scenario
+from undulog.sim import Readings, Twin, load_scenario, record
 from undulog.sim.scenario.gaits import generator
-from undulog.sim.twin.recording import record
-from undulog.sim.twin.twin import Twin
 
 CYCLE = 200  # ticks
 
@@ -135,19 +133,18 @@ def test_felt_servos_keep_the_wave_and_slow_it_a_little():
     late = shift[-1 - CYCLE : -1].mean(axis=0)
     assert np.ptp(late) < math.radians(10.0)
     drift = (late - shift[1000 : 1000 + CYCLE].mean(axis=0)) / (time_s[-1 - CYCLE] - 10.0)
-    expected = -(chain.feedback**2) / (2 * math.pi)
-    np.testing.assert_allclose(drift, expected, rtol=0.2)
+    np.testing.assert_allclose(drift, -(chain.feedback**2) / (2 * math.pi), rtol=0.2)
 
 
 @pytest.mark.parametrize("name", ["delay-blocks", "oscillators-one-way"])
-def test_a_session_tells_what_each_joint_was_meant_to_do(tmp_path, name):
+def test_a_session_records_what_each_joint_was_meant_to_do(tmp_path, name):
     scenario = load_scenario(name).changed(duration_s=0.3)
     record(scenario, tmp_path / "run.mcap")
     with Session.open(tmp_path / "run.mcap") as session:
         meant, commands = session.joints("/gait"), session.joints("/joint_commands")
-    told = dict(zip(meant.names, meant.values, strict=True))
+    shown = dict(zip(meant.names, meant.values, strict=True))
     commanded = dict(zip(commands.names, commands.values, strict=True))
     for i in scenario.robot.joint_indices(Plane.HORIZONTAL):
         joint = scenario.robot.joint_names[i]
-        angle = told[f"{joint}.A"] * np.sin(told[f"{joint}.phase"]) + told[f"{joint}.offset"]
+        angle = shown[f"{joint}.A"] * np.sin(shown[f"{joint}.phase"]) + shown[f"{joint}.offset"]
         np.testing.assert_allclose(commanded[joint], angle, atol=1e-12)

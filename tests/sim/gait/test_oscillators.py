@@ -71,9 +71,8 @@ def test_a_bidirectional_chain_locks_at_the_lag_it_asks_for(make_robot, kind, si
 def test_a_locked_chain_is_the_serpentine_gait(make_robot, kind):
     robot = make_robot()
     _, commands, amplitudes = run(robot, 6.0, oscillator=kind)
-    serpentine = SerpentineGait(
-        Serpentine({Plane.HORIZONTAL: PlaneGait(0.4, 0.5, PSI)}, 0.0), robot
-    )
+    wave = Serpentine({Plane.HORIZONTAL: PlaneGait(0.4, 0.5, PSI)}, 0.0)
+    serpentine = SerpentineGait(wave, robot)
     t = np.arange(601) / 100
     expected = [serpentine.step(x, nothing(25)).command[0::2] for x in t]
     np.testing.assert_allclose(commands[500:], expected[500:], atol=1e-6)
@@ -93,8 +92,7 @@ def test_the_slowest_mode_decays_as_the_path_graph_says(make_robot, n):
     robot, start = make_robot(n + 1, planar=True), tuple((1e-3 * mode).tolist())
     theta, _, _ = run(robot, 3.0 / expected, forward=K, backward=K, start_phase=start)
     share = (theta + PSI * np.arange(n)) @ mode
-    t = np.arange(len(share)) / 100
-    slope = np.polyfit(t, np.log(share), 1)[0]
+    slope = np.polyfit(np.arange(len(share)) / 100, np.log(share), 1)[0]
     assert slope == pytest.approx(-expected, rel=1e-4)
 
 
@@ -110,8 +108,7 @@ def test_a_one_way_chain_settles_in_sequence(make_robot):
     t = np.arange(len(theta)) / 100
     start = theta[0, 1] + PSI - theta[0, 0]
     expected = 2.0 * np.arctan(np.tan(start / 2.0) * np.exp(-2.0 * t))
-    found = theta[:, 1] + PSI - theta[:, 0]
-    np.testing.assert_allclose(found, expected, atol=1e-8)
+    np.testing.assert_allclose(theta[:, 1] + PSI - theta[:, 0], expected, atol=1e-8)
 
 
 @pytest.mark.parametrize("ratio", [0.5, 0.99, 1.01, 2.0])
@@ -190,15 +187,9 @@ def test_hopf_oscillators_against_scipy_and_the_paper_s_form(make_robot):
     first = np.concatenate([A * np.cos(phase), A * np.sin(phase)])
     times = np.arange(801) / 100
     foreign = solve_ivp(rate, (0, 8.0), first, "DOP853", t_eval=times, rtol=1e-11, atol=1e-12).y.T
-    _, commands, _ = run(
-        make_robot(n + 1, planar=True),
-        8.0,
-        oscillator=OscillatorKind.HOPF,
-        amplitude=A,
-        attraction=alpha,
-        approach_rate=100.0,
-        **chain(forward, backward, detuning, start),
-    )
+    fields = chain(forward, backward, detuning, start) | {"oscillator": OscillatorKind.HOPF}
+    fields |= {"amplitude": A, "attraction": alpha, "approach_rate": 100.0}
+    _, commands, _ = run(make_robot(n + 1, planar=True), 8.0, **fields)
     np.testing.assert_allclose(commands[100:], foreign[100:, n:], atol=1e-7)
 
 
@@ -230,9 +221,8 @@ def test_the_approach_against_scipy_under_moving_targets():
 
 def test_a_change_of_amplitude_and_offset_does_not_jump(make_robot):
     robot = make_robot(7, planar=True)
-    gait = OscillatorGait(
-        OscillatorChains({Plane.HORIZONTAL: OscillatorChain(0.3, 0.5, PSI)}), robot
-    )
+    chains = OscillatorChains({Plane.HORIZONTAL: OscillatorChain(0.3, 0.5, PSI)})
+    gait = OscillatorGait(chains, robot)
     commands = []
     for k in range(800):
         if k == 400:
@@ -344,8 +334,7 @@ def test_a_joint_that_has_reported_nothing_is_not_fed_back(make_robot):
         return np.array([np.nan, 0.1, np.nan, np.nan])
 
     half, _, _ = run(robot, 3.0, answer=answer, feedback=2.0, **UNCOUPLED)
-    moved = np.ptp(half, axis=0) > 1e-3
-    assert moved.tolist() == [False, True, False, False]
+    assert (np.ptp(half, axis=0) > 1e-3).tolist() == [False, True, False, False]
 
 
 def test_the_frequency_factor_turns_every_oscillator(make_robot):

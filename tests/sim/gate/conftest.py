@@ -14,5 +14,4 @@ def small(tmp_path_factory):
 @pytest.fixture(scope="session")
 def session(small, tmp_path_factory):
     """A minute of commands."""
-    path = tmp_path_factory.mktemp("session") / "wave.mcap"
-    return gate_stage.commanded(path, small[0], 60.0)
+    return gate_stage.commanded(tmp_path_factory.mktemp("session") / "wave.mcap", small[0], 60.0)

@@ -41,16 +41,14 @@ def test_no_sequence_of_wishes_gives_a_command_beyond_a_limit_on_the_bus(wanted,
 
 
 def test_what_is_within_the_limits_passes_bit_by_bit():
-    pose = np.zeros(25)
-    clamp = Clamp(LIMITS, pose, PERIOD_S)
+    clamp = Clamp(LIMITS, np.zeros(25), PERIOD_S)
     for k in range(200):
         wanted = 0.4 * np.sin(np.pi * k * PERIOD_S + np.arange(25)) * min(k / 100, 1.0)
-        found = clamp.apply(wanted)
-        np.testing.assert_array_equal(found.command, wanted)
+        np.testing.assert_array_equal(clamp.apply(wanted).command, wanted)
     assert clamp.cuts == {"by_position": 0, "by_rate": 0, "unconfirmed": 0, "not_finite": 0}
 
 
-def test_cuts_are_told_by_joint_and_reason():
+def test_cuts_are_reported_by_joint_and_reason():
     clamp = Clamp(LIMITS, np.zeros(25), PERIOD_S)
     wanted = np.zeros(25)
     wanted[[3, 4, 5]] = 1.0, 0.3, np.nan
@@ -77,8 +75,7 @@ def test_a_ramp_arrives_and_no_joint_is_faster_than_it_may(start, target, rate):
     np.testing.assert_array_equal(ramp.at(0.0), start if ramp.duration_s else ramp.at(0.0))
     np.testing.assert_allclose(ramp.at(ramp.duration_s), target, atol=1e-15)
     t = np.linspace(0.0, ramp.duration_s, 500)
-    way = np.array([ramp.at(each) for each in t])
-    step = np.abs(np.diff(way, axis=0)).max(axis=0)
+    step = np.abs(np.diff(np.array([ramp.at(each) for each in t]), axis=0)).max(axis=0)
     smallest = 1e-300  # ways below the normal numbers have no relative precision
     assert (step <= rate * (1 + 1e-6) * t[1] + smallest).all()
 
@@ -90,8 +87,7 @@ def test_an_ending_starts_where_the_joints_are(how):
     angle[6] = -0.3  # blocked: 0.5 rad from where it was sent
     angle[7] = np.nan
     unknown = np.full(25, np.nan)
-    status = JointStatus(angle, np.zeros(25), unknown, unknown, np.zeros(25))
-    ending = Ending(limits, last, status)
+    ending = Ending(limits, last, JointStatus(angle, np.zeros(25), unknown, unknown, np.zeros(25)))
     begin = last.copy()
     begin[6] = -0.3
     np.testing.assert_array_equal(ending.at(0.0), begin)
@@ -102,8 +98,7 @@ def test_an_ending_starts_where_the_joints_are(how):
 
 
 def test_a_servo_that_draws_too_much_is_pushed_less_until_it_does_not():
-    limit = np.array([1.0, 1.0, np.nan])
-    yielding = CurrentLimiter(limit)
+    yielding = CurrentLimiter(np.array([1.0, 1.0, np.nan]))
     wanted, angle = np.array([0.3, 0.3, 0.3]), np.array([0.1, 0.1, np.nan])
     current = np.array([8.0 * 0.2, 0.5, 5.0])  # of a stiff servo: proportional to the distance
     pushed = []
@@ -160,8 +155,7 @@ def test_frames_that_wait_for_their_times_are_never_too_fast(data, apart_s, coun
         spacing.sent(command, np.array(sent_ns))
         if before is not None:
             for a_ns, b_ns in zip(before[1], sent_ns, strict=True):
-                way = np.abs(command - before[0])
-                assert (way <= 4.0 * (b_ns - a_ns) * 1e-9 + 1e-12).all()
+                assert (np.abs(command - before[0]) <= 4.0 * (b_ns - a_ns) * 1e-9 + 1e-12).all()
         before = command, sent_ns
     assert spacing.longest_s <= PERIOD_S + 1e-9
 

@@ -70,8 +70,7 @@ def test_whatever_is_held_up_no_more_than_a_step_arrives_at_once(joints, loss):
                 bounds = confirmation.bounds()
                 if bounds is not None and joints == 1:
                     bounds = tuple(np.broadcast_to(bound, COUNT) for bound in bounds)
-                wanted = np.full(COUNT, 0.5 * math.sin(tick / 12))
-                command = clamp.apply(wanted, bounds).command
+                command = clamp.apply(np.full(COUNT, 0.5 * math.sin(tick / 12)), bounds).command
                 confirmation.send(command[:joints], np.zeros(joints))
                 line.up.append(command[0])
             if confirmation.ask():

@@ -17,6 +17,8 @@ from support.processes import UNDULOG, process, serving, undulog
 from undulog.capture import Session
 from undulog.capture.log.health.session_check import check_session
 
+pytestmark = pytest.mark.slow
+
 # -- kill -9 --------------------------------------------------------------------------------------
 
 
@@ -29,18 +31,17 @@ def check_kept(written, lines):
         given = np.array([row[name] for _, row in written.commands])
         assert len(angle) - len(given) in {0, 1}
         assert np.abs(given - angle[: len(given)]).max() <= gate_stage.STEP / 2 * (1 + 1e-6)
-    said = [text for _, _, text in written.said]
-    assert said[0] == "drives wave.mcap (commands) on " + said[0].rpartition(" on ")[2]
-    assert "gate: reading the pose" in said
-    assert any(text.startswith("gate: approach, ") for text in said)
-    assert "gate: run" in said
+    notes = [text for _, _, text in written.said]
+    assert notes[0] == "drives wave.mcap (commands) on " + notes[0].rpartition(" on ")[2]
+    assert "gate: reading the pose" in notes
+    assert any(text.startswith("gate: approach, ") for text in notes)
+    assert "gate: run" in notes
 
 
-def check_kill(folder, scenario, session, seed):
-    """Kill an armed drive at a random moment, and look at what is left of its session."""
-    folder.mkdir(exist_ok=True)
-    path, repaired = folder / "a.mcap", folder / "repaired.mcap"
-    with staged(folder, scenario) as on_stage, on_stage.replay(session, path) as controller:
+@pytest.mark.parametrize("seed", range(6))
+def test_a_drive_that_is_killed_has_all_that_was_commanded(seed, small, session, tmp_path):
+    path, repaired = tmp_path / "a.mcap", tmp_path / "repaired.mcap"
+    with staged(tmp_path, small[1]) as on_stage, on_stage.replay(session, path) as controller:
         on_stage.wait_for_commands(controller, 80)
         time.sleep(random.Random(seed).uniform(0.0, 1.5))
         controller.kill()
@@ -52,25 +53,17 @@ def check_kill(folder, scenario, session, seed):
     assert "exists already" in again.stderr
     with Session.open(path) as left:
         commands = left.joints("/joint_commands")
-        ticks = len(commands.t_ns[0])
         assert any("undulog log recover" in warning for warning in left.warnings)
     done = undulog("log", "recover", path, "-o", repaired, "--json")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert report["missing"] == 0
-    assert report["from_wal"] > 0
+    assert report["missing"] == 0 < report["from_wal"]
     written = Written(repaired)
     check_kept(written, lines)
-    assert ticks == len(written.commands)
+    assert len(commands.t_ns[0]) == len(written.commands)
     for name, values in zip(commands.names, commands.values, strict=True):
         assert values.tolist() == [row[name] for _, row in written.commands]
     gate_stage.check_limits(lines)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(6))
-def test_a_drive_that_is_killed_has_all_that_was_commanded(seed, small, session, tmp_path):
-    check_kill(tmp_path, small[1], session, seed)
 
 
 # -- a full disk ----------------------------------------------------------------------------------
@@ -88,8 +81,14 @@ def fill(folder):
                 size //= 2
 
 
+def check_missing(err, size):
+    """The bytes that are needed are those that are free, and those that are missing."""
+    found = re.search(rf"needs {size} bytes and the disk has (\d+) free: (\d+) bytes are mi", err)
+    assert int(found[1]) + int(found[2]) == size
+
+
 def check_told(controller, path, disk, *, ramp_rate=gate_stage.RAMP_RATE):
-    """The robot came to its safe end, and that is in a whole session; what was said and written."""
+    """The robot came to its safe end, and that is in a whole session; its report and log."""
     _, err = controller.communicate(timeout=120)
     assert controller.returncode == 1, err
     assert err.startswith(f"error: the disk at {disk} is full or fails: {path}")
@@ -105,7 +104,6 @@ def check_told(controller, path, disk, *, ramp_rate=gate_stage.RAMP_RATE):
     return err, written
 
 
-@pytest.mark.slow
 def test_a_disk_that_somebody_fills_brings_the_robot_down_first(small, session, tmp_path, disk_of):
     disk = disk_of("64m")
     path = disk / "a.mcap"
@@ -120,7 +118,6 @@ def test_a_disk_that_somebody_fills_brings_the_robot_down_first(small, session, 
     gate_stage.check_session(path, lines)
 
 
-@pytest.mark.slow
 def test_a_disk_that_the_drive_itself_fills_brings_the_robot_down_first(disk_of):
     disk = disk_of("50m")
     path = disk / "a.mcap"
@@ -130,13 +127,9 @@ def test_a_disk_that_the_drive_itself_fills_brings_the_robot_down_first(disk_of)
         with process(*words) as controller:
             err, written = check_told(controller, path, disk, ramp_rate=0.5)
     assert len(written.commands) > 1000
-    missing = re.search(
-        r"needs 16777216 bytes and the disk has (\d+) free: (\d+) bytes are mi", err
-    )
-    assert int(missing[1]) + int(missing[2]) == 1 << 24
+    check_missing(err, 1 << 24)
 
 
-@pytest.mark.slow
 def test_on_a_disk_without_room_nothing_is_sent(small, session, tmp_path, disk_of):
     disk = disk_of("44m")
     path = disk / "a.mcap"
@@ -146,9 +139,6 @@ def test_on_a_disk_without_room_nothing_is_sent(small, session, tmp_path, disk_o
         assert on_stage.lines
         assert not on_stage.command_lines
     assert controller.returncode == 1
-    missing = re.search(
-        r"needs 50331648 bytes and the disk has (\d+) free: (\d+) bytes are mi", err
-    )
     assert err.startswith(f"error: {path}: needs")
-    assert int(missing[1]) + int(missing[2]) == 48 << 20
+    check_missing(err, 48 << 20)
     assert list(disk.iterdir()) == []

@@ -70,7 +70,7 @@ def errors(written):
 
 
 def check_told(written, reason):
-    """The fault is told when it is found and at the end, and no other one is."""
+    """The fault is reported when it is found and at the end, and no other one is."""
     found, end = errors(written)
     assert found.startswith(f"fault: {reason}")
     assert end.startswith(f"fault: {reason}")
@@ -105,9 +105,8 @@ def test_lost_replies_end_it_and_name_the_joint(driving):
 
 @pytest.mark.slow
 def test_the_robots_file_can_say_that_joints_are_held(driving, tmp_path):
-    robot, scenario = gate_stage.robot_files(
-        tmp_path / "holds", safety=SAFETY | {"on_fault": '"hold"'}
-    )
+    holds = SAFETY | {"on_fault": '"hold"'}
+    robot, scenario = gate_stage.robot_files(tmp_path / "holds", safety=holds)
     holding = gate_stage.commanded(tmp_path / "holding.mcap", robot, 60.0)
     with driving(f"lost:1@{FAULT_AT_S}", scenario=scenario, recorded=holding) as drive:
         _, err, written = drive.ended()
@@ -123,8 +122,7 @@ def test_after_bus_off_nothing_more_is_sent(driving):
     assert err.startswith("error: bus-off: ")
     assert "nothing more was sent" in err
     check_told(written, "bus-off: ")
-    after = written.after("fault: ")
-    assert all(len(angle) == 0 for angle in after.values())
+    assert all(len(angle) == 0 for angle in written.after("fault: ").values())
 
 
 @pytest.mark.slow
@@ -153,7 +151,7 @@ def test_a_process_that_comes_late_does_not_jump(driving):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plain", [False, True])
-def test_a_process_that_stops_and_goes_on_tells_no_joint_to_be_too_fast(plain, driving):
+def test_a_process_that_stops_and_goes_on_commands_no_joint_too_fast(plain, driving):
     """It catches up at the greatest rate that the robot's file allows: in true time, too."""
     with driving(plain=plain) as drive:
         drive.begun()
@@ -165,10 +163,10 @@ def test_a_process_that_stops_and_goes_on_tells_no_joint_to_be_too_fast(plain, d
     left_out = [text for _, _, text in written.said if " control ticks were left out" in text]
     assert sum("s of the gait" in text for text in left_out) >= 4
     assert any("command held back to 4 rad/s" in text for _, _, text in written.said)
-    told = re.search(r"(\d+) control ticks were left out, as the one before took too long", out)
+    given = re.search(r"(\d+) control ticks were left out, as the one before took too long", out)
     skipped = [re.search(r"late, (\S+) control tick", text) for _, _, text in written.said]
     counts = [1 if found[1] == "a" else int(found[1]) for found in skipped if found]
-    assert sum(counts) <= int(told[1]) >= 4 * 25
+    assert sum(counts) <= int(given[1]) >= 4 * 25
 
 
 # -- what is refused ----------------------------------------------------------------------------
@@ -176,31 +174,31 @@ def test_a_process_that_stops_and_goes_on_tells_no_joint_to_be_too_fast(plain, d
 
 def refused(folder, scenario, sessions):
     """What the controller says of sessions that it refuses, by name; nothing at all is sent."""
-    said = {}
+    noted = {}
     with staged(folder, scenario) as on_stage, ExitStack() as running:
         started = {
             name: running.enter_context(on_stage.replay(chosen, folder / f"{name}-out.mcap"))
             for name, chosen in sessions.items()
         }
         for name, controller in started.items():
-            _, said[name] = controller.communicate(timeout=60)
-            assert controller.returncode == 2, (name, said)
+            _, noted[name] = controller.communicate(timeout=60)
+            assert controller.returncode == 2, (name, noted)
             assert not (folder / f"{name}-out.mcap").exists(), name
         on_stage.settle()
         assert on_stage.lines  # the robot spoke all the while
         assert not on_stage.command_lines
-    return said
+    return noted
 
 
 def test_a_robot_without_limits_is_refused_and_nothing_is_sent(small, tmp_path):
     bare, _ = gate_stage.robot_files(tmp_path / "bare", safety=None)
     session = gate_stage.commanded(tmp_path / "limits.mcap", bare, 1.0)
-    said = refused(tmp_path, small[1], {"limits": session})["limits"]
-    assert said.startswith(
+    noted = refused(tmp_path, small[1], {"limits": session})["limits"]
+    assert noted.startswith(
         "error: snake4 can't be armed: its description lacks max_rate, ramp_rate, "
         "max_tracking_error, reply_timeout_s, max_late_s, max_current in [safety]"
     )
-    assert "\n  [safety]\n  max_rate = " in said
+    assert "\n  [safety]\n  max_rate = " in noted
 
 
 @pytest.mark.slow
@@ -209,19 +207,15 @@ def test_another_joint_set_and_another_robot_are_refused_and_nothing_is_sent(sma
     joints = ("joint01", "joint02", "joint03", "wheel")
     sessions["foreign"] = write(tmp_path / "foreign.mcap", small[0], 1.0, names=joints)
     sessions["fewer"] = write(tmp_path / "fewer.mcap", small[0], 1.0, names=joints[:3])
-    sessions["robot"] = write(
-        tmp_path / "robot.mcap",
-        "snake25",
-        1.0,
-        names=[f"joint{k + 1:02d}" for k in range(25)],
-        commands=lambda times_s: np.full((len(times_s), 25), 0.1),
-    )
-    said = refused(tmp_path, small[1], sessions)
-    assert "joint01, joint02, joint03, wheel" in said["foreign"]
-    assert "joint01, joint02, joint03, joint04" in said["foreign"]
-    assert "it commands 3 joints: joint01, joint02, joint03\n" in said["fewer"]
-    assert "snake4 has 4: joint01, joint02, joint03, joint04" in said["fewer"]
-    assert " is snake4, and robot.mcap is for snake25; nothing was sent" in said["robot"]
+    whole = {"names": [f"joint{k + 1:02d}" for k in range(25)]}
+    whole["commands"] = lambda times_s: np.full((len(times_s), 25), 0.1)
+    sessions["robot"] = write(tmp_path / "robot.mcap", "snake25", 1.0, **whole)
+    noted = refused(tmp_path, small[1], sessions)
+    for last in ("wheel", "joint04"):
+        assert f"joint01, joint02, joint03, {last}" in noted["foreign"]
+    assert "it commands 3 joints: joint01, joint02, joint03\n" in noted["fewer"]
+    assert "snake4 has 4: joint01, joint02, joint03, joint04" in noted["fewer"]
+    assert " is snake4, and robot.mcap is for snake25; nothing was sent" in noted["robot"]
 
 
 @pytest.mark.slow
@@ -242,8 +236,8 @@ def test_another_robot_is_known_by_its_frames_where_nobody_says_who_is_there(dri
     assert drive.controller.returncode == 2, err
     assert "no command was sent: another robot is on this bus" in err
     assert "0 are of snake4; others have the identifiers 601" in err
-    states = {1537, 1538, 1539, 1540}
-    assert {one["id"] for one in lines} == {*states, gate_stage.MARK}  # nobody else spoke
+    # Nobody else spoke:
+    assert {one["id"] for one in lines} == {1537, 1538, 1539, 1540, gate_stage.MARK}
 
 
 # -- who is in charge goes ----------------------------------------------------------------------
@@ -254,9 +248,7 @@ def test_ctrl_c_brings_the_joints_down(driving):
         drive.begun(60)
         drive.signal(signal.SIGINT)
         _, err, written = drive.ended()
-    assert err.startswith(
-        "error: stop requested (Ctrl-C); the joints were brought straight within "
-    )
+    assert err.startswith("error: stop requested (Ctrl-C); the joints were brought straight within")
     assert not errors(written)
     gate_stage.check_ramp_down(written, "gate: ending, stop requested (Ctrl-C)")
 
@@ -338,13 +330,11 @@ def test_all_joints_of_the_whole_robot_are_kept_within_their_limits(tmp_path):
     names = [f"joint{k + 1:02d}" for k in range(25)]
 
     def wild(times_s):  # steps of all sizes, beyond the limits too
-        return np.random.default_rng(7).uniform(-0.8, 0.8, (len(times_s) // 20 + 1, 25))[
-            np.arange(len(times_s)) // 20
-        ]
+        levels = np.random.default_rng(7).uniform(-0.8, 0.8, (len(times_s) // 20 + 1, 25))
+        return levels.repeat(20, axis=0)[: len(times_s)]
 
-    steps = gate_stage.commanded(
-        tmp_path / "steps.mcap", "snake25", 1.0, names=names, commands=wild
-    )
+    steps = tmp_path / "steps.mcap"
+    gate_stage.commanded(steps, "snake25", 1.0, names=names, commands=wild)
     # In lockstep the robot waits for its commands: no machine is too slow for 25 joints.
     with (
         staged(tmp_path, "flat", pace="--lockstep") as on_stage,
@@ -357,5 +347,4 @@ def test_all_joints_of_the_whole_robot_are_kept_within_their_limits(tmp_path):
     gate_stage.check_limits(lines)
     written = gate_stage.check_session(path, lines, lockstep=True)
     assert len(gate_stage.commands_of(lines)) == 25
-    cuts = [text for _, _, text in written.said if "command held back to 4 rad/s" in text]
-    assert cuts
+    assert [text for _, _, text in written.said if "command held back to 4 rad/s" in text]

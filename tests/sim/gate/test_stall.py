@@ -9,35 +9,26 @@ import json
 import math
 import os
 import signal
-import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from subprocess import PIPE
 
 import numpy as np
 import pytest
 
 from support import far_end
+from support.arm_limits import ARM_LIMITS
 from support.far_end import beyond_rate, largest_burst
 from support.processes import start
 from support.written_sessions import write_commands
-from undulog.capture import Session
-from undulog.capture.robot.description import load_robot
+from undulog.capture import Session, load_robot
 
-FAR_END = far_end.__file__
+pytestmark = pytest.mark.slow
+
 MAX_RATE, PERIOD_S = 4.0, 0.01
 STEP = MAX_RATE * PERIOD_S
 ROUNDING = 2 * math.radians(0.01)  # of two commands on the bus
-SAFETY = """
-[safety]
-max_rate = 4.0
-ramp_rate = 1.0
-max_tracking_error = 0.5
-max_current = 5.0
-max_temperature = 60.0
-reply_timeout_s = 0.25
-max_late_s = 0.5
-"""
 # The wall clock is set by a day to and fro while it drives.
 DRIVE = """
 import sys, time
@@ -50,10 +41,9 @@ sys.exit(undulog.run(sys.argv[1:]))
 
 
 @contextmanager
-def far_end(*words):
+def running_far_end(*words):
     """One process, and its port."""
-    command = [sys.executable, str(FAR_END), *map(str, words)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as one:
+    with start(sys.executable, far_end.__file__, *words, stdin=PIPE, stderr=None) as one:
         try:
             yield one, int(one.stdout.readline())
         finally:
@@ -66,7 +56,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("stall")
     polled, unasked = load_robot("arcsnake-joint"), load_robot("snake25")
     wide = unasked.toml.replace("-0.5235987755982988", "-3.0").replace("0.5235987755982988", "3.0")
-    tomls = {"polled": polled.toml + SAFETY, "unasked": wide}
+    tomls = {"polled": polled.toml + ARM_LIMITS, "unasked": wide}
     for name, text in (*polled.databases, *unasked.databases):
         (folder / name).write_text(text)
     for kind, toml in tomls.items():
@@ -123,12 +113,10 @@ class Drive:
 
     def check_held(self):
         """It held, and was brought to rest."""
-        assert self.code == 1
-        assert self.report["fault"]["kind"] == "silent"
+        assert (self.code, self.report["fault"]["kind"]) == (1, "silent")
         assert "the bus was silent: no joint was received for " in self.errors
         assert self.phases[:4] == ["reading the pose", "run", "hold", "ending"]
-        assert self.phases[-1] == "ending"
-        assert self.verdict == "bad"
+        assert (self.phases[-1], self.verdict) == ("ending", "bad")
         assert self.report["held_s"] > 0
         assert abs(self.arrivals[-1][2]) < ROUNDING
 
@@ -137,8 +125,8 @@ class Drive:
 def driving(folder, tmp_path, kind, *, period_s=0.01, latency_s=0.0, duration_s=3.0, route=()):
     path, which = tmp_path / "a.mcap", "unasked" if kind == "unasked" else "polled"
     with (
-        far_end("robot", kind, period_s, latency_s) as (robot, port),
-        far_end("router", port) as (router, front),
+        running_far_end("robot", kind, period_s, latency_s) as (robot, port),
+        running_far_end("router", port) as (router, front),
     ):
         drive = Drive(robot, router, None, path)
         for line in route:
@@ -158,7 +146,6 @@ def driving(folder, tmp_path, kind, *, period_s=0.01, latency_s=0.0, duration_s=
                 running.kill()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["polled", "unasked"])
 @pytest.mark.parametrize("stall_s", [0.2, 1.0, 5.0])
 def test_a_far_end_that_stops_is_held_and_then_brought_to_rest(folder, tmp_path, kind, stall_s):
@@ -169,7 +156,6 @@ def test_a_far_end_that_stops_is_held_and_then_brought_to_rest(folder, tmp_path,
     drive.check_held()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["polled", "unasked"])
 def test_short_stalls_change_no_joint_beyond_the_bound(folder, tmp_path, kind):
     with driving(folder, tmp_path, kind, duration_s=5.0) as drive:
@@ -191,11 +177,10 @@ WAYS = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("way", list(WAYS))
+@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 def test_a_router_on_the_way_makes_no_step_larger(folder, tmp_path, way):
     with driving(folder, tmp_path, "polled", duration_s=4.0) as drive:
-        for each in WAYS[way]:
+        for each in way:
             if isinstance(each, str):
                 drive.route(each)
             else:
@@ -204,15 +189,13 @@ def test_a_router_on_the_way_makes_no_step_larger(folder, tmp_path, way):
     drive.check_bound()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["polled", "unasked"])
 def test_a_half_open_connection_ends_without_a_ramp(folder, tmp_path, kind):
     with driving(folder, tmp_path, kind, duration_s=20.0) as drive:
         drive.route("hold both")
         drive.end()
     drive.check_bound()
-    assert drive.code == 1
-    assert drive.report["fault"]["kind"] == "silent"
+    assert (drive.code, drive.report["fault"]["kind"]) == (1, "silent")
     assert drive.report["held_s"] == pytest.approx(10.0, abs=1.0)
     assert drive.report["ended"].startswith("nothing more was sent")
     assert drive.phases[:3] == ["reading the pose", "run", "hold"]
@@ -229,10 +212,8 @@ HEALTHY = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("which", list(HEALTHY))
-def test_a_bus_that_is_slow_late_or_lossy_is_never_held(folder, tmp_path, which):
-    kind, more = HEALTHY[which]
+@pytest.mark.parametrize(("kind", "more"), HEALTHY.values(), ids=HEALTHY)
+def test_a_bus_that_is_slow_late_or_lossy_is_never_held(folder, tmp_path, kind, more):
     with driving(folder, tmp_path, kind, duration_s=4.0, **more) as drive:
         drive.end()
     if kind != "unasked":

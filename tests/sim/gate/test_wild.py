@@ -1,6 +1,6 @@
 """The whole gate against anything: readings, wishes, stops, trouble and lateness drawn at random.
 
-Whatever it is told and in whatever phase, what it sends, decoded by cantools, is within the limits;
+Under any command and in any phase, what it sends, decoded by cantools, is within the limits;
 once it is done it sends nothing; and an ending ends.
 """
 
@@ -73,8 +73,8 @@ def test_nothing_that_happens_makes_it_send_a_command_beyond_a_limit(pose, drawn
         nonlocal tick
         gait.wish = wish
         status = JointStatus(angle, current, unknown, unknown, np.zeros(COUNT))
-        heard = GateInput(Readings(angle, unknown), status, **more)
-        found = gate.step(tick, heard, stop, at_once=at_once)
+        received = GateInput(Readings(angle, unknown), status, **more)
+        found = gate.step(tick, received, stop, at_once=at_once)
         tick += 1
         if found.command is not None:
             sent.append(on_the_bus(found.command))
@@ -99,7 +99,7 @@ def test_nothing_that_happens_makes_it_send_a_command_beyond_a_limit(pose, drawn
     step(pose, np.zeros(COUNT), np.zeros(COUNT))
     assert len(sent) == count
     if sent:
-        told = np.array(sent)
-        assert np.abs(told).max() <= LIMIT + STEP / 2
-        steps = np.abs(np.diff(told, axis=0, prepend=np.clip(pose, -LIMIT, LIMIT)[None]))
+        shown = np.array(sent)
+        assert np.abs(shown).max() <= LIMIT + STEP / 2
+        steps = np.abs(np.diff(shown, axis=0, prepend=np.clip(pose, -LIMIT, LIMIT)[None]))
         assert steps.max() <= MAX_RATE / RATE_HZ + STEP * (1 + 1e-6)

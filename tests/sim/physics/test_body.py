@@ -50,8 +50,7 @@ def test_links_lie_where_our_kinematics_has_them(uneven, writhe):
         head = rotation_from_quaternion(state.quaternion[:, 0])
         centres, turns = link_poses(uneven, state.position[:, 0], head, state.angle)
         np.testing.assert_allclose(state.position.T, centres, atol=1e-12)
-        found = rotation_from_quaternion(state.quaternion.T)
-        np.testing.assert_allclose(found, turns, atol=1e-12)
+        np.testing.assert_allclose(rotation_from_quaternion(state.quaternion.T), turns, atol=1e-12)
     assert np.abs(states[-1].angle).max() > 0.1
 
 
@@ -85,8 +84,7 @@ def test_joints_cannot_change_the_momentum(uneven, writhe):
 
 
 def test_a_thrown_body_flies_a_parabola(make_robot):
-    robot = make_robot(4)
-    body = BulletEngine(robot, BodyStart((0, 0, -9.81), 1.0, 0.3, (1, 0, 2), 1e-3))
+    body = BulletEngine(make_robot(4), BodyStart((0, 0, -9.81), 1.0, 0.3, (1, 0, 2), 1e-3))
     for _ in range(500):
         body.step(np.zeros(3))
     state = body.read()
@@ -142,14 +140,12 @@ def test_the_urdf_describes_the_same_body(uneven, tmp_path):
         pybullet.resetJointState(body, i, angle, physicsClientId=client)
         info = pybullet.getJointInfo(body, i, client)
         joint = uneven.joints[i]
-        assert info[1].decode() == joint.name
-        assert info[12].decode() == uneven.links[i + 1].name
+        assert (info[1].decode(), info[12].decode()) == (joint.name, uneven.links[i + 1].name)
         assert info[6] == info[7] == 0.0  # damping, friction
         assert info[8:12] == (joint.lower, joint.upper, joint.servo.stall_torque, 10.0)
     for i, link in enumerate(uneven.links):
         dynamics = pybullet.getDynamicsInfo(body, i - 1, client)
-        assert dynamics[0] == link.mass
-        assert dynamics[2] == link.inertia
+        assert (dynamics[0], dynamics[2]) == (link.mass, link.inertia)
     found = pybullet.getLinkStates(body, range(4), 0, 1, client)
     pybullet.disconnect(client)
     centres, turns = link_poses(uneven, np.zeros(3), np.eye(3), angles)
@@ -162,8 +158,7 @@ def test_the_urdf_describes_the_same_body(uneven, tmp_path):
 
 def test_the_urdf_is_plain_xml_with_shapes(uneven):
     root = ET.fromstring(urdf(uneven))
-    assert root.get("name") == uneven.name
-    assert len(root.findall("link")) == 5
+    assert (root.get("name"), len(root.findall("link"))) == (uneven.name, 5)
     assert {len(link.findall("visual")) for link in root.findall("link")} == {3}
 
 
@@ -171,6 +166,5 @@ def test_two_bodies_live_side_by_side(make_scenario, make_robot):
     small = make_scenario(make_robot(4), duration_s=0.2, ramp_s=0.0)
     expected = [sample.step.body.angle for sample in simulate(small)]
     with Twin(small) as one, Twin(make_scenario(make_robot(6), amplitude=0.0)) as other:
-        both = zip(one.samples(), other.samples(), strict=False)
-        found = [a.step.body.angle for a, _ in both]
+        found = [a.step.body.angle for a, _ in zip(one.samples(), other.samples(), strict=False)]
     assert math.isclose(np.abs(np.array(found) - expected[: len(found)]).max(), 0.0)

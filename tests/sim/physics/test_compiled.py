@@ -9,7 +9,7 @@ from support.processes import python
 from support.twin_runs import simulate
 from undulog.capture import Session
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
-from undulog.sim import FrictionLaw, Ground, World, load_scenario
+from undulog.sim import Cylinder, FrictionLaw, Ground, World, load_scenario, record
 from undulog.sim.physics.bullet import BulletEngine
 from undulog.sim.physics.compiled_bullet import CompiledBulletEngine
 from undulog.sim.physics.compiled_kernels import CompiledLaws
@@ -17,9 +17,7 @@ from undulog.sim.physics.engine import BodyStart
 from undulog.sim.physics.laws import NumpyLaws
 from undulog.sim.physics.servo import Servos
 from undulog.sim.physics.steps import Steps
-from undulog.sim.scenario.obstacles import Cylinder
 from undulog.sim.scenario.scenario import EngineKind, Kernels
-from undulog.sim.twin.recording import record
 
 START = BodyStart((0.3, 0, -9.81), 0.3, 0.7, (0.2, 0.1, 0.0), 1e-3)
 
@@ -29,20 +27,12 @@ def uneven(make_uneven):
     """Servos and radii differ too."""
     robot = make_uneven(6)
     links = [dataclasses.replace(one, radius=0.02 + 1e-3 * i) for i, one in enumerate(robot.links)]
-    servos = [
-        dataclasses.replace(
-            joint.servo,
-            stall_torque=0.2 + 0.1 * i,
-            backlash=0.02 * (i % 2),
-            supply_v=6 + i,
-            static_friction=0.05 * (i % 3 == 0),
-        )
-        for i, joint in enumerate(robot.joints)
-    ]
-    joints = [
-        dataclasses.replace(joint, servo=servo)
-        for joint, servo in zip(robot.joints, servos, strict=True)
-    ]
+    joints = []
+    for i, joint in enumerate(robot.joints):
+        own = {"stall_torque": 0.2 + 0.1 * i, "backlash": 0.02 * (i % 2), "supply_v": 6 + i}
+        own["static_friction"] = 0.05 * (i % 3 == 0)
+        servo = dataclasses.replace(joint.servo, **own)
+        joints.append(dataclasses.replace(joint, servo=servo))
     return dataclasses.replace(robot, links=tuple(links), joints=tuple(joints))
 
 
@@ -74,8 +64,7 @@ def test_without_ground_there_is_no_force(uneven):
     steps = Steps.empty(1, 6, 5)
     steps.table[:] = np.random.default_rng(3).normal(size=steps.table.shape)
     steps.stacked.body.position[:, 2] = 0.0
-    laws = CompiledLaws(steps, uneven, None, Servos([j.servo for j in uneven.joints]), 1e-3)
-    laws.start(0)
+    CompiledLaws(steps, uneven, None, Servos([j.servo for j in uneven.joints]), 1e-3).start(0)
     assert not steps.stacked.contact.force.any()
 
 
@@ -142,18 +131,17 @@ def test_compiled_runs_give_the_same_bytes_and_say_how_they_were_made(
 )
 def test_a_missing_extra_is_named_and_auto_goes_without(tmp_path, package, words):
     engine = "mujoco" if package == "mujoco" else "bullet"
-    scenario = dataclasses.replace(
-        load_scenario("flat").changed(duration_s=0.02), engine=EngineKind(engine)
-    )
+    short = load_scenario("flat").changed(duration_s=0.02)
+    scenario = dataclasses.replace(short, engine=EngineKind(engine))
     (tmp_path / "a.toml").write_text(scenario.toml())
     code = (
         f"import sys; sys.modules[{package!r}] = None; import undulog\n"
         f"sys.exit(undulog.run(['sim', 'run', 'a.toml', '-o', 'a.mcap', *{words.split()!r}]))"
     )
-    said = python(code, cwd=tmp_path)
+    found = python(code, cwd=tmp_path)
     if words.endswith("auto"):
-        assert (said.returncode, said.stderr) == (0, "")
+        assert (found.returncode, found.stderr) == (0, "")
     else:
-        assert said.returncode == 2
-        assert f"needs the package {package}, which is not installed" in said.stderr
-        assert f"pip install 'undulog[{package}]'" in said.stderr
+        assert found.returncode == 2
+        assert f"needs the package {package}, which is not installed" in found.stderr
+        assert f"pip install 'undulog[{package}]'" in found.stderr

@@ -90,8 +90,7 @@ def test_tangents_are_the_x_axes_laid_on_the_ground(roll, pitch, yaw):
     quaternion = np.array(q)
     x_axis = rotation_from_quaternion(quaternion)[:2, 0]
     expected = x_axis / np.linalg.norm(x_axis)
-    found = np.array(tangents(quaternion[:, None]))[:, 0]
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(np.array(tangents(quaternion[:, None]))[:, 0], expected, atol=1e-12)
 
 
 def test_a_vertical_link_has_no_tangent_and_no_fault():
@@ -103,15 +102,13 @@ def test_a_vertical_link_has_no_tangent_and_no_fault():
 @settings(max_examples=50)
 @given(turn=angles, yaw=angles, law=st.sampled_from(FrictionLaw), seed=st.integers(0, 99))
 def test_turning_everything_turns_the_forces(turn, yaw, law, seed):
-    random = np.random.default_rng(seed)
-    velocity, spin = random.normal(size=(2, 3, 1))
+    velocity, spin = np.random.default_rng(seed).normal(size=(2, 3, 1))
 
     def at(heading, by):
         c, s = math.cos(by), math.sin(by)
         matrix = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         quaternion = np.array([[0.0], [0.0], [math.sin(heading / 2)], [math.cos(heading / 2)]])
-        position = np.array([[0.0], [0.0], [0.024]])
-        state = position, quaternion, matrix @ velocity, matrix @ spin
+        state = np.array([[0.0], [0.0], [0.024]]), quaternion, matrix @ velocity, matrix @ spin
         return matrix, touch(Ground(law=law), *state).force
 
     matrix, turned = at(yaw + turn, turn)
@@ -125,8 +122,7 @@ def test_viscous_drag_is_linear_and_takes_no_notice_of_the_load(vt, vn, depth):
     position, velocity = np.array([[0.0], [0.0], [0.025 - depth]]), np.array([[vt], [vn], [0.0]])
     force = touch(ground, position, level, velocity, still).force[:, 0]
     assert force == pytest.approx([-0.3 * vt, -4.0 * vn, 2000.0 * depth], rel=1e-9)
-    lifted = position + np.array([[0.0], [0.0], [2 * depth]])
-    above = touch(ground, lifted, level, velocity, still)
+    above = touch(ground, position + np.array([[0.0], [0.0], [2 * depth]]), level, velocity, still)
     assert not above.force.any()
 
 

@@ -11,9 +11,8 @@ from support.processes import python
 from support.twin_runs import energies, simulate
 from undulog.capture.common.errors import SimulationError, UsageError
 from undulog.capture.robot.model import Plane
-from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, World
+from undulog.sim import Box, Cylinder, FrictionLaw, Ground, PlaneGait, Serpentine, World
 from undulog.sim.physics.engine import BodyStart, engine_type
-from undulog.sim.scenario.obstacles import Box, Cylinder
 from undulog.sim.scenario.scenario import EngineKind
 
 pytest.importorskip("mujoco")
@@ -56,8 +55,7 @@ def test_engines_agree_after_six_seconds_on_the_ground(make_scenario, make_robot
     world = World(heading=0.3, ground=Ground(law=law))
     scenario = make_scenario(robot, gait=Serpentine(gait, 2.0), world=world, duration_s=6.0)
     bullet, mujoco = both(scenario)
-    way = bullet[-1].step.body.position - bullet[0].step.body.position
-    assert np.abs(way).max() > 0.05
+    assert np.abs(bullet[-1].step.body.position - bullet[0].step.body.position).max() > 0.05
     assert apart(bullet, mujoco) < 1e-10
     np.testing.assert_allclose(mujoco[-1].energy, bullet[-1].energy, atol=1e-10)
 
@@ -118,8 +116,7 @@ with Twin(dataclasses.replace(scenario, engine=EngineKind.MUJOCO)) as twin:
 print(hashlib.sha256(b"".join(rows)).hexdigest())
 """
     found = {python(code, env=os.environ | {"PYTHONHASHSEED": seed}).stdout for seed in ("1", "2")}
-    assert len(found) == 1
-    assert len(*found) == 65
+    assert (len(found), len(*found)) == (1, 65)
 
 
 def test_an_impossible_state_is_an_error_and_leaves_no_file(
@@ -128,8 +125,7 @@ def test_an_impossible_state_is_an_error_and_leaves_no_file(
     monkeypatch.chdir(tmp_path)
     world = World(ground=Ground(stiffness=1e7))
     engine = EngineKind.MUJOCO
-    robot = make_robot(5)
-    scenario = make_scenario(robot, ramp_s=0.0, duration_s=2.0, world=world, engine=engine)
+    scenario = make_scenario(make_robot(5), ramp_s=0.0, duration_s=2.0, world=world, engine=engine)
     with pytest.raises(SimulationError, match="the twin failed at 0"):
         simulate(scenario)
     assert not list(tmp_path.iterdir())

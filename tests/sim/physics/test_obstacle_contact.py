@@ -43,8 +43,7 @@ def random_links(seed, links=400, tilted=True):
 
 def test_at_a_distance_nothing_acts():
     contact = law(FIELD)(np.array([[2.0, 0, 0.025]]).T, about_z(np.zeros(1)), *np.ones((2, 3, 1)))
-    assert len(contact.link) == 0
-    assert contact.layers(1) == []
+    assert (len(contact.link), contact.layers(1)) == (0, [])
 
 
 @pytest.mark.parametrize(
@@ -67,10 +66,8 @@ def test_the_force_is_that_of_a_spring_and_damper_along_the_normal(velocity, for
 def test_a_link_beside_a_cylinder_is_pushed_off_and_held_by_friction():
     # Side by side, 1 mm in, sliding along at 1 m/s and rolling up and down at the contact.
     y = 0.08 + RADIUS - 0.001
-    spin = np.array([[4.0, 0.0, 0.0]]).T
-    contact = law([Cylinder((0.0, 0.0), 0.08)])(
-        np.array([[0.01, y, 0.025]]).T, about_z(np.zeros(1)), np.array([[1.0, 0, 0]]).T, spin
-    )
+    place, velocity, spin = np.array([[[0.01, y, 0.025]], [[1, 0, 0]], [[4, 0, 0]]]).mT
+    contact = law([Cylinder((0.0, 0.0), 0.08)])(place, about_z(np.zeros(1)), velocity, spin)
     press = 5000 * 0.001
     # The contact is at y = -r on the link: v + w x (0, -r, 0) = (1, 0, -4 r).
     slip = np.array([1.0, 0.0, -4.0 * RADIUS])
@@ -81,23 +78,17 @@ def test_a_link_beside_a_cylinder_is_pushed_off_and_held_by_friction():
 
 def test_over_the_top_it_does_not_touch():
     def touching(height):
-        found = law([Cylinder((0.0, 0.0), 0.08, height)])(
-            np.array([[0.0, 0.09, 0.1]]).T, about_z(np.zeros(1)), *np.zeros((2, 3, 1))
-        )
-        return len(found.link)
+        place, pushes = np.array([[0.0, 0.09, 0.1]]).T, law([Cylinder((0.0, 0.0), 0.08, height)])
+        return len(pushes(place, about_z(np.zeros(1)), *np.zeros((2, 3, 1))).link)
 
-    assert touching(0.1 - RADIUS + 1e-6) == 1
-    assert touching(0.1 - RADIUS - 1e-6) == 0
+    assert (touching(0.1 - RADIUS + 1e-6), touching(0.1 - RADIUS - 1e-6)) == (1, 0)
 
 
 def test_between_two_obstacles_both_push():
-    gap = RADIUS - 0.001
-    pair = [Cylinder((0.0, 0.1 + gap), 0.1), Cylinder((0.0, -0.1 - gap), 0.1)]
-    contact = law(pair, links=2)(
-        np.array([[0.0, 0.0, 0.025], [1.0, 0.0, 0.025]]).T,
-        about_z(np.zeros(2)),
-        *np.zeros((2, 3, 2)),
-    )
+    away = 0.1 + RADIUS - 0.001
+    pushes = law([Cylinder((0.0, side * away), 0.1) for side in (1, -1)], links=2)
+    places = np.array([[0.0, 0.0, 0.025], [1.0, 0.0, 0.025]]).T
+    contact = pushes(places, about_z(np.zeros(2)), *np.zeros((2, 3, 2)))
     assert contact.link.tolist() == [0, 0]
     np.testing.assert_allclose(contact.force.sum(axis=1), 0.0, atol=1e-12)
     layers = contact.layers(2)
@@ -143,8 +134,7 @@ def test_friction_and_damper_only_take(seed):
 def test_friction_never_turns_the_slip_of_a_free_link_within_a_step(dt):
     links = random_links(7)
     contact, position = law(FIELD, links=400, dt=dt)(*links), links[0]
-    press = (contact.force * contact.normal).sum(axis=0)
-    friction = contact.force - press * contact.normal
+    friction = contact.force - (contact.force * contact.normal).sum(axis=0) * contact.normal
     arm = contact.point - position[:, contact.link]
     slip = contact.velocity - (contact.velocity * contact.normal).sum(axis=0) * contact.normal
     # A free ball of the link's mass and least moment, the bluntest body that there could be.

@@ -101,8 +101,7 @@ def test_beyond_it_it_slides_with_g_sin_less_mu_cos(slide, engine, axis, law):
     expected = G * (math.sin(slope) - mu * math.cos(slope))
     # Smoothing weakens friction by (eps/v)^2 / 2 at most.
     smoothing = 0.5 * (SLIP_SPEED / min(speeds)) ** 2 * mu * G * math.cos(slope)
-    found = (speeds[-1] - speeds[0]) / 0.5
-    assert expected - 1e-6 < found < expected + smoothing + 1e-6
+    assert expected - 1e-6 < (speeds[-1] - speeds[0]) / 0.5 < expected + smoothing + 1e-6
 
 
 @along_and_across
@@ -133,8 +132,7 @@ def test_viscous_drag_stops_it_after_m_v_over_c(slide, engine, axis):
     samples = slide(engine, axis=axis, law=FrictionLaw.VISCOUS, speed=1.0, duration_s=0.3)
     speeds = np.array([velocity(sample)[0] for sample in samples])
     expected = np.exp(-c / MASS * 0.01 * np.arange(31))
-    stepped = (1 - c / MASS * 5e-4) ** (20 * np.arange(31))
-    np.testing.assert_allclose(speeds, stepped, atol=1e-9)
+    np.testing.assert_allclose(speeds, (1 - c / MASS * 5e-4) ** (20 * np.arange(31)), atol=1e-9)
     np.testing.assert_allclose(speeds, expected, atol=0.02)
 
 
@@ -143,8 +141,7 @@ def test_pushed_sideways_a_straight_robot_rolls_as_a_log(slide, engine):
     # a = g sin / (1 + I / (m r^2)): its contact points follow below the centres.
     slope = 0.1
     samples = slide(engine, axis="across", slope=slope, radius=RADIUS, duration_s=1.0)
-    inertia = 4e-5
-    expected = G * math.sin(slope) / (1 + inertia / (MASS * RADIUS**2))
+    expected = G * math.sin(slope) / (1 + 4e-5 / (MASS * RADIUS**2))
     # From 0.5 s on, when the creep that passes the friction on is steady.
     found = (velocity(samples[-1]) - velocity(samples[50]))[0] / 0.5
     assert found == pytest.approx(expected, rel=1e-6)

@@ -143,8 +143,7 @@ def test_the_twin_swims_as_the_overdamped_chain(run_twin, case, ratio):
     # The joints follow: alike in amplitude, and all with the same delay.
     np.testing.assert_allclose(np.abs(tracking), 1.0, atol=1e-3)
     assert np.ptp(np.angle(tracking)) < 1e-3
-    theory = slender_body(*case[1:])
-    assert speed / theory[0] == pytest.approx(ratio, rel=1e-2)
+    assert speed / slender_body(*case[1:])[0] == pytest.approx(ratio, rel=1e-2)
     chain = overdamped_chain(*case)
     assert speed == pytest.approx(chain[0], rel=3e-3)
     assert power == pytest.approx(chain[1], rel=1e-2)

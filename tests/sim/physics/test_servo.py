@@ -36,11 +36,9 @@ def test_a_free_rotor_speeds_up_as_a_first_order_lag():
     final = servo.stall_torque / drag
     state, zero, found = rotors(0.0), np.zeros(1), []
     for _ in range(2000):
-        drive = servos.drive(np.array([1e3]), zero, zero, state)
-        state = servos.advance(state, drive, dt)
+        state = servos.advance(state, servos.drive(np.array([1e3]), zero, zero, state), dt)
         found.append(state.speed[0])
-    t = dt * np.arange(1, 2001)
-    expected = final * (1 - np.exp(-t * drag / servo.rotor_inertia))
+    expected = final * (1 - np.exp(-(dt * np.arange(1, 2001)) * drag / servo.rotor_inertia))
     np.testing.assert_allclose(found, expected, atol=1e-3 * final)
 
 

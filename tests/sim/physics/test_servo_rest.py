@@ -10,10 +10,9 @@ import pytest
 from support.twin_runs import energies, simulate
 from undulog.capture.common.errors import ScenarioError
 from undulog.capture.robot.model import Plane, Servo
-from undulog.sim import PlaneGait, Serpentine, World
+from undulog.sim import PlaneGait, Serpentine, World, load_scenario, parse_scenario
 from undulog.sim.physics.servo import Rotors, Servos
 from undulog.sim.scenario.scenario import EngineKind, Kernels
-from undulog.sim.scenario.scenario_file import load_scenario, parse_scenario
 from undulog.sim.twin.stability import stability
 
 DT = 1e-3
@@ -52,20 +51,14 @@ def test_it_comes_to_rest_where_friction_can_hold_it_and_stays_there_bit_by_bit(
 
 
 def test_a_free_rotor_stops_after_j_om2_over_2_t_c():
-    servo = Servo(
-        stall_torque=1e-12,  # no drag by the winding
-        viscous_friction=0.0,
-        gear_stiffness=0.0,
-        gear_damping=0.0,
-        coulomb_friction=0.03,
-        static_friction=0.03,
-    )
+    nothing = dict.fromkeys(("viscous_friction", "gear_stiffness", "gear_damping"), 0.0)
+    # Without drag by the winding either:
+    servo = Servo(stall_torque=1e-12, coulomb_friction=0.03, static_friction=0.03, **nothing)
     servos, zero, dt = Servos([servo]), np.zeros(1), 1e-5
     state = Rotors(np.zeros(1), np.array([2.0]))
     steps = 0
     while state.speed[0] != 0.0:
-        drive = servos.drive(zero, zero, zero, state)
-        state = servos.advance(state, drive, dt)
+        state = servos.advance(state, servos.drive(zero, zero, zero, state), dt)
         steps += 1
     assert steps * dt == pytest.approx(1.5e-3 * 2.0 / 0.03, abs=2 * dt)
     assert state.angle[0] == pytest.approx(1.5e-3 * 4.0 / (2 * 0.03), rel=1e-3)
@@ -93,13 +86,11 @@ def test_servos_without_it_keep_their_smooth_friction_beside_one_that_has_it():
 
 def test_a_scenario_asks_for_it_and_less_than_kinetic_friction_is_a_fault():
     text = load_scenario("flat").toml()
-    scenario = parse_scenario(
-        text, "flat.toml", changes={"servo.static_friction": 0.05, "servo.stribeck_speed": 0.1}
-    )
+    changes = {"servo.static_friction": 0.05, "servo.stribeck_speed": 0.1}
+    scenario = parse_scenario(text, "flat.toml", changes=changes)
     servo = scenario.robot.joints[0].servo
     assert (servo.static_friction, servo.stribeck_speed) == (0.05, 0.1)
-    again = parse_scenario(scenario.toml(), "flat.toml")
-    assert again.robot.joints[0].servo == servo
+    assert parse_scenario(scenario.toml(), "flat.toml").robot.joints[0].servo == servo
     with pytest.raises(ScenarioError, match=r"static_friction.*at least coulomb_friction"):
         parse_scenario(text, "flat.toml", changes={"servo.static_friction": 0.01})
 
@@ -116,10 +107,9 @@ def test_rotors_rest_at_every_reversal_and_the_ledger_closes_on_all_engines_and_
     make_robot, make_scenario
 ):
     robot = make_robot(3, planar=True, static_friction=0.15, coulomb_friction=0.1)
-    gait = Serpentine({Plane.HORIZONTAL: PlaneGait(0.3, 1.0, math.pi / 3)}, 0.0)
     scenario = make_scenario(
         robot,
-        gait=gait,
+        gait=Serpentine({Plane.HORIZONTAL: PlaneGait(0.3, 1.0, math.pi / 3)}, 0.0),
         world=World(gravity=(0.0, 0.0, 0.0), ground=None),
         physics_rate_hz=4000,
         duration_s=1.2,

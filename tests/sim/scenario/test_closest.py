@@ -46,8 +46,7 @@ def test_rectangles_apart(seed):
     assert apart.sum() > 100
     np.testing.assert_allclose(np.hypot(*found.normal), 1.0, rtol=1e-12)
     for i in range(300):
-        points = middle[:, i, None] + PLACES * half[:, i, None]
-        brute = outside(points, size[:, i]).min()
+        brute = outside(middle[:, i, None] + PLACES * half[:, i, None], size[:, i]).min()
         assert max(found.distance[i], 0.0) == pytest.approx(brute, abs=1e-4)
         if apart[i]:
             # The point on the rectangle that the normal leads back to is on its edge.

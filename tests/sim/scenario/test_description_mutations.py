@@ -34,9 +34,9 @@ def test_depth_and_long_integers_are_faults(kind, line, tmp_path, capsys):
     file = tmp_path / "deep.toml"
     file.write_text(DEEP[kind])
     assert undulog.run(line.format(file=file, out=tmp_path / "x.mcap").split()) in (1, 2)
-    said = capsys.readouterr().err
-    assert f"{file}" in said
-    assert "64" in said or "digits" in said
+    shown = capsys.readouterr().err
+    assert f"{file}" in shown
+    assert "64" in shown or "digits" in shown
 
 
 def changed(text: str, rng: random.Random) -> str:
@@ -63,5 +63,5 @@ def test_odd_numbers_end_in_a_run_or_an_error_of_ours(folder, tmp_path, capsys):
             run.write_text(re.sub(r'(?m)^robot = ".*"', 'robot = "robot.toml"', flat))
         words = f"sim run {run} -o {tmp_path / 'o.mcap'} --force --set duration_s=0.02"
         code = undulog.run(words.split())
-        said = capsys.readouterr().err
-        assert code == 0 or "error: " in said, (seed, said)
+        shown = capsys.readouterr().err
+        assert code == 0 or "error: " in shown, (seed, shown)

@@ -4,7 +4,8 @@ import dataclasses
 
 import pytest
 
-from support.twin_runs import SNAKE13, faults_of
+from support.twin_chains import chain
+from support.twin_runs import SNAKE13, check_keys, faults_of
 from undulog.capture.common.errors import RobotFileError, ScenarioError, UsageError
 from undulog.capture.robot.model import Plane
 from undulog.sim import FrictionLaw, Wave, load_scenario, parse_scenario, scenario_names
@@ -57,26 +58,22 @@ position = 1e-3
 
 def test_what_is_left_out_has_defaults():
     scenario = parse_scenario(SNAKE13, "some/where/short.toml")
-    assert scenario.name == "short"
-    assert scenario.robot.name == "snake13"
-    assert scenario.gait.ramp_s == 2.0
-    assert scenario.gait.planes[Plane.HORIZONTAL].wave is Wave.HEAD_TO_TAIL
-    assert scenario.world.ground.law is FrictionLaw.ELLIPSE
-    assert scenario.world.gravity == (0.0, 0.0, -9.81)
-    assert scenario.epoch_ns == 1_735_689_600_000_000_000
-    assert scenario.tick_count == 201
+    gait, world = scenario.gait, scenario.world
+    assert (scenario.name, scenario.robot.name, gait.ramp_s) == ("short", "snake13", 2.0)
+    assert gait.planes[Plane.HORIZONTAL].wave is Wave.HEAD_TO_TAIL
+    assert (world.ground.law, world.gravity) == (FrictionLaw.ELLIPSE, (0.0, 0.0, -9.81))
+    assert (scenario.epoch_ns, scenario.tick_count) == (1_735_689_600_000_000_000, 201)
 
 
 def test_every_key_is_read_and_written_back():
     scenario = parse_scenario(FULL, "x.toml")
     assert scenario.gait.planes[Plane.HORIZONTAL].signed_lag == 0.5
     assert scenario.world.ground.law is FrictionLaw.BOX
-    stalls = [joint.servo.stall_torque for joint in scenario.robot.joints]
-    assert stalls == [0.25, 0.25, 0.2, *[0.25] * 9]
-    assert scenario.robot.joints[2].servo.coulomb_friction == 0.0
-    masses = [link.mass for link in scenario.robot.links]
-    assert masses == pytest.approx([0.1] * 3 + [0.15] + [0.1] * 9, rel=1e-15)
-    assert scenario.robot.links[3].inertia == pytest.approx((6e-5, 7.5e-5, 7.5e-5), rel=1e-15)
+    joints, links = scenario.robot.joints, scenario.robot.links
+    assert [one.servo.stall_torque for one in joints] == [0.25, 0.25, 0.2, *[0.25] * 9]
+    assert joints[2].servo.coulomb_friction == 0.0
+    assert [one.mass for one in links] == pytest.approx([0.1] * 3 + [0.15] + [0.1] * 9, rel=1e-15)
+    assert links[3].inertia == pytest.approx((6e-5, 7.5e-5, 7.5e-5), rel=1e-15)
     assert parse_scenario(scenario.toml(), "y.toml") == scenario
 
 
@@ -134,31 +131,16 @@ def test_all_faults_are_listed_at_once():
         position = nan
         """
     )
-    assert set(found) == {
-        "description",
-        "robot",
-        "duration_s",
-        "seed",
-        "epoch_s",
-        "physics_rate_hz",
-        "gaits",
-        "gait.horizontal.amplitude",
-        "gait.horizontal.frequency_hz",
-        "gait.horizontal.wave",
-        "gait.horizontal.lag",
-        "gait.horizontal.lagg",
-        "world.gravity",
-        "world.surface",
-        "world.ground.stiffness",
-        "world.ground.law",
-        "servo.stall_torque",
-        "servo.stal_torque",
-        "noise.position",
-    }
-    assert "did you mean snake13?" in found["robot"]
-    assert "did you mean ellipse?" in found["world.ground.law"]
-    assert "did you mean lag?" in found["gait.horizontal.lagg"]
-    assert "did you mean gait?" in found["gaits"]
+    check_keys(
+        found,
+        "description robot duration_s seed epoch_s physics_rate_hz gaits gait.horizontal.amplitude "
+        "gait.horizontal.frequency_hz gait.horizontal.wave gait.horizontal.lag "
+        "gait.horizontal.lagg world.gravity world.surface world.ground.stiffness world.ground.law "
+        "servo.stall_torque servo.stal_torque noise.position",
+    )
+    meant = {"robot": "snake13", "world.ground.law": "ellipse", "gaits": "gait"}
+    for key, name in {**meant, "gait.horizontal.lagg": "lag"}.items():
+        assert f"did you mean {name}?" in found[key]
 
 
 @pytest.mark.parametrize(
@@ -178,19 +160,15 @@ def test_faults_that_depend_on_other_keys(before, after, key):
 
 def test_a_gait_needs_a_plane_that_the_robot_has(tmp_path):
     assert "gait.horizontal" in faults_of(SNAKE13.split("[gait", maxsplit=1)[0])
-    (tmp_path / "planar.toml").write_text(
-        'name = "planar"\nclock = "simulated"\n'
-        'joints = [{ name = "joint01", plane = "horizontal" }]\n'
-        "[defaults.link]\nlength = 0.06\nradius = 0.02\nmass = 0.1\ninertia = [4e-5, 5e-5, 5e-5]\n"
-    )
-    text = SNAKE13.replace("snake13", "planar.toml")
-    path = tmp_path / "s.toml"
+    robot, path = tmp_path / "planar.toml", tmp_path / "s.toml"
+    robot.write_text(chain(1, planes=["horizontal"]))
+    text = SNAKE13.replace("snake13", robot.name)
     path.write_text(text)
-    assert load_scenario(path).robot.name == "planar"  # a robot beside its scenario
+    assert load_scenario(path).robot.name == "chain1"  # a robot beside its scenario
     path.write_text(text.replace("gait.horizontal", "gait.vertical"))
-    with pytest.raises(ScenarioError, match="planar has no vertical joints"):
+    with pytest.raises(ScenarioError, match="chain1 has no vertical joints"):
         load_scenario(path)
-    (tmp_path / "planar.toml").write_text("name = 3")
+    robot.write_text("name = 3")
     with pytest.raises(RobotFileError, match=r"planar\.toml"):
         load_scenario(path)
 

@@ -5,18 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from support.twin_runs import SNAKE13, faults_of
+from support.twin_runs import SNAKE13, check_keys, faults_of
+from undulog import sim
 from undulog.capture.common.errors import UsageError
-from undulog.sim import (
-    Box,
-    Cylinder,
-    Ground,
-    ObstacleMaterial,
-    RandomField,
-    Target,
-    Wall,
-    parse_scenario,
-)
 
 WORLD = """
 [world]
@@ -58,33 +49,33 @@ gap = 0.15
 
 
 def test_obstacles_are_read_and_written_back():
-    scenario = parse_scenario(SNAKE13 + WORLD, "x.toml")
+    scenario = sim.parse_scenario(SNAKE13 + WORLD, "x.toml")
     world = scenario.world
     assert world.obstacles == (
-        Cylinder((1.5, 0.2), 0.1, 0.4),
-        Box((2.5, 0.2), (0.4, 0.2), 0.3),
-        Wall((0.0, 1.0), (3.0, 1.5), 0.05),
+        sim.Cylinder((1.5, 0.2), 0.1, 0.4),
+        sim.Box((2.5, 0.2), (0.4, 0.2), 0.3),
+        sim.Wall((0.0, 1.0), (3.0, 1.5), 0.05),
     )
-    assert world.obstacle_contact == ObstacleMaterial(stiffness=8000.0, mu=0.2)
-    assert world.target == Target((3.6, 0.0))
-    assert world.ground == Ground()
-    assert parse_scenario(scenario.toml(), "y.toml") == scenario
+    assert world.obstacle_contact == sim.ObstacleMaterial(stiffness=8000.0, mu=0.2)
+    assert (world.target, world.ground) == (sim.Target((3.6, 0.0)), sim.Ground())
+    assert sim.parse_scenario(scenario.toml(), "y.toml") == scenario
 
 
 def test_a_slope_tilts_gravity():
-    gravity = parse_scenario(SNAKE13 + WORLD, "x.toml").world.gravity
+    gravity = sim.parse_scenario(SNAKE13 + WORLD, "x.toml").world.gravity
     assert math.hypot(*gravity) == pytest.approx(9.81)
     assert math.atan2(math.hypot(*gravity[:2]), -gravity[2]) == pytest.approx(0.1)
     assert math.atan2(gravity[1], gravity[0]) == pytest.approx(0.5)
-    assert "world.gravity" in faults_of(
-        SNAKE13 + "[world]\nslope = 0.1\ngravity = [0.0, 0.0, -1.0]\n"
-    )
-    assert "world.slope_heading" in faults_of(SNAKE13 + "[world]\nslope_heading = 0.1\n")
+    for key, text in (
+        ("world.gravity", "slope = 0.1\ngravity = [0.0, 0.0, -1.0]"),
+        ("world.slope_heading", "slope_heading = 0.1"),
+    ):
+        assert key in faults_of(f"{SNAKE13}[world]\n{text}\n")
 
 
 def test_a_wall_is_a_box_along_it():
-    box = Wall((1.0, 1.0), (4.0, 5.0), 0.1, 0.5).box
-    assert box == Box((2.5, 3.0), (5.0, 0.1), math.atan2(4, 3), 0.5)
+    box = sim.Wall((1.0, 1.0), (4.0, 5.0), 0.1, 0.5).box
+    assert box == sim.Box((2.5, 3.0), (5.0, 0.1), math.atan2(4, 3), 0.5)
 
 
 def test_faults_are_listed_at_once():
@@ -111,22 +102,17 @@ def test_faults_are_listed_at_once():
         to = [1.0, 1.0]
         """
     )
-    assert set(found) == {
-        "world.obstacle_contact.stiffness",
-        "world.target.position",
-        "world.field.count",
-        "world.field.size",
-        "world.field.radius",
-        "world.obstacles[0].shape",
-        "world.obstacles[1].radius",
-        "world.obstacles[1].size",
-        "world.obstacles[2].to",
-    }
+    check_keys(
+        found,
+        "world.obstacle_contact.stiffness world.target.position world.field.count world.field.size "
+        "world.field.radius world.obstacles[0].shape world.obstacles[1].radius "
+        "world.obstacles[1].size world.obstacles[2].to",
+    )
 
 
 @pytest.mark.parametrize("seed", range(1, 9))
 def test_a_field_keeps_its_distances(seed):
-    scenario = parse_scenario(f"seed = {seed}\n{SNAKE13}{FIELD}", "x.toml")
+    scenario = sim.parse_scenario(f"seed = {seed}\n{SNAKE13}{FIELD}", "x.toml")
     placed = scenario.world.obstacles
     assert len(placed) == 12
     at = np.array([one.position for one in placed])
@@ -143,29 +129,24 @@ def test_a_field_keeps_its_distances(seed):
 
 
 def test_a_field_follows_the_seed_and_is_stored_as_its_obstacles():
-    scenario = parse_scenario(SNAKE13 + FIELD, "x.toml")
+    scenario = sim.parse_scenario(SNAKE13 + FIELD, "x.toml")
     assert "[world.field]" not in scenario.toml()
-    assert parse_scenario(scenario.toml(), "y.toml") == scenario
-    assert scenario.world.field == RandomField(
+    assert sim.parse_scenario(scenario.toml(), "y.toml") == scenario
+    assert scenario.world.field == sim.RandomField(
         12, (4.0, 3.0), (1.8, 0.0), (0.05, 0.12), clear=0.25, gap=0.15
     )
-    again = parse_scenario(SNAKE13 + FIELD, "z.toml")
-    assert again.world.obstacles == scenario.world.obstacles
-    other = scenario.changed(seed=9)
-    assert (
-        other.world.obstacles
-        == parse_scenario(f"seed = 9\n{SNAKE13}{FIELD}", "x.toml").world.obstacles
-    )
-    assert other.world.obstacles != scenario.world.obstacles
+    assert sim.parse_scenario(SNAKE13 + FIELD, "z.toml").world.obstacles == scenario.world.obstacles
+    ninth = sim.parse_scenario(f"seed = 9\n{SNAKE13}{FIELD}", "x.toml").world.obstacles
+    assert scenario.changed(seed=9).world.obstacles == ninth != scenario.world.obstacles
     assert scenario.changed(duration_s=1.0).world.obstacles == scenario.world.obstacles
-    fixed = parse_scenario(f"{SNAKE13}{FIELD}seed = 4\n", "x.toml")
+    fixed = sim.parse_scenario(f"{SNAKE13}{FIELD}seed = 4\n", "x.toml")
     assert fixed.changed(seed=9).world.obstacles == fixed.world.obstacles
 
 
 def test_a_field_stands_clear_of_what_is_there_and_joins_it():
     box = "[[world.obstacles]]\nshape = 'box'\nposition = [2.0, 0.0]\nsize = [1.0, 1.0]\n"
-    world = parse_scenario(SNAKE13 + FIELD + box, "x.toml").world
-    assert world.obstacles[0] == Box((2.0, 0.0), (1.0, 1.0))
+    world = sim.parse_scenario(SNAKE13 + FIELD + box, "x.toml").world
+    assert world.obstacles[0] == sim.Box((2.0, 0.0), (1.0, 1.0))
     for one in world.obstacles[1:]:
         x, y = (max(abs(c - m) - 0.5, 0.0) for c, m in zip(one.position, (2.0, 0.0), strict=True))
         assert math.hypot(x, y) - one.radius >= 0.15 - 1e-12
@@ -174,10 +155,10 @@ def test_a_field_stands_clear_of_what_is_there_and_joins_it():
     assert len(redrawn.obstacles) == len(world.obstacles) == 13
 
 
-def test_no_room_is_told():
+def test_no_room_is_reported():
     text = FIELD.replace("[4.0, 3.0]", "[0.4, 0.4]")
     assert "room for" in faults_of(SNAKE13 + text)["world.field"]
-    scenario = parse_scenario(SNAKE13 + FIELD, "x.toml")
-    tight = RandomField(12, (0.4, 0.4))
+    scenario = sim.parse_scenario(SNAKE13 + FIELD, "x.toml")
+    tight = sim.RandomField(12, (0.4, 0.4))
     with pytest.raises(UsageError, match=r"room for \d of 12"):
         scenario.world.scattered(tight, 1, 0.8)

@@ -6,53 +6,43 @@ import re
 import pytest
 
 from support.paths import DOCS
-from undulog.sim import (
-    AccelerometerModel,
-    CompassModel,
-    InfraredModel,
-    ObstacleMaterial,
-    RandomField,
-    ServoPolling,
-    SonarModel,
-    parse_scenario,
-)
+from undulog import sim
 
 PAGE = (DOCS / "twin-world.md").read_text()
 
 
 def test_the_examples_make_a_scenario():
     examples = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
-    scenario = parse_scenario("\n".join(examples), "x.toml")
+    scenario = sim.parse_scenario("\n".join(examples), "x.toml")
     assert [push.link for push in scenario.disturbances] == ["link07"]
-    assert len(scenario.world.obstacles) == 10
-    assert scenario.sensing.ir.noise_v == 0.058
+    assert (len(scenario.world.obstacles), scenario.sensing.ir.noise_v) == (10, 0.058)
 
 
 @pytest.mark.parametrize(
     ("table", "kind"),
     [
-        ("world.field", RandomField),
-        ("world.obstacle_contact", ObstacleMaterial),
-        ("sensing.servo", ServoPolling),
-        ("sensing.ir", InfraredModel),
-        ("sensing.sonar", SonarModel),
-        ("sensing.accelerometer", AccelerometerModel),
-        ("sensing.compass", CompassModel),
+        ("world.field", sim.RandomField),
+        ("world.obstacle_contact", sim.ObstacleMaterial),
+        ("sensing.servo", sim.ServoPolling),
+        ("sensing.ir", sim.InfraredModel),
+        ("sensing.sonar", sim.SonarModel),
+        ("sensing.accelerometer", sim.AccelerometerModel),
+        ("sensing.compass", sim.CompassModel),
     ],
 )
 def test_the_tables_have_all_keys_and_their_defaults(table, kind):
     rows = PAGE.split(f"| key of `[{table}]` |")[1].split("\n\n")[0].splitlines()[2:]
-    told = {}
+    found = {}
     for row in rows:
         key, _, default, _ = (cell.strip() for cell in row.strip("|").split("|"))
-        told[key.strip("`")] = default.strip("`")
-    assert set(told) == {item.name for item in dataclasses.fields(kind)}
+        found[key.strip("`")] = default.strip("`")
+    assert set(found) == {item.name for item in dataclasses.fields(kind)}
     for item in dataclasses.fields(kind):
         if item.default is dataclasses.MISSING:
-            assert told[item.name] == ""
+            assert found[item.name] == ""
         elif item.default is None:
-            assert told[item.name] == "the scenario's"
+            assert found[item.name] == "the scenario's"
         elif isinstance(item.default, tuple):
-            assert eval(told[item.name]) == list(item.default)
+            assert eval(found[item.name]) == list(item.default)
         else:
-            assert float(told[item.name]) == item.default
+            assert float(found[item.name]) == item.default

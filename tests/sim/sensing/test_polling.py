@@ -61,8 +61,7 @@ def test_a_cycle_comes_two_ticks_after_its_start_and_each_tick_has_one():
     released = [[sample.cycle for sample in poll.observe(period)] for period in ramps(5)]
     # The period that is handed over p-th ends with tick p + 1.
     assert released == [[], [0], [1], [2], [3]]
-    assert [sample.cycle for sample in poll.flush()] == [4, 5]
-    assert poll.flush() == []
+    assert ([sample.cycle for sample in poll.flush()], poll.flush()) == ([4, 5], [])
 
 
 def test_a_run_without_a_control_period_has_no_cycle_and_a_short_one_has_all():
@@ -113,7 +112,7 @@ def test_a_ripple_with_the_control_period_cancels_wherever_a_joint_is_sampled():
         np.testing.assert_allclose(sample.voltage, 3.0, atol=1e-12)
 
 
-def test_the_encoder_tells_whole_steps():
+def test_the_encoder_sends_whole_steps():
     step = 0.0015
     for sample in cycles(polling(ServoPolling(resolution=step)), ramps(5)):
         true = SLOPE * sample.cycle * N * DT
@@ -125,10 +124,10 @@ def test_the_encoder_tells_whole_steps():
 def test_within_its_dead_band_the_encoder_stands_still():
     swing, band = 0.02, 0.015
     run = moving(40, lambda t: np.full(JOINTS, swing * math.sin(2 * math.pi * 5 * t)))
-    told = np.array([s.position[0] for s in cycles(polling(ServoPolling(dead_band=band)), run)])
+    found = np.array([s.position[0] for s in cycles(polling(ServoPolling(dead_band=band)), run)])
     true = swing * np.sin(2 * np.pi * 5 * 0.01 * np.arange(41))
-    assert np.abs(told - true).max() <= band
-    changes = np.diff(told)
+    assert np.abs(found - true).max() <= band
+    changes = np.diff(found)
     assert (np.abs(changes[changes != 0.0]) > band).all()
     still = moving(5, lambda t: np.full(JOINTS, 0.9 * band * math.sin(100 * t)))
     for sample in cycles(polling(ServoPolling(dead_band=band)), still):

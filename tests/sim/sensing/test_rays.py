@@ -15,8 +15,7 @@ INF = math.inf
 def one(caster, origin, direction, **options):
     way = np.array(direction, dtype=float)[:, None]
     start = np.array(origin, dtype=float)[:, None]
-    found = caster.distance(start, way / np.linalg.norm(way), **options)
-    return float(found[0])
+    return float(caster.distance(start, way / np.linalg.norm(way), **options)[0])
 
 
 @pytest.mark.parametrize("degrees", [0, 20, 45, 70])

@@ -7,22 +7,11 @@ import tomllib
 import numpy as np
 import pytest
 
-from support.twin_runs import SNAKE25, faults_of, sensed, simulate
+from support.twin_runs import SNAKE25, check_keys, faults_of, sensed, simulate
+from undulog import sim
 from undulog.capture import Session
 from undulog.capture.robot.model import Plane
-from undulog.sim import (
-    Cylinder,
-    InfraredModel,
-    Readings,
-    SensorModels,
-    ServoPolling,
-    Wall,
-    load_scenario,
-    parse_scenario,
-)
 from undulog.sim.sensing.contract import JointSample, RangeSample, VectorSample
-from undulog.sim.twin.recording import record
-from undulog.sim.twin.twin import Twin
 
 SCENARIO = f"""{SNAKE25.replace("2.0", "0.6")}
 [world]
@@ -39,49 +28,47 @@ resolution = 1.5e-3
 
 @pytest.fixture(scope="module")
 def scenario():
-    return parse_scenario(SCENARIO, "x.toml")
+    return sim.parse_scenario(SCENARIO, "x.toml")
 
 
 @pytest.fixture(scope="module")
 def run(scenario):
-    with Twin(scenario) as twin:
-        samples = [(sample, twin._sensing.readings) for sample in twin.samples()]
-        return samples, twin.flush()
+    with sim.Twin(scenario) as twin:
+        return [(sample, twin._sensing.readings) for sample in twin.samples()], twin.flush()
 
 
-def test_nothing_is_told_before_it_was_measured_or_twice(run):
+def test_nothing_is_delivered_before_it_was_measured_or_twice(run):
     seen = {}
     for sample, _ in run[0]:
-        cycles = [told.cycle for told in sample.sensed if isinstance(told, JointSample)]
+        cycles = [value.cycle for value in sample.sensed if isinstance(value, JointSample)]
         assert cycles == ([sample.tick - 2] if sample.tick >= 2 else [])
-        for told in sample.sensed:
-            if isinstance(told, JointSample):
+        for value in sample.sensed:
+            if isinstance(value, JointSample):
                 continue
-            assert sample.time_s - 0.01 <= told.time_s + 1e-9 < sample.time_s + 1e-9
-            assert told.time_s > seen.get(told.name, -1.0)
-            seen[told.name] = told.time_s
-        times = [told.time_s for told in sample.sensed if not isinstance(told, JointSample)]
+            assert sample.time_s - 0.01 <= value.time_s + 1e-9 < sample.time_s + 1e-9
+            assert value.time_s > seen.get(value.name, -1.0)
+            seen[value.name] = value.time_s
+        times = [value.time_s for value in sample.sensed if not isinstance(value, JointSample)]
         assert times == sorted(times)
-    assert len(seen) == 18
-    assert [told.cycle for told in run[1]] == [59, 60]
+    assert (len(seen), [value.cycle for value in run[1]]) == (18, [59, 60])
 
 
 def test_the_readings_hold_the_newest_value_of_each_sensor(run, scenario):
     newest = {}
     assert run[0][0][1].angle.tolist() == pytest.approx([math.nan] * 25, nan_ok=True)
     for sample, readings in run[0]:
-        for told in sample.sensed:
-            newest["joints" if isinstance(told, JointSample) else told.name] = told
-        for name, told in newest.items():
-            if isinstance(told, JointSample):
-                np.testing.assert_array_equal(readings.angle, told.position)
-                np.testing.assert_array_equal(readings.velocity, told.velocity)
-            elif isinstance(told, RangeSample):
-                assert readings.ranges[name] == told.distance
+        for value in sample.sensed:
+            newest["joints" if isinstance(value, JointSample) else value.name] = value
+        for name, value in newest.items():
+            if isinstance(value, JointSample):
+                np.testing.assert_array_equal(readings.angle, value.position)
+                np.testing.assert_array_equal(readings.velocity, value.velocity)
+            elif isinstance(value, RangeSample):
+                assert readings.ranges[name] == value.distance
             elif name == "compass":
-                np.testing.assert_array_equal(readings.magnetic_field[name], told.vector)
+                np.testing.assert_array_equal(readings.magnetic_field[name], value.vector)
             else:
-                np.testing.assert_array_equal(readings.acceleration[name], told.vector)
+                np.testing.assert_array_equal(readings.acceleration[name], value.vector)
     last = run[0][-1][1]
     assert len(last.ranges) == 16
     # The head looks at the cylinder, 0.2 rad off to the left.
@@ -92,12 +79,12 @@ def test_the_readings_hold_the_newest_value_of_each_sensor(run, scenario):
 
 def test_a_session_holds_every_sample_with_both_its_times(run, scenario, tmp_path):
     path = tmp_path / "senses.mcap"
-    record(scenario, path)
-    told = [(sample.tick, one) for sample, _ in run[0] for one in sample.sensed]
+    sim.record(scenario, path)
+    value = [(sample.tick, one) for sample, _ in run[0] for one in sample.sensed]
     topics = {one.name: one.topic for one in scenario.robot.sensors}
     with Session.open(path) as session:
         for name, topic in topics.items():
-            mine = [(tick, one) for tick, one in told if getattr(one, "name", "") == name]
+            mine = [(tick, one) for tick, one in value if getattr(one, "name", "") == name]
             found = list(session.messages(topic))
             assert len(found) == len(mine) > 5
             for (tick, one), (log_ns, message) in zip(mine, found, strict=True):
@@ -106,11 +93,8 @@ def test_a_session_holds_every_sample_with_both_its_times(run, scenario, tmp_pat
                 assert stamp == scenario.epoch_ns + round(one.time_s * 1e9)
                 assert message.header.frame_id == name
                 if isinstance(one, VectorSample):
-                    vector = (
-                        message.magnetic_field
-                        if topic == "/compass"
-                        else message.linear_acceleration
-                    )
+                    field = "magnetic_field" if topic == "/compass" else "linear_acceleration"
+                    vector = getattr(message, field)
                     np.testing.assert_array_equal([vector.x, vector.y, vector.z], one.vector)
                 else:
                     assert message.range == np.float32(one.distance)
@@ -125,13 +109,8 @@ def test_polling_in_turn_changes_no_phase_where_each_joint_has_its_own_time(
     yaw = robot.joint_indices(Plane.HORIZONTAL)
 
     def phases(servo, *, own_times=True):
-        scenario = make_scenario(
-            robot,
-            frequency_hz=hz,
-            ramp_s=0.5,
-            duration_s=4.0,
-            sensing=SensorModels(servo),
-        )
+        short = {"frequency_hz": hz, "ramp_s": 0.5, "duration_s": 4.0}
+        scenario = make_scenario(robot, **short, sensing=sim.SensorModels(servo))
         chosen = sensed(scenario)[-202:-2]  # two whole cycles
         angle = np.array([one.position for one in chosen])
         cycle = np.array([one.cycle for one in chosen])[:, None] / 100
@@ -143,14 +122,13 @@ def test_polling_in_turn_changes_no_phase_where_each_joint_has_its_own_time(
             found.append(math.degrees(math.atan2(c, d)))
         return np.array(found)
 
-    at_once, in_turn = phases(ServoPolling()), phases(ServoPolling(slot_s=slot_s))
+    at_once, in_turn = phases(sim.ServoPolling()), phases(sim.ServoPolling(slot_s=slot_s))
     # Within a control period the joints ripple, each command being held: 0.055 degrees from peak to
     # peak of this phase, by the place in the period at which the physics steps are looked at.
     np.testing.assert_allclose(in_turn, at_once, atol=0.055)
     # One stamp for all would be off by omega times the skew, up to 3 degrees.
-    careless = phases(ServoPolling(slot_s=slot_s), own_times=False)
-    expected = 360.0 * hz * slot_s * yaw
-    np.testing.assert_allclose(careless - in_turn, expected, atol=0.02)
+    careless = phases(sim.ServoPolling(slot_s=slot_s), own_times=False)
+    np.testing.assert_allclose(careless - in_turn, 360.0 * hz * slot_s * yaw, atol=0.02)
 
 
 def test_without_its_sensors_a_robot_has_its_servos_only_and_moves_alike(scenario, run):
@@ -158,25 +136,23 @@ def test_without_its_sensors_a_robot_has_its_servos_only_and_moves_alike(scenari
     mute = dataclasses.replace(scenario, sensing=quiet)
     samples = simulate(mute)
     assert {type(one) for sample in samples for one in sample.sensed} == {JointSample}
-    assert parse_scenario(mute.toml(), "y.toml") == mute
-    last = samples[-1].step.body.position
-    np.testing.assert_array_equal(last, run[0][-1][0].step.body.position)
+    assert sim.parse_scenario(mute.toml(), "y.toml") == mute
+    np.testing.assert_array_equal(samples[-1].step.body.position, run[0][-1][0].step.body.position)
 
 
 def test_a_robot_without_sensors_has_none(make_scenario):
     for sample in simulate(make_scenario(duration_s=0.05)):
         assert all(isinstance(one, JointSample) for one in sample.sensed)
-    nothing = Readings.nothing(make_scenario().robot)
-    assert nothing.ranges == {}
+    assert sim.Readings.nothing(make_scenario().robot).ranges == {}
 
 
 def test_seeds_change_the_noise_and_only_that(scenario):
-    def told(seed):
+    def value(seed):
         samples = simulate(scenario.changed(seed=seed, duration_s=0.1))
         values = [one.vector for s in samples for one in s.sensed if isinstance(one, VectorSample)]
         return np.nan_to_num(values), samples[-1].step.body.angle
 
-    (first, angle), (again, _), (other, same) = told(1), told(1), told(2)
+    (first, angle), (again, _), (other, same) = value(1), value(1), value(2)
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
     np.testing.assert_array_equal(angle, same)
@@ -216,9 +192,9 @@ north = 0.3
 
 
 def test_every_key_is_read_and_written_back():
-    scenario = parse_scenario(SNAKE25 + SENSING, "x.toml")
+    scenario = sim.parse_scenario(SNAKE25 + SENSING, "x.toml")
     assert dataclasses.asdict(scenario.sensing) == tomllib.loads(SENSING)["sensing"]
-    assert parse_scenario(scenario.toml(), "y.toml") == scenario
+    assert sim.parse_scenario(scenario.toml(), "y.toml") == scenario
 
 
 def test_faults_are_listed_at_once():
@@ -240,34 +216,29 @@ def test_faults_are_listed_at_once():
             inclination = 65
             """
     )
-    assert set(found) == {
-        "sensing.enabled",
-        "sensing.gyro",
-        "sensing.servo.slot_s",  # 25 turns of 0.4 ms are a whole control period
-        "sensing.servo.dead_band",
-        "sensing.ir.hold_s",
-        "sensing.ir.adc_bits",
-        "sensing.sonar.rays",
-        "sensing.compass.inclination",
-    }
+    # 25 turns of 0.4 ms are a whole control period.
+    check_keys(
+        found,
+        "sensing.enabled sensing.gyro sensing.servo.slot_s sensing.servo.dead_band "
+        "sensing.ir.hold_s sensing.ir.adc_bits sensing.sonar.rays sensing.compass.inclination",
+    )
 
 
 def test_a_twin_between_walls_sees_them():
-    flat = load_scenario("flat").changed(duration_s=0.1)
-    sensing = dataclasses.replace(flat.sensing, ir=InfraredModel(noise_v=0.0))
+    flat = sim.load_scenario("flat").changed(duration_s=0.1)
+    sensing = dataclasses.replace(flat.sensing, ir=sim.InfraredModel(noise_v=0.0))
     walls = (
-        Wall((-3.0, 0.5), (3.0, 0.5)),
-        Wall((-3.0, -0.7), (3.0, -0.7)),
-        Cylinder((9.0, 9.0), 1.0),
+        sim.Wall((-3.0, 0.5), (3.0, 0.5)),
+        sim.Wall((-3.0, -0.7), (3.0, -0.7)),
+        sim.Cylinder((9.0, 9.0), 1.0),
     )
     world = dataclasses.replace(flat.world, obstacles=walls)
-    with Twin(dataclasses.replace(flat, world=world, sensing=sensing)) as twin:
+    with sim.Twin(dataclasses.replace(flat, world=world, sensing=sensing)) as twin:
         for _ in twin.samples():
             pass
         ranges = twin._sensing.readings.ranges
     # The sensors on the sides sit 0.025 m off the axis, the walls' faces are 0.49 and 0.69 m off.
-    for name in ("ir04", "ir06", "ir08", "ir10", "ir12"):
-        assert ranges[name] == pytest.approx(0.465, abs=2e-3)
-    for name in ("ir05", "ir07", "ir09", "ir11", "ir13"):
-        assert ranges[name] == pytest.approx(0.665, abs=2e-3)
+    for number in range(4, 14):
+        expected = 0.665 if number % 2 else 0.465
+        assert ranges[f"ir{number:02d}"] == pytest.approx(expected, abs=2e-3)
     assert ranges["ir01"] == math.inf

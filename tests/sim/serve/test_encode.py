@@ -17,8 +17,6 @@ from undulog.sim.sensing.contract import JointSample, RangeSample, VectorSample
 from undulog.sim.serve.reply_frames import ReplyEncoder
 from undulog.sim.serve.robot import CommandLatch
 
-STEP = {"position": 0.01, "velocity": 0.1, "torque": 1, "current": 1}
-
 
 @pytest.fixture(scope="module")
 def robot():
@@ -31,8 +29,7 @@ def database(robot):
 
 
 def cycle(number=3, joints=25, slot_s=0.0003):
-    rng = np.random.default_rng(number)
-    values = rng.uniform(-0.5, 0.5, (5, joints))
+    values = np.random.default_rng(number).uniform(-0.5, 0.5, (5, joints))
     return JointSample(number, slot_s * np.arange(joints), *values)
 
 
@@ -84,8 +81,7 @@ def test_every_message_is_what_cantools_encodes(robot, database):
 
 
 def test_each_frame_has_the_time_of_its_sample(robot):
-    sample = cycle()
-    frames = ReplyEncoder(robot).frames([sample], clock_ns)
+    frames = ReplyEncoder(robot).frames([cycle()], clock_ns)
     assert frames["id_flags"].tolist() == list(range(513, 538))
     expected = 7_000_000 + 30_000_000 + 300_000 * np.arange(25)
     assert frames["t_device_ns"].tolist() == expected.tolist()
@@ -124,17 +120,13 @@ databases = ["two.dbc"]
 bitrate = 1000000
 signals = [{signals}]
 """
-    robot = parse_robot(description, "two.toml", {"two.dbc": text})
-    encoder = ReplyEncoder(robot)
+    encoder = ReplyEncoder(parse_robot(description, "two.toml", {"two.dbc": text}))
     (frame,) = encoder.frames([cycle(0, joints=2, slot_s=0.001)], clock_ns)
-    assert frame["id_flags"] == 1024 | EXTENDED_FLAG
-    assert frame["t_device_ns"] == 8_000_000
-    values = cantools.database.load_string(text, "dbc").decode_message(
-        "pair", frame["data"].tobytes()
-    )
-    sample = cycle(0, joints=2)
-    assert values["one"] == pytest.approx(math.degrees(sample.position[0]), abs=0.005)
-    assert values["two"] == pytest.approx(sample.position[1], rel=1e-7)
+    assert (frame["id_flags"], frame["t_device_ns"]) == (1024 | EXTENDED_FLAG, 8_000_000)
+    pair = cantools.database.load_string(text, "dbc").get_message_by_name("pair")
+    values, position = pair.decode(frame["data"].tobytes()), cycle(0, joints=2).position
+    assert values["one"] == pytest.approx(math.degrees(position[0]), abs=0.005)
+    assert values["two"] == pytest.approx(position[1], rel=1e-7)
     assert encoder.identifiers("joint02").tolist() == encoder.identifiers().tolist()
 
 
@@ -159,15 +151,13 @@ def test_servos_hold_their_last_command_within_their_limits(robot):
     assert latch.commanded.all()
     frames = commands(robot, {"joint02": 0.1, "joint03": 1.5, "joint01": -math.pi / 6}, 10**9)
     assert set(frames["dir"]) == {DIR_TX}
-    told = latch.take(frames)
-    assert np.flatnonzero(told).tolist() == [0, 1, 2]
+    assert np.flatnonzero(latch.take(frames)).tolist() == [0, 1, 2]
     assert latch.angle[:3] == pytest.approx([-math.pi / 6, 0.1, math.pi / 6], abs=1e-4)
     assert latch.cut == {"joint03"}
     latch.take(np.concatenate([commands(robot, {"joint02": a}) for a in (0.3, 0.2)]))
     assert latch.angle[1] == pytest.approx(0.2, abs=1e-4)  # the later one
     assert latch.take(commands(robot, {"joint02": -0.2}), received=False)[1]
-    assert latch.angle[1] == pytest.approx(0.2, abs=1e-4)
-    assert latch.frames == 6
+    assert (latch.angle[1], latch.frames) == (pytest.approx(0.2, abs=1e-4), 6)
 
 
 def test_commands_are_read_as_cantools_writes_them(robot, database):

@@ -45,8 +45,8 @@ def test_any_way_of_cutting_what_a_client_sends_gives_the_same(pieces, seed):
 @settings(max_examples=30, deadline=None)
 @given(pieces=anything)
 def test_nothing_that_a_client_sends_harms_the_others(pieces):
-    said = []
-    server = SocketcandServer("127.0.0.1", 0, "can0", lambda *words: said.append(words))
+    notes = []
+    server = SocketcandServer("127.0.0.1", 0, "can0", lambda *words: notes.append(words))
     frames = empty_frames(3)
     try:
         with (
@@ -55,7 +55,7 @@ def test_nothing_that_a_client_sends_harms_the_others(pieces):
         ):
             mad.setblocking(False)
             good.settimeout(0.001)
-            heard = b""
+            received = b""
             good.sendall(b"< open can0 >< rawmode >")
             for piece in [*pieces, b"", b""]:
                 with suppress(OSError):  # it may have been let go
@@ -68,12 +68,12 @@ def test_nothing_that_a_client_sends_harms_the_others(pieces):
             for _ in range(1000):
                 server.pump(0.001)
                 try:
-                    heard += good.recv(65536)
+                    received += good.recv(65536)
                 except TimeoutError:
                     continue
-                if heard.endswith(b"< echo >"):
+                if received.endswith(b"< echo >"):
                     break
-            assert heard.startswith(b"< hi >< ok >< ok >")
-            assert heard.endswith(b"< echo >")
+            assert received.startswith(b"< hi >< ok >< ok >")
+            assert received.endswith(b"< echo >")
     finally:
         server.close()

@@ -126,7 +126,7 @@ def heedless(scenario, port, control):
 
 
 def on_the_bus(folder, scenario, *words, controller=driven):
-    """Robot, two recorders and a controller; returns what each said and wrote."""
+    """Robot, two recorders and a controller; returns what each reported and wrote."""
     bus = folder / "bus.sock"
     over_bus = {way: folder / f"{way}.mcap" for way in ("tcp", "unix")}
     words = ("--unix", str(bus), "--duration", str(DURATION_S), "--lockstep", *words)
@@ -200,12 +200,11 @@ SENSOR_COLUMNS = {
 
 
 @pytest.mark.slow
-def test_times_over_the_bus_are_those_of_the_run(run):
+def test_times_over_the_bus_are_those_of_the_run(run, opened):
     """Device times to the microsecond; what the recorder makes of them, within 2 ms."""
     start_ns = round(run.end["start_s"] * 1e9)
-    with Session.open(run.in_process) as truth:
-        _, _, expected = columns(truth, "/joint_states", "position")
-        expected = expected - expected.min()
+    _, _, expected = columns(opened(run.in_process), "/joint_states", "position")
+    expected = expected - expected.min()
     for way, path in run.over_bus.items():
         with Session.open(path) as found:
             frames = found.frames("/can/can0")
@@ -225,7 +224,7 @@ def test_times_over_the_bus_are_those_of_the_run(run):
 
 
 @pytest.mark.slow
-def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario):
+def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario, opened):
     words = ("lost:joint07:0.2", "frozen:joint03@0.2", "noise:0.02", "bus-off@1.5+0.4")
     faults = [word for text in words for word in ("--fault", text)]
     _, end, _, over_bus = on_the_bus(tmp_path, scenario, *faults, controller=heedless)
@@ -241,17 +240,15 @@ def test_faults_that_were_ordered_are_in_the_verdict(tmp_path, scenario):
         assert "error frames" in reasons
         (bus,) = health.buses
         assert bus.error_frames == end["hit"] + 2  # off, and back again
-        with Session.open(path) as session:
-            said = [message.msg for _, message in session.messages("/rosout")]
-        assert "bus-off: the controller left the bus" in said
-        assert "the controller is back on the bus" in said
+        notes = [message.msg for _, message in opened(path).messages("/rosout")]
+        assert "bus-off: the controller left the bus" in notes
+        assert "the controller is back on the bus" in notes
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_it_ends_in_good_order(number, tmp_path):
-    bus = tmp_path / "bus.sock"
-    words = ("--wait", "--unix", str(bus)) if number is signal.SIGINT else ()
+    words = ("--wait", "--unix", str(tmp_path / "bus.sock")) if number is signal.SIGINT else ()
     with serving("flat", *words, stderr=subprocess.PIPE) as (robot, ready):
         assert ready["waits"] is bool(words)
         with socket.create_connection((ready["host"], ready["port"])) as client:
@@ -286,8 +283,8 @@ def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
         with process(*UNDULOG, *record, **options) as recording:
 
             def connected():
-                said = undulog("record", "status", "--json", **options)
-                found = json.loads(said.stdout or "{}").get("recordings", [])
+                status = undulog("record", "status", "--json", **options)
+                found = json.loads(status.stdout or "{}").get("recordings", [])
                 return found and found[0]["sources"][0]["connected"]
 
             wait_for(connected, "the recorder")
@@ -295,9 +292,9 @@ def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
                 subprocess.run([*UNDULOG, *words], check=True, timeout=PATIENCE_S, **options)
             assert recording.wait(60) == 0
         robot.send_signal(signal.SIGINT)
-        told, _ = robot.communicate(timeout=60)
+        shown, _ = robot.communicate(timeout=60)
         assert robot.returncode == 0
-        assert re.match(r"snake25 ran for [\d.]+ s of flat ", told)
+        assert re.match(r"snake25 ran for [\d.]+ s of flat ", shown)
     with Session.open(tmp_path / "run.mcap") as session:
         commanded, measured = (session.joints(f"/joint_{w}") for w in ("commands", "states"))
         assert commanded.names == measured.names == session.robot.joint_names
@@ -319,8 +316,8 @@ def test_the_manuals_own_controller_moves_the_robot():
     assert end["ticks"] > 10
 
 
-def test_what_cannot_be_served_is_said_at_once(capsys):
-    for words, said in (
+def test_what_cannot_be_served_is_refused_at_once(command):
+    for words, message in (
         (["flat"], "give --socketcand PORT or --unix PATH"),
         (["flat", "--socketcand", "1e3"], "expected [HOST:]PORT"),
         (["flat", "--socketcand", "192.0.2.1:0"], "is not this computer's loopback"),
@@ -331,5 +328,4 @@ def test_what_cannot_be_served_is_said_at_once(capsys):
         (["flat", "--socketcand", "0", "--duration", "0"], "a duration of 0 s"),
         (["flat", "--unix", "x" * 200], "AF_UNIX path too long"),
     ):
-        assert front.run(["sim", "serve", *words]) == 2
-        assert said in capsys.readouterr().err
+        assert message in command("sim", "serve", *words, code=2).err

@@ -15,6 +15,7 @@ from can.interfaces.socketcand.socketcand import (
 from hypothesis import given
 from hypothesis import strategies as st
 
+from support.can_messages import can_message, frames_of
 from support.processes import wait_for
 from undulog.capture import SessionWriter
 from undulog.capture.common.errors import UsageError
@@ -29,14 +30,8 @@ from undulog.capture.sources.contract import SourceContext, open_source, parse_a
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcand import SocketcandText
 from undulog.sim.drive.links import find_virtual_robot
+from undulog.sim.serve import socketcand_server
 from undulog.sim.serve.socketcand_protocol import ClientText, frame_text, sent_frame
-from undulog.sim.serve.socketcand_server import (
-    HOLD_S,
-    MOST_CLIENTS,
-    MOST_SENT,
-    SocketcandServer,
-    VirtualBus,
-)
 
 PATIENCE_S = 60.0
 
@@ -61,36 +56,16 @@ def same(found, truth):
     return len(found) == len(truth) and all(np.array_equal(found[f], truth[f]) for f in fields)
 
 
-def as_frames(messages):
-    frames = empty_frames(len(messages))
-    for frame, message in zip(frames, messages, strict=True):
-        frame["id_flags"] = message.arbitration_id | message.is_extended_id * EXTENDED_FLAG
-        frame["dlc"] = message.dlc
-        frame["data"] = list(bytes(message.data).ljust(8, b"\0"))
-    return frames
-
-
-def as_messages(frames):
-    return [
-        can.Message(
-            arbitration_id=int(f["id_flags"]) & 0x1FFFFFFF,
-            is_extended_id=bool(f["id_flags"] & EXTENDED_FLAG),
-            data=f["data"][: f["dlc"]].tobytes(),
-        )
-        for f in frames
-    ]
-
-
 class Serving:
     """A bus whose clients are served by a thread; its robot is the test."""
 
     def __init__(self):
-        self.said = []
-        self.server = SocketcandServer(
-            "localhost", 0, "can0", lambda level, text: self.said.append((level, text))
+        self.events = []
+        self.server = socketcand_server.SocketcandServer(
+            "localhost", 0, "can0", lambda level, text: self.events.append((level, text))
         )
         self.port = self.server.address[1]
-        self.bus = VirtualBus(self.server, None, lambda *_: None)
+        self.bus = socketcand_server.VirtualBus(self.server, None, lambda *_: None)
         self.lock, self.ended = threading.Lock(), False
         self.pulling = True
         self.pulled = []
@@ -143,14 +118,14 @@ def hand(serving, *words):
     """A client by hand; what it asked for has been answered when the block begins."""
     with socket.create_connection(("127.0.0.1", serving.port)) as sock:
         sock.settimeout(PATIENCE_S)
-        assert heard(sock, b"< hi >") == b"< hi >"
+        assert read_until(sock, b"< hi >") == b"< hi >"
         for word in words:
             sock.sendall(b"< %s >" % word)
-            assert heard(sock, b"< ok >") == b"< ok >"
+            assert read_until(sock, b"< ok >") == b"< ok >"
         yield sock
 
 
-def heard(sock, end):
+def read_until(sock, end):
     data = b""
     while not data.endswith(end):
         chunk = sock.recv(65536)
@@ -161,11 +136,8 @@ def heard(sock, end):
 
 
 def received(bus, count):
-    messages = []
-    while len(messages) < count:
-        message = bus.recv(PATIENCE_S)
-        assert message is not None, len(messages)
-        messages.append(message)
+    messages = [bus.recv(PATIENCE_S) for _ in range(count)]
+    assert all(messages)
     return messages
 
 
@@ -180,8 +152,7 @@ def test_what_the_server_writes_both_clients_read_alike():
     assert same(found, truth)
     assert np.array_equal(found["t_device_ns"], truth["t_device_ns"])
     pieces = [piece + ">" for piece in text.decode().split(">")[:-1]]
-    theirs = [convert_ascii_message_to_can_message(piece) for piece in pieces]
-    assert same(as_frames(theirs), truth)
+    assert same(frames_of([convert_ascii_message_to_can_message(piece) for piece in pieces]), truth)
     odd = empty_frames(2)
     odd["id_flags"] = [ERROR_FLAG | 0x40, REMOTE_FLAG | 0x123]
     odd["dlc"] = [8, 3]
@@ -192,20 +163,15 @@ def test_what_the_server_writes_both_clients_read_alike():
     assert tally.counts.malformed == 0
 
 
-@given(
-    identifier=st.integers(0, 2**29 - 1),
-    extended=st.booleans(),
-    data=st.binary(max_size=8),
-)
+@given(st.integers(0, 2**29 - 1), st.booleans(), st.binary(max_size=8))
 def test_what_python_can_sends_is_read(identifier, extended, data):
     identifier &= 0x1FFFFFFF if extended else 0x7FF
     message = can.Message(arbitration_id=identifier, is_extended_id=extended, data=data)
-    text = convert_can_message_to_ascii_message(message).encode()
-    (said,) = ClientText().feed(text)
-    word, _, rest = said.partition(" ")
+    (text,) = ClientText().feed(convert_can_message_to_ascii_message(message).encode())
+    word, _, rest = text.partition(" ")
     record = sent_frame(word, rest.strip())
     assert record is not None
-    assert same(records([record]), as_frames([message]))
+    assert same(records([record]), frames_of([message]))
     assert records([record])["dir"].tolist() == [DIR_TX]
 
 
@@ -221,8 +187,8 @@ def test_remote_requests_have_a_length_and_no_data():
     record = sent_frame("sendrtr", "1AAAAAAA 2")
     assert record is not None
     (frame,) = records([record])
-    assert frame["id_flags"] == 0x1AAAAAAA | EXTENDED_FLAG | REMOTE_FLAG
-    assert (frame["dlc"], frame["data"].any()) == (2, False)
+    found = frame["id_flags"], frame["dlc"], frame["data"].any()
+    assert found == (0x1AAAAAAA | EXTENDED_FLAG | REMOTE_FLAG, 2, False)
     assert sent_frame("sendrtr", "123 1 22") is None
 
 
@@ -234,12 +200,12 @@ def test_frames_go_to_everyone_but_their_sender(serving):
     with peer(serving) as first, peer(serving) as second:
         wait_for(lambda: serving.raw() == 2, "two clients")
         serving.send(own)
-        assert same(as_frames(received(first, 300)), own)
-        assert same(as_frames(received(second, 300)), own)
-        for message in as_messages(other):
-            first.send(message)
+        assert same(frames_of(received(first, 300)), own)
+        assert same(frames_of(received(second, 300)), own)
+        for frame in other:
+            first.send(can_message(frame))
         messages = received(second, 200)
-        assert same(as_frames(messages), other)
+        assert same(frames_of(messages), other)
         assert {message.timestamp for message in messages} == {12.345678}
         wait_for(lambda: len(serving.frames()) == 200, "all frames at the robot")
         assert same(serving.frames(), other)
@@ -256,8 +222,8 @@ def test_our_own_source_records_the_bus(serving, tmp_path):
             arrays = []
             serving.send(own)
             with peer(serving) as foreign:
-                for message in as_messages(other):
-                    foreign.send(message)
+                for frame in other:
+                    foreign.send(can_message(frame))
 
                 def enough():
                     arrays.extend(source.poll().frames)
@@ -297,23 +263,26 @@ def test_pythons_client_can_join_a_busy_bus(serving):
 
 def test_answers_are_those_of_the_protocol(serving):
     with hand(serving, b"open can0") as sock:
-        for said, answer in (
+        for request, answer in (
             (b"echo", b"< echo >"),
             (b"bcmmode", b"< ok >"),
             (b"subscribe 0 0 123", b"< error only the raw mode is served >"),
             (b"statistics 100", b"< error unknown command >"),
             (b"send 123 2 11", b"< error syntax error >"),
         ):
-            sock.sendall(b"< %s >" % said)
-            assert heard(sock, b">") == answer
+            sock.sendall(b"< %s >" % request)
+            assert read_until(sock, b">") == answer
         sock.sendall(b"< send 123 1 A >")  # without the raw mode one can send, too
         wait_for(lambda: len(serving.pulled), "the frame")
-    for said in (b"< send 123 1 A >", b"< open can7 >"):
+    for request in (b"< send 123 1 A >", b"< open can7 >"):
         with hand(serving) as sock:
-            sock.sendall(said)
-            assert heard(sock, b">") == b"< error could not open bus >"
+            sock.sendall(request)
+            assert read_until(sock, b">") == b"< error could not open bus >"
             assert sock.recv(10) == b""
-    wait_for(lambda: any("there is only can0" in text for _, text in serving.said), "why")
+    wait_for(
+        lambda: any("there is only can0" in text for _, text in serving.events),
+        "can7 refused",
+    )
 
 
 def test_a_client_that_does_not_listen_is_let_go_and_the_others_hear_all(serving):
@@ -326,9 +295,9 @@ def test_a_client_that_does_not_listen_is_let_go_and_the_others_hear_all(serving
             sent += 1000
             assert len(received(good, 1000)) == 1000
             assert sent < 2_000_000
-    said = [text for level, text in serving.said if level == "warn"]
-    assert len(said) == 1
-    assert "does not take its frames" in said[0]
+    warnings = [text for level, text in serving.events if level == "warn"]
+    assert len(warnings) == 1
+    assert "does not take its frames" in warnings[0]
 
 
 def test_a_client_that_makes_no_sense_is_let_go(serving):
@@ -342,15 +311,13 @@ def test_who_sends_more_than_the_robot_takes_has_to_wait_and_loses_nothing(servi
     with serving.lock:
         serving.pulling = False
     many = traffic(60_000, 7)
-    text = b"".join(
-        convert_can_message_to_ascii_message(message).encode() for message in as_messages(many)
-    )
+    text = "".join(convert_can_message_to_ascii_message(can_message(frame)) for frame in many)
     with hand(serving, b"open can0") as sock:
-        thread = threading.Thread(target=sock.sendall, args=(text,))
+        thread = threading.Thread(target=sock.sendall, args=(text.encode(),))
         thread.start()
-        wait_for(lambda: serving.bus.waiting >= MOST_SENT, "a full queue")
+        wait_for(lambda: serving.bus.waiting >= socketcand_server.MOST_SENT, "a full queue")
         time.sleep(0.2)
-        assert serving.bus.waiting < MOST_SENT + 2000
+        assert serving.bus.waiting < socketcand_server.MOST_SENT + 2000
         with serving.lock:
             serving.pulling = True
         wait_for(lambda: sum(map(len, serving.pulled)) == len(many), "all frames")
@@ -366,7 +333,7 @@ def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(
         serving.server.mark(0)
     address = parse_address(f"can:socketcand:can0?port={serving.port}")
     link = find_virtual_robot(address, Tally(lambda: 0))
-    time.sleep(2 * HOLD_S)
+    time.sleep(2 * socketcand_server.HOLD_S)
     with serving.lock:  # the robot does not listen
         # It sent more than the controller has read, so that the end resets the connection; and it
         # sends again before it listens.
@@ -383,39 +350,38 @@ def test_commands_that_the_robot_has_not_read_survive_the_end_of_the_connection(
 
 def test_no_more_clients_than_there_is_room_for(serving):
     with ExitStack() as clients:
-        for _ in range(MOST_CLIENTS):
+        for _ in range(socketcand_server.MOST_CLIENTS):
             clients.enter_context(hand(serving, b"open can0", b"rawmode"))
         with socket.create_connection(("127.0.0.1", serving.port)) as late:
             late.settimeout(PATIENCE_S)
             assert late.recv(10) == b""
 
 
-@pytest.mark.parametrize("said", [(), (b"open can0",)], ids=["nothing", "open"])
-def test_silent_clients_lock_nobody_out(serving, said):
+@pytest.mark.parametrize("words", [(), (b"open can0",)], ids=["nothing", "open"])
+def test_silent_clients_lock_nobody_out(serving, words):
     """Whoever connects and stays silent gives way; who works on the bus stays."""
     frames = traffic(50)
     with ExitStack() as clients:
         worker = clients.enter_context(hand(serving, b"open can0", b"rawmode"))
-        for _ in range(3 * MOST_CLIENTS):
-            clients.enter_context(hand(serving, *said))
+        for _ in range(3 * socketcand_server.MOST_CLIENTS):
+            clients.enter_context(hand(serving, *words))
         late = clients.enter_context(peer(serving))
         wait_for(lambda: serving.raw() == 2, "both in raw mode")
         serving.send(frames)
         found = received(late, len(frames))
         text = frame_text(frames)
-        assert heard(worker, text[-40:]) == text
-    sane = (frames["id_flags"] & REMOTE_FLAG) == 0
-    assert same(as_frames(found), frames[sane])
+        assert read_until(worker, text[-40:]) == text
+    assert same(frames_of(found), frames[(frames["id_flags"] & REMOTE_FLAG) == 0])
 
 
 def test_only_loopback_is_served():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        for host, at, said in (
+        for host, at, why in (
             ("0.0.0.0", 0, "is not this computer's loopback"),
             ("192.0.2.1", 0, "is not this computer's loopback"),
             ("no.such.host.invalid", 0, "no address to serve at"),
             ("127.0.0.1", port, f"can't serve at 127.0.0.1:{port}: Address already"),
         ):
-            with pytest.raises(UsageError, match=said):
-                SocketcandServer(host, at, "can0", lambda *_: None)
+            with pytest.raises(UsageError, match=why):
+                socketcand_server.SocketcandServer(host, at, "can0", lambda *_: None)

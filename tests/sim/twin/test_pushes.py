@@ -25,8 +25,7 @@ def pushed(make_robot, make_scenario):
     def run(*pushes, **fields):
         robot = make_robot(5)
         fields |= {"amplitude": 0.0, "world": FREE, "disturbances": pushes}
-        scenario = make_scenario(robot, **fields)
-        return simulate(scenario)[-1], robot
+        return simulate(make_scenario(robot, **fields))[-1], robot
 
     return run
 
@@ -39,9 +38,8 @@ def momentum(sample, robot):
 def test_a_push_gives_its_impulse(pushed, engine):
     # Along the body, which stays straight: exact, also in the middle of control periods.
     push = Push("link02", (0.3, 0.0, 0.0), start_s=0.203, duration_s=0.25)
-    np.testing.assert_allclose(
-        momentum(*pushed(push, engine=engine)), [0.075, 0.0, 0.0], rtol=1e-12, atol=1e-12
-    )
+    found = momentum(*pushed(push, engine=engine))
+    np.testing.assert_allclose(found, [0.075, 0.0, 0.0], rtol=1e-12, atol=1e-12)
 
 
 def test_a_push_that_bends_the_body_converges_to_its_impulse(pushed):
@@ -82,5 +80,4 @@ def test_a_push_is_read_and_written_back():
 
 
 def test_a_push_on_nobody_is_a_fault():
-    found = faults_of(TEXT.replace("link07", "link14"))
-    assert 'found "link14"' in found["disturbances[0].link"]
+    assert 'found "link14"' in faults_of(TEXT.replace("link07", "link14"))["disturbances[0].link"]

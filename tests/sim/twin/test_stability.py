@@ -6,21 +6,12 @@ import numpy as np
 import pytest
 
 from support.twin_runs import simulate
+from undulog import sim
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.model import Plane
-from undulog.sim import (
-    FrictionLaw,
-    Ground,
-    PlaneGait,
-    Serpentine,
-    World,
-    load_scenario,
-    scenario_names,
-)
-from undulog.sim.scenario.obstacles import Cylinder, ObstacleMaterial
 from undulog.sim.twin.stability import likely_cause, stability, warnings
 
-IN_SPACE = World(gravity=(0.0, 0.0, 0.0), ground=None)
+IN_SPACE = sim.World(gravity=(0.0, 0.0, 0.0), ground=None)
 
 
 def restless(scenario):
@@ -35,15 +26,16 @@ def restless(scenario):
 
 @pytest.fixture
 def nudged(make_scenario, make_robot):
-    """A robot that is told to bend each joint a little, each in its own way, and to stay so."""
+    """A robot that bends each joint a little, each in its own way, and stays so."""
 
     def build(links, *, planar=True, rate_hz=1000, world=None, plane=Plane.HORIZONTAL, **servo):
         # Weak and without Coulomb friction: the servos neither hold the motion nor drive it.
         servo = {"coulomb_friction": 0.0, "stall_torque": 1e-2} | servo
-        wave = PlaneGait(amplitude=1e-4, frequency_hz=0.01, lag=1.0)
         return make_scenario(
             make_robot(links, planar=planar, **servo),
-            gait=Serpentine({plane: wave}, 0.0),
+            gait=sim.Serpentine(
+                {plane: sim.PlaneGait(amplitude=1e-4, frequency_hz=0.01, lag=1.0)}, 0.0
+            ),
             world=world or IN_SPACE,
             physics_rate_hz=rate_hz,
             duration_s=1.0,
@@ -75,10 +67,10 @@ def test_gears_are_unstable_from_a_share_of_one(nudged, links, planar):
 @pytest.mark.parametrize(
     ("ground", "name"),
     [
-        (Ground(stiffness=4e5, damping=0.0, mu_normal=0.0, mu_tangential=0.0), "stiffness"),
-        (Ground(damping=200.0, mu_normal=0.0, mu_tangential=0.0), "damping"),
-        (Ground(law=FrictionLaw.VISCOUS, drag_normal=75.0), "drag_normal"),
-        (Ground(law=FrictionLaw.VISCOUS, drag_tangential=100.0), "drag_tangential"),
+        (sim.Ground(stiffness=4e5, damping=0.0, mu_normal=0.0, mu_tangential=0.0), "stiffness"),
+        (sim.Ground(damping=200.0, mu_normal=0.0, mu_tangential=0.0), "damping"),
+        (sim.Ground(law=sim.FrictionLaw.VISCOUS, drag_normal=75.0), "drag_normal"),
+        (sim.Ground(law=sim.FrictionLaw.VISCOUS, drag_tangential=100.0), "drag_tangential"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -86,9 +78,8 @@ def test_a_ground_is_too_stiff_from_a_share_of_one(nudged, ground, name):
     # Thrown flat on the ground with a little speed all ways.
     def scaled(share, one=1.0):
         field = {name: getattr(ground, name) * share / one}
-        world = World(velocity=(1e-4, 1e-4, -1e-4), ground=dataclasses.replace(ground, **field))
-        gear = {"gear_stiffness": 1.0, "gear_damping": 1e-4}
-        return nudged(3, planar=False, world=world, **gear)
+        world = sim.World(velocity=(1e-4, 1e-4, -1e-4), ground=dataclasses.replace(ground, **field))
+        return nudged(3, planar=False, world=world, gear_stiffness=1.0, gear_damping=1e-4)
 
     one = largest(scaled(1.0))
     calm, wild = scaled(0.95, one), scaled(1.05, one)
@@ -102,12 +93,12 @@ def test_an_obstacle_uses_the_range_as_the_end_of_the_chain_gives_way(nudged):
     # Two links with a loose gear: 1 / mass at the end, from free links and the joint between them.
     def found(material):
         world = dataclasses.replace(
-            IN_SPACE, obstacles=(Cylinder((1.0, 0.0), 0.1),), obstacle_contact=material
+            IN_SPACE, obstacles=(sim.Cylinder((1.0, 0.0), 0.1),), obstacle_contact=material
         )
         scenario = nudged(2, world=world, gear_stiffness=1e-9, gear_damping=1e-9)
         return stability(scenario)[Plane.HORIZONTAL]
 
-    material = ObstacleMaterial(stiffness=3e4, damping=5.0, mu=0.0)
+    material = sim.ObstacleMaterial(stiffness=3e4, damping=5.0, mu=0.0)
     free = np.diag(1 / np.array([0.1, 5e-5, 0.1, 5e-5]))  # shift and turn, shift and turn
     joint = np.array([1.0, -0.03, -1.0, -0.03])
     end = np.array([1.0, 0.03, 0.0, 0.0])
@@ -127,9 +118,9 @@ def test_a_ground_that_does_not_carry_a_link_is_named(make_scenario, make_robot)
     heavy = dataclasses.replace(robot.links[2], mass=0.025 * 2000.0 / 9.81 + 0.01)
     links = (*robot.links[:2], heavy, robot.links[3])
     scenario = make_scenario(dataclasses.replace(robot, links=links), physics_rate_hz=4000)
-    said = "link03 is too heavy for world.ground.stiffness: with 5.10684 kg it rests 0.025 m deep"
-    assert warnings(scenario)[-1] == said
-    assert likely_cause(scenario) == f"likely cause: {said}"
+    shown = "link03 is too heavy for world.ground.stiffness: with 5.10684 kg it rests 0.025 m deep"
+    assert warnings(scenario)[-1] == shown
+    assert likely_cause(scenario) == f"likely cause: {shown}"
 
 
 @pytest.mark.parametrize(
@@ -145,17 +136,17 @@ def test_a_ground_that_does_not_carry_a_link_is_named(make_scenario, make_robot)
 )
 def test_the_default_robot_on_the_default_ground(nudged, links, planar, rate_hz, stable):
     servo = {"stall_torque": 1.5, "coulomb_friction": 0.03}
-    scenario = nudged(links, planar=planar, rate_hz=rate_hz, world=World(), **servo)
+    scenario = nudged(links, planar=planar, rate_hz=rate_hz, world=sim.World(), **servo)
     assert bool(warnings(scenario)) is not stable
     assert (restless(scenario) < 1e-4) is stable
 
 
-@pytest.mark.parametrize("name", scenario_names())
+@pytest.mark.parametrize("name", sim.scenario_names())
 def test_shipped_scenarios_are_within_the_bound(name):
-    assert not warnings(load_scenario(name))
+    assert not warnings(sim.load_scenario(name))
 
 
 def test_among_obstacles_the_shipped_robot_needs_two_kilohertz():
-    slow, fast = (load_scenario("random-walk", {"physics_rate_hz": hz}) for hz in (1000, 2000))
+    slow, fast = (sim.load_scenario("random-walk", {"physics_rate_hz": hz}) for hz in (1000, 2000))
     assert any("too stiff for steps of 1 ms" in text for text in warnings(slow))
     assert not warnings(fast)

@@ -8,9 +8,8 @@ import pytest
 from support.twin_runs import energies, simulate
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.model import Plane
-from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, World
+from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, Twin, World
 from undulog.sim.sensing.contract import JointSample
-from undulog.sim.twin.twin import Twin
 
 
 def centre_of_mass(samples):
@@ -69,15 +68,11 @@ def test_power_closes_over_five_cycles(make_scenario, make_robot, planes, backla
     ground = ("friction_tangential", "friction_normal", "contact_damping")
     assert min(flow[term] for term in losses) > 0.0
     assert min(flow[term] for term in ground) >= 0.0
-    stored = sum(flow[t] for t in ("kinetic", "potential", "contact_spring"))
-    rotor = flow["rotor_kinetic"] + flow["gear_spring"]
-    net = flow["mechanical_net"]
-    assert net == pytest.approx(
-        sum(flow[t] for t in ground) + stored + flow["mechanical_residual"], rel=1e-9
-    )
-    assert flow["electrical_net"] == pytest.approx(
-        net + sum(flow[t] for t in losses) + rotor + flow["electrical_residual"], rel=1e-9
-    )
+    net, stored = flow["mechanical_net"], ("kinetic", "potential", "contact_spring")
+    spent = sum(flow[t] for t in (*ground, *stored, "mechanical_residual"))
+    drawn = sum(flow[t] for t in (*losses, "rotor_kinetic", "gear_spring", "electrical_residual"))
+    assert net == pytest.approx(spent, rel=1e-9)
+    assert flow["electrical_net"] == pytest.approx(net + drawn, rel=1e-9)
     assert net == pytest.approx(2 * flow["mechanical_plus"] - flow["mechanical_abs"], rel=1e-9)
 
 
@@ -107,9 +102,8 @@ def test_without_ground_nothing_is_lost_to_it(make_scenario, make_robot):
 
 def test_a_failure_without_a_stiff_part_says_so(make_scenario, make_robot):
     world = World(velocity=(11.0, 0.0, 0.0))
-    with pytest.raises(
-        SimulationError, match=r"at 0\.000 s: link01 moves at 11 m/s.*look at the gait"
-    ):
+    shown = r"at 0\.000 s: link01 moves at 11 m/s.*look at the gait"
+    with pytest.raises(SimulationError, match=shown):
         simulate(make_scenario(make_robot(3), amplitude=0.0, world=world))
 
 

@@ -1,17 +1,14 @@
 """The twin among obstacles: collisions in closed form, the energy balance, and both engines."""
 
 import dataclasses
-import json
 import math
 
 import numpy as np
 import pytest
 
-import undulog as front
-from support.twin_runs import energies, simulate
+from support.twin_runs import SNAKE13, energies, simulate
 from undulog.capture.robot.model import Plane
-from undulog.sim import PlaneGait, Serpentine, World
-from undulog.sim.scenario.obstacles import Cylinder, ObstacleMaterial, Wall
+from undulog.sim import Cylinder, ObstacleMaterial, PlaneGait, Serpentine, Wall, World
 from undulog.sim.scenario.scenario import EngineKind
 
 MASS, V = 0.3, 0.4  # of three links; the speed at which they come
@@ -31,9 +28,8 @@ def thrown(make_scenario, make_robot):
             obstacles=(WALL,),
             obstacle_contact=ObstacleMaterial(**material),
         )
-        return simulate(
-            make_scenario(make_robot(3), amplitude=0.0, duration_s=seconds, world=world)
-        )
+        straight = {"amplitude": 0.0, "duration_s": seconds, "world": world}
+        return simulate(make_scenario(make_robot(3), **straight))
 
     return throw
 
@@ -62,8 +58,7 @@ def test_a_damped_collision_loses_what_the_ledger_says(thrown):
     # falls by exp(-zeta / sqrt(1 - zeta^2) (pi - ...)) (Hunt & Crossley, J. Appl. Mech. 42, 1975).
     zeta = 20.0 / (2 * math.sqrt(MASS * 5000.0))
     root = math.sqrt(1 - zeta**2)
-    angle = math.atan2(2 * zeta * root, 2 * zeta**2 - 1)
-    restitution = math.exp(-zeta / root * angle)
+    restitution = math.exp(-zeta / root * math.atan2(2 * zeta * root, 2 * zeta**2 - 1))
     speed = -last.step.body.velocity[0, 0]
     assert speed == pytest.approx(restitution * V, rel=0.02)
     energy = energies(last)
@@ -77,18 +72,14 @@ def test_a_damped_collision_loses_what_the_ledger_says(thrown):
 def forest(make_scenario, make_robot):
     """A snake that undulates between pegs and along a wall, so that it touches both."""
     pegs = tuple(Cylinder((x, y), 0.03) for x in (0.15, -0.1, -0.35, -0.6) for y in (-0.075, 0.075))
+    gait = Serpentine({Plane.HORIZONTAL: PlaneGait(0.4, 0.7, math.pi / 3)}, 1.0)
+    world = World(obstacles=(*pegs, Wall((-1.0, 0.2), (1.0, 0.16))))
     robot = make_robot(13, stall_torque=0.5)
-    planes = {Plane.HORIZONTAL: PlaneGait(0.4, 0.7, math.pi / 3)}
-
-    def build():
-        world = World(obstacles=(*pegs, Wall((-1.0, 0.2), (1.0, 0.16))))
-        return make_scenario(robot, gait=Serpentine(planes, 1.0), duration_s=4.0, world=world)
-
-    return build
+    return make_scenario(robot, gait=gait, duration_s=4.0, world=world)
 
 
 def test_power_closes_among_obstacles(forest):
-    last = simulate(forest())[-1]
+    last = simulate(forest)[-1]
     energy = energies(last)
     assert (last.contact_s > 0.0).sum() >= 8
     assert last.contact_s.max() <= 4.0 + 1e-9
@@ -100,13 +91,13 @@ def test_power_closes_among_obstacles(forest):
     obstacles = ("obstacle_friction", "obstacle_damping")
     stored = ("kinetic", "potential", "contact_spring", "obstacle_spring")
     spent = sum(energy[term] for term in (*ground, *obstacles, *stored))
-    before = energies(simulate(dataclasses.replace(forest(), duration_s=0.01))[0])
+    before = energies(simulate(dataclasses.replace(forest, duration_s=0.01))[0])
     spent -= sum(before[term] for term in stored)
     assert energy["mechanical_net"] == pytest.approx(spent + energy["mechanical_residual"])
 
 
 def test_both_engines_meet_the_same_obstacles(forest):
-    scenario = dataclasses.replace(forest(), duration_s=1.5)
+    scenario = dataclasses.replace(forest, duration_s=1.5)
     ours, theirs = (
         simulate(dataclasses.replace(scenario, engine=engine))[-1] for engine in EngineKind
     )
@@ -124,32 +115,16 @@ def test_obstacles_out_of_reach_change_nothing(make_scenario, make_robot):
         np.testing.assert_array_equal(one.energy, other.energy)
 
 
-def test_the_command_line_tells_the_time_in_contact(tmp_path, capsys):
-    text = """
-description = "Past a peg."
-robot = "snake13"
-duration_s = 0.3
-[gait]
-ramp_s = 0.0
-[gait.horizontal]
-amplitude = 0.4
-frequency_hz = 1.0
-lag = 1.0
-[[world.obstacles]]
-shape = "cylinder"
-position = [-0.12, 0.06]
-radius = 0.03
-"""
-    path, words = tmp_path / "peg.toml", ["-o", str(tmp_path / "a.mcap"), "--force"]
+def test_the_command_line_shows_the_time_in_contact(tmp_path, command, report_of):
+    peg = '[[world.obstacles]]\nshape = "cylinder"\nposition = [-0.12, 0.06]\nradius = 0.03\n'
+    text = f"gait.ramp_s = 0.0\n{SNAKE13.replace('2.0', '0.3').replace('0.5', '1.0')}{peg}"
+    path, words = tmp_path / "peg.toml", ("-o", tmp_path / "a.mcap", "--force")
     path.write_text(text)
-    assert front.run(["sim", "run", str(path), *words, "--json"]) == 0
-    touched = json.loads(capsys.readouterr().out)["obstacle_contact_s"]
+    touched = report_of("sim", "run", path, *words)["obstacle_contact_s"]
     assert touched
     assert all(0.0 < seconds <= 0.3 for seconds in touched.values())
     longest = max(touched, key=touched.get)
-    assert front.run(["sim", "run", str(path), *words]) == 0
-    said = capsys.readouterr().out
-    assert f"touched obstacles, {longest} longest: {touched[longest]:.3g} s\n" in said
+    found = command("sim", "run", path, *words).out
+    assert f"touched obstacles, {longest} longest: {touched[longest]:.3g} s\n" in found
     path.write_text(text.replace("0.06]", "2.0]"))
-    assert front.run(["sim", "run", str(path), *words]) == 0
-    assert "no link touched an obstacle\n" in capsys.readouterr().out
+    assert "no link touched an obstacle\n" in command("sim", "run", path, *words).out

@@ -32,10 +32,8 @@ def coupled(experiment):
     + [(0.1, how, 6) for how in ("each", "common", "odd", "drift")],
 )
 def test_intervals_hold_and_a_linear_robot_is_linear(scatter_deg, how, base_runs):
-    random = np.random.default_rng(3)
-    found = kick_tables.row(
-        random, 50, 5, scatter_deg, how=how, base_runs=base_runs, index=scatter_deg == 0.1
-    )
+    random, options = np.random.default_rng(3), {"how": how, "base_runs": base_runs}
+    found = kick_tables.row(random, 50, 5, scatter_deg, **options, index=scatter_deg == 0.1)
     assert min(found[name] for name in "PRGS") >= 0.91
     assert found["worst"] >= 0.90  # of one row, 250 elements that share an estimate of scatter
     assert found["nonlinear"] <= 0.05
@@ -46,8 +44,7 @@ def test_intervals_hold_and_a_linear_robot_is_linear(scatter_deg, how, base_runs
 
 
 def test_without_coupling_the_headline_shows_none():
-    random = np.random.default_rng(4)
-    found = kick_tables.row(random, 200, 5, 0.1, coupled=False, index=False)
+    found = kick_tables.row(np.random.default_rng(4), 200, 5, 0.1, coupled=False, index=False)
     assert found["headline"] <= 0.05
 
 
@@ -70,16 +67,14 @@ def test_the_errors_of_a_run_are_those_planted(common):
     random = np.random.default_rng(6)
     L = H * c[None, :] / (H @ c)[:, None]
     found, correlated = [], []
-    for answers in kick_tables.experiments(
-        random, count, kicks, H, c, scatter=sigma, how="common" if common else "each"
-    ):
+    how = {"scatter": sigma, "how": "common" if common else "each"}
+    for answers in kick_tables.experiments(random, count, kicks, H, c, **how):
         variance = np.hstack([answers.phase_variance, answers.log_gain_variance])
         errors = run_errors(kicks, answers.log, variance, (L, L))
         found.append(errors.variance)
         correlated.append(errors.correlation[0, 1])
-        assert (
-            errors.dof == 2 + 2 * (m - 2) + 1
-        )  # repeats, others' pairs of two kinds, the rows' sum
+        # Repeats, others' pairs of two kinds, the rows' sum.
+        assert errors.dof == 2 + 2 * (m - 2) + 1
     expected = sigma**2 + kick_tables.NOISE**2
     np.testing.assert_allclose(np.mean(found, axis=0), expected, rtol=0.1)
     # Each estimate has the spread of a mean of seven squares.
@@ -150,8 +145,7 @@ def test_kicks_too_small_are_stated_with_what_to_record(size, scatter_deg):
 def test_what_is_to_be_recorded_would_do():
     """The size or number of repeats that the answer asks for brings the interval to 0.1."""
     coupling, answer = answered(0.1, 0.03)
-    wanted = float(answer.rpartition("record kicks of ")[2].split()[0])
-    again, _ = answered(wanted / 0.05, 0.03)
+    again, _ = answered(float(answer.rpartition("record kicks of ")[2].split()[0]) / 0.05, 0.03)
     assert again.kick_size.verdict == "fits"
     assert coupling.kick_size.resolved > 0.1
 

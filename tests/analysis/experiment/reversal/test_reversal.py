@@ -30,6 +30,12 @@ def pattern(joints):
     return np.log(heterogeneity_tables.boundary_pattern(joints))
 
 
+def permuted_welch(forward, reverse):
+    """Welch's test of one joint by all labellings, as SciPy has it."""
+    every = PermutationMethod(n_resamples=np.inf)
+    return ttest_ind(forward.real, reverse.real, equal_var=False, method=every)
+
+
 @pytest.mark.parametrize("runs", [(6, 6), (4, 5), (3, 7)])
 def test_one_joint_is_a_permuted_welch_test(runs):
     rng = np.random.default_rng(3)
@@ -37,12 +43,7 @@ def test_one_joint_is_a_permuted_welch_test(runs):
         forward = (rng.normal(shift, 1.0, (runs[0], 1))).astype(complex)
         reverse = (rng.normal(0.0, 1.0, (runs[1], 1))).astype(complex)
         test = mirror_test(forward, reverse)
-        foreign = ttest_ind(
-            forward.real,
-            reverse.real,
-            equal_var=False,
-            method=PermutationMethod(n_resamples=np.inf),
-        )
+        foreign = permuted_welch(forward, reverse)
         assert test.score[0, 0] == pytest.approx(foreign.statistic[0], rel=1e-9)
         assert test.dof[0, 0] == pytest.approx(foreign.df[0], rel=1e-9)
         if runs[0] == runs[1]:
@@ -50,10 +51,8 @@ def test_one_joint_is_a_permuted_welch_test(runs):
             continue
         # Of unequal numbers SciPy doubles the smaller tail, which isn't the share of larger |t|.
         both = np.concatenate([forward.real[:, 0], reverse.real[:, 0]])
-        t = [
-            ttest_ind(both[labels], both[~labels], equal_var=False).statistic
-            for labels in every_labelling(*runs)
-        ]
+        every = every_labelling(*runs)
+        t = [ttest_ind(both[one], both[~one], equal_var=False).statistic for one in every]
         share = np.mean(np.abs(t) >= np.abs(foreign.statistic[0]) * (1 - 1e-9))
         assert test.p == pytest.approx(share, abs=1e-12)
 
@@ -92,10 +91,7 @@ def test_a_random_subset_agrees_with_all_labellings():
     reverse = rng.normal(0.0, 1.0, (9, 1)).astype(complex)
     test = mirror_test(forward, reverse)
     assert (test.labellings, test.tried) == (48_620, 10_000)
-    foreign = ttest_ind(
-        forward.real, reverse.real, equal_var=False, method=PermutationMethod(n_resamples=np.inf)
-    )
-    p = foreign.pvalue[0]
+    p = permuted_welch(forward, reverse).pvalue[0]
     assert test.p == pytest.approx(p, abs=4 * (p * (1 - p) / 10_000) ** 0.5)
 
 
@@ -149,9 +145,8 @@ def test_a_weak_module_is_found_and_named(size):
         test = mirror_test(*both_ways(rng, pattern(13), module, scatter=scatter))
         pairs = ordered_pairs(names, test)
         found += test.p < 0.05
-        right += [(one.name, one.mirror, one.by) for one in pairs[:1]] == [
-            ("joint10", "joint04", "lag")
-        ]
+        first = [(one.name, one.mirror, one.by) for one in pairs[:1]]
+        right += first == [("joint10", "joint04", "lag")]
     missed = nct.cdf(t_distribution.isf(0.05 / 26 / 2, 10), 10, 2**0.5 * size)
     assert found / sets == pytest.approx(1 - missed, abs=0.09)  # standard error up to 3.5 %
     if size >= 3:
@@ -176,8 +171,7 @@ def test_ground_that_differs_fore_and_aft_names_no_module():
     y = pattern(7)
     forward, reverse = scattered(rng, y, 6, 0.002), scattered(rng, y[::-1] - 0.05j, 6, 0.002)
     result = reversal_of("abcdefg", forward, reverse)
-    assert result.p == pytest.approx(2 / 924)
-    assert result.pairs == ()
+    assert (result.p, result.pairs) == (pytest.approx(2 / 924), ())
 
 
 @pytest.mark.parametrize(("runs", "floor"), [((3, 3), 0.1), ((4, 4), 2 / 70), ((4, 5), 1 / 126)])
@@ -185,8 +179,7 @@ def test_few_runs_leave_a_floor_under_p(runs, floor):
     rng = np.random.default_rng(1)
     module = np.array([1.0, 0, 0, 0, 0, 0])
     test = mirror_test(*both_ways(rng, pattern(6), module, runs=runs, scatter=1e-3))
-    assert test.floor == pytest.approx(floor)
-    assert test.p == pytest.approx(floor)
+    assert (test.floor, test.p) == (pytest.approx(floor), pytest.approx(floor))
 
 
 def test_intervals_hold_together():
@@ -222,8 +215,7 @@ def test_shares_in_closed_form():
     rng = np.random.default_rng(8)
     boundary, module = pattern(9), 0.05 * rng.normal(size=9) + 0.05j * rng.normal(size=9)
     shares = variance_shares(*both_ways(rng, boundary, module, scatter=1e-7))
-    paired = np.arange(9) != 4
-    own = np.mean(np.abs(module - module[::-1])[paired] ** 2) / 2
+    own = np.mean(np.abs(module - module[::-1])[np.arange(9) != 4] ** 2) / 2
     ways = [np.var(one + module, ddof=1) for one in (boundary, boundary[::-1])]
     assert shares.module_variance.value == pytest.approx(own, rel=1e-5)
     assert shares.boundary_variance.value == pytest.approx(np.mean(ways) - own, rel=1e-5)
@@ -234,10 +226,8 @@ def test_shares_in_closed_form():
 def test_noise_is_nobodys_share():
     """Identical modules without any pattern: on average no variance is left, for either."""
     rng = np.random.default_rng(9)
-    found = [
-        variance_shares(*both_ways(rng, np.zeros(13), np.zeros(13), scatter=0.02))
-        for _ in range(60)
-    ]
+    nothing = (np.zeros(13), np.zeros(13))
+    found = [variance_shares(*both_ways(rng, *nothing, scatter=0.02)) for _ in range(60)]
     noise = np.mean([one.noise_variance for one in found])
     assert noise == pytest.approx(2 * 0.02**2 / 6, rel=0.1)  # gain and lag
     assert np.mean([one.module_variance.value for one in found]) < 0.3 * noise
@@ -252,9 +242,8 @@ def test_the_interval_of_the_share_covers():
     truth = variance_shares(*both_ways(rng, boundary, module, scatter=1e-9)).module_share.value
     held = 0
     for _ in range(100):
-        low, high = variance_shares(
-            *both_ways(rng, boundary, module, scatter=0.01)
-        ).module_share.ci95
+        shares = variance_shares(*both_ways(rng, boundary, module, scatter=0.01))
+        low, high = shares.module_share.ci95
         held += low <= truth <= high
     # 100 at 95 %: standard error 2.2 %; of six runs each way a bootstrap reaches a little less.
     assert held / 100 > 0.88

@@ -111,8 +111,7 @@ def servo_torque(servo, omega, command, angle):
             [0, -Kt, servo.rotor_inertia * s**2 + servo.viscous_friction * s, 1],
         ]
     )
-    b = [servo.proportional_gain * (command - angle), 0, -gear * angle, 0]
-    return np.linalg.solve(A, b)[3]
+    return np.linalg.solve(A, [servo.proportional_gain * (command - angle), 0, -gear * angle, 0])[3]
 
 
 @pytest.mark.parametrize("frequency_hz", [0.1, 0.5, 3.0])
@@ -152,16 +151,14 @@ def test_tones_are_found_on_uneven_times_between_steps():
         turn = np.exp(1j * (omega * t[:, None] + rng.uniform(-3, 3, 3)))
         value = 0.1 + np.real(turn) @ [0.02, 0.015, 0.01]
         channels.append(Series(f"j{k}", t, np.round(value / 1.5e-3) * 1.5e-3))
-    found = find_tones(channels)
-    np.testing.assert_allclose(found, omega, rtol=2e-4)
+    np.testing.assert_allclose(find_tones(channels), omega, rtol=2e-4)
     assert common_step(omega) == pytest.approx(2 * np.pi * 0.08)
 
 
 def test_what_is_no_multisine():
     t = np.arange(2000) / 100
     gait = np.sin(np.pi * t) + 0.3 * np.sin(2 * np.pi * t) + 0.1 * np.sin(3 * np.pi * t)
-    noise = np.random.default_rng(1).normal(size=t.size)
-    for values in (gait, t, noise, np.zeros_like(t)):
+    for values in (gait, t, np.random.default_rng(1).normal(size=t.size), np.zeros_like(t)):
         assert find_tones([Series("j1", t, values)]) is None
 
 
@@ -191,5 +188,4 @@ def test_what_is_no_sweep():
     kicks = wave * np.exp(0.05j * np.concatenate([np.eye(5), -np.eye(5)]))
     assert find_sweep(sessions([wave, *kicks])) is None
     pair = np.exp(1j * np.array([[0, 1], [0, -1]]))
-    assert find_sweep(sessions([*pair, *pair], names="ab")) is None
-    assert find_sweep([]) is None
+    assert (find_sweep(sessions([*pair, *pair], names="ab")), find_sweep([])) == (None, None)

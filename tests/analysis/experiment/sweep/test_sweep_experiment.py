@@ -1,12 +1,10 @@
 """Sessions of sweeps as one experiment: written to files, answered by a planted chain."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
 
-import undulog
 from support.analysed import experiment
 from support.joint_runs import write_joints
 from support.linear_chain import within
@@ -14,7 +12,7 @@ from undulog.analysis.experiment.sweep.coupling import servo_side
 from undulog.analysis.plan.designs import tones
 from undulog.analysis.present.text_experiment import render_experiment
 from undulog.analysis.results.coupling import LinearCoupling, Route
-from undulog.capture import Session, load_robot
+from undulog.capture import load_robot
 from undulog.capture.robot.model import Plane
 
 ROBOT = load_robot("snake25")
@@ -59,10 +57,8 @@ def write_run(
     t = np.arange(RATE * SECONDS)[:, None] / RATE
     shift = rng.uniform(-np.pi, np.pi)
     turn = [np.exp(1j * omega * (t + shift)) for omega in omegas]
-    moved = [
-        response(w) @ c * x * (1 + drift * t)
-        for w, c, x in zip(omegas, commands, turn, strict=True)
-    ]
+    tones = zip(omegas, commands, turn, strict=True)
+    moved = [response(w) @ c * x * (1 + drift * t) for w, c, x in tones]
     angle = np.real(sum(moved))
     speed = np.real(sum(1j * w * q for w, q in zip(omegas, moved, strict=True)))
     torque = sum(np.real(q @ impedance(w).T) for w, q in zip(omegas, moved, strict=True))
@@ -91,8 +87,7 @@ def close(matrix, truth):
     off = np.array(matrix.real) + 1j * np.array(matrix.imag) - truth
     assert np.abs(off).max() < 5 * np.max(matrix.standard_error)
     half = np.array(matrix.ci95_half)
-    inside = np.concatenate([np.abs(off.real) <= half, np.abs(off.imag) <= half])
-    assert inside.mean() > 0.85
+    assert np.concatenate([np.abs(off.real) <= half, np.abs(off.imag) <= half]).mean() > 0.85
 
 
 @pytest.fixture(scope="module")
@@ -138,14 +133,14 @@ def test_h_and_z_are_those_planted(result):
     assert coupling.sideband_energy.ci95[0] == 0.0
 
 
-def test_contact_that_is_not_known_is_said(result):
+def test_contact_that_is_not_known_is_reported(result):
     assert result.coupling.contact is None
     assert "which its sessions don't record" in result.coupling.validity
     assert [one for one in result.warnings if "whether the robot touched anything" in one]
     assert len(result.warnings) == 1
 
 
-def test_the_text_and_the_object(result, lag_sweep, capsys):
+def test_the_text_and_the_object(result, lag_sweep, report_of):
     text = render_experiment(result)
     lines = text.splitlines()
     assert lines[0].startswith("4 sessions: coupling at 0.5 Hz: ")
@@ -155,12 +150,10 @@ def test_the_text_and_the_object(result, lag_sweep, capsys):
     assert any("Method: lag-sweep, 4 runs of 4 joints" in line for line in lines)
     assert text.count(" sweep\n") == M
     assert "reversal" not in text
-    assert undulog.run(["analyse", *map(str, lag_sweep), "--json"]) == 0
-    coupling = json.loads(capsys.readouterr().out)["coupling"]
+    coupling = report_of("analyse", *lag_sweep)["coupling"]
     assert coupling["identifiable"] is True
     (tone,) = coupling["tones"]
-    assert tone["route"] == "torque"
-    assert np.shape(tone["Z"]["real"]) == (M, M)
+    assert (tone["route"], np.shape(tone["Z"]["real"])) == ("torque", (M, M))
     H = np.array(tone["H"]["real"]) + 1j * np.array(tone["H"]["imag"])
     np.testing.assert_allclose(coupling["matrix"], np.abs(H))
 
@@ -182,8 +175,7 @@ def test_without_torques_a_known_servo_is_taken_off(folder):
     ],
 )
 def test_with_an_unknown_servo_it_is_known_up_to_rows(tmp_path, text, why):
-    robot = robot_of(tmp_path, text)
-    coupling = experiment(sweep(tmp_path, robot=robot, effort=False)).coupling
+    coupling = experiment(sweep(tmp_path, robot=robot_of(tmp_path, text), effort=False)).coupling
     (tone,) = coupling.tones
     assert (tone.route, tone.Z) == (Route.ROW_SCALED, None)
     assert why in coupling.route_why
@@ -193,8 +185,7 @@ def test_with_an_unknown_servo_it_is_known_up_to_rows(tmp_path, text, why):
 
 
 def test_a_lag_sweep_in_contact_is_refused(tmp_path):
-    paths = sweep(tmp_path, robot=ROBOT, scenario='[world]\nsurface = "flat"\n')
-    result = experiment(paths)
+    result = experiment(sweep(tmp_path, robot=ROBOT, scenario='[world]\nsurface = "flat"\n'))
     assert not result.coupling.identifiable
     assert "every gait is its own operating point" in result.coupling.why
     assert "phase-kicks" in result.coupling.record
@@ -208,7 +199,7 @@ def test_a_sweep_with_a_run_missing(lag_sweep):
     assert coupling.matrix is None
 
 
-def test_responses_that_drift_are_told(tmp_path):
+def test_responses_that_drift_are_reported(tmp_path):
     result = experiment(sweep(tmp_path, robot=ROBOT, scenario=FREE, drift=2e-3))
     # 0.2 % a second is 0.4 % a cycle.
     assert result.coupling.drift_per_cycle == pytest.approx(4e-3, rel=0.1)
@@ -216,7 +207,7 @@ def test_responses_that_drift_are_told(tmp_path):
     assert result.coupling.contact is False
 
 
-def test_a_multisine_tells_every_tone(tmp_path):
+def test_a_multisine_shows_every_tone(tmp_path):
     omegas = tuple(tones(2 * np.pi * F0, 3))
     scenario = f"physics_rate_hz = 1000000000\n[servo]\ncoulomb_friction = 0.0\n{FREE}"
     result = experiment(sweep(tmp_path, omegas=omegas, robot=ROBOT, scenario=scenario))
@@ -233,27 +224,25 @@ def test_a_multisine_tells_every_tone(tmp_path):
     assert [run.role for run in result.runs] == ["sweep"] * M
 
 
-def test_a_multisine_in_contact_tells_what_is_mixed(tmp_path):
+def test_a_multisine_in_contact_reports_what_is_mixed(tmp_path, opened):
     omegas = tuple(tones(2 * np.pi * F0, 3))
     scenario = 'physics_rate_hz = 1000\n[world]\nsurface = "flat"\n'
     how = {"omegas": omegas, "scenario": scenario, "effort": False, "bend": 400.0}
     paths = sweep(tmp_path, robot=ROBOT, **how)
     result = experiment(paths)
     coupling = result.coupling
-    assert coupling.identifiable
-    assert coupling.contact is True
+    assert (coupling.identifiable, coupling.contact) == (True, True)
     assert coupling.validity.startswith("in contact")
     assert any(one.startswith("not linear") for one in result.warnings)
     # A record holds two periods of the grid: line k of 0.1 Hz is bin 2 k of its transform.
     lines = np.arange(1, 28)  # to the highest tone and twice the gait's beyond it
-    told = np.isin(lines, [5, 11, 17])
+    found = np.isin(lines, [5, 11, 17])
     beside = at_tones = 0.0
     for path in paths:
-        with Session.open(path) as session:
-            signals = session.joints("/joint_states")
-            values = np.stack([signals.signal(name).values for name in NAMES])
+        signals = opened(path).joints("/joint_states")
+        values = np.stack([signals.signal(name).values for name in NAMES])
         power = np.sum(np.abs(np.fft.rfft(values, axis=1)[:, 2 * lines]) ** 2, axis=0)
-        beside, at_tones = beside + power[~told].sum(), at_tones + power[told].sum()
+        beside, at_tones = beside + power[~found].sum(), at_tones + power[found].sum()
     assert coupling.sideband_energy.value == pytest.approx(beside / at_tones, rel=0.05)
     low, high = coupling.sideband_energy.ci95
     assert 0 < low < beside / at_tones < high

@@ -41,8 +41,7 @@ def free_chain(robot, omega):
         else:
             ties.append(turn)
     N = np.linalg.svd(np.array(ties))[2][len(ties) :].T
-    mobility = G @ N @ np.linalg.inv(N.T @ M @ N) @ N.T @ G.T
-    Z = -(omega**2) * np.linalg.inv(mobility)
+    Z = -(omega**2) * np.linalg.inv(G @ N @ np.linalg.inv(N.T @ M @ N) @ N.T @ G.T)
     V, Kt, R, Kp = 6.0, 1.0, 4.0, 8.0  # stall torque Kt V / R = 1.5 N m
     kappa = Kt * V * Kp / R
     servo = -(omega**2) * 1.5e-3 + 1j * omega * (0.005 + Kt**2 / R)
@@ -56,8 +55,7 @@ def measured(folder, plan, *words, kernels=Kernels.NUMBA):
     like, runs = folder / "like.mcap", folder / plan
     if not like.exists():
         record(load_scenario(folder / "free.toml"), like, kernels=kernels)
-    told = ["plan", plan, "--like", str(like), "-o", str(runs), *map(str, words)]
-    assert undulog.run(told) == 0
+    assert undulog.run(["plan", plan, "--like", str(like), "-o", str(runs), *map(str, words)]) == 0
     driven = []
     for seed, file in enumerate(sorted(runs.glob("*.mcap"))):
         world = load_scenario(folder / "free.toml").changed(seed=seed + 1)
@@ -134,8 +132,7 @@ def test_a_short_chain(tmp_path):
 def long_chain(tmp_path_factory):
     """25 joints, 13 of them driven, at 0.5 Hz."""
     folder = tmp_path_factory.mktemp("chain25")
-    robot = world(folder, 25, 0.5)
-    return robot, measured(folder, "lag-sweep"), measured(folder, "multisine")
+    return world(folder, 25, 0.5), measured(folder, "lag-sweep"), measured(folder, "multisine")
 
 
 @pytest.mark.slow
@@ -158,8 +155,7 @@ def test_both_plans_agree(long_chain):
     error = np.hypot(one["H"]["standard_error"], other["H"]["standard_error"])
     scores = np.array([apart.real, apart.imag]) / error
     # 338 parts that are independent of each other: so many lie inside by chance, and so far off.
-    inside = np.count_nonzero(np.abs(scores) <= norm.ppf(0.975))
-    assert binom.cdf(inside, scores.size, 0.95) > 1e-3
+    assert binom.cdf(np.count_nonzero(np.abs(scores) <= norm.ppf(0.975)), scores.size, 0.95) > 1e-3
     assert chi2.sf(np.sum(scores**2), scores.size) > 1e-3
 
 

@@ -8,10 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from undulog.analysis import Choices, Experiment, compare_sessions, load
+from undulog.analysis import Choices, Estimate, Experiment, compare_sessions, load
 from undulog.analysis.results.artefact import Artefact
 from undulog.analysis.results.coupling import Route
-from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError, InputFileError, OutputExistsError, UsageError
@@ -97,8 +96,7 @@ def test_columns_carry_their_units_and_the_numbers_of_the_result(snake):
     for joint, row in zip(snake.joints, frame.itertuples(), strict=True):
         assert row.name == joint.name
         if joint.lag_rad.value is None:
-            assert np.isnan(row.lag_rad)
-            assert np.isnan(row.lag_low_rad)
+            assert np.isnan([row.lag_rad, row.lag_low_rad]).all()
         else:
             assert (row.lag_low_rad, row.lag_high_rad) == joint.lag_rad.ci95
     indices = snake.frames()["heterogeneity"].set_index("name")
@@ -115,9 +113,8 @@ def test_artefacts_are_one_row_a_stretch_and_oscillators_one_row_a_link(snake, k
     )
     link = Link("a", "b", Estimate(2.0, (1.9, 2.1)), Estimate(0.5, (0.4, 0.6)))
     rate = Rate("a", Estimate(3.1, (3.0, 3.2)), Estimate(), 1e-3)
-    chain = ChainCoupling(
-        "vertical", True, "kicked", None, 40.0, 11, 60.0, 1, links=(link,), oscillators=(rate,)
-    )
+    facts = ("vertical", True, "kicked", None, 40.0, 11, 60.0, 1)
+    chain = ChainCoupling(*facts, links=(link,), oscillators=(rate,))
     frames = dataclasses.replace(snake, artefacts=artefacts, oscillators=(chain,)).frames()
     held = frames["artefacts"]
     assert held["joint"].tolist() == ["joint01", "joint01", "joint02"]
@@ -160,8 +157,7 @@ def test_pictures_are_whole_files_of_their_own(results, name, pictures, tmp_path
     assert result.plot().caption == result.plot(pictures[0]).caption
     for what in pictures:
         picture = result.plot(what)
-        root = ET.fromstring(picture.save(tmp_path / f"{what}.svg").read_text())
-        assert root.tag == f"{SVG}svg"
+        assert ET.fromstring(picture.save(tmp_path / f"{what}.svg").read_text()).tag == f"{SVG}svg"
         text = picture.to_svg()
         assert "http" not in text.replace("http://www.w3.org/2000/svg", "")
         assert "var(--ink)" not in text
@@ -174,29 +170,21 @@ def test_two_figures_on_one_page_share_no_identifier(snake):
     first, second = (snake.plot()._repr_html_() for _ in range(2))
     ids = [{part.split('"')[0] for part in one.split(' id="')[1:]} for one in (first, second)]
     assert ids[0]
-    assert not ids[0] & ids[1]
+    assert ids[0].isdisjoint(ids[1])
 
 
 def test_what_can_not_be_drawn_says_why(results, snake):
     with pytest.raises(UsageError, match="no matrix"):
         snake.coupling.plot()
-    alone = Experiment(
-        answer="one",
-        sessions=(snake,),
-        runs=(),
-        heterogeneity={},
-        reversal=None,
-        coupling=snake.coupling,
-        warnings=(),
-        provenance=snake.provenance,
-    )
+    facts = {"answer": "one", "sessions": (snake,), "runs": (), "heterogeneity": {}}
+    facts |= {"reversal": None, "coupling": snake.coupling, "warnings": ()}
+    alone = Experiment(**facts, provenance=snake.provenance)
     with pytest.raises(UsageError, match="plot its sessions one by one"):
         alone.plot()
 
 
 def test_the_comparison_shows_the_margins_and_the_differences(comparison):
-    frame = comparison.frames()["differences"]
-    assert list(frame.place.unique()) != []
+    assert list(comparison.frames()["differences"].place.unique()) != []
     assert comparison.partial is not None
     assert comparison.frames()["waveforms"].groupby("name").size().eq(72).all()
 

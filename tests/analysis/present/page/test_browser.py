@@ -56,8 +56,7 @@ def address(tmp_path_factory, request):
 def test_it_opens_without_a_word_and_asks_for_nothing(browser, address, name):
     url = address(name)
     browser.open(url)
-    assert browser.requests() == [url]
-    assert browser.complaints() == []
+    assert (browser.requests(), browser.complaints()) == ([url], [])
     assert browser.evaluate("document.scripts.length") == 0
 
 
@@ -112,7 +111,6 @@ def test_it_prints_on_white_with_its_figures(browser, address):
     printed = browser.call("Page.printToPDF", preferCSSPageSize=True)["data"]
     assert base64.b64decode(printed).startswith(b"%PDF-")
     browser.open(address("snake"), dark=True, media="print")
-    assert (
-        browser.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
-    )
+    ground = browser.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert ground == "rgb(255, 255, 255)"
     assert browser.evaluate("getComputedStyle(document.querySelector('nav')).display") == "none"

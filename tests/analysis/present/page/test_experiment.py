@@ -38,9 +38,10 @@ def rows(page, table):
 @pytest.mark.parametrize("name", ["both_ways", "kicked", "swept"])
 def test_the_answer_is_the_first_heading(pages, name, request):
     heading = re.search(r"<h1[^>]*>(.*?)</h1>", pages[name], re.DOTALL)[1]
-    told = re.sub(r"<[^>]+>", "", heading)
-    told = told.replace("\N{NO-BREAK SPACE}", " ").replace("⁻¹", "^-1")
-    assert told == sentence(request.getfixturevalue(name).answer)
+    text = re.sub(r"<[^>]+>", "", heading)
+    assert text.replace("\N{NO-BREAK SPACE}", " ").replace("⁻¹", "^-1") == sentence(
+        request.getfixturevalue(name).answer
+    )
 
 
 def test_mirror_pairs_are_those_of_the_result(pages, both_ways):
@@ -50,19 +51,15 @@ def test_mirror_pairs_are_those_of_the_result(pages, both_ways):
         gain, lag = joint.log_gain_difference, joint.lag_difference_rad
         percent = [100 * math.expm1(v) for v in (gain.value, *gain.ci95)]
         degrees = [math.degrees(v) for v in (lag.value, *lag.ci95)]
-        assert row[2] == pytest.approx(percent)
-        assert row[3] == pytest.approx(degrees)
+        assert (row[2], row[3]) == (pytest.approx(percent), pytest.approx(degrees))
         assert row[4] == [joint.p]
 
 
 def test_profiles_are_the_runs_and_mirrored(both_ways):
     seen = profiles(both_ways, both_ways.reversal)
     assert seen.gain.shape == seen.mirrored_lag_deg.shape == (6, 5)
-    reverse = next(
-        s
-        for s, run in zip(both_ways.sessions, both_ways.runs, strict=True)
-        if run.role == "reverse"
-    )
+    roles = [run.role for run in both_ways.runs]
+    reverse = both_ways.sessions[roles.index("reverse")]
     gains = [joint.gain.value for joint in reverse.joints]
     np.testing.assert_array_equal(seen.mirrored_gain[0], gains[::-1])
     # What the figure shows is what was tested: d = ln of the ratio of geometric means.
@@ -74,16 +71,14 @@ def test_profiles_are_the_runs_and_mirrored(both_ways):
 def test_matrices_and_row_sums_are_those_of_the_result(pages, kicked):
     coupling = kicked.coupling
     shown = rows(pages["kicked"], "coupling")
-    assert [[cell[0] for cell in row[1:]] for row in shown] == [
-        list(row) for row in coupling.P.value
-    ]
+    assert [[cell[0] for cell in row[1:]] for row in shown] == list(map(list, coupling.P.value))
     sums = rows(pages["kicked"], "rows")
     assert [row[1][0] for row in sums] == [one.total.value for one in coupling.phase_rows]
     held = rows(pages["kicked"], "heldout")
     assert [row[2][0] for row in held] == [100 * one.error for one in coupling.held_out]
 
 
-def test_a_sweep_is_told_tone_by_tone(pages, swept):
+def test_a_sweep_is_shown_tone_by_tone(pages, swept):
     (tone,) = swept.coupling.tones
     (row,) = rows(pages["swept"], "tones")
     assert row[0] == [tone.frequency_hz]
@@ -112,10 +107,9 @@ def test_every_matrix_has_a_picture_and_a_table(pages):
 
 
 def test_tests_answer_in_words(both_ways, kicked, snake):
-    told = {one.question: one for one in experiment_trials(both_ways)}
-    mirror = told["Do the modules mirror, as identical ones do? (H1, reversal)"]
-    assert mirror.p == both_ways.reversal.p
-    assert mirror.verdict == "no, modules differ"
+    trials = {one.question: one for one in experiment_trials(both_ways)}
+    mirror = trials["Do the modules mirror, as identical ones do? (H1, reversal)"]
+    assert (mirror.p, mirror.verdict) == (both_ways.reversal.p, "no, modules differ")
     verdicts = [one.verdict for one in experiment_trials(kicked)]
     assert verdicts[:2] == ["as any settled gait's do"] * 2
     assert verdicts[2] == "a deviation could not be shown"
@@ -125,17 +119,15 @@ def test_tests_answer_in_words(both_ways, kicked, snake):
 
 
 def test_what_was_not_recorded_is_named(both_ways):
-    alone = dataclasses.replace(both_ways, reversal=None, warnings=("record the reverse",))
-    page = render(alone)
+    page = render(dataclasses.replace(both_ways, reversal=None, warnings=("record the reverse",)))
     assert "Not tested; the" in page
     assert "Record the reverse." in page
     assert "Not identifiable from these sessions" in page
 
 
 def test_a_page_that_grows_too_large_goes_without_every_run(both_ways, pages, monkeypatch):
-    monkeypatch.setattr(
-        "undulog.analysis.present.page.page.LARGEST_BYTES", len(pages["both_ways"].encode()) - 1
-    )
+    largest = len(pages["both_ways"].encode()) - 1
+    monkeypatch.setattr("undulog.analysis.present.page.page.LARGEST_BYTES", largest)
     assert "Gain and lag of every run are left out" in render(both_ways)
 
 
@@ -179,10 +171,9 @@ def test_times_of_artefacts():
 
 
 def test_artefacts_are_shown_with_their_times_once_for_all_joints(snake):
-    gaps = [
-        Artefact(j.name, "/joint_states", "position", "gaps", ((9.0, 9.5),)) for j in snake.joints
-    ]
-    frozen = Artefact("joint07", "/joint_states", "position", "frozen", ((10.0, 12.0),), "stuck")
+    where = ("/joint_states", "position")
+    gaps = [Artefact(joint.name, *where, "gaps", ((9.0, 9.5),)) for joint in snake.joints]
+    frozen = Artefact("joint07", *where, "frozen", ((10.0, 12.0),), "stuck")
     known = dataclasses.replace(snake, artefacts=(*gaps, frozen))
     first, second = artefact_rows(known)
     assert (first.joints, first.flag, first.times) == ("joint07", "frozen", "10.00 to 12.00 s")
@@ -190,5 +181,4 @@ def test_artefacts_are_shown_with_their_times_once_for_all_joints(snake):
     assert (second.joints, second.about) == ("all 25 joints", "the record, not mechanics")
     # Ten of sixteen seconds into the session, two long.
     assert 'd="M62.50 0h12.50v10h-12.50z"' in str(first.line)
-    page = render(known)
-    assert page.count("10.00 to 12.00 s") == 1
+    assert render(known).count("10.00 to 12.00 s") == 1

@@ -7,9 +7,9 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
+from undulog.analysis import Estimate
 from undulog.analysis.present.page.experiment_view import entrainment_entries
 from undulog.analysis.present.page.page import chain_view, render
-from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 
 LINKS = (
@@ -43,7 +43,7 @@ def test_every_coupling_is_in_the_table(page):
     degrees = np.degrees([0.5, 0.4, 0.6])
     shown = numbers(page, "links")
     np.testing.assert_allclose(shown[0], [2.0, 1.9, 2.1, *degrees])
-    assert shown[1] == [0.01, 0.0, 0.06]  # no lag where K can't be told from 0
+    assert shown[1] == [0.01, 0.0, 0.06]  # no lag where K does not differ from 0
     assert [row[0] for row in numbers(page, "rates")] == [3.1] * 3
 
 
@@ -53,8 +53,7 @@ def test_locked_phases_say_what_to_record(page):
 
 
 def test_the_picture_leaves_out_what_was_not_looked_for():
-    view = chain_view(CHAIN, "x")
-    root = ET.fromstring(view["matrix"].svg)
+    root = ET.fromstring(chain_view(CHAIN, "x")["matrix"].svg)
     rows = [g for g in root.iter("g") if g.get("class") == "row"]
     cells = [sum("style" in r.attrib for r in row.iter("rect")) for row in rows]
     assert cells == [1, 1, 1]  # who turns a, who turns b, who turns c

@@ -64,14 +64,10 @@ def test_what_three_harmonics_do_not_hold_is_kept(rhythm):
 
 def test_the_interval_holds_the_truth_as_often_as_it_says(rhythm):
     t = jittered()
-    rng = np.random.default_rng(11)
-    tracks = [
-        Track(str(i), ns(t), 0.4 * np.sin(chirp(t)) + 0.02 * rng.standard_normal(t.size))
-        for i in range(60)
-    ]
+    waves = 0.4 * np.sin(chirp(t)) + 0.02 * np.random.default_rng(11).standard_normal((60, t.size))
+    tracks = [Track(str(i), ns(t), wave) for i, wave in enumerate(waves)]
     found = mean_cycles(tracks, pace(rhythm))
-    inside = np.abs(found.value - 0.4 * np.sin(PHASE)) <= found.half
-    assert 0.93 < inside[:, :-1].mean() < 0.97
+    assert 0.93 < (np.abs(found.value - 0.4 * np.sin(PHASE)) <= found.half)[:, :-1].mean() < 0.97
 
 
 def test_a_gap_costs_its_cycles_only(rhythm):
@@ -123,13 +119,11 @@ def test_without_a_logged_phase_it_is_zero_at_the_commands_crest(steady):
 
 def test_without_a_whole_cycle_there_is_none():
     t = np.arange(150) / 100
-    assert pace(Rhythm.from_phase(ns(t), 2 * np.pi * 0.5 * t)) is None
-    assert pace(None) is None
+    assert (pace(Rhythm.from_phase(ns(t), 2 * np.pi * 0.5 * t)), pace(None)) == (None, None)
 
 
 def test_the_frame_goes_along_with_the_body(snake25):
-    rng = np.random.default_rng(5)
-    angles = rng.uniform(-0.4, 0.4, (7, 25))
+    angles = np.random.default_rng(5).uniform(-0.4, 0.4, (7, 25))
     centre, rotation = body_frame(snake25, angles)
     np.testing.assert_allclose(centre.mean(axis=1), 0.0, atol=1e-12)
     # The mean orientation is the identity: no small turn brings the links nearer to it.
@@ -138,10 +132,8 @@ def test_the_frame_goes_along_with_the_body(snake25):
     assert np.linalg.eigvalsh(mean).min() > 0
     # And it is the same body: a rigid motion of what forward kinematics has.
     world, _ = link_poses(snake25, np.zeros((7, 3)), np.tile(np.eye(3), (7, 1, 1)), angles)
-    apart = np.linalg.norm(world[:, :, None] - world[:, None], axis=-1)
-    np.testing.assert_allclose(
-        np.linalg.norm(centre[:, :, None] - centre[:, None], axis=-1), apart, atol=1e-12
-    )
+    own, other = (np.linalg.norm(x[:, :, None] - x[:, None], axis=-1) for x in (centre, world))
+    np.testing.assert_allclose(own, other, atol=1e-12)
 
 
 def test_a_straight_body_lies_along_x_head_first(snake25):

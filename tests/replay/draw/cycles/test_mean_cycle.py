@@ -21,7 +21,7 @@ from undulog.replay.samples.timeline import ENSEMBLE_CYCLE
 
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory, read_back):
-    """A chain of five joints in a steady wave: (session's file, what was said, recording)."""
+    """A chain of five joints in a steady wave: (session's file, what was reported, recording)."""
     folder = tmp_path_factory.mktemp("twin")
     (folder / "chain.toml").write_text(chain(5, planes=["horizontal"]))
     run = {"duration_s": 8.0, "settle_s": 3.0, "physics_rate_hz": 4000, "gait": {"ramp_s": 0.5}}
@@ -29,9 +29,8 @@ def twin(tmp_path_factory, read_back):
     words = ["sim", "run", str(folder / "wave.toml"), "-o", str(folder / "run.mcap")]
     assert undulog.run(words) == 0
     with Session.open(folder / "run.mcap") as session:
-        layer = computed(session)
-        said = write_recording(session, folder / "run.rrd", analysis=layer.analysis)
-    return folder / "run.mcap", said, read_back(folder / "run.rrd")
+        written = write_recording(session, folder / "run.rrd", analysis=computed(session).analysis)
+    return folder / "run.mcap", written, read_back(folder / "run.rrd")
 
 
 def rows(recorded, entity):
@@ -40,14 +39,13 @@ def rows(recorded, entity):
 
 
 def test_angles_errors_and_power_are_the_closed_form(recording):
-    said, recorded = recording
-    assert said.content.mean.period_s == pytest.approx(2.0)
+    written, recorded = recording
+    assert written.content.mean.period_s == pytest.approx(2.0)
     degrees = np.arange(0, 361, 5)
-    times = recorded.times("/ensemble/measured", ENSEMBLE_CYCLE)
-    np.testing.assert_array_equal(times, degrees)
+    np.testing.assert_array_equal(recorded.times("/ensemble/measured", ENSEMBLE_CYCLE), degrees)
     phase, k = np.radians(degrees)[:, None], np.arange(13)
     late = phase - k * np.pi / 3 - np.radians(7 + 0.5 * k)
-    (series,) = said.content.mean.measured
+    (series,) = written.content.mean.measured
     assert len(series.names) == 25
     angles = rows(recorded, "/ensemble/measured")
     np.testing.assert_array_equal(angles[0], angles[-1])
@@ -85,19 +83,20 @@ def test_one_cycle_has_no_interval_and_says_so(recording):
     assert "there is no interval" in words
 
 
-def test_a_gait_that_changes_is_averaged_and_says_so(session_file, analysis, tmp_path, read_back):
+def test_a_gait_that_changes_is_averaged_and_says_so(
+    session_file, analysis, tmp_path, read_back, opened
+):
     none = dataclasses.replace(analysis.gait, frequency_hz=Estimate())
-    with Session.open(session_file) as session:
-        changing = dataclasses.replace(analysis, gait=none)
-        write_recording(session, tmp_path / "a.rrd", analysis=changing)
+    changing = dataclasses.replace(analysis, gait=none)
+    write_recording(opened(session_file), tmp_path / "a.rrd", analysis=changing)
     words = read_back(tmp_path / "a.rrd").static("/ensemble/about", "TextDocument:text")[0]
     assert "No steady gait was found" in words
     assert "0.0 to 3.0 s" in words  # all of the logged phase
 
 
 def test_the_twins_settled_motion_is_its_mean_cycle(twin):
-    file, said, recorded = twin
-    (series,) = said.content.mean.measured
+    file, written, recorded = twin
+    (series,) = written.content.mean.measured
     angles = np.radians(rows(recorded, "/ensemble/measured"))
     with Session.open(file) as session:
         joints = session.joints("/joint_states", "position")
@@ -123,28 +122,27 @@ def test_the_twins_interval_is_as_narrow_as_its_cycles_agree(twin):
     assert np.degrees(1e-3) > (high - low).max()
 
 
-def test_the_cycles_agree_with_the_reports_maps(twin):
-    with Session.open(twin[0]) as session:
-        measured = measure_session(session)
+def test_the_cycles_agree_with_the_reports_maps(twin, opened):
+    measured = measure_session(opened(twin[0]))
     maps = cycle_maps(measured)
     gain, lag, energy = cycle_tables(measured.analysis)
     inside = gain.start_s >= maps.start_s[0]
-    np.testing.assert_allclose(
-        gain.value[:, inside].mean(axis=1), 100 * (maps.gain.mean(axis=1) - 1), atol=0.02
-    )
-    np.testing.assert_allclose(
-        lag.value[:, inside].mean(axis=1), np.degrees(maps.lag_rad.mean(axis=1)), atol=0.02
-    )
+    for table, expected in (
+        (gain, 100 * (maps.gain.mean(axis=1) - 1)),
+        (lag, np.degrees(maps.lag_rad.mean(axis=1))),
+    ):
+        np.testing.assert_allclose(table.value[:, inside].mean(axis=1), expected, atol=0.02)
     np.testing.assert_allclose(energy.value / (energy.stop_s - energy.start_s), maps.power_w)
 
 
-def test_joints_with_a_false_sensor_are_left_out(session_file, analysis, tmp_path, read_back):
+def test_joints_with_a_false_sensor_are_left_out(
+    session_file, analysis, tmp_path, read_back, opened
+):
     frozen = Artefact("joint09", "/joint_states", "position", "frozen", ((0.2, 1.0),))
     false = dataclasses.replace(analysis, artefacts=(frozen,))
-    with Session.open(session_file) as session:
-        said = write_recording(session, tmp_path / "a.rrd", analysis=false)
-    (series,) = said.content.mean.measured
+    written = write_recording(opened(session_file), tmp_path / "a.rrd", analysis=false)
+    (series,) = written.content.mean.measured
     assert "joint09" not in series.names
-    assert any("the mean cycle leaves out joint09" in note for note in said.warnings)
+    assert any("the mean cycle leaves out joint09" in note for note in written.warnings)
     shapes = read_back(tmp_path / "a.rrd").column("/ensemble/body/measured", "Capsules3D:radii")
     assert {len(row) for row in shapes} == {9}  # the links before the joint

@@ -30,36 +30,24 @@ NO_COST = Transport(Estimate(), None, *[Estimate()] * 5, why="")
 
 def over_time(name, gain, lag, starts=STARTS, stops=STOPS):
     """A joint's response in each cycle, without intervals."""
-    nothing = (None,) * len(starts)
-    return JointOverTime(
-        name, starts, stops, (0,) * len(starts), (1.0,) * len(starts), gain, nothing, lag, nothing
-    )
+    nothing, zeros, ones = ((one,) * len(starts) for one in (None, 0, 1.0))
+    return JointOverTime(name, starts, stops, zeros, ones, gain, nothing, lag, nothing)
 
 
 @pytest.fixture
 def by_cycle(analysis, snake25):
     """The fixture's analysis with cycles: gain 0.9 + 0.002 i, lag 0.1 + 0.01 i, second row null."""
-    yaw = snake25.joint_names[::2]
+    turned = np.pi - 0.1, 0.1 - np.pi
     joints = tuple(
-        over_time(
-            name,
-            (0.9 + 0.002 * i, None, 0.95),
-            (0.1 + 0.01 * i, None, np.pi - 0.1 + 0.2 * (i == 3) - 2 * np.pi * (i == 3)),
-        )
-        for i, name in enumerate(yaw)
+        over_time(name, (0.9 + 0.002 * i, None, 0.95), (0.1 + 0.01 * i, None, turned[i == 3]))
+        for i, name in enumerate(snake25.joint_names[::2])
     )
+    rest = {"plus_j": (0.0, 0.0), "abs_j": (0.0, 0.0)}
+    rest |= dict.fromkeys(("el_j", "el_clipped_j", "el_coverage"))
+    nets = [(0.01 * i - 0.05, 0.02 * i) for i in range(25)]
     energy = tuple(
-        JointCycles(
-            name,
-            net_j=(0.01 * i - 0.05, 0.02 * i),
-            plus_j=(0.0, 0.0),
-            abs_j=(0.0, 0.0),
-            el_j=None,
-            el_clipped_j=None,
-            coverage=(1.0, 0.5 if i == 4 else 1.0),
-            el_coverage=None,
-        )
-        for i, name in enumerate(snake25.joint_names)
+        JointCycles(name, net_j=net, coverage=(1.0, 0.5 if i == 4 else 1.0), **rest)
+        for i, (name, net) in enumerate(zip(snake25.joint_names, nets, strict=True))
     )
     return dataclasses.replace(
         analysis,
@@ -70,13 +58,13 @@ def by_cycle(analysis, snake25):
 
 @pytest.fixture(scope="module")
 def written(session_file, tmp_path_factory, read_back):
-    """Writes the session with an analysis; (what was said, what is in the file)."""
+    """Writes the session with an analysis; (what was reported, what is in the file)."""
 
     def write(analysis, **options):
         path = tmp_path_factory.mktemp("cycles") / "made.rrd"
         with Session.open(session_file) as session:
-            said = write_recording(session, path, analysis=analysis, **options)
-        return said, read_back(path)
+            found = write_recording(session, path, analysis=analysis, **options)
+        return found, read_back(path)
 
     return write
 
@@ -96,21 +84,17 @@ def test_the_numbers_are_the_analysiss(by_cycle):
 
 
 def test_a_step_spans_its_cycle_and_ends_with_it(by_cycle, written):
-    said, recorded = written(by_cycle)
+    found, recorded = written(by_cycle)
     entity = "/cycles/gain_minus_one_percent"
-    assert [quantity.key for quantity, _ in said.content.cycles] == [
-        "gain_minus_one_percent",
-        "lag_degrees",
-        "energy_net_joule",
-    ]
+    keys = [quantity.key for quantity, _ in found.content.cycles]
+    assert keys == ["gain_minus_one_percent", "lag_degrees", "energy_net_joule"]
     rows = np.array(recorded.column(entity, "Scalars:scalars"), dtype=float)
     np.testing.assert_allclose(recorded.times(entity) / 1e9, [0, 1, 2, 3])
     np.testing.assert_allclose(rows[0], 100 * (0.9 + 0.002 * np.arange(13) - 1), rtol=1e-6)
     assert np.isnan(rows[1]).all()
     assert np.isnan(rows[3]).all()
     # The session's gait runs at 0.5 Hz: a second is half a cycle.
-    beat = recorded.times(entity, "gait_cycle") / 1e9
-    np.testing.assert_allclose(beat, [0, 0.5, 1.0], atol=1e-6)
+    np.testing.assert_allclose(recorded.times(entity, "gait_cycle") / 1e9, [0, 0.5, 1.0], atol=1e-6)
 
 
 def test_a_steady_gait_without_a_logged_phase_shows_the_reports_maps(analysis):
@@ -131,10 +115,8 @@ def test_a_steady_gait_without_a_logged_phase_shows_the_reports_maps(analysis):
 
 def test_planes_with_cycles_of_their_own_meet_in_one_map():
     slow = CycleTable(GAIN, ("a",), np.array([0.0, 2.0]), np.array([2.0, 4.0]), np.array([[1, 2]]))
-    fast = CycleTable(
-        GAIN, ("b",), np.arange(5.0), np.arange(5.0) + 1, np.array([[3.0, 4, 5, 6, 7]])
-    )
-    both = together([slow, fast])
+    t, numbers = np.arange(5.0), np.array([[3.0, 4, 5, 6, 7]])
+    both = together([slow, CycleTable(GAIN, ("b",), t, t + 1, numbers)])
     assert both.names == ("a", "b")
     np.testing.assert_array_equal(both.value, [[1, 1, 2, 2, np.nan], [3, 4, 5, 6, 7]])
 
@@ -155,9 +137,8 @@ def test_a_map_runs_head_to_tail_and_its_colours_end_at_the_window(by_cycle, sna
     assert not (scale == colors[1, 0]).all(axis=1).any()
     # 0.02 * 24 J in a second is the most that a joint gave.
     assert power.high == pytest.approx(480)
-    np.testing.assert_array_equal(
-        cell_colors(power)[0, 7], power_colors(np.array([20.0]), power.high)[0, :3]
-    )
+    expected = power_colors(np.array([20.0]), power.high)[0, :3]
+    np.testing.assert_array_equal(cell_colors(power)[0, 7], expected)
 
 
 def test_frame_and_white_bars_are_of_the_cycle_at_the_cursor(by_cycle, written):
@@ -180,14 +161,12 @@ def test_frame_and_white_bars_are_of_the_cycle_at_the_cursor(by_cycle, written):
 def test_energies_of_a_cycle_stand_beside_bars_of_a_mean_cycle(by_cycle, analysis):
     window = dataclasses.replace(analysis.gait.windows[0], cycles=4.0)
     four = dataclasses.replace(analysis, gait=dataclasses.replace(analysis.gait, windows=(window,)))
-    energy = charts(four)[2]
-    assert energy.bars[3].value == pytest.approx(0.01 / 4)
+    assert charts(four)[2].bars[3].value == pytest.approx(0.01 / 4)
 
 
 def test_without_cycles_there_are_no_views_of_them(analysis, written):
-    said, recorded = written(analysis)
-    assert said.content.cycles == ()
-    assert said.content.maps == ()
+    found, recorded = written(analysis)
+    assert (found.content.cycles, found.content.maps) == ((), ())
     assert not any(path.startswith(("/cycles", "/maps")) for path in recorded.entities)
 
 
@@ -201,13 +180,11 @@ def test_bars_show_gain_lag_and_energy_of_the_joints_that_have_them(analysis):
     assert lag.bars[1].value == pytest.approx(7.6)
     assert lag.bars[1].far == pytest.approx(7.6 + math.degrees(0.02))
     assert len(energy.bars) == 25
-    assert energy.bars[3].value == pytest.approx(0.01)
-    assert energy.bars[3].far is None
+    assert (energy.bars[3].value, energy.bars[3].far) == (pytest.approx(0.01), None)
 
 
 def test_what_no_joint_has_gets_no_chart(analysis):
-    bare = [
-        dataclasses.replace(joint, gain=Estimate(), lag_rad=Estimate()) for joint in analysis.joints
-    ]
+    none = {"gain": Estimate(), "lag_rad": Estimate()}
+    bare = [dataclasses.replace(joint, **none) for joint in analysis.joints]
     (energy,) = charts(dataclasses.replace(analysis, joints=tuple(bare)))
     assert energy.title == "Net energy [J]"

@@ -37,7 +37,8 @@ def bag(tmp_path_factory):
     folder = tmp_path_factory.mktemp("foreign") / "bag"
     vector, turn = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
     still = turn(x=0.0, y=0.0, z=0.0, w=1.0)
-    none = np.zeros(0)
+    none, parts = np.zeros(0), ("orientation", "angular_velocity", "linear_acceleration")
+    unknown = {f"{part}_covariance": np.zeros(9) for part in parts}
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         ways = {t: writer.add_connection(t, kind, typestore=store) for t, kind in TOPICS.items()}
 
@@ -53,17 +54,10 @@ def bag(tmp_path_factory):
             joints = {"header": header, "name": NAMES, "velocity": none, "effort": none}
             write("/snake/targets", t_ns, **joints, position=0.4 * np.sin(phase))
             write("/snake/encoders", t_ns, **joints, position=0.36 * np.sin(phase - 0.2))
-            write(
-                "/imu/data",
-                t_ns,
-                header=header,
-                orientation=still,
-                orientation_covariance=np.zeros(9),
-                angular_velocity=vector(x=0.01 * tick, y=0.0, z=0.0),
-                angular_velocity_covariance=np.zeros(9),
-                linear_acceleration=vector(x=0.0, y=0.0, z=9.81),
-                linear_acceleration_covariance=np.zeros(9),
-            )
+            imu = {"header": header, "orientation": still} | unknown
+            imu["angular_velocity"] = vector(x=0.01 * tick, y=0.0, z=0.0)
+            imu["linear_acceleration"] = vector(x=0.0, y=0.0, z=9.81)
+            write("/imu/data", t_ns, **imu)
             layout = types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
             write("/currents", t_ns, layout=layout, data=np.array([tick, -tick, 2.0]))
             if tick % 100 == 0:
@@ -76,17 +70,17 @@ def bag(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def shown(bag, tmp_path_factory, read_back):
-    """The bag as a recording, its joints named: (what was said, what is in the file)."""
+    """The bag as a recording, its joints named: (what was reported, what is in the file)."""
     path = tmp_path_factory.mktemp("shown") / "bag.rrd"
-    told = path.with_suffix(".txt")
-    with told.open("w") as out, redirect_stdout(out):
+    found = path.with_suffix(".txt")
+    with found.open("w") as out, redirect_stdout(out):
         assert undulog.run(["view", str(bag), *NAMED, "--save", str(path), "--json"]) == 0
-    return json.loads(told.read_text()), read_back(path)
+    return json.loads(found.read_text()), read_back(path)
 
 
 def test_the_joints_are_shown_under_the_names_that_were_given(shown):
-    said, recorded = shown
-    assert said["joints"] == NAMES
+    written, recorded = shown
+    assert written["joints"] == NAMES
     t = recorded.times("/joints/measured") / 1e9
     angle = np.radians(np.array(recorded.column("/joints/measured", "Angle:degrees")))
     truth = 0.36 * np.sin(OMEGA * t[:, None] - np.arange(3) - 0.2)
@@ -106,7 +100,7 @@ def test_they_are_analysed_and_averaged_too(shown):
 
 
 def test_other_numbers_are_plotted_words_are_events_and_the_rest_is_named(shown):
-    said, recorded = shown
+    written, recorded = shown
     names = recorded.static("/others/imu/data", "SeriesLines:names")
     assert {"angular_velocity.x", "linear_acceleration.z"} <= set(names)
     assert not any("covariance" in name for name in names)
@@ -119,21 +113,21 @@ def test_other_numbers_are_plotted_words_are_events_and_the_rest_is_named(shown)
     assert recorded.column("/events/said", "TextLog:text") == [["/state: go"], ["/state: turn"]]
     np.testing.assert_allclose(recorded.times("/events/said") / 1e9, [0.0, 3.0])
     left_out = "/camera (sensor_msgs/msg/CompressedImage), /tf (tf2_msgs/msg/TFMessage)"
-    assert f"not shown: {left_out}" in said["warnings"]
+    assert f"not shown: {left_out}" in written["warnings"]
 
 
-def test_without_names_the_joints_are_plotted_and_the_notes_say_what_to_do(bag, tmp_path, capsys):
-    assert undulog.run(["view", str(bag), "--save", str(tmp_path / "a.rrd"), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["joints"] == []
-    (why,) = [note for note in said["warnings"] if note.startswith("not analysed")]
+def test_without_names_the_joints_are_plotted_and_the_notes_say_what_to_do(
+    bag, tmp_path, report_of
+):
+    written = report_of("view", bag, "--save", tmp_path / "a.rrd")
+    assert written["joints"] == []
+    (why,) = [note for note in written["warnings"] if note.startswith("not analysed")]
     assert "/snake/encoders, /snake/targets; name them with --command-topic" in why
 
 
-def test_a_name_that_is_not_there_fails_and_lists_what_is(bag, tmp_path, capsys):
-    words = ["view", str(bag), "--command-topic", "/none", "--save", str(tmp_path / "a.rrd")]
-    assert undulog.run(words) == 1
-    assert "has no /none; it has /camera, /currents" in capsys.readouterr().err
+def test_a_name_that_is_not_there_fails_and_lists_what_is(bag, tmp_path, command):
+    words = ("view", bag, "--command-topic", "/none", "--save", tmp_path / "a.rrd")
+    assert "has no /none; it has /camera, /currents" in command(*words, code=1).err
     with Session.open(bag) as session, pytest.raises(MissingChannelError):
         session.view(rename={"/joint_commands": "/none"})
 

@@ -6,12 +6,7 @@ from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Plane
 from undulog.replay.draw.plots.lines import changes, head_middle_tail, joint_palette, rhythm_of
 from undulog.replay.draw.scene.stage import trail_segments
-from undulog.replay.samples.quantities import (
-    electrical_power,
-    mechanical_power,
-    total,
-    tracking_errors,
-)
+from undulog.replay.samples import quantities
 from undulog.replay.samples.tracks import Track
 
 T = np.arange(200, dtype=np.int64) * 10_000_000
@@ -24,12 +19,10 @@ def waves(robot, horizontal, vertical):
 
 def test_head_middle_and_tail_are_of_the_busier_plane(snake25):
     yaw = head_middle_tail(snake25, waves(snake25, 0.4, 0.1))
-    assert yaw.plane is Plane.HORIZONTAL
-    assert yaw.names == ("joint01", "joint13", "joint25")
+    assert (yaw.plane, yaw.names) == (Plane.HORIZONTAL, ("joint01", "joint13", "joint25"))
     assert yaw.labels == ("head", "middle", "tail")
     pitch = head_middle_tail(snake25, waves(snake25, 0.0, 0.1))
-    assert pitch.plane is Plane.VERTICAL
-    assert pitch.names == ("joint02", "joint14", "joint24")
+    assert (pitch.plane, pitch.names) == (Plane.VERTICAL, ("joint02", "joint14", "joint24"))
 
 
 def test_without_a_robot_all_joints_are_one_plane():
@@ -43,7 +36,7 @@ def test_without_a_robot_all_joints_are_one_plane():
 def test_the_error_is_measured_minus_the_command_in_force():
     command = Track("a", T, np.floor(np.arange(200) / 2.0))
     measured = Track("a", T + 3_000_000, np.arange(200) / 2.0 + 0.25)
-    (error,) = tracking_errors([measured, Track("b", T, np.zeros(200))], [command])
+    (error,) = quantities.tracking_errors([measured, Track("b", T, np.zeros(200))], [command])
     assert error.name == "a"
     np.testing.assert_allclose(error.values, np.tile([0.25, 0.75], 100))
     np.testing.assert_array_equal(error.t_ns, measured.t_ns)
@@ -61,9 +54,9 @@ def test_mechanical_power_is_torque_times_velocity():
         ("/joint_states", "effort"): (Track("a", T, np.cos(phase)),),
         ("/joint_states", "velocity"): (Track("a", T, np.sin(phase)), Track("b", T, phase)),
     }
-    (power,) = mechanical_power(columns)
+    (power,) = quantities.mechanical_power(columns)
     np.testing.assert_allclose(power.values, np.sin(2 * phase) / 2, atol=1e-12)
-    assert electrical_power(columns) == ()
+    assert quantities.electrical_power(columns) == ()
 
 
 def test_electrical_power_takes_the_voltage_at_the_currents_times():
@@ -73,7 +66,7 @@ def test_electrical_power_takes_the_voltage_at_the_currents_times():
         ("/joint_current", "position"): (current,),
         ("/joint_voltage", "position"): (voltage,),
     }
-    (power,) = electrical_power(columns)
+    (power,) = quantities.electrical_power(columns)
     np.testing.assert_allclose(power.values[:-1], 2e-9 * current.t_ns[:-1])
     assert np.isnan(power.values[-1])  # after the last voltage nothing is known
 
@@ -81,10 +74,10 @@ def test_electrical_power_takes_the_voltage_at_the_currents_times():
 def test_the_whole_bodys_power_needs_every_joint():
     lossy = np.ones(200)
     lossy[7] = np.nan
-    whole = total([Track("a", T, np.ones(200)), Track("b", T, lossy)])
+    whole = quantities.total([Track("a", T, np.ones(200)), Track("b", T, lossy)])
     assert np.flatnonzero(np.isnan(whole.values)).tolist() == [7]
     assert np.nanmax(whole.values) == np.nanmin(whole.values) == 2.0
-    assert total([]) is None
+    assert quantities.total([]) is None
 
 
 LONG = np.arange(500, dtype=np.int64) * 10_000_000
@@ -110,8 +103,7 @@ def test_a_phase_that_stands_still_is_no_rhythm():
 
 
 def test_a_mode_begins_where_it_differs_from_the_one_before():
-    assert changes(["walk", "walk", "avoid", "avoid", "walk"]) == [0, 2, 4]
-    assert changes([]) == []
+    assert (changes(["walk", "walk", "avoid", "avoid", "walk"]), changes([])) == ([0, 2, 4], [])
 
 
 def test_the_trail_joins_successive_positions_but_not_across_a_gap():

@@ -16,9 +16,7 @@ SHAPES = "/world/snake/meshes"
 
 def box(x, y, z):
     """A binary STL of a box about the origin."""
-    corner = [
-        np.array(c) for c in itertools.product((-x / 2, x / 2), (-y / 2, y / 2), (-z / 2, z / 2))
-    ]
+    corner = [np.array(c) * (x, y, z) / 2 for c in itertools.product((-1, 1), repeat=3)]
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [(a, b, c) for a, b, c, _ in quads] + [(a, c, d) for a, _, c, d in quads]
     rows = [struct.pack("<12fH", 0, 0, 0, *np.ravel([corner[i] for i in f]), 0) for f in faces]
@@ -82,5 +80,4 @@ def test_only_links_without_a_mesh_are_capsules(file, read_back):
 
 @pytest.mark.slow
 def test_the_viewer_draws_the_boxes(file, show):
-    viewer = show(file, 0.09)
-    assert viewer.complaints() == []
+    assert show(file, 0.09).complaints() == []

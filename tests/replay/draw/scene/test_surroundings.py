@@ -6,8 +6,7 @@ import pytest
 from support.written_topics import EPOCH_NS, write_topics
 from undulog.capture import Session
 from undulog.replay.feed.recording import write_recording
-from undulog.sim import load_scenario
-from undulog.sim.scenario.obstacles import Cylinder, Wall
+from undulog.sim import Cylinder, Wall, load_scenario
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +34,7 @@ def recorded(snake25, tmp_path):
 
 
 def test_obstacles_and_target_stand_where_the_scenario_has_them(world, recorded, read_back):
-    scenario = load_scenario("target-following").toml().encode()
-    found = read_back(recorded(scenario).path)
+    found = read_back(recorded(load_scenario("target-following").toml().encode()).path)
     cylinders = [one for one in world.obstacles if isinstance(one, Cylinder)]
     walls = [one for one in world.obstacles if isinstance(one, Wall)]
     radii = found.static("/world/obstacles/cylinders", "Cylinders3D:radii")
@@ -49,6 +47,6 @@ def test_obstacles_and_target_stand_where_the_scenario_has_them(world, recorded,
     np.testing.assert_allclose(np.hypot(*away.T), world.target.radius, rtol=1e-5)
 
 
-def test_a_faulty_scenario_is_said_and_the_rest_drawn(recorded):
+def test_a_faulty_scenario_is_reported_and_the_rest_drawn(recorded):
     recording = recorded(b"[world]\nheading = 'north'\n")
     assert any("obstacles are not drawn: world.heading" in text for text in recording.warnings)
