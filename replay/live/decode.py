@@ -116,10 +116,11 @@ class LiveLog:
             self._read_robot()
         return self._robot
 
-    def unit(self, topic: str) -> str:
-        """Unit of a JointState topic; ``rad`` where its channel has none."""
-        found = [one.channel for one in self._topics.values() if one.channel.topic == topic]
-        return found[0].metadata.get("unit", "rad") if found else "rad"
+    @property
+    def units(self) -> dict[str, str]:
+        """Topic to its unit; ``rad`` where its channel has none."""
+        channels = [one.channel for one in self._topics.values()]
+        return {one.topic: one.metadata.get("unit", "rad") for one in channels}
 
     def define(self, record: Description | object) -> None:
         """Take what explains messages; the same again changes nothing.

@@ -197,18 +197,6 @@ def log_total_look(rec: rr.RecordingStream, kind: str) -> None:
     rec.log(f"{TOTAL}/{kind}", look, static=True)
 
 
-def log_sum(rec: rr.RecordingStream, clock: Clock, kind: str, whole: Track) -> None:
-    """Write one kind of the body's power.
-
-    Args:
-        kind: ``mechanical`` or ``electrical``.
-        whole: The body's power [W].
-    """
-    log_total_look(rec, kind)
-    t_ns, values = mark_gaps(whole.t_ns, whole.values[:, None])
-    log_rows(rec, clock, f"{TOTAL}/{kind}", t_ns, values)
-
-
 MODE = "/gait/mode"
 EVENTS = "/events"
 
