@@ -25,7 +25,6 @@ from undulog.capture.robot.model import Robot
 
 from ..draw.cycles.heat_maps import POWER
 from ..draw.cycles.steps import CYCLES, SEGMENTS
-from ..draw.plots.lines import log_look
 from ..draw.plots.write import Plot
 from ..samples.content import GAIN, LAG, Chart, Color, Quantity
 from ..samples.content import Series as Lines
@@ -72,29 +71,6 @@ class Cycle:
     power_w: FloatArray
 
 
-class _Store:
-    """Samples of one joint, the last minute's."""
-
-    def __init__(self) -> None:
-        self._parts: list[Track] = []
-
-    def add(self, track: Track) -> None:
-        self._parts.append(track)
-
-    def forget(self, before_ns: int) -> None:
-        """Let go of batches that end before a time."""
-        while self._parts and int(self._parts[0].t_ns[-1]) < before_ns:
-            self._parts.pop(0)
-
-    @property
-    def last_ns(self) -> int:
-        return int(self._parts[-1].t_ns[-1]) if self._parts else 0
-
-    def track(self, name: str) -> Track:
-        nothing = Track(name, np.zeros(0, dtype=np.int64), np.zeros(0))
-        return one_after_another(self._parts or [nothing])
-
-
 class CycleMeter:
     """Computes each cycle once its surroundings have come."""
 
@@ -105,7 +81,8 @@ class CycleMeter:
             origin_ns: Unix time from which seconds are counted [ns].
         """
         self._origin_ns = origin_ns
-        self._stores: dict[tuple[str, str], dict[str, _Store]] = {key: {} for key in _KEYS}
+        # Of each joint the batches of the last minute.
+        self._stores: dict[tuple[str, str], dict[str, list[Track]]] = {key: {} for key in _KEYS}
         self._gait_ns: IntArray = np.zeros(0, dtype=np.int64)
         self._gait: dict[str, FloatArray] = {}
         # Phase at which the run's first cycle starts, and the number of the next one. Counted, not
@@ -126,7 +103,7 @@ class CycleMeter:
         for key, stores in self._stores.items():
             for track in batch.columns.get(key, ()):
                 if track.t_ns.size:
-                    stores.setdefault(track.name, _Store()).add(track)
+                    stores.setdefault(track.name, []).append(track)
                     self._newest_ns = max(self._newest_ns, int(track.t_ns[-1]))
         self._add_gait(batch.columns.get((GAIT, "position"), ()))
         found: list[Cycle] = []
@@ -183,8 +160,9 @@ class CycleMeter:
             ]
             oldest_ns = max(oldest_ns, min(needed))
         for stores in self._stores.values():
-            for store in stores.values():
-                store.forget(oldest_ns)
+            for batches in stores.values():
+                while batches and int(batches[0].t_ns[-1]) < oldest_ns:
+                    batches.pop(0)
 
     def _needed_ns(self, name: str, start: float) -> int:
         """The time of the first sample that the next cycle needs [ns]."""
@@ -228,7 +206,9 @@ class CycleMeter:
     def _ready(self, until_s: float, joints: Sequence[str]) -> bool:
         """Whether all joints' samples have come up to a time, or won't come any more."""
         ends = [
-            self._stores[key][joint].last_ns for key in (_COMMAND, _POSITION) for joint in joints
+            int(batches[-1].t_ns[-1]) if batches else 0
+            for key in (_COMMAND, _POSITION)
+            for batches in (self._stores[key][joint] for joint in joints)
         ]
         known_ns = max(min(ends), self._newest_ns - PATIENCE_NS)
         return (known_ns - self._origin_ns) * 1e-9 >= until_s
@@ -261,9 +241,7 @@ class CycleMeter:
     def _power(self, joint: str, edges: tuple[float, float]) -> float:
         """Mean of torque times velocity [W]; NaN where less than nine tenths of it are known."""
         both = [
-            (self._stores[key][joint].track(joint),)
-            for key in (_EFFORT, _VELOCITY)
-            if joint in self._stores[key]
+            (self._track(key, joint),) for key in (_EFFORT, _VELOCITY) if joint in self._stores[key]
         ]
         found = products(*both) if len(both) == 2 else ()
         if not found:
@@ -277,8 +255,12 @@ class CycleMeter:
             return float("nan")
         return float(np.sum(weighed.weights * series.values)) / (edges[1] - edges[0])
 
+    def _track(self, key: tuple[str, str], joint: str) -> Track:
+        nothing = Track(joint, np.zeros(0, dtype=np.int64), np.zeros(0))
+        return one_after_another(self._stores[key][joint] or [nothing])
+
     def _series(self, key: tuple[str, str], joint: str) -> Series:
-        track = self._stores[key][joint].track(joint)
+        track = self._track(key, joint)
         return clean(joint, track.t_ns, track.values, self._origin_ns)
 
     def _seconds(self, t_ns: IntArray) -> FloatArray:
@@ -362,9 +344,8 @@ class CycleBars:
                 else []
             )
             plot = Plot(f"{CYCLES}/{quantity.key}", refined(known, [cycle.names]))
-            for one in plot.series:
-                log_look(rec, one.entity, one.names, palette, steps=True)
-            plot.write(rec, clock, tracks, lambda *_: slice(None))
+            plot.style(rec, palette, steps=True)
+            plot.write(rec, clock, tracks)
             self._plots[quantity] = plot
             if not everything:
                 return

@@ -25,41 +25,10 @@ from undulog.capture.common.process import StopRequest, interruptible
 from undulog.capture.recorder.live_wire import Kind, LiveMessage, read_records
 
 from ..feed.recording import open_recording, recording_id, require_whole, send_properties
-from ..viewer import viewer
 from ..viewer.viewer import Viewer
 from .decode import LiveLog
 from .inbox import Datagram, Inbox
 from .scene import LiveScene
-
-_WINDOW = "--memory-limit=1GB"
-_SERVER = "--server-memory-limit=256MB"
-
-
-def open_window() -> Viewer:
-    """Open the native viewer, empty.
-
-    Raises:
-        UndulogError: If it doesn't start.
-    """
-    window = viewer.open_window(_WINDOW)
-    window.wait_until_it_listens()
-    return window
-
-
-def open_server(notify: Callable[[str], None]) -> Viewer:
-    """Serve the viewer to browsers on this machine.
-
-    Args:
-        notify: Called with the address to open, once it is served.
-
-    Raises:
-        UndulogError: If it doesn't start.
-    """
-    server, page = viewer.open_server(_SERVER)
-    server.wait_until_it_listens()
-    notify(page)
-    return server
-
 
 BATCH_S = 0.03
 """How often what has come is drawn [s]."""

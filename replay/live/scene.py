@@ -137,10 +137,8 @@ def _grown(
     old: tuple[IntArray, FloatArray] | None, t_ns: IntArray, values: FloatArray
 ) -> tuple[IntArray, FloatArray]:
     """Append new samples to those of the last seconds before them."""
-    if old is None:
+    if old is None or t_ns[-1] < old[0][-1] - _KEPT_NS:  # the clock was set back
         return t_ns, values
-    if not t_ns.size:
-        return old
     first = int(np.searchsorted(old[0], int(t_ns[0]) - _KEPT_NS))
     first = max(min(first, old[0].size - _KEPT), 0)
     return ordered(np.concatenate([old[0][first:], t_ns]), np.concatenate([old[1][first:], values]))

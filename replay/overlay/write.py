@@ -33,12 +33,12 @@ from undulog.capture.common.files import check_stop
 from undulog.capture.common.process import StopRequest
 
 from ..draw.facts import log_facts
-from ..draw.plots.lines import log_table
+from ..draw.plots.write import Plot
 from ..draw.scene.body import body_title
 from ..feed.recording import Recording, recording_file, recording_id
 from ..samples.content import Color
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
-from ..samples.tracks import Table, decimate
+from ..samples.tracks import Track, decimate
 from . import draw
 from . import layout as words
 from .layout import SEPARATE, Found, Shown, build_blueprint
@@ -300,8 +300,9 @@ def _log_apart(
     known = bool(np.isfinite(apart).any())
     if known:
         name = f"{b.name}, {a.name}"
-        table = Table((name,), t_ns, apart[:, None])
-        log_table(rec, a.clock, f"{b.own}{SEPARATE}", table, {name: color}, degrees=False)
+        plot = Plot(f"{b.own}{SEPARATE}", [(name,)])
+        plot.style(rec, {name: color})
+        plot.write(rec, a.clock, [Track(name, t_ns, apart)])
     return known
 
 

@@ -187,6 +187,11 @@ Rows = Callable[[str, IntArray], slice]
 """Of an entity and the times of its samples: which of them are drawn."""
 
 
+def every_row(_entity: str, t_ns: IntArray) -> slice:
+    """Draw all samples."""
+    return slice(0, t_ns.size)
+
+
 class Plot:
     """One quantity of all joints."""
 
@@ -218,12 +223,19 @@ class Plot:
             for track in samples
         }
 
+    def style(
+        self, rec: rr.RecordingStream, palette: Mapping[str, Color] | None, **look: Any
+    ) -> None:
+        """Write the style of its lines, as :func:`~.replay.draw.plots.lines.log_look` takes it."""
+        for one in self.series:
+            log_look(rec, one.entity, one.names, palette, **look)
+
     def write(
         self,
         rec: rr.RecordingStream,
         clock: Clock,
         tracks: Sequence[Track],
-        rows: Rows,
+        rows: Rows = every_row,
         known_ns: int | None = None,
     ) -> None:
         """Write samples.
@@ -293,9 +305,7 @@ class Plots:
             if entity.startswith(f"{TOTAL}/"):
                 log_total_look(rec, entity.removeprefix(f"{TOTAL}/"))
                 continue
-            colors = None if entity == COMMANDED else _colors(entity, plot, palette)
-            for one in plot.series:
-                log_look(rec, one.entity, one.names, colors)
+            plot.style(rec, None if entity == COMMANDED else _colors(entity, plot, palette))
         if places is not None:
             for source, kind in ((COMMANDED, "commanded"), (MEASURED, "measured")):
                 self._add_places(parts.get(source, ()), places, samples, source, kind)
@@ -370,9 +380,8 @@ class Plots:
         own = [one for one in samples.get(source, ()) if one.name in places.names]
         plot = Plot(f"{PLACES}/{kind}", [part for part in chosen if part], own, degrees=True)
         self._places[source] = plot
-        for one in plot.series:
-            colors = self._palette if kind == "measured" else None
-            log_look(self._rec, one.entity, one.names, colors, **places_look(places, kind))
+        colors = self._palette if kind == "measured" else None
+        plot.style(self._rec, colors, **places_look(places, kind))
 
 
 def _colors(entity: str, plot: Plot, palette: Mapping[str, Color]) -> Mapping[str, Color]:
