@@ -179,16 +179,3 @@ def disk_of(tmp_path):
     yield mount
     if place.is_mount():
         subprocess.run(["umount", str(place)], check=True)
-
-
-@pytest.fixture
-def command(capsys):
-    """Runs a command in this process to its exit code; returns output and errors."""
-
-    def run(*words, code=0):
-        import undulog
-
-        assert undulog.run([str(word) for word in words]) == code
-        return capsys.readouterr()
-
-    return run

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ..live.relay import RelayReport
 
 _NICENESS, _LIVE_NICENESS = 5, 10
+_WINDOW, _SERVER = "--memory-limit=1GB", "--server-memory-limit=256MB"  # of a live view
 
 
 def view(
@@ -176,7 +177,7 @@ def _view_live(
     path: Path, *, save: Path | None, web: bool, connect: str | None, json: bool
 ) -> None:
     """Show what a recorder on this machine records, until it is closed or interrupted."""
-    from ..live.relay import open_server, open_window, relay_to_file, relay_to_viewer
+    from ..live.relay import relay_to_file, relay_to_viewer
 
     if not (web or connect or save):
         viewer.require_display()
@@ -185,12 +186,10 @@ def _view_live(
         report = relay_to_file(path, save)
     elif connect is not None:
         report = relay_to_viewer(path, None, connect)
-    elif web:
-        with open_server(echo) as server:
-            report = relay_to_viewer(path, server, server.address)
     else:
-        with open_window() as window:
-            report = relay_to_viewer(path, window, window.address)
+        with _open_viewer(_SERVER if web else _WINDOW, web=web) as process:
+            process.wait_until_it_listens()
+            report = relay_to_viewer(path, process, process.address)
     _report_live(report, save, json=json)
     if connect is not None and report.complaint:
         complain(f"error: {report.complaint}")
@@ -229,12 +228,8 @@ def _view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
             from ..feed.numbers import read_results
 
             known = read_results(session, single.result)
-        if web:
-            process, page = viewer.open_server(viewer.WHOLE_IN_MEMORY)
-            stack.enter_context(process).wait_until_it_listens()
-            echo(page)
-        else:
-            process = stack.enter_context(viewer.open_window())
+        options = [viewer.WHOLE_IN_MEMORY] if web else []
+        process = stack.enter_context(_open_viewer(*options, web=web))
         # Rerun would report a closed window as errors of its own, in colours.
         os.environ.setdefault("RUST_LOG", "off")
         from ..feed.numbers import Analysing
@@ -253,6 +248,16 @@ def _view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
         echo(f"{file}: {session.duration_s:.1f} s, all of it in the viewer")
         echo(*(f"note: {note}" for note in notes))
         process.wait(stop)
+
+
+def _open_viewer(*options: str, web: bool) -> viewer.Viewer:
+    """Start a window, or a server whose page is printed once it is there."""
+    if not web:
+        return viewer.open_window(*options)
+    server, page = viewer.open_server(*options)
+    server.wait_until_it_listens()
+    echo(page)
+    return server
 
 
 def _be_nice(niceness: int) -> None:

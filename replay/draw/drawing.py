@@ -18,18 +18,18 @@ from undulog.capture.robot.kinematics import rotation_from_quaternion
 from undulog.capture.robot.model import Robot
 
 from ..samples import content as entities
-from ..samples.content import Content, Layer, Named, Signal, Start, signal_title
-from ..samples.quantities import SIGNALS, topic_entity
+from ..samples.content import Content, Layer, Named, Start
+from ..samples.quantities import quantities
 from ..samples.survey import GAIT, Survey, survey
 from ..samples.timeline import Clock, Span, Stretch
 from ..samples.tracks import Track, drawn_topics, read_columns
 from . import facts
 from .cycles.heat_maps import heat_maps, log_maps
-from .cycles.mean_cycle import Look, log_mean_cycle, read_averaged
+from .cycles.mean_cycle import log_mean_cycle, read_averaged
 from .cycles.steps import charts, cycle_tables, log_charts, log_current, log_cycles
 from .plots import lines
 from .plots.write import Plots, log_others, log_words
-from .scene.body import body_title
+from .scene.body import Look, body_title
 from .scene.motion import BODY_RATE_HZ, HeadPath, read_head
 from .scene.stage import Scene
 
@@ -118,7 +118,10 @@ class Drawing:
         moving = sources.measured or sources.commanded
         self._palette = palette_of(robot, [track.name for track in moving])
         self._places = lines.head_middle_tail(robot, sources.commanded or sources.measured)
-        self._plots = Plots(rec, clock, sources.found, self._places, self._palette)
+        found = sources.found
+        self._plots = Plots(
+            rec, clock, found.parts, self._places, self._palette, samples=found.samples
+        )
         self._head, self._scene = self._open_scene(span)
         self.content = self._written()
         """What is drawn by now."""
@@ -130,7 +133,10 @@ class Drawing:
 
     def write(self, stretch: Stretch) -> None:
         """Draw a stretch."""
-        self._plots.write(stretch)
+        span = stretch.span
+        self._plots.write(
+            quantities(stretch.columns), lambda _, t_ns: span.rows(t_ns), span.known_ns
+        )
         if self._scene is not None:
             self._scene.write(stretch)
 
@@ -187,7 +193,7 @@ class Drawing:
             self._rec,
             self._clock,
             read_averaged(sources.session, sources.found.wanted, self._clock, analysis),
-            Look(sources.session.robot, self._places, self._palette, self.limit_w),
+            self._look(self.limit_w),
             analysis=analysis,
             warnings=sources.warnings,
         )
@@ -222,19 +228,17 @@ class Drawing:
 
     def _written(self) -> Content:
         """Return the content that every window of samples has."""
-        plots = self._plots
-        return Content(
-            robot=self._sources.session.robot,
+        session = self._sources.session
+        units = {topic: one.metadata.get("unit", "rad") for topic, one in session.channels.items()}
+        return replace(
+            self._plots.content(session.robot, units),
             start=None if self._head is None else start_of(self._head),
             power_limit_w=self.limit_w,
-            places=self._places,
-            commanded=plots.series(entities.COMMANDED),
-            measured=plots.series(entities.MEASURED),
-            errors=plots.series(entities.ERROR),
-            has_power=any(one.startswith(entities.TOTAL) for one in self._sources.found.samples),
-            joint_power=plots.series(entities.MECHANICAL),
-            signals=self._signals(),
         )
+
+    def _look(self, limit_w: float | None) -> Look:
+        robot = self._sources.session.robot
+        return Look(robot, self._places, self._palette, limit_w, self._named)
 
     def _open_scene(self, span: Span) -> tuple[HeadPath | None, Scene | None]:
         """The 3D scene, where there is a robot whose joints were measured."""
@@ -256,25 +260,11 @@ class Drawing:
             session,
             robot,
             head,
-            places=self._places,
-            palette=self._palette,
-            limit_w=sources.found.power_limit_w,
+            look=self._look(sources.found.power_limit_w),
             warnings=sources.warnings,
             span=span,
         )
-        scene.named = self._named
         return head, scene
-
-    def _signals(self) -> tuple[Signal, ...]:
-        """Every other JointState topic as it is: currents, voltages, temperatures, foreign ones."""
-        found: list[Signal] = []
-        topics = {topic_entity(SIGNALS, one): one for one in self._sources.session.channels}
-        for entity, series in self._plots.signals.items():
-            topic = topics[entity]
-            unit = self._sources.session.channels[topic].metadata.get("unit", "rad")
-            of_joints = any(name in self._palette for one in series for name in one.names)
-            found.append(Signal(signal_title(topic, unit), series, of_joints))
-        return tuple(found)
 
 
 def palette_of(robot: Robot | None, names: Sequence[str]) -> dict[str, entities.Color]:

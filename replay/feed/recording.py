@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
+from typing import TypeVar
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -32,6 +33,8 @@ from ..samples.content import Content, Layer, Named
 from ..samples.timeline import stretches
 
 APPLICATION = "undulog"
+
+Stream = TypeVar("Stream", bound=rr.RecordingStream)
 
 _RERUN = Path(rr.__file__).parent
 _NAMESPACE = uuid.UUID("8f4b6f0e-6f0a-5d3f-9a53-5d1f7a3f2c11")
@@ -135,18 +138,19 @@ def recording_file(
         check_stop(path, stop)
 
 
-def open_recording(identity: str, *, in_file: bool = False) -> rr.RecordingStream:
+def open_recording(
+    identity: str, kind: type[Stream] = rr.RecordingStream, *, in_file: bool = False
+) -> Stream:
     """Return a recording stream for a session, without a sink.
 
     Args:
         identity: The recording's id.
+        kind: Its class.
         in_file: Cut chunks by their size alone: those that a clock cuts differ from run to run.
     """
     rr.set_strict_mode(True)
     batching = rr.ChunkBatcherConfig(flush_tick=timedelta(days=1)) if in_file else None
-    rec = rr.RecordingStream(
-        APPLICATION, recording_id=identity, send_properties=False, batcher_config=batching
-    )
+    rec = kind(APPLICATION, recording_id=identity, send_properties=False, batcher_config=batching)
     rec.set_log_time_enabled(False)
     rec.set_log_tick_enabled(False)
     return rec

@@ -1,4 +1,4 @@
-"""Gain, lag and power of each joint in each cycle of a gait, while it is recorded.
+"""Gain, lag and power of each joint in each cycle of a gait, computed and drawn as it is recorded.
 
 The estimator is the analysis's own (:mod:`.analysis.estimators.demodulation`), on cycles that
 start where its do: half a turn after the logged phase began to run evenly. It looks half a cycle to
@@ -7,10 +7,12 @@ either side, so a cycle is known half a cycle after its end.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import rerun as rr
 
 from undulog.analysis.estimators.cycle_sums import weigh
 from undulog.analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate
@@ -21,8 +23,14 @@ from undulog.analysis.signals.columns import planes_of
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.robot.model import Robot
 
+from ..draw.cycles.heat_maps import POWER
+from ..draw.cycles.steps import CYCLES, SEGMENTS
+from ..draw.plots.write import Plot
+from ..samples.content import GAIN, LAG, Chart, Color, Quantity
+from ..samples.content import Series as Lines
 from ..samples.quantities import products
-from ..samples.survey import GAIT
+from ..samples.survey import GAIT, refined
+from ..samples.timeline import SESSION_TIME, Clock
 from ..samples.tracks import Track, one_after_another
 from .decode import PATIENCE_NS, Batch
 
@@ -63,29 +71,6 @@ class Cycle:
     power_w: FloatArray
 
 
-class _Store:
-    """Samples of one joint, the last minute's."""
-
-    def __init__(self) -> None:
-        self._parts: list[Track] = []
-
-    def add(self, track: Track) -> None:
-        self._parts.append(track)
-
-    def forget(self, before_ns: int) -> None:
-        """Let go of batches that end before a time."""
-        while self._parts and int(self._parts[0].t_ns[-1]) < before_ns:
-            self._parts.pop(0)
-
-    @property
-    def last_ns(self) -> int:
-        return int(self._parts[-1].t_ns[-1]) if self._parts else 0
-
-    def track(self, name: str) -> Track:
-        nothing = Track(name, np.zeros(0, dtype=np.int64), np.zeros(0))
-        return one_after_another(self._parts or [nothing])
-
-
 class CycleMeter:
     """Computes each cycle once its surroundings have come."""
 
@@ -96,7 +81,8 @@ class CycleMeter:
             origin_ns: Unix time from which seconds are counted [ns].
         """
         self._origin_ns = origin_ns
-        self._stores: dict[tuple[str, str], dict[str, _Store]] = {key: {} for key in _KEYS}
+        # Of each joint the batches of the last minute.
+        self._stores: dict[tuple[str, str], dict[str, list[Track]]] = {key: {} for key in _KEYS}
         self._gait_ns: IntArray = np.zeros(0, dtype=np.int64)
         self._gait: dict[str, FloatArray] = {}
         # Phase at which the run's first cycle starts, and the number of the next one. Counted, not
@@ -117,7 +103,7 @@ class CycleMeter:
         for key, stores in self._stores.items():
             for track in batch.columns.get(key, ()):
                 if track.t_ns.size:
-                    stores.setdefault(track.name, _Store()).add(track)
+                    stores.setdefault(track.name, []).append(track)
                     self._newest_ns = max(self._newest_ns, int(track.t_ns[-1]))
         self._add_gait(batch.columns.get((GAIT, "position"), ()))
         found: list[Cycle] = []
@@ -174,8 +160,9 @@ class CycleMeter:
             ]
             oldest_ns = max(oldest_ns, min(needed))
         for stores in self._stores.values():
-            for store in stores.values():
-                store.forget(oldest_ns)
+            for batches in stores.values():
+                while batches and int(batches[0].t_ns[-1]) < oldest_ns:
+                    batches.pop(0)
 
     def _needed_ns(self, name: str, start: float) -> int:
         """The time of the first sample that the next cycle needs [ns]."""
@@ -219,7 +206,9 @@ class CycleMeter:
     def _ready(self, until_s: float, joints: Sequence[str]) -> bool:
         """Whether all joints' samples have come up to a time, or won't come any more."""
         ends = [
-            self._stores[key][joint].last_ns for key in (_COMMAND, _POSITION) for joint in joints
+            int(batches[-1].t_ns[-1]) if batches else 0
+            for key in (_COMMAND, _POSITION)
+            for batches in (self._stores[key][joint] for joint in joints)
         ]
         known_ns = max(min(ends), self._newest_ns - PATIENCE_NS)
         return (known_ns - self._origin_ns) * 1e-9 >= until_s
@@ -252,9 +241,7 @@ class CycleMeter:
     def _power(self, joint: str, edges: tuple[float, float]) -> float:
         """Mean of torque times velocity [W]; NaN where less than nine tenths of it are known."""
         both = [
-            (self._stores[key][joint].track(joint),)
-            for key in (_EFFORT, _VELOCITY)
-            if joint in self._stores[key]
+            (self._track(key, joint),) for key in (_EFFORT, _VELOCITY) if joint in self._stores[key]
         ]
         found = products(*both) if len(both) == 2 else ()
         if not found:
@@ -268,8 +255,12 @@ class CycleMeter:
             return float("nan")
         return float(np.sum(weighed.weights * series.values)) / (edges[1] - edges[0])
 
+    def _track(self, key: tuple[str, str], joint: str) -> Track:
+        nothing = Track(joint, np.zeros(0, dtype=np.int64), np.zeros(0))
+        return one_after_another(self._stores[key][joint] or [nothing])
+
     def _series(self, key: tuple[str, str], joint: str) -> Series:
-        track = self._stores[key][joint].track(joint)
+        track = self._track(key, joint)
         return clean(joint, track.t_ns, track.values, self._origin_ns)
 
     def _seconds(self, t_ns: IntArray) -> FloatArray:
@@ -279,3 +270,103 @@ class CycleMeter:
 def _whole(phase: FloatArray) -> FloatArray:
     """The phase counted upwards, whichever way the gait runs."""
     return phase if phase[-1] >= phase[0] else -phase
+
+
+_WIDTH = 0.8
+
+
+class CycleBars:
+    """Bars and steps of gain, lag and power.
+
+    The entities are the replay's; here a bar is the newest cycle, and a joint of which the cycle
+    tells nothing has none. Power takes the place of the net energy: its mean over the cycle.
+    """
+
+    def __init__(self) -> None:
+        """Nothing has been drawn."""
+        self._plots: dict[Quantity, Plot] = {}
+        self._drawn: set[str] = set()
+        self._waiting: deque[tuple[Quantity, Cycle, FloatArray]] = deque()
+
+    @property
+    def charts(self) -> tuple[Chart, ...]:
+        """The bar charts that have been written to."""
+        return tuple(
+            Chart(quantity.key, f"{quantity.name} [{quantity.unit}]", ())
+            for quantity, _ in self.cycles
+        )
+
+    @property
+    def cycles(self) -> tuple[tuple[Quantity, tuple[Lines, ...]], ...]:
+        """The quantities whose steps have been written, each with where."""
+        return tuple(
+            (quantity, self._plots[quantity].series)
+            for quantity in (GAIN, LAG, POWER)
+            if quantity in self._plots
+        )
+
+    def take(self, cycle: Cycle) -> None:
+        """Take a cycle, to be drawn a quantity at a time, so that no batch is late for it."""
+        for quantity, values in (
+            (GAIN, 100.0 * (cycle.gain - 1.0)),
+            (LAG, np.degrees(cycle.lag_rad)),
+            (POWER, 1e3 * cycle.power_w),
+        ):
+            if quantity in self._plots or np.isfinite(values).any():
+                self._waiting.append((quantity, cycle, values))
+
+    def write(
+        self,
+        rec: rr.RecordingStream,
+        clock: Clock,
+        palette: Mapping[str, Color],
+        *,
+        everything: bool = False,
+    ) -> None:
+        """Draw waiting cycles, at the times at which they started.
+
+        Args:
+            palette: Colour by joint name, head to tail.
+            everything: Whether to draw all of it rather than one quantity of one cycle.
+        """
+        while self._waiting:
+            quantity, cycle, values = self._waiting.popleft()
+            t_ns = np.array([cycle.start_ns], dtype=np.int64)
+            tracks = [Track(name, t_ns, values[i : i + 1]) for i, name in enumerate(cycle.names)]
+            rec.set_time(
+                SESSION_TIME, duration=np.timedelta64(cycle.start_ns - clock.start_ns, "ns")
+            )
+            self._write_bars(rec, quantity, tracks, palette)
+            rec.reset_time()
+            known = (
+                [one.names for one in self._plots[quantity].series]
+                if quantity in self._plots
+                else []
+            )
+            plot = Plot(f"{CYCLES}/{quantity.key}", refined(known, [cycle.names]))
+            plot.style(rec, palette, steps=True)
+            plot.write(rec, clock, tracks)
+            self._plots[quantity] = plot
+            if not everything:
+                return
+
+    def _write_bars(
+        self,
+        rec: rr.RecordingStream,
+        quantity: Quantity,
+        tracks: Sequence[Track],
+        palette: Mapping[str, Color],
+    ) -> None:
+        place = {name: i + 1 for i, name in enumerate(palette)}
+        for track in tracks:
+            part = rr.escape_entity_path_part(track.name)
+            entity = f"{SEGMENTS}/{quantity.key}/estimate/{part}"
+            if np.isfinite(track.values).all():
+                left = place[track.name] - _WIDTH / 2
+                color = palette[track.name]
+                bar = rr.BarChart(track.values, abscissa=[left], widths=[_WIDTH], color=color)
+                rec.log(entity, bar)
+                self._drawn.add(entity)
+            elif entity in self._drawn:
+                rec.log(entity, rr.Clear(recursive=False))
+                self._drawn.discard(entity)

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Metadata, Schema
 from numpy.typing import NDArray
 
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import DataError, RobotFileError
 from undulog.capture.log.columns.layouts import LayoutSorter, Matrix, names_of, stamps_of, values_of
+from undulog.capture.log.columns.topics import decoder_of
 from undulog.capture.log.messages.cdr import Layout, layout_of
 from undulog.capture.log.messages.definitions import MessageType, parse_message_type
 from undulog.capture.log.read.joint_states import OFFSET_TOPICS, JointRows, merge_rows
@@ -53,7 +52,6 @@ class Batch:
         ranges: Topic to sampling times [ns], shape (n,), and distances [m], shape (n,).
         modes: Times of gait modes [ns], and their names.
         events: When something happened [ns], and its message.
-        newest_ns: The newest log time [ns]; 0 where there is no message.
         messages: How many messages it was made of.
     """
 
@@ -62,7 +60,6 @@ class Batch:
     ranges: dict[str, Samples] = field(default_factory=dict[str, Samples])
     modes: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])
     events: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
-    newest_ns: int = 0
     messages: int = 0
 
 
@@ -116,10 +113,11 @@ class LiveLog:
             self._read_robot()
         return self._robot
 
-    def unit(self, topic: str) -> str:
-        """Unit of a JointState topic; ``rad`` where its channel has none."""
-        found = [one.channel for one in self._topics.values() if one.channel.topic == topic]
-        return found[0].metadata.get("unit", "rad") if found else "rad"
+    @property
+    def units(self) -> dict[str, str]:
+        """Topic to its unit; ``rad`` where its channel has none."""
+        channels = [one.channel for one in self._topics.values()]
+        return {one.topic: one.metadata.get("unit", "rad") for one in channels}
 
     def define(self, record: Description | object) -> None:
         """Take what explains messages; the same again changes nothing.
@@ -155,7 +153,6 @@ class LiveLog:
         batch = Batch()
         for message in messages:
             by_channel.setdefault(message.channel_id, []).append(message)
-            batch.newest_ns = max(batch.newest_ns, message.log_time_ns)
             batch.messages += 1
         found: list[tuple[_Topic, list[LiveMessage]]] = []
         for channel_id, own in by_channel.items():
@@ -299,15 +296,11 @@ class LiveLog:
 
     def _general(self, topic: _Topic, messages: Sequence[LiveMessage]) -> list[tuple[int, Any]]:
         """Log times and messages of any shape."""
-        from mcap_ros2.decoder import DecoderFactory, McapROS2DecodeError
-
         found: list[tuple[int, Any]] = []
         try:
-            if topic.decode is None:
-                topic.decode = cast("Any", DecoderFactory().decoder_for("cdr", topic.schema))
-            decode = cast("Callable[[bytes], Any]", topic.decode)
+            decode = topic.decode = topic.decode or decoder_of(topic.schema, topic.channel.topic)
             found.extend((one.log_time_ns, decode(one.payload)) for one in messages)
-        except (McapROS2DecodeError, McapError, struct.error, ValueError, IndexError):
+        except DataError:
             self.unread += len(messages) - len(found)
         return found
 

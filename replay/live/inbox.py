@@ -11,11 +11,12 @@ import os
 import socket
 import threading
 from collections import deque
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple
 
 from undulog.capture.common.errors import DataError, UsageError
+from undulog.capture.recorder.control_client import Identity, release
 from undulog.capture.recorder.live_wire import (
     HEAD_SIZE,
     MAX_DATAGRAM,
@@ -73,10 +74,7 @@ class Inbox(AbstractContextManager["Inbox"]):
         """Stop reading and remove the socket, unless another relay has taken its place."""
         self._ending.set()
         self._thread.join()
-        self._socket.close()
-        with suppress(FileNotFoundError):
-            if self.path.stat().st_ino == self._file:
-                self.path.unlink()
+        release(self.path, self._socket, self._file)
 
     def take(self) -> list[Datagram]:
         """Take the datagrams received since the last call, in order."""
@@ -123,8 +121,8 @@ def _said(datagram: Datagram) -> bytes:
     return bytes([datagram.head.kind]) + datagram.data[HEAD_SIZE:]
 
 
-def _bind(path: Path) -> tuple[socket.socket, int]:
-    """Bind a socket that only its owner may write to; return it and its inode."""
+def _bind(path: Path) -> tuple[socket.socket, Identity]:
+    """Bind a socket that only its owner may write to."""
     if path.exists() and not path.is_socket():
         raise UsageError(f"{path} is there and is no socket; choose another name")
     if path.is_socket() and _answers(path):
@@ -136,13 +134,13 @@ def _bind(path: Path) -> tuple[socket.socket, int]:
     try:
         link.bind(str(draft))
         draft.chmod(0o600)
-        inode = draft.stat().st_ino
+        found = draft.stat()
         draft.replace(path)
     except OSError as error:
         link.close()
         draft.unlink(missing_ok=True)
         raise UsageError(f"{path}: the socket can't be made: {error.strerror or error}") from error
-    return link, inode
+    return link, (found.st_dev, found.st_ino)
 
 
 def _answers(path: Path) -> bool:

@@ -11,9 +11,10 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -23,43 +24,11 @@ from undulog.capture.common.files import part_file
 from undulog.capture.common.process import StopRequest, interruptible
 from undulog.capture.recorder.live_wire import Kind, LiveMessage, read_records
 
-from ..feed.recording import APPLICATION, recording_id, require_whole, send_properties
-from ..viewer import viewer
+from ..feed.recording import open_recording, recording_id, require_whole, send_properties
 from ..viewer.viewer import Viewer
 from .decode import LiveLog
 from .inbox import Datagram, Inbox
-from .plot import LiveStream
 from .scene import LiveScene
-
-_WINDOW = "--memory-limit=1GB"
-_SERVER = "--server-memory-limit=256MB"
-
-
-def open_window() -> Viewer:
-    """Open the native viewer, empty.
-
-    Raises:
-        UndulogError: If it doesn't start.
-    """
-    window = viewer.open_window(_WINDOW)
-    window.wait_until_it_listens()
-    return window
-
-
-def open_server(notify: Callable[[str], None]) -> Viewer:
-    """Serve the viewer to browsers on this machine.
-
-    Args:
-        notify: Called with the address to open, once it is served.
-
-    Raises:
-        UndulogError: If it doesn't start.
-    """
-    server, page = viewer.open_server(_SERVER)
-    server.wait_until_it_listens()
-    notify(page)
-    return server
-
 
 BATCH_S = 0.03
 """How often what has come is drawn [s]."""
@@ -97,6 +66,44 @@ class RelayReport:
     unread: int
     lag_s: tuple[float, float, float] | None
     complaint: str = ""
+
+
+class LiveStream(rr.RecordingStream):
+    """A recording stream that logs static data only when they change."""
+
+    def __init__(self, application_id: str, **options: Any) -> None:
+        """Make a stream that isn't connected yet."""
+        super().__init__(application_id, **options)
+        self._said: dict[tuple[str, str], Any] = {}  # Arrow arrays
+
+    def log(
+        self,
+        entity_path: str | list[object],
+        entity: Any,
+        *extra: Any,
+        static: bool = False,
+        strict: bool | None = None,
+    ) -> None:
+        """Log, unless it is static and known already.
+
+        Args:
+            static: Whether it has no time.
+            strict: Whether to raise on data that can't be logged.
+        """
+        if static and not self._is_news(str(entity_path), [entity, *extra]):
+            return
+        super().log(entity_path, entity, *extra, static=static, strict=strict)
+
+    def _is_news(self, entity_path: str, archetypes: Sequence[Any]) -> bool:
+        batches = [batch for one in archetypes for batch in one.as_component_batches()]
+        values = {
+            (entity_path, str(batch.component_descriptor())): batch.as_arrow_array()
+            for batch in batches
+        }
+        known = self._said
+        news = [key for key in values if key not in known or not known[key].equals(values[key])]
+        known.update(values)
+        return bool(news)
 
 
 class Relay:
@@ -229,7 +236,6 @@ class Relay:
 
     def _open(self, first_ns: int) -> LiveScene:
         """Open a recording stream for the session."""
-        rr.set_strict_mode(True)
         facts = self._log.facts
         session_id = facts.get("session_id") or f"feed-{self._feed_id or 0:016x}"
         epoch = facts.get("epoch_ns", "")
@@ -237,9 +243,7 @@ class Relay:
         if self._rec is not None:
             self._rec.disconnect()
         # Not the id of the replay, which has more in it; a relay that is started anew goes on here.
-        rec = LiveStream(APPLICATION, recording_id(f"{session_id}/live"))
-        rec.set_log_time_enabled(False)
-        rec.set_log_tick_enabled(False)
+        rec = open_recording(recording_id(f"{session_id}/live"), LiveStream)
         self._connect(rec)
         send_properties(rec, f"{session_id} live", epoch_ns)
         self._rec = rec

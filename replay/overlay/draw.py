@@ -33,7 +33,8 @@ from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.robot.model import Robot
 
 from ..draw.cycles.steps import bar_of, log_bar
-from ..draw.plots.lines import log_look, log_rows, log_table, part_entities
+from ..draw.plots.lines import DEGREES, log_look, log_rows
+from ..draw.plots.write import Plot
 from ..draw.scene.body import MEASURED, MESHES, meshed
 from ..draw.scene.motion import HeadPath
 from ..draw.scene.stage import TRAIL
@@ -43,7 +44,6 @@ from ..samples.tracks import (
     Track,
     decimate,
     interpolate,
-    join_tracks,
     mark_gaps,
     pairs,
     typical_step_ns,
@@ -374,11 +374,9 @@ def log_differences(
         differences: The differences [rad].
         drawn: Its measured angles; joints of one series are drawn at common times.
     """
-    known = {track.name: track for track in differences}
-    parts = [[known[name] for name in one.names if name in known] for one in drawn]
-    tables = [join_tracks(part) for part in parts if part]
-    paths = part_entities(entity, [table.names for table in tables])
-    return tuple(
-        log_table(rec, a.clock, path, table, a.palette, degrees=True)
-        for path, table in zip(paths, tables, strict=True)
-    )
+    known = {track.name for track in differences}
+    parts = [tuple(name for name in one.names if name in known) for one in drawn]
+    plot = Plot(entity, [part for part in parts if part], degrees=True, component=DEGREES)
+    plot.style(rec, a.palette)
+    plot.write(rec, a.clock, differences)
+    return plot.series

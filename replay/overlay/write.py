@@ -31,12 +31,12 @@ from undulog.capture.common.files import check_stop
 from undulog.capture.common.process import StopRequest
 
 from ..draw.facts import log_facts
-from ..draw.plots.lines import log_table
+from ..draw.plots.write import Plot
 from ..draw.scene.body import body_title
 from ..feed.recording import Recording, recording_file, recording_id
 from ..samples.content import Color
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
-from ..samples.tracks import Table, decimate
+from ..samples.tracks import Track, decimate
 from . import draw
 from . import layout as words
 from .layout import SEPARATE, Found, Shown, build_blueprint
@@ -287,12 +287,13 @@ def _log_apart(
         return False
     t_ns = one.t_ns[decimate(one.t_ns, _APART_RATE_HZ)]
     apart = head_distance(a, b, how, placed, t_ns)
-    if not np.isfinite(apart).any():
-        return False
-    table = Table((f"{b.name}, {a.name}",), t_ns, apart[:, None])
-    colors = dict.fromkeys(table.names, color)
-    log_table(rec, a.clock, f"{b.own}{SEPARATE}", table, colors, degrees=False)
-    return True
+    known = bool(np.isfinite(apart).any())
+    if known:
+        name = f"{b.name}, {a.name}"
+        plot = Plot(f"{b.own}{SEPARATE}", [(name,)])
+        plot.style(rec, {name: color})
+        plot.write(rec, a.clock, [Track(name, t_ns, apart)])
+    return known
 
 
 def _log_body(

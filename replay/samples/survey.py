@@ -108,7 +108,7 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
                 # Not a view, which keeps all.
                 some = Track(track.name, track.t_ns[::thin].copy(), track.values[::thin].copy())
                 own.setdefault(track.name, []).append(some)
-            parts[entity] = _refined(parts.get(entity, []), _parts(tracks, turns=takes_turns))
+            parts[entity] = refined(parts.get(entity, []), _parts(tracks, turns=takes_turns))
             if entity == MEASURED:
                 times.append(tracks[0].t_ns[decimate(tracks[0].t_ns, rate_hz)])
             if entity == MECHANICAL and session.robot is not None:
@@ -192,7 +192,7 @@ def _parts(tracks: Sequence[Track], *, turns: bool) -> list[tuple[str, ...]]:
     return [tuple(names) for _, names in found]
 
 
-def _refined(
+def refined(
     before: Sequence[tuple[str, ...]], now: Sequence[tuple[str, ...]]
 ) -> list[tuple[str, ...]]:
     """Return parts that are together in both; a line in one of them only follows that one."""

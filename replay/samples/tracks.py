@@ -179,15 +179,22 @@ def tables(tracks: Sequence[Track]) -> tuple[Table, ...]:
         The tables, in the order of their first joints; one table where all joints share their
         times.
     """
+    return tuple(
+        Table(
+            tuple(track.name for track in group),
+            group[0].t_ns,
+            np.stack([track.values for track in group], axis=1),
+        )
+        for group in sampled_together(tracks)
+    )
+
+
+def sampled_together(tracks: Sequence[Track]) -> list[list[Track]]:
+    """Group joints that were sampled at the same times, in the order of their first joints."""
     together: dict[bytes, list[Track]] = {}
     for track in tracks:
         together.setdefault(track.t_ns.tobytes(), []).append(track)
-
-    def table(group: Sequence[Track]) -> Table:
-        values = np.stack([track.values for track in group], axis=1)
-        return Table(tuple(track.name for track in group), group[0].t_ns, values)
-
-    return tuple(map(table, together.values()))
+    return list(together.values())
 
 
 def in_turn(first: IntArray, other: IntArray) -> bool:
@@ -338,15 +345,16 @@ def mark_gaps(
     return np.insert(t_ns, after, t_ns[before] + step), np.insert(values, after, np.nan, axis=0)
 
 
-def decimate(t_ns: IntArray, rate_hz: float) -> IntArray:
+def decimate(t_ns: IntArray, rate_hz: float, origin_ns: int | None = None) -> IntArray:
     """Choose samples so that no more than ``rate_hz`` a second remain.
 
     Every slot of 1 / ``rate_hz`` that holds samples keeps its first one; slots are centred on
-    multiples of that period after the first sample, so that jitter about a multiple is harmless.
+    multiples of that period after the origin, so that jitter about a multiple is harmless.
 
     Args:
         t_ns: Sampling times [ns], ascending, shape (n,).
         rate_hz: At most this many samples a second.
+        origin_ns: Where the slots are counted from [ns]; None for the first sample.
 
     Returns:
         Indices into ``t_ns``, ascending.
@@ -354,8 +362,9 @@ def decimate(t_ns: IntArray, rate_hz: float) -> IntArray:
     if not t_ns.size:
         return np.zeros(0, dtype=np.int64)
     period = round(1e9 / rate_hz)
-    slot = (t_ns - t_ns[0] + period // 4) // period
-    return np.flatnonzero(np.diff(slot, prepend=slot[0] - 1)).astype(np.int64)
+    slot = (t_ns - (t_ns[0] if origin_ns is None else origin_ns) + period // 4) // period
+    first = np.flatnonzero(np.diff(slot, prepend=slot[0] - 1))
+    return first.astype(np.int64)
 
 
 def interpolate(t_ns: IntArray, values: FloatArray, at_ns: IntArray) -> FloatArray:

@@ -49,6 +49,35 @@ class Channel:
         return (self.encoding, self.schema_encoding) == (_ENCODING, _SCHEMA_ENCODING)
 
 
+def decoder_of(schema: Schema, where: str) -> Callable[[bytes], Any]:
+    """Return the general decoder of a schema, for messages of any shape.
+
+    Args:
+        where: Begins the texts of errors.
+
+    Returns:
+        A function as :meth:`Topics.decoder` gives it.
+
+    Raises:
+        DataError: If the schema can't be used.
+    """
+    from mcap_ros2.decoder import DecoderFactory
+
+    try:
+        with redirect_stderr(StringIO()):  # its parser prints what it raises
+            decode = cast("Any", DecoderFactory().decoder_for("cdr", schema))
+    except Exception as error:  # the library's parser has no error tree of its own
+        raise DataError(f"{where}: its schema can't be used: {error}") from error
+
+    def checked(message: bytes) -> Any:
+        try:
+            return decode(message)
+        except (McapError, struct.error, ValueError, IndexError, ArithmeticError) as error:
+            raise DataError(f"{where}: a message is damaged: {error}") from error
+
+    return checked
+
+
 class Topics:
     """Reads topics of one file by name."""
 
@@ -171,24 +200,9 @@ class Topics:
             MissingChannelError: If the log has no such topic.
             DataError: If the topic's schema can't be used.
         """
-        from mcap_ros2.decoder import DecoderFactory
-
         schema = self._schema(topic)
         self.message_type(topic)  # its error for a damaged schema is more precise
-        where = f"{self._file.path}: {topic}"
-        try:
-            with redirect_stderr(StringIO()):  # its parser prints what it raises
-                decode = cast("Any", DecoderFactory().decoder_for("cdr", schema))
-        except Exception as error:  # the library's parser has no error tree of its own
-            raise DataError(f"{where}: its schema can't be used: {error}") from error
-
-        def checked(message: bytes) -> Any:
-            try:
-                return decode(message)
-            except (McapError, struct.error, ValueError, IndexError, ArithmeticError) as error:
-                raise DataError(f"{where}: a message is damaged: {error}") from error
-
-        return checked
+        return decoder_of(schema, f"{self._file.path}: {topic}")
 
     def _channel(self, topic: str) -> Channel:
         channels = [self._file.channels[channel_id] for channel_id in self._ids[topic]]

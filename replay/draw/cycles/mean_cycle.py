@@ -8,7 +8,6 @@ first shape, so that its view isn't black there.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
@@ -21,12 +20,12 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Robot
 
-from ...samples.content import GREY, Color, MeanCycle, Places, Series, line_title
+from ...samples.content import GREY, Color, MeanCycle, Series, line_title
 from ...samples.quantities import mechanical_power, segment_power
 from ...samples.timeline import ENSEMBLE_CYCLE, Clock
 from ...samples.tracks import Columns, read_columns
 from ..plots.lines import log_look
-from ..scene.body import capsule_columns, capsule_poses, power_colors
+from ..scene.body import Look, capsule_columns, capsule_poses, power_colors
 from .ensemble import DEGREES, MeanCycles, Pace, body_frame, falsified, mean_cycles, pace_of
 
 ENSEMBLE = "/ensemble"
@@ -41,23 +40,6 @@ _TOPICS = ("/joint_states", "/joint_commands")
 
 _WHITE = (255, 255, 255, 255)
 _FAINT = 110  # opacity of the lines at the ends of an interval
-
-
-@dataclass(frozen=True)
-class Look:
-    """How the session is drawn, and so its mean cycle.
-
-    Attributes:
-        robot: The robot, or None.
-        places: The joints that stand for the body, or None.
-        palette: Colour by joint name.
-        limit_w: Power at which a segment's colour is full [W], or None.
-    """
-
-    robot: Robot | None
-    places: Places | None
-    palette: Mapping[str, Color]
-    limit_w: float | None
 
 
 def read_averaged(

@@ -22,9 +22,9 @@ from undulog.capture.common.errors import DataError
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Plane, Robot
 
-from ...samples.content import GREY, SCALARS, TOTAL, Color, Places, Series, line_title
+from ...samples.content import GREY, SCALARS, TOTAL, Color, Places, line_title
 from ...samples.timeline import Clock, Rhythm
-from ...samples.tracks import Table, Track, mark_gaps, rounded
+from ...samples.tracks import Track, rounded
 
 PLACES = "/joints/places"
 DEGREES = "Angle:degrees"
@@ -98,28 +98,6 @@ def part_entities(entity: str, parts: Sequence[Sequence[str]]) -> list[str]:
     return [f"{entity}/{rr.escape_entity_path_part(part[0])}" for part in parts]
 
 
-def log_table(
-    rec: rr.RecordingStream,
-    clock: Clock,
-    entity: str,
-    table: Table,
-    palette: Mapping[str, Color] | None,
-    *,
-    degrees: bool,
-) -> Series:
-    """Write joints that were sampled together.
-
-    Args:
-        palette: Colour by joint name; None for grey.
-        degrees: Whether the values are angles [rad], to be plotted in degrees.
-    """
-    component = DEGREES if degrees else SCALARS
-    log_look(rec, entity, table.names, palette)
-    t_ns, values = mark_gaps(table.t_ns, table.values)
-    log_rows(rec, clock, entity, t_ns, values, degrees=degrees, component=component)
-    return Series(entity, table.names, component)
-
-
 def log_look(
     rec: rr.RecordingStream,
     entity: str,
@@ -190,18 +168,6 @@ def log_total_look(rec: rr.RecordingStream, kind: str) -> None:
     """
     look = rr.SeriesLines(names=kind, colors=_COLORS[kind], widths=1.5)
     rec.log(f"{TOTAL}/{kind}", look, static=True)
-
-
-def log_sum(rec: rr.RecordingStream, clock: Clock, kind: str, whole: Track) -> None:
-    """Write one kind of the body's power.
-
-    Args:
-        kind: ``mechanical`` or ``electrical``.
-        whole: The body's power [W].
-    """
-    log_total_look(rec, kind)
-    t_ns, values = mark_gaps(whole.t_ns, whole.values[:, None])
-    log_rows(rec, clock, f"{TOTAL}/{kind}", t_ns, values)
 
 
 MODE = "/gait/mode"

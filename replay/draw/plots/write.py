@@ -9,30 +9,35 @@ views of their own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
 import rerun as rr
 
 from undulog.capture import SessionView
+from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.columns.topics import Channel
+from undulog.capture.robot.model import Robot
 
 from ...samples.content import (
     COMMANDED,
     ERROR,
     MEASURED,
+    MECHANICAL,
     SCALARS,
     TOTAL,
     Color,
+    Content,
     Places,
     Series,
     Signal,
+    signal_title,
 )
-from ...samples.quantities import SIGNALS, quantities, topic_entity
-from ...samples.survey import Survey
-from ...samples.timeline import Clock, Span, Stretch, stretch_length_ns
+from ...samples.quantities import SIGNALS, topic_entity
+from ...samples.timeline import Clock, stretch_length_ns
 from ...samples.tracks import JOINT_STATE, Track, join_tracks, mark_gaps, ordered, plot_step
 from .lines import (
     DEGREES,
@@ -176,6 +181,14 @@ def _tables(session: SessionView, topic: str) -> Iterator[Any]:
 
 _ANGLES = (COMMANDED, MEASURED, ERROR)
 
+Rows = Callable[[str, IntArray], slice]
+"""Of an entity and the times of its samples: which of them are drawn."""
+
+
+def every_row(_entity: str, t_ns: IntArray) -> slice:
+    """Draw all samples."""
+    return slice(0, t_ns.size)
+
 
 class Plot:
     """One quantity of all joints."""
@@ -183,18 +196,18 @@ class Plot:
     def __init__(
         self,
         entity: str,
-        samples: Sequence[Track],
         parts: Sequence[tuple[str, ...]],
+        samples: Sequence[Track] = (),
         *,
-        degrees: bool,
+        degrees: bool = False,
         component: str = SCALARS,
     ) -> None:
         """Prepare it.
 
         Args:
             entity: E.g. ``/joints/measured``.
-            samples: Some samples of each line, by which it is rounded.
             parts: Names of the lines, those in one part that are drawn at common times.
+            samples: Some samples of each line, by which it is rounded; without them it isn't.
             degrees: Whether the values are angles [rad], to be plotted in degrees.
         """
         paths = part_entities(entity, parts)
@@ -208,14 +221,27 @@ class Plot:
             for track in samples
         }
 
-    def write(
-        self, rec: rr.RecordingStream, clock: Clock, tracks: Sequence[Track], span: Span
+    def style(
+        self, rec: rr.RecordingStream, palette: Mapping[str, Color] | None, **look: Any
     ) -> None:
-        """Write the samples of a stretch.
+        """Write the style of its lines, as :func:`~.replay.draw.plots.lines.log_look` takes it."""
+        for one in self.series:
+            log_look(rec, one.entity, one.names, palette, **look)
+
+    def write(
+        self,
+        rec: rr.RecordingStream,
+        clock: Clock,
+        tracks: Sequence[Track],
+        rows: Rows = every_row,
+        known_ns: int | None = None,
+    ) -> None:
+        """Write samples.
 
         Args:
-            tracks: The samples, with those just before and after it.
-            span: What of them is drawn.
+            tracks: The samples, with those just before and after them.
+            rows: What of them is drawn.
+            known_ns: Until when samples are at hand [ns]; None where nothing comes after them.
         """
         by_name = {track.name: track for track in tracks}
         for one in self.series:
@@ -225,14 +251,15 @@ class Plot:
             table = join_tracks(own)
             values = np.full((table.t_ns.size, len(one.names)), np.nan)
             values[:, [one.names.index(name) for name in table.names]] = table.values
-            t_ns, values = mark_gaps(table.t_ns, values, span.known_ns)
-            rows = span.rows(t_ns)
+            t_ns, values = mark_gaps(table.t_ns, values, known_ns)
+            drawn = rows(one.entity, t_ns)
+            steps: FloatArray = np.array([self._steps.get(name, 0.0) for name in one.names])
             log_rows(
                 rec,
                 clock,
                 one.entity,
-                t_ns[rows],
-                values[rows],
+                t_ns[drawn],
+                values[drawn],
                 degrees=self._degrees,
                 component=one.component,
                 steps=np.array([self._steps.get(name, 0.0) for name in one.names]),
@@ -246,38 +273,40 @@ class Plots:
         self,
         rec: rr.RecordingStream,
         clock: Clock,
-        found: Survey,
+        parts: Mapping[str, Sequence[tuple[str, ...]]],
         places: Places | None,
         palette: Mapping[str, Color],
+        *,
+        samples: Mapping[str, Sequence[Track]] = MappingProxyType({}),
     ) -> None:
         """Write the style of the lines.
 
         Args:
+            parts: Entity to the names of its lines, as :class:`Plot` takes them.
             places: Joints that stand for the body, or None.
             palette: Colour by joint name.
+            samples: Entity to some samples of each line, by which it is rounded.
         """
-        self._rec, self._clock = rec, clock
+        self._rec, self._clock, self._palette, self._chosen = rec, clock, palette, places
         self._plots = {
             entity: Plot(
                 entity,
-                samples,
-                found.parts[entity],
+                own,
+                samples.get(entity, ()),
                 degrees=entity in _ANGLES,
                 component=DEGREES if entity in _ANGLES else SCALARS,
             )
-            for entity, samples in found.samples.items()
+            for entity, own in parts.items()
         }
-        self._places: dict[str, tuple[Plot, Places]] = {}
+        self._places: dict[str, Plot] = {}
         for entity, plot in self._plots.items():
             if entity.startswith(f"{TOTAL}/"):
                 log_total_look(rec, entity.removeprefix(f"{TOTAL}/"))
                 continue
-            colors = None if entity == COMMANDED else _colors(entity, plot, palette)
-            for one in plot.series:
-                log_look(rec, one.entity, one.names, colors)
+            plot.style(rec, None if entity == COMMANDED else _colors(entity, plot, palette))
         if places is not None:
             for source, kind in ((COMMANDED, "commanded"), (MEASURED, "measured")):
-                self._add_places(found, places, source, kind, palette)
+                self._add_places(parts.get(source, ()), places, samples, source, kind)
 
     def series(self, entity: str) -> tuple[Series, ...]:
         """Return the series that are written of a quantity.
@@ -290,41 +319,67 @@ class Plots:
         """
         return self._plots[entity].series if entity in self._plots else ()
 
-    @property
-    def signals(self) -> dict[str, tuple[Series, ...]]:
-        """Series of the topics without views of their own, by entity."""
-        own = f"{SIGNALS}/"
-        return {name: one.series for name, one in self._plots.items() if name.startswith(own)}
+    def content(self, robot: Robot | None, units: Mapping[str, str]) -> Content:
+        """Return what the plots hold of a recording.
 
-    def write(self, stretch: Stretch) -> None:
-        """Write a stretch."""
-        tracks = quantities(stretch.columns)
+        Args:
+            units: Topic to the unit of its positions, of all JointState topics.
+        """
+        return Content(
+            robot=robot,
+            places=self._chosen,
+            commanded=self.series(COMMANDED),
+            measured=self.series(MEASURED),
+            errors=self.series(ERROR),
+            has_power=any(entity.startswith(TOTAL) for entity in self._plots),
+            joint_power=self.series(MECHANICAL),
+            signals=self._signals(units),
+        )
+
+    def write(
+        self, tracks: Mapping[str, Sequence[Track]], rows: Rows, known_ns: int | None = None
+    ) -> None:
+        """Write samples.
+
+        Args:
+            tracks: Entity to its lines, as :func:`~.replay.samples.quantities.quantities` has them.
+            rows: What of them is drawn.
+            known_ns: As :meth:`Plot.write` takes it.
+        """
         for entity, plot in self._plots.items():
             if entity in tracks:
-                plot.write(self._rec, self._clock, tracks[entity], stretch.span)
-        for source, (plot, places) in self._places.items():
-            chosen = [track for track in tracks.get(source, ()) if track.name in places.names]
-            plot.write(self._rec, self._clock, chosen, stretch.span)
+                plot.write(self._rec, self._clock, tracks[entity], rows, known_ns)
+        for source, plot in self._places.items():
+            names = {name for one in plot.series for name in one.names}
+            chosen = [track for track in tracks.get(source, ()) if track.name in names]
+            plot.write(self._rec, self._clock, chosen, rows, known_ns)
+
+    def _signals(self, units: Mapping[str, str]) -> tuple[Signal, ...]:
+        """Every other JointState topic as it is: currents, voltages, temperatures, foreign ones."""
+        found: list[Signal] = []
+        topics = {topic_entity(SIGNALS, topic): topic for topic in units}
+        for entity, plot in self._plots.items():
+            if entity.startswith(f"{SIGNALS}/"):
+                topic = topics[entity]
+                of_joints = any(name in self._palette for one in plot.series for name in one.names)
+                found.append(Signal(signal_title(topic, units[topic]), plot.series, of_joints))
+        return tuple(found)
 
     def _add_places(
         self,
-        found: Survey,
+        parts: Sequence[tuple[str, ...]],
         places: Places,
+        samples: Mapping[str, Sequence[Track]],
         source: str,
         kind: str,
-        palette: Mapping[str, Color],
     ) -> None:
         """Add a plot of head, middle and tail alone, which can be read at a glance."""
-        samples = [one for one in found.samples.get(source, ()) if one.name in places.names]
-        if not samples:
-            return
-        parts = [tuple(n for n in part if n in places.names) for part in found.parts[source]]
-        parts = [part for part in parts if part]
-        plot = Plot(f"{PLACES}/{kind}", samples, parts, degrees=True)
-        self._places[source] = (plot, places)
-        for one in plot.series:
-            colors = palette if kind == "measured" else None
-            log_look(self._rec, one.entity, one.names, colors, **places_look(places, kind))
+        chosen = [tuple(name for name in part if name in places.names) for part in parts]
+        own = [one for one in samples.get(source, ()) if one.name in places.names]
+        plot = Plot(f"{PLACES}/{kind}", [part for part in chosen if part], own, degrees=True)
+        self._places[source] = plot
+        colors = self._palette if kind == "measured" else None
+        plot.style(self._rec, colors, **places_look(places, kind))
 
 
 def _colors(entity: str, plot: Plot, palette: Mapping[str, Color]) -> Mapping[str, Color]:

@@ -15,6 +15,7 @@ neither is on it, so power is not mistaken for place.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
@@ -32,6 +33,26 @@ from ...samples.timeline import Clock
 from .motion import Motion
 
 MESHES = "/world/snake/meshes"
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a session's body is drawn, in the scene and in its mean cycle.
+
+    Attributes:
+        robot: The robot, or None.
+        places: Joints that stand for the body, or None.
+        palette: Colour by joint name.
+        limit_w: Power at which a segment's colour is full [W]; None where none is known.
+        named: Joints of modules that a test names, which carry a mark in the scene.
+    """
+
+    robot: Robot | None
+    places: Places | None
+    palette: Mapping[str, Color]
+    limit_w: float | None
+    named: Sequence[str] = ()
+
 
 _NOWHERE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 

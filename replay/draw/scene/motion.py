@@ -115,22 +115,25 @@ class HeadPath:
         return HeadPath(self.t_ns[rows], self.position[rows], self.quaternion[rows], self.tracked)
 
 
-def frames_of(head: HeadPath, end_ns: int) -> tuple[HeadPath, BoolArray]:
+def frames_of(
+    head: HeadPath, end_ns: int | None, origin_ns: int | None = None
+) -> tuple[HeadPath, BoolArray]:
     """Choose when the body is drawn.
 
     Args:
-        head: The head's path.
-        end_ns: The session's end [ns].
+        head: The head's path, or a part of it.
+        end_ns: The session's end [ns]; None where it isn't known.
+        origin_ns: First time of the whole path [ns]; None for that of this part.
 
     Returns:
         The path at most 50 times a second, on its own sampling times, with a row of NaN in each
         gap; and which of these rows, no more than 25 a second, are drawn of what moves beside the
         body, shape (n,).
     """
-    chosen = head.at(decimate(head.t_ns, BODY_RATE_HZ))
+    chosen = head.at(decimate(head.t_ns, BODY_RATE_HZ, origin_ns))
     t_ns, pose = mark_gaps(chosen.t_ns, chosen.pose, end_ns)
     sparse = np.zeros(t_ns.size, dtype=np.bool_)
-    sparse[decimate(t_ns, SPARSE_RATE_HZ)] = True
+    sparse[decimate(t_ns, SPARSE_RATE_HZ, origin_ns)] = True
     # A gap ends whatever is drawn.
     sparse |= np.isnan(pose).any(axis=1)
     return HeadPath.of(t_ns, pose, tracked=head.tracked), sparse

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,11 +18,10 @@ from undulog.capture.robot.model import Robot, Sensor, SensorKind
 from undulog.sim.scenario.obstacles import Box, Cylinder, Obstacle, Target, Wall
 from undulog.sim.scenario.world import World, read_world
 
-from ...samples.content import Color, Places
 from ...samples.timeline import Clock, Span, Stretch
 from ...samples.tracks import decimate, gaps, hold, ordered
 from . import body
-from .body import ROUNDING, rounded_to
+from .body import ROUNDING, Look, rounded_to
 from .motion import HeadPath, Motion, assemble, frames_of
 
 RANGES = "/world/snake/ranges"
@@ -155,21 +154,28 @@ def trail_segments(t_ns: IntArray, position: FloatArray) -> tuple[IntArray, NDAr
     return t_ns[1:][whole], pieces[whole]
 
 
-def log_trail(rec: rr.RecordingStream, clock: Clock, head: HeadPath, span: Span = _WHOLE) -> None:
+def log_trail(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    head: HeadPath,
+    rows: Callable[[IntArray], slice] = _WHOLE.rows,
+    origin_ns: int | None = None,
+) -> None:
     """Draw the head's path; the view shows its last 20 s.
 
     Args:
-        head: The head's path.
-        span: The part that is drawn.
+        head: The head's path, or a part of it.
+        rows: Of the times of its points, those that are drawn.
+        origin_ns: First time of the whole path [ns]; None for that of this part.
     """
-    chosen = decimate(head.t_ns, TRAIL_RATE_HZ)
+    chosen = decimate(head.t_ns, TRAIL_RATE_HZ, origin_ns)
     t_ns, pieces = trail_segments(head.t_ns[chosen], head.position[chosen])
-    part = span.rows(t_ns)
+    part = rows(t_ns)
     t_ns, pieces = t_ns[part], pieces[part]
     look = rr.LineStrips3D.from_fields(colors=_COLOR, radii=rr.Radius.ui_points(1.0))
     rec.log(TRAIL, look, static=True)
-    for rows, times in clock.rows(t_ns):
-        rec.send_columns(TRAIL, times, rr.LineStrips3D.columns(strips=pieces[rows]))
+    for part, times in clock.rows(t_ns):
+        rec.send_columns(TRAIL, times, rr.LineStrips3D.columns(strips=pieces[part]))
 
 
 CYLINDERS = "/world/obstacles/cylinders"
@@ -248,6 +254,28 @@ def _rim(target: Target) -> rr.LineStrips3D:
     return rr.LineStrips3D([rim], colors=[_GOAL], radii=[0.01], labels=["target"])
 
 
+def log_motion(
+    rec: rr.RecordingStream,
+    clock: Clock,
+    motion: Motion,
+    sparse: IntArray,
+    *,
+    look: Look,
+    ranges: tuple[tuple[Sensor, ...], FloatArray | NDArray[np.float32]],
+) -> None:
+    """Draw the body, and what moves with it.
+
+    Args:
+        sparse: Which of its drawing times are drawn of what moves beside the body, shape (n,).
+        ranges: Distance sensors, k of them, and their readings at those times [m], shape (n, k).
+    """
+    body.log_body(rec, clock, motion, limit_w=look.limit_w)
+    body.log_ghost(rec, clock, motion, sparse)
+    log_rays(rec, clock, motion, sparse, sensors=ranges[0], reading=ranges[1])
+    body.log_marks(rec, clock, motion, look.named, sparse)
+    body.log_markers(rec, clock, motion, look.places, look.palette, named=sparse)
+
+
 class Scene:
     """The 3D scene of a session with a robot whose joints were measured."""
 
@@ -259,9 +287,7 @@ class Scene:
         robot: Robot,
         head: HeadPath,
         *,
-        places: Places | None,
-        palette: Mapping[str, Color],
-        limit_w: float | None,
+        look: Look,
         warnings: list[str],
         span: Span,
     ) -> None:
@@ -269,16 +295,10 @@ class Scene:
 
         Args:
             head: Where its head was.
-            places: Joints that stand for the body, or None.
-            palette: Colour by joint name.
-            limit_w: Power at which a segment's colour is full [W]; None where none is known.
             warnings: Grows by a sentence where the surroundings can't be drawn.
             span: The part of the trail that is drawn.
         """
-        self._rec, self._clock, self._robot = rec, clock, robot
-        self._places, self._palette, self._limit_w = places, palette, limit_w
-        self.named: list[str] = []
-        """Joints of modules that a test names, which carry a mark."""
+        self._rec, self._clock, self._robot, self._look = rec, clock, robot, look
         self._head, sparse = frames_of(head, session.end_ns)
         self._sparse = np.flatnonzero(sparse)
         self._sensors = range_sensors(robot, session.channels)
@@ -287,7 +307,7 @@ class Scene:
         if (world := world_of(session, warnings)) is not None:
             log_surroundings(rec, world)
         if head.tracked:
-            log_trail(rec, clock, head, span)
+            log_trail(rec, clock, head, span.rows)
 
     def write(self, stretch: Stretch) -> None:
         """Draw a stretch."""
@@ -297,9 +317,5 @@ class Scene:
         motion = assemble(self._robot, self._head.at(rows), stretch.columns)
         own = slice(*np.searchsorted(self._sparse, [rows.start, rows.stop]).tolist())
         sparse = self._sparse[own] - rows.start
-        rec, clock = self._rec, self._clock
-        body.log_body(rec, clock, motion, limit_w=self._limit_w)
-        body.log_ghost(rec, clock, motion, sparse)
-        log_rays(rec, clock, motion, sparse, sensors=self._sensors, reading=self._distance[own])
-        body.log_marks(rec, clock, motion, self.named, sparse)
-        body.log_markers(rec, clock, motion, self._places, self._palette, named=sparse)
+        ranges = self._sensors, self._distance[own]
+        log_motion(self._rec, self._clock, motion, sparse, look=self._look, ranges=ranges)
