@@ -55,9 +55,9 @@ def cut_at_random(stream, seed):
 
 def frames_of(messages):
     """Return messages of python-can as frames, with the robot's times in whole microseconds."""
-    frames = empty_frames(len(messages))
+    frames = fr.empty_frames(len(messages))
     for frame, message in zip(frames, messages, strict=True):
-        kind = message.is_extended_id * EXTENDED_FLAG | message.is_error_frame * ERROR_FLAG
+        kind = message.is_extended_id * fr.EXTENDED_FLAG | message.is_error_frame * fr.ERROR_FLAG
         frame["id_flags"], frame["dlc"] = message.arbitration_id | kind, message.dlc
         frame["data"][: message.dlc] = list(message.data)
         frame["t_device_ns"] = round(message.timestamp * 1e6) * 1000

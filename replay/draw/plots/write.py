@@ -17,7 +17,7 @@ import numpy as np
 import rerun as rr
 
 from undulog.capture import SessionView
-from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.arrays import IntArray
 from undulog.capture.common.errors import DataError
 from undulog.capture.log.columns.topics import Channel
 from undulog.capture.robot.model import Robot
@@ -253,7 +253,6 @@ class Plot:
             values[:, [one.names.index(name) for name in table.names]] = table.values
             t_ns, values = mark_gaps(table.t_ns, values, known_ns)
             drawn = rows(one.entity, t_ns)
-            steps: FloatArray = np.array([self._steps.get(name, 0.0) for name in one.names])
             log_rows(
                 rec,
                 clock,
