@@ -60,6 +60,7 @@ chain = {
     "feedback_bias": numbers(6),
     "kick_every_s": within(0.0, 10.0),
     "kick_size": within(0.0, 7.0),
+    "kick_seed": st.integers(0, 2**31),
 }
 ramp = within(0.0, 10.0)
 gaits = st.one_of(
