@@ -15,9 +15,11 @@ from support import twin_chains
 from support.closed_loop import Sines
 from undulog.analysis.experiment.kicks.coupling import kick_coupling
 from undulog.analysis.experiment.kicks.runs import KickExperiment, sort_kicks
+from undulog.analysis.experiment.pooling import pool_runs
 from undulog.analysis.plan.compensate import compensation
 from undulog.analysis.plan.gait_base import BaseGait
 from undulog.analysis.response.response import Response
+from undulog.analysis.session.heterogeneity import response_indices
 from undulog.analysis.session.runs import GaitRun
 from undulog.sim import load_scenario
 from undulog.sim.scenario.scenario import Kernels
@@ -81,20 +83,31 @@ class Driven:
 
     def run(self):
         """Return what the analysis would keep of its session."""
-        m, wave = len(self.command), self.wave
-        names = tuple(f"joint{2 * k + 1:02d}" for k in range(m))
-        hz = wave.frequency_hz
-        return GaitRun(
-            "driven.mcap",
-            "chain",
-            0,
-            names,
-            ("horizontal",),
-            hz,
-            self.command,
-            "head-to-tail",
-            self.response,
-        )
+        return gait_run(names(len(self.command)), self.wave, self.command, self.response)
+
+
+def names(m):
+    """Of the yaw joints, with a pitch joint between each two."""
+    return tuple(f"joint{2 * k + 1:02d}" for k in range(m))
+
+
+def gait_run(joints, wave, command, response):
+    """Return a run as the analysis keeps it."""
+    facts = ("driven.mcap", "chain", 0, joints, ("horizontal",), wave.frequency_hz)
+    return GaitRun(*facts, command, "head-to-tail", response)
+
+
+def indices(runs, wave):
+    """Return CV of gain and spread of lag against the wanted wave, of several runs together."""
+    pooled = pool_runs(names(wave.m), [run.against(wave) for run in runs])
+    found = response_indices(pooled.response)
+    return found["gain_cv"], found["lag_sd"]
+
+
+def ratio(after, before):
+    """Return after over before, and the ends of its interval from those of both (conservative)."""
+    low, high = (a / b for a, b in zip(after.ci95, before.ci95[::-1], strict=True))
+    return after.value / before.value, low, high
 
 
 class Stage:
@@ -149,8 +162,8 @@ class Stage:
         """Return the gait as a plan has it."""
         n = 2 * self.m - 1
         driven = tuple(range(0, n, 2))
-        names = self.robot.joint_names
-        return BaseGait(names, driven, wave.phasors, np.zeros(n), wave.omega)
+        joints = self.robot.joint_names
+        return BaseGait(joints, driven, wave.phasors, np.zeros(n), wave.omega)
 
     def kicks(self, wave, seed):
         """Kick each phase and amplitude, and return the local matrices."""
@@ -165,7 +178,7 @@ class Stage:
         experiment = KickExperiment(
             index=tuple(range(len(runs))),
             runs=sort_kicks(commands),
-            names=runs[0].run().names,
+            names=names(m),
             command=wave.phasors,
             ratio=np.stack([one.response.ratio for one in runs]),
             log_gain_variance=np.stack([one.response.log_gain_variance for one in runs]),
