@@ -67,7 +67,7 @@ def test_newtons_step_is_that_of_the_planted_matrix():
     assert kicked_spread == pytest.approx(spreads(response), rel=1e-2)
 
 
-def test_newtons_steps_converge_quadratically_where_the_matrix_is_that_of_the_start():
+def test_steps_from_what_was_measured_converge():
     found, after = [spreads(H @ WANTED / WANTED)], ()
     for _ in range(3):
         plan, commands = compensation(EXACT, BASE, None, after)
