@@ -92,11 +92,12 @@ def _runs(files: Sequence[Path], start: float | None) -> tuple[GaitRun, ...]:
 def _notes(found: Compensation, kicked_hz: float, base: BaseGait) -> tuple[str, ...]:
     """Say what the commands do, and where they can't."""
     before, now = found.kicked, found.now
-    left = found.prediction_error
+    left, again = found.prediction_error, found.now != found.kicked
     gain = (before.gain_cv.value, now.gain_cv.value, found.predicted_gain_cv)
     lag = (before.lag_sd.value, now.lag_sd.value, found.predicted_lag_sd)
     notes = [
-        f"{what}: {first} without compensation, {last} measured last, {then} predicted"
+        f"{what}: {first} without compensation, {f'{last} by the last, ' if again else ''}{then} "
+        "predicted"
         for what, (first, last, then) in (
             ("Gain CV", map(_percent, gain)),
             ("Lag spread", map(_degrees, lag)),

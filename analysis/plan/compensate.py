@@ -108,8 +108,8 @@ class Compensation:
         predicted_gain_cv: Of the commands written here, by M.
         predicted_lag_sd: The same [rad].
         prediction_error: Root mean square of what the errors of M leave open, a joint.
-        identified: Directions that the kicks identify, of ``directions`` = 2 m - 1: all phases together
-            are a shift of time.
+        identified: Directions that the kicks identify, of ``directions`` = 2 m - 1: all phases
+            together are a shift of time.
         largest_step: Largest step of a phase [rad] or log amplitude.
         step_limit: Largest that is allowed; where it is reached, the command is to be given again.
         nonlinearity: Of the kicks; what a step is off by, in shares of it.
@@ -261,10 +261,10 @@ def _driven(base: BaseGait, names: Sequence[str], after: Sequence[GaitRun]) -> S
     if pooled.names != tuple(names):
         lost = [name for name in names if name not in pooled.names]
         raise UsageError(f"--after {first.label}: no gain and lag of {', '.join(lost)}")
-    x = np.log(first.command / base.amplitude)
-    turned = np.exp(1j * (x.imag - np.angle(np.exp(1j * x.imag).sum())))  # an earlier start
-    phase = np.angle(turned)
-    x = (x.real + 1j * (phase - phase.mean())).astype(np.complex128)
+    change: ComplexArray = first.command / base.amplitude
+    change = change * np.exp(-1j * np.angle(np.sum(change / np.abs(change))))  # an earlier start
+    phase = np.angle(change)
+    x = (np.log(np.abs(change)) + 1j * (phase - phase.mean())).astype(np.complex128)
     one = pooled.response
     ratio = (one.ratio * np.exp(x)).astype(np.complex128)
     return Start(x, Response(ratio, one.log_gain_variance, one.lag_variance, one.dof))
