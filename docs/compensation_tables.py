@@ -21,12 +21,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from support.compensating import Stage, Wave, indices, ratio
 
-RUNS, ROUNDS = 4, 2
+RUNS, ROUNDS = 3, 2
 NEIGHBOURS = (("amplitude", 1.1), ("amplitude", 0.9), ("frequency_hz", 1.1), ("frequency_hz", 0.9))
 FURTHER = (("amplitude", 0.75), ("frequency_hz", 1.5), ("frequency_hz", 0.6))
 LAGS_DEG = (5, -5, 15, -15)
-T_95 = 3.182
-"""Student's factor of four runs."""
+T_95 = 4.303
+"""Student's factor of three runs."""
 
 
 def gaits(wave):

@@ -28,6 +28,7 @@ def compensate(
     after: list[Path] | None = None,
     start: float | None = None,
     gain: float | None = None,
+    keep: float = 0.15,
     runs: int = 1,
     settle: float = 10.0,
     measure: float = 10.0,
@@ -49,6 +50,8 @@ def compensate(
         after: A recording of the last compensation; of several runs the mean is taken.
         start: Start of what is analysed of each of them, from its start [s]; chosen if not given.
         gain: Gain that all joints are to have; the kicks' mean if not given.
+        keep: Price of a change of the commands against the spread of the responses; 0 makes them
+            alike at any expense of energy.
         runs: How often the commands are run.
         settle: Time before what is measured [s].
         measure: Length of what is measured [s].
@@ -64,7 +67,9 @@ def compensate(
         from ..plan.compensate import compensation
         from ..plan.designs import PlannedRun
 
-        found, amplitude = compensation(coupling, base, session.robot, driven, target_gain=gain)
+        found, amplitude = compensation(
+            coupling, base, session.robot, driven, target_gain=gain, keep=keep
+        )
         run = PlannedRun("compensated", amplitude, {"kind": "compensated"})
         notes = _notes(found, coupling.base.frequency_hz if coupling.base else math.nan, base)
         return Planned((run,) * runs, settle, measure, notes=notes, result=asdict(found))

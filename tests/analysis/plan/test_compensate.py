@@ -51,7 +51,7 @@ def spreads(ratio):
 
 
 def test_newtons_step_is_that_of_the_planted_matrix():
-    plan, commands = compensation(EXACT, BASE, None)
+    plan, commands = compensation(EXACT, BASE, None, keep=0.0)
     L = H * WANTED / (H @ WANTED)[:, None]  # d ln a = L d ln c of a linear chain
     matrix = np.block([[L.real, L.imag], [-L.imag, L.real]])  # of (d psi, d ln|.|)
     response = H @ WANTED / WANTED
@@ -70,7 +70,7 @@ def test_newtons_step_is_that_of_the_planted_matrix():
 def test_steps_from_what_was_measured_converge():
     found, after = [spreads(H @ WANTED / WANTED)], ()
     for _ in range(3):
-        plan, commands = compensation(EXACT, BASE, None, after)
+        plan, commands = compensation(EXACT, BASE, None, after, keep=0.0)
         run, spread = answered(commands)
         turned = replace(run, command=run.command * np.exp(2j))  # a run starts at any time
         after = (turned, turned)
@@ -91,20 +91,20 @@ def test_a_joint_at_its_limit_is_named_and_the_others_make_up_for_it():
     names = robot.joint_names
     base = BaseGait(names, tuple(yaw), WANTED, np.zeros(25), WAVE.omega)
     local = replace(EXACT, joints=tuple(names[k] for k in yaw))
-    free, _ = compensation(local, base, None)
+    free, _ = compensation(local, base, None, keep=0.0)
     needs = np.array([one.amplitude_rad for one in free.joints])
     worst = int(np.argmax(needs))
     limit = float((needs[worst] + np.sort(needs)[-2]) / 2)
     joints = list(robot.joints)
     joints[yaw[worst]] = replace(joints[yaw[worst]], upper=limit / (1 - RESERVE))
-    plan, commands = compensation(local, base, replace(robot, joints=tuple(joints)))
+    plan, commands = compensation(local, base, replace(robot, joints=tuple(joints)), keep=0.0)
     one = plan.joints[worst]
     assert abs(commands[worst]) == pytest.approx(limit, rel=1e-6)
     assert (one.limited_by, one.margin) == ("position", pytest.approx(RESERVE))
     assert one.lacking == pytest.approx(math.log(needs[worst] / limit), abs=1e-3)
     assert [other.name for other in plan.joints if other.lacking > 0] == [one.name]
     # Better than cutting the command of that joint alone.
-    _, cut = compensation(local, base, None)
+    _, cut = compensation(local, base, None, keep=0.0)
     cut[worst] *= limit / abs(cut[worst])
     here, there = (np.linalg.norm(spreads(H @ c / WANTED)) for c in (commands, cut))
     assert here < there
@@ -125,12 +125,24 @@ def test_what_errors_hide_is_not_moved():
             )
             for key in "PRGS"
         }
-        plan, commands = compensation(replace(EXACT, **wide), BASE, None)
+        plan, commands = compensation(replace(EXACT, **wide), BASE, None, keep=0.0)
         sizes.append(np.linalg.norm(np.log(commands / WANTED)))
         identified.append(plan.identified)
     assert sizes[0] > sizes[1] > 10 * sizes[2]
     assert identified[0] > 12.9
     assert identified[2] < 0.5
+
+
+def test_the_price_of_a_change_holds_over_the_steps():
+    """A linear chain ends where spread and change of the commands balance, from any step."""
+    after, sizes = (), []
+    for _ in range(4):
+        _, commands = compensation(EXACT, BASE, None, after, keep=0.5)
+        after = (answered(commands)[0],)
+        sizes.append(np.linalg.norm(np.log(commands / WANTED)))
+    _, free = compensation(EXACT, BASE, None, keep=0.0)
+    assert sizes[3] == pytest.approx(sizes[2], rel=0.02)
+    assert sizes[3] < 0.9 * np.linalg.norm(np.log(free / WANTED))
 
 
 def test_what_does_not_fit_is_refused():
