@@ -20,6 +20,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from support.compensating import Stage, Wave, indices, ratio
+from undulog.analysis.plan.compensate import KEEP
 
 RUNS, ROUNDS = 3, 2
 NEIGHBOURS = (("amplitude", 1.1), ("amplitude", 0.9), ("frequency_hz", 1.1), ("frequency_hz", 0.9))
@@ -37,11 +38,11 @@ def gaits(wave):
         yield f"lag {degrees:+d} degrees", replace(wave, lag=wave.lag + math.radians(degrees))
 
 
-def print_chain(m, stall, runs, rounds):
+def print_chain(m, stall, runs, rounds, keep=KEEP):
     """Print the figures of one chain."""
     stage, wave = Stage(m, stall), Wave(m)
     coupling = stage.kicks(wave, 1)
-    planned = stage.compensate(coupling, wave, 2, rounds)
+    planned = stage.compensate(coupling, wave, 2, rounds, keep)
     print(f"{m} yaw joints, {stall} N m, held-out patterns to {coupling.valid_to} rad")
     before = [stage.drive(wave, wave.phasors, [3, k]) for k in range(runs)]
     print(f"  before: {figures(before, wave)}")
@@ -98,11 +99,12 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("chains", nargs="*", help="yaw joints, or joints:stall torque [N m]")
     parser.add_argument("--quick", action="store_true", help="a chain of 3 yaw joints")
+    parser.add_argument("--keep", type=float, default=KEEP, help="price of a change")
     options = parser.parse_args()
     runs, rounds = (2, 1) if options.quick else (RUNS, ROUNDS)
     for word in options.chains or ("3" if options.quick else "5",):
         m, _, stall = word.partition(":")
-        print_chain(int(m), float(stall or 0.25), runs, rounds)
+        print_chain(int(m), float(stall or 0.25), runs, rounds, options.keep)
 
 
 if __name__ == "__main__":

@@ -15,8 +15,8 @@ y* = (0, ln g*), commands x that gave y are followed by x + dx with the least
 
 D regularises by the errors of M: nothing is moved that the kicks do not show to help.
 ``identified`` is the trace of its resolution matrix. k is the price of a change. In contact there
-are patterns of commands that the body hardly follows (13 yaw joints: singular values of 0.055,
-the next of 0.39); with k = 0 they are driven by whatever is left, far beyond the range of M, at
+are patterns of commands that the body hardly follows (13 yaw joints: singular values 0.04 and
+0.06, the next 0.37); with k = 0 they are driven by whatever is left, far beyond the range of M, at
 great expense of energy. With k a pattern of singular value s keeps 1/(1 + s^2/k^2) of its spread
 and is commanded at most 1/(2 k) times that.
 
@@ -182,20 +182,22 @@ def compensation(
     if not gain > 0 or not keep >= 0:
         raise UsageError(f"--gain {gain:g} has to be above 0, --keep {keep:g} at least 0")
     limits = _limits(base, robot)
-    allowed = np.log((1 - RESERVE) * limits.min(axis=0) / np.abs(base.amplitude)) - start.x.real
-    if allowed.min() < 0:
-        worst = int(np.argmin(allowed))
+    over = np.abs(base.amplitude) > limits.min(axis=0)
+    if over.any():
+        worst = int(np.argmax(over))
         raise UsageError(
             f"{names[worst]} is commanded more than its servo's limit of "
             f"{limits[:, worst].min():.3g} rad already; name a gait of less amplitude"
         )
-    y = np.concatenate([-start.response.lag_near_mean_rad, np.log(start.response.gain / gain)])
     most = max(coupling.valid_to or 0.0, LEAST_STEP)
+    allowed = np.log((1 - RESERVE) * limits.min(axis=0) / np.abs(base.amplitude)) - start.x.real
+    allowed = np.maximum(allowed, -most / 2)  # of a joint at its limit it is about 0
+    y = np.concatenate([-start.response.lag_near_mean_rad, np.log(start.response.gain / gain)])
     here = np.concatenate([start.x.imag, start.x.real])
     A = np.vstack([_centred(M), np.diag(np.sqrt(variance)), keep * np.eye(2 * m)])
     b = -np.concatenate([_centred(y), np.zeros(2 * m), keep * here])
     free = _bounded(A, b, np.full(m, most), most)
-    step = _bounded(A, b, np.minimum(allowed, most), most)
+    step = _bounded(A, b, allowed, most)
     x = start.x + step[m:] + 1j * (step[:m] - step[:m].mean())
     commands = (base.amplitude * np.exp(x)).astype(np.complex128)
     left = y + M @ step
@@ -227,7 +229,7 @@ def _centred(values: FloatArray) -> FloatArray:
 
 def _bounded(A: FloatArray, b: FloatArray, allowed: FloatArray, most: float) -> FloatArray:
     """Return the step dx of least squares within its bounds, shape (2 m,)."""
-    upper = np.concatenate([np.full(len(allowed), most), np.maximum(allowed, 1e-9)])
+    upper = np.concatenate([np.full(len(allowed), most), np.minimum(allowed, most)])
     found = lsq_linear(A, b, bounds=(np.full(len(upper), -most), upper), method="bvls")
     return np.asarray(found.x, dtype=np.float64)
 

@@ -16,7 +16,7 @@ from support.closed_loop import Sines
 from undulog.analysis.experiment.kicks.coupling import kick_coupling
 from undulog.analysis.experiment.kicks.runs import KickExperiment, sort_kicks
 from undulog.analysis.experiment.pooling import pool_runs
-from undulog.analysis.plan.compensate import compensation
+from undulog.analysis.plan.compensate import KEEP, compensation
 from undulog.analysis.plan.gait_base import BaseGait
 from undulog.analysis.response.response import Response
 from undulog.analysis.session.heterogeneity import response_indices
@@ -189,11 +189,12 @@ class Stage:
         )
         return kick_coupling(experiment, lambda _: None)
 
-    def compensate(self, coupling, wave, seed, rounds=3):
+    def compensate(self, coupling, wave, seed, rounds=2, keep=KEEP):
         """Return the commands of each round and what was planned for it."""
         found, after = [], ()
         for k in range(rounds):
-            plan, commands = compensation(coupling, self.base(wave), self.robot, after)
+            base = self.base(wave)
+            plan, commands = compensation(coupling, base, self.robot, after, keep=keep)
             found.append((plan, commands))
             after = (self.drive(wave, commands, [seed, k]).run(),)
         return found

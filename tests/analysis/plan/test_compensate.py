@@ -46,6 +46,10 @@ def answered(command):
     return run, spreads(answer / WANTED)
 
 
+def driven(command, local):
+    return replace(answered(command)[0], names=local.joints)
+
+
 def spreads(ratio):
     return np.abs(ratio).std() / np.abs(ratio).mean(), np.angle(ratio / ratio.mean()).std()
 
@@ -103,6 +107,11 @@ def test_a_joint_at_its_limit_is_named_and_the_others_make_up_for_it():
     assert (one.limited_by, one.margin) == ("position", pytest.approx(RESERVE))
     assert one.lacking == pytest.approx(math.log(needs[worst] / limit), abs=1e-3)
     assert [other.name for other in plan.joints if other.lacking > 0] == [one.name]
+    again, held = compensation(
+        local, base, replace(robot, joints=tuple(joints)), (driven(commands, local),), keep=0.0
+    )
+    assert abs(held[worst]) == pytest.approx(limit, rel=1e-6)
+    assert again.joints[worst].lacking > 0
     # Better than cutting the command of that joint alone.
     _, cut = compensation(local, base, None, keep=0.0)
     cut[worst] *= limit / abs(cut[worst])
