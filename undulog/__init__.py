@@ -50,6 +50,10 @@ VERBS: dict[str, tuple[str, str]] = {
         "From kicks: how oscillators that feel their servos synchronise.",
     ),
     "compare": ("analysis compare:compare", "What differs between two sessions or groups."),
+    "plan compensate": (
+        "analysis compensate:compensate",
+        "Commands that make the response homogeneous, from kicks.",
+    ),
     "plan lag-sweep": (
         "analysis plan:lag_sweep",
         "Commands that identify the coupling without contact.",

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from cyclopts import Parameter
@@ -56,17 +56,17 @@ def phase_kicks(
     """
     if base_runs < 1 or not LEAST <= kick <= MOST:
         raise UsageError(f"--base-runs is at least 1, --kick {LEAST:g} to {MOST:g}")
-    _check_numbers(runs, settle, measure)
+    check_numbers(runs, settle, measure)
 
-    def design(base: BaseGait, session: SessionView) -> _Planned:
+    def design(base: BaseGait, session: SessionView) -> Planned:
         from ..plan.designs import phase_kicks as kicks
 
         _check_joints(base, session, "kicks need")
         names = tuple(base.names[k] for k in base.driven)
         planned = kicks(names, base.amplitude, runs, kick=kick, base_runs=base_runs)
-        return _Planned(planned, settle, measure)
+        return Planned(planned, settle, measure)
 
-    _plan("phase-kicks", like, output, design, as_json=json)
+    write_sessions("phase-kicks", like, output, design, as_json=json)
 
 
 def reversal(
@@ -94,32 +94,34 @@ def reversal(
         measure: Length of what is measured [s].
         json: Print one JSON object.
     """
-    _check_numbers(runs, settle, measure)
+    check_numbers(runs, settle, measure)
 
-    def design(base: BaseGait, _: SessionView) -> _Planned:
+    def design(base: BaseGait, _: SessionView) -> Planned:
         from ..plan.designs import reversal as both_ways
 
         note = (
             "Before each file whose name ends in -180, put the robot down turned by 180 degrees; "
             "before the others, as in the first"
         )
-        return _Planned(both_ways(base.amplitude, runs), settle, measure, notes=(note,))
+        return Planned(both_ways(base.amplitude, runs), settle, measure, notes=(note,))
 
-    _plan("reversal", like, output, design, as_json=json)
+    write_sessions("reversal", like, output, design, as_json=json)
 
 
 @dataclass(frozen=True)
-class _Planned:
-    """Runs with their times, facts for their metadata, and notes for the user."""
+class Planned:
+    """Runs with their times, facts for their metadata, notes for the user, more for the JSON."""
 
     runs: tuple[PlannedRun, ...]
     settle_s: float
     measure_s: float
     facts: dict[str, str] = field(default_factory=dict[str, str])
     notes: tuple[str, ...] = ()
+    result: dict[str, Any] = field(default_factory=dict[str, Any])
 
 
-def _check_numbers(runs: int, settle_s: float, measure_s: float) -> None:
+def check_numbers(runs: int, settle_s: float, measure_s: float) -> None:
+    """Refuse numbers of runs and times that no plan has."""
     if runs < 1 or settle_s < 0 or measure_s <= 0:
         raise UsageError("--runs is at least 1, --settle at least 0, --measure more than 0")
 
@@ -129,11 +131,11 @@ def _check_joints(base: BaseGait, session: SessionView, need: str) -> None:
         raise UsageError(f"{session.path}: it drives {len(base.driven)} joints; {need} at least 3")
 
 
-def _plan(
+def write_sessions(
     plan: str,
     like: Path,
     folder: Path,
-    design: Callable[[BaseGait, SessionView], _Planned],
+    design: Callable[[BaseGait, SessionView], Planned],
     *,
     as_json: bool,
 ) -> None:
@@ -150,7 +152,8 @@ def _plan(
         times = {"settle_s": settle_s, "measure_s": measure_s}
         files = write_plan(plan, base, planned.runs, session, folder, **times, facts=planned.facts)
     if as_json:
-        emit_json({"plan": plan, "files": [str(file) for file in files], "settle_s": settle_s})
+        written = {"plan": plan, "files": [str(file) for file in files], "settle_s": settle_s}
+        emit_json(written | planned.result)
         return
     length_s = settle_s + measure_s
     echo(
@@ -198,13 +201,13 @@ def lag_sweep(
     """
     _check_tones(amplitude, runs)
 
-    def design(base: BaseGait, session: SessionView) -> _Planned:
+    def design(base: BaseGait, session: SessionView) -> Planned:
         from ..plan.designs import lag_sweep as sweep
 
         planned = sweep(len(base.driven), amplitude, runs)
         return _without_contact(base, session, planned, (amplitude, settle, measure))
 
-    _plan("lag-sweep", like, output, design, as_json=json)
+    write_sessions("lag-sweep", like, output, design, as_json=json)
 
 
 def multisine(
@@ -242,7 +245,7 @@ def multisine(
         raise UsageError("--tones is at least 2; for one frequency there is plan lag-sweep")
     _check_tones(amplitude, runs)
 
-    def design(base: BaseGait, session: SessionView) -> _Planned:
+    def design(base: BaseGait, session: SessionView) -> Planned:
         from ..plan import designs
 
         omega = designs.tones(base.omega, tones)
@@ -251,7 +254,7 @@ def multisine(
         whole_s = math.ceil(measure / period - 1e-6) * period
         return _without_contact(base, session, planned, (amplitude, settle, whole_s))
 
-    _plan("multisine", like, output, design, as_json=json)
+    write_sessions("multisine", like, output, design, as_json=json)
 
 
 def _check_tones(amplitude: float, runs: int) -> None:
@@ -264,7 +267,7 @@ def _without_contact(
     session: SessionView,
     runs: tuple[PlannedRun, ...],
     numbers: tuple[float, float | None, float],
-) -> _Planned:
+) -> Planned:
     """Check the runs of a chain without contact, and find how long it takes to settle."""
     amplitude, settle_s, measure_s = numbers
     _check_joints(base, session, "a sweep needs")
@@ -282,7 +285,7 @@ def _without_contact(
     if settle_s < needed_s:
         notes.append(f"Warning: it needs {needed_s:g} s to settle; {settle_s:g} s is less")
     facts = {"amplitude_rad": f"{amplitude:g}", **facts}
-    return _Planned(runs, settle_s, measure_s, facts, tuple(notes))
+    return Planned(runs, settle_s, measure_s, facts, tuple(notes))
 
 
 def settling(base: BaseGait, session: SessionView) -> tuple[float, dict[str, str]]:

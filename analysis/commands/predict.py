@@ -70,7 +70,7 @@ def predict(
     if any(one.suffix.lower() == ".json" for one in files):
         if others:
             raise UsageError("predict takes one result file, or the sessions of an experiment")
-        coupling = _of_result(first)
+        coupling = coupling_of_result(first)
     else:
         coupling = _local(experiment_of(files, options, "predict").coupling)
     found = closed_loop(coupling, eps, age_s=age, kick=turned, until_s=until)
@@ -96,7 +96,12 @@ def _kicks(words: Sequence[str]) -> dict[str, float]:
     return found
 
 
-def _of_result(file: Path) -> LocalCoupling:
+def coupling_of_result(file: Path) -> LocalCoupling:
+    """Read the coupling of a result of kicks.
+
+    Raises:
+        DataError: If the file holds none.
+    """
     from ..present.notebook.files import load
     from ..results.coupling import Coupling
     from ..results.experiment import Experiment

@@ -267,8 +267,6 @@ Rates: TypeAlias = Annotated[Numbers, at_least(-_STRONGEST), at_most(_STRONGEST)
 PositiveRate: TypeAlias = Annotated[float, above(0.0), at_most(_STRONGEST)]
 
 
-_KICK_SEED = 1
-
 _SAME_TIME_S = 1e-9  # rounding of times: a kick comes no tick late for it
 
 
@@ -295,8 +293,8 @@ class OscillatorChain(PlaneGait):
         feedback_bias: b, one number or n.
         kick_every_s: Time from the start to the first kick and from one to the next, of which
             at most one comes in a control period; 0: no kicks.
-        kick_size: Largest jump of a phase; each is drawn evenly up to it, the same in every run
-            [rad].
+        kick_size: Largest jump of a phase; each is drawn evenly up to it [rad].
+        kick_seed: Of these jumps; one seed gives the same in every run.
     """
 
     oscillator: OscillatorKind = OscillatorKind.PHASE
@@ -310,6 +308,7 @@ class OscillatorChain(PlaneGait):
     feedback_bias: Numbers = 0.0
     kick_every_s: NonNegative = 0.0
     kick_size: NonNegative = 0.0
+    kick_seed: Annotated[int, at_least(0)] = 1
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Feedback is measured against an amplitude."""
@@ -369,7 +368,7 @@ class _OscillatorRhythm:
         )
         self._amplitude = Approach(np.zeros(n), chain.approach_rate)
         self._offset = Approach(np.zeros(n), chain.approach_rate)
-        self._random, self._kicks = np.random.default_rng(_KICK_SEED), 0
+        self._random, self._kicks = np.random.default_rng(chain.kick_seed), 0
         # What is in force until the next tick.
         self._time_s, self._factor = 0.0, 1.0
         self._felt, self._steady = np.zeros(n), np.zeros(n)

@@ -42,6 +42,7 @@ LINES = [
     "predict {no}.mcap --eps 0.3",
     "predict {no}.json --eps 0.3",
     "compare {run} {no}.mcap",
+    "plan compensate {no}.json --like {run} -o {out}",
     "plan lag-sweep --like {no}.mcap -o {out}",
     "plan multisine --like {no}.mcap -o {out}",
     "plan phase-kicks --like {no}.mcap -o {out}",

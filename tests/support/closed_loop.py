@@ -42,14 +42,14 @@ class Sines:
 
     names = ()
 
-    def __init__(self, phasors):
-        """Take the phasors of the yaw joints' commands [rad]."""
-        self._phasors = phasors
+    def __init__(self, phasors, omega=OMEGA):
+        """Take the phasors of the yaw joints' commands [rad], and their rate [rad/s]."""
+        self._phasors, self._omega = phasors, omega
 
     def step(self, time_s, readings):
         """Return the command by the phasors, growing from zero over 2 s."""
         x = min(time_s / 2.0, 1.0)
-        wave = x * x * (3.0 - 2.0 * x) * np.imag(np.exp(1j * OMEGA * time_s) * self._phasors)
+        wave = x * x * (3.0 - 2.0 * x) * np.imag(np.exp(1j * self._omega * time_s) * self._phasors)
         command = np.zeros(2 * wave.size - 1)
         command[::2] = wave
         return GaitTick(command, np.empty(0), "walk", ())

@@ -322,6 +322,8 @@ def test_a_kicked_chain_comes_back(make_robot):
     assert np.abs(pattern[-1]).max() < 1e-3
     again, _, _ = run(make_robot(5, planar=True), 11.0, **fields)
     np.testing.assert_array_equal(theta, again)
+    other, _, _ = run(make_robot(5, planar=True), 11.0, **fields, kick_seed=2)
+    assert np.abs(other[600] - theta[600]).max() > 0.3
 
 
 def test_a_joint_that_has_reported_nothing_is_not_fed_back(make_robot):

@@ -60,6 +60,7 @@ chain = {
     "feedback_bias": numbers(6),
     "kick_every_s": within(0.0, 10.0),
     "kick_size": within(0.0, 7.0),
+    "kick_seed": st.integers(0, 2**31),
 }
 hopf = {"oscillator": st.just(OscillatorKind.HOPF), "attraction": rate}
 hopf_chains = st.builds(OscillatorChain, **chain, **hopf)
