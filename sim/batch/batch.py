@@ -41,6 +41,7 @@ from .body import (
     PLACE,
     RADIUS,
     SERVO,
+    SPIN,
     TURN,
     VELOCITY,
 )
@@ -71,6 +72,7 @@ class BatchRun:
         head: Centre of the head link [m], shape (k, 3).
         head_quaternion: Its orientation x, y, z, w, shape (k, 4).
         head_velocity: Velocity of its centre in the world [m/s], shape (k, 3).
+        head_spin: Its angular velocity along its own axes [rad/s], shape (k, 3).
     """
 
     scenario: Scenario
@@ -85,6 +87,7 @@ class BatchRun:
     head: FloatArray
     head_quaternion: FloatArray
     head_velocity: FloatArray
+    head_spin: FloatArray
 
     @property
     def time_s(self) -> FloatArray:
@@ -121,7 +124,7 @@ def run_batch(
             oscillators with feedback; lists all such fields.
     """
     precision = np.dtype(dtype)
-    if precision not in (np.float64, np.float32):
+    if precision.name not in ("float64", "float32"):
         raise UsageError(f"dtype {precision}: use float64 or float32")
     for scenario in scenarios:
         _refuse(scenario)
@@ -258,6 +261,7 @@ class _Block:
                 head=poses[:, PLACE : PLACE + 3],
                 head_quaternion=poses[:, TURN : TURN + 4],
                 head_velocity=poses[:, VELOCITY : VELOCITY + 3],
+                head_spin=poses[:, SPIN : SPIN + 3],
             )
 
     def _failed(self, r: int) -> tuple[SimulationError | None, int]:
@@ -270,4 +274,3 @@ class _Block:
         speed = value**0.5 if of_link else value
         time_s = step / scenario.physics_rate_hz
         return failure(scenario, time_s, parts[int(place)], speed), -(-int(step) // self._steps)
-

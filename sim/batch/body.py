@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numba import njit
@@ -59,9 +59,10 @@ I, H, M, WRENCH = 19, 25, 34, 40
 A = 46
 CARRIED_ROWS = 52
 
-_ONE, _TWO, _HALF = (np.float32(value) for value in (1.0, 2.0, 0.5))
+_HALF, _ONE, _TWO = cast("list[float]", [np.float32(x) for x in (0.5, 1.0, 2.0)])
 _QUARTER_1, _QUARTER_2 = 1.5707963267341256, 6.077100506506192e-11  # pi/2 in two parts
 _SYMMETRIC = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+
 
 @inlined
 def of_lanes(rows: FloatArray) -> None:
@@ -363,7 +364,11 @@ def accelerate_head(
         head[PLACE, r] += dt * vx
         head[PLACE + 1, r] += dt * vy
         head[PLACE + 2, r] += dt * vz
-        sx, sy, sz = head[SPIN, r] + dt * ax, head[SPIN + 1, r] + dt * ay, head[SPIN + 2, r] + dt * az
+        sx, sy, sz = (
+            head[SPIN, r] + dt * ax,
+            head[SPIN + 1, r] + dt * ay,
+            head[SPIN + 2, r] + dt * az,
+        )
         head[SPIN, r], head[SPIN + 1, r], head[SPIN + 2, r] = sx, sy, sz
         # By exp(dt s): sin(a)/a and cos(a) of half the angle by their series.
         half = _HALF * dt

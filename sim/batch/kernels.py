@@ -10,6 +10,7 @@ import hashlib
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numba import njit
@@ -28,12 +29,10 @@ from .body import (
     DEPTH,
     FASTEST,
     FLAT,
-    H,
     HEIGHT,
     I,
     INERTIA,
     LOAD,
-    M,
     MASS,
     PITCH_ACCELERATE,
     PITCH_BACKWARD,
@@ -68,7 +67,7 @@ GROUND_ROWS = 7
 SAMPLE_ROWS = 9
 """Angle, rate, effort, current, voltage; work: mechanical, absolute, electrical, its plus."""
 
-_ZERO, _HALF, _ONE, _TINY = (np.float32(value) for value in (0.0, 0.5, 1.0, 1e-37))
+_ZERO, _HALF, _ONE, _TINY = cast("list[float]", [np.float32(x) for x in (0.0, 0.5, 1.0, 1e-37)])
 
 
 @njit(error_model="numpy")
@@ -351,6 +350,6 @@ def _entry(sources: str) -> Callable[..., None]:
 
 _digest = hashlib.sha256()
 for _module in (body, compiled_kernels):
-    _digest.update(Path(_module.__file__).read_bytes())
+    _digest.update(Path(str(_module.__file__)).read_bytes())
 run_block = _entry(_digest.hexdigest())
 """Run all runs of a block through some control periods."""

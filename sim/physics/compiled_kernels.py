@@ -16,6 +16,7 @@ seconds; later ones load what was compiled.
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 from numba import njit
@@ -36,7 +37,7 @@ LAWS = tuple(FrictionLaw)
 _BOX, _TRANSETH, _VISCOUS = (
     LAWS.index(law) for law in (FrictionLaw.BOX, FrictionLaw.TRANSETH, FrictionLaw.VISCOUS)
 )
-_ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
+_ZERO, _HALF, _ONE, _TWO = cast("list[float]", [np.float32(x) for x in (0.0, 0.5, 1.0, 2.0)])
 _FARTHEST = np.float32(-40.0)  # exp(-40) + 1 = 1 in double precision
 _SHARE, _DOUBLINGS = np.float32(1 / 128), 7
 _SLOPE = np.float32(1 / COULOMB_SPEED)
@@ -388,7 +389,7 @@ def kinetic_energy(
 
 
 def ground_table(ground: Ground | None) -> FloatArray:
-    """Return k, d, mu_t, mu_n, eps, c_t and c_n, shape (7,); without ground, of one that is slack."""
+    """Return k, d, mu_t, mu_n, eps, c_t and c_n, shape (7,); all forces 0 without ground."""
     one = ground or Ground(stiffness=0.0, damping=0.0, drag_tangential=0.0, drag_normal=0.0)
     return np.array(
         [

@@ -162,7 +162,9 @@ class Twin:
         time_s = start_s + k * self._plant.dt
         if not sound[k].all():  # a servo that runs away throws links, hardly the other way round
             joint = int(np.argmax(rotors[k]))  # NaN before all numbers
-            raise failure(self.scenario, time_s, self.scenario.robot.joints[joint], rotors[k, joint])
+            raise failure(
+                self.scenario, time_s, self.scenario.robot.joints[joint], rotors[k, joint]
+            )
         link = int(np.argmax(speed[k]))
         raise failure(self.scenario, time_s, self.scenario.robot.links[link], speed[k, link])
 
