@@ -54,7 +54,7 @@ W, V, UP, HEIGHT = 0, 3, 6, 9
 ALONG, ACROSS, LOAD, DEPTH = 10, 11, 12, 13
 FASTEST, WHERE, FLAT = 14, 15, 16
 # ... from tail to head ...
-I, H, M, WRENCH = 19, 25, 34, 40
+AI, AH, AM, WRENCH = 19, 25, 34, 40
 # ... and back.
 A = 46
 CARRIED_ROWS = 52
@@ -112,10 +112,10 @@ def _joint(vertical: bool) -> Joint:
     """Compile the passes over a joint about y (vertical) or z."""
     Y, Z, SIGN = (2, 1, -1.0) if vertical else (1, 2, 1.0)
     IXY, IXZ, IYY, IYZ, IZZ = (
-        I + _SYMMETRIC[a][b] for a, b in ((0, Y), (0, Z), (Y, Y), (Y, Z), (Z, Z))
+        AI + _SYMMETRIC[a][b] for a, b in ((0, Y), (0, Z), (Y, Y), (Y, Z), (Z, Z))
     )
-    MXY, MXZ, MYY, MYZ, MZZ = (k - I + M for k in (IXY, IXZ, IYY, IYZ, IZZ))
-    HXY, HXZ, HYX, HZX = H + Y, H + Z, H + 3 * Y, H + 3 * Z
+    MXY, MXZ, MYY, MYZ, MZZ = (k - AI + AM for k in (IXY, IXZ, IYY, IYZ, IZZ))
+    HXY, HXZ, HYX, HZX = AH + Y, AH + Z, AH + 3 * Y, AH + 3 * Z
     HYY, HYZ, HZY, HZZ = HYX + Y, HYX + Z, HZX + Y, HZX + Z
     F = WRENCH + 3
 
@@ -156,15 +156,15 @@ def _joint(vertical: bool) -> Joint:
             # The link and all behind it, about its front joint.
             mass, centre = link[MASS, r], link[CENTRE, r]
             static = mass * centre
-            ixx, ixy = carried[I, r] + link[INERTIA, r], sign * carried[IXY, r]
+            ixx, ixy = carried[AI, r] + link[INERTIA, r], sign * carried[IXY, r]
             ixz, iyz = carried[IXZ, r], sign * carried[IYZ, r]
             iyy = carried[IYY, r] + link[INERTIA + Y, r] + static * centre
             izz = carried[IZZ, r] + link[INERTIA + Z, r] + static * centre
-            hxx, hxy, hxz = carried[H, r], sign * carried[HXY, r], carried[HXZ, r]
+            hxx, hxy, hxz = carried[AH, r], sign * carried[HXY, r], carried[HXZ, r]
             hyx, hyy = sign * carried[HYX, r], carried[HYY, r]
             hyz = sign * carried[HYZ, r] - static
             hzx, hzy, hzz = carried[HZX, r], sign * carried[HZY, r] + static, carried[HZZ, r]
-            mxx, mxy, mxz = carried[M, r] + mass, sign * carried[MXY, r], carried[MXZ, r]
+            mxx, mxy, mxz = carried[AM, r] + mass, sign * carried[MXY, r], carried[MXZ, r]
             myy, myz = carried[MYY, r] + mass, sign * carried[MYZ, r]
             mzz = carried[MZZ, r] + mass
             nx = carried[WRENCH, r] + link[BIAS, r]
@@ -217,14 +217,14 @@ def _joint(vertical: bool) -> Joint:
             iyy -= arm * hyz
             hyx, hyy, hyz = hyx - arm * mxz, hyy - arm * myz, hyz - arm * mzz
             iyy -= arm * hyz
-            carried[I, r], carried[IXY, r], carried[IXZ, r] = ixx, sign * ixy, arm * hxy
+            carried[AI, r], carried[IXY, r], carried[IXZ, r] = ixx, sign * ixy, arm * hxy
             carried[IYY, r], carried[IYZ, r] = iyy, sign * arm * hyy
             carried[IZZ, r] = arm * arm * myy
-            carried[H, r], carried[HXY, r], carried[HXZ, r] = hxx, sign * hxy, hxz
+            carried[AH, r], carried[HXY, r], carried[HXZ, r] = hxx, sign * hxy, hxz
             carried[HYX, r], carried[HYY, r], carried[HYZ, r] = sign * hyx, hyy, sign * hyz
             carried[HZX, r], carried[HZY, r] = arm * mxy, sign * arm * myy
             carried[HZZ, r] = arm * myz
-            carried[M, r], carried[MXY, r], carried[MXZ, r] = mxx, sign * mxy, mxz
+            carried[AM, r], carried[MXY, r], carried[MXZ, r] = mxx, sign * mxy, mxz
             carried[MYY, r], carried[MYZ, r], carried[MZZ, r] = myy, sign * myz, mzz
             carried[WRENCH, r], carried[WRENCH + Y, r] = nx, sign * (ny - arm * fz)
             carried[WRENCH + Z, r] = nz + arm * fy
@@ -320,14 +320,14 @@ def accelerate_head(
     real = carried.dtype.type
     for r in range(lanes):
         mass = link[MASS, r]
-        ixx, ixy, ixz = carried[I, r] + link[INERTIA, r], carried[I + 1, r], carried[I + 2, r]
-        iyy, iyz = carried[I + 3, r] + link[INERTIA + 1, r], carried[I + 4, r]
-        izz = carried[I + 5, r] + link[INERTIA + 2, r]
-        hxx, hxy, hxz = carried[H, r], carried[H + 1, r], carried[H + 2, r]
-        hyx, hyy, hyz = carried[H + 3, r], carried[H + 4, r], carried[H + 5, r]
-        hzx, hzy, hzz = carried[H + 6, r], carried[H + 7, r], carried[H + 8, r]
-        mxx, mxy, mxz = carried[M, r] + mass, carried[M + 1, r], carried[M + 2, r]
-        myy, myz, mzz = carried[M + 3, r] + mass, carried[M + 4, r], carried[M + 5, r] + mass
+        ixx, ixy, ixz = carried[AI, r] + link[INERTIA, r], carried[AI + 1, r], carried[AI + 2, r]
+        iyy, iyz = carried[AI + 3, r] + link[INERTIA + 1, r], carried[AI + 4, r]
+        izz = carried[AI + 5, r] + link[INERTIA + 2, r]
+        hxx, hxy, hxz = carried[AH, r], carried[AH + 1, r], carried[AH + 2, r]
+        hyx, hyy, hyz = carried[AH + 3, r], carried[AH + 4, r], carried[AH + 5, r]
+        hzx, hzy, hzz = carried[AH + 6, r], carried[AH + 7, r], carried[AH + 8, r]
+        mxx, mxy, mxz = carried[AM, r] + mass, carried[AM + 1, r], carried[AM + 2, r]
+        myy, myz, mzz = carried[AM + 3, r] + mass, carried[AM + 4, r], carried[AM + 5, r] + mass
         n, f = WRENCH, WRENCH + 3
         fx, fy = carried[f, r] + link[BIAS + 3, r], carried[f + 1, r] + link[BIAS + 4, r]
         fz = carried[f + 2, r] + link[BIAS + 5, r]

@@ -22,6 +22,7 @@ from ..physics.compiled_kernels import LAWS, drive, load, resistance, rotor_fric
 from . import body
 from .body import (
     ACROSS,
+    AI,
     ALONG,
     ANGLE,
     BIAS,
@@ -30,7 +31,6 @@ from .body import (
     FASTEST,
     FLAT,
     HEIGHT,
-    I,
     INERTIA,
     LOAD,
     MASS,
@@ -45,15 +45,15 @@ from .body import (
     SUMS,
     TORQUE,
     UP,
-    V,
-    W,
     WHERE,
     WORK,
     WRENCH,
-    Lanes,
     YAW_ACCELERATE,
     YAW_BACKWARD,
     YAW_FORWARD,
+    Lanes,
+    V,
+    W,
     accelerate_head,
     begin,
     of_lanes,
@@ -251,7 +251,7 @@ def _move(
     lanes: int,
 ) -> None:
     """Advance the body by one step."""
-    for row in range(I, WRENCH + 6):
+    for row in range(AI, WRENCH + 6):
         for r in range(lanes):
             carried[row, r] = _ZERO
     for i in range(len(links) - 1, 0, -1):
@@ -278,7 +278,7 @@ def _take_sums(links: FloatArray, sample: FloatArray, lanes: int) -> None:
 
 
 def _entry(sources: str) -> Callable[..., None]:
-    """Compile the entry, or load it as compiled from these sources: numba looks at its file only."""
+    """Compile the entry, or load what was compiled from these sources: numba checks one file."""
 
     @njit(cache=True, error_model="numpy")
     def run_block(
