@@ -38,10 +38,11 @@ _BOX, _TRANSETH, _VISCOUS = (
     LAWS.index(law) for law in (FrictionLaw.BOX, FrictionLaw.TRANSETH, FrictionLaw.VISCOUS)
 )
 _ZERO, _HALF, _ONE, _TWO = cast("list[float]", [np.float32(x) for x in (0.0, 0.5, 1.0, 2.0)])
-_FARTHEST = np.float32(-40.0)  # exp(-40) + 1 = 1 in double precision
-_SHARE, _DOUBLINGS = np.float32(1 / 128), 7
-_SLOPE = np.float32(1 / COULOMB_SPEED)
-_TINY = np.float32(1e-37)  # makes 0/0 a zero
+# exp(-40) + 1 = 1 in double precision; expm1 begins at a share of x; 1e-37 makes 0/0 a zero.
+_FARTHEST, _SHARE, _SLOPE, _TINY = cast(
+    "list[float]", [np.float32(x) for x in (-40.0, 1 / 128, 1 / COULOMB_SPEED, 1e-37)]
+)
+_DOUBLINGS = 7
 
 
 @inlined
