@@ -89,6 +89,7 @@ bench: $(READY)  ## speed, as ratios against named peers
 	$(BIN)/python bench/analyse_hour.py
 	$(BIN)/python bench/analyse_hour.py --adaptive
 	$(BIN)/python bench/twin_step.py
+	$(BIN)/python bench/batch_twin.py
 	$(BIN)/python bench/sweep.py
 	$(BIN)/python bench/catalog.py
 	$(BIN)/python bench/replay_convert.py --minutes 5

@@ -19,6 +19,7 @@ import os
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import TypeVar
 
 import pybullet
 from measuring import arguments
@@ -31,6 +32,7 @@ from undulog.sim.scenario.scenario_file import load_scenario
 from undulog.sim.twin.twin import Twin
 
 LENGTHS = (12, 25, 50, 100)
+_Way = TypeVar("_Way")
 BUILT_IN = "PyBullet contacts + motors"
 NUMPY, NUMBA = "twin, NumPy", "twin, numba"
 
@@ -135,7 +137,7 @@ def chain(robot: Robot, joints: int) -> Robot:
     )
 
 
-def least(ways: dict[str, Callable[[], float]], runs: int) -> dict[str, float]:
+def least(ways: dict[_Way, Callable[[], float]], runs: int) -> dict[_Way, float]:
     """Return microseconds a step of each way, the least of some runs in turn."""
     found = dict.fromkeys(ways, math.inf)
     for _ in range(runs):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from undulog.capture.common.lazy import attach
 
 if TYPE_CHECKING:
+    from .batch.batch import BatchRun, run_batch
     from .gait.contract import Gait, GaitTick, Readings
     from .gait.wave import PlaneGait, Serpentine, SerpentineGait, Wave
     from .scenario.obstacles import Box, Cylinder, ObstacleMaterial, RandomField, Target, Wall
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from .twin.twin import Twin
 
 _HOMES = {
+    "batch.batch": "BatchRun run_batch",
     "gait.contract": "Gait GaitTick Readings",
     "gait.wave": "PlaneGait Serpentine SerpentineGait Wave",
     "scenario.obstacles": "Box Cylinder ObstacleMaterial RandomField Target Wall",

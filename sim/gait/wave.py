@@ -206,6 +206,13 @@ class _PlanePart:
     lower: FloatArray
     upper: FloatArray
 
+    def angles(self, swing: WaveState) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Commands, and the amplitudes and offsets that are within the limits."""
+        amplitude, offset = within_limits(swing.amplitude, swing.offset, self.lower, self.upper)
+        angle = amplitude * np.sin(swing.phase) + offset
+        # Rounding of offset + amplitude may pass the limit in the last digit.
+        return np.minimum(np.maximum(angle, self.lower), self.upper), amplitude, offset
+
     def cut(self, key: str, wanted: FloatArray, given: FloatArray) -> list[str]:
         """Names of a value that was cut: that of the plane, or those of the joints concerned."""
         differs: BoolArray = wanted != given
@@ -276,12 +283,9 @@ class WaveGenerator:
                 modulation.frequency_factor,
             )
             swing = part.rhythm.step(time_s, change, readings)
-            amplitude, offset = within_limits(swing.amplitude, swing.offset, part.lower, part.upper)
+            command[joints], amplitude, offset = part.angles(swing)
             clamped += part.cut("A", swing.amplitude, amplitude)
             clamped += part.cut("offset", swing.offset, offset)
-            angle = amplitude * np.sin(swing.phase) + offset
-            # Rounding of offset + amplitude may pass the limit in the last digit.
-            command[joints] = np.minimum(np.maximum(angle, part.lower), part.upper)
             first = amplitude[0], swing.omega, swing.lag, offset[0], swing.phase[0]
             values.append(np.array(first))
             if self._per_joint:
@@ -317,6 +321,21 @@ class SerpentineGait(WaveGenerator):
             for plane, wave in parameters.planes.items()
         }
         super().__init__(rhythms, robot, per_joint=per_joint)
+        self._rhythms = rhythms
+
+    def commands(self, times_s: FloatArray) -> FloatArray:
+        """Return the commands of many ticks at once, unmodulated; the generator stays as it is.
+
+        Args:
+            times_s: Times since the start, from 0 on, ascending [s], shape (k,).
+
+        Returns:
+            As :meth:`step` gives them one after the other [rad], shape (k, m).
+        """
+        command = np.tile(self._held, (len(times_s), 1))
+        for part in self._parts:
+            command[:, part.joints] = part.angles(self._rhythms[part.plane].waves(times_s))[0]
+        return command
 
 
 class _SerpentineRhythm:
@@ -336,5 +355,19 @@ class _SerpentineRhythm:
             offset=ramp * wave.offset + change.offset,
             phase=self._phase.advance(time_s, omega) + self._lags,
             omega=omega,
+            lag=wave.signed_lag,
+        )
+
+    def waves(self, times_s: FloatArray) -> WaveState:
+        """Return the unmodulated waves of ticks, a leading axis of time."""
+        wave = self._wave
+        ramp = np.array([[started(time_s, self._ramp_s)] for time_s in times_s.tolist()])
+        passed = self._omega * np.diff(times_s, prepend=0.0)
+        phase = np.cumsum(np.concatenate([[wave.phase], passed]))[1:]  # added up as in step
+        return WaveState(
+            amplitude=ramp * wave.amplitude * np.ones_like(self._lags),
+            offset=ramp * wave.offset * np.ones_like(self._lags),
+            phase=phase[:, np.newaxis] + self._lags,
+            omega=self._omega,
             lag=wave.signed_lag,
         )

@@ -1,11 +1,13 @@
-"""The twin's force laws, compiled.
+"""The twin's force laws, compiled: as :class:`.sim.physics.laws.NumpyLaws`, within rounding.
 
-The same equations as :mod:`.sim.physics.contact` and :mod:`.sim.physics.servo`, in the same order
-of operations, written out over links and joints. They serve speed alone and are held against those
-modules, which say what the equations mean. Hyperbolic tangents may round otherwise than NumPy's, so
-results agree within rounding and not bit by bit.
+The same equations as :mod:`.sim.physics.contact` and :mod:`.sim.physics.servo`, which say what they
+mean, and are what these are held against.
 
-The force laws compiled: as :class:`.sim.physics.laws.NumpyLaws`, within rounding.
+First the laws of one link and of one joint, as functions of numbers: one run calls them link by
+link, a batch (:mod:`.sim.batch`) run by run. They compute in the precision of their arguments, so
+constants are float32 where float32 holds them exactly, and else of the argument's type. They hold
+no call that a compiler can't turn into instructions on several numbers at a time: tanh and exp are
+series, within 4 units of the last place.
 
 Importing it needs the extra ``numba``. The first import on a machine compiles, which takes some
 seconds; later ones load what was compiled.
@@ -14,6 +16,7 @@ seconds; later ones load what was compiled.
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 from numba import njit
@@ -25,40 +28,146 @@ from ..scenario.world import FrictionLaw, Ground
 from .servo import COULOMB_SPEED, Servos
 from .steps import Steps
 
+inlined = njit(error_model="numpy", forceinline=True)
+"""Compile a function of numbers, which becomes part of the loop that calls it."""
+
 LAWS = tuple(FrictionLaw)
 """A friction law's number is its place here."""
 
-_ELLIPSE, _BOX, _TRANSETH, _VISCOUS = (
-    LAWS.index(law)
-    for law in (FrictionLaw.ELLIPSE, FrictionLaw.BOX, FrictionLaw.TRANSETH, FrictionLaw.VISCOUS)
+_BOX, _TRANSETH, _VISCOUS = (
+    LAWS.index(law) for law in (FrictionLaw.BOX, FrictionLaw.TRANSETH, FrictionLaw.VISCOUS)
 )
-_TINY = 1e-300
+_ZERO, _HALF, _ONE, _TWO = cast("list[float]", [np.float32(x) for x in (0.0, 0.5, 1.0, 2.0)])
+# exp(-40) + 1 = 1 in double precision; expm1 begins at a share of x; 1e-37 makes 0/0 a zero.
+_FARTHEST, _SHARE, _SLOPE, _TINY = cast(
+    "list[float]", [np.float32(x) for x in (-40.0, 1 / 128, 1 / COULOMB_SPEED, 1e-37)]
+)
+_DOUBLINGS = 7
 
 
-@njit(cache=True)
-def _resistance(
-    law: int, along: float, across: float, normal: float, ground: FloatArray
+@inlined
+def expm1(x: float) -> float:
+    """exp(x) - 1 for x <= 0, by its series at x/128 and 7 doublings, e -> e (e + 2)."""
+    real = type(x)
+    z = max(x, _FARTHEST) * _SHARE
+    e = _ONE + z * real(1 / 11)
+    e = _ONE + z * real(1 / 10) * e
+    e = _ONE + z * real(1 / 9) * e
+    e = _ONE + z * real(1 / 8) * e
+    e = _ONE + z * real(1 / 7) * e
+    e = _ONE + z * real(1 / 6) * e
+    e = _ONE + z * real(1 / 5) * e
+    e = _ONE + z * real(1 / 4) * e
+    e = _ONE + z * real(1 / 3) * e
+    e = z * (_ONE + z * _HALF * e)
+    for _ in range(_DOUBLINGS):
+        e *= e + _TWO
+    return e
+
+
+@inlined
+def tanh(x: float) -> float:
+    """Hyperbolic tangent."""
+    e = expm1(-_TWO * abs(x))
+    return math.copysign(e / (e + _TWO), x)
+
+
+@inlined
+def load(depth: float, rate: float, stiffness: float, damping: float) -> float:
+    """Normal force of the ground, Eq. 7 [N].
+
+    Args:
+        depth: Of the contact point below the surface [m].
+        rate: Its velocity upwards [m/s].
+    """
+    force = max(stiffness * depth - damping * rate, _ZERO)
+    return force if depth > _ZERO else _ZERO
+
+
+@inlined
+def resistance(
+    law: int,
+    along: float,
+    across: float,
+    normal: float,
+    mu_t: float,
+    mu_n: float,
+    eps: float,
+    drag_t: float,
+    drag_n: float,
 ) -> tuple[float, float]:
     """Force along (tangential, normal) against slip at a link that touches the ground [N]."""
-    mu_t, mu_n, eps = ground[2], ground[3], ground[4]
     if law == _VISCOUS:
-        return -ground[5] * along, -ground[6] * across
+        return -drag_t * along, -drag_n * across
     if law == _BOX:
         return (
-            -mu_t * along / math.sqrt(along * along + eps**2) * normal,
-            -mu_n * across / math.sqrt(across * across + eps**2) * normal,
+            -mu_t * along / math.sqrt(along * along + eps * eps) * normal,
+            -mu_n * across / math.sqrt(across * across + eps * eps) * normal,
         )
     if law == _TRANSETH:
-        speed = math.sqrt(along * along + across * across + eps**2)
+        speed = math.sqrt(along * along + across * across + eps * eps)
         return -mu_t * along / speed * normal, -mu_n * across / speed * normal
     weighted_t, weighted_n = mu_t * along, mu_n * across
     squares = weighted_t * weighted_t + weighted_n * weighted_n
-    force_t = -mu_t * weighted_t / math.sqrt(squares + ((mu_t * eps) ** 2 + _TINY)) * normal
-    force_n = -mu_n * weighted_n / math.sqrt(squares + ((mu_n * eps) ** 2 + _TINY)) * normal
-    return force_t, force_n
+    floor_t, floor_n = mu_t * eps, mu_n * eps
+    return (
+        -mu_t * weighted_t / math.sqrt(squares + (floor_t * floor_t + _TINY)) * normal,
+        -mu_n * weighted_n / math.sqrt(squares + (floor_n * floor_n + _TINY)) * normal,
+    )
 
 
-@njit(cache=True)
+@inlined
+def drive(
+    error: float,
+    twist: float,
+    speed: float,
+    rate: float,
+    supply: float,
+    resistance: float,
+    torque_constant: float,
+    gain: float,
+    gear_stiffness: float,
+    gear_damping: float,
+    play: float,
+) -> tuple[float, float, float]:
+    """Voltage [V], current [A] and gear torque [N m] of a servo.
+
+    Args:
+        error: q_ref - q [rad].
+        twist: th - q [rad].
+        speed: Rotor speed om [rad/s].
+        rate: Joint rate q' [rad/s].
+    """
+    voltage = supply * min(max(gain * error, -_ONE), _ONE)
+    slack = _HALF * play
+    twist -= min(max(twist, -slack), slack)
+    torque = gear_stiffness * twist + gear_damping * (speed - rate)
+    return voltage, (voltage - torque_constant * speed) / resistance, torque
+
+
+@inlined
+def rotor_friction(
+    speed: float, torque: float, kinetic: float, static: float, stribeck: float, per_step: float
+) -> tuple[float, bool]:
+    """Friction of one rotor [N m], and whether it is at rest after the step.
+
+    As :meth:`.sim.physics.servo.Servos.friction`.
+
+    Args:
+        speed: Rotor speed om at the step's start [rad/s].
+        torque: Kt i - b om - t_g, all else that acts on the rotor [N m].
+        per_step: Its inertia over the step [kg m^2/s].
+    """
+    smooth = kinetic * tanh(speed * _SLOPE)
+    share = speed / stribeck
+    most = kinetic + (static - kinetic) * (_ONE + expm1(-share * share))
+    stopping = per_step * speed + torque
+    rests = static > _ZERO
+    friction = min(max(stopping, -most), most) if rests else smooth
+    return friction, rests & (abs(stopping) <= most)  # branches cost more than both
+
+
+@njit(cache=True, error_model="numpy")
 def touch_ground(
     row: FloatArray, n: int, m: int, radius: FloatArray, ground: FloatArray, law: int
 ) -> None:
@@ -90,8 +199,11 @@ def touch_ground(
         tangent[0, i], tangent[1, i] = tx, ty
         depth[i] = deep
         if deep > 0.0:
-            normal = max(ground[0] * deep - ground[1] * vz, 0.0)
-            along, across = _resistance(law, tx * vx + ty * vy, tx * vy - ty * vx, normal, ground)
+            normal = load(deep, vz, ground[0], ground[1])
+            along, across = resistance(
+                *(law, tx * vx + ty * vy, tx * vy - ty * vx, normal),
+                *(ground[2], ground[3], ground[4], ground[5], ground[6]),
+            )
             force[0, i] = tx * along - ty * across
             force[1, i] = ty * along + tx * across
             force[2, i] = normal
@@ -99,7 +211,7 @@ def touch_ground(
             force[0, i] = force[1, i] = force[2, i] = 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def drive_joints(
     row: FloatArray, n: int, m: int, reference: FloatArray, servos: FloatArray
 ) -> None:
@@ -116,38 +228,14 @@ def drive_joints(
     voltage, current = row[start + 2 * m : start + 3 * m], row[start + 3 * m : start + 4 * m]
     torque = row[start + 4 * m : start + 5 * m]
     for j in range(m):
-        duty = min(max(servos[3, j] * (reference[j] - angle[j]), -1.0), 1.0)
-        voltage[j] = servos[0, j] * duty
-        current[j] = (voltage[j] - servos[2, j] * speed[j]) / servos[1, j]
-        twist, play = rotor[j] - angle[j], 0.5 * servos[9, j]
-        twist -= min(max(twist, -play), play)
-        torque[j] = servos[7, j] * twist + servos[8, j] * (speed[j] - rate[j])
+        voltage[j], current[j], torque[j] = drive(
+            *(reference[j] - angle[j], rotor[j] - angle[j], speed[j], rate[j]),
+            *(servos[0, j], servos[1, j], servos[2, j], servos[3, j]),
+            *(servos[7, j], servos[8, j], servos[9, j]),
+        )
 
 
-@njit(cache=True)
-def rotor_friction(
-    servos: FloatArray, j: int, speed: float, torque: float, dt: float
-) -> tuple[float, bool]:
-    """Friction of one rotor [N m], and whether it is at rest after the step.
-
-    Args:
-        servos: :attr:`.sim.physics.servo.Servos.table`.
-        speed: Rotor speed om at the step's start [rad/s].
-        torque: Kt i - b om - t_g, all else that acts on the rotor [N m].
-        dt: Step [s].
-
-    Returns:
-        As :meth:`.sim.physics.servo.Servos.friction`.
-    """
-    static, kinetic = servos[10, j], servos[6, j]
-    if static == 0.0:
-        return kinetic * math.tanh(speed / COULOMB_SPEED), False
-    most = kinetic + (static - kinetic) * math.exp(-((speed / servos[11, j]) ** 2))
-    stopping = servos[4, j] * speed / dt + torque
-    return min(max(stopping, -most), most), abs(stopping) <= most
-
-
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def advance_rotors(
     before: FloatArray, here: FloatArray, n: int, m: int, servos: FloatArray, dt: float
 ) -> None:
@@ -163,14 +251,16 @@ def advance_rotors(
         speed = before[start + m + j]
         current, torque = before[start + 3 * m + j], before[start + 4 * m + j]
         motor = servos[2, j] * current - servos[5, j] * speed
-        drag, held = rotor_friction(servos, j, speed, motor - torque, dt)
+        drag, held = rotor_friction(
+            *(speed, motor - torque, servos[6, j], servos[10, j], servos[11, j]), servos[4, j] / dt
+        )
         total = motor - (drag + torque)
         after = 0.0 if held else speed + dt * total / servos[4, j]
         here[start + j] = before[start + j] + dt * after
         here[start + m + j] = after
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def act(
     before: FloatArray,
     here: FloatArray,
@@ -199,7 +289,7 @@ def act(
     drive_joints(here, n, m, reference, servos)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def add_joint_flows(
     table: FloatArray, n: int, m: int, servos: FloatArray, dt: float, flows: FloatArray
 ) -> None:
@@ -229,16 +319,16 @@ def add_joint_flows(
             flows[4, j] += dt * max(electrical, 0.0)
             flows[5, j] += dt * servos[1, j] * current * current
             flows[6, j] += dt * servos[5, j] * acting * speed
-            if servos[10, j] == 0.0:
-                flows[7, j] += dt * servos[6, j] * math.tanh(acting / COULOMB_SPEED) * speed
-            else:
-                motor = servos[2, j] * drive[3 * m + j] - servos[5, j] * acting
-                friction, _ = rotor_friction(servos, j, acting, motor - torque, dt)
-                flows[7, j] += dt * friction * speed
+            motor = servos[2, j] * drive[3 * m + j] - servos[5, j] * acting
+            friction, _ = rotor_friction(
+                *(acting, motor - torque, servos[6, j], servos[10, j], servos[11, j]),
+                servos[4, j] / dt,
+            )
+            flows[7, j] += dt * friction * speed
             flows[8, j] += dt * servos[8, j] * (acting - rates[j]) * (speed - rate)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def add_ground_flows(
     table: FloatArray, n: int, m: int, stiffness: float, dt: float, flows: FloatArray
 ) -> None:
@@ -264,7 +354,7 @@ def add_ground_flows(
             flows[2] -= dt * (fz - stiffness * max(depth, 0.0)) * vz
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def kinetic_energy(
     quaternion: FloatArray,
     velocity: FloatArray,
@@ -299,6 +389,17 @@ def kinetic_energy(
     return 0.5 * twice
 
 
+def ground_table(ground: Ground | None) -> FloatArray:
+    """Return k, d, mu_t, mu_n, eps, c_t and c_n, shape (7,); all forces 0 without ground."""
+    one = ground or Ground(stiffness=0.0, damping=0.0, drag_tangential=0.0, drag_normal=0.0)
+    return np.array(
+        [
+            *(one.stiffness, one.damping, one.mu_tangential, one.mu_normal),
+            *(one.slip_speed, one.drag_tangential, one.drag_normal),
+        ]
+    )
+
+
 class CompiledLaws:
     """The laws by :mod:`.sim.physics.compiled_kernels`."""
 
@@ -312,17 +413,11 @@ class CompiledLaws:
             ground: What carries it, if anything does.
             dt: Step [s].
         """
-        surface = ground or Ground(stiffness=0.0, damping=0.0, drag_tangential=0.0, drag_normal=0.0)
         self._rows = tuple(steps.table)
         self._sizes = steps.link_count, steps.joint_count
         self._radius = np.array([link.radius for link in robot.links])
-        self._ground = np.array(
-            [
-                *(surface.stiffness, surface.damping, surface.mu_tangential, surface.mu_normal),
-                *(surface.slip_speed, surface.drag_tangential, surface.drag_normal),
-            ]
-        )
-        self._law = LAWS.index(surface.law)
+        self._ground = ground_table(ground)
+        self._law = 0 if ground is None else LAWS.index(ground.law)
         self._servos = servos.table
         self._dt = dt
         self._reference = np.zeros(steps.joint_count)

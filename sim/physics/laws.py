@@ -116,7 +116,7 @@ class Plant:
             if world.obstacles
             else None
         )
-        height = _resting_height(scenario)
+        height = resting_height(scenario)
         start = BodyStart(world.gravity, height, world.heading, world.velocity, self.dt)
         self._engine = engine_type(scenario.engine, kernels)(robot, start)
         count = scenario.physics_rate_hz // CONTROL_RATE_HZ
@@ -190,7 +190,7 @@ class Plant:
             self._period.obstacles[k] = self._obstacle_law(*body[:4])
 
 
-def _resting_height(scenario: Scenario) -> float:
+def resting_height(scenario: Scenario) -> float:
     """Height at which the ground carries a straight robot's weight: m g / k deep [m]."""
     robot, world = scenario.robot, scenario.world
     radius = float(np.mean([link.radius for link in robot.links]))

@@ -83,7 +83,7 @@ class MujocoEngine:
         mujoco.mj_fwdVelocity(self._model, self._data)
 
 
-def _model(robot: Robot, gravity: Sequence[float], dt: float) -> mujoco.MjModel:
+def body_spec(robot: Robot, gravity: Sequence[float], dt: float) -> mujoco.MjSpec:
     """The chain of links: masses, inertias and hinges, nothing else."""
     spec = mujoco.MjSpec()
     spec.option.timestep = dt
@@ -106,8 +106,12 @@ def _model(robot: Robot, gravity: Sequence[float], dt: float) -> mujoco.MjModel:
             axis = _AXES[robot.joints[i - 1].plane]
             body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, pos=(half, 0.0, 0.0), axis=axis)
         before, behind = body, -half
+    return spec
+
+
+def _model(robot: Robot, gravity: Sequence[float], dt: float) -> mujoco.MjModel:
     try:
-        return spec.compile()
+        return body_spec(robot, gravity, dt).compile()
     except ValueError as error:  # e.g. moments of inertia that no body can have
         reason = str(error).splitlines()[0]
         raise UsageError(f"the engine cannot hold robot {robot.name}: {reason}") from error

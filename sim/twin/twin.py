@@ -14,6 +14,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SimulationError
+from undulog.capture.robot.model import Joint, Link
 
 from ..control.adaptive import build_gait
 from ..gait.contract import CONTROL_RATE_HZ, Gait, GaitTick
@@ -158,16 +159,29 @@ class Twin:
         speed = motion.max(axis=1)
         sound = rotors <= MAX_ROTOR_SPEED  # false for NaN
         k = int(np.argmin(sound.all(axis=1) & (speed <= MAX_SPEED).all(axis=1)))
+        time_s = start_s + k * self._plant.dt
         if not sound[k].all():  # a servo that runs away throws links, hardly the other way round
             joint = int(np.argmax(rotors[k]))  # NaN before all numbers
-            name = self.scenario.robot.joints[joint].name
-            what = f"the servo of {name} turns at {rotors[k, joint]:g} rad/s"
-            bound = f"{MAX_ROTOR_SPEED:g} rad/s"
-        else:
-            link = int(np.argmax(speed[k]))
-            name = self.scenario.robot.links[link].name
-            what, bound = f"{name} moves at {speed[k, link]:g} m/s", f"{MAX_SPEED:g} m/s"
-        raise SimulationError(
-            f"the twin failed at {start_s + k * self._plant.dt:.3f} s: {what}, more than {bound}; "
-            f"{likely_cause(self.scenario)}"
-        )
+            raise failure(
+                self.scenario, time_s, self.scenario.robot.joints[joint], rotors[k, joint]
+            )
+        link = int(np.argmax(speed[k]))
+        raise failure(self.scenario, time_s, self.scenario.robot.links[link], speed[k, link])
+
+
+def failure(scenario: Scenario, time_s: float, part: Joint | Link, speed: float) -> SimulationError:
+    """Describe an impossible state.
+
+    Args:
+        time_s: When it was reached [s].
+        part: The joint whose servo, or the link that is too fast.
+        speed: Of the servo [rad/s] or the link [m/s].
+    """
+    if isinstance(part, Joint):
+        what = f"the servo of {part.name} turns at {speed:g} rad/s"
+        bound = f"{MAX_ROTOR_SPEED:g} rad/s"
+    else:
+        what, bound = f"{part.name} moves at {speed:g} m/s", f"{MAX_SPEED:g} m/s"
+    return SimulationError(
+        f"the twin failed at {time_s:.3f} s: {what}, more than {bound}; {likely_cause(scenario)}"
+    )

@@ -19,10 +19,10 @@ PUBLIC = {
     ),
     "replay": ("Content Recording write_recording"),
     "sim": (
-        "AccelerometerModel Box CompassModel Cylinder FrictionLaw Gait GaitTick Ground "
+        "AccelerometerModel BatchRun Box CompassModel Cylinder FrictionLaw Gait GaitTick Ground "
         "InfraredModel Noise ObstacleMaterial PlaneGait RandomField Readings Scenario "
         "SensorModels Serpentine SerpentineGait ServoPolling SonarModel Target Twin Wall Wave "
-        "World load_scenario parse_scenario record scenario_names"
+        "World load_scenario parse_scenario record run_batch scenario_names"
     ),
 }
 

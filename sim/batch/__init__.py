@@ -1,0 +1,1 @@
+"""Many runs of the twin in one process."""

@@ -1,0 +1,276 @@
+"""Many runs of the twin at once, on one core.
+
+For sweeps: open-loop gaits on open ground, or without contact. Laws, integrator, start and checks
+are those of :class:`.sim.twin.twin.Twin`, and results agree with its runs on MuJoCo within
+rounding. A run's results don't depend on the runs beside it, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import SimulationError, UsageError
+from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture.robot.model import Plane
+
+from ..gait.contract import CONTROL_RATE_HZ, Readings
+from ..gait.oscillators import OscillatorChains
+from ..gait.wave import SerpentineGait
+from ..physics.compiled_kernels import LAWS, ground_table
+from ..physics.laws import resting_height
+from ..physics.servo import Servos
+from ..scenario.gaits import generator
+from ..scenario.scenario import Scenario
+from ..sensing.contract import quantised
+from ..twin.twin import MAX_ROTOR_SPEED, MAX_SPEED, failure
+from .body import (
+    ARM,
+    CARRIED_ROWS,
+    CENTRE,
+    HEAD_ROWS,
+    INERTIA,
+    LANES,
+    LINK_ROWS,
+    MASS,
+    PLACE,
+    RADIUS,
+    SERVO,
+    SPIN,
+    TURN,
+    VELOCITY,
+)
+from .kernels import GROUND_ROWS, SAMPLE_ROWS, run_block
+
+_TICKS_A_CALL = CONTROL_RATE_HZ  # Ctrl-C waits for a call
+
+_Shape: TypeAlias = tuple[object, ...]
+_Commands: TypeAlias = dict[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class BatchRun:
+    """One run of a batch, at its k control ticks: all of them, or those before it failed.
+
+    Values are the true ones; the scenario's sensors, noise and sampling times have no part in them.
+
+    Attributes:
+        error: Why it failed, with the time and the link or servo; None: it did not.
+        angle: Joint angles [rad], shape (k, m).
+        rate: Joint rates [rad/s], shape (k, m).
+        command: Commanded joint angles from the tick on [rad], shape (k, m).
+        effort: Gear torques, means over the control period around the tick [N m], shape (k, m).
+        current: Winding currents, such means [A], shape (k, m).
+        voltage: Motor voltages, such means [V], shape (k, m).
+        work: Since the start, by joint [J]: mechanical work on it, its absolute value, electrical
+            work at its motor, the positive part of that; shape (4, k, m).
+        head: Centre of the head link [m], shape (k, 3).
+        head_quaternion: Its orientation x, y, z, w, shape (k, 4).
+        head_velocity: Velocity of its centre in the world [m/s], shape (k, 3).
+        head_spin: Its angular velocity along its own axes [rad/s], shape (k, 3).
+    """
+
+    scenario: Scenario
+    error: SimulationError | None
+    angle: FloatArray
+    rate: FloatArray
+    command: FloatArray
+    effort: FloatArray
+    current: FloatArray
+    voltage: FloatArray
+    work: FloatArray
+    head: FloatArray
+    head_quaternion: FloatArray
+    head_velocity: FloatArray
+    head_spin: FloatArray
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Times of the ticks since the start [s], shape (k,)."""
+        return np.arange(len(self.angle), dtype=np.float64) / CONTROL_RATE_HZ
+
+    @property
+    def centre_of_mass(self) -> FloatArray:
+        """The robot's centre of mass [m], shape (k, 3)."""
+        robot = self.scenario.robot
+        turn = rotation_from_quaternion(self.head_quaternion)
+        centres, _ = link_poses(robot, self.head, turn, self.angle)
+        mass = np.array([link.mass for link in robot.links])
+        return np.einsum("i,kij->kj", mass / mass.sum(), centres)
+
+
+def run_batch(
+    scenarios: Sequence[Scenario], *, dtype: DTypeLike = np.float64
+) -> tuple[BatchRun, ...]:
+    """Run scenarios, many at a time, each from its start to its end.
+
+    Runs of equal joints, friction law, length and physics rate share the steps; everything else may
+    differ from run to run. The engine that a scenario names is not used.
+
+    Args:
+        scenarios: The runs; what they give stays in memory, 80 bytes a joint and tick.
+        dtype: ``float64``, or ``float32`` for gains and lags within 1e-3 at a higher speed.
+
+    Returns:
+        Results in the order of the scenarios.
+
+    Raises:
+        UsageError: If a scenario needs what a batch hasn't: obstacles, pushes, a controller or
+            oscillators with feedback; lists all such fields.
+    """
+    precision = np.dtype(dtype)
+    if precision.name not in ("float64", "float32"):
+        raise UsageError(f"dtype {precision}: use float64 or float32")
+    for scenario in scenarios:
+        _refuse(scenario)
+    groups: dict[_Shape, list[int]] = {}
+    for i, scenario in enumerate(scenarios):
+        groups.setdefault(_shape(scenario), []).append(i)
+    runs: dict[int, BatchRun] = {}
+    commands: _Commands = {}
+    for group in groups.values():
+        for first in range(0, len(group), LANES):
+            members = group[first : first + LANES]
+            block = _Block([scenarios[i] for i in members], precision, commands)
+            block.run()
+            runs |= zip(members, block.results(), strict=True)
+    return tuple(runs[i] for i in range(len(scenarios)))
+
+
+def _refuse(scenario: Scenario) -> None:
+    """Raise for what a batch can't run."""
+    needs = {
+        "world.obstacles": bool(scenario.world.obstacles),
+        "disturbances": bool(scenario.disturbances),
+        "controller": scenario.controller is not None,
+    }
+    if isinstance(scenario.gait, OscillatorChains):
+        for plane, chain in scenario.gait.planes.items():
+            needs[f"gait.{plane}.feedback"] = chain.feedback > 0.0
+    if found := [name for name, needed in needs.items() if needed]:
+        raise UsageError(
+            f"a batch can't run scenario {scenario.name}: it has {', '.join(found)}; leave out "
+            "what it has, or use Twin or record"
+        )
+
+
+def _shape(scenario: Scenario) -> _Shape:
+    """What runs must share to share their steps."""
+    ground = scenario.world.ground
+    law = None if ground is None else ground.law
+    planes = tuple(joint.plane for joint in scenario.robot.joints)
+    return planes, law, scenario.physics_rate_hz, scenario.tick_count
+
+
+def _commands(scenario: Scenario, known: _Commands) -> FloatArray:
+    """Commands of all ticks, shape (k, m), computed once for runs that share them."""
+    resolution = scenario.sensing.servo.command_resolution
+    limits = [(joint.plane, joint.lower, joint.upper) for joint in scenario.robot.joints]
+    key = repr((scenario.gait, limits, scenario.tick_count, resolution))
+    if key not in known:
+        times_s = np.arange(scenario.tick_count) / CONTROL_RATE_HZ
+        gait = generator(scenario.gait, scenario.robot)
+        if isinstance(gait, SerpentineGait):
+            commands = gait.commands(times_s)
+        else:
+            unknown = Readings.nothing(scenario.robot)
+            commands = np.array([gait.step(t, unknown).command for t in times_s.tolist()])
+        known[key] = quantised(commands, resolution)
+    return known[key]
+
+
+class _Block:
+    """Runs that share their steps; lanes that are left over repeat the last of them."""
+
+    def __init__(self, scenarios: Sequence[Scenario], dtype: np.dtype, known: _Commands) -> None:
+        """Set the robots on the ground, straight, their servos at rest."""
+        self._scenarios = scenarios
+        lanes = [scenarios[min(r, len(scenarios) - 1)] for r in range(LANES)]
+        one = scenarios[0]
+        n, m, ticks = len(one.robot.links), len(one.robot.joints), one.tick_count
+        self._vertical = np.array([joint.plane is Plane.VERTICAL for joint in one.robot.joints])
+        self._law = 0 if one.world.ground is None else LAWS.index(one.world.ground.law)
+        self._steps = one.physics_rate_hz // CONTROL_RATE_HZ
+        self._links = np.zeros((n, LINK_ROWS, LANES), dtype)
+        self._head = np.zeros((HEAD_ROWS, LANES), dtype)
+        self._carried = np.zeros((CARRIED_ROWS, LANES), dtype)
+        self._ground = np.zeros((GROUND_ROWS, LANES), dtype)
+        self._gravity = np.zeros((3, LANES), dtype)
+        self._commands = np.zeros((ticks, m, LANES), dtype)
+        self._samples = np.zeros((ticks, SAMPLE_ROWS, m, LANES), dtype)
+        self._poses = np.zeros((ticks, HEAD_ROWS, LANES), dtype)
+        self._failure = np.full((4, LANES), -1.0)
+        for r, scenario in enumerate(lanes):
+            self._put(r, scenario)
+            self._commands[:, :, r] = _commands(scenario, known)
+        self._poses[0] = self._head
+
+    def _put(self, r: int, scenario: Scenario) -> None:
+        """Put a run into a lane."""
+        robot, world = scenario.robot, scenario.world
+        half = np.array([link.length / 2 for link in robot.links])
+        links, head = self._links[:, :, r], self._head[:, r]
+        links[:, ARM], links[1:, CENTRE] = -2.0 * half, -half[1:]
+        links[0, ARM] = -half[0]
+        links[:, RADIUS] = [link.radius for link in robot.links]
+        links[:, MASS] = [link.mass for link in robot.links]
+        links[:, INERTIA : INERTIA + 3] = [link.inertia for link in robot.links]
+        servos = Servos([joint.servo for joint in robot.joints]).table
+        links[1:, SERVO : SERVO + len(servos)] = servos.T
+        head[PLACE + 2] = resting_height(scenario)
+        head[TURN + 2], head[TURN + 3] = np.sin(world.heading / 2), np.cos(world.heading / 2)
+        head[VELOCITY : VELOCITY + 3] = world.velocity
+        self._ground[:, r] = ground_table(world.ground)
+        self._gravity[:, r] = world.gravity
+
+    def run(self) -> None:
+        """Run to the end, or until all have failed."""
+        ticks, n = len(self._commands), len(self._scenarios)
+        limits = np.array([MAX_ROTOR_SPEED, MAX_SPEED**2])
+        step_s = 1.0 / self._scenarios[0].physics_rate_hz
+        for first in range(0, ticks - 1, _TICKS_A_CALL):
+            if (self._failure[0, :n] >= 0).all():
+                return
+            run_block(
+                *(self._links, self._head, self._carried, self._ground, self._gravity),
+                *(self._vertical, self._law, self._commands, self._samples, self._poses),
+                *(self._failure, limits, step_s, self._steps),
+                *(first, min(first + _TICKS_A_CALL, ticks - 1), LANES),
+            )
+
+    def results(self) -> Iterator[BatchRun]:
+        """Take the runs apart."""
+        ticks = len(self._commands)
+        counts = np.full((ticks, 1), float(self._steps))
+        counts[[0, -1]] /= 2
+        for r, scenario in enumerate(self._scenarios):
+            error, end = self._failed(r)
+            samples = self._samples[:end, :, :, r].swapaxes(0, 1).astype(np.float64)
+            samples[2:5] /= counts[:end]
+            poses = self._poses[:end, :, r].astype(np.float64)
+            yield BatchRun(
+                scenario,
+                error,
+                *(samples[0], samples[1], self._commands[:end, :, r].astype(np.float64)),
+                *(samples[2], samples[3], samples[4], samples[5:]),
+                head=poses[:, PLACE : PLACE + 3],
+                head_quaternion=poses[:, TURN : TURN + 4],
+                head_velocity=poses[:, VELOCITY : VELOCITY + 3],
+                head_spin=poses[:, SPIN : SPIN + 3],
+            )
+
+    def _failed(self, r: int) -> tuple[SimulationError | None, int]:
+        """Why a run failed, and how many ticks it has: those before the period in which it did."""
+        step, of_link, place, value = self._failure[:, r].tolist()
+        if step < 0:
+            return None, len(self._commands)
+        scenario = self._scenarios[r]
+        parts = scenario.robot.links if of_link else scenario.robot.joints
+        speed = value**0.5 if of_link else value
+        time_s = step / scenario.physics_rate_hz
+        return failure(scenario, time_s, parts[int(place)], speed), -(-int(step) // self._steps)
