@@ -113,8 +113,7 @@ def stale(position: Series) -> tuple[Span, ...]:
     if not np.any(_around(repeats) > STALE_SHARE * _FEW):
         return ()
     travel = np.abs(value[4:] - value[:-4])
-    least = max(0.5 * np.percentile(travel, 95), 2 * RESOLVED * resolution_of(value))
-    fast = travel > least
+    fast = travel > max(0.5 * np.percentile(travel, 95), 2 * RESOLVED * resolution_of(value))
     of, among = (_around(one) for one in (fast & repeats, fast))
     known = np.flatnonzero(among >= _FEW)
     if known.size == 0:

@@ -233,7 +233,7 @@ def compare_sessions(
         f"{sentence} ({'all sessions' if len(names) == every else ', '.join(names)})"
         for sentence, names in warnings.items()
     ]
-    return compare_fitted(*sides, choices, noted)
+    return compare_fitted(sides[0], sides[1], choices, noted)
 
 
 def compare_fitted(
@@ -254,8 +254,7 @@ def compare_fitted(
     if not a or not b:
         raise UsageError("a comparison needs at least one session a side")
     every_warning = list(warnings)
-    unpaired = "sessions" if len(a) == len(b) == 1 else "groups"
-    design = "pairs" if choices.paired else unpaired
+    design = "pairs" if choices.paired else "sessions" if len(a) == len(b) == 1 else "groups"
     aligned = align([one.run for one in a], [one.run for one in b], any_gait=choices.any_gait)
     keys = family(a, b, aligned.names)
     # Lags near pi must not part company: all are taken within pi of the first session's.

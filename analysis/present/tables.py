@@ -214,18 +214,18 @@ def body_table(body: BodyResult) -> Table[tuple[BodyPoint, ...]]:
     names = [("seen mm (95 %)", "phase° (95 %)"), *((f"{n} null mm", "phase°") for n in body.null)]
     for k, (amplitude, phase) in enumerate(names):
         columns += [
-            Column(amplitude, None, lambda row, k=k: _mm(row[k]), (1, 1), spare=2 if k else 0),
-            Column(phase, None, lambda row, k=k: _deg(row[k]), (1, 1), spare=1 if k else 0),
+            Column(amplitude, None, partial(_amplitude_mm, k), (1, 1), spare=2 if k else 0),
+            Column(phase, None, partial(_phase_deg, k), (1, 1), spare=1 if k else 0),
         ]
     return Table(columns, list(zip(body.observed, *body.null.values(), strict=True)))
 
 
-def _mm(point: BodyPoint) -> Estimate:
-    return scaled(point.amplitude_m, 1000.0)
+def _amplitude_mm(k: int, points: Sequence[BodyPoint]) -> Estimate:
+    return scaled(points[k].amplitude_m, 1000.0)
 
 
-def _deg(point: BodyPoint) -> Estimate:
-    return degrees(point.phase_rad)
+def _phase_deg(k: int, points: Sequence[BodyPoint]) -> Estimate:
+    return degrees(points[k].phase_rad)
 
 
 def point_table(body: BodyResult) -> Table[tuple[str, BodyPoint]]:
@@ -239,8 +239,8 @@ def point_table(body: BodyResult) -> Table[tuple[str, BodyPoint]]:
         Column(None, "place", lambda row: row[1].place, kind="word"),
         Column(None, "link", lambda row: row[1].link, kind="word"),
         Column(None, "of", lambda row: row[0], kind="word"),
-        Column(None, "amplitude [mm]", lambda row: _mm(row[1]), (1, 1)),
-        Column(None, "phase [°]", lambda row: _deg(row[1]), (1, 1)),
+        Column(None, "amplitude [mm]", lambda row: _amplitude_mm(0, row[1:]), (1, 1)),
+        Column(None, "phase [°]", lambda row: _phase_deg(0, row[1:]), (1, 1)),
     ]
     return Table(columns, rows)
 

@@ -299,8 +299,7 @@ def _out_of_profile(
     beside = _beside_neighbours(profile, others, one.joint)
     place = profile.place
     first, last = place[others].min(), place[others].max()
-    at_an_end = not first <= place[one.joint] <= last
-    extrapolated = at_an_end and abs(one.value) <= reach
+    extrapolated = not first <= place[one.joint] <= last and abs(one.value) <= reach
     if (extrapolated and not smooth) or min(each / one.value for each in beside) < LOCAL:
         return False
     mirror = np.flatnonzero(profile.place == profile.count - 1 - profile.place[one.joint])

@@ -226,8 +226,7 @@ def _noncentral_root(value: float, dof: float, quantile: float) -> float:
     """Root of the noncentrality whose chi-square has the value at this quantile; 0 if none has."""
     if value > _ASYMPTOTIC:
         return float(value**0.5 - ndtri(quantile))
-    central = chdtr(dof, value) <= quantile
-    return 0.0 if central else float(chndtrinc(value, dof, quantile)) ** 0.5
+    return 0.0 if chdtr(dof, value) <= quantile else float(chndtrinc(value, dof, quantile)) ** 0.5
 
 
 def _contrast(
@@ -242,8 +241,11 @@ def _contrast(
     parts = weight**2 * variance
     value, error = float(weight @ values), float(parts.sum()) ** 0.5
     freedom = float(parts.sum() ** 2 / np.sum(parts**2 / dof)) if error > 0 else float(dof.min())
-    p = float(2 * stdtr(freedom, -abs(value) / error)) if error > 0 else float(value == 0)
-    return value, around(value, t_factor(freedom) * error), p
+    return value, around(value, t_factor(freedom) * error), _t_p(value, error, freedom)
+
+
+def _t_p(value: float, error: float, dof: float) -> float:
+    return float(2 * stdtr(dof, -abs(value) / error)) if error > 0 else float(value == 0)
 
 
 def _equivalence(

@@ -85,8 +85,7 @@ def steady_part(commands: Sequence[Series], start_s: float, stop_s: float) -> tu
             first_s = max(first_s, float(edges_s[lead]))
         if tail:
             last_s = min(last_s, float(edges_s[edges_s.size - 1 - tail]))
-    short = last_s - first_s < MIN_CYCLES * slowest_s
-    return (start_s, stop_s) if short else (first_s, last_s)
+    return (start_s, stop_s) if last_s - first_s < MIN_CYCLES * slowest_s else (first_s, last_s)
 
 
 def _strongest(rhythm: Rhythm) -> int:

@@ -112,8 +112,7 @@ def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Surv
             if entity == MEASURED:
                 times.append(tracks[0].t_ns[decimate(tracks[0].t_ns, rate_hz)])
             if entity == MECHANICAL and session.robot is not None:
-                at_ns = tracks[0].t_ns[::thin]
-                power = resampled(tracks, names, at_ns, interpolate)
+                power = resampled(tracks, names, tracks[0].t_ns[::thin], interpolate)
                 powers.append(segment_power(power))
     return Survey(
         wanted={topic: fields for topic, fields in wanted.items() if fields},

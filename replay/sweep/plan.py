@@ -146,8 +146,7 @@ def read_plan(path: Path) -> SweepPlan:
     top = Table(values, "", faults)
     plan = read_fields(top, SweepPlan, parameters=lambda: _parameters(top))
     top.close()
-    points = plan.points or math.prod(len(one.values) for one in plan.parameters)
-    runs = points * plan.seeds
+    runs = (plan.points or math.prod(len(one.values) for one in plan.parameters)) * plan.seeds
     if runs > MOST_RUNS:
         top.fault("points", f"at most {MOST_RUNS} runs", str(runs))
     if found := faults.all():

@@ -209,9 +209,11 @@ def stacked(
             the same kicks.
         correlation: Of a column's errors.
     """
-    parts = ("value", "error", "dof")
-    stack = (np.block([[getattr(one, part) for one in row] for row in blocks]) for part in parts)
-    return MeasuredDerivatives(*stack, correlation)
+
+    def block(part: str) -> FloatArray:
+        return np.block([[getattr(one, part) for one in row] for row in blocks])
+
+    return MeasuredDerivatives(block("value"), block("error"), block("dof"), correlation)
 
 
 BANDS = (1, 2, 3)

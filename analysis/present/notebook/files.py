@@ -217,7 +217,7 @@ def html(result: Any) -> str:
     """Return the answer, the first table, and the warnings, for a notebook; all text escaped."""
     answer = escape(plain(headline(result)))
     name, frame = next(iter(result.frames().items()))
-    clean = frame.head(MOST_ROWS).map(lambda cell: plain(cell) if isinstance(cell, str) else cell)
+    clean = frame.head(MOST_ROWS).map(_readable)
     shown = clean.to_html(float_format="{:.4g}".format, index=False, na_rep="–")
     left = len(frame) - MOST_ROWS
     more = f", {left} more rows in frames()[{name!r}]" if left > 0 else ""
@@ -226,3 +226,7 @@ def html(result: Any) -> str:
         items = "".join(f"<li>{escape(plain(text))}</li>" for text in getattr(result, kind, ()))
         remarks += f"<details><summary>{kind}</summary><ul>{items}</ul></details>" if items else ""
     return f"<p><strong>{answer}</strong></p><p>{escape(name)}{escape(more)}</p>{shown}{remarks}"
+
+
+def _readable(cell: object) -> object:
+    return plain(cell) if isinstance(cell, str) else cell

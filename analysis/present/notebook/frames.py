@@ -81,9 +81,7 @@ def _cells(name: str, value: Any) -> dict[str, Any]:
     if isinstance(value, tuple):
         words = cast("tuple[Any, ...]", value)
         return {name: " ".join(words)} if all(isinstance(one, str) for one in words) else {}
-    if is_dataclass(value) or isinstance(value, dict):
-        return {}
-    return {name: value}
+    return {} if is_dataclass(value) or isinstance(value, dict) else {name: value}
 
 
 def _columns(kind: type[Any]) -> list[str]:

@@ -361,7 +361,7 @@ def _without_control(value: object) -> object:
 
 @cache
 def _environment() -> Environment:
-    environment = Environment(
+    environment: Any = Environment(
         loader=PackageLoader("undulog.analysis.present.page"),
         autoescape=True,
         finalize=_without_control,

@@ -180,9 +180,7 @@ def _rename_identifiers(root: ET.Element, prefix: str) -> None:
     used: dict[str, str] = {}
     for element in root.iter():
         for key, value in element.attrib.items():
-            found = _URL.findall(value)
-            if key == _XLINK:
-                found = [value.removeprefix("#")]
+            found = [value.removeprefix("#")] if key == _XLINK else _URL.findall(value)
             for name in found:
                 used.setdefault(name, f"{prefix}-{len(used)}")
     for element in root.iter():
