@@ -41,7 +41,6 @@ _PLACES_EVERY_S = 0.2
 _CLEARER = 2.0  # another plane's joints are plotted once they swing so many times as far
 
 _KEPT_NS = 2_000_000_000  # length of a window
-_KEPT = 3  # samples of a line that are kept however old they are: they tell a gap from a pause
 
 # Quantities of several samples, and what they are computed from.
 _WAITING = {
@@ -139,8 +138,7 @@ def _grown(
     """Append new samples to those of the last seconds before them."""
     if old is None or t_ns[-1] < old[0][-1] - _KEPT_NS:  # the clock was set back
         return t_ns, values
-    first = int(np.searchsorted(old[0], int(t_ns[0]) - _KEPT_NS))
-    first = max(min(first, old[0].size - _KEPT), 0)
+    first = int(np.searchsorted(old[0], int(old[0][-1]) - _KEPT_NS))  # a gap needs what was before
     return ordered(np.concatenate([old[0][first:], t_ns]), np.concatenate([old[1][first:], values]))
 
 

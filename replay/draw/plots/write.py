@@ -349,9 +349,7 @@ class Plots:
             if entity in tracks:
                 plot.write(self._rec, self._clock, tracks[entity], rows, known_ns)
         for source, plot in self._places.items():
-            names = {name for one in plot.series for name in one.names}
-            chosen = [track for track in tracks.get(source, ()) if track.name in names]
-            plot.write(self._rec, self._clock, chosen, rows, known_ns)
+            plot.write(self._rec, self._clock, tracks.get(source, ()), rows, known_ns)
 
     def _signals(self, units: Mapping[str, str]) -> tuple[Signal, ...]:
         """Every other JointState topic as it is: currents, voltages, temperatures, foreign ones."""

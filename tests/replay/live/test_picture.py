@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from support.live_stage import EPOCH_NS, seen_live
+from support.written_topics import write_topics
 from undulog.capture import Session
 from undulog.replay.feed.recording import write_recording
 
@@ -86,3 +87,27 @@ def test_entities_names_and_colours_are_the_replays_and_sent_once(live, replay):
             assert drawn.static(entity, component) == replay.static(entity, component)
     static = [one for one in drawn._chunks if one.entity_path == "/joints/measured"]
     assert sum(one.is_static for one in static) == 1
+
+
+def test_a_gap_ends_lines_and_body_as_in_a_replay(snake25, truth, tmp_path, read_back):
+    t_ns = truth.t_ns + np.where(np.arange(len(truth.t_ns)) < 150, 0, 3_000_000_000)
+    names = snake25.joint_names
+    topics = {
+        "/joint_commands": (names, "rad", truth.command),
+        "/joint_states": (names, "rad", truth.position, truth.velocity, truth.effort),
+    }
+    head = np.outer(np.arange(len(t_ns)), [1e-3, 0.0, 0.0])
+    path = write_topics(tmp_path / "gap.mcap", t_ns, topics, head=head, robot=snake25)
+    _, output = seen_live(path, tmp_path)
+    with Session.open(path) as session:
+        write_recording(session, tmp_path / "replay.rrd")
+    seen, expected = read_back(output), read_back(tmp_path / "replay.rrd")
+    for entity in (
+        "/joints/measured",
+        "/joints/error",
+        "/power/total/mechanical",
+        "/world/snake/measured",
+        "/world/snake/commanded",
+        "/world/trail",
+    ):
+        assert seen.times(entity).tolist() == expected.times(entity).tolist(), entity
