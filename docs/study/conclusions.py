@@ -1,0 +1,222 @@
+"""The study's conclusions: each an inequality on an end of an interval, evaluated from the rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .heterogeneity import bootstrapped
+from .results import Results
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """A sentence that holds if its inequality does.
+
+    Attributes:
+        name: For references from the page.
+        sentence: What it says; ``{value}`` stands for value and interval.
+        bound: What the interval has to lie above or below.
+        above: Whether above.
+        of: Value and both ends of the 95 % interval, of the results.
+        lengths: Chains of how many lengths it needs; fewer leave it open.
+    """
+
+    name: str
+    sentence: str
+    bound: float
+    above: bool
+    of: Callable[[Results], Sequence[float]]
+    lengths: int = 2
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A conclusion, evaluated.
+
+    Attributes:
+        low: Lower end of the interval.
+        high: Upper end.
+        holds: None where there are too few chains for it.
+    """
+
+    conclusion: Conclusion
+    value: float
+    low: float
+    high: float
+    holds: bool | None
+
+    @property
+    def expression(self) -> str:
+        """Return the inequality with its numbers."""
+        end, sign = (self.low, ">") if self.conclusion.above else (self.high, "<")
+        return f"{end:.3g} {sign} {self.conclusion.bound:g}"
+
+
+def _exponent(outcome: str, factor: str) -> Callable[[Results], Sequence[float]]:
+    return lambda results: results.exponents[outcome].loc[factor].tolist()
+
+
+def _boundary_identical(results: Results) -> Sequence[float]:
+    alike = results.shares[results.shares["weakened"] == 8.0]["boundary_share"].to_numpy()
+    return float(np.median(alike)), float(alike.min()), float(alike.max())
+
+
+def _named(results: Results) -> Sequence[float]:
+    weak = results.shares[results.shares["weakened"] < 8.0]["named"].to_numpy(dtype=float)
+    return bootstrapped(weak, np.mean).tolist()
+
+
+def _worst(
+    column: str, pick: Callable[..., float], least: int = 0
+) -> Callable[[Results], Sequence[float]]:
+    """Return the extreme of a measure over all chains that long, each with its own interval."""
+
+    def of(results: Results) -> Sequence[float]:
+        table = results.measures[results.measures["n"] >= least]
+        low, high = (table.get(f"{column}_{end}", table[column]) for end in ("low", "high"))
+        return pick(table[column]), pick(low), pick(high)
+
+    return of
+
+
+def _explicit(results: Results) -> Sequence[float]:
+    """Explicit coupling that weak servos need, over that of a chain without a body; longest."""
+    table = results.measures
+    one = table[table["stall"] == 0.25].sort_values("n").iloc[-1]
+    ends = one[["explicit", "explicit_low", "explicit_high"]].to_numpy(dtype=float)
+    return (ends / one["explicit_alone"]).tolist()
+
+
+def _time_exponent(kind: str) -> Callable[[Results], Sequence[float]]:
+    def of(results: Results) -> Sequence[float]:
+        table = results.growth
+        one = table[(table["stall"] == 0.25) & (table["kind"] == kind)].iloc[0]
+        return [float(one[end]) for end in ("value", "low", "high")]
+
+    return of
+
+
+def _alone(results: Results) -> Sequence[float]:
+    """Largest share of starts from which the body alone synchronises a chain."""
+    table = results.chains
+    share = table[table["kind"] == "identified"]["synchronous"].max()
+    return float(share), float(share), float(share)
+
+
+CONCLUSIONS = (
+    Conclusion(
+        "weak-servos",
+        "Weak servos make joints unequal: the spread of lag goes as stall torque to the {value}.",
+        0.0,
+        above=False,
+        of=_exponent("lag_sd", "stall_torque"),
+    ),
+    Conclusion(
+        "friction",
+        "Friction across the body makes joints unequal: the spread of lag goes as mu_n to the {value}.",
+        0.0,
+        above=True,
+        of=_exponent("lag_sd", "mu_normal"),
+    ),
+    Conclusion(
+        "long-chains",
+        "Longer chains are not more unequal: the spread of lag goes as n to the {value}.",
+        0.5,
+        above=False,
+        of=_exponent("lag_sd", "n"),
+    ),
+    Conclusion(
+        "contact",
+        "It is contact that makes joints unequal: with it the spread of lag is {value} times as large.",
+        2.0,
+        above=True,
+        of=lambda results: bootstrapped(results.contact["ratio"].to_numpy()).tolist(),
+    ),
+    Conclusion(
+        "boundary",
+        "Of identical modules reversal gives the boundary all of the spread: a share of {value}.",
+        0.99,
+        above=True,
+        of=_boundary_identical,
+    ),
+    Conclusion(
+        "module",
+        "The pair of a weak module has the largest contrast in a share of {value} of the points.",
+        0.5,
+        above=True,
+        of=_named,
+    ),
+    Conclusion(
+        "non-normal",
+        "P is far from normal: Henrici's departure is at least {value}.",
+        0.3,
+        above=True,
+        of=_worst("henrici", min),
+    ),
+    Conclusion(
+        "not-neighbours",
+        "From 9 joints on next neighbours hold at most {value} of the off-diagonal energy of P.",
+        0.7,
+        above=False,
+        of=_worst("band1", max, least=9),
+    ),
+    Conclusion(
+        "neutral",
+        "The body alone leaves a pattern to itself or drives it: the slowest rate is at most {value} eps.",
+        0.02,
+        above=False,
+        of=_worst("gap", max),
+    ),
+    Conclusion(
+        "never-alone",
+        "The body alone synchronises no chain: from a share of {value} of the starts.",
+        0.5,
+        above=False,
+        of=_alone,
+    ),
+    Conclusion(
+        "linear",
+        "P predicts random patterns of 0.1 rad: its error is at most {value} of that of joints that "
+        "keep their response.",
+        0.5,
+        above=False,
+        of=_worst("held_out", max),
+    ),
+    Conclusion(
+        "helps",
+        "With weak servos the body spares explicit coupling: the longest chain needs {value} of what "
+        "it needs without a body.",
+        1.0,
+        above=False,
+        of=_explicit,
+    ),
+    Conclusion(
+        "path",
+        "A path of next neighbours takes a time to synchronise that grows as n to the {value}.",
+        1.3,
+        above=True,
+        of=_time_exponent("path"),
+    ),
+    Conclusion(
+        "body-and-path",
+        "With the identified body that exponent is {value}.",
+        2.2,
+        above=False,
+        of=_time_exponent("path + identified"),
+    ),
+)
+
+
+def evaluate(results: Results) -> list[Verdict]:
+    """Return all conclusions, evaluated."""
+    return [_verdict(one, results) for one in CONCLUSIONS]
+
+
+def _verdict(one: Conclusion, results: Results) -> Verdict:
+    lengths = results.measures["n"].nunique()
+    value, low, high = (float(x) for x in one.of(results))
+    holds = low > one.bound if one.above else high < one.bound
+    return Verdict(one, value, low, high, None if lengths < one.lengths else bool(holds))

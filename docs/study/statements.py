@@ -1,0 +1,92 @@
+"""Part (e): the paper's own statements, each held against the conclusions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .conclusions import Verdict
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A statement of the paper.
+
+    Attributes:
+        verdict: If all conclusions named hold.
+        finding: What was found, on top of those conclusions.
+        conclusions: Names of those that it rests on; the page elsewhere if there are none.
+    """
+
+    text: str
+    verdict: str
+    finding: str
+    conclusions: tuple[str, ...] = ()
+
+
+STATEMENTS = (
+    Statement(
+        "Segments of the chain move unequally: amplitude and phase of head, middle and tail differ.",
+        "refined",
+        "It holds for the joints' response to their commands, as the last figure of "
+        "[the paper, figure by figure](paper.md) has it beside its null. Link positions, which the "
+        "paper shows, differ by kinematics alone with every joint exactly on its command.",
+        ("weak-servos", "boundary"),
+    ),
+    Statement(
+        "The differences come from the missing neighbours at the chain's ends.",
+        "supported",
+        "Identical modules mirror when the wave is reversed.",
+        ("boundary",),
+    ),
+    Statement(
+        "Weak servos and the load of the ground are why joints respond unequally.",
+        "supported",
+        "",
+        ("weak-servos", "friction", "contact"),
+    ),
+    Statement(
+        "Oscillators are coupled to their next neighbours (Eq. 1).",
+        "refuted for what the body couples",
+        "A generator may be built so; the body couples further, with both signs.",
+        ("not-neighbours",),
+    ),
+    Statement(
+        "Coupled through the body, generators synchronise.",
+        "refuted for the body alone",
+        "Most patterns are left alone, one grows slowly: explicit coupling has to supply the gap.",
+        ("neutral", "never-alone"),
+    ),
+    Statement(
+        "How heterogeneous couplings affect scalability and synchronisation is open.",
+        "answered for this body",
+        "P is measured open loop and predicts it.",
+        ("helps", "path", "body-and-path", "linear"),
+    ),
+    Statement(
+        "The skin is rougher along the body than across.",
+        "refuted for lateral undulation",
+        "The slice of friction below: distance against μ_n / μ_t.",
+    ),
+    Statement(
+        "A chain of delay blocks makes the serpentine wave of Eq. 2.",
+        "refined",
+        "Equal at constant frequency and amplitude alone ([delay blocks](paper.md#delay-blocks)).",
+    ),
+    Statement(
+        "A~(d) = exp(k d) - A_max shrinks the amplitude near a wall.",
+        "refined",
+        "Ill-formed as printed; [adaptive control](control.md) has the bounded law that does.",
+    ),
+)
+
+
+def lines(verdicts: list[Verdict]) -> list[str]:
+    """Return the table of statements; a statement whose conclusions fail is open."""
+    by_name = {one.conclusion.name: one for one in verdicts}
+    rows = ["| the paper | verdict | with |", "|---|---|---|"]
+    for one in STATEMENTS:
+        named = [by_name[name] for name in one.conclusions]
+        verdict = one.verdict if all(v.holds for v in named) else "open"
+        with_ = " ".join([*(f"`{v.conclusion.name}`: {v.expression}." for v in named), one.finding])
+        rows.append(f"| {one.text} | **{verdict}** | {with_} |")
+    return rows
