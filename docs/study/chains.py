@@ -22,8 +22,9 @@ PATH = 1.0
 """Coupling of next neighbours, both ways [eps]."""
 DRAWN, START = 100, 1.0
 """Chains that start with phases drawn evenly up to +-START [rad]."""
-SYNCHRONOUS = 0.99
+SYNCHRONOUS = 0.9999
 """Order parameter from which on a chain counts as synchronous."""
+RESAMPLES = 500
 STEP, LONGEST = 0.1, 600.0
 """Between looks, and when a chain is given up [1/eps]."""
 KINDS = ("path", "path + identified", "path + homogeneous", "identified", "homogeneous")
@@ -31,8 +32,11 @@ KINDS = ("path", "path + identified", "path + homogeneous", "identified", "homog
 
 def coupling(kind: str, P: FloatArray) -> FloatArray:
     """Return the matrix whose rows sum to 1 and whose off-diagonal part is K."""
-    parts = {"identified": P, "homogeneous": homogeneous(P)}
-    body = next((M for name, M in parts.items() if name in kind), np.eye(len(P)))
+    body = np.eye(len(P))
+    if "identified" in kind:
+        body = P
+    elif "homogeneous" in kind:
+        body = homogeneous(P)
     return body - PATH * path_laplacian(len(P)) if "path" in kind else body
 
 
@@ -62,7 +66,7 @@ def times(
 
     theta = np.random.default_rng(n).uniform(-START, START, (draws, n))
     seen = [order(theta)]
-    while len(seen) * STEP < longest and not (seen[-1] > 1.0 - 1e-4).all():
+    while len(seen) * STEP < longest and not (seen[-1] > 1.0 - 1e-5).all():
         theta = integrate(rate, theta, STEP, fastest)
         seen.append(order(theta))
     seen = np.array(seen)
@@ -98,35 +102,46 @@ def table(chains: list[Kicked], *, draws: int = DRAWN, longest: float = LONGEST)
 
 
 def growth_with_n(found: pd.DataFrame) -> pd.DataFrame:
-    """Return exponents in n of time to synchrony and of detuning, by stall torque and kind.
+    """Return exponents in n of time to synchrony, slowest rate and detuning, by stall and kind.
 
-    The time is the median over the chains' starts; its interval by bootstrap over them. Kinds with
-    a chain that never became synchronous in more than half of its starts have none.
+    The time is the median over the chains' starts, its interval by bootstrap over them; all kinds
+    have the same starts, so ``against`` is the paired difference from the path alone. Kinds of
+    which more than half of the chains never became synchronous have neither.
     """
     rows = []
-    random = np.random.default_rng(6)
     for (stall, kind), group in found.groupby(["stall", "kind"], sort=False):
         logs = np.log(group["n"].to_numpy(dtype=float))
         if len(logs) < 2:
             continue
-        all_times = np.stack(group["times"].to_list())
-        drawn = [np.median(all_times, axis=1)]
-        for _ in range(500):
-            picks = [one[random.integers(0, len(one), len(one))] for one in all_times]
-            drawn.append(np.median(picks, axis=1))
-        ok = np.isfinite(drawn).all() and np.min(drawn) > 0
-        slopes = [np.polyfit(logs, np.log(one), 1)[0] for one in drawn] if ok else [np.nan]
-        low, high = np.quantile(slopes, (0.025, 0.975))
+        drawn = _exponents(logs, group["times"].to_list())
+        path = _exponents(logs, found.loc[group.index - KINDS.index(kind), "times"].to_list())
         rows.append(
             {
                 "stall": stall,
                 "kind": kind,
                 "lengths": len(logs),
-                "value": slopes[0],
-                "low": low,
-                "high": high,
+                **_ends("", drawn),
+                **_ends("against_", drawn - path),
+                "settles": bool((group["gap"] > 0.0).all()),
                 "detuned": np.polyfit(logs, np.log(group["detuned"].to_numpy()), 1)[0],
                 "gap": np.polyfit(logs, np.log(np.abs(group["gap"].to_numpy())), 1)[0],
             }
         )
     return pd.DataFrame(rows)
+
+
+def _exponents(logs: FloatArray, times_of: list[FloatArray]) -> FloatArray:
+    """Return exponents of the median time: that of all starts first, then those of resamples."""
+    random = np.random.default_rng(6)
+    medians = [[np.median(one) for one in times_of]]
+    for _ in range(RESAMPLES):
+        picks = [one[random.integers(0, len(one), len(one))] for one in times_of]
+        medians.append([np.median(one) for one in picks])
+    if not np.isfinite(medians).all():
+        return np.full(1 + RESAMPLES, np.nan)
+    return np.polyfit(logs, np.log(medians).T, 1)[0]
+
+
+def _ends(name: str, drawn: FloatArray) -> dict[str, float]:
+    low, high = np.quantile(drawn, (0.025, 0.975))
+    return {f"{name}value": drawn[0], f"{name}low": low, f"{name}high": high}

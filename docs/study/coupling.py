@@ -1,4 +1,4 @@
-"""Part (b): the phase-coupling matrix P of chains of several lengths, from the rows of the kicks."""
+"""Part (b): the phase-coupling matrix P of chains of several lengths, from rows of kicks."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _matrices(rows: pd.DataFrame, n: int, stall: float) -> Kicked | None:
     defect = P.sum(axis=1) - 1.0
     ratios = []
     for phase, one in y.items():
-        if 2 <= np.count_nonzero(phase) and max(np.abs(phase)) <= HELD_OUT:
+        if np.count_nonzero(phase) >= 2 and max(np.abs(phase)) <= HELD_OUT:
             moved = (one - base).imag + np.array(phase)
             kept, predicted = np.array(phase), P @ np.array(phase)
             ratios.append(np.linalg.norm(moved - predicted) / np.linalg.norm(moved - kept))

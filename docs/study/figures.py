@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from undulog.analysis.oscillators.laplacian import of_deviations, smallest_singular, spectrum
+from undulog.capture.common.arrays import FloatArray
 
 from . import heterogeneity
 from .chains import KINDS, STEP
@@ -32,6 +35,23 @@ NAMES = {
     "transeth": "law transeth (ln of the factor)",
 }
 """Of factors, for readers."""
+LOGARITHMIC = {
+    "stall": (0.15, 0.4, 1.5),
+    "gain": (4, 8, 16, 32),
+    "friction": (0.05, 0.2, 1),
+    "joints": (3, 5, 9, 17, 50),
+}
+"""Ticks of the slices whose axis is logarithmic."""
+LENGTHS = (3, 5, 9, 13, 17, 25, 50)
+
+
+def log_axis(axis: Axis, ticks: Sequence[float]) -> None:
+    """Make an axis logarithmic, with ticks at these values alone."""
+    one = axis.axes
+    (one.set_xscale if axis is one.xaxis else one.set_yscale)("log")
+    axis.set_major_locator(FixedLocator(list(ticks)))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axis.set_minor_locator(NullLocator())
 
 
 def draw_all(results: Results, folder: Path) -> list[str]:
@@ -58,11 +78,11 @@ def slices(results: Results) -> Figure:
         x = table[column] if name != "law" else np.arange(len(table))
         ax.plot(x, np.degrees(table["lag_sd"]), "o-", color="#1c7ed6", label="spread of lag [°]")
         ax.plot(x, 100 * table["gain_cv"], "s--", color="#e8590c", label="CV of gain [%]")
-        ax.set_yscale("log")
+        log_axis(ax.yaxis, (1, 3, 10, 30))
         if name == "law":
             ax.set_xticks(x, table["law"], rotation=20)
-        elif name in ("stall", "gain", "friction", "joints"):
-            ax.set_xscale("log")
+        elif name in LOGARITHMIC:
+            log_axis(ax.xaxis, LOGARITHMIC[name])
         ax.set_xlabel(label)
     axes[0, 0].legend(frameon=False, fontsize=8)
     return figure
@@ -86,7 +106,9 @@ def exponents(results: Results) -> Figure:
 def collapse(results: Results) -> Figure:
     """The spread of lag against single groups."""
     points = results.points
-    names = list(results.groups["lag_sd"].loc[list(heterogeneity.GROUPS)]["value"].nlargest(3).index)
+    names = list(
+        results.groups["lag_sd"].loc[list(heterogeneity.GROUPS)]["value"].nlargest(3).index
+    )
     figure, axes = plt.subplots(1, 3, figsize=(10, 3.4), sharey=True)
     for ax, name in zip(axes, names, strict=True):
         x = np.asarray(heterogeneity.GROUPS[name](points), dtype=float)
@@ -95,14 +117,21 @@ def collapse(results: Results) -> Figure:
         X = heterogeneity.quadratic(np.log(x))
         fit = np.linalg.lstsq(X, np.log(points["lag_sd"].to_numpy()), rcond=None)[0]
         ax.plot(x[order], np.exp(X @ fit)[order], color="#e8590c")
-        ax.set_xscale("log")
+        log_axis(ax.xaxis, _decades(x))
         ax.set_yscale("log")
         R2 = results.groups["lag_sd"].loc[name, "value"]
         ax.set_title(f"R² out of sample {R2:.2f}", fontsize=9)
         ax.set_xlabel(name)
     axes[0].set_ylabel("spread of lag [rad]")
-    figure.colorbar(shown, ax=axes, label="n")
+    bar = figure.colorbar(shown, ax=axes, label="n")
+    log_axis(bar.ax.yaxis, LENGTHS)
     return figure
+
+
+def _decades(values: FloatArray) -> list[float]:
+    """Return 1, 2, 5, 10, ... within the values' range."""
+    every = [m * 10.0**k for k in range(-5, 5) for m in (1, 2, 5)]
+    return [one for one in every if values.min() <= one <= values.max()]
 
 
 def shares(results: Results) -> Figure:
@@ -130,7 +159,13 @@ def matrices(results: Results) -> Figure:
     figure, axes = plt.subplots(1, len(weak) + 1, figsize=(2.6 * len(weak) + 3.2, 2.9))
     for ax, one in zip(axes, weak, strict=False):
         ax.spines[:].set_visible(True)
-        shown = ax.imshow(one.P - np.eye(one.n), cmap="RdBu_r", vmin=-0.25, vmax=0.25)
+        shown = ax.imshow(
+            one.P - np.eye(one.n),
+            cmap="RdBu_r",
+            vmin=-0.25,
+            vmax=0.25,
+            extent=(0.5, one.n + 0.5, one.n + 0.5, 0.5),
+        )
         ax.set_title(f"P − I, n = {one.n}", fontsize=9)
         ax.set_xlabel("command turned")
     axes[0].set_ylabel("joint")
@@ -140,7 +175,8 @@ def matrices(results: Results) -> Figure:
         style = "o-" if one.stall == 0.25 else "s--"
         energy = [band_energy(one.P, int(k)) for k in reach]
         axes[-1].plot(reach, energy, style, ms=3, label=f"n = {one.n}, {one.stall:g} N m")
-    axes[-1].set(xscale="log", xlabel="within |i − j|", ylabel="share of off-diagonal energy")
+    log_axis(axes[-1].xaxis, (1, 2, 4, 8, 16, 32))
+    axes[-1].set(xlabel="within |i − j|", ylabel="share of off-diagonal energy")
     axes[-1].legend(frameon=False, fontsize=7)
     return figure
 
@@ -161,10 +197,10 @@ def modes(results: Results) -> Figure:
     ax.set(xlabel="real part of the rate [ε]", ylabel="imaginary part [ε]")
     ax.set_title(f"log10 of the change of P that makes it a rate, n = {one.n}", fontsize=9)
     found = spectrum(one.P)
-    for k in range(min(3, one.n - 1)):
+    for k in np.flatnonzero(found.rates.imag >= 0.0)[:3]:
         pattern = found.patterns[:, k]
         pattern = (pattern / pattern[np.argmax(np.abs(pattern))]).real
-        beside.plot(np.arange(1, one.n + 1), pattern, "o-", label=f"rate {found.rates[k]:.3f} ε")
+        beside.plot(np.arange(1, one.n + 1), pattern, "o-", label=f"{found.rates[k]:.3f} ε")
     beside.set(xlabel="joint, from the head", ylabel="pattern, largest = 1")
     beside.legend(frameon=False, fontsize=8)
     return figure
@@ -185,13 +221,17 @@ def synchrony(results: Results) -> Figure:
     for kind in KINDS[:3]:
         one = weak[weak["kind"] == kind].sort_values("n")
         second.plot(one["n"], one["median"], "o-", color=COLOURS[kind], label=kind)
-    second.set(xscale="log", yscale="log", xlabel="n", ylabel="median time to synchrony [1/ε]")
+    log_axis(second.xaxis, LENGTHS)
+    log_axis(second.yaxis, _decades(weak.loc[weak["kind"] == "path", "median"].to_numpy()))
+    second.set(xlabel="n", ylabel="median time to synchrony [1/ε]")
     second.legend(frameon=False, fontsize=7)
-    for stall, group in results.measures.groupby("stall"):
-        group = group.sort_values("n")
+    for stall, group in results.measures.sort_values("n").groupby("stall"):
         third.plot(group["n"], group["explicit"], "o-", label=f"body, {stall:g} N m")
-    third.plot(group["n"], group["explicit_alone"], "k--", lw=1, label="no body: 0.1/(4 sin² π/2n)")
-    third.set(xscale="log", yscale="log", xlabel="n", ylabel="explicit coupling needed [ε]")
+    every = results.measures.sort_values("n")
+    third.plot(every["n"], every["explicit_alone"], "k--", lw=1, label="no body: 0.1/(4 sin² π/2n)")
+    log_axis(third.xaxis, LENGTHS)
+    log_axis(third.yaxis, _decades(results.measures["explicit"].to_numpy()))
+    third.set(xlabel="n", ylabel="explicit coupling needed [ε]")
     third.legend(frameon=False, fontsize=7)
     return figure
 

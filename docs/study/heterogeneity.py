@@ -16,6 +16,8 @@ from .rows import responses
 LINK_M, LINK_KG, GRAVITY = 0.06, 0.1, 9.81
 SUPPLY_V, TORQUE_CONSTANT, VISCOUS, INERTIA = 6.0, 1.0, 0.005, 1.5e-3
 """Of the links and servos of ``plans/chain.toml``."""
+SOUND = 8.0
+"""Gain of the modules that are not weakened [1/rad]."""
 MOST_DRIFT = 0.01
 """Rows whose response drifts by more per cycle (log gain or rad) are not settled, and left out."""
 DRAWS = 1000
@@ -98,14 +100,14 @@ def group_fits(points: pd.DataFrame, outcome: str) -> pd.DataFrame:
     """
     y = np.log(points[outcome].to_numpy())
     logs = {name: np.log(np.asarray(of(points), dtype=float)) for name, of in GROUPS.items()}
-    rows = {name: _held_out([quadratic(x)], y) for name, x in logs.items()}
+    rows = {name: held_out([quadratic(x)], y) for name, x in logs.items()}
     n = np.log(points["n"].to_numpy(dtype=float))
     scaled = [quadratic(logs["A K_p T_s / (μ_n m g L)"] - p * n) for p in POWERS]
-    rows["A K_p T_s / (μ_n m g L n^p)"] = _held_out(scaled, y)
+    rows["A K_p T_s / (μ_n m g L n^p)"] = held_out(scaled, y)
     pairs = {f"{a}, {b}": quadratic(logs[a], logs[b]) for a, b in combinations(logs, 2)}
-    best = max(pairs, key=lambda name: _held_out([pairs[name]], y)[0])
-    rows[best] = _held_out([pairs[best]], y)
-    rows["all factors, power law"] = _held_out([design(points)], y)
+    best = max(pairs, key=lambda name: held_out([pairs[name]], y)[0])
+    rows[best] = held_out([pairs[best]], y)
+    rows["all factors, power law"] = held_out([design(points)], y)
     return pd.DataFrame(rows, index=["value", "low", "high"]).T
 
 
@@ -115,7 +117,7 @@ def quadratic(*logs: FloatArray) -> FloatArray:
     return np.stack([np.ones(len(logs[0])), *logs, *squares], axis=1)
 
 
-def _held_out(models: list[FloatArray], y: FloatArray, folds: int = 10) -> FloatArray:
+def held_out(models: list[FloatArray], y: FloatArray, folds: int = 10) -> FloatArray:
     """Return R^2 out of sample and its 95 % interval by bootstrap over points, shape (3,)."""
     fold = np.random.default_rng(2).permutation(np.arange(len(y)) % folds)
     error, spread = np.empty(len(y)), np.empty(len(y))
@@ -153,9 +155,9 @@ def shares(rows: pd.DataFrame) -> pd.DataFrame:
             }
         )
     table = pd.DataFrame(found)
-    return table.assign(**{
-        name: both[0][name].to_numpy() for name in ("weakened", "stall_torque", "lag_sd", "key")
-    })
+    return table.assign(
+        **{name: both[0][name].to_numpy() for name in ("weakened", "stall_torque", "lag_sd", "key")}
+    )
 
 
 def contact(rows: pd.DataFrame) -> pd.DataFrame:

@@ -24,10 +24,16 @@ DRIFT = re.compile(r"drifts by ([+-][\d.e-]+) % in gain and ([+-][\d.e-]+) degre
 
 def gather(folder: Path, path: Path) -> None:
     """Write the finished rows of all sweeps under a folder into one Parquet file."""
-    found = []
-    for store in sorted(one.parent for one in folder.glob("*/rows")):
-        for row in RowStore(str(store)).rows():
-            found.append({"plan": store.name, **_kept(row)})
+    stores = sorted(one.parent for one in folder.glob("*/rows"))
+    sources = {
+        one.stem: json.loads(one.read_text())["software"]["source"]
+        for one in folder.glob("*/settings/*.json")
+    }
+    found = [
+        {"plan": store.name, "source": sources[row["setting"]], **_kept(row)}
+        for store in stores
+        for row in RowStore(str(store)).rows()
+    ]
     path.parent.mkdir(parents=True, exist_ok=True)
     frame = pd.DataFrame(found).sort_values(["plan", "changes", "key"], ignore_index=True)
     frame.to_parquet(path, compression="zstd", index=False)

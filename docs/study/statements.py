@@ -25,7 +25,7 @@ class Statement:
 
 STATEMENTS = (
     Statement(
-        "Segments of the chain move unequally: amplitude and phase of head, middle and tail differ.",
+        "Segments move unequally: amplitude and phase of head, middle and tail differ.",
         "refined",
         "It holds for the joints' response to their commands, as the last figure of "
         "[the paper, figure by figure](paper.md) has it beside its null. Link positions, which the "
@@ -65,7 +65,20 @@ STATEMENTS = (
     Statement(
         "The skin is rougher along the body than across.",
         "refuted for lateral undulation",
-        "The slice of friction below: distance against μ_n / μ_t.",
+        "The robot's wheels, and lateral undulation, need μ_n > μ_t.",
+        ("rough-across",),
+    ),
+    Statement(
+        "The last figure: with a lag of π/2 segments move more alike than with π/3.",
+        "supported",
+        "Part of it is kinematics, which the null beside [that figure]"
+        "(paper.md#head-middle-and-tail-of-13-links) shows.",
+        ("short-waves",),
+    ),
+    Statement(
+        "Contact is a spring and damper, F_n = -k p_z - d v_z for p_z < 0 (Eq. 7).",
+        "refined",
+        "Clamped at 0: ground doesn't pull ([physics](physics.md)).",
     ),
     Statement(
         "A chain of delay blocks makes the serpentine wave of Eq. 2.",

@@ -15,7 +15,6 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from study.design import PLANS, stages
 from study.rows import gather
-
 from undulog.capture.common.process import StopRequest, interruptible
 from undulog.replay.sweep.rows import RowStore
 from undulog.replay.sweep.sweep import prepare, run_sweep
@@ -53,9 +52,7 @@ def main() -> int:
     chosen = parser.parse_args()
     folder: Path = chosen.out or OUT / ("quick" if chosen.quick else "long")
     with interruptible() as stop:
-        if not chosen.no_runs and not run(
-            folder, stop, quick=chosen.quick, workers=chosen.workers
-        ):
+        if not chosen.no_runs and not run(folder, stop, quick=chosen.quick, workers=chosen.workers):
             return 1
     if chosen.no_page:
         return 0
@@ -64,7 +61,7 @@ def main() -> int:
     rows = folder / "rows.parquet" if chosen.quick else Path(__file__).parent / "rows/long.parquet"
     gather(folder, rows)
     page = folder / "study.md" if chosen.quick else DOCS / "study.md"
-    write_page(rows, page)
+    write_page(rows, page, quick=chosen.quick)
     print(page)
     return 0
 
