@@ -63,10 +63,10 @@ def stages(*, quick: bool) -> Iterator[Stage]:
     yield from (_part(name) for name in SLICED[:2])
     yield from (_part(f"reversal-{way}", 16) for way in ("forward", "back"))
     yield from (_part(f"pair-{world}", 16) for world in ("ground", "free"))
-    yield from kicked[4:7]
-    yield _part("sobol", 96)
+    yield kicked[4]
     yield from (_part(name) for name in SLICED[2:])
-    yield kicked[7]
+    yield _part("sobol", 96)
+    yield from kicked[5:8]
     yield from (_part(f"reversal-{way}") for way in ("forward", "back"))
     yield from (_part(f"pair-{world}") for world in ("ground", "free"))
     yield _part("sobol")

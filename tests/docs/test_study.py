@@ -7,6 +7,7 @@ import pytest
 from study import chains, coupling, heterogeneity, statements
 from study.conclusions import CONCLUSIONS, evaluate
 from study.results import results_of
+from study.rows import read_rows
 
 from support.paths import ROOT
 from support.processes import run
@@ -35,6 +36,20 @@ def test_the_rows_in_the_tree_give_the_page_and_all_conclusions():
     results = results_of(LONG)
     assert [one for one in evaluate(results) if not one.holds] == []
     assert results.digest in (ROOT / "docs/study.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("n", "stall", "gap", "homogeneous", "explicit"),
+    [(5, 0.25, -0.034, -0.022, 0.28), (9, 0.25, -0.017, -0.031, 0.68)],
+)
+def test_kicks_as_rows_give_the_matrix_of_a_kick_experiment(n, stall, gap, homogeneous, explicit):
+    """docs/oscillators.md has these, from sessions by ``analyse_experiment``."""
+    rows = read_rows(LONG)
+    rows = rows[rows["plan"] == f"kicks-{n}-{stall}"]
+    one = coupling.measures(coupling.kicked(rows)).iloc[0]
+    assert one["gap"] == pytest.approx(gap, abs=5e-4)
+    assert one["homogeneous_gap"] == pytest.approx(homogeneous, abs=5e-4)
+    assert one["explicit"] == pytest.approx(explicit, abs=5e-3)
 
 
 def test_statements_rest_on_conclusions_that_exist():
