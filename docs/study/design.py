@@ -28,7 +28,7 @@ QUICK_JOINTS = (9, 17)
 """5 and 9 yaw joints."""
 QUICK_S = {"wave": 13.0, "wave-back": 13.0, "wave-free": 30.0, "kicks": 15.0}
 """Length of quick runs; 5 s are measured, settling is what is left."""
-QUICK_POINTS = {"sobol": 64, "pair": 6, "reversal": 8}
+QUICK_POINTS = {"sobol": 20, "pair": 6, "reversal": 8}
 SLICES = ("stall", "joints", "lag", "law", "friction", "gain", "amplitude", "frequency", "servo")
 SLICED = tuple(f"slice-{name}" for name in SLICES)
 CHAINS = (

@@ -92,7 +92,7 @@ def exponents(results: Results) -> Figure:
     """Exponents of the power law with their intervals."""
     figure, ax = plt.subplots(figsize=(7, 3.6))
     for k, (outcome, label) in enumerate(heterogeneity.OUTCOMES.items()):
-        table = results.exponents[outcome].iloc[1:]
+        table = results.exponents[outcome].loc[list(NAMES)]
         y = -np.arange(len(table)) - 0.25 * k
         error = np.abs(table[["low", "high"]].to_numpy().T - table["value"].to_numpy())
         ax.errorbar(table["value"], y, xerr=error, fmt="o", capsize=3, label=label)
@@ -121,7 +121,7 @@ def collapse(results: Results) -> Figure:
         ax.set_yscale("log")
         R2 = results.groups["lag_sd"].loc[name, "value"]
         ax.set_title(f"R² out of sample {R2:.2f}", fontsize=9)
-        ax.set_xlabel(name)
+        ax.set_xlabel(name, fontsize=8)
     axes[0].set_ylabel("spread of lag [rad]")
     bar = figure.colorbar(shown, ax=axes, label="n")
     log_axis(bar.ax.yaxis, LENGTHS)

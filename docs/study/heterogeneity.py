@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
-from itertools import combinations
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
 from undulog.analysis.experiment.reversal.modules import variance_shares
 from undulog.capture.common.arrays import FloatArray
+from undulog.replay.sweep.plan import points_of, read_plan
 
+from .design import PLANS
 from .rows import responses
 
 LINK_M, LINK_KG, GRAVITY = 0.06, 0.1, 9.81
@@ -34,17 +37,39 @@ def settled(rows: pd.DataFrame, plan: str) -> pd.DataFrame:
     return found[(found["drift"] <= MOST_DRIFT) & (found["lag_sd"] > 0.0) & (found["gain_cv"] > 0)]
 
 
-def design(points: pd.DataFrame) -> FloatArray:
+def contact_points(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the settled points in contact: of the Sobol design, and of that without ground."""
+    both = pd.concat([settled(rows, "sobol"), settled(rows, "pair-ground")], ignore_index=True)
+    return both.fillna({"law": "ellipse", "mu_normal": 0.5, "mu_tangential": 0.05})
+
+
+def power_law(points: pd.DataFrame) -> FloatArray:
     """Return regressors: 1, logs of the factors, the laws; shape (points, 11)."""
     logs = np.log(points[list(FACTORS)].to_numpy(dtype=float))
     laws = [(points["law"] == law).to_numpy(dtype=float)[:, None] for law in LAWS]
     return np.hstack([np.ones((len(points), 1)), logs, *laws])
 
 
+def hump(points: pd.DataFrame) -> FloatArray:
+    """Return regressors of a hump in n whose place depends on the lag; shape (points, 2).
+
+    A chain much shorter than a wave and one much longer are both more alike than one of a wave.
+    """
+    n, lag = (np.log(points[name].to_numpy(dtype=float)) for name in ("n", "lag"))
+    n, lag = n - n.mean(), lag - lag.mean()
+    return np.stack([n**2, n * lag], axis=1)
+
+
+def design(points: pd.DataFrame) -> FloatArray:
+    """Return regressors of the power law with the hump, shape (points, 13)."""
+    return np.hstack([power_law(points), hump(points)])
+
+
 def exponents(points: pd.DataFrame, outcome: str) -> pd.DataFrame:
     """Return exponents of each factor with 95 % intervals by bootstrap over points.
 
-    Of the laws they are logarithms of the factor against the ellipse.
+    Those of n and lag hold at the points' geometric means; of the laws they are logarithms of the
+    factor against the ellipse.
     """
     X, y = design(points), np.log(points[outcome].to_numpy())
     random = np.random.default_rng(1)
@@ -55,7 +80,7 @@ def exponents(points: pd.DataFrame, outcome: str) -> pd.DataFrame:
     low, high = np.quantile(drawn, (0.025, 0.975), axis=0)
     value = np.linalg.lstsq(X, y, rcond=None)[0]
     table = pd.DataFrame({"value": value, "low": low, "high": high})
-    return table.set_index(pd.Index(["constant", *FACTORS, *LAWS]))
+    return table.set_index(pd.Index(["constant", *FACTORS, *LAWS, "n n", "n lag"]))
 
 
 def _friction(p: pd.DataFrame) -> FloatArray:
@@ -70,18 +95,26 @@ def _omega(p: pd.DataFrame) -> FloatArray:
     return 2.0 * np.pi * p["frequency_hz"].to_numpy(dtype=float)
 
 
+def _inertial(p: pd.DataFrame) -> FloatArray:
+    return _omega(p) ** 2 * LINK_KG * LINK_M**2
+
+
 def _time_constant(p: pd.DataFrame) -> FloatArray:
     """Of the servo alone: (Kt^2/R + b) / (Kp stall torque) [s]."""
     damping = p["stall_torque"].to_numpy(dtype=float) * TORQUE_CONSTANT / SUPPLY_V + VISCOUS
     return damping / _stiffness(p)
 
 
+TWO_LOADS = "√(μ_n m g L · ω² m L²) / (√A K_p T_s)"
 GROUPS: Mapping[str, Callable[[pd.DataFrame], FloatArray]] = {
     "T_s / (μ_n m g L)": lambda p: p["stall_torque"].to_numpy(dtype=float) / _friction(p),
     "K_p T_s / (μ_n m g L)": lambda p: _stiffness(p) / _friction(p),
     "A K_p T_s / (μ_n m g L)": lambda p: p["amplitude"] * _stiffness(p) / _friction(p),
     "ω t_s": lambda p: _omega(p) * _time_constant(p),
-    "ω² m L² / (K_p T_s)": lambda p: _omega(p) ** 2 * LINK_KG * LINK_M**2 / _stiffness(p),
+    "ω² m L² / (K_p T_s)": lambda p: _inertial(p) / _stiffness(p),
+    TWO_LOADS: lambda p: (
+        np.sqrt(_friction(p) * _inertial(p)) / _stiffness(p) / np.sqrt(p["amplitude"])
+    ),
     "n φ / 2π": lambda p: p["n"] * p["lag"] / (2.0 * np.pi),
     "2π / φ": lambda p: 2.0 * np.pi / p["lag"],
     "μ_n / μ_t": lambda p: p["mu_normal"] / p["mu_tangential"],
@@ -89,26 +122,63 @@ GROUPS: Mapping[str, Callable[[pd.DataFrame], FloatArray]] = {
 """Dimensionless groups; T_s is the stall torque, t_s the time constant of the servo alone, n φ / 2π
 the waves on the body."""
 
+KNOWN = {"sobol": 32, "pair-ground": 16}
+FEWEST = 30
+"""Points before and after, below which nothing is foretold."""
+SHAPE, ALL = " + shape", "all factors"
+SCALED = "A K_p T_s / (μ_n m g L n^p)"
 POWERS = np.arange(-1.0, 2.01, 0.25)
 
 
 def group_fits(points: pd.DataFrame, outcome: str) -> pd.DataFrame:
-    """Return R^2 out of sample, with intervals, of models of one group, of two, and of all factors.
+    """Return R^2 out of sample, with intervals, of models of one group and of all factors.
 
-    Groups enter as quadratics of their logarithms. Of ``K_p T_s / (μ_n m g L n^p)`` p is chosen
-    within each training set.
+    Groups alone enter as quadratics of their logarithms; beside n, lag and the hump (NAME + shape)
+    as powers. Of ``A K_p T_s / (μ_n m g L n^p)`` p is chosen within each training set.
     """
     y = np.log(points[outcome].to_numpy())
     logs = {name: np.log(np.asarray(of(points), dtype=float)) for name, of in GROUPS.items()}
+    n, shape = np.log(points["n"].to_numpy(dtype=float)), _shape(points)
     rows = {name: held_out([quadratic(x)], y) for name, x in logs.items()}
-    n = np.log(points["n"].to_numpy(dtype=float))
-    scaled = [quadratic(logs["A K_p T_s / (μ_n m g L)"] - p * n) for p in POWERS]
-    rows["A K_p T_s / (μ_n m g L n^p)"] = held_out(scaled, y)
-    pairs = {f"{a}, {b}": quadratic(logs[a], logs[b]) for a, b in combinations(logs, 2)}
-    best = max(pairs, key=lambda name: held_out([pairs[name]], y)[0])
-    rows[best] = held_out([pairs[best]], y)
-    rows["all factors, power law"] = held_out([design(points)], y)
+    rows |= {name + SHAPE: held_out([np.column_stack([shape, x])], y) for name, x in logs.items()}
+    load = logs["A K_p T_s / (μ_n m g L)"]
+    rows[SCALED] = held_out([quadratic(load - p * n) for p in POWERS], y)
+    rows[ALL] = held_out([power_law(points)], y)
+    rows["none" + SHAPE] = held_out([shape], y)
+    rows[ALL + SHAPE] = held_out([design(points)], y)
     return pd.DataFrame(rows, index=["value", "low", "high"]).T
+
+
+def foretold(points: pd.DataFrame) -> FloatArray:
+    """Return R^2, with its interval, of later points' ln spread by the group of both loads.
+
+    The group was made up when ``KNOWN`` points had been run, and the model is fitted to these.
+    """
+    known = {
+        json.dumps(point, sort_keys=True)
+        for name, count in KNOWN.items()
+        for point in points_of(replace(read_plan(PLANS / f"{name}.toml"), points=count))
+    }
+    early = points["changes"].isin(known).to_numpy()
+    if min(early.sum(), (~early).sum()) < FEWEST:
+        return np.full(3, np.nan)
+    y = np.log(points["lag_sd"].to_numpy())
+    X = np.column_stack([_shape(points), np.log(GROUPS[TWO_LOADS](points))])
+    fit = np.linalg.lstsq(X[early], y[early], rcond=None)[0]
+    return _explained((y - X @ fit)[~early], y[~early] - y[early].mean())
+
+
+def _shape(points: pd.DataFrame) -> FloatArray:
+    logs = np.log(points[["n", "lag"]].to_numpy(dtype=float))
+    return np.column_stack([np.ones(len(points)), logs, hump(points)])
+
+
+def _explained(error: FloatArray, spread: FloatArray) -> FloatArray:
+    """Return R^2 and its 95 % interval by bootstrap over points, shape (3,)."""
+    pick = np.random.default_rng(3).integers(0, len(error), (DRAWS, len(error)))
+    drawn = 1.0 - np.sum(error[pick] ** 2, axis=1) / np.sum(spread[pick] ** 2, axis=1)
+    value = 1.0 - np.sum(error**2) / np.sum(spread**2)
+    return np.array([value, *np.quantile(drawn, (0.025, 0.975))])
 
 
 def quadratic(*logs: FloatArray) -> FloatArray:
@@ -128,10 +198,7 @@ def held_out(models: list[FloatArray], y: FloatArray, folds: int = 10) -> FloatA
         one = int(np.argmin(left))
         error[~train] = y[~train] - models[one][~train] @ fits[one]
         spread[~train] = y[~train] - y[train].mean()
-    pick = np.random.default_rng(3).integers(0, len(y), (DRAWS, len(y)))
-    drawn = 1.0 - np.sum(error[pick] ** 2, axis=1) / np.sum(spread[pick] ** 2, axis=1)
-    value = 1.0 - np.sum(error**2) / np.sum(spread**2)
-    return np.array([value, *np.quantile(drawn, (0.025, 0.975))])
+    return _explained(error, spread)
 
 
 def shares(rows: pd.DataFrame) -> pd.DataFrame:

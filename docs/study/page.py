@@ -89,7 +89,8 @@ def _numbers(results: Results) -> dict[str, Iterable[str]]:
         "lengths": ", ".join(f"{n:g}" for n in sorted(results.measures["n"].unique())),
         "points": f"{len(results.points)}",
         "pairs": f"{pairs}",
-        "resonant": f"{pairs - len(results.contact)}",
+        "missing": f"{pairs - len(results.contact)}",
+        "free_most": f"{np.degrees(heterogeneity.settled(rows, 'pair-free')['lag_sd'].max()):.0f}",
         "contacts": f"{len(results.contact)}",
         "ratio": interval(*bootstrapped(results.contact["ratio"].to_numpy()), digits=1),
     }
@@ -166,16 +167,19 @@ def _exponents(results: Results) -> list[str]:
 
 
 def _groups(results: Results) -> list[str]:
-    names = dict.fromkeys(name for y in OUTCOMES for name in results.groups[y].index)
+    names = [*heterogeneity.GROUPS, heterogeneity.SCALED, heterogeneity.ALL, "none"]
+    kinds = [(y, shape) for y in OUTCOMES for shape in ("", heterogeneity.SHAPE)]
     cells = [
         [name]
         + [
-            interval(*found.loc[name]) if name in found.index else "–"
-            for found in (results.groups[y] for y in OUTCOMES)
+            interval(*results.groups[y].loc[name + shape])
+            if name + shape in results.groups[y].index
+            else "–"
+            for y, shape in kinds
         ]
         for name in names
     ]
-    return table(["model", *OUTCOMES.values()], cells)
+    return table(["group", *(OUTCOMES[y] + shape for y, shape in kinds)], cells)
 
 
 def _shares(results: Results) -> list[str]:

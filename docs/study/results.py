@@ -44,7 +44,10 @@ class Results:
     def slice(self, name: str) -> pd.DataFrame:
         """Return a slice's rows that are done, in the order of its values."""
         found = self.rows[(self.rows["plan"] == f"slice-{name}") & (self.rows["status"] == "done")]
-        return found.sort_values(list(SLICES[name][:1]), ignore_index=True)
+        column = SLICES[name][0]
+        if column not in found:  # not run yet
+            return found.assign(**{column: None})
+        return found.sort_values(column, ignore_index=True)
 
     def chain(self, n: int, stall: float, column: str) -> FloatArray:
         """Return a measure of a chain with the ends of its interval, shape (3,)."""
@@ -71,7 +74,7 @@ SLICES = {
 def results_of(path: Path) -> Results:
     """Compute all parts from the study's rows."""
     rows = read_rows(path)
-    points = heterogeneity.settled(rows, "sobol")
+    points = heterogeneity.contact_points(rows)
     kicked = coupling.kicked(rows)
     of_chains = chains.table(kicked)
     return Results(
