@@ -59,8 +59,8 @@ STATEMENTS = (
     Statement(
         "How heterogeneous couplings affect scalability and synchronisation is open.",
         "answered for this body",
-        "P is measured open loop and predicts it.",
-        ("helps", "path", "body-and-path", "linear"),
+        "P is measured open loop and gives it.",
+        ("helps", "path", "body-and-path", "heterogeneity", "linear"),
     ),
     Statement(
         "The skin is rougher along the body than across.",

@@ -14,8 +14,8 @@ from support.processes import run
 from undulog.analysis.oscillators.predictions import path_laplacian
 
 LONG = ROOT / "docs/study/rows/long.parquet"
-NEEDS_MORE = {"load", "long-chains"}
-"""Left open by the short form: too few points, or chains of too few lengths."""
+NEEDS_MORE = {"heterogeneity", "load", "long-chains"}
+"""Left open by the short form: too few points, or chains too short or of too few lengths."""
 
 
 @pytest.mark.slow
