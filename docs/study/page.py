@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from string import Template
@@ -50,16 +51,22 @@ EXPLICIT = {
     "explicit": "with this body",
     "explicit_homogeneous": "with the homogeneous one",
 }
+ANSWER = ("neutral", "helps", "path", "body-and-path", "heterogeneity", "long-chains")
+"""Conclusions that answer the question, those that hold."""
 
 
 def write_page(rows: Path, page: Path, *, quick: bool) -> Results:
     """Write the page and, in ``images/`` beside it, its figures."""
     results = results_of(rows)
     draw_all(results, page.parent / "images")
+    verdicts = evaluate(results)
+    by_name = {one.conclusion.name: one for one in verdicts}
     parts = _numbers(results) | {
+        "planned": f"{sum(_planned(quick=quick).values())}",
+        "answer": [_sentence(by_name[name]) for name in ANSWER if by_name[name].holds],
         "design": _design(results, quick=quick),
-        "conclusions": _conclusions(evaluate(results)),
-        "statements": statements.lines(evaluate(results)),
+        "conclusions": _conclusions(verdicts),
+        "statements": statements.lines(verdicts),
         "exponents": _exponents(results),
         "groups": _groups(results),
         "shares": _shares(results),
@@ -126,11 +133,18 @@ def _cell(value: object) -> str:
     return ("never" if np.isinf(value) else f"{value:.3g}").replace("-", "−")
 
 
+def _planned(*, quick: bool) -> dict[str, int]:
+    """Return how many runs each sweep has."""
+    plans = {one.name: one.plan for one in stages(quick=quick)}  # the last of a name has all points
+    return {
+        name: plan.points or math.prod(len(one.values) for one in plan.parameters)
+        for name, plan in plans.items()
+    }
+
+
 def _design(results: Results, *, quick: bool) -> list[str]:
-    planned = {one.name: one for one in stages(quick=quick)}  # the last of a name has all points
     cells = []
-    for name, stage in planned.items():
-        count = stage.plan.points or np.prod([len(one.values) for one in stage.plan.parameters])
+    for name, count in _planned(quick=quick).items():
         rows = results.rows[results.rows["plan"] == name]
         done = rows[rows["status"] == "done"]
         part = "coupling" if name.startswith("kicks") else "heterogeneity"
@@ -144,12 +158,16 @@ def _design(results: Results, *, quick: bool) -> list[str]:
     return table(names, cells)
 
 
+def _sentence(one: Verdict) -> str:
+    return one.conclusion.sentence.format(value=interval(one.value, one.low, one.high))
+
+
 def _conclusions(verdicts: list[Verdict]) -> list[str]:
     holds = {True: "yes", False: "**no**", None: "open"}
     cells = [
         [
             f"`{one.conclusion.name}`",
-            one.conclusion.sentence.format(value=interval(one.value, one.low, one.high)),
+            _sentence(one),
             one.expression,
             holds[one.holds],
         ]

@@ -33,9 +33,9 @@ STATEMENTS = (
         ("weak-servos", "boundary"),
     ),
     Statement(
-        "The differences come from the missing neighbours at the chain's ends.",
+        "The chain has open ends, and the first and the last have one neighbour (Eq. 1).",
         "supported",
-        "Identical modules mirror when the wave is reversed.",
+        "The ends are what makes identical modules unequal: they mirror when the wave is reversed.",
         ("boundary",),
     ),
     Statement(
@@ -51,9 +51,10 @@ STATEMENTS = (
         ("not-neighbours",),
     ),
     Statement(
-        "Coupled through the body, generators synchronise.",
-        "refuted for the body alone",
-        "Most patterns are left alone, one grows slowly: explicit coupling has to supply the gap.",
+        "The body may take part in coupling the rhythm generators (left open).",
+        "refined",
+        "It does, and alone it doesn't suffice: most patterns are left to themselves, one grows "
+        "slowly, so explicit coupling has to supply the gap.",
         ("neutral", "never-alone"),
     ),
     Statement(
@@ -69,10 +70,10 @@ STATEMENTS = (
         ("rough-across",),
     ),
     Statement(
-        "The last figure: with a lag of π/2 segments move more alike than with π/3.",
-        "supported",
-        "Part of it is kinematics, which the null beside [that figure]"
-        "(paper.md#head-middle-and-tail-of-13-links) shows.",
+        "The last figure compares lags of π/2 and π/3.",
+        "refined",
+        "Joints respond the more alike the larger the lag. Part of what link positions show is "
+        "kinematics: [the null](paper.md#head-middle-and-tail-of-13-links) beside that figure.",
         ("short-waves",),
     ),
     Statement(
