@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import stdtrit
 from scipy.stats import linregress
 
-from .heterogeneity import DRAWS, SOUND, bootstrapped, foretold
+from .heterogeneity import DRAWS, SOUND, bootstrapped, foretold, short_ratio
 from .results import Results
 
 LONG = 13
@@ -195,11 +195,11 @@ CONCLUSIONS = (
     ),
     Conclusion(
         "contact",
-        "It is contact that makes joints unequal: with it the spread of lag is {value} times "
-        "as large.",
+        "Up to 9 joints it is contact that makes them unequal: with it the spread of lag is "
+        "{value} times as large.",
         2.0,
         above=True,
-        of=lambda results: bootstrapped(results.contact["ratio"].to_numpy()).tolist(),
+        of=lambda results: short_ratio(results.contact).tolist(),
     ),
     Conclusion(
         "boundary",

@@ -235,6 +235,15 @@ def contact(rows: pd.DataFrame) -> pd.DataFrame:
     return both.assign(ratio=both["ground"] / both["free"])
 
 
+SHORT = 9
+"""Yaw joints up to which bending modes lie above the design's gaits."""
+
+
+def short_ratio(found: pd.DataFrame) -> FloatArray:
+    """Return the median ratio of chains up to ``SHORT`` joints, with its interval, shape (3,)."""
+    return bootstrapped(found.loc[found["n"] <= SHORT, "ratio"].to_numpy())
+
+
 def _paired(rows: pd.DataFrame, one: str, other: str) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the settled rows of two sweeps over the same points, in the same order."""
     a, b = (settled(rows, name).set_index("changes").sort_index() for name in (one, other))

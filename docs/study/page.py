@@ -99,7 +99,11 @@ def _numbers(results: Results) -> dict[str, Iterable[str]]:
         "missing": f"{pairs - len(results.contact)}",
         "free_most": f"{np.degrees(heterogeneity.settled(rows, 'pair-free')['lag_sd'].max()):.0f}",
         "contacts": f"{len(results.contact)}",
-        "ratio": interval(*bootstrapped(results.contact["ratio"].to_numpy()), digits=1),
+        "ratio": interval(*heterogeneity.short_ratio(results.contact), digits=1),
+        "by_length": ", ".join(
+            f"{ratio['ratio'].median():.2g} at n = {n:g} ({len(ratio)} points)"
+            for n, ratio in results.contact.groupby("n")
+        ),
     }
 
 

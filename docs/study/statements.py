@@ -40,8 +40,8 @@ STATEMENTS = (
     ),
     Statement(
         "Weak servos and the load of the ground are why joints respond unequally.",
-        "supported",
-        "",
+        "refined",
+        "Near a bending mode inertia does as much, without a ground too.",
         ("weak-servos", "friction", "contact"),
     ),
     Statement(
