@@ -11,7 +11,7 @@ DEMO   := out/demo
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow zoo campaign check format bench docs pictures golden lock clean
+.PHONY: help demo test slow zoo campaign study check format bench docs pictures golden lock clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -66,6 +66,9 @@ zoo: $(READY)  ## planted faults, 100 seeds each: is every output right? (SEEDS=
 
 campaign: $(READY)  ## 50,000 attacks with new seeds, resumable (SEED=1 CASES=2000 for fewer)
 	PYTHONPATH=tests:bench:. $(BIN)/python -m campaign.run $(and $(SEED),--seed $(SEED)) $(and $(CASES),--cases $(CASES))
+
+study: $(READY)  ## what body couplings do to synchrony, short form (LONG=1 for all of it, hours, resumable)
+	$(BIN)/python docs/study/study.py $(if $(LONG),,--quick)
 
 check: $(READY)  ## lint, format, types, layers
 	$(BIN)/ruff check .

@@ -214,3 +214,19 @@ def test_the_age_of_a_reading_is_lag():
     felt = felt_response(np.array([0.9 * np.exp(-0.2j)]), math.pi, 0.02)
     assert np.angle(felt[0]) == pytest.approx(-0.2 - 0.02 * math.pi)
     assert felt.imag[0] == pytest.approx(0.9 * math.sin(-0.2 - 0.02 * math.pi))
+
+
+@pytest.mark.parametrize("k", [0.0, 0.5, 7.0])
+def test_distance_from_normal_is_that_of_the_closed_form(k):
+    """[[1, k], [0, 2]] has eigenvalues 1 and 2, and eigenvectors (1, 0) and (k, 1)."""
+    A = np.array([[1.0, k], [0.0, 2.0]])
+    basis = np.linalg.qr(np.column_stack([np.ones(3), np.eye(3)[:, 1:]]))[0][:, 1:]
+    P = np.eye(3) - basis @ A @ basis.T
+    assert laplacian.henrici(P) == pytest.approx(k / math.sqrt(5.0 + k * k), abs=1e-7)
+    cosine = k / math.sqrt(1.0 + k * k)  # between the two eigenvectors
+    expected = math.sqrt((1.0 + cosine) / (1.0 - cosine))
+    assert laplacian.pattern_condition(P) == pytest.approx(expected)
+
+
+def test_no_coupling_is_normal():
+    assert laplacian.henrici(np.eye(4)) == 0.0

@@ -1,0 +1,83 @@
+"""The study of body couplings: its short form runs, and each conclusion holds or is open there."""
+
+import sys
+
+import numpy as np
+import pytest
+from study import chains, coupling, heterogeneity, statements
+from study.conclusions import CONCLUSIONS, evaluate
+from study.results import results_of
+from study.rows import read_rows
+
+from support.paths import ROOT
+from support.processes import run
+from undulog.analysis.oscillators.predictions import path_laplacian
+
+LONG = ROOT / "docs/study/rows/long.parquet"
+NEEDS_MORE = {"heterogeneity", "load", "long-chains"}
+"""Left open by the short form: too few points, or chains too short or of too few lengths."""
+
+
+@pytest.mark.slow
+def test_the_short_form_reaches_the_conclusions(tmp_path):
+    script = ROOT / "docs/study/study.py"
+    done = run(sys.executable, str(script), "--quick", "--out", str(tmp_path), timeout=1800)
+    assert done.returncode == 0, done.stderr
+    verdicts = evaluate(results_of(tmp_path / "rows.parquet"))
+    assert {one.conclusion.name for one in verdicts if one.holds is None} == NEEDS_MORE
+    assert [one for one in verdicts if one.holds is False] == []
+    page = (tmp_path / "study.md").read_text()
+    for name in (one.name for one in CONCLUSIONS):
+        assert f"`{name}`" in page
+
+
+@pytest.mark.slow
+def test_the_rows_in_the_tree_give_the_page_and_all_conclusions():
+    results = results_of(LONG)
+    assert [one for one in evaluate(results) if not one.holds] == []
+    assert results.digest in (ROOT / "docs/study.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("n", "stall", "gap", "homogeneous", "explicit"),
+    [(5, 0.25, -0.034, -0.022, 0.28), (9, 0.25, -0.017, -0.031, 0.68)],
+)
+def test_kicks_as_rows_give_the_matrix_of_a_kick_experiment(n, stall, gap, homogeneous, explicit):
+    """docs/oscillators.md has these, from sessions by ``analyse_experiment``."""
+    rows = read_rows(LONG)
+    rows = rows[rows["plan"] == f"kicks-{n}-{stall}"]
+    one = coupling.measures(coupling.kicked(rows)).iloc[0]
+    assert one["gap"] == pytest.approx(gap, abs=5e-4)
+    assert one["homogeneous_gap"] == pytest.approx(homogeneous, abs=5e-4)
+    assert one["explicit"] == pytest.approx(explicit, abs=5e-3)
+
+
+def test_statements_rest_on_conclusions_that_exist():
+    names = {one.name for one in CONCLUSIONS}
+    assert {name for one in statements.STATEMENTS for name in one.conclusions} <= names
+
+
+@pytest.mark.parametrize("n", [5, 12])
+def test_a_path_synchronises_at_the_rate_of_its_closed_form(n):
+    """1 - r falls as exp(-2 gap t) once the slowest pattern is left."""
+    M = chains.coupling("path", np.eye(n))
+    _, order = chains.times(M, draws=40)
+    rate = -np.diff(np.log(1.0 - order))[-20:].mean() / chains.STEP / 2.0
+    assert rate == pytest.approx(4.0 * np.sin(np.pi / (2 * n)) ** 2, rel=0.02)
+
+
+def test_neighbours_alone_have_a_reach_of_one():
+    P = np.eye(7) - 0.1 * path_laplacian(7)
+    assert coupling.band_energy(P, 1) == 1.0
+    assert coupling.reach_of(P) == 1
+    assert coupling.amplification(P) == pytest.approx(1.0)
+
+
+def test_a_planted_group_is_found_out_of_sample():
+    """Where the outcome depends on one group, its model predicts it, and unrelated ones don't."""
+    random = np.random.default_rng(1)
+    x, other = random.normal(size=(2, 200))
+    y = -1.3 * x + random.normal(0.0, 0.1, 200)
+    good, bad = (heterogeneity.held_out([heterogeneity.quadratic(one)], y)[0] for one in (x, other))
+    assert good > 0.98
+    assert bad < 0.05
