@@ -288,12 +288,15 @@ def _flat(value: Any, before: str = "") -> dict[str, str]:
                 name = cast("dict[str, Any]", one).get("name", k)
                 parts[f"{before}[{name}]"] = one
     if not parts:
-        text = f"{value:g}" if isinstance(value, float) else str(value)
-        return {} if value == {} else {before: text}
+        return {} if value == {} else {before: _text(value)}
     flat: dict[str, str] = {}
     for key, one in parts.items():
         flat |= _flat(one, key)
     return flat
+
+
+def _text(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 Key = tuple[str, str]

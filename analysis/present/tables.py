@@ -220,11 +220,11 @@ def body_table(body: BodyResult) -> Table[tuple[BodyPoint, ...]]:
     return Table(columns, list(zip(body.observed, *body.null.values(), strict=True)))
 
 
-def _amplitude_mm(k: int, points: Sequence[BodyPoint]) -> Estimate:
+def _amplitude_mm(k: int, points: tuple[BodyPoint, ...]) -> Estimate:
     return scaled(points[k].amplitude_m, 1000.0)
 
 
-def _phase_deg(k: int, points: Sequence[BodyPoint]) -> Estimate:
+def _phase_deg(k: int, points: tuple[BodyPoint, ...]) -> Estimate:
     return degrees(points[k].phase_rad)
 
 

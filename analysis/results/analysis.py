@@ -413,8 +413,8 @@ def interval_key(key: str) -> str:
 def _estimates(record: Any) -> dict[str, Any]:
     """Return each estimate of a record as two keys: its value and its interval."""
     flat: dict[str, Any] = {}
-    named: dict[str, Any] = vars(record)
-    for key, one in named.items():
+    for each in dataclasses.fields(record):
+        one, key = getattr(record, each.name), each.name
         if isinstance(one, Estimate):
             flat |= {key: one.value, interval_key(key): one.ci95}
     return flat
