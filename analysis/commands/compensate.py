@@ -81,15 +81,15 @@ def _runs(files: Sequence[Path], start: float | None) -> tuple[GaitRun, ...]:
     """Fit the gaits of the sessions."""
     from undulog.capture import Session
 
-    from ..session.analyse import examine_session
+    from ..session.analyse import measure_session
     from ..session.runs import gait_run
-    from .options import chosen
+    from .analyse import chosen
 
     options = chosen(start, None, "/joint_commands", "/joint_states")
     found: list[GaitRun] = []
     for file in files:
         with Session.open(file) as session:
-            fitted = examine_session(session, options, with_dead_bands=False)
+            fitted = measure_session(session, options, with_dead_bands=False)
             found.append(gait_run(file.name, session.robot, fitted.analysis, fitted.gait))
     return tuple(found)
 
