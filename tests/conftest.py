@@ -3,9 +3,11 @@
 import contextlib
 import ctypes
 import ctypes.util
+import json
 import os
 import shutil
 import signal
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -128,3 +130,52 @@ def webgl_browser(chromium, tmp_path):
     started = Browser(chromium, tmp_path / "chromium", patience_s=120.0, flags=flags)
     yield started
     started.close()
+
+
+@pytest.fixture
+def command(capsys):
+    """Runs a command in this process and checks its exit code; returns its output and errors."""
+    import undulog
+
+    def run(*words, code=0):
+        capsys.readouterr()
+        assert undulog.run([str(word) for word in words]) == code
+        return capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def report_of(command):
+    """Runs a command with ``--json``; returns its report."""
+    return lambda *words, code=0: json.loads(command(*words, "--json", code=code).out)
+
+
+@pytest.fixture
+def opened():
+    """Opens sessions by their paths; closes them after the test."""
+    from undulog.capture import Session
+
+    with contextlib.ExitStack() as stack:
+        yield lambda path: stack.enter_context(Session.open(path))
+
+
+@pytest.fixture
+def disk_of(tmp_path):
+    """Mounts a file system of a size, e.g. ``4m``; skips where that is not permitted."""
+    place = tmp_path / "disk"
+
+    def mount(size):
+        place.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+        except OSError as error:
+            pytest.skip(f"no mount: {error}")
+        if done.returncode:
+            pytest.skip(f"mounting is not permitted here: {done.stderr.strip()}")
+        return place
+
+    yield mount
+    if place.is_mount():
+        subprocess.run(["umount", str(place)], check=True)
