@@ -108,7 +108,8 @@ def centre_of_mass(
 
 def _at(t_s: FloatArray, known_s: FloatArray, columns: FloatArray) -> FloatArray:
     """Columns, shape (n, k), at other times."""
-    return np.stack([np.interp(t_s, known_s, column) for column in columns.T], axis=1)
+    values: list[FloatArray] = [np.interp(t_s, known_s, column) for column in columns.T]
+    return np.stack(values, axis=1)
 
 
 def mean_of_cycles(per_cycle: FloatArray) -> tuple[float, float, float] | None:

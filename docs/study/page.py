@@ -51,6 +51,27 @@ EXPLICIT = {
     "explicit": "with this body",
     "explicit_homogeneous": "with the homogeneous one",
 }
+LOOP = {
+    "n": "n",
+    "engine": "engine",
+    "law": "friction",
+    "stall": "N m",
+    "eps": "ε 1/s",
+    "kick": "kick rad",
+    "K": "K 1/s",
+    "until_s": "after s",
+}
+SHARES = {
+    "error": "error %",
+    "+-": "± (patterns)",
+    "of P": "± (of P)",
+    "worst": "worst pattern",
+    "at any time": "at any time",
+    "still": "nothing moves",
+    "error/still": "ratio",
+    "toeplitz": "Toeplitz",
+    "below": "below it",
+}
 ANSWER = ("neutral", "helps", "path", "body-and-path", "heterogeneity", "long-chains")
 """Conclusions that answer the question, those that hold."""
 
@@ -230,15 +251,40 @@ def _slices(results: Results) -> list[str]:
 
 
 def _prediction() -> list[str]:
-    """Return the table of ``prediction.py``, from ``rows/prediction`` where it was computed."""
+    """Return the tables of ``prediction.py``, from ``rows/prediction`` where it was computed."""
     folder = HERE / "rows" / "prediction"
     if not folder.is_dir():
         known = "[Oscillators](oscillators.md#measured-in-the-twin)"
         return [f"{known} has what has been predicted so far: 5 to 13 yaw joints."]
-    from .prediction import rows, summary
+    from .prediction import PATTERNS, STANDARD, rows, summary
 
-    found = summary(rows(folder))
-    return markdown(found, {name: name for name in found.columns})
+    kicks = rows(folder).query("kind == 'kick'")
+    count = kicks.groupby(list(LOOP), sort=True).size().rename("patterns").reset_index()
+    found = summary(kicks).merge(count, on=list(LOOP))
+    shares = [
+        *(name for name in SHARES if name not in ("error/still", "below")),
+        "left",
+        "foretold",
+    ]
+    found[shares] = found[shares].mul(100.0).map(lambda x: "–" if np.isnan(x) else f"{x:.1f}")
+    coupled = found.K > 0
+    usual = (found.patterns == PATTERNS) & (found.kick == STANDARD.kick) & ~coupled
+    shown = coupled | (found.until_s > STANDARD.until_s)
+    left = LOOP | {"left": "left %", "foretold": "foretold %", "patterns": "patterns"}
+    return [
+        *markdown(found[usual], {n: LOOP[n] for n in ("n", "engine", "law")} | SHARES),
+        "",
+        "Explicit coupling K of next neighbours: none, half of what is foretold as needed, all.",
+        "",
+        *markdown(
+            found[shown],
+            {n: left[n] for n in ("n", "K", "until_s")} | dict(list(left.items())[-3:]),
+        ),
+        "",
+        "Where it breaks: weaker servos, larger kicks, faster feedback.",
+        "",
+        *markdown(found[~usual & ~shown], LOOP | SHARES),
+    ]
 
 
 def _growth(results: Results) -> list[str]:
