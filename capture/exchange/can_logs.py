@@ -47,7 +47,8 @@ from ..log.messages.frames import (
     ID_MASK,
     REMOTE_FLAG,
 )
-from .frame_log import LATEST_NS, FrameLog, FrameRow, LogBlock, blocks_of, read_candump
+from .candump import read_candump
+from .frame_log import LATEST_NS, FrameLog, FrameRow, LogBlock, blocks_of
 from .mf4 import open_mf4
 
 if TYPE_CHECKING:

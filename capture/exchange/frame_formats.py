@@ -40,8 +40,9 @@ from ..log.messages.frames import (
     REMOTE_FLAG,
     FrameArray,
 )
+from .candump import candump_lines
 from .frame_blocks import FrameFacts, is_error, is_remote
-from .frame_log import LogBlock, candump_lines
+from .frame_log import LogBlock
 
 if TYPE_CHECKING:
     from can.io.generic import MessageWriter
