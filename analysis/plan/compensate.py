@@ -1,14 +1,14 @@
 """Commands that make the response homogeneous, from kicks around one gait.
 
-Let w be the wanted wave, x = (d psi_c, d ln|c|) the deviation of m commands from it and y = (d psi,
-d ln|a|) that of the responses. Kicks give dy = M dx with
+Let w be the wanted wave, x = (d psi_c, d ln ``|c|``) the deviation of m commands from it and
+y = (d psi, d ln ``|a|``) that of the responses. Kicks give dy = M dx with ::
 
     M = ( P  S )
         ( R  G ),
 
 shape (2 m, 2 m), each element with a standard error; errors of different columns are independent.
 All joints are to respond with the same gain, at any time: with C taking the mean off the phases and
-y* = (0, ln g*), commands x that gave y are followed by x + dx with the least
+``y* = (0, ln g*)``, commands x that gave y are followed by x + dx with the least ::
 
     E |C (y - y* + (M + E) dx)|^2 + k^2 |x + dx|^2
         = |C (y - y* + M dx)|^2 + dx' D dx + k^2 |x + dx|^2,    D_jj = sum_i var(M_ij).
@@ -62,7 +62,7 @@ class Start:
     """Commands that were driven, and their response; both against the wanted wave.
 
     Attributes:
-        x: d ln|c| + j d psi_c, mean phase 0, shape (m,).
+        x: d ln ``|c|`` + j d psi_c, mean phase 0, shape (m,).
         response: a/w, shape (m,).
     """
 
@@ -75,7 +75,7 @@ class Spreads:
     """How unlike the joints respond to the wanted wave.
 
     Attributes:
-        gain_cv: Coefficient of variation of |a|/|w|, what noise adds taken off.
+        gain_cv: Coefficient of variation of ``|a|/|w|``, what noise adds taken off.
         lag_sd: Circular standard deviation of the lag behind w [rad], likewise.
     """
 
@@ -112,7 +112,7 @@ class Compensation:
     """The next commands.
 
     Attributes:
-        target_gain: g*, |a|/|w| that all joints are to have.
+        target_gain: ``g*``, ``|a|/|w|`` that all joints are to have.
         kicked: Response to the wanted wave itself, as the kicks' runs without a kick gave it.
         now: Response to the commands that the step starts from; the same without earlier ones.
         predicted_gain_cv: Of the commands written here, by M.
