@@ -227,7 +227,7 @@ def stalled(
         effort: Torque, or motor current.
         most: Torque or current at standstill and full voltage; None where it is not known.
         asked: Its command, or else its position: what it does at most, 95 % of the time less,
-            tells what standing still is.
+            shows what standing still is.
 
     Returns:
         Stretches of ``STALL_S`` or more.

@@ -48,21 +48,25 @@ if TYPE_CHECKING:
     from can.io.generic import MessageWriter
 
 
-_TYPE_NAME = "can_msgs/msg/Frame"
-_SCHEMA = (
+TYPE_NAME = "can_msgs/msg/Frame"
+"""Type of a frame in ROS 2."""
+
+SCHEMA = (
     "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\n"
     "uint8 dlc\nuint8[8] data\n"
     + "=" * 80
     + "\nMSG: std_msgs/Header\n"
     + schema_text("std_msgs/msg/Header")
 )
+"""Its definition, with that of its header."""
+
 _STAMP_END_NS = 2**31 * NS
 
 
 class RosFrames:
     """An MCAP file of ``can_msgs/msg/Frame``."""
 
-    title = f"{_TYPE_NAME}, one message a frame"
+    title = f"{TYPE_NAME}, one message a frame"
     holds_fd = False
 
     def kept(self, block: LogBlock) -> FrameArray:
@@ -89,7 +93,7 @@ class RosFrames:
             writer = Writer(stream)
             writer.start(profile="ros2", library=f"undulog/{version('undulog')}")
             writer.add_metadata("undulog.export", {"session_id": facts.session_id})
-            schema = writer.register_schema(_TYPE_NAME, "ros2msg", _SCHEMA.encode())
+            schema = writer.register_schema(TYPE_NAME, "ros2msg", SCHEMA.encode())
             templates = [_Template(name) for name in facts.buses]
             channels: dict[tuple[int, bool], int] = {}
             sequence = count()
@@ -115,7 +119,7 @@ class _Template:
     """Messages of one bus: all have one length, and their numbers at the same places."""
 
     def __init__(self, bus: str) -> None:
-        kind = parse_message_type(_TYPE_NAME, _SCHEMA)
+        kind = parse_message_type(TYPE_NAME, SCHEMA)
         example = encode(kind, {"header": {"frame_id": bus}})
         self._example = np.frombuffer(example, dtype=np.uint8)
         self._leaves = layout_of(kind, example).leaves

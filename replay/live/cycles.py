@@ -279,7 +279,7 @@ class CycleBars:
     """Bars and steps of gain, lag and power.
 
     The entities are the replay's; here a bar is the newest cycle, and a joint of which the cycle
-    tells nothing has none. Power takes the place of the net energy: its mean over the cycle.
+    has no values has none. Power takes the place of the net energy: its mean over the cycle.
     """
 
     def __init__(self) -> None:

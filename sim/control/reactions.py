@@ -69,7 +69,7 @@ class Distances:
 
         Args:
             time_s: Now [s].
-            ranges: Name to distance [m]; a sensor that has not told anything yet may be missing
+            ranges: Name to distance [m]; one without a reading yet may be missing
                 or NaN, and is taken to see nothing; -inf is too near to tell (REP 117).
         """
         read = np.array([ranges.get(name, math.inf) for name in self._names])

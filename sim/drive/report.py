@@ -92,7 +92,7 @@ class BusReport:
         feedback: What supervised it; None where the robot set the pace, or it was never armed.
         first_frames: The commands of the first tick, as candump writes frames.
         taken: Samples of the gait that the recorder took.
-        not_taken: Why the recorder was not told all, or None.
+        not_taken: Why the recorder did not receive all of it, or None.
     """
 
     plan: BusPlan

@@ -8,7 +8,7 @@ of the frames at its ends has it.
 Magnetometers as compasses: the earth's field in their own frame.
 
 Magnetic north is the world's +x, unless the model turns it; the field dips into the ground by the
-inclination, 65 degrees in central Europe. A compass of two axes that is level tells its heading by
+inclination, 65 degrees in central Europe. A level compass of two axes gives its heading by
 atan2(-B_y, B_x), counter-clockwise from north; tilted, it mixes the vertical field in: pointing
 north, each degree of roll turns the heading by tan(inclination) degrees, 2.1.
 

@@ -1,5 +1,7 @@
 """Rules of the house that no linter holds."""
 
+import sys
+
 import pytest
 
 from support.paths import ROOT
@@ -20,3 +22,10 @@ def test_no_package_folder_of_the_tests_shadows_ours():
 def test_no_recording_or_output_is_tracked_but_the_one_that_pictures_are_held_to():
     recordings = [name for name in _tracked() if name.endswith((".mcap", ".rrd", ".candump.log"))]
     assert recordings == ["tests/replay/golden/session.mcap"]
+
+
+def test_every_bench_finds_what_it_imports():
+    names = sorted(path.stem for path in (ROOT / "bench").glob("*.py"))
+    assert "twin_step" in names
+    done = run(sys.executable, "-c", f"import {', '.join(names)}", cwd=ROOT / "bench")
+    assert done.returncode == 0, done.stderr
