@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from undulog.capture.common.arrays import NS
 from undulog.capture.common.errors import LogWriteError, UsageError
-from undulog.capture.common.process import StopRequest
+from undulog.capture.common.process import StopRequest, raised_priority
 from undulog.capture.log.messages.frames import FrameArray, identifier_text
 from undulog.capture.recorder.status import SessionClock
 from undulog.capture.robot.model import Direction, Quantity, Robot
@@ -190,7 +190,8 @@ def drive_bus(
         begun = time.monotonic()
         try:
             publish.begin()
-            loop.run(stop, each_tick, console)
+            with _urgent(session, lockstep=lockstep):
+                loop.run(stop, each_tick, console)
             report = _report(plan, gate, loop, spacing, tally.counts)
             publish.end(report)
             session.close()
@@ -207,6 +208,22 @@ def drive_bus(
             f"{teller.dropped} samples: the recorder was too slow" if teller.dropped else None
         )
     return report
+
+
+@contextmanager
+def _urgent(session: BusSession, *, lockstep: bool) -> Generator[None]:
+    """Raise the priority; not in lockstep, where the robot waits for each command."""
+    if lockstep:
+        yield
+        return
+    with raised_priority() as priority:
+        if priority.refused:
+            session.log_event(
+                "info",
+                "priority was refused: while other programs hold the processors, replies may be "
+                "seen so late that the drive holds; CAP_SYS_NICE allows it",
+            )
+        yield
 
 
 def _virtual(link: Link, plan: BusPlan) -> VirtualRobotLink | None:

@@ -1,6 +1,7 @@
 """The control loop over a bus, against the virtual robot of ``sim serve`` and a plain server."""
 
 import dataclasses
+import os
 import signal
 import socket
 import threading
@@ -18,7 +19,7 @@ from support.written_sessions import write_commands
 from undulog.capture import Session, load_robot
 from undulog.capture.bus.encoding import BusEncoder
 from undulog.capture.common.errors import LogWriteError, SourceError, UsageError
-from undulog.capture.common.process import StopRequest
+from undulog.capture.common.process import StopRequest, raised_priority
 from undulog.capture.log.messages.frames import DIR_TX
 from undulog.capture.robot.model import Direction, OnFault, Quantity
 from undulog.capture.sources.contract import parse_address
@@ -157,6 +158,23 @@ def test_in_real_time_the_loop_keeps_to_the_clock(tmp_path):
         assert len(times) == report.ticks
         assert (session.verdict == "good") == (report.tally.overruns == 0)
         assert session.settle_s >= load_scenario("flat").settle_s > 0
+
+
+@pytest.mark.parametrize("lockstep", [False, True])
+def test_a_drive_by_the_clock_has_what_priority_the_system_grants(tmp_path, lockstep):
+    def policy():
+        return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+
+    with raised_priority():
+        granted = policy()
+    before, seen = policy(), set()
+    with alive(load_scenario("flat").changed(duration_s=30.0), lockstep=lockstep) as (on, _):
+        drive_bus(
+            planned("flat", on, tmp_path / "a.mcap"),
+            stop=StopRequest(),
+            on_tick=lambda _: seen.add(policy()),
+        )
+    assert (seen, policy()) == ({before if lockstep else granted}, before)
 
 
 def planned(what, on, output, *, duration_s=0.2, robot=None):
