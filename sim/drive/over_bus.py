@@ -176,8 +176,7 @@ def drive_bus(
         spacing = confirmation = None
         if not lockstep:
             spacing = Spacing(plan.limits.rate, clock.now_ns)
-            period_s = 1.0 / CONTROL_RATE_HZ
-            confirmation = Confirmation(plan.limits.rate, period_s, clock.now_ns)
+            confirmation = Confirmation(plan.limits.rate, 1.0 / CONTROL_RATE_HZ, clock.now_ns)
         loop = ControlLoop(gate, robot, link, pace, spacing=spacing, confirmation=confirmation)
 
         def each_tick(tick: BusTick) -> None:
