@@ -1,8 +1,9 @@
-"""A sweep on two processes against one, and what the coordinator costs.
+"""A sweep on two processes, and on a Dask cluster of two, against one process.
 
 Runs: a chain of five yaw joints on the ground, 2 s each, a random design over the servos' strength.
 The baseline is a tenth of the runs on one worker. Overhead is the part of the workers' time, wall
-clock times workers, that was not spent in runs, without the start of the workers.
+clock times workers, that was not spent in runs, without the start of the workers. The scheduler and
+its worker processes run on loopback; their rows are those of the local processes, bit for bit.
 
 Run: python bench/sweep.py [--runs 2000]
 """
@@ -21,7 +22,8 @@ from undulog.replay.sweep.rows import Row, RowStore
 from undulog.replay.sweep.sweep import prepare, run_sweep
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from support.sweep_plans import write_plan
+from support.dask_cluster import free_port, scheduler, workers
+from support.sweep_plans import comparable, write_plan
 
 PLAN = """scenario = "wave.toml"
 design = "random"
@@ -32,11 +34,13 @@ high = 0.4
 """
 
 
-def measure(folder: Path, points: int, workers: int) -> tuple[float, float]:
+def measure(
+    folder: Path, points: int, processes: int, cluster: str | None = None
+) -> tuple[float, float]:
     """Return runs a second and the share of overhead, from the first row on."""
     plan = folder / "plan.toml"
     plan.write_text(PLAN.format(points=points))
-    output = str(folder / f"rows{workers}")
+    output = _rows(folder, processes, cluster)
     ends: list[float] = []
     spent: list[float] = []
 
@@ -45,12 +49,20 @@ def measure(folder: Path, points: int, workers: int) -> tuple[float, float]:
         spent.append(row["run_wall"])
 
     report = run_sweep(
-        prepare(read_plan(plan), folder, output), RowStore(output), workers=workers, on_row=note
+        prepare(read_plan(plan), folder, output),
+        RowStore(output),
+        workers=processes,
+        cluster=cluster,
+        on_row=note,
     )
     assert (report.run, report.failed) == (points, 0), report
-    first = 2 * workers  # the workers' start, imports included
+    first = 2 * processes  # the workers' start, imports included
     wall = ends[-1] - ends[first - 1]
-    return (points - first) / wall, 1 - sum(spent[first:]) / (workers * wall)
+    return (points - first) / wall, 1 - sum(spent[first:]) / (processes * wall)
+
+
+def _rows(folder: Path, processes: int, cluster: str | None) -> str:
+    return str(folder / (f"rows{processes}" if cluster is None else "cluster"))
 
 
 def main() -> None:
@@ -63,9 +75,18 @@ def main() -> None:
         write_plan(folder, joints=5)  # its robot and scenario serve here
         one, _ = measure(folder, max(20, runs // 10), 1)
         two, overhead = measure(folder, runs, 2)
+        port = free_port()
+        address = f"tcp://127.0.0.1:{port}"
+        with scheduler(port), workers(port, folder / "dask"):
+            dask, dask_overhead = measure(folder, runs, 2, address)
+        local = comparable(RowStore(_rows(folder, 2, None)).rows())
+        same = comparable(RowStore(_rows(folder, 2, address)).rows()) == local
     print(f"1 worker:  {one:.2f} runs/s ({max(20, runs // 10)} runs)")
     print(f"2 workers: {two:.2f} runs/s ({runs} runs), {two / one:.2f} times one worker")
     print(f"overhead:  {100 * overhead:.1f} % of the workers' time")
+    print(f"Dask, 2:   {dask:.2f} runs/s, {dask / one:.2f} times one worker")
+    print(f"overhead:  {100 * dask_overhead:.1f} % of the workers' time")
+    print(f"same rows: {'yes' if same else 'NO'}")
 
 
 if __name__ == "__main__":

@@ -3,38 +3,16 @@
 import json
 import os
 import signal
-import socket
-import sys
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 
 import pytest
 
-from support.processes import UNDULOG, listening, process, undulog, wait_for
+from support.dask_cluster import free_port, scheduler, workers
+from support.processes import UNDULOG, process, undulog, wait_for
 from support.sweep_plans import comparable, write_plan
 from undulog.replay.sweep.rows import RowStore
 
 STRENGTHS = tuple(0.1 + k / 100 for k in range(20))
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
-@contextmanager
-def scheduler(port):
-    words = (sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1")
-    with process(*words, "--port", port, "--no-dashboard", "--no-jupyter") as running:
-        wait_for(lambda: listening(port), "the scheduler", alive=[running])
-        yield running
-
-
-def workers(port, folder):
-    """Two worker processes of one thread, restarted if they are killed."""
-    words = (sys.executable, "-m", "distributed.cli.dask_worker", f"tcp://127.0.0.1:{port}")
-    options = ("--nthreads", "1", "--nworkers", "2", "--no-dashboard")
-    place = ("--host", "127.0.0.1", "--local-directory", folder)
-    return process(*words, *options, *place)
 
 
 def rows_of(output):
