@@ -1,0 +1,1 @@
+"""Frequency responses from any excitation."""

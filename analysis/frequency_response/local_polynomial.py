@@ -1,0 +1,124 @@
+"""The local polynomial method: frequency responses without leakage, with their noise.
+
+Over a few neighbouring bins k + r of a record's discrete Fourier transform the response G and the
+leakage T of a transient are smooth, so that
+
+    Y(k + r) = sum_i G_i(k + r) U_i(k + r) + T(k + r) + V(k + r),    |r| <= n            (1)
+
+with G_i and T polynomials of order R in r is a linear least-squares problem in (R + 1)(m + 1)
+unknowns. Its solution at r = 0 is the response, and its residual the power of the noise V, of
+which nonlinear distortion is a part where the excitation isn't periodic.
+
+Source: Pintelon, Schoukens, Vandersteen & Barbe, Mechanical Systems and Signal Processing 24
+(2010) 573-595, doi 10.1016/j.ymssp.2009.08.003.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+
+ORDER = 2
+"""Of the polynomials: the lowest that follows a curved response and an odd transient alike."""
+
+LEAST_FREEDOM = 6
+"""Complex residuals at least left over: their power is known to 40 %."""
+
+_SMALLEST_PIVOT = 1e-6
+"""Relative; below it the inputs can't be told apart in a window."""
+
+
+@dataclass(frozen=True)
+class LocalResponse:
+    """Responses at c bins from m inputs to one output.
+
+    Attributes:
+        bins: The bins, shape (c,).
+        value: G, output over input, shape (c, m); NaN where the inputs can't be told apart.
+        covariance: E[e e^H] of the error e of ``value``, shape (c, m, m); circular.
+        noise: E|V|^2 at the output, in the DFT's scale, shape (c,).
+        freedom: Complex degrees of freedom of ``noise``.
+    """
+
+    bins: IntArray
+    value: ComplexArray
+    covariance: ComplexArray
+    noise: FloatArray
+    freedom: int
+
+    @property
+    def variance(self) -> FloatArray:
+        """E|e|^2 of each response, shape (c, m)."""
+        return np.einsum("cmm->cm", self.covariance).real
+
+    def radius(self, level: float = 0.95) -> FloatArray:
+        """Return the radius of the disc that holds each response, shape (c, m).
+
+        |e|^2 / variance is distributed as F with 2 and 2 q degrees of freedom.
+        """
+        quantile = float(stats.f.ppf(level, 2, 2 * self.freedom))
+        return np.sqrt(self.variance * quantile)
+
+
+def window(inputs: int, order: int = ORDER, freedom: int = LEAST_FREEDOM) -> int:
+    """Return the least half width n of the window that leaves so many degrees of freedom."""
+    return (freedom + (order + 1) * (inputs + 1)) // 2
+
+
+def local_response(
+    output: ComplexArray,
+    inputs: ComplexArray,
+    bins: IntArray,
+    half: int,
+    *,
+    order: int = ORDER,
+    usable: BoolArray | None = None,
+) -> LocalResponse:
+    """Fit equation (1) around each of some bins.
+
+    Args:
+        output: Spectrum Y from bin 0 on, shape (n,).
+        inputs: Spectra U, shape (m, n).
+        bins: Centres k, shape (c,). Near the ends the window is moved inwards.
+        half: Half width n of the window.
+        usable: Bins that the fit may use, shape (n,); all but the constant by default.
+
+    Returns:
+        The responses.
+
+    Raises:
+        ValueError: If the window leaves no degree of freedom or the spectrum is shorter.
+    """
+    m, length = inputs.shape
+    width, unknowns = 2 * half + 1, (order + 1) * (m + 1)
+    if width <= unknowns or length <= width:
+        raise ValueError(f"a window of {width} bins of {length} for {unknowns} unknowns")
+    first = np.clip(bins - half, 1, length - width)
+    index = first[:, None] + np.arange(width)  # (c, w)
+    powers = ((index - bins[:, None]) / half)[:, :, None] ** np.arange(order + 1)  # (c, w, R+1)
+    weight = np.ones(index.shape) if usable is None else usable[index].astype(np.float64)
+    local = inputs[:, index]  # (m, c, w)
+    scale = np.sqrt(np.mean(np.abs(local) ** 2, axis=2)) + np.finfo(float).tiny  # (m, c)
+    columns = [local[i, :, :, None] / scale[i, :, None, None] * powers for i in range(m)]
+    design = np.concatenate([*columns, powers.astype(np.complex128)], axis=2) * weight[:, :, None]
+    q, r = np.linalg.qr(design)
+    pivots = np.abs(np.einsum("cii->ci", r))
+    sound = pivots.min(axis=1) > _SMALLEST_PIVOT * pivots.max(axis=1)
+    r[~sound] = np.eye(unknowns)
+    data = output[index] * weight
+    projected = np.einsum("cwp,cw->cp", q.conj(), data)
+    solution = np.linalg.solve(r, projected[..., None])[..., 0]
+    residual = data - np.einsum("cwp,cp->cw", q, projected)
+    freedom = int(np.median(weight.sum(axis=1))) - unknowns
+    noise = np.sum(np.abs(residual) ** 2, axis=1) / (weight.sum(axis=1) - unknowns)
+    inverse = np.linalg.inv(r)
+    at = np.arange(m) * (order + 1)  # the constants of the G_i
+    rows = inverse[:, at, :] / scale.T[:, :, None]
+    value = solution[:, at] / scale.T
+    value[~sound] = np.nan
+    covariance = noise[:, None, None] * (rows @ rows.conj().transpose(0, 2, 1))
+    return LocalResponse(bins, value, covariance, noise, freedom)
