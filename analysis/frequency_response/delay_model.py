@@ -1,0 +1,185 @@
+"""A delay and a rational transfer function fitted to a measured frequency response.
+
+    G(s) = exp(-s tau) B(s) / A(s),    A(0) = 1,    s = j w / w_0                         (1)
+
+is fitted by weighted least squares, each line by its own variance; w_0 is the geometric mean of the
+frequencies. For each delay of a grid B and A are linear after Sanathanan and Koerner's iteration
+(IEEE Trans. Automatic Control 8 (1963) 56-58); the best of them starts Levenberg and Marquardt's.
+Orders grow until the residual is what the variances say it is; if none does, there is no model, and
+the delay is the group delay: the slope of the phase.
+
+Source: Pintelon & Schoukens, System Identification, 2nd ed. (Wiley 2012), chapters 9 and 11.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize, stats
+
+from undulog.capture.common.arrays import ComplexArray, FloatArray
+
+ORDERS = ((0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (1, 3), (2, 3))
+"""Degrees of B and A, in the order in which they are tried."""
+
+LEVEL = 0.05
+"""A model is refused where its residual is larger with a probability below this."""
+
+_DELAYS = 41
+_ITERATIONS = 8
+
+
+@dataclass(frozen=True)
+class DelayModel:
+    """The fitted delay, and the model if one passed.
+
+    Attributes:
+        delay_s: tau, or the group delay where ``orders`` is None [s].
+        delay_sd_s: Its standard deviation [s].
+        orders: Degrees of B and A; None where no model passed the residual test.
+        numerator: Coefficients of B from s^0 on.
+        denominator: Coefficients of A from s^0 on.
+        scale: w_0 [rad/s].
+        p: Probability of a residual at least as large, of the model that passed; of the best one
+            where none did.
+    """
+
+    delay_s: float
+    delay_sd_s: float
+    orders: tuple[int, int] | None
+    numerator: FloatArray
+    denominator: FloatArray
+    scale: float
+    p: float
+
+    def response(self, frequency_hz: FloatArray) -> ComplexArray:
+        """Return G of equation (1) at some frequencies."""
+        omega = 2 * np.pi * frequency_hz
+        s = 1j * omega / self.scale
+        top = np.polynomial.polynomial.polyval(s, self.numerator)
+        return np.exp(-1j * omega * self.delay_s) * top / _denominator(s, self.denominator)
+
+
+def _denominator(s: ComplexArray, coefficients: FloatArray) -> ComplexArray:
+    return np.asarray(np.polynomial.polynomial.polyval(s, coefficients), dtype=np.complex128)
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """The measured lines, scaled: s, G over its standard deviation, the weight, w / w_0."""
+
+    s: ComplexArray
+    value: ComplexArray
+    weight: FloatArray
+
+    def model(self, parameters: FloatArray, order: int) -> ComplexArray:
+        tau, b = parameters[0], parameters[1 : order + 2]
+        a = np.concatenate([[1.0], parameters[order + 2 :]])
+        top = np.polynomial.polynomial.polyval(self.s, b)
+        return np.exp(-self.s * tau) * top / _denominator(self.s, a)
+
+    def residual(self, parameters: FloatArray, order: int) -> FloatArray:
+        error = (self.model(parameters, order) - self.value) * self.weight
+        return np.concatenate([error.real, error.imag])
+
+
+def fit_delay(
+    frequency_hz: FloatArray, value: ComplexArray, variance: FloatArray, freedom: float
+) -> DelayModel:
+    """Fit equation (1).
+
+    Args:
+        frequency_hz: Lines, shape (k,), ascending.
+        value: Responses, shape (k,).
+        variance: E|e|^2 of each, above 0, shape (k,).
+        freedom: Complex degrees of freedom of each variance.
+
+    Returns:
+        The model of the lowest order that passes, or the group delay.
+    """
+    omega = 2 * np.pi * frequency_hz
+    scale = float(np.exp(np.mean(np.log(omega))))
+    # E|e|^2 is shared by real and imaginary part.
+    lines = _Lines(1j * omega / scale, value, np.sqrt(2.0 / variance))
+    best = 0.0
+    for orders in ORDERS:
+        unknowns = 2 + sum(orders)
+        left = 2 * omega.size - unknowns
+        if left < max(2, unknowns // 2):
+            break
+        found = _fit(lines, *orders)
+        if found is None:
+            continue
+        # The variances are estimates: a ratio of chi-squares rather than a chi-square.
+        ratio = 2 * found.cost / left
+        p = float(stats.f.sf(ratio, left, 2 * freedom * omega.size))
+        best = max(best, p)
+        if p >= LEVEL and (sd := _delay_sd(found.jac)) is not None:
+            b, a = found.x[1 : orders[0] + 2], np.append(1.0, found.x[orders[0] + 2 :])
+            return DelayModel(found.x[0] / scale, sd / scale, orders, b, a, scale, p)
+    delay_s, sd_s = group_delay(omega, value, variance)
+    return DelayModel(delay_s, sd_s, None, np.zeros(0), np.ones(1), scale, best)
+
+
+def group_delay(
+    omega: FloatArray, value: ComplexArray, variance: FloatArray
+) -> tuple[float, float]:
+    """Return minus the slope of the phase over w, and its standard deviation [s].
+
+    Lines whose response isn't distinct from zero are left out. The slope's standard deviation is
+    that of the scatter about the line where this is larger than what the variances explain.
+    """
+    known = np.abs(value) ** 2 > 4 * variance
+    if known.sum() < 3:
+        return float("nan"), float("nan")
+    phase = np.unwrap(np.angle(value[known]))
+    weight = np.abs(value[known]) / np.sqrt(variance[known] / 2)
+    design = np.stack([-omega[known], np.ones(phase.size)], axis=1) * weight[:, None]
+    solution, *_ = np.linalg.lstsq(design, phase * weight, rcond=None)
+    residual = design @ solution - phase * weight
+    spread = max(1.0, float(residual @ residual) / (phase.size - 2))
+    covariance = np.linalg.inv(design.T @ design) * spread
+    return float(solution[0]), float(np.sqrt(covariance[0, 0]))
+
+
+def _delay_sd(jacobian: FloatArray) -> float | None:
+    """Return the standard deviation of the first parameter, None where it isn't determined."""
+    information = jacobian.T @ jacobian
+    if np.linalg.cond(information) > 1e14:
+        return None
+    return float(np.sqrt(np.linalg.inv(information)[0, 0]))
+
+
+def _fit(lines: _Lines, top: int, bottom: int) -> optimize.OptimizeResult | None:
+    """Fit one pair of orders from the best start over a grid of delays; None where none is stable."""
+    highest = np.abs(lines.s[-1])
+    best = None
+    for tau in np.linspace(0.0, 2 * np.pi, _DELAYS) / highest:
+        start = _linear(lines, tau, top, bottom)
+        cost = float(np.sum(lines.residual(start, top) ** 2))
+        if np.isfinite(cost) and (best is None or cost < best[0]):
+            best = cost, start
+    if best is None:
+        return None
+    found = optimize.least_squares(lines.residual, best[1], args=(top,), method="lm", max_nfev=400)
+    poles = np.polynomial.polynomial.polyroots(np.append(1.0, found.x[top + 2 :]))
+    return found if not len(poles) or (poles.real < 0).all() else None
+
+
+def _linear(lines: _Lines, tau: float, top: int, bottom: int) -> FloatArray:
+    """Return the parameters of Sanathanan and Koerner's iteration at one delay."""
+    undelayed = lines.value * np.exp(lines.s * tau)
+    powers = lines.s[:, None] ** np.arange(max(top, bottom) + 1)
+    weight, found = lines.weight, np.zeros(1 + top + bottom)
+    for _ in range(_ITERATIONS if bottom else 1):
+        left = np.hstack([powers[:, : top + 1], -undelayed[:, None] * powers[:, 1 : bottom + 1]])
+        left, right = left * weight[:, None], undelayed * weight
+        found = np.linalg.lstsq(
+            np.vstack([left.real, left.imag]),
+            np.concatenate([right.real, right.imag]),
+            rcond=None,
+        )[0]
+        below = _denominator(lines.s, np.append(1.0, found[top + 1 :]))
+        weight = lines.weight / np.maximum(np.abs(below), 1e-9)
+    return np.append(tau, found)

@@ -1,0 +1,161 @@
+"""Responses to commands that are sums of sines, by least squares at their frequencies.
+
+Frequencies come from the command alone: peaks of a spectrum whose side lobes are below -92 dB, made
+exact by Gauss-Newton steps of
+
+    u(t) = sum_k Re(A_k exp(j w_k t)) + drift(t),                                        (1)
+
+with a quadratic drift. The response is fitted with the same frequencies, and its noise at each of
+them is the power of the residual in the nearest bins that no tone is in. Distortion is in the
+residual, too, as far as the tones' combinations don't fall on tones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal, stats
+
+from undulog.capture.common.arrays import ComplexArray, FloatArray
+
+from ..estimators.series import Series
+
+LEAST_AMPLITUDE = 0.01
+"""Of the largest tone's; smaller ones are left in the residual."""
+
+MOST_TONES = 64
+EXPLAINED = 0.999
+"""Share of the command's variance that the tones of a sum of sines explain."""
+
+SEPARATION = 4.0
+"""Least distance of two tones, in bins of the record: half the main lobe of the window."""
+
+NOISE_BINS = 12
+_DRIFT = 2  # order of the polynomial
+_STEPS = 4
+_SHIFT = 1.5  # bins from a tone to the first bin of noise
+
+
+@dataclass(frozen=True)
+class LineResponse:
+    """Responses at k frequencies.
+
+    Attributes:
+        frequency_hz: Shape (k,).
+        value: Output over input, shape (k,).
+        variance: E|e|^2 of the error e of ``value``, shape (k,); circular.
+        freedom: Complex degrees of freedom of ``variance``, shape (k,).
+    """
+
+    frequency_hz: FloatArray
+    value: ComplexArray
+    variance: FloatArray
+    freedom: FloatArray
+
+    def radius(self, level: float = 0.95) -> FloatArray:
+        """Return the radius of the disc that holds each response, shape (k,)."""
+        return np.sqrt(self.variance * stats.f.ppf(level, 2, 2 * self.freedom))
+
+
+def uniform(series: Series, period_s: float | None = None) -> tuple[FloatArray, FloatArray]:
+    """Return a series at equal intervals, by cubic splines.
+
+    Args:
+        period_s: The interval [s]; the series' median interval by default.
+
+    Returns:
+        Times [s] and values, shape (n,) each.
+    """
+    from scipy.interpolate import CubicSpline
+
+    step = series.period_s if period_s is None else period_s
+    t_s = np.arange(series.t_s[0], series.t_s[-1] + step / 2, step)
+    return t_s, CubicSpline(series.t_s, series.values)(t_s)
+
+
+def find_tones(command: Series) -> FloatArray | None:
+    """Return the frequencies of a sum of sines [Hz], or None if the command is none.
+
+    Args:
+        command: At least 32 samples.
+    """
+    t_s, values = uniform(command)
+    values = signal.detrend(values)
+    if not values.any():
+        return None
+    spectrum = np.abs(np.fft.rfft(values * signal.windows.blackmanharris(values.size)))
+    peaks, _ = signal.find_peaks(spectrum, height=LEAST_AMPLITUDE * spectrum.max())
+    peaks = peaks[peaks >= SEPARATION]  # below it is the drift
+    if not 0 < peaks.size <= MOST_TONES or (np.diff(peaks) < SEPARATION).any():
+        return None
+    found = peaks / (values.size * command.period_s)
+    for _ in range(_STEPS):
+        found = found + _step(command, found)
+    residual = command.values - _fitted(command, found)
+    left = np.var(residual) / np.var(command.values)
+    return found if left <= 1 - EXPLAINED else None
+
+
+def tone_response(command: Series, response: Series, tones_hz: FloatArray) -> LineResponse:
+    """Estimate the response at some tones.
+
+    Args:
+        command: Its samples.
+        response: Samples of the same stretch, at times of their own.
+        tones_hz: From :func:`find_tones`.
+    """
+    inputs, outputs = _amplitudes(command, tones_hz), _amplitudes(response, tones_hz)
+    residual = response.values - _fitted(response, tones_hz)
+    length_s = response.t_s[-1] - response.t_s[0]
+    noise, freedom = np.empty(tones_hz.size), np.empty(tones_hz.size)
+    for k, tone in enumerate(tones_hz):
+        bins = _bins_beside(tone, tones_hz, length_s, 0.5 / response.period_s)
+        turns = np.exp(-2j * np.pi * np.outer(bins, response.t_s))
+        noise[k] = np.mean(np.abs(2.0 / response.count * (turns @ residual)) ** 2)
+        freedom[k] = bins.size
+    return LineResponse(tones_hz, outputs / inputs, noise / np.abs(inputs) ** 2, freedom)
+
+
+def _bins_beside(tone: float, tones_hz: FloatArray, length_s: float, highest: float) -> FloatArray:
+    """Return the frequencies next to a tone that are at least a bin and a half from any [Hz]."""
+    reach = np.arange(4 * NOISE_BINS) + _SHIFT
+    beside = np.concatenate([tone - reach / length_s, tone + reach / length_s])
+    beside = beside[(beside > _SHIFT / length_s) & (beside < highest)]
+    distance = np.abs(beside[:, None] - tones_hz).min(axis=1)
+    beside = beside[distance >= 0.999 * _SHIFT / length_s]
+    return beside[np.argsort(np.abs(beside - tone))[:NOISE_BINS]]
+
+
+def _design(t_s: FloatArray, tones_hz: FloatArray) -> FloatArray:
+    span = (t_s[-1] - t_s[0]) / 2
+    drift = np.polynomial.legendre.legvander((t_s - t_s[0]) / span - 1, _DRIFT)
+    angle = 2 * np.pi * np.outer(t_s, tones_hz)
+    return np.hstack([drift, np.cos(angle), np.sin(angle)])
+
+
+def _solve(series: Series, design: FloatArray) -> FloatArray:
+    return np.linalg.lstsq(design, series.values, rcond=None)[0]
+
+
+def _amplitudes(series: Series, tones_hz: FloatArray) -> ComplexArray:
+    """Return A_k of equation (1), shape (k,)."""
+    found = _solve(series, _design(series.t_s, tones_hz))[_DRIFT + 1 :]
+    return found[: tones_hz.size] - 1j * found[tones_hz.size :]
+
+
+def _fitted(series: Series, tones_hz: FloatArray) -> FloatArray:
+    design = _design(series.t_s, tones_hz)
+    return design @ _solve(series, design)
+
+
+def _step(series: Series, tones_hz: FloatArray) -> FloatArray:
+    """Return the Gauss-Newton step of the frequencies [Hz]."""
+    middle_s = (series.t_s[0] + series.t_s[-1]) / 2
+    moved = 2 * np.pi * (series.t_s - middle_s)[:, None]
+    angle = 2 * np.pi * np.outer(series.t_s, tones_hz)
+    amplitude = _amplitudes(series, tones_hz)
+    # d/df of Re(A exp(j w t)), at a fixed phase in the middle of the record.
+    slope = -moved * (amplitude.real * np.sin(angle) + amplitude.imag * np.cos(angle))
+    design = np.hstack([_design(series.t_s, tones_hz), slope])
+    return _solve(series, design)[-tones_hz.size :]
