@@ -56,13 +56,13 @@ class DelayModel:
     def response(self, frequency_hz: FloatArray) -> ComplexArray:
         """Return G of equation (1) at some frequencies."""
         omega = 2 * np.pi * frequency_hz
-        s = 1j * omega / self.scale
-        top = np.polynomial.polynomial.polyval(s, self.numerator)
-        return np.exp(-1j * omega * self.delay_s) * top / _denominator(s, self.denominator)
+        s = np.asarray(1j * omega / self.scale, dtype=np.complex128)
+        top = _polynomial(s, self.numerator)
+        return np.exp(-1j * omega * self.delay_s) * top / _polynomial(s, self.denominator)
 
 
-def _denominator(s: ComplexArray, coefficients: FloatArray) -> ComplexArray:
-    return np.asarray(np.polynomial.polynomial.polyval(s, coefficients), dtype=np.complex128)
+def _polynomial(s: ComplexArray, coefficients: FloatArray) -> ComplexArray:
+    return s[:, None] ** np.arange(coefficients.size) @ coefficients.astype(np.complex128)
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ class _Lines:
     def model(self, parameters: FloatArray, order: int) -> ComplexArray:
         tau, b = parameters[0], parameters[1 : order + 2]
         a = np.concatenate([[1.0], parameters[order + 2 :]])
-        top = np.polynomial.polynomial.polyval(self.s, b)
-        return np.exp(-self.s * tau) * top / _denominator(self.s, a)
+        top = _polynomial(self.s, b)
+        return np.exp(-self.s * tau) * top / _polynomial(self.s, a)
 
     def residual(self, parameters: FloatArray, order: int) -> FloatArray:
         error = (self.model(parameters, order) - self.value) * self.weight
@@ -101,7 +101,9 @@ def fit_delay(
     omega = 2 * np.pi * frequency_hz
     scale = float(np.exp(np.mean(np.log(omega))))
     # E|e|^2 is shared by real and imaginary part.
-    lines = _Lines(1j * omega / scale, value, np.sqrt(2.0 / variance))
+    lines = _Lines(
+        np.asarray(1j * omega / scale, dtype=np.complex128), value, np.sqrt(2.0 / variance)
+    )
     best = 0.0
     for orders in ORDERS:
         unknowns = 2 + sum(orders)
@@ -115,9 +117,10 @@ def fit_delay(
         ratio = 2 * found.cost / left
         p = float(stats.f.sf(ratio, left, 2 * freedom * omega.size))
         best = max(best, p)
-        if p >= LEVEL and (sd := _delay_sd(found.jac)) is not None:
-            b, a = found.x[1 : orders[0] + 2], np.append(1.0, found.x[orders[0] + 2 :])
-            return DelayModel(found.x[0] / scale, sd / scale, orders, b, a, scale, p)
+        if p >= LEVEL and (sd := _delay_sd(np.asarray(found.jac, dtype=np.float64))) is not None:
+            x = np.asarray(found.x, dtype=np.float64)
+            b, a = x[1 : orders[0] + 2], np.append(1.0, x[orders[0] + 2 :])
+            return DelayModel(x[0] / scale, sd / scale, orders, b, a, scale, p)
     delay_s, sd_s = group_delay(omega, value, variance)
     return DelayModel(delay_s, sd_s, None, np.zeros(0), np.ones(1), scale, best)
 
@@ -152,7 +155,7 @@ def _delay_sd(jacobian: FloatArray) -> float | None:
 
 
 def _fit(lines: _Lines, top: int, bottom: int) -> optimize.OptimizeResult | None:
-    """Fit one pair of orders from the best start over a grid of delays; None where none is stable."""
+    """Fit one pair of orders from the best start over a grid of delays; None if it isn't stable."""
     highest = np.abs(lines.s[-1])
     best = None
     for tau in np.linspace(0.0, 2 * np.pi, _DELAYS) / highest:
@@ -163,8 +166,8 @@ def _fit(lines: _Lines, top: int, bottom: int) -> optimize.OptimizeResult | None
     if best is None:
         return None
     found = optimize.least_squares(lines.residual, best[1], args=(top,), method="lm", max_nfev=400)
-    poles = np.polynomial.polynomial.polyroots(np.append(1.0, found.x[top + 2 :]))
-    return found if not len(poles) or (poles.real < 0).all() else None
+    poles = np.roots(np.append(found.x[: top + 1 : -1], 1.0))
+    return found if (poles.real < 0).all() else None
 
 
 def _linear(lines: _Lines, tau: float, top: int, bottom: int) -> FloatArray:
@@ -180,6 +183,6 @@ def _linear(lines: _Lines, tau: float, top: int, bottom: int) -> FloatArray:
             np.concatenate([right.real, right.imag]),
             rcond=None,
         )[0]
-        below = _denominator(lines.s, np.append(1.0, found[top + 1 :]))
+        below = _polynomial(lines.s, np.append(1.0, found[top + 1 :]))
         weight = lines.weight / np.maximum(np.abs(below), 1e-9)
     return np.append(tau, found)

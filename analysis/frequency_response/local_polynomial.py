@@ -111,14 +111,14 @@ def local_response(
     r[~sound] = np.eye(unknowns)
     data = output[index] * weight
     projected = np.einsum("cwp,cw->cp", q.conj(), data)
-    solution = np.linalg.solve(r, projected[..., None])[..., 0]
     residual = data - np.einsum("cwp,cp->cw", q, projected)
     freedom = int(np.median(weight.sum(axis=1))) - unknowns
     noise = np.sum(np.abs(residual) ** 2, axis=1) / (weight.sum(axis=1) - unknowns)
-    inverse = np.linalg.inv(r)
-    at = np.arange(m) * (order + 1)  # the constants of the G_i
+    inverse = np.asarray(np.linalg.inv(r), dtype=np.complex128)
+    solution: ComplexArray = np.einsum("cpq,cq->cp", inverse, projected)
+    at: IntArray = np.arange(m, dtype=np.int64) * (order + 1)  # the constants of the G_i
     rows = inverse[:, at, :] / scale.T[:, :, None]
-    value = solution[:, at] / scale.T
+    value: ComplexArray = solution[:, at] / scale.T
     value[~sound] = np.nan
     covariance = noise[:, None, None] * (rows @ rows.conj().transpose(0, 2, 1))
     return LocalResponse(bins, value, covariance, noise, freedom)

@@ -6,10 +6,10 @@ Of a nonlinear system driven by a random-phase multisine,
 
 where V, the noise, differs from period to period, and S, the stochastic nonlinear distortion, only
 from one realisation of the phases to the next. The scatter over periods therefore gives the noise,
-and what the scatter over realisations is above it the distortion (the robust method). A multisine of
-odd lines, some of them left out, shows the kind of distortion already in one realisation: a
-nonlinearity of even order puts power into even lines, one of odd order into the odd ones that were
-left out.
+and what the scatter over realisations is above it the distortion (the robust method). A multisine
+of odd lines, some of them left out, shows the kind of distortion already in one realisation: a
+nonlinearity of even order puts power into even lines, one of odd order into the odd ones that
+were left out.
 
 Source: Pintelon & Schoukens, System Identification, 2nd ed. (Wiley 2012), section 4.3.
 """
@@ -34,7 +34,8 @@ class BestLinearApproximation:
         lines: Multiples of the reciprocal period, shape (k,).
         value: G_BLA, shape (k,).
         noise: E|e|^2 of ``value`` made by noise, shape (k,); NaN from one period.
-        total: E|e|^2 of ``value`` made by noise and distortion, shape (k,); NaN from one realisation.
+        total: E|e|^2 of ``value`` made by noise and distortion, shape (k,); NaN from one
+            realisation.
         distortion: E|S / U|^2 of one realisation, shape (k,); NaN from one realisation or period,
             where it can't be told from noise.
         realisations: M.
@@ -128,7 +129,9 @@ def detection_lines(outputs: FloatArray, lines: IntArray) -> DetectionLines:
     mean = y.mean(axis=1)
     scatter = np.sum(np.abs(y - mean[:, None]) ** 2, axis=1) / (periods - 1) / periods
     power = np.mean(np.abs(mean) ** 2 - scatter, axis=0)
-    free = np.setdiff1d(np.arange(1, power.size), lines)
+    unexcited = np.ones(power.size, dtype=bool)
+    unexcited[[0, *lines]] = False
+    free = np.flatnonzero(unexcited)
 
     def level(parity: int) -> float:
         chosen = free[free % 2 == parity]

@@ -37,6 +37,10 @@ _STEPS = 4
 _SHIFT = 1.5  # bins from a tone to the first bin of noise
 
 
+def _float(values: object) -> FloatArray:
+    return np.asarray(values, dtype=np.float64)
+
+
 @dataclass(frozen=True)
 class LineResponse:
     """Responses at k frequencies.
@@ -55,23 +59,18 @@ class LineResponse:
 
     def radius(self, level: float = 0.95) -> FloatArray:
         """Return the radius of the disc that holds each response, shape (k,)."""
-        return np.sqrt(self.variance * stats.f.ppf(level, 2, 2 * self.freedom))
+        return _float(np.sqrt(self.variance * stats.f.ppf(level, 2, 2 * self.freedom)))
 
 
-def uniform(series: Series, period_s: float | None = None) -> tuple[FloatArray, FloatArray]:
-    """Return a series at equal intervals, by cubic splines.
+def resampled(series: Series, t_s: FloatArray) -> FloatArray:
+    """Return a series at other times, by cubic splines.
 
     Args:
-        period_s: The interval [s]; the series' median interval by default.
-
-    Returns:
-        Times [s] and values, shape (n,) each.
+        t_s: Times [s], shape (n,).
     """
     from scipy.interpolate import CubicSpline
 
-    step = series.period_s if period_s is None else period_s
-    t_s = np.arange(series.t_s[0], series.t_s[-1] + step / 2, step)
-    return t_s, CubicSpline(series.t_s, series.values)(t_s)
+    return np.asarray(CubicSpline(series.t_s, series.values)(t_s), dtype=np.float64)
 
 
 def find_tones(command: Series) -> FloatArray | None:
@@ -80,8 +79,8 @@ def find_tones(command: Series) -> FloatArray | None:
     Args:
         command: At least 32 samples.
     """
-    t_s, values = uniform(command)
-    values = signal.detrend(values)
+    t_s = np.arange(command.t_s[0], command.t_s[-1], command.period_s)
+    values = signal.detrend(resampled(command, t_s))
     if not values.any():
         return None
     spectrum = np.abs(np.fft.rfft(values * signal.windows.blackmanharris(values.size)))
@@ -120,7 +119,7 @@ def tone_response(command: Series, response: Series, tones_hz: FloatArray) -> Li
 def _bins_beside(tone: float, tones_hz: FloatArray, length_s: float, highest: float) -> FloatArray:
     """Return the frequencies next to a tone that are at least a bin and a half from any [Hz]."""
     reach = np.arange(4 * NOISE_BINS) + _SHIFT
-    beside = np.concatenate([tone - reach / length_s, tone + reach / length_s])
+    beside = _float(np.concatenate([tone - reach / length_s, tone + reach / length_s]))
     beside = beside[(beside > _SHIFT / length_s) & (beside < highest)]
     distance = np.abs(beside[:, None] - tones_hz).min(axis=1)
     beside = beside[distance >= 0.999 * _SHIFT / length_s]
@@ -129,13 +128,13 @@ def _bins_beside(tone: float, tones_hz: FloatArray, length_s: float, highest: fl
 
 def _design(t_s: FloatArray, tones_hz: FloatArray) -> FloatArray:
     span = (t_s[-1] - t_s[0]) / 2
-    drift = np.polynomial.legendre.legvander((t_s - t_s[0]) / span - 1, _DRIFT)
+    drift = ((t_s - t_s[0]) / span - 1)[:, None] ** np.arange(_DRIFT + 1)
     angle = 2 * np.pi * np.outer(t_s, tones_hz)
     return np.hstack([drift, np.cos(angle), np.sin(angle)])
 
 
 def _solve(series: Series, design: FloatArray) -> FloatArray:
-    return np.linalg.lstsq(design, series.values, rcond=None)[0]
+    return _float(np.linalg.lstsq(design, series.values, rcond=None)[0])
 
 
 def _amplitudes(series: Series, tones_hz: FloatArray) -> ComplexArray:
