@@ -14,6 +14,7 @@ Source: Pintelon & Schoukens, System Identification, 2nd ed. (Wiley 2012), chapt
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import optimize, stats
@@ -23,7 +24,7 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray
 ORDERS = ((0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (1, 3), (2, 3))
 """Degrees of B and A, in the order in which they are tried."""
 
-LEVEL = 0.05
+LEVEL = 0.01
 """A model is refused where its residual is larger with a probability below this."""
 
 _DELAYS = 41
@@ -115,9 +116,9 @@ def fit_delay(
             continue
         # The variances are estimates: a ratio of chi-squares rather than a chi-square.
         ratio = 2 * found.cost / left
-        p = float(stats.f.sf(ratio, left, 2 * freedom * omega.size))
+        p = float(stats.f.sf(float(ratio), left, 2 * freedom * omega.size))
         best = max(best, p)
-        if p >= LEVEL and (sd := _delay_sd(np.asarray(found.jac, dtype=np.float64))) is not None:
+        if p >= LEVEL and (sd := _delay_sd(found.jac)) is not None:
             x = np.asarray(found.x, dtype=np.float64)
             b, a = x[1 : orders[0] + 2], np.append(1.0, x[orders[0] + 2 :])
             return DelayModel(x[0] / scale, sd / scale, orders, b, a, scale, p)
@@ -146,15 +147,15 @@ def group_delay(
     return float(solution[0]), float(np.sqrt(covariance[0, 0]))
 
 
-def _delay_sd(jacobian: FloatArray) -> float | None:
+def _delay_sd(jacobian: Any) -> float | None:
     """Return the standard deviation of the first parameter, None where it isn't determined."""
-    information = jacobian.T @ jacobian
+    information: FloatArray = np.asarray(jacobian.T @ jacobian, dtype=np.float64)
     if np.linalg.cond(information) > 1e14:
         return None
-    return float(np.sqrt(np.linalg.inv(information)[0, 0]))
+    return float(np.linalg.inv(information)[0, 0]) ** 0.5
 
 
-def _fit(lines: _Lines, top: int, bottom: int) -> optimize.OptimizeResult | None:
+def _fit(lines: _Lines, top: int, bottom: int) -> Any:
     """Fit one pair of orders from the best start over a grid of delays; None if it isn't stable."""
     highest = np.abs(lines.s[-1])
     best = None
@@ -165,12 +166,14 @@ def _fit(lines: _Lines, top: int, bottom: int) -> optimize.OptimizeResult | None
             best = cost, start
     if best is None:
         return None
-    found = optimize.least_squares(lines.residual, best[1], args=(top,), method="lm", max_nfev=400)
+    found: Any = optimize.least_squares(
+        lines.residual, best[1], args=(top,), method="lm", max_nfev=400
+    )
     poles = np.roots(np.append(found.x[: top + 1 : -1], 1.0))
     return found if (poles.real < 0).all() else None
 
 
-def _linear(lines: _Lines, tau: float, top: int, bottom: int) -> FloatArray:
+def _linear(lines: _Lines, tau: Any, top: int, bottom: int) -> FloatArray:
     """Return the parameters of Sanathanan and Koerner's iteration at one delay."""
     undelayed = lines.value * np.exp(lines.s * tau)
     powers = lines.s[:, None] ** np.arange(max(top, bottom) + 1)

@@ -20,6 +20,7 @@ from ..results.comparison import BODY, Comparison, Difference, NamedJoint, Wavef
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, MirrorJoint, Reversal, Run
 from ..results.formats import degrees, scaled
+from ..results.frequency_response import JointFrequencyResponse
 
 Row = TypeVar("Row")
 Digits = int | Callable[[Sequence[Estimate]], int]
@@ -130,6 +131,48 @@ def _typical(most: int) -> Callable[[Sequence[Estimate]], int]:
 def _significant(digits: int) -> Callable[[Sequence[Estimate]], int]:
     """Return the digits that show so many of the column's largest value."""
     return lambda column: formats.decimals_for_values((one.value for one in column), digits)
+
+
+def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequencyResponse]:
+    """Return frequency responses in short: band, bandwidth, delay, distortion, repeatability."""
+
+    def at_lowest(one: JointFrequencyResponse) -> Estimate:
+        return Estimate(one.gain[0], one.gain_ci95[0])
+
+    def agree(one: JointFrequencyResponse) -> str | None:
+        return None if one.halves_agree is None else "{} of {}".format(*one.halves_agree)
+
+    def model(one: JointFrequencyResponse) -> str:
+        return "group delay" if one.delay_model is None else "model {}/{}".format(*one.delay_model)
+
+    columns: list[Column[JointFrequencyResponse]] = [
+        Column("joint", "joint", lambda one: one.joint, kind="word"),
+        Column("command", "command", lambda one: one.excitation, kind="word", spare=2),
+        Column("from Hz", "from [Hz]", lambda one: one.frequency_hz[0], (3, 4)),
+        Column("to Hz", "to [Hz]", lambda one: one.frequency_hz[-1], (2, 3)),
+        Column(
+            "gain there (95 %)", "gain at the lowest [1]", at_lowest, (_typical(4), _typical(4))
+        ),
+        Column("-3 dB Hz", "-3 dB [Hz]", lambda one: Estimate(one.bandwidth_hz), (2, 3)),
+        Column(
+            "delay ms (95 %)",
+            "delay [ms]",
+            lambda one: scaled(one.delay_s, 1e3),
+            (_typical(2), _typical(3)),
+            note="with the offset of the clocks",
+        ),
+        Column("is", "delay is", model, kind="word", spare=4),
+        Column(
+            "distortion %",
+            "distortion [%]",
+            lambda one: scaled(Estimate(one.distortion), 100.0),
+            (2, 2),
+            spare=3,
+            note="nonlinear, of the response; a dash where it can't be told from noise",
+        ),
+        Column("halves agree", "halves agree", agree, kind="word", spare=1),
+    ]
+    return Table(columns, found)
 
 
 _ENERGIES: tuple[tuple[str, str, Callable[[JointResult], float | None], int | None], ...] = (

@@ -224,6 +224,8 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     sheet.print(answer.detail)
     moved = [j for j in analysis.joints if j.gain.value is not None or j.flags]
     shown: list[tables.AnyTable] = [tables.joint_table(analysis, moved or analysis.joints)]
+    if analysis.frequency_response:
+        shown = [tables.frequency_table(analysis.frequency_response)]
     if analysis.body is not None:
         shown.append(tables.body_table(analysis.body))
     if any(one.value is not None for one in analysis.heterogeneity.values()):

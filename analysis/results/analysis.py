@@ -16,6 +16,7 @@ from .answer import Answer
 from .artefact import Artefact, DeadBand, Span
 from .coupling import Coupling
 from .estimate import Estimate, Interval, Provenance
+from .frequency_response import JointFrequencyResponse
 from .shown import PresentedResult
 
 if TYPE_CHECKING:
@@ -361,6 +362,8 @@ class Analysis(PresentedResult):
         energy: Energies cycle by cycle, cost of transport, closure.
         oscillators: Couplings of the oscillators that drove it, one a plane; none where no
             oscillator's phase was logged.
+        frequency_response: Of joints whose commands are no gait but excite a band or several
+            frequencies.
         answer: Which joints do not follow or stand out, and the shape of the rest, in words.
         notes: One sentence each: what was not recorded, does not apply or was assumed.
     """
@@ -375,6 +378,7 @@ class Analysis(PresentedResult):
     over_time: ResponseOverTime | None = None
     energy: EnergyResult | None = None
     oscillators: tuple[ChainCoupling, ...] = ()
+    frequency_response: tuple[JointFrequencyResponse, ...] = ()
     artefacts: tuple[Artefact, ...] = ()
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
@@ -391,6 +395,7 @@ class Analysis(PresentedResult):
             "joints": [_record(joint) for joint in self.joints],
             "body": None if self.body is None else _body_dict(self.body),
             "energy": None if self.energy is None else _energy_dict(self.energy),
+            "frequency_response": [_record(one) for one in self.frequency_response],
             "artefacts": [dataclasses.asdict(one) | {"about": one.about} for one in self.artefacts],
             "warnings": list(self.warnings),
             "notes": list(self.notes),

@@ -19,6 +19,7 @@ from ..results import formats
 from ..results.analysis import GaitFacts, Index, JointResult
 from ..results.answer import Answer, NotFollowing, Shape, StandOut, Verdict
 from ..results.estimate import Estimate, Interval
+from ..results.frequency_response import JointFrequencyResponse
 from .examine import Findings
 
 NAMED = 4
@@ -59,6 +60,7 @@ class Facts:
         not_following: Joints that do not follow, in chain order.
         findings: Joints that stand out, and the shape of the rest.
         warnings: Of the analysis: they hold the reason where there is no answer.
+        swept: Frequency responses, where there is no gait.
         left_out: What of a session with a break is analysed; empty without a break.
     """
 
@@ -68,6 +70,7 @@ class Facts:
     not_following: tuple[NotFollowing, ...]
     findings: Findings
     warnings: tuple[str, ...]
+    swept: tuple[JointFrequencyResponse, ...] = ()
     left_out: str = ""
 
 
@@ -217,6 +220,8 @@ def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str
     """Verdict, sentence and detail on the joints that are not named."""
     named = bool(facts.not_following or facts.findings.stand_out or facts.findings.undecided)
     if facts.gait.frequency_hz.value is None:
+        if facts.swept:
+            return Verdict.NOTHING, _swept(facts.swept), _why_not(facts, "no gait")
         lead = "No gait was found in this session, so there is no gain and no lag to compare."
         return Verdict.NOTHING, lead, _why_not(facts, "no gait")
     if not known:
@@ -225,6 +230,23 @@ def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str
     if len(known) == 1:
         return _single(facts, known[0], named=named)
     return *_compared(facts, named=named), _responding(facts, known) + _caveat(facts.joints)
+
+
+def _swept(found: Sequence[JointFrequencyResponse]) -> str:
+    """Return the sentence on frequency responses."""
+    kinds = " and ".join(sorted({one.excitation for one in found}))
+    low = min(one.frequency_hz[0] for one in found)
+    high = max(one.frequency_hz[-1] for one in found)
+    text = f"No gait: the commands are of the kind {kinds}; frequency responses of {len(found)} "
+    text += f"joint{'s' if len(found) > 1 else ''} from {low:.3g} to {high:.3g} Hz"
+    if edges := sorted(one.bandwidth_hz for one in found if one.bandwidth_hz is not None):
+        span = f"{edges[0]:.3g}" if len(edges) == 1 else f"{edges[0]:.3g} to {edges[-1]:.3g}"
+        text += f", -3 dB at {span} Hz"
+    delays = sorted(1e3 * one.delay_s.value for one in found if one.delay_s.value is not None)
+    if delays:
+        text += f", delay {delays[0]:.0f} to {delays[-1]:.0f} ms"
+    shared = all(one.shares_command for one in found)
+    return text + (". All joints share one command: it is the response to that." if shared else ".")
 
 
 def _single(facts: Facts, joint: JointResult, *, named: bool) -> tuple[Verdict, str, str]:

@@ -32,6 +32,7 @@ from ..energy import (
 from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..estimators.series import Series, clean_together, coverage
 from ..estimators.spectrum import BINS_PER_SIDE
+from ..frequency_response.estimate import frequency_responses
 from ..oscillators.chain import session_couplings
 from ..response.fitting import GaitFit, fit_gait
 from ..response.response import gain_estimate, lag_estimate
@@ -186,6 +187,7 @@ def measure_session(
     broken = stopped(faulty)  # whose plateaus are no dead bands
     moving = {name: one for name, one in sound.items() if name not in broken}
     dead = dead_bands(columns, commands, moving, gait, origin_ns) if with_dead_bands else {}
+    swept = frequency_responses(commands, sound) if gait is None else ()
     del commands
     session.forget()
     energies = joint_energies(session, columns, held, span, warn)
@@ -238,11 +240,19 @@ def measure_session(
         artefacts=artefacts,
         over_time=over_time,
         energy=energy,
+        frequency_response=swept,
         oscillators=session_couplings(session, options.start_s, options.stop_s),
         notes=warn.notes,
     )
     facts = Facts(
-        analysis.gait, joints, commanded, faulty, findings, analysis.warnings, left_out=left_out
+        analysis.gait,
+        joints,
+        commanded,
+        faulty,
+        findings,
+        analysis.warnings,
+        swept=swept,
+        left_out=left_out,
     )
     analysis = dataclasses.replace(analysis, answer=compose(facts))
     return SessionMeasurement(analysis, gait, sound, energies, span, follows.offsets)

@@ -45,5 +45,5 @@ def test_without_a_model_it_is_the_group_delay():
     ripple = np.exp(-2j * np.pi * F_HZ * 0.05) * (1 + 0.5 * np.sin(40 * np.log(F_HZ)))
     value, variance = noisy(ripple, rng, 0.002)
     model = fit_delay(F_HZ, value, variance, freedom=12)
-    assert (model.orders, model.p < 0.05) == (None, True)
+    assert (model.orders, model.p < 0.01) == (None, True)
     assert model.delay_s == pytest.approx(0.05, abs=0.002)

@@ -1,0 +1,246 @@
+"""Frequency responses of joints to commands of any kind."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy import stats
+
+from undulog.capture.common.arrays import ComplexArray, FloatArray
+
+from ..estimators.series import Series
+from ..results.estimate import Estimate, Interval
+from ..results.frequency_response import JointFrequencyResponse
+from .delay_model import DelayModel, fit_delay
+from .excitation import Excitation, Kind, excited_bins, find_excitation
+from .local_polynomial import local_response, window
+from .periodic import excited_lines
+from .tones import LineResponse, resampled, tone_response
+
+LINES = 40
+"""Frequencies at which the response to a band is given."""
+
+SAME_COMMAND = 0.999
+"""Commands that correlate so much are one input."""
+
+LEAST_PERIODS = 2
+_FREEDOM = 12  # of the noise, complex
+_HIGHEST = 0.25  # of the sampling rate: beyond it splines are not exact
+_HALF_POWER = 1 / np.sqrt(2)
+_ROUNDING = 1e-9  # of a gain
+
+
+def frequency_responses(
+    commands: Mapping[str, Series], responses: Mapping[str, Series]
+) -> tuple[JointFrequencyResponse, ...]:
+    """Estimate the response of each joint to its own command.
+
+    Args:
+        commands: By joint, without gaps.
+        responses: By joint; those without a command that moves are left out.
+
+    Returns:
+        One result a joint, in the order of the commands.
+    """
+    found: dict[str, Excitation] = {}
+    for name, command in commands.items():
+        if name in responses and (excitation := find_excitation(command)) is not None:
+            found[name] = excitation
+    sharing = _same_commands({name: commands[name] for name in found})
+    results = list[JointFrequencyResponse]()
+    for name, excitation in found.items():
+        command, response = _overlap(commands[name], responses[name])
+        lines = estimate(command, response, excitation)
+        if lines is not None and lines.frequency_hz.size:
+            results.append(_result(excitation, sharing[name], lines, command, response))
+    return tuple(results)
+
+
+def estimate(command: Series, response: Series, excitation: Excitation) -> LineResponse | None:
+    """Estimate the response of one joint.
+
+    Args:
+        excitation: Of the command.
+
+    Returns:
+        At the tones, or at up to :data:`LINES` frequencies of the excited band; None where the
+        record is too short.
+    """
+    if response.count <= 2 * excitation.tones_hz.size + 16:
+        return None
+    if excitation.tones_hz.size:
+        return _sound(tone_response(command, response, excitation.tones_hz))
+    step = max(command.period_s, response.period_s)
+    t_s = np.arange(command.t_s[0], command.t_s[-1], step)
+    u, y = (_spectrum(resampled(one, t_s)) for one in (command, response))
+    half = window(1, freedom=_FREEDOM)
+    bins = excited_bins(np.abs(u) ** 2)
+    bins = bins[(bins > half // 2) & (bins < 2 * _HIGHEST * u.size)]
+    if u.size <= 4 * half or not bins.size:
+        return None
+    wanted = _log_spaced(float(bins[0]), float(bins[-1]), LINES)
+    chosen = np.array(sorted({int(bins[np.abs(bins - each).argmin()]) for each in wanted}))
+    found = local_response(y, u[None], chosen, half)
+    frequency = chosen / (t_s.size * step)
+    freedom = np.full(chosen.size, float(found.freedom))
+    return _sound(LineResponse(frequency, found.value[:, 0], found.variance[:, 0], freedom))
+
+
+def _sound(lines: LineResponse) -> LineResponse:
+    """Leave out lines without a value, and give those without noise that of rounding."""
+    gain = np.abs(lines.value)
+    variance = np.maximum(lines.variance, (_ROUNDING * gain) ** 2)
+    known = np.isfinite(gain) & np.isfinite(variance) & (variance > 0) & (lines.freedom > 0)
+    return LineResponse(
+        lines.frequency_hz[known], lines.value[known], variance[known], lines.freedom[known]
+    )
+
+
+def _log_spaced(low: float, high: float, count: int) -> FloatArray:
+    return np.asarray(np.geomspace(low, high, count), dtype=np.float64)
+
+
+def _spectrum(values: FloatArray) -> ComplexArray:
+    """Return the DFT without the mean; a straight line taken off would leak unlike the rest."""
+    return np.fft.rfft(values - values.mean())
+
+
+def _overlap(command: Series, response: Series) -> tuple[Series, Series]:
+    start = max(command.t_s[0], response.t_s[0])
+    stop = min(command.t_s[-1], response.t_s[-1]) + 1e-9
+    return command.between(start, stop), response.between(start, stop)
+
+
+def _same_commands(commands: Mapping[str, Series]) -> dict[str, tuple[str, ...]]:
+    """Return for each joint the others whose commands are the same but for sign and scale."""
+    names = list(commands)
+    if not names:
+        return {}
+    first = commands[names[0]]
+    table = np.array([commands[name].at(first.t_s) for name in names])
+    with np.errstate(invalid="ignore"):
+        correlation = np.abs(np.atleast_2d(np.corrcoef(table)))
+    return {
+        name: tuple(
+            other
+            for j, other in enumerate(names)
+            if other != name and correlation[i, j] > SAME_COMMAND
+        )
+        for i, name in enumerate(names)
+    }
+
+
+def _result(
+    excitation: Excitation,
+    sharing: tuple[str, ...],
+    lines: LineResponse,
+    command: Series,
+    response: Series,
+) -> JointFrequencyResponse:
+    gain = np.abs(lines.value)
+    sd = np.sqrt(lines.variance / 2)
+    reach = stats.t.ppf(0.975, 2 * lines.freedom) * sd
+    known = gain > lines.radius()
+    model = fit_delay(
+        lines.frequency_hz, lines.value, lines.variance, float(np.median(lines.freedom))
+    )
+    lag = -np.angle(lines.value)
+    delay = Estimate()
+    if np.isfinite(model.delay_s):
+        width = 1.96 * model.delay_sd_s
+        delay = Estimate(model.delay_s, (model.delay_s - width, model.delay_s + width))
+    return JointFrequencyResponse(
+        joint=response.name,
+        excitation=str(excitation.kind),
+        shares_command=sharing,
+        frequency_hz=tuple(lines.frequency_hz.tolist()),
+        gain=tuple(gain.tolist()),
+        gain_ci95=tuple(_intervals(gain, reach)),
+        lag_rad=tuple(lag.tolist()),
+        lag_ci95=tuple(
+            interval if sure else None
+            for interval, sure in zip(_intervals(lag, reach / gain), known, strict=True)
+        ),
+        coherence=tuple((gain**2 / (gain**2 + lines.variance)).tolist()),
+        delay_s=delay,
+        delay_model=model.orders,
+        bandwidth_hz=_bandwidth(lines, gain, model),
+        resonance_hz=_resonance(lines, gain, reach),
+        distortion=_distortion(command, response, excitation),
+        halves_agree=_halves(command, response, excitation),
+    )
+
+
+def _intervals(values: FloatArray, reach: FloatArray) -> list[Interval]:
+    return [
+        (float(low), float(high)) for low, high in zip(values - reach, values + reach, strict=True)
+    ]
+
+
+def _bandwidth(lines: LineResponse, gain: FloatArray, model: DelayModel) -> float | None:
+    """Return where the gain falls 3 dB below the lowest line's, by the model if there is one."""
+    frequency, curve = lines.frequency_hz, gain
+    if model.orders is not None:
+        frequency = _log_spaced(float(frequency[0]), float(frequency[-1]), 2000)
+        curve = np.abs(model.response(frequency))
+    below = np.flatnonzero(curve < _HALF_POWER * curve[0])
+    if not below.size:
+        return None
+    after = int(below[0])
+    level = _HALF_POWER * curve[0]
+    share = (curve[after - 1] - level) / (curve[after - 1] - curve[after])
+    return float(frequency[after - 1] * (frequency[after] / frequency[after - 1]) ** share)
+
+
+def _resonance(lines: LineResponse, gain: FloatArray, reach: FloatArray) -> float | None:
+    top = int(np.argmax(gain))
+    if gain[top] - reach[top] <= gain[0] + reach[0]:
+        return None
+    return float(lines.frequency_hz[top])
+
+
+def _distortion(command: Series, response: Series, excitation: Excitation) -> float | None:
+    """Return the power at lines that a periodic command leaves out, over that at its own.
+
+    Noise is taken off by the scatter over periods. Other joints' motion is in it, too.
+    """
+    if not excitation.period_s > 0:
+        return None
+    length = round(excitation.period_s / max(command.period_s, response.period_s))
+    step = excitation.period_s / length
+    periods = int((command.t_s[-1] - command.t_s[0]) / excitation.period_s)
+    if periods < LEAST_PERIODS:
+        return None
+    # The last periods: at the beginning there may be a transient.
+    t_s = command.t_s[-1] - np.arange(periods * length)[::-1] * step
+    shape = (periods, length)
+    u, y = (np.fft.rfft(resampled(one, t_s).reshape(shape)) for one in (command, response))
+    lines = excited_lines(u.mean(axis=0)[None])
+    free = np.array(sorted({*range(int(lines[0]), int(lines[-1]))} - {*lines.tolist()}))
+    if not free.size:
+        return None
+    mean = y.mean(axis=0)
+    noise = np.sum(np.abs(y - mean) ** 2, axis=0) / (periods - 1) / periods
+    power = np.abs(mean) ** 2 - noise
+    share = power[free].mean() / power[lines].mean()
+    return float(np.sqrt(max(share, 0.0)))
+
+
+def _halves(command: Series, response: Series, excitation: Excitation) -> tuple[int, int] | None:
+    """Compare the two halves of a record, at the lines that both have."""
+    if excitation.kind is Kind.CHIRP:
+        return None  # the halves excite different bands
+    middle = (command.t_s[0] + command.t_s[-1]) / 2
+    limits = (command.t_s[0], middle), (middle, command.t_s[-1])
+    first, second = (
+        estimate(command.between(*each), response.between(*each), excitation) for each in limits
+    )
+    if first is None or second is None:
+        return None
+    if first.frequency_hz.size != second.frequency_hz.size:
+        return None
+    differ = np.abs(first.value - second.value) ** 2
+    quantile = stats.f.ppf(0.95, 2, 2 * (first.freedom + second.freedom))
+    agree = differ <= (first.variance + second.variance) * quantile
+    return int(agree.sum()), int(agree.size)

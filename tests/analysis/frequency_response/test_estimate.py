@@ -1,0 +1,120 @@
+"""Sessions whose commands are no gait: chosen systems, and recordings of real robots."""
+
+import csv
+import json
+import zipfile
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from support.paths import SHARED
+from support.written_sessions import EPOCH_NS
+from undulog.analysis import analyse_session
+from undulog.capture import Session, SessionWriter
+
+STEP_S = 0.01
+SERVO = signal.TransferFunction([1.0], [1 / 25.0**2, 2 * 0.5 / 25.0, 1.0])
+DELAY_S = 0.03
+
+
+def write(path, names, commands, states):
+    """Analyse a session of commands and states, each with its times [s] and angles [rad]."""
+    with SessionWriter(path, session_id="one", epoch_ns=EPOCH_NS) as writer:
+        sent = writer.joint_state("/joint_commands", names, unit="rad")
+        measured = writer.joint_state("/joint_states", names, unit="rad")
+        for t, values in zip(*commands, strict=True):
+            sent.write(EPOCH_NS + round(t * 1e9), values)
+        for t, values in zip(*states, strict=True):
+            measured.write(EPOCH_NS + round(t * 1e9), values)
+        writer.set_verdict("good")
+    with Session.open(path) as session:
+        return analyse_session(session)
+
+
+def responded(u, t):
+    """The servo's response to a command, with a delay of whole steps."""
+    y = signal.lsim(SERVO, u, t)[1]
+    late = round(DELAY_S / STEP_S)
+    return np.concatenate([np.zeros(late), y[:-late]])
+
+
+@pytest.mark.parametrize(
+    ("kind", "command"),
+    [
+        ("chirp", lambda t, rng: 0.3 * signal.chirp(t, 0.1, t[-1], 2.5)),
+        ("steps", lambda t, rng: 0.2 * np.sign(rng.normal(size=t.size // 20)).repeat(20)),
+        ("broadband", lambda t, rng: signal.lfilter([0.1], [1, -0.9], rng.normal(size=t.size))),
+        ("sum of sines", lambda t, rng: sum(0.1 * np.sin(6.28 * f * t) for f in (0.31, 0.7, 1.9))),
+    ],
+)
+def test_the_response_of_a_known_servo_lies_within_its_intervals(kind, command, tmp_path):
+    rng = np.random.default_rng(3)
+    t = np.arange(0.0, 80.0, STEP_S)
+    u = command(t, rng)
+    y = responded(u, t) + 0.002 * rng.normal(size=t.size)
+    result = write(tmp_path / "a.mcap", ["joint01"], (t, u[:, None]), (t, y[:, None]))
+    (found,) = result.frequency_response
+    assert found.excitation == kind
+    f = np.array(found.frequency_hz)
+    _, exact = signal.freqresp(SERVO, 2 * np.pi * f)
+    exact = exact * np.sinc(f * STEP_S) ** 2  # a line from sample to sample, as lsim has it
+    low, high = np.array(found.gain_ci95).T
+    sure = np.array([one is not None for one in found.lag_ci95])  # others are noise
+    assert sure.sum() >= 3
+    assert np.mean(((low <= np.abs(exact)) & (np.abs(exact) <= high))[sure]) >= 0.85
+    assert "frequency response" in result.answer.sentence
+    assert json.loads(json.dumps(result.to_dict()))["frequency_response"][0]["joint"] == "joint01"
+    if kind in ("steps", "broadband"):  # with power beyond the bandwidth
+        assert found.bandwidth_hz == pytest.approx(25.0 * 1.27 / 2 / np.pi, rel=0.05)
+    if kind != "sum of sines":  # three lines have no model
+        assert found.delay_model is not None
+        assert found.delay_s.value == pytest.approx(DELAY_S, abs=2e-3)
+
+
+needs_recordings = pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/data")
+
+
+def columns(path, key):
+    with path.open() as stream:
+        rows = list(csv.DictReader(stream))
+    times = np.array([float(row["timestamp"]) * 1e-6 for row in rows])
+    return times, np.array([json.loads(row[key]) for row in rows])
+
+
+@needs_recordings
+def test_the_halves_of_an_arms_multisine_agree(tmp_path):
+    folder = SHARED / "so101/multisine"
+    names = (folder / "joint_list.txt").read_text().split()
+    commands, states = (
+        columns(folder / "control.csv", "positions"),
+        columns(folder / "state_motor.csv", "positions"),
+    )
+    result = write(tmp_path / "a.mcap", names, commands, states)
+    found = {one.joint: one for one in result.frequency_response}
+    assert list(found) == names
+    agree, lines = np.sum([one.halves_agree for one in found.values()], axis=0)
+    assert lines == 24
+    assert agree >= 22
+    assert found["Rotation"].gain[0] == pytest.approx(1.0, abs=0.03)
+    assert all(one.gain[0] > one.gain[-1] for one in found.values())
+
+
+@needs_recordings
+def test_a_quadrupeds_chirp_is_one_input(tmp_path):
+    with zipfile.ZipFile(SHARED / "go2/traj_0.pt") as archive:
+        t, position, command = (
+            np.frombuffer(archive.read(f"traj_0/data/{k}"), "<f4").astype(float) for k in (0, 1, 3)
+        )
+    names = [
+        f"{leg}_{part}" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")
+    ]
+    states, commands = position.reshape(-1, 12), command.reshape(-1, 12)
+    result = write(tmp_path / "a.mcap", names, (t, commands), (t, states))
+    assert len(result.frequency_response) == 12
+    for one in result.frequency_response:
+        assert one.excitation == "chirp"
+        assert len(one.shares_command) == 11
+        assert one.halves_agree is None
+        assert one.distortion is None
+    assert "All joints share one command" in result.answer.sentence
