@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 from .answer import Answer
 from .artefact import Artefact, DeadBand, Span
 from .coupling import Coupling
-from .estimate import Estimate, Interval, Provenance
+from .estimate import Estimate, Provenance, WithInterval
 from .frequency_response import JointFrequencyResponse
 from .shown import PresentedResult
 
@@ -329,22 +329,18 @@ class BodyResult:
 
 
 @dataclass(frozen=True)
-class Index:
-    """One heterogeneity index.
+class Index(WithInterval):
+    """One heterogeneity index, in ``unit``.
 
     Attributes:
-        value: In ``unit``, or None.
-        ci95: 95 % interval, or None.
         p: p-value of the index's null, or None where no test belongs to it.
         unit: SI unit, or ``1``.
         label: What it measures, in a few words.
     """
 
-    value: float | None
-    ci95: Interval | None
-    p: float | None
-    unit: str
-    label: str
+    p: float | None = None
+    unit: str = "1"
+    label: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,16 +22,28 @@ def leaves_out_zero(ci95: Interval | None) -> bool:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class WithInterval:
     """A value with its 95 % interval.
 
     Attributes:
-        value: The estimate, or None where it could not be computed.
-        ci95: Low and high end of the 95 % interval, or None.
+        value: None where it could not be computed or isn't finite.
+        ci95: Low and high end of the 95 % interval, or None where either isn't finite.
     """
 
     value: float | None = None
     ci95: Interval | None = None
+
+    def __post_init__(self) -> None:
+        """Replace what isn't finite, which JSON can't hold, by None."""
+        if self.value is not None and not math.isfinite(self.value):
+            object.__setattr__(self, "value", None)
+        if self.ci95 is not None and not all(map(math.isfinite, self.ci95)):
+            object.__setattr__(self, "ci95", None)
+
+
+@dataclass(frozen=True)
+class Estimate(WithInterval):
+    """An estimate, in the unit that its name gives."""
 
 
 @dataclass(frozen=True)

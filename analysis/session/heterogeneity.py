@@ -266,7 +266,10 @@ def _jackknifed(
     value = statistic(total)
     if cycles < 3:
         return value, None
-    partial = np.array([statistic(total - per_cycle[:, c]) for c in range(cycles)])
+    rest = total[:, None] - per_cycle  # (k, c)
+    if not rest.any(axis=0).all():  # all of the energy is in one cycle
+        return value, None
+    partial = np.array([statistic(one) for one in rest.T])
     error = ((cycles - 1) / cycles * np.sum((partial - partial.mean()) ** 2)) ** 0.5
     half = t_factor(cycles - 1) * float(error)
     return value, (max(0.0, value - half), value + half)
