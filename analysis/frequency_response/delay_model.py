@@ -109,7 +109,7 @@ def fit_delay(
     for orders in ORDERS:
         unknowns = 2 + sum(orders)
         left = 2 * omega.size - unknowns
-        if left < max(2, unknowns // 2):
+        if left < unknowns:  # at least two numbers for each
             break
         found = _fit(lines, *orders)
         if found is None:
@@ -118,7 +118,10 @@ def fit_delay(
         ratio = 2 * found.cost / left
         p = float(stats.f.sf(float(ratio), left, 2 * freedom * omega.size))
         best = max(best, p)
-        if p >= LEVEL and (sd := _delay_sd(found.jac)) is not None:
+        sd = _delay_sd(found.jac)
+        if sd is None or found.x[0] < -2 * sd:  # an effect before its cause
+            continue
+        if p >= LEVEL:
             x = np.asarray(found.x, dtype=np.float64)
             b, a = x[1 : orders[0] + 2], np.append(1.0, x[orders[0] + 2 :])
             return DelayModel(x[0] / scale, sd / scale, orders, b, a, scale, p)

@@ -29,6 +29,7 @@ _FREEDOM = 12  # of the noise, complex
 _HIGHEST = 0.25  # of the sampling rate: beyond it splines are not exact
 _HALF_POWER = 1 / np.sqrt(2)
 _ROUNDING = 1e-9  # of a gain
+_LONG_GAP = 0.01  # of the record
 
 
 def frequency_responses(
@@ -43,16 +44,15 @@ def frequency_responses(
     Returns:
         One result a joint, in the order of the commands.
     """
-    found: dict[str, Excitation] = {}
-    for name, command in commands.items():
-        if name in responses and (excitation := find_excitation(command)) is not None:
-            found[name] = excitation
-    sharing = _same_commands({name: commands[name] for name in found})
+    moving = [name for name, one in commands.items() if one.count and np.ptp(one.values) > 0]
+    known = [name for name in moving if name in responses and responses[name].count]
+    sharing = _same_commands({name: commands[name] for name in known})
     results = list[JointFrequencyResponse]()
-    for name, excitation in found.items():
-        command, response = _overlap(commands[name], responses[name])
-        lines = estimate(command, response, excitation)
-        if lines is not None and lines.frequency_hz.size:
+    for name in known:
+        command, response = _unbroken(commands[name], responses[name])
+        excitation = find_excitation(command)
+        lines = None if excitation is None else estimate(command, response, excitation)
+        if excitation is not None and lines is not None and lines.frequency_hz.size:
             results.append(_result(excitation, sharing[name], lines, command, response))
     return tuple(results)
 
@@ -106,10 +106,20 @@ def _spectrum(values: FloatArray) -> ComplexArray:
     return np.fft.rfft(values - values.mean())
 
 
-def _overlap(command: Series, response: Series) -> tuple[Series, Series]:
+def _unbroken(command: Series, response: Series) -> tuple[Series, Series]:
+    """Return the longest stretch that both have without a long gap; short ones are bridged."""
     start = max(command.t_s[0], response.t_s[0])
-    stop = min(command.t_s[-1], response.t_s[-1]) + 1e-9
-    return command.between(start, stop), response.between(start, stop)
+    stop = min(command.t_s[-1], response.t_s[-1])
+    breaks = [(stop, start)] if start > stop else []
+    for one in (command, response):
+        step = np.diff(one.t_s)
+        long = np.flatnonzero(step > _LONG_GAP * (stop - start))
+        breaks.extend(zip(one.t_s[long].tolist(), one.t_s[long + 1].tolist(), strict=True))
+    starts = [start, *(after for _, after in breaks)]
+    stops = [min([stop, *(before for before, _ in breaks if before >= one)]) for one in starts]
+    k = int(np.argmax(np.subtract(stops, starts)))
+    limits = starts[k], stops[k] + 1e-9
+    return command.between(*limits), response.between(*limits)
 
 
 def _same_commands(commands: Mapping[str, Series]) -> dict[str, tuple[str, ...]]:

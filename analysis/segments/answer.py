@@ -235,18 +235,20 @@ def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str
 def _swept(found: Sequence[JointFrequencyResponse]) -> str:
     """Return the sentence on frequency responses."""
     kinds = " and ".join(sorted({one.excitation for one in found}))
-    low = min(one.frequency_hz[0] for one in found)
-    high = max(one.frequency_hz[-1] for one in found)
-    text = f"No gait: the commands are of the kind {kinds}; frequency responses of {len(found)} "
-    text += f"joint{'s' if len(found) > 1 else ''} from {low:.3g} to {high:.3g} Hz"
-    if edges := sorted(one.bandwidth_hz for one in found if one.bandwidth_hz is not None):
-        span = f"{edges[0]:.3g}" if len(edges) == 1 else f"{edges[0]:.3g} to {edges[-1]:.3g}"
-        text += f", -3 dB at {span} Hz"
-    delays = sorted(1e3 * one.delay_s.value for one in found if one.delay_s.value is not None)
-    if delays:
-        text += f", delay {delays[0]:.0f} to {delays[-1]:.0f} ms"
+    band = _range([f for one in found for f in (one.frequency_hz[0], one.frequency_hz[-1])])
+    text = f"No gait: the commands are of the kind {kinds}; frequency response of {len(found)} "
+    text += f"joint{'s' if len(found) > 1 else ''} from {band} Hz"
+    edges = [one.bandwidth_hz for one in found if one.bandwidth_hz is not None]
+    delays = [1e3 * one.delay_s.value for one in found if one.delay_s.value is not None]
+    text += f", -3 dB at {_range(edges)} Hz" if edges else ""
+    text += f", delay {_range(delays)} ms" if delays else ""
     shared = all(one.shares_command for one in found)
     return text + (". All joints share one command: it is the response to that." if shared else ".")
+
+
+def _range(values: Sequence[float]) -> str:
+    low, high = f"{min(values):.3g}", f"{max(values):.3g}"
+    return low if low == high else f"{low} to {high}"
 
 
 def _single(facts: Facts, joint: JointResult, *, named: bool) -> tuple[Verdict, str, str]:

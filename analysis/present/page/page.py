@@ -41,6 +41,7 @@ from ...session.cycles import CycleMaps
 from .. import tables
 from ..text import chain_detail
 from .artefacts import artefact_rows, command_response, flagged_joints, read_traces
+from .bode import bode
 from .comparison_view import comparison_view
 from .experiment_view import experiment_view
 from .maps import cycle_drawings
@@ -90,6 +91,7 @@ def _session_view(
         ],
         "trials": session_trials(analysis.heterogeneity),
         "segments": segments(joints, "segments-figure") if numbers else None,
+        "bode": bode(analysis.frequency_response, "bode-figure"),
         "signals": command_response(traces, len(joints)) if traces else None,
         "maps": () if cycles is None else cycle_drawings(cycles),
         "artefacts": artefact_rows(analysis),

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from support.paths import SHARED
+from support.paths import SHARED, TRACE
 from support.written_sessions import EPOCH_NS
 from undulog.analysis import analyse_session
+from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session, SessionWriter
 
 STEP_S = 0.01
@@ -118,3 +119,14 @@ def test_a_quadrupeds_chirp_is_one_input(tmp_path):
         assert one.halves_agree is None
         assert one.distortion is None
     assert "All joints share one command" in result.answer.sentence
+
+
+@needs_recordings
+def test_a_servo_of_a_snake_follows_with_the_lag_of_its_ramp(tmp_path, command):
+    session = tmp_path / "ramp.mcap"
+    command("import", TRACE, "-o", session, "--robot", "arcsnake-joint")
+    with Session.open(session) as opened:
+        (found,) = analyse_session(opened, Options(start_s=3.0, stop_s=10.5)).frequency_response
+    # Fitted in the time domain: position = 1.000 command(t - 7.4 ms) + offset.
+    assert found.gain_ci95[0][0] <= 1.0 <= found.gain_ci95[0][1]
+    assert found.delay_s.ci95[0] <= 7.4e-3 <= found.delay_s.ci95[1]

@@ -80,7 +80,7 @@ def test_a_real_ramp_gets_its_page_without_invented_numbers(tmp_path, command):
     session, page = tmp_path / "real.mcap", tmp_path / "real.html"
     command("import", REAL, "-o", session, "--robot", "arcsnake-joint")
     printed = command("report", session, "-o", page).out
-    assert printed.startswith("No gait was found in this session")
+    assert printed.startswith("No gait: the commands are of the kind broadband; ")
     text = page.read_text(encoding="utf-8")
     assert "Command and response of joint01" in text
     assert "No gait: the best rhythm" in text

@@ -1,0 +1,96 @@
+"""Draw frequency responses: gain and lag of joints against frequency (Bode's diagram)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib.ticker
+import numpy as np
+
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.palette import joint_hex
+
+from ...results.formats import short
+from ...results.frequency_response import JointFrequencyResponse
+from .svg import Drawing, drawing, inline_svg, key, legend
+
+JOINTS = 6
+"""Joints in one figure."""
+
+_TICKS = (1.0, 2.0, 5.0)
+ticker: Any = matplotlib.ticker  # its stubs lack the classes
+
+
+def bode(found: Sequence[JointFrequencyResponse], prefix: str) -> list[Drawing]:
+    """Draw the responses, :data:`JOINTS` joints a figure.
+
+    Args:
+        found: In chain order.
+        prefix: For identifiers, unique in the page.
+    """
+    groups = [found[k : k + JOINTS] for k in range(0, len(found), JOINTS)]
+    return [_figure(group, f"{prefix}-{k}") for k, group in enumerate(groups)]
+
+
+def _figure(group: Sequence[JointFrequencyResponse], prefix: str) -> Drawing:
+    colors = joint_hex(len(group))
+    with drawing(4.6) as figure:
+        gain_axes, lag_axes = figure.subplots(2, 1, sharex=True)
+        for one, color in zip(group, colors, strict=True):
+            frequency = np.array(one.frequency_hz)
+            gain, ends = np.array(one.gain), np.array(one.gain_ci95)
+            style = {"color": color, "linewidth": 1.4, "marker": "o", "markersize": 2.6}
+            gain_axes.plot(frequency, gain, **style)
+            low = np.maximum(ends[:, 0], gain.min() / 10)  # a logarithm has no zero
+            gain_axes.fill_between(frequency, low, ends[:, 1], color=color, alpha=0.18, linewidth=0)
+            sure = np.array([interval is not None for interval in one.lag_ci95])
+            if sure.any():
+                lag = _unwrapped(np.array(one.lag_rad)[sure])
+                reach = np.array([_reach(one, k) for k in np.flatnonzero(sure).tolist()])
+                lag_axes.plot(frequency[sure], np.degrees(lag), **style)
+                band = np.degrees(lag - reach), np.degrees(lag + reach)
+                lag_axes.fill_between(frequency[sure], *band, color=color, alpha=0.18, linewidth=0)
+        gain_axes.set_xscale("log")
+        gain_axes.set_yscale("log")
+        for axis in (gain_axes.yaxis, lag_axes.xaxis):
+            axis.set_major_locator(ticker.LogLocator(subs=_TICKS))
+            axis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+            axis.set_minor_locator(ticker.NullLocator())
+        gain_axes.set_ylabel("gain [1]")
+        lag_axes.set_ylabel("lag [°]")
+        lag_axes.set_xlabel("frequency [Hz]")
+        handles = [
+            key(color=color, linewidth=1.4, label=short(one.joint, 14))
+            for one, color in zip(group, colors, strict=True)
+        ]
+        legend(figure, *handles)
+        figure.align_ylabels()
+        names = ", ".join(one.joint for one in group)
+        svg = inline_svg(figure, prefix, f"Frequency response of {names}", _in_words(group))
+    return Drawing(
+        svg,
+        "Gain and lag of each joint's response to its command; bands hold the 95 % interval. Lag "
+        "is drawn where the gain is distinct from zero.",
+    )
+
+
+def _reach(one: JointFrequencyResponse, k: int) -> float:
+    """Return the half width of a lag's interval [rad]; 0 where there is none."""
+    interval = one.lag_ci95[k]
+    return 0.0 if interval is None else (interval[1] - interval[0]) / 2
+
+
+def _unwrapped(lag_rad: FloatArray) -> FloatArray:
+    """Remove jumps by a whole turn, beginning in (-pi, pi]."""
+    return np.asarray(np.unwrap(lag_rad), dtype=np.float64)
+
+
+def _in_words(group: Sequence[JointFrequencyResponse]) -> str:
+    return "; ".join(
+        f"{one.joint}: gain {one.gain[0]:.3g} at {one.frequency_hz[0]:.3g} Hz and "
+        f"{one.gain[-1]:.3g} at {one.frequency_hz[-1]:.3g} Hz, lag "
+        f"{math.degrees(one.lag_rad[0]):.3g}° and {math.degrees(one.lag_rad[-1]):.3g}°"
+        for one in group
+    )
