@@ -19,6 +19,8 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.process import in_threads
+from undulog.capture.following.linear_model import linearised
+from undulog.capture.following.motion import JointMotion, Samples
 from undulog.capture.log.read.sample_times import LARGEST, Signal
 from undulog.capture.robot.model import Joint
 
@@ -369,6 +371,13 @@ def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Fo
             yield "position", "jump", left, ""
 
 
+def _linear(position: Series, command: Series) -> Series:
+    """Return what a joint makes of a command that is no rhythm; a rhythm as it is."""
+    both = (Samples(one.t_s, one.values) for one in (command, position))
+    own = linearised(JointMotion(command.name, *both)).command
+    return command if own.t_s is command.t_s else Series(command.name, own.t_s, own.values)
+
+
 def _of_scale(
     joint: _Joint, position: Series, command: Series | None, way: Series | None
 ) -> _Found:
@@ -383,7 +392,8 @@ def _of_scale(
         return
     edges = turns(leader)
     if command is not None:
-        for flag, spans in against_command(compare(position, command, edges)).items():
+        leading = _linear(position, command)
+        for flag, spans in against_command(compare(position, leading, edges)).items():
             found.add(flag)
             yield "position", flag, spans, ""
     if second is not None:

@@ -19,6 +19,7 @@ from ..common.process import in_threads
 from .excursions import Excursions, departures, find_excursions, find_holds
 from .fault import Fault, Span, Symptom
 from .kinds import fault_of, powerless, usual_effort
+from .linear_model import linearised
 from .motion import (
     DEGREE,
     FEW_SAMPLES,
@@ -230,10 +231,11 @@ def joints_not_following(motions: Sequence[JointMotion]) -> tuple[Fault, ...]:
         At most one fault a joint, in chain order. Joints whose command does not move are not
         judged.
     """
+    samples = sum(each.command.t_s.size + each.position.t_s.size for each in motions)
+    motions = in_threads(linearised, motions, samples)
     largest = max((each.command.range for each in motions), default=0.0)
     least = max(DRIVEN_SHARE * largest, MIN_COMMAND_RAD)
     driven = [each for each in motions if each.command.range > least and _lasts(each)]
-    samples = sum(each.command.t_s.size + each.position.t_s.size for each in motions)
     responses = in_threads(lambda each: each.response, driven, samples)
     own = [own_response(each) for each in responses]
     common = common_response(own)

@@ -1,0 +1,66 @@
+"""A joint's own linear response to a command that is no rhythm, taken off before it is judged.
+
+At one frequency a sound joint has one gain and one lag, and what departs from them is a fault. A
+chirp, a multisine or noise has no such frequency: gain and lag of a sound joint change all the
+time. There a finite impulse response is fitted,
+
+    y(t) = sum_i h_i c(t - i D) + offset,
+
+and its output stands in for the command: a sound joint follows that with gain 1 and without lag. A
+joint that it doesn't explain is judged by its command as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..common.arrays import FloatArray
+from .motion import JointMotion, Samples, cycle_s
+
+SWEPT = 2.0
+"""Ratio of long to short cycles, as 90 % and 10 % quantiles, of a command that is no rhythm."""
+
+CYCLES = 8  # of the command, that show it
+TAPS = 40
+MEMORY_S = 0.8  # that the taps span at least, and two thirds of a cycle
+EXPLAINED = 0.8  # share of the position's variance that makes it the joint's response
+_ROWS = 20_000  # that the fit takes
+
+
+def linearised(motion: JointMotion) -> JointMotion:
+    """Return a joint whose command, if it is no rhythm, is replaced by its linear response.
+
+    A response with a negative gain at rest is turned round, so that the joint moves against it.
+    """
+    command, position = motion.command, motion.position
+    if position.t_s.size < 4 * TAPS or not _is_swept(command):
+        return motion
+    step = max(max(MEMORY_S, cycle_s(command) * 2 / 3) / TAPS, position.period_s)
+    rows = slice(None, None, -(-position.t_s.size // _ROWS))
+    design = _design(command, position.t_s, step)
+    taps = np.linalg.lstsq(design[rows], position.values[rows], rcond=1e-9)[0]
+    response = np.asarray(design @ taps, dtype=np.float64)
+    left = float(np.var(position.values - response))
+    if left > (1 - EXPLAINED) * float(np.var(position.values)):
+        return motion
+    if float(taps[:-1].sum()) < 0:
+        response = 2 * response.mean() - response
+    return replace(motion, command=Samples(position.t_s, response))
+
+
+def _design(command: Samples, t_s: FloatArray, step_s: float) -> FloatArray:
+    """Return c(t - i D) and a constant, shape (n, taps + 1)."""
+    late = [command.at(t_s - k * step_s) for k in range(TAPS)]
+    return np.stack([*late, np.ones(t_s.size)], axis=1)
+
+
+def _is_swept(command: Samples) -> bool:
+    """Return whether cycles of the command, from one rise through its middle to the next, vary."""
+    above = command.values > np.median(command.values)
+    rises = command.t_s[1:][above[1:] & ~above[:-1]]
+    if rises.size <= CYCLES:
+        return False
+    short, long = np.percentile(np.diff(rises), (10, 90))
+    return bool(long > SWEPT * short)
