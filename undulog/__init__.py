@@ -90,6 +90,7 @@ _EXTRAS = {
     "distributed": "cluster",
     "pyarrow": "parquet",
     "duckdb": "catalog",
+    "obstore": "remote",
     "statsmodels": "catalog",
 }
 """Optional package to the extra that installs it."""

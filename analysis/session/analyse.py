@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -411,15 +410,10 @@ def _estimates(gait: GaitFit | None, name: str) -> tuple[Estimate, Estimate]:
 
 def _provenance(session: SessionView, options: Options) -> Provenance:
     """What makes the same numbers again."""
-    digest = hashlib.sha256()
-    for path in session.files:  # one, or the parts of a split session
-        with path.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
     return Provenance(
         command=shlex.join(["undulog", "analyse", str(session.path), *options.arguments()]),
         versions=base_versions(),
-        inputs={str(session.path): digest.hexdigest()},
+        inputs={str(session.path): session.fingerprint()},
         options={
             **asdict(options),
             "confidence": CONFIDENCE,

@@ -59,7 +59,7 @@ def describe(session: Session) -> dict[str, Any]:
             "start_ns": None if empty else session.start_ns,
             "start_utc": None if empty else _utc(session.start_ns),
             "duration_s": seconds,
-            "size_bytes": sum(path.stat().st_size for path in session.files),
+            "size_bytes": session.size,
             "files": [path.name for path in session.files],
             "profile": session.profile,
             "library": session.library,

@@ -11,6 +11,7 @@ import numpy as np
 
 from ...common.arrays import IntArray
 from ...common.errors import DataError, RobotFileError
+from ...common.remote import as_path
 from ...robot.description import robot_in_session
 from ...robot.model import Robot
 from ...robot.run import RUN_RECORD, Run, run_from_record, run_from_scenario
@@ -37,7 +38,7 @@ class OpenLog:
 
     def __init__(self, path: Path, column_folder: Path | None, threads: int) -> None:
         """Open a log; see :meth:`.Session.open`."""
-        self.path = path
+        self.path = path = as_path(path)
         self.file = LogFile(path, column_folder)
         self.warnings = list(self.file.warnings)
         self.topics = Topics(self.file, self._warn, threads=threads)

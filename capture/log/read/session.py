@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ...common.arrays import NS
 from ...common.errors import MissingChannelError
 from ...common.process import threads_or_default
+from ...common.remote import as_path
 from ...robot.model import Robot
 from ...robot.run import Run
 from ..columns.blocks import Window
@@ -128,6 +129,15 @@ class SessionView:
     def files(self) -> tuple[Path, ...]:
         """The files that are read, in order: one, or the parts of a split session."""
         return tuple(file.path for file in self._log.file.files)
+
+    @property
+    def size(self) -> int:
+        """Size of the files [byte]."""
+        return self._log.file.size
+
+    def fingerprint(self) -> str:
+        """Return the SHA-256 of the files; of those on a server, their ETags."""
+        return self._log.file.fingerprint()
 
     @property
     def warnings(self) -> list[str]:
@@ -406,7 +416,7 @@ class Session(SessionView):
         self, path: Path | str, *, threads: int | None = None, column_folder: Path | None = None
     ) -> None:
         """See :meth:`open`."""
-        super().__init__(OpenLog(Path(path), column_folder, threads_or_default(threads)))
+        super().__init__(OpenLog(as_path(path), column_folder, threads_or_default(threads)))
 
     @classmethod
     def open(
@@ -415,7 +425,8 @@ class Session(SessionView):
         """Open a session; the same as calling the class.
 
         Args:
-            path: The MCAP file; of a split session any part, or the folder that holds it.
+            path: The MCAP file, or its URL; of a split session any part, or the folder that holds
+                it.
             threads: Number of decompressing threads; None for one per core that this process may
                 use, at most four.
             column_folder: A folder on a disk for large columns, in files without names, so that
@@ -427,6 +438,7 @@ class Session(SessionView):
         Raises:
             NotALogError: If it is not an MCAP file or nothing in it can be read.
             LogError: If it can't be opened.
+            InputFileError: If it is a URL that can't be read.
             UsageError: If ``threads`` is less than 1.
         """
         return cls(path, threads=threads, column_folder=column_folder)
