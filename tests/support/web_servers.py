@@ -50,7 +50,7 @@ def _handler(server):
             self.end_headers()
             self.wfile.write(body)
 
-        def do_GET(self):  # noqa: N802 - as the library calls it
+        def do_GET(self):
             wanted = self.headers.get("Range")
             with server.lock:
                 server.asked.append((self.path, wanted))

@@ -134,9 +134,13 @@ class FetchedFile:
         """Hold a chunk to its index and take its CRC, which no index has; return the offset."""
         at = block.record_at - base + PREFIX_SIZE
         head = chunk_at(data, at, block.stop - base)
-        same = head is not None and head.complete and (
-            (head.start + base, head.stop + base, head.size, head.compression)
-            == (block.start, block.stop, block.size, block.compression)
+        same = (
+            head is not None
+            and head.complete
+            and (
+                (head.start + base, head.stop + base, head.size, head.compression)
+                == (block.start, block.stop, block.size, block.compression)
+            )
         )
         if head is None or not same:
             where = f"the chunk at byte {block.start}"

@@ -42,8 +42,8 @@ _Record = TypeVar("_Record")
 
 _FOOTER_SIZE = 1 + 8 + 20
 _CHUNK_INDEX = struct.Struct("<16xQQI")  # after the times: the chunk's place and length, offsets
-_INDEX_END = struct.Struct("<QI")  # behind the offsets: size of the indexes, of the compression's name
-_SIZES = struct.Struct("<QQ")  # behind that name: of the payload as it is stored, and decompressed
+_INDEX_END = struct.Struct("<QI")  # behind the offsets: sizes of the indexes and of a name,
+_SIZES = struct.Struct("<QQ")  # the compression's; behind it: of the payload, stored and not
 _INDEX_OFFSET = struct.Struct("<HQ")  # channel, place of its message index
 
 
