@@ -410,8 +410,10 @@ def _estimates(gait: GaitFit | None, name: str) -> tuple[Estimate, Estimate]:
 
 def _provenance(session: SessionView, options: Options) -> Provenance:
     """What makes the same numbers again."""
+    given = [] if session.robot_given is None else ["--robot", session.robot_given]
+    words = ["undulog", "analyse", str(session.path), *options.arguments(), *given]
     return Provenance(
-        command=shlex.join(["undulog", "analyse", str(session.path), *options.arguments()]),
+        command=shlex.join(words),
         versions=base_versions(),
         inputs={str(session.path): session.fingerprint()},
         options={

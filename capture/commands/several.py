@@ -24,6 +24,9 @@ _COLUMNS = (
     Column("first sentence", left=True),
 )
 
+FAILED = "failed"
+"""Verdict of a session that couldn't be worked on; its sentence is why."""
+
 
 @dataclass(frozen=True)
 class Line:
@@ -45,15 +48,19 @@ class Line:
 
 
 def sessions_of(given: Iterable[Path]) -> list[Path]:
-    """Return the sessions that paths, URLs, folders and patterns name, each once.
+    """Return the sessions that paths, URLs, folders and patterns name, in that order.
 
     Args:
         given: Of a folder, all sessions in it and in the folders in it, in order of name; a
             rosbag2 folder and the parts of a split session are one. A pattern (``*``, ``?``,
-            ``[...]``, ``**``) is of a path that isn't there. What names no session stays, for the
+            ``[...]``, ``**``) is a path that isn't there. What names no session stays, for the
             command to refuse.
     """
-    return list(dict.fromkeys(one for path in given for one in _named(as_path(path))))
+    found: list[Path] = []
+    for path in map(as_path, given):
+        own = _named(path)
+        found += [one for one in own if one == path or one not in found]
+    return found
 
 
 def _named(path: Path) -> list[Path]:
@@ -97,6 +104,7 @@ def each(what: Sequence[Any], verb: str, work: Callable[[Any], Line]) -> dict[st
     Returns:
         Each one's name in the table to its line: its path only where names repeat.
     """
+    what = list(dict.fromkeys(what))
     short = [one.name if isinstance(one, Path) else str(one) for one in what]
     names = [n if short.count(n) == 1 else str(one) for n, one in zip(short, what, strict=True)]
     lines: dict[str, Line] = {}
@@ -108,7 +116,7 @@ def each(what: Sequence[Any], verb: str, work: Callable[[Any], Line]) -> dict[st
             except (UndulogError, OSError, MemoryError) as error:
                 why = str(error).removeprefix(f"{one}: ") or "there is not enough memory"
                 facts = {"path": str(one), "error": why}
-                lines[name] = Line(verdict="failed", sentence=why, facts=facts, good=False)
+                lines[name] = Line(verdict=FAILED, sentence=why, facts=facts, good=False)
     return lines
 
 

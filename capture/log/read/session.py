@@ -200,6 +200,12 @@ class SessionView:
         return self._log.robot
 
     @property
+    def robot_given(self) -> str | None:
+        """Name or file of the robot that was given for a log without one; None otherwise."""
+        given = self._log.robot_given
+        return None if given is None else given[0]
+
+    @property
     def run(self) -> Run | None:
         """Servos, contact and physics rate of a twin's run; None for other sessions."""
         return self._log.run
@@ -413,14 +419,25 @@ class Session(SessionView):
     """A recorded session, opened for reading: a view of the whole, which can be closed."""
 
     def __init__(
-        self, path: Path | str, *, threads: int | None = None, column_folder: Path | None = None
+        self,
+        path: Path | str,
+        *,
+        threads: int | None = None,
+        column_folder: Path | None = None,
+        robot: str | Path | None = None,
     ) -> None:
         """See :meth:`open`."""
-        super().__init__(OpenLog(as_path(path), column_folder, threads_or_default(threads)))
+        number = threads_or_default(threads)
+        super().__init__(OpenLog(as_path(path), column_folder, number, robot))
 
     @classmethod
     def open(
-        cls, path: Path | str, *, threads: int | None = None, column_folder: Path | None = None
+        cls,
+        path: Path | str,
+        *,
+        threads: int | None = None,
+        column_folder: Path | None = None,
+        robot: str | Path | None = None,
     ) -> Self:
         """Open a session; the same as calling the class.
 
@@ -431,6 +448,8 @@ class Session(SessionView):
                 use, at most four.
             column_folder: A folder on a disk for large columns, in files without names, so that
                 :meth:`forget` can release their memory (Linux). None for memory.
+            robot: Description of the robot of a log that has none, a name or a file; a log with
+                one keeps its own, with a warning.
 
         Returns:
             The session, usable in a ``with`` block.
@@ -439,9 +458,11 @@ class Session(SessionView):
             NotALogError: If it is not an MCAP file or nothing in it can be read.
             LogError: If it can't be opened.
             InputFileError: If it is a URL that can't be read.
-            UsageError: If ``threads`` is less than 1.
+            UsageError: If ``threads`` is less than 1, or there is no such robot.
+            RobotFileError: If the description has faults.
+            JointSetError: If its joints aren't those of the log.
         """
-        return cls(path, threads=threads, column_folder=column_folder)
+        return cls(path, threads=threads, column_folder=column_folder, robot=robot)
 
     def close(self) -> None:
         """Release the file."""
