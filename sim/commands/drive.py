@@ -181,12 +181,13 @@ def _dry_runs(
 
 def _motions(given: Sequence[str]) -> list[str]:
     """Return what is named: of a folder its TOML files and sessions, of a pattern what fits it."""
+    from ..scenario.scenario_file import scenario_names
+
     found: list[str] = []
     for what in given:
-        path = Path(what)
-        plans = sorted(path.glob("*.toml")) if path.is_dir() else []
-        sessions = sessions_of([path])
-        found += map(str, plans if plans and sessions == [path] else [*plans, *sessions])
+        plans = sorted(Path(what).glob("*.toml")) if what not in scenario_names() else []
+        sessions = [one for one in sessions_of([Path(what)]) if str(one) != str(Path(what))]
+        found += map(str, [*plans, *sessions]) if plans or sessions else [what]
     return found
 
 
