@@ -59,6 +59,7 @@ from ..signals.stretch import (
     Options,
     SharedTimes,
     choose_stretch,
+    fetched_part,
     part_of,
     recorded,
     without_breaks,
@@ -160,6 +161,7 @@ def measure_session(
     """
     options = options or Options()
     warn = Remarks()
+    session = fetched_part(session, options, warn)
     topics = (options.command_topic, options.response_topic)
     columns = read_columns(session, *topics, warn, reference_topic=options.reference_topic)
     columns, left_out = without_breaks(session, columns, options, warn)

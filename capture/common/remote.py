@@ -168,10 +168,16 @@ _CAUSES = {
     "UnauthenticatedError": "the server asks for credentials",
     "NotSupportedError": "the server sends no ranges of bytes; download the file first",
 }
+_CREDENTIALS = {
+    "s": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY; AWS_SKIP_SIGNATURE=true is for public buckets",
+    "g": "GOOGLE_APPLICATION_CREDENTIALS; GOOGLE_SKIP_SIGNATURE=true is for public buckets",
+    "a": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
+}
 _WORDS = {
     "416": "the file is empty (0 bytes)",
-    "169.254.169.254": "no credentials are set, e.g. AWS_ACCESS_KEY_ID and "
-    "AWS_SECRET_ACCESS_KEY; AWS_SKIP_SIGNATURE=true is for public buckets",
+    "169.254.169.254": "no credentials are set: ",
+    "Account must be specified": "no account is set: ",
+    "error sending request": "the server can't be reached",
 }
 
 
@@ -179,5 +185,7 @@ def _failed(path: RemotePath, error: Exception) -> InputFileError:
     """Return the error of a path for one of the library; never with a URL's query."""
     kind, text = type(error).__name__, str(error)
     cause = _CAUSES.get(kind) or next((why for word, why in _WORDS.items() if word in text), "")
+    if cause.endswith(": "):
+        cause += _CREDENTIALS.get(str(path)[0], "")
     first = re.sub(r"\?\S+", "", text.partition("\n")[0]).rstrip(" :")
     return InputFileError(path, cause or f"can't be read: {first}")

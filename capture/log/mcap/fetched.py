@@ -10,6 +10,7 @@ import mmap
 import os
 import tempfile
 import threading
+import weakref
 from collections.abc import Iterable, Sequence
 
 from ...common.errors import LogError, NotALogError
@@ -47,9 +48,11 @@ class FetchedFile:
         self._whole = False
         if not self._file.size:
             raise NotALogError(path, "the file is empty (0 bytes)")
-        self._sparse = tempfile.TemporaryFile(prefix="undulog-")  # noqa: SIM115 - as long as this
-        self._sparse.truncate(self._file.size)
-        self._buffer = mmap.mmap(self._sparse.fileno(), 0, access=mmap.ACCESS_READ)
+        with tempfile.TemporaryFile(prefix="undulog-") as sparse:
+            sparse.truncate(self._file.size)
+            self._descriptor = os.dup(sparse.fileno())
+        self.close = weakref.finalize(self, os.close, self._descriptor)
+        self._buffer = mmap.mmap(self._descriptor, 0, access=mmap.ACCESS_READ)
         self._write(0, self._file.head)
 
     @property
@@ -59,7 +62,7 @@ class FetchedFile:
 
     def mapped(self) -> tuple[mmap.mmap, int]:
         """Return the mapped sparse file and a descriptor of it."""
-        return self._buffer, os.dup(self._sparse.fileno())
+        return self._buffer, os.dup(self._descriptor)
 
     def need(self, start: int, stop: int) -> None:
         """Fetch the bytes [start, stop) into the mapped file.
@@ -152,7 +155,7 @@ class FetchedFile:
         """Write into the sparse file: on a full disk the mapping would end the process."""
         pages = range(at // _PAGE, -(-(at + len(data)) // _PAGE))
         while data:
-            written = os.pwrite(self._sparse.fileno(), data, at)
+            written = os.pwrite(self._descriptor, data, at)
             at, data = at + written, data[written:]
         self._pages.update(pages)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import zstandard
 
-from ...common.errors import LogError, NotALogError
+from ...common.errors import InputFileError, LogError, NotALogError
 from ...common.remote import RemotePath
 from .cache import cache
 from .chunk import Block, Buffer, checks_itself, inflate, inflate_zstd_into, read_at
@@ -51,6 +51,8 @@ class McapPayloads:
         with suppress(BufferError):  # the frames of an error still refer to it: it goes with them
             self.buffer.close()
         self._close_descriptor()
+        if self.remote is not None:
+            self.remote.close()
 
     def need(self, start: int, stop: int) -> None:
         """Fetch the bytes [start, stop) of a file on a server into the buffer, where they stay."""
@@ -132,6 +134,8 @@ class McapPayloads:
                 checked = not block.crc or checks_itself(raw)
         except zstandard.ZstdError as error:
             raise self._error(block, f"can't be decompressed: {error}") from error
+        except InputFileError:  # of a server: no fault of the chunk
+            raise
         except OSError as error:
             raise self._error(block, f"can't be read: {error.strerror}") from error
         if size != block.size:

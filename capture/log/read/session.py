@@ -47,6 +47,7 @@ class SessionView:
         window_ns: Window = (None, None),
         names: Mapping[str, str] = _NO_NAMES,
         on_read: Callable[[], None] = lambda: None,
+        limits_ns: tuple[int, int] | None = None,
     ) -> None:
         """Create a view of a log; :meth:`.Session.open` and :meth:`view` call this.
 
@@ -54,8 +55,9 @@ class SessionView:
             window_ns: Half-open time window [Unix ns]; None for open ends.
             names: Name of a topic in the view to its name in the log, if they differ.
             on_read: Called before each read.
+            limits_ns: Start and end that the view states; those of the window if None.
         """
-        self._log, self._window_ns = log, window_ns
+        self._log, self._window_ns, self._limits_ns = log, window_ns, limits_ns
         self._names, self._on_read = names, on_read
 
     def view(
@@ -97,6 +99,21 @@ class SessionView:
             on_read=on_read or self._on_read,
         )
 
+    def part(self, start_ns: int | None, stop_ns: int | None) -> SessionView:
+        """Return a view that reads a time window only; its start and end stay those of this one.
+
+        Args:
+            start_ns: First time that is read [Unix ns]; None for the session's start.
+            stop_ns: One past the last time that is read [Unix ns]; None for the end.
+        """
+        return SessionView(
+            self._log,
+            window_ns=self._within(start_ns, stop_ns),
+            names=self._names,
+            on_read=self._on_read,
+            limits_ns=(self.start_ns, self.end_ns),
+        )
+
     def forget(self) -> None:
         """Release memory of the data read so far, e.g. between parts of a long session.
 
@@ -131,6 +148,11 @@ class SessionView:
         return tuple(file.path for file in self._log.file.files)
 
     @property
+    def is_remote(self) -> bool:
+        """Whether it is on a server, so that each read costs time."""
+        return any(file.remote is not None for file in self._log.file.files)
+
+    @property
     def size(self) -> int:
         """Size of the files [byte]."""
         return self._log.file.size
@@ -147,6 +169,8 @@ class SessionView:
     @property
     def start_ns(self) -> int:
         """Log time of the first message [Unix ns]; 0 without messages."""
+        if self._limits_ns is not None:
+            return self._limits_ns[0]
         start_ns = self._window_ns[0]
         first_ns = self._log.file.limits[0]
         return first_ns if start_ns is None else max(first_ns, start_ns)
@@ -154,6 +178,8 @@ class SessionView:
     @property
     def end_ns(self) -> int:
         """Log time of the last message [Unix ns], or the window's end; 0 without messages."""
+        if self._limits_ns is not None:
+            return self._limits_ns[1]
         stop_ns = self._window_ns[1]
         last_ns = self._log.file.limits[1]
         return last_ns if stop_ns is None else min(last_ns, stop_ns)
