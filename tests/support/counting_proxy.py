@@ -19,35 +19,42 @@ def _pump(source, sink, count):
         while data := source.recv(1 << 16):
             count(len(data))
             sink.sendall(data)
-    for end, how in ((source, socket.SHUT_RD), (sink, socket.SHUT_WR)):
-        with suppress(OSError):
-            end.shutdown(how)
+    with suppress(OSError):
+        sink.shutdown(socket.SHUT_WR)
 
 
 @contextmanager
 def counting_proxy(port):
     """Relay connections to a port of this computer until the end of the block."""
-    lock = threading.Lock()
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        counted = Counted(listener.getsockname()[1])
+    lock, ends, threads = threading.Lock(), [], []
+    listener = socket.create_server(("127.0.0.1", 0))
+    counted = Counted(listener.getsockname()[1])
 
-        def count(size):
-            with lock:
-                counted.sent += size
+    def count(size):
+        with lock:
+            counted.sent += size
 
-        def serve():
+    def serve():
+        with suppress(OSError):
             while True:
-                try:
-                    client, _ = listener.accept()
-                except OSError:
-                    return
+                client, _ = listener.accept()
                 server = socket.create_connection(("127.0.0.1", port))
-                pairs = ((client, server, lambda _: None), (server, client, count))
-                for pair in pairs:
-                    threading.Thread(target=_pump, args=pair, daemon=True).start()
+                ends.extend((client, server))
+                for pair in ((client, server, lambda _: None), (server, client, count)):
+                    threads.append(threading.Thread(target=_pump, args=pair))
+                    threads[-1].start()
 
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
+    accepting = threading.Thread(target=serve)
+    accepting.start()
+    try:
         yield counted
+    finally:
         listener.shutdown(socket.SHUT_RDWR)
-    thread.join()
+        accepting.join()
+        for end in ends:
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+        for thread in threads:
+            thread.join()
+        for end in (*ends, listener):
+            end.close()
