@@ -120,8 +120,9 @@ class RemoteFile:
         ]
         found: list[list[bytes]] = [[] for _ in ranges]
         with ThreadPoolExecutor(max(1, min(_PARALLEL, len(pieces)))) as pool:
-            fetched = pool.map(lambda piece: self.read(*piece[1:]), pieces)
-            for (k, *_), data in zip(pieces, fetched, strict=True):
+            _, starts, stops = zip(*pieces, strict=True) if pieces else ((), (), ())
+            fetched = pool.map(self.read, starts, stops)
+            for (k, _, _), data in zip(pieces, fetched, strict=True):
                 found[k].append(data)
         return [b"".join(parts) for parts in found]
 

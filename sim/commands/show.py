@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from json import dumps
-from typing import Any
+from typing import Any, cast
 
 from undulog.capture.common.console import UNLIMITED, Column, emit, table
 
@@ -55,5 +55,5 @@ def show(scenario: str, /, *, json: bool = False) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    first = value[0] if isinstance(value, list) and value else value
-    return isinstance(first, int | float) and not isinstance(first, bool)
+    every = cast("list[object]", value) if isinstance(value, list) else [value]
+    return all(isinstance(one, int | float) and not isinstance(one, bool) for one in every)

