@@ -235,7 +235,10 @@ def drive(
 
     whats = _motions([what, *more])
     if len(whats) > 1 and (arm or output is not None or on.partition(":")[0] == _TWIN):
-        raise UsageError("several motions are for dry runs over a bus, without --arm and -o")
+        raise UsageError(
+            f"{what}: {len(whats)} motions; several are for dry runs over a bus, without --arm and "
+            "-o; name one"
+        )
     what = whats[0]
     if output is not None:
         check_session_name(output)
