@@ -100,12 +100,7 @@ class SessionView:
         )
 
     def part(self, start_ns: int | None, stop_ns: int | None) -> SessionView:
-        """Return a view that reads a time window only; its start and end stay those of this one.
-
-        Args:
-            start_ns: First time that is read [Unix ns]; None for the session's start.
-            stop_ns: One past the last time that is read [Unix ns]; None for the end.
-        """
+        """Return a view that reads a window [Unix ns]; its start and end stay those of this one."""
         return SessionView(
             self._log,
             window_ns=self._within(start_ns, stop_ns),
