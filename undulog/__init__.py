@@ -38,7 +38,15 @@ VERBS: dict[str, tuple[str, str]] = {
         "capture import_export:export_log",
         "Write frames or joint columns for other tools.",
     ),
+    "robot list": ("capture robot:robot_list", "List the shipped robots."),
+    "robot show": ("capture robot:robot_show", "Show a robot: joints, limits, sensors, bus."),
+    "robot check": ("capture robot:robot_check", "Check a robot description; list all faults."),
+    "robot new": (
+        "capture robot:robot_new",
+        "Write a description to start from, from a log if given.",
+    ),
     "sim list": ("sim run:list_scenarios", "List the shipped scenarios."),
+    "sim show": ("sim show:show", "Show a scenario: every value with its unit."),
     "sim run": ("sim run:run", "Simulate a scenario and record it."),
     "sim fit": ("replay fit:fit", "Fit the twin's servo and friction to a session."),
     "sim null": ("sim run:null", "Model identical modules, for analyse --null."),
@@ -74,6 +82,7 @@ _GROUPS = {
     "plan": "Write the commands of an experiment around a recorded gait.",
     "record": "Record a robot; look after a running recording.",
     "log": "Look after sessions.",
+    "robot": "Robot descriptions: list, show, check, begin one.",
     "sim": "The twin: simulate and record.",
 }
 
@@ -90,6 +99,7 @@ _EXTRAS = {
     "distributed": "cluster",
     "pyarrow": "parquet",
     "duckdb": "catalog",
+    "obstore": "remote",
     "statsmodels": "catalog",
 }
 """Optional package to the extra that installs it."""

@@ -5,14 +5,20 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from undulog.capture.commands.several import Line, sessions_of
+from undulog.capture.commands.several import each as each_session
+from undulog.capture.commands.several import show as show_table
 from undulog.capture.common.console import UNLIMITED, Progress, echo, emit_json, progress
-from undulog.capture.common.errors import UsageError
-from undulog.capture.common.files import check_output
+from undulog.capture.common.errors import UndulogError, UsageError
+from undulog.capture.common.files import check_output, write_text
+from undulog.capture.common.remote import as_path
 
 if TYPE_CHECKING:
     from undulog.capture import SessionView
@@ -31,45 +37,56 @@ def analyse(
     command_topic: str = "/joint_commands",
     response_topic: str = "/joint_states",
     reference_topic: str | None = None,
+    robot: str | None = None,
     null: Path | None = None,
+    each: bool = False,
     force: bool = False,
-) -> None:
+) -> int:
     """Compute gain and lag, energy and spread over the segments, each with its interval.
 
     Works on sessions of undulog and on any ROS 2 bag (MCAP) that has JointStates of commands and
     of responses. The first line printed is the answer; the method comes last. Several sessions are
-    one experiment: runs of a gait and of its reverse separate boundary from module.
+    one experiment: runs of a gait and of its reverse separate boundary from module. A folder, a
+    pattern, or `--each` give a table instead, a line for each session; one that fails stops none.
     The glossary of the manual, also at the end of each report, defines the words of results.
 
     Example: `undulog analyse run.mcap --json -o run.json`
 
     Args:
-        files: Sessions (MCAP); several are runs of one experiment.
-        json: Print the result as one JSON object.
+        files: Sessions (MCAP), or their URLs; several are runs of one experiment. Folders of
+            sessions or patterns, such as 'runs/**/*.mcap', give a table.
+        json: Print the result as one JSON object; a table as a list of them.
         output: Write the JSON to this file too, a name that ends in .json.
         start: Start of what is analysed, from the session's start [s]; chosen if not given.
         stop: Its end [s].
         command_topic: JointState topic of the commands.
         response_topic: JointState topic of the responses.
         reference_topic: JointState topic of a second sensor of the same positions, to be compared.
+        robot: Description of the robot of a log without one, a name or a TOML file.
         null: Model of identical modules (see `undulog sim null`) to hold the one session to.
+        each: Analyse several sessions one by one instead of as one experiment.
         force: Replace the output file if it exists.
     """
     if not files:
         raise UsageError("analyse needs at least one session, e.g. undulog analyse run.mcap")
     options = chosen(start, stop, command_topic, response_topic, reference_topic)
-    if null is not None and len(files) > 1:
+    paths = sessions_of(files)
+    if null is not None and len(paths) > 1:
         raise UsageError("--null takes one session; with both directions recorded leave it out")
     if output is not None:
         why = "the result file is JSON; end its name in .json (a page is made by undulog report)"
         check_output(output, (".json",), why, force=force)
-    alone = len(files) == 1
-    result = _one(files[0], options, null) if alone else experiment_of(files, options, "analyse")
+    if len(paths) > 1 and (each or paths != [*map(as_path, files)]):
+        return _table(paths, options, robot, output, as_json=json)
+    if len(paths) == 1:
+        result = _one(paths[0], options, null, robot)
+    else:
+        result = _experiment(paths, options, robot, as_json=json)
     if output is not None:
         result.save(output, force=True)  # refused before the work began, if it was there
     if json:
         emit_json(result.to_dict())
-        return
+        return 0
     from ..present.text import render
     from ..results.analysis import Analysis
 
@@ -81,16 +98,17 @@ def analyse(
         return render_experiment(result, width=width, color=color)
 
     show(text, output)
+    return 0
 
 
-def _one(file: Path, options: Options, null: Path | None) -> Analysis:
+def _one(file: Path, options: Options, null: Path | None, robot: str | None) -> Analysis:
     from undulog.capture import Session
 
     from ..session.analyse import analyse_session
 
     with progress("analyse", total=1) as bar:
         bar.update(0, note=file.name)
-        with Session.open(file) as session:
+        with Session.open(file, robot=robot) as session:
             if null is None:
                 return analyse_session(session, options)
             from ..experiment.null_model import analyse_with_null
@@ -98,12 +116,66 @@ def _one(file: Path, options: Options, null: Path | None) -> Analysis:
             return analyse_with_null(session, null, options)
 
 
-def experiment_of(files: Sequence[Path], options: Options, verb: str) -> Experiment:
+def _experiment(
+    files: Sequence[Path], options: Options, robot: str | None, *, as_json: bool
+) -> Experiment:
+    """Analyse sessions as one experiment; if one of them fails, print a table of all of them."""
+    try:
+        return experiment_of(files, options, "analyse", robot=robot)
+    except UndulogError:
+        lines = each_session(files, "analyse", partial(_line, options=options, robot=robot))
+        if not all(line.good for line in lines.values()):
+            show_table(lines, as_json=as_json)
+        raise
+
+
+def _table(
+    paths: Sequence[Path],
+    options: Options,
+    robot: str | None,
+    output: Path | None,
+    *,
+    as_json: bool,
+) -> int:
+    """Analyse sessions one by one and print a table, or a list of results."""
+    lines = each_session(paths, "analyse", partial(_line, options=options, robot=robot))
+    if output is not None:
+        facts = [line.facts for line in lines.values()]
+        write_text(output, dumps(facts, indent=2, allow_nan=False) + "\n")
+    return show_table(lines, as_json=as_json)
+
+
+def _line(file: Path, *, options: Options, robot: str | None) -> Line:
+    from undulog.capture import Session
+
+    from ..session.analyse import analyse_session
+
+    with Session.open(file, robot=robot) as session:
+        return line_of(analyse_session(session, options))
+
+
+def line_of(analysis: Analysis) -> Line:
+    """Return the line of a session in a table."""
+    from ..results import formats
+
+    answer, known = analysis.answer, analysis.gait.frequency_hz.value is not None
+    return Line(
+        robot=analysis.session.robot or "",
+        gait=formats.gait_frequency(analysis.gait) if known else "",
+        verdict=answer.verdict,
+        sentence=answer.sentence,
+        facts=analysis.to_dict(),
+    )
+
+
+def experiment_of(
+    files: Sequence[Path], options: Options, verb: str, *, robot: str | None = None
+) -> Experiment:
     """Analyse sessions as one experiment, one open at a time, with a progress bar."""
     from ..experiment.analyse import analyse_experiment
 
     with progress(verb, total=len(files)) as bar:
-        return analyse_experiment(opened(files, bar), options)
+        return analyse_experiment(opened(files, bar, robot=robot), options)
 
 
 PAGES = (".html", ".htm")
@@ -136,17 +208,20 @@ def chosen(
     return Options(start, stop, command_topic, response_topic, reference_topic)
 
 
-def opened(files: Iterable[Path], bar: Progress, done: int = 0) -> Iterator[SessionView]:
+def opened(
+    files: Iterable[Path], bar: Progress, done: int = 0, *, robot: str | None = None
+) -> Iterator[SessionView]:
     """Open sessions, each until the next one is taken, and show the progress.
 
     Args:
         done: Sessions of the progress bar that are done before.
+        robot: Description for logs without one.
     """
     from undulog.capture import Session
 
     for k, file in enumerate(files, start=done):
         bar.update(k, note=file.name)
-        with Session.open(file) as session:
+        with Session.open(file, robot=robot) as session:
             yield session
 
 

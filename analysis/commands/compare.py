@@ -35,6 +35,7 @@ def compare(
     stop: float | None = None,
     command_topic: str = "/joint_commands",
     response_topic: str = "/joint_states",
+    robot: str | None = None,
     force: bool = False,
     json: bool = False,
 ) -> None:
@@ -59,6 +60,7 @@ def compare(
         stop: Its end [s].
         command_topic: JointState topic of the commands.
         response_topic: JointState topic of the responses.
+        robot: Description for logs without one, a name or a TOML file.
         force: Replace the output file if it exists.
         json: Print the result as one JSON object.
     """
@@ -80,8 +82,9 @@ def compare(
         session=session,
     )
     with progress("compare", total=sum(map(len, sides))) as bar:
-        first = opened(sides[0], bar)
-        result = compare_sessions(first, opened(sides[1], bar, len(sides[0])), choices)
+        first = opened(sides[0], bar, robot=robot)
+        second = opened(sides[1], bar, len(sides[0]), robot=robot)
+        result = compare_sessions(first, second, choices)
     if output is not None:
         _write(result, output)
     if json:

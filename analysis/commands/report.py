@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import echo, emit_json, progress
+from undulog.capture.commands.several import FAILED, Line, each, sessions_of, show
+from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output, write_text
 
-from .analyse import PAGES, chosen, experiment_of
+from .analyse import PAGES, chosen, experiment_of, line_of
 
 if TYPE_CHECKING:
     from ..results.analysis import Analysis
@@ -29,20 +30,25 @@ def report(
     stop: float | None = None,
     command_topic: str = "/joint_commands",
     response_topic: str = "/joint_states",
+    robot: str | None = None,
     force: bool = False,
     json: bool = False,
-) -> None:
+) -> int:
     """Write the offline report: one HTML page that needs no network and no script.
 
     Several sessions are one experiment, as for `undulog analyse`: runs of a gait and of its reverse
-    separate boundary from module, kicks of single joints identify the coupling. With `--catalog`
+    separate boundary from module, kicks of single joints identify the coupling. If `-o` names a
+    folder, each session gets a page of its own in it, and index.html lists them. With `--catalog`
     the page is on all sessions of a folder over time: joints that change, trends, outliers.
 
     Example: `undulog report run.mcap -o run.html`
 
+    A page a session: `undulog report runs/ -o pages/`
+
     Args:
-        files: Sessions (MCAP); several are runs of one experiment.
-        output: The page, a name that ends in .html.
+        files: Sessions (MCAP), their URLs, folders of them or patterns such as 'runs/**/*.mcap';
+            several are runs of one experiment.
+        output: The page, a name that ends in .html; for several sessions also a folder.
         catalog: Folder or URL of sessions to compare over time, instead of files; those without
             results are analysed first.
         find: Condition on the sessions of the catalogue, as for `undulog catalog`.
@@ -50,8 +56,10 @@ def report(
         stop: Its end [s].
         command_topic: JointState topic of the commands.
         response_topic: JointState topic of the responses.
+        robot: Description of the robot of a log without one, a name or a TOML file.
         force: Replace the page if it exists.
-        json: Print one JSON object: the page, the answer, and the answer to each session.
+        json: Print one JSON object: the page, the answer, and the answer to each session; of a
+            folder of pages a list of them.
     """
     if not files and catalog is None:
         raise UsageError(
@@ -64,39 +72,100 @@ def report(
     options = chosen(start, stop, command_topic, response_topic)
     if catalog is not None and options != chosen(None, None, "/joint_commands", "/joint_states"):
         raise UsageError("--catalog shows results as they are; leave out window and topics")
+    paths = sessions_of(files)
+    if len(paths) > 1 and (output.is_dir() or not output.suffix):
+        return _pages(paths, options, robot, output, force=force, as_json=json)
     check_output(output, PAGES, "the report is an HTML page; end its name in .html", force=force)
     if catalog is not None:
         page, facts, warnings = _fleet(catalog, find, output)
+    elif len(paths) == 1:
+        page, facts, warnings = _one(paths[0], options, robot)
     else:
-        alone = len(files) == 1
-        page, facts, warnings = _one(files[0], options) if alone else _several(files, options)
+        page, facts, warnings = _several(paths, options, robot)
     write_text(output, page)
     size = output.stat().st_size
     if json:
         emit_json({"page": str(output), "bytes": size, **facts})
-        return
+        return 0
     echo(facts["answer"])
     noted = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
     echo(f"{output}: {size / 1e3:.0f} kB{noted}")
+    return 0
 
 
-def _one(file: Path, options: Options) -> tuple[str, dict[str, Any], int]:
+def _one(file: Path, options: Options, robot: str | None) -> tuple[str, dict[str, Any], int]:
     """Return the page on one session, its answer, and the number of warnings."""
+    with progress("report", total=2) as bar:
+        bar.update(0, note=file.name)
+        page, analysis = _page(file, options, robot, lambda: bar.update(1, note="page"))
+    summary = _summary(analysis)
+    return page, {"answer": summary["sentence"], "answers": [summary]}, len(analysis.warnings)
+
+
+def _page(
+    file: Path, options: Options, robot: str | None, on_page: Callable[[], None] = lambda: None
+) -> tuple[str, Analysis]:
     from undulog.capture import Session
 
     from ..present.page.page import render
     from ..session.analyse import measure_session
     from ..session.cycles import cycle_maps
 
-    with progress("report", total=2) as bar:
-        bar.update(0, note=file.name)
-        with Session.open(file) as session:
-            measured = measure_session(session, options)
-            analysis = measured.analysis
-            bar.update(1, note="page")
-            page = render(analysis, session, cycle_maps(measured))
-    summary = _summary(analysis)
-    return page, {"answer": summary["sentence"], "answers": [summary]}, len(analysis.warnings)
+    with Session.open(file, robot=robot) as session:
+        measured = measure_session(session, options)
+        on_page()
+        return render(measured.analysis, session, cycle_maps(measured)), measured.analysis
+
+
+def _pages(
+    paths: Sequence[Path],
+    options: Options,
+    robot: str | None,
+    folder: Path,
+    *,
+    force: bool,
+    as_json: bool,
+) -> int:
+    """Write a page for each session into a folder, and an index of them."""
+    from ..present.page.page import render_index
+
+    index = folder / "index.html"
+    folder.mkdir(exist_ok=True)
+    refuse_existing(index, force=force)
+    paths = list(dict.fromkeys(paths))
+    pages = _page_names(paths)
+
+    def written(path: Path) -> Line:
+        page = folder / pages[path]
+        refuse_existing(page, force=force)
+        text, analysis = _page(path, options, robot)
+        write_text(page, text)
+        return replace(line_of(analysis), facts={"page": str(page), **_summary(analysis)})
+
+    lines = each(paths, "report", written)
+    rows = [
+        (name, line, pages[path] if line.verdict != FAILED else None)
+        for path, (name, line) in zip(paths, lines.items(), strict=True)
+    ]
+    write_text(index, render_index(rows))
+    code = show(lines, as_json=as_json)
+    if not as_json:
+        echo(f"{index}: {sum(page is not None for *_, page in rows)} pages")
+    return code
+
+
+def _page_names(paths: Sequence[Path]) -> dict[Path, str]:
+    """Return a file name for each session's page; those that would be the same get a number."""
+    names: dict[Path, str] = {}
+    taken = {"index"}
+    for path in paths:
+        stem = name = path.stem or "session"
+        number = 2
+        while name in taken:
+            name, number = f"{stem}-{number}", number + 1
+        taken.add(name)
+        names[path] = f"{name}.html"
+    return names
 
 
 def _fleet(where: str, find: str, output: Path) -> tuple[str, dict[str, Any], int]:
@@ -121,11 +190,13 @@ def _fleet(where: str, find: str, output: Path) -> tuple[str, dict[str, Any], in
     return page, fleet.to_dict(), len(warnings)
 
 
-def _several(files: Sequence[Path], options: Options) -> tuple[str, dict[str, Any], int]:
+def _several(
+    files: Sequence[Path], options: Options, robot: str | None
+) -> tuple[str, dict[str, Any], int]:
     """Return the page on an experiment, all answers, and the number of warnings."""
     from ..present.page.page import render
 
-    experiment = experiment_of(files, options, "report")
+    experiment = experiment_of(files, options, "report", robot=robot)
     page = render(experiment)
     facts = {
         "answer": f"{len(files)} sessions: {experiment.answer}.",

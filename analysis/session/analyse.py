@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -61,6 +60,7 @@ from ..signals.stretch import (
     Options,
     SharedTimes,
     choose_stretch,
+    fetched_part,
     part_of,
     recorded,
     without_breaks,
@@ -162,6 +162,7 @@ def measure_session(
     """
     options = options or Options()
     warn = Remarks()
+    session = fetched_part(session, options, warn)
     topics = (options.command_topic, options.response_topic)
     columns = read_columns(session, *topics, warn, reference_topic=options.reference_topic)
     columns, left_out = without_breaks(session, columns, options, warn)
@@ -421,15 +422,12 @@ def _estimates(gait: GaitFit | None, name: str) -> tuple[Estimate, Estimate]:
 
 def _provenance(session: SessionView, options: Options) -> Provenance:
     """What makes the same numbers again."""
-    digest = hashlib.sha256()
-    for path in session.files:  # one, or the parts of a split session
-        with path.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
+    given = [] if session.robot_given is None else ["--robot", session.robot_given]
+    words = ["undulog", "analyse", str(session.path), *options.arguments(), *given]
     return Provenance(
-        command=shlex.join(["undulog", "analyse", str(session.path), *options.arguments()]),
+        command=shlex.join(words),
         versions=base_versions(),
-        inputs={str(session.path): digest.hexdigest()},
+        inputs={str(session.path): session.fingerprint()},
         options={
             **asdict(options),
             "confidence": CONFIDENCE,

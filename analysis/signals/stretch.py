@@ -16,6 +16,7 @@ from undulog.capture.log.read.sample_times import Signal, longest_unbroken
 
 from ..estimators.series import clean
 from ..response.rhythm import MIN_CYCLES
+from ..results.answer import Note
 from .columns import COMMAND_TOPIC, QUANTITIES, RESPONSE_TOPIC, Columns
 from .windows import Stretch, covered, long_enough, moving, settled, steady_part, steady_runs
 
@@ -23,6 +24,8 @@ GAIT_TOPIC = "/gait"
 _NS = 1e9
 _WORTH_IT = 0.1
 """Less than this part of a session after its settling time is not worth leaving the rest out."""
+_AROUND_S = 2.0
+"""Read on each side of a window that was chosen, so that no sample at its ends is missing."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +156,30 @@ def choose_stretch(session: SessionView, columns: Columns, options: Options, war
         later = chosen
     stated = settle_s > 0 or GAIT_TOPIC in session.channels
     return _in_motion(columns, later, options, warn, stated=stated)
+
+
+def fetched_part(session: SessionView, options: Options, warn: Warn) -> SessionView:
+    """Return a view that reads no more of a session on a server than the options leave of it.
+
+    Of a file on this computer all is read: artefacts and cycles are those of the whole session.
+
+    Raises:
+        UsageError: If the user's limits leave nothing.
+    """
+    chosen = options.start_s, options.stop_s
+    if not session.is_remote or chosen == (None, None):
+        return session
+    if (options.start_s or 0.0) >= session.duration_s:
+        raise UsageError(
+            f"{session.path}: nothing after --start {options.start_s:g}; it lasts "
+            f"{session.duration_s:.2f} s"
+        )
+    warn(Note("only the window was fetched: artefacts and cycles around it are not known"))
+    ends = [
+        None if t is None else session.start_ns + round((t + side) * _NS)
+        for t, side in zip(chosen, (-_AROUND_S, _AROUND_S), strict=True)
+    ]
+    return session.part(*ends)
 
 
 def recorded(session: SessionView, columns: Columns, options: Options) -> Stretch:

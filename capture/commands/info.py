@@ -16,6 +16,7 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "report": ("jinja2", "matplotlib"),
     "parquet": ("pyarrow",),
     "mf4": ("asammdf",),
+    "remote": ("obstore",),
     "cluster": ("dask", "distributed"),
 }
 

@@ -16,6 +16,7 @@ from ..common.errors import DataError
 from ..log.columns.topics import Channel
 from ..log.messages.frames import FD_TOPIC_PREFIX
 from ..log.read.session import Session
+from .several import Line, each, sessions_of, show, stated_gait
 
 if TYPE_CHECKING:
     from ..log.health.bus_tally import SourceHealth
@@ -59,7 +60,7 @@ def describe(session: Session) -> dict[str, Any]:
             "start_ns": None if empty else session.start_ns,
             "start_utc": None if empty else _utc(session.start_ns),
             "duration_s": seconds,
-            "size_bytes": sum(path.stat().st_size for path in session.files),
+            "size_bytes": session.size,
             "files": [path.name for path in session.files],
             "profile": session.profile,
             "library": session.library,
@@ -88,18 +89,33 @@ def _fd_frames(session: Session, channel: Channel) -> int | None:
         return None
 
 
-def log_info(file: Path, /, *, json: bool = False) -> None:
+def log_info(file: Path, /, *more: Path, json: bool = False) -> int:
     """Show what a log holds: robot, times, topics, attachments, and what is wrong with it.
+
+    Several logs, folders of them or patterns give a table, a line each.
 
     Example: `undulog log info run.mcap`
 
     Args:
-        file: An MCAP file, of any make; of a split session any part, or the folder.
-        json: Print one JSON object.
+        file: An MCAP file, of any make, or its URL; of a split session any part, or the folder.
+        more: More of them; a folder has all logs in it, a pattern such as 'runs/**/*.mcap' too.
+        json: Print one JSON object, or for several logs a list of them.
     """
-    with Session.open(file) as session:
+    paths = sessions_of([file, *more])
+    if len(paths) > 1:
+        return show(each(paths, "log info", _info_line), as_json=json)
+    with Session.open(paths[0]) as session:
         facts = describe(session)
     emit(facts, _info_lines(facts), as_json=json)
+    return 0
+
+
+def _info_line(path: Path) -> Line:
+    with Session.open(path) as session:
+        facts, gait = describe(session), stated_gait(session.metadata)
+    first = next(_info_lines(facts)).removeprefix(f"{facts['session']['id']}: ")
+    robot, verdict = facts["session"]["robot"] or "", facts["session"]["verdict"] or ""
+    return Line(robot, gait, verdict, first, facts)
 
 
 def _info_lines(facts: dict[str, Any]) -> Iterator[str]:
@@ -154,25 +170,42 @@ def _utc(t_ns: int) -> str:
     return datetime.fromtimestamp(t_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-def log_check(file: Path, /, *, json: bool = False) -> int:
+def log_check(file: Path, /, *more: Path, json: bool = False) -> int:
     """Judge whether a recorded session is good, degraded or bad, and why.
 
     Everything is computed from the data: rhythm, gaps, jitter and dropped messages of every
     channel, values that are not a number, frozen joints and joints at their limits, the CRC of
     every chunk, error frames and load of the bus. Exit code 1 for a bad session.
+    Several logs, folders of them or patterns give a table, a line each.
 
     Example: `undulog log check run.mcap`
 
     Args:
-        file: An MCAP file, of any make.
-        json: Print one JSON object.
+        file: An MCAP file, of any make, or its URL, which is fetched whole.
+        more: More of them; a folder has all logs in it, a pattern such as 'runs/**/*.mcap' too.
+        json: Print one JSON object, or for several logs a list of them.
     """
     from ..log.health.session_check import check_session
 
+    paths = sessions_of([file, *more])
+    if len(paths) > 1:
+        return show(each(paths, "log check", _check_line), as_json=json)
+    (file,) = paths
     with progress(f"checking {file.name}", 1.0) as bar:
         health = check_session(file, bar.update)
     emit(as_json(health), _check_lines(health), as_json=json)
     return int(health.verdict == "bad")
+
+
+def _check_line(path: Path) -> Line:
+    from ..log.health.session_check import check_session
+
+    health = check_session(path)
+    with Session.open(path) as session:
+        gait = stated_gait(session.metadata)
+    said = (*health.reasons, *health.notes, "nothing is wrong with it")
+    good = health.verdict != "bad"
+    return Line(health.robot or "", gait, health.verdict, said[0], as_json(health), good)
 
 
 def as_json(health: SessionHealth) -> dict[str, Any]:

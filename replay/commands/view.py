@@ -39,6 +39,7 @@ def view(
     clip: Path | None = None,
     shot: Annotated[ClipOptions | None, Parameter(name="*")] = None,
     beside: Annotated[OverlayOptions | None, Parameter(name="*")] = None,
+    robot: str | None = None,
     force: bool = False,
     json: bool = False,
 ) -> None:
@@ -59,7 +60,7 @@ def view(
     Robot and twin: `undulog view robot.mcap twin.mcap --align phase --names robot,twin`
 
     Args:
-        files: The session, `.mcap`, or several.
+        files: The session, `.mcap`, or its URL; or several.
         live: Instead of a file, the socket that a recorder on this machine sends to.
         save: Write the recording to this `.rrd` file instead of opening the viewer. Of what is
             recorded live, one session, when it has ended.
@@ -71,6 +72,7 @@ def view(
             the viewer; it is drawn off screen.
         shot: How the clip is filmed.
         beside: How several sessions are put side by side.
+        robot: Description of the robot of a log without one, a name or a TOML file.
         force: Replace the recording or the clip if it is there.
         json: Print one JSON object: what was written and what is missing. Needs `--save` or
             `--clip`.
@@ -82,19 +84,21 @@ def view(
         raise UsageError(f"{', '.join(single.given)}: needs one session, and no --clip")
     if shot is not None and clip is None:
         raise UsageError(f"{', '.join(shot.given)}: an option of clips; give --clip as well")
+    if live is not None and robot is not None:
+        raise UsageError("--robot is for recorded logs; a recorder sends its robot's description")
     if clip is not None:
-        view_clip(files[0], clip, shot or ClipOptions(), force=force, json=json)
+        view_clip(files[0], clip, shot or ClipOptions(), robot=robot, force=force, json=json)
         return
     if save is not None:
         check_output(save, [".rrd"], "a Rerun recording; end its name in .rrd", force=force)
     if live is not None:
         _view_live(live, save=save, web=web, connect=connect, json=json)
     elif len(files) == 1 and save is not None:
-        _report(*_convert(files[0], save, single or SingleOptions()), json=json)
+        _report(*_convert(files[0], save, single or SingleOptions(), robot), json=json)
     elif len(files) == 1:
-        _view_session(files[0], single or SingleOptions(), web=web)
+        _view_session(files[0], single or SingleOptions(), robot, web=web)
     else:
-        view_overlay(files, beside or OverlayOptions(), save=save, web=web, json=json)
+        view_overlay(files, beside or OverlayOptions(), robot=robot, save=save, web=web, json=json)
 
 
 def _check_usage(
@@ -123,7 +127,9 @@ def _check_usage(
         )
 
 
-def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording, float]:
+def _convert(
+    file: Path, output: Path, single: SingleOptions, robot: str | None
+) -> tuple[Recording, float]:
     from undulog.analysis.signals.stretch import Options
 
     from ..feed.numbers import saved
@@ -132,7 +138,7 @@ def _convert(file: Path, output: Path, single: SingleOptions) -> tuple[Recording
     options = Options(command_topic=command, response_topic=response)
     folder = output.parent  # on a disk, so that an hour's columns need not be in memory
     with ExitStack() as stack:
-        session = stack.enter_context(Session.open(file, column_folder=folder))
+        session = stack.enter_context(Session.open(file, column_folder=folder, robot=robot))
         bar = stack.enter_context(progress("view", total=2))
         bar.update(0, note="results" if single.result else "analysis")
         layer = saved(session, single.result or (), options)
@@ -216,13 +222,13 @@ def _report_live(report: RelayReport, save: Path | None, *, json: bool) -> None:
         echo(f"note: {report.unread} messages could not be read")
 
 
-def _view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
+def _view_session(file: Path, single: SingleOptions, robot: str | None, *, web: bool) -> None:
     """Show a session until the viewer is closed or a stop is requested."""
     if not web:
         viewer.require_display()
     with ExitStack() as stack:
         stop = stack.enter_context(interruptible())
-        session = single.view(stack.enter_context(Session.open(file)))
+        session = single.view(stack.enter_context(Session.open(file, robot=robot)))
         known = Layer(None)
         if single.result:
             from ..feed.numbers import read_results
@@ -235,7 +241,7 @@ def _view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
         from ..feed.numbers import Analysing
         from ..feed.progressive import NoLongerWantedError, Task, show_session, steps
 
-        analysing = stack.enter_context(Analysing(file, single.topics))
+        analysing = stack.enter_context(Analysing(file, single.topics, robot))
         try:
             with progress("view", total=steps(session)) as bar:
                 bar.update(0, note="the beginning")
@@ -245,7 +251,7 @@ def _view_session(file: Path, single: SingleOptions, *, web: bool) -> None:
                 notes = show_session(task, process, stop)
         except NoLongerWantedError:
             return
-        echo(f"{file}: {session.duration_s:.1f} s, all of it in the viewer")
+        echo(f"{session.path}: {session.duration_s:.1f} s, all of it in the viewer")
         echo(*(f"note: {note}" for note in notes))
         process.wait(stop)
 

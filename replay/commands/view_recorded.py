@@ -124,13 +124,22 @@ class OverlayOptions(_Options):
     place: Annotated[Literal["start", "world"] | None, Parameter(name="--place")] = None
 
 
-def view_clip(file: Path, clip: Path, options: ClipOptions, *, force: bool, json: bool) -> None:
+def view_clip(
+    file: Path,
+    clip: Path,
+    options: ClipOptions,
+    *,
+    robot: str | None = None,
+    force: bool,
+    json: bool,
+) -> None:
     """Write a moving picture of a session's body.
 
     Args:
         file: The session.
         clip: The clip, ``.gif`` or ``.mp4``.
         options: How it is filmed.
+        robot: Description for a log without one.
         force: Replace the clip if it is there.
         json: Print the report as one JSON object.
 
@@ -149,7 +158,7 @@ def view_clip(file: Path, clip: Path, options: ClipOptions, *, force: bool, json
     with (
         interruptible() as stop,
         tempfile.TemporaryDirectory(prefix="undulog-clip-") as folder,
-        Session.open(file) as session,
+        Session.open(file, robot=robot) as session,
     ):
         shot = _shot(options, session.duration_s, file)
         check_film(clip.suffix.lower(), shot.size, shot.fps)
@@ -211,6 +220,7 @@ def view_overlay(
     files: Sequence[Path],
     options: OverlayOptions,
     *,
+    robot: str | None = None,
     save: Path | None,
     web: bool,
     json: bool,
@@ -220,6 +230,7 @@ def view_overlay(
     Args:
         files: Two or more sessions.
         options: How they are aligned, placed and called.
+        robot: Description for logs without one.
         save: Write the recording there instead of opening the viewer.
         web: Serve it to a browser on this machine.
         json: Print one JSON object.
@@ -243,6 +254,7 @@ def view_overlay(
             beside = combine_sessions(
                 files,
                 path,
+                robot=robot,
                 names=names,
                 how=how,
                 place=place,

@@ -39,13 +39,14 @@ _NICENESS = 10
 class Analysing(AbstractContextManager["Analysing"]):
     """An analysis that is started when there is time for it, and ended on leaving."""
 
-    def __init__(self, path: Path, topics: tuple[str, str]) -> None:
+    def __init__(self, path: Path, topics: tuple[str, str], robot: str | None = None) -> None:
         """Prepare it.
 
         Args:
             topics: JointState topics of its commands and responses.
+            robot: Description for a log without one.
         """
-        self._arguments = [str(path), *topics]
+        self._arguments = [str(path), *topics, *([] if robot is None else [robot])]
         self._process: subprocess.Popen[bytes] | None = None
         self._answer = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
         self._said = tempfile.TemporaryFile()  # noqa: SIM115
@@ -91,13 +92,14 @@ def main(arguments: Sequence[str]) -> None:
     """Analyse a session and write the result to standard output.
 
     Args:
-        arguments: The session's path, the topics of commands and responses.
+        arguments: The session's path, the topics of commands and responses, and a robot if given.
     """
     os.nice(_NICENESS)
-    path, command, response = arguments
+    path, command, response, *robot = arguments
     options = Options(command_topic=command, response_topic=response)
     folder = Path(tempfile.gettempdir())  # its columns lie there in files without names
-    with Session.open(path, column_folder=folder) as session:
+    given = robot[0] if robot else None
+    with Session.open(path, column_folder=folder, robot=given) as session:
         layer = computed(session, options)
     pickle.dump(layer, sys.stdout.buffer)
 

@@ -331,6 +331,7 @@ def combine_sessions(
     files: Sequence[Path],
     path: Path,
     *,
+    robot: str | None = None,
     names: Sequence[str] | None = None,
     how: Align = Align.TIME,
     place: Place = Place.START,
@@ -342,6 +343,7 @@ def combine_sessions(
     Args:
         files: Two or more sessions; differences are from the first.
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
+        robot: Description for logs without one.
         names: What they are called, or None for the files' names.
         place: Where the bodies are drawn.
         on_step: Called before each of :func:`steps` with how many are done, and what comes.
@@ -363,7 +365,8 @@ def combine_sessions(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="undulog-beside-")))
         pairs: list[tuple[SessionView, str]] = []
         for file, name in zip(files, called, strict=True):
-            session = stack.enter_context(Session.open(file, column_folder=folder))
+            opened = Session.open(file, column_folder=folder, robot=robot)
+            session = stack.enter_context(opened)
             pairs.append((session.view(on_read=partial(check_stop, path, stop)), name))
         step("angles")
         # Aligned before the long part, since that may refuse.

@@ -6,12 +6,14 @@ import os
 import shutil
 import sys
 import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+from undulog.capture.commands.several import Line, each, sessions_of, show
 from undulog.capture.common.console import (
     UNLIMITED,
     complain,
@@ -155,10 +157,44 @@ def _only_recorder() -> Path | None:
 _TWIN = "twin"
 
 
+def _dry_runs(
+    whats: Sequence[str], on: str, robot: Robot | None, duration_s: float | None
+) -> dict[str, Line]:
+    """Run motions in the twin, through the gate of a bus, one after the other."""
+    from ..drive.dry_run import dry_run, reported, summary_lines
+    from ..drive.motion import find_motion
+    from ..drive.over_bus import check_drivable
+
+    def line(what: str) -> Line:
+        driven = find_motion(what, robot=robot)
+        check_drivable(driven, robot or driven.robot)
+        with interruptible() as stop:
+            dry = dry_run(driven, robot=robot, duration_s=duration_s, stop=stop)
+        if stop.requested:
+            raise KeyboardInterrupt
+        first, verdict = next(iter(summary_lines(dry, UNLIMITED))), dry.verdict
+        facts = {"on": on, **reported(dry)}
+        return Line(dry.scenario.robot.name, driven.name, verdict, first, facts, verdict.fit)
+
+    return each(whats, "dry run", line)
+
+
+def _motions(given: Sequence[str]) -> list[str]:
+    """Return what is named: of a folder its TOML files and sessions, of a pattern what fits it."""
+    from ..scenario.scenario_file import scenario_names
+
+    found: list[str] = []
+    for what in given:
+        plans = sorted(Path(what).glob("*.toml")) if what not in scenario_names() else []
+        sessions = [one for one in sessions_of([Path(what)]) if str(one) != str(Path(what))]
+        found += map(str, [*plans, *sessions]) if plans or sessions else [what]
+    return found
+
+
 def drive(
     what: str,
     /,
-    *,
+    *more: str,
     on: str,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     duration: float | None = None,
@@ -181,6 +217,7 @@ def drive(
     Args:
         what: Name of a shipped scenario, or a scenario's TOML file: its gait is driven. Or a plan,
             a TOML file of segments. Or a session, `.mcap`: its commands are given again.
+        more: More of them, folders or patterns, for dry runs over a bus: a table, a line each.
         on: `twin` (the world that it was made for), `twin:SCENARIO`, or a bus,
             `can:INTERFACE:CHANNEL[?KEY=VALUE&...]`.
         output: The session file to write, `.mcap`; a dry run needs none.
@@ -196,6 +233,13 @@ def drive(
     from ..drive.motion import find_motion
     from ..scenario.scenario_file import load_scenario
 
+    whats = _motions([what, *more])
+    if len(whats) > 1 and (arm or output is not None or on.partition(":")[0] == _TWIN):
+        raise UsageError(
+            f"{what}: {len(whats)} motions; several are for dry runs over a bus, without --arm and "
+            "-o; name one"
+        )
+    what = whats[0]
     if output is not None:
         check_session_name(output)
         refuse_existing(output, force=force)
@@ -209,6 +253,8 @@ def drive(
 
         bus_address(on)
         described = load_robot(robot) if robot is not None else None
+        if len(whats) > 1:
+            return show(_dry_runs(whats, on, described, duration), as_json=json)
         driven = find_motion(what, robot=described)
         given: dict[str, Any] = {
             "robot": described,

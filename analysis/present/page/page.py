@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path, PurePosixPath
@@ -23,6 +23,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from undulog.capture import SessionView
+from undulog.capture.commands.several import Line, first_sentence
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import plain
 from undulog.capture.common.errors import UsageError
@@ -201,6 +202,19 @@ def _page(
     else:
         template, view = "session.html.j2", _session_view(result, session, cycles)
     return _environment().get_template(template).render(v=view, left_out=left_out)
+
+
+def render_index(lines: Sequence[tuple[str, Line, str | None]]) -> str:
+    """Return the index of a folder of pages, one HTML page without outside references.
+
+    Args:
+        lines: Name of each session, its line, and the file of its page; None where it has none.
+    """
+    rows = [
+        (name, line, quote(page) if page else None, first_sentence(line.sentence))
+        for name, line, page in lines
+    ]
+    return _environment().get_template("index.html.j2").render(rows=rows)
 
 
 _DATES: Any = matplotlib.dates  # whose annotations leave arguments unknown

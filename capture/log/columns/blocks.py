@@ -144,6 +144,7 @@ def filled_arenas(
         for each in blocks
         if (not ids.isdisjoint(each.index_at) if each.index_at else not each.is_empty)
     ]
+    log_file.expect(wanted)
     runs = list(_runs(log_file, wanted))
     spare = 1 if threads > 1 and len(runs) > 1 else 0
     keep_freed(ARENA_SIZE)  # no copy of messages is larger

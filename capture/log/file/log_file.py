@@ -7,13 +7,14 @@ one more block, in memory, after the files' blocks; nothing on the disk is chang
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import mmap
 import os
 import sys
 import tempfile
 import weakref
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +24,7 @@ from mcap.records import Attachment, Channel, Header, Metadata, Schema
 from numpy.typing import NDArray
 
 from ...common.errors import LogError, NotALogError
+from ...common.remote import as_path
 from ..mcap.chunk import LAST_NS, Block, read_message_heads
 from ..mcap.file import McapFile
 from ..wal.reader import MessageKey, WalContents, WalTail, beyond, read_wal
@@ -169,14 +171,16 @@ class LogFile:
         """Open a session.
 
         Args:
-            path: Its file, any of its parts, or a folder that holds it and no other.
+            path: Its file, any of its parts, or a folder that holds it and no other; or the URL of
+                a file.
             column_folder: Folder for large columns in files; None for memory.
 
         Raises:
             NotALogError: If it is empty, not MCAP, or nothing in it can be read.
             LogError: If the operating system can't open it, or a folder holds several sessions.
+            InputFileError: If it is a URL that can't be read.
         """
-        self.path = path
+        self.path = path = as_path(path)
         self.warnings: list[str] = []
         self.profile = self.library = ""
         self.schemas: dict[int, Schema] = {}
@@ -244,6 +248,32 @@ class LogFile:
             file.forget()
         if self.pages is not None:
             self.pages.release()
+
+    def expect(self, blocks: Sequence[Block]) -> None:
+        """Announce blocks that will be read next; those on a server are fetched many at a time."""
+        for part, file in enumerate(self.files):
+            if file.remote is not None:
+                file.remote.expect([block for block in blocks if block.part == part])
+
+    @property
+    def size(self) -> int:
+        """Size of the files [byte]."""
+        return sum(len(file.buffer) for file in self.files)
+
+    def fingerprint(self) -> str:
+        """Return the SHA-256 of the files, one after the other, or the ETags of those of a server.
+
+        A hash would fetch the whole file.
+        """
+        tags = [file.remote.tag for file in self.files if file.remote is not None]
+        if tags:
+            return f"etag {' '.join(tags)}"
+        digest = hashlib.sha256()
+        for file in self.files:
+            with file.path.open("rb") as stream:
+                while piece := stream.read(1 << 20):
+                    digest.update(piece)
+        return digest.hexdigest()
 
     def source_of(self, block: Block) -> McapFile | WalTail:
         """Return the file, or the part of the write-ahead log, that holds a block."""

@@ -9,9 +9,11 @@ from __future__ import annotations
 import hashlib
 import re
 from dataclasses import dataclass, field
+from itertools import count, takewhile
 from pathlib import Path
 
-from ...common.errors import LogError, NotALogError, some_names
+from ...common.errors import InputFileError, LogError, NotALogError, some_names
+from ...common.remote import RemoteFile, RemotePath
 from ..mcap.file import McapFile
 from ..wal.writer import wal_folder
 
@@ -149,7 +151,8 @@ def check_chain(parts: PartFiles) -> list[str]:
 
 def _open_parts(found: PartFiles, first: Path, *, bare: bool) -> None:
     paths = {1: first}
-    if part_path(first, 2).exists() or not first.exists():
+    local = not isinstance(first, RemotePath)
+    if local and (part_path(first, 2).exists() or not first.exists()):
         paths |= _later(first)
     opened: dict[int, McapFile] = {}
     try:
@@ -189,12 +192,22 @@ def _open_all(
 
 def _later(first: Path) -> dict[int, Path]:
     """Return the files that have the name of a later part, by number."""
+    if isinstance(first, RemotePath):  # a folder can't be listed, the parts are asked for in turn
+        numbers = takewhile(lambda number: _is_there(part_path(first, number)), count(2))
+        return {number: part_path(first, number) for number in numbers}
     if not first.parent.is_dir():
         return {}
     try:
         return {split_part_path(path)[1]: path for path in later_parts(first)}
     except OSError as error:
         raise LogError(first, f"its folder can't be listed: {error.strerror}") from error
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return isinstance(path, RemotePath) and RemoteFile(path).size > 0
+    except InputFileError:
+        return False
 
 
 def _stranger(opened: dict[int, McapFile], number: int) -> str:

@@ -23,6 +23,7 @@ from mcap.opcode import Opcode
 
 from ...common.errors import DataError, LogError
 from ...common.process import threads_or_default
+from ...common.remote import as_path
 from ...following.session import faults_in_session
 from ..file.parts import check_chain
 from ..mcap.chunk import MAGIC, PREFIX_SIZE, Block, chunk_at, read_message_heads, walk_records
@@ -51,10 +52,10 @@ class Container:
     truncated: bool = False
 
 
-def check_container(path: Path) -> Container:
+def check_container(file: McapFile) -> Container:
     """Check all records of an MCAP file whose magic is right."""
     found = Container()
-    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+    with file.whole() as data:
         last, at, header_stop = 0, len(MAGIC), len(MAGIC)
         ended = False
         for opcode, start, stop in walk_records(data, at, len(data)):
@@ -160,7 +161,7 @@ def check_session(
         NotALogError: If it is not an MCAP file or nothing in it can be read.
         LogError: If it can't be opened.
     """
-    log = OpenLog(Path(path), None, threads_or_default(None))
+    log = OpenLog(as_path(path), None, threads_or_default(None))
     try:
         return _Check(log).run(on_part or (lambda _: None))
     finally:
@@ -259,7 +260,7 @@ class _Check:
     def _read_file(self, part: int, file: McapFile, step: Callable[[], None]) -> FileHealth:
         path = file.path
         blocks = [block for block in self._file.blocks if block.part == part]
-        container = check_container(path)
+        container = check_container(file)
         loose = [block for block in blocks if block.complete]
         indexed = not container.truncated and all(b.index_at for b in loose if b.end_ns)
         skipped = [note for note in file.warnings if note.startswith("the record at byte")]

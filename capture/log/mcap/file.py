@@ -34,6 +34,7 @@ from mcap.records import (
 from ...common.arrays import IntArray, frozen
 from ...common.errors import LogError, NotALogError
 from .chunk import MAGIC, PREFIX_SIZE, Block, Buffer, chunk_at, next_chunk, walk_records
+from .fetched import FetchedFile
 from .payloads import McapPayloads
 
 _Record = TypeVar("_Record")
@@ -41,6 +42,8 @@ _Record = TypeVar("_Record")
 
 _FOOTER_SIZE = 1 + 8 + 20
 _CHUNK_INDEX = struct.Struct("<16xQQI")  # after the times: the chunk's place and length, offsets
+_INDEX_END = struct.Struct("<QI")  # behind the offsets: sizes of the indexes and of a name,
+_SIZES = struct.Struct("<QQ")  # the compression's; behind it: of the payload, stored and not
 _INDEX_OFFSET = struct.Struct("<HQ")  # channel, place of its message index
 
 
@@ -99,11 +102,13 @@ class _Summary:
         """Return the first byte of the summary and of the footer."""
         buffer = self._buffer
         footer = len(buffer) - len(MAGIC) - _FOOTER_SIZE
+        self._file.need(max(footer, 0), len(buffer))
         if footer < len(MAGIC) or buffer[-len(MAGIC) :] != MAGIC or buffer[footer] != Opcode.FOOTER:
             raise _NoSummaryError("the file is cut short (no footer)")
         (summary_start,) = struct.unpack_from("<Q", buffer, footer + PREFIX_SIZE)
         if not len(MAGIC) <= summary_start < footer:
             raise _NoSummaryError("the file has no summary")
+        self._file.need(summary_start, footer)
         return summary_start, footer
 
     def _block(self, start: int, stop: int) -> Block:
@@ -117,8 +122,30 @@ class _Summary:
             raise LogError(path, "a chunk index is damaged")
         if not len(MAGIC) <= at <= at + length <= len(buffer):
             raise LogError(path, f"a chunk index points to byte {at}, outside the file")
-        block = _chunk_at(self._file, at + PREFIX_SIZE, at + length)
+        if self._file.remote is None:
+            block = _chunk_at(self._file, at + PREFIX_SIZE, at + length)
+        else:
+            block = self._indexed_only(self._file.remote, start, entries_at + size, stop)
         block.index_at = dict(_INDEX_OFFSET.iter_unpack(buffer[entries_at : entries_at + size]))
+        return block
+
+    def _indexed_only(self, remote: FetchedFile, start: int, at: int, stop: int) -> Block:
+        """Return the block of a chunk that isn't here; its CRC is read with it."""
+        buffer, error = self._buffer, LogError(self._file.path, "a chunk index is cut short")
+        if at + _INDEX_END.size > stop:
+            raise error
+        indexes, name_size = _INDEX_END.unpack_from(buffer, at)
+        name_at = at + _INDEX_END.size
+        if name_at + name_size + _SIZES.size > stop:
+            raise error
+        name = buffer[name_at : name_at + name_size].decode("ascii", "replace")
+        stored, size = _SIZES.unpack_from(buffer, name_at + name_size)
+        begin, end, record_at, length = struct.unpack_from("<4Q", buffer, start)
+        first, last = record_at + length - stored, record_at + length
+        block = Block(first, last, name, size, 0, begin, end, record_at=record_at)
+        if stored > length or last + indexes > len(buffer):
+            raise LogError(self._file.path, "a chunk index is damaged")
+        remote.add(block, last + indexes)
         return block
 
     def _check_places(self, summary_start: int) -> None:
@@ -138,6 +165,11 @@ class _Summary:
         """Return the range of an indexed record's body, which begins at ``before`` or later."""
         if offset < before:
             raise LogError(self._file.path, f"indexes overlap at byte {offset}")
+        self._file.need(offset, offset + PREFIX_SIZE)
+        if self._file.remote is not None and offset + PREFIX_SIZE <= len(self._buffer):
+            (length,) = struct.unpack_from("<Q", self._buffer, offset + 1)
+            if length <= len(self._buffer):
+                self._file.need(offset, offset + PREFIX_SIZE + length)
         for _, start, stop in walk_records(self._buffer, offset, len(self._buffer)):
             return start, stop
         raise LogError(self._file.path, f"an index points to byte {offset}, where no record is")
@@ -155,6 +187,7 @@ class _Scan:
     def read(self) -> None:
         """Read from the first record to the last whole one."""
         file, buffer, end = self._file, self._file.buffer, len(self._file.buffer)
+        file.need(0, end)
         former = at = len(MAGIC)
         while at + PREFIX_SIZE <= end:
             opcode = buffer[at]
@@ -371,7 +404,8 @@ class McapFile(McapPayloads):
         """
         if block.offsets is not None or not block.index_at:
             return [self.offsets(block, channel_id) for channel_id in channel_ids]
-        buffer, end = self.buffer, len(self.buffer)
+        buffer, base = self.around(block)
+        end = len(buffer)
         head_size = _INDEX_HEAD.size
         found: list[IntArray] = []
         for channel_id in channel_ids:
@@ -379,6 +413,7 @@ class McapFile(McapPayloads):
             if at is None:
                 found.append(_NO_OFFSETS)
                 continue
+            at -= base
             if at + head_size > end:
                 raise LogError(self.path, f"an index points to byte {at}, where no record is")
             opcode, length, found_id, size = _INDEX_HEAD.unpack_from(buffer, at)

@@ -2,73 +2,32 @@
 
 from __future__ import annotations
 
-import itertools
 import mmap
 import os
-import threading
 import weakref
 import zlib
-from collections import OrderedDict, deque
-from contextlib import suppress
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import zstandard
 
-from ...common.errors import LogError, NotALogError
+from ...common.errors import InputFileError, LogError, NotALogError
+from ...common.remote import RemotePath
+from .cache import cache
 from .chunk import Block, Buffer, checks_itself, inflate, inflate_zstd_into, read_at
+from .fetched import FetchedFile
 
-_CACHE_SIZE = 64 << 20
 _CORRUPT = "is corrupt (its CRC doesn't fit)"
 
 
-class _Cache:
-    """Payloads that were decompressed last, of all open files together.
+class McapPayloads:
+    """A memory-mapped MCAP file and the payloads of its blocks.
 
     Attributes:
-        abandoned: Files that nothing refers to. The garbage collector adds to it at any moment,
-            also while the lock is held, so it must not take the lock.
+        buffer: The file; of one on a server, a file of its size that holds what was needed.
+        remote: What was fetched of a file on a server; None for a local file.
     """
-
-    def __init__(self) -> None:
-        self._held: OrderedDict[tuple[int, int], bytes] = OrderedDict()
-        self._size = 0
-        self._lock = threading.Lock()
-        self.owners = itertools.count()
-        self.abandoned: deque[int] = deque()
-
-    def get(self, key: tuple[int, int]) -> bytes | None:
-        with self._lock:
-            data = self._held.get(key)
-            if data is not None:
-                self._held.move_to_end(key)
-            return data
-
-    def put(self, key: tuple[int, int], data: bytes) -> None:
-        """Keep a payload, unless it is larger than the cache."""
-        with suppress(IndexError):  # empty, perhaps since another thread was faster
-            while True:
-                self.drop(self.abandoned.popleft())
-        if len(data) > _CACHE_SIZE:
-            return
-        with self._lock:
-            self._size += len(data) - len(self._held.pop(key, b""))
-            self._held[key] = data
-            while self._size > _CACHE_SIZE:
-                _, dropped = self._held.popitem(last=False)
-                self._size -= len(dropped)
-
-    def drop(self, owner: int) -> None:
-        """Drop all payloads of one file."""
-        with self._lock:
-            for key in [key for key in self._held if key[0] == owner]:
-                self._size -= len(self._held.pop(key))
-
-
-_cache = _Cache()
-
-
-class McapPayloads:
-    """A memory-mapped MCAP file and the payloads of its blocks."""
 
     def __init__(self, path: Path) -> None:
         """Map a file.
@@ -76,24 +35,46 @@ class McapPayloads:
         Raises:
             NotALogError: If it is empty.
             LogError: If the operating system can't open it.
+            InputFileError: If it is on a server and can't be read.
         """
         self.path = path
-        self.buffer, descriptor = _mapped(path)
+        self._owner = next(cache.owners)
+        self.remote = FetchedFile(path, self._owner) if isinstance(path, RemotePath) else None
+        self.buffer, descriptor = _mapped(path) if self.remote is None else self.remote.mapped()
         self._close_descriptor = weakref.finalize(self, os.close, descriptor)
         self._descriptor = descriptor
-        self._owner = next(_cache.owners)
-        weakref.finalize(self, _cache.abandoned.append, self._owner)
+        weakref.finalize(self, cache.abandoned.append, self._owner)
 
     def close(self) -> None:
         """Release the mapping."""
-        _cache.drop(self._owner)
+        cache.drop(self._owner)
         with suppress(BufferError):  # the frames of an error still refer to it: it goes with them
             self.buffer.close()
         self._close_descriptor()
+        if self.remote is not None:
+            self.remote.close()
+
+    def need(self, start: int, stop: int) -> None:
+        """Fetch the bytes [start, stop) of a file on a server into the buffer, where they stay."""
+        if self.remote is not None:
+            self.remote.need(start, stop)
+
+    def around(self, block: Block) -> tuple[Buffer, int]:
+        """Return a buffer with a block and its message indexes, and its first byte's offset."""
+        return (self.buffer, 0) if self.remote is None else self.remote.around(block)
+
+    @contextmanager
+    def whole(self) -> Generator[mmap.mmap]:
+        """Map the whole file once more, so that its pages go when they have been read."""
+        self.need(0, len(self.buffer))
+        with mmap.mmap(self._descriptor, 0, access=mmap.ACCESS_READ) as data:
+            yield data
 
     def forget(self) -> None:
         """Release the file's pages and decompressed payloads; they are read again when needed."""
-        _cache.drop(self._owner)
+        if self.remote is not None:
+            return  # its cache is bounded, and fetching again is slow
+        cache.drop(self._owner)
         if hasattr(mmap, "MADV_DONTNEED"):  # mapped pages count as this process's memory
             self.buffer.madvise(mmap.MADV_DONTNEED)
 
@@ -107,12 +88,12 @@ class McapPayloads:
             LogError: If the payload can't be decompressed or its CRC is wrong.
         """
         if not block.compression:
-            return self.buffer, block.start, block.stop
+            return self._stored(block)
         key = self._owner, block.start
-        data = _cache.get(key)
+        data = cache.get(key)
         if data is None:
             data = self._decompress(block)
-            _cache.put(key, data)
+            cache.put(key, data)
         return data, 0, len(data)
 
     def payload_once(self, block: Block) -> tuple[Buffer, int, int]:
@@ -123,11 +104,12 @@ class McapPayloads:
         if block.compression:
             data = self._decompress(block)
             return data, 0, len(data)
+        data, start, stop = self._stored(block)
         if block.crc and block.complete:
-            with memoryview(self.buffer) as whole, whole[block.start : block.stop] as payload:
+            with memoryview(data) as whole, whole[start:stop] as payload:
                 if zlib.crc32(payload) != block.crc:
                     raise self._error(block, _CORRUPT)
-        return self.buffer, block.start, block.stop
+        return data, start, stop
 
     def inflates(self, block: Block, limit: int) -> bool:
         """Whether :meth:`inflate_into` can be used: a whole zstd chunk up to ``limit`` bytes."""
@@ -147,11 +129,13 @@ class McapPayloads:
             LogError: If it can't be decompressed or its CRC is wrong.
         """
         try:
-            with read_at(self._descriptor, block.start, block.stop) as raw:
+            with self._compressed(block) as raw:
                 size = inflate_zstd_into(raw, room)
                 checked = not block.crc or checks_itself(raw)
         except zstandard.ZstdError as error:
             raise self._error(block, f"can't be decompressed: {error}") from error
+        except InputFileError:  # of a server: no fault of the chunk
+            raise
         except OSError as error:
             raise self._error(block, f"can't be read: {error.strerror}") from error
         if size != block.size:
@@ -159,8 +143,20 @@ class McapPayloads:
         if not checked and zlib.crc32(room) != block.crc:
             raise self._error(block, _CORRUPT)
 
+    def _stored(self, block: Block) -> tuple[Buffer, int, int]:
+        """Return a buffer, and the first and one past the last stored byte of a block in it."""
+        data, base = self.around(block)
+        return data, block.start - base, block.stop - base
+
+    def _compressed(self, block: Block) -> memoryview:
+        if self.remote is None:
+            return read_at(self._descriptor, block.start, block.stop)
+        data, start, stop = self._stored(block)
+        return memoryview(data)[start:stop]
+
     def _decompress(self, block: Block) -> bytes:
-        raw = self.buffer[block.start : block.stop]
+        stored, start, stop = self._stored(block)
+        raw = bytes(stored[start:stop])
         try:
             data = inflate(block.compression, raw, block.size, whole=block.complete)
         except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:

@@ -262,7 +262,7 @@ class JointReader:
             MissingChannelError: If a topic never carries a field.
         """
         keys = [(topic, field) for topic, fields in wanted.items() for field in fields]
-        series = {key: self._series(*key, found[key[0]]) for key in keys}
+        series = {key: self._series(*key, found[key[0]], window_ns) for key in keys}
         times = {key: list(each.t_ns) for key, each in series.items()}
         for offset_topic in sorted({name for t, _ in keys if (name := self._offset_topic(t))}):
             own = [key for key in keys if self._offset_topic(key[0]) == offset_topic]
@@ -296,7 +296,7 @@ class JointReader:
         """Return the offsets of a topic from before the first stamp on; may be overwritten."""
         if topic in self._offsets:
             return _copied(self._offsets[topic])
-        offsets = self._series(topic, "position", found[topic])
+        offsets = self._series(topic, "position", found[topic], window_ns)
         first = min((int(t[0]) for each in stamped for t in each.t_ns if len(t)), default=0)
         known = all(len(t) and int(t[0]) <= first for t in offsets.t_ns)
         if known or window_ns[0] is None:
@@ -319,12 +319,16 @@ class JointReader:
                 if field not in UNITS:
                     raise DataError(f"a JointState has no {field!r}; it has {', '.join(UNITS)}")
 
-    def _series(self, topic: str, field: str, found: Messages) -> Series:
+    def _series(
+        self, topic: str, field: str, found: Messages, window_ns: Window = (None, None)
+    ) -> Series:
         """Return one field of a topic at message stamps on the log's clock."""
         rows = [rows_of(group, field) for group in found.groups]
         rows.extend(self._general_rows(topic, field, found))
         if rows and not any(row.values.size for row in rows):
-            raise MissingChannelError(self._path, f"{field} in {topic}", self._filled(topic))
+            raise MissingChannelError(
+                self._path, f"{field} in {topic}", self._filled(topic, window_ns)
+            )
         rows = [self._on_log_clock(row, topic) for row in rows]
         return Series(*merge_rows(rows, topic, field, self._warn))
 
@@ -376,9 +380,10 @@ class JointReader:
             self._warn(f"{topic}: {lost} messages can't be read: {found.unread[0].why}")
         return rows
 
-    def _filled(self, topic: str) -> list[str]:
-        """Return the fields that the topic has."""
-        found = self._topics.read({topic: list(UNITS)}, (None, None))[topic]
+    def _filled(self, topic: str, window_ns: Window) -> list[str]:
+        """Return the fields that the topic has in a window of sampling times."""
+        window_ns = widened(window_ns, SLACK_NS)
+        found = self._topics.read({topic: list(UNITS)}, window_ns)[topic]
         return [name for name in UNITS if any(name in group.paths for group in found.groups)]
 
     def _on_log_clock(self, row: JointRows, topic: str) -> JointRows:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...common.arrays import IntArray
-from ...common.errors import DataError, RobotFileError
-from ...robot.description import robot_in_session
+from ...common.errors import DataError, RobotFileError, UndulogError
+from ...common.remote import as_path
+from ...robot.description import load_robot, robot_in_session
 from ...robot.model import Robot
 from ...robot.run import RUN_RECORD, Run, run_from_record, run_from_scenario
 from ..columns.blocks import Window
@@ -20,6 +21,7 @@ from ..columns.layouts import Group
 from ..columns.topics import Topics
 from ..file.log_file import LogFile
 from ..messages.frames import FrameArray, join_batches
+from .joint_names import check_joints
 from .joint_states import JointReader
 from .sample_times import JointSignals, StampClock
 
@@ -35,24 +37,46 @@ class OpenLog:
         warnings: Missing or doubtful parts, one sentence each; grows while columns are read.
     """
 
-    def __init__(self, path: Path, column_folder: Path | None, threads: int) -> None:
+    def __init__(
+        self,
+        path: Path,
+        column_folder: Path | None,
+        threads: int,
+        robot: str | Path | None = None,
+    ) -> None:
         """Open a log; see :meth:`.Session.open`."""
-        self.path = path
+        self.path = path = as_path(path)
+        described = None if robot is None else load_robot(robot)
         self.file = LogFile(path, column_folder)
         self.warnings = list(self.file.warnings)
         self.topics = Topics(self.file, self._warn, threads=threads)
         self._clock = StampClock(self.topics, self._warn)
         self._joints = JointReader(path, self.topics, self._clock, self._warn)
+        self.robot_given = None if described is None else self._given(str(robot), described)
 
     @cached_property
     def robot(self) -> Robot | None:
-        """The robot whose description is attached, or None."""
+        """The robot whose description is attached, or was given for a log without one; or None."""
+        if self.robot_given is not None:
+            return self.robot_given[1]
         attached = {name: item.data for name, item in self.file.attachments.items()}
         try:
             return robot_in_session(attached, self.path)
         except RobotFileError as error:
             self._warn(f"the attached robot description can't be used: {error}")
             return None
+
+    def _given(self, name: str, robot: Robot) -> tuple[str, Robot] | None:
+        """Return a robot given for the log, as it was named, if the log has none of its own."""
+        if "robot.toml" in self.file.attachments:
+            self._warn(f"the log has a description of its robot; the one given, {name}, isn't used")
+            return None
+        try:
+            check_joints(self.path, self.topics, robot.joint_names, name)
+        except UndulogError:
+            self.file.close()
+            raise
+        return name, robot
 
     @cached_property
     def run(self) -> Run | None:

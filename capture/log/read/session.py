@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ...common.arrays import NS
 from ...common.errors import MissingChannelError
 from ...common.process import threads_or_default
+from ...common.remote import as_path
 from ...robot.model import Robot
 from ...robot.run import Run
 from ..columns.blocks import Window
@@ -46,6 +47,7 @@ class SessionView:
         window_ns: Window = (None, None),
         names: Mapping[str, str] = _NO_NAMES,
         on_read: Callable[[], None] = lambda: None,
+        limits_ns: tuple[int, int] | None = None,
     ) -> None:
         """Create a view of a log; :meth:`.Session.open` and :meth:`view` call this.
 
@@ -53,8 +55,9 @@ class SessionView:
             window_ns: Half-open time window [Unix ns]; None for open ends.
             names: Name of a topic in the view to its name in the log, if they differ.
             on_read: Called before each read.
+            limits_ns: Start and end that the view states; those of the window if None.
         """
-        self._log, self._window_ns = log, window_ns
+        self._log, self._window_ns, self._limits_ns = log, window_ns, limits_ns
         self._names, self._on_read = names, on_read
 
     def view(
@@ -96,6 +99,16 @@ class SessionView:
             on_read=on_read or self._on_read,
         )
 
+    def part(self, start_ns: int | None, stop_ns: int | None) -> SessionView:
+        """Return a view that reads a window [Unix ns]; its start and end stay those of this one."""
+        return SessionView(
+            self._log,
+            window_ns=self._within(start_ns, stop_ns),
+            names=self._names,
+            on_read=self._on_read,
+            limits_ns=(self.start_ns, self.end_ns),
+        )
+
     def forget(self) -> None:
         """Release memory of the data read so far, e.g. between parts of a long session.
 
@@ -130,6 +143,20 @@ class SessionView:
         return tuple(file.path for file in self._log.file.files)
 
     @property
+    def is_remote(self) -> bool:
+        """Whether it is on a server, so that each read costs time."""
+        return any(file.remote is not None for file in self._log.file.files)
+
+    @property
+    def size(self) -> int:
+        """Size of the files [byte]."""
+        return self._log.file.size
+
+    def fingerprint(self) -> str:
+        """Return the SHA-256 of the files; of those on a server, their ETags."""
+        return self._log.file.fingerprint()
+
+    @property
     def warnings(self) -> list[str]:
         """Missing or doubtful parts, one sentence each; grows while columns are read."""
         return list(self._log.warnings)
@@ -137,6 +164,8 @@ class SessionView:
     @property
     def start_ns(self) -> int:
         """Log time of the first message [Unix ns]; 0 without messages."""
+        if self._limits_ns is not None:
+            return self._limits_ns[0]
         start_ns = self._window_ns[0]
         first_ns = self._log.file.limits[0]
         return first_ns if start_ns is None else max(first_ns, start_ns)
@@ -144,6 +173,8 @@ class SessionView:
     @property
     def end_ns(self) -> int:
         """Log time of the last message [Unix ns], or the window's end; 0 without messages."""
+        if self._limits_ns is not None:
+            return self._limits_ns[1]
         stop_ns = self._window_ns[1]
         last_ns = self._log.file.limits[1]
         return last_ns if stop_ns is None else min(last_ns, stop_ns)
@@ -188,6 +219,12 @@ class SessionView:
     def robot(self) -> Robot | None:
         """The robot whose description is attached, or None."""
         return self._log.robot
+
+    @property
+    def robot_given(self) -> str | None:
+        """Name or file of the robot that was given for a log without one; None otherwise."""
+        given = self._log.robot_given
+        return None if given is None else given[0]
 
     @property
     def run(self) -> Run | None:
@@ -403,23 +440,37 @@ class Session(SessionView):
     """A recorded session, opened for reading: a view of the whole, which can be closed."""
 
     def __init__(
-        self, path: Path | str, *, threads: int | None = None, column_folder: Path | None = None
+        self,
+        path: Path | str,
+        *,
+        threads: int | None = None,
+        column_folder: Path | None = None,
+        robot: str | Path | None = None,
     ) -> None:
         """See :meth:`open`."""
-        super().__init__(OpenLog(Path(path), column_folder, threads_or_default(threads)))
+        number = threads_or_default(threads)
+        super().__init__(OpenLog(as_path(path), column_folder, number, robot))
 
     @classmethod
     def open(
-        cls, path: Path | str, *, threads: int | None = None, column_folder: Path | None = None
+        cls,
+        path: Path | str,
+        *,
+        threads: int | None = None,
+        column_folder: Path | None = None,
+        robot: str | Path | None = None,
     ) -> Self:
         """Open a session; the same as calling the class.
 
         Args:
-            path: The MCAP file; of a split session any part, or the folder that holds it.
+            path: The MCAP file, or its URL; of a split session any part, or the folder that holds
+                it.
             threads: Number of decompressing threads; None for one per core that this process may
                 use, at most four.
             column_folder: A folder on a disk for large columns, in files without names, so that
                 :meth:`forget` can release their memory (Linux). None for memory.
+            robot: Description of the robot of a log that has none, a name or a file; a log with
+                one keeps its own, with a warning.
 
         Returns:
             The session, usable in a ``with`` block.
@@ -427,9 +478,12 @@ class Session(SessionView):
         Raises:
             NotALogError: If it is not an MCAP file or nothing in it can be read.
             LogError: If it can't be opened.
-            UsageError: If ``threads`` is less than 1.
+            InputFileError: If it is a URL that can't be read.
+            UsageError: If ``threads`` is less than 1, or there is no such robot.
+            RobotFileError: If the description has faults.
+            JointSetError: If its joints aren't those of the log.
         """
-        return cls(path, threads=threads, column_folder=column_folder)
+        return cls(path, threads=threads, column_folder=column_folder, robot=robot)
 
     def close(self) -> None:
         """Release the file."""

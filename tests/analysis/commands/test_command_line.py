@@ -60,7 +60,7 @@ def test_a_bad_file_is_named_and_leaves_nothing_behind(verb, good, tmp_path, com
         (cut, "without any channel that could be read"),
     ):
         out, err = command(verb, good, bad, *output, code=1)
-        assert out == ""
+        assert out == "" or verb == "analyse"  # which prints a line for each file
         assert re.match(rf"error: {re.escape(str(bad))}: .*{why}", err)
         assert not page.exists()
 

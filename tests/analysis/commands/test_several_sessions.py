@@ -1,0 +1,89 @@
+"""``analyse``, ``report`` and dry runs of several sessions: a line and a page for each."""
+
+import json
+import shutil
+from html.parser import HTMLParser
+
+import pytest
+
+from support.paths import ROOT
+
+GOLDEN = ROOT / "tests/replay/golden/session.mcap"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A session, the same in a folder, and a file that is none."""
+    place = tmp_path_factory.mktemp("several")
+    (place / "sub").mkdir()
+    shutil.copy(GOLDEN, place / "a.mcap")
+    shutil.copy(GOLDEN, place / "sub/a.mcap")
+    (place / "bad.mcap").write_text("junk")
+    return place
+
+
+def test_analyse_of_a_folder_is_a_table_and_a_list_of_results(folder, tmp_path, command):
+    lines = command("analyse", folder, code=1).out.splitlines()
+    assert len(lines) == 4
+    assert " snake25 " in lines[1]
+    assert " Hz " in lines[1]
+    assert "unlike" in lines[1]
+    assert lines[2].startswith("bad.mcap")
+    output = tmp_path / "all.json"
+    found = json.loads(command("analyse", folder, "--json", "-o", output, code=1).out)
+    assert json.loads(output.read_text()) == found
+    alone = json.loads(command("analyse", folder / "a.mcap", "--json").out)
+    assert found[0] == alone
+    assert "not an MCAP file" in found[1]["error"]
+
+
+def test_named_files_are_one_experiment_unless_each_is_asked_for(folder, command):
+    files = folder / "a.mcap", folder / "sub/a.mcap"
+    assert command("analyse", *files).out.startswith("2 sessions: ")
+    assert command("analyse", *files, "--each").out.startswith("session ")
+
+
+def test_an_experiment_with_a_bad_file_fails_and_shows_which(folder, command):
+    shown = command("analyse", folder / "a.mcap", folder / "bad.mcap", code=1)
+    assert "not an MCAP file" in shown.err
+    assert [line.split()[0] for line in shown.out.splitlines()] == ["session", "a.mcap", "bad.mcap"]
+
+
+class Links(HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.found = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "a" and not dict(attrs)["href"].startswith("#"):
+            self.found.append(dict(attrs)["href"])
+
+
+def test_report_into_a_folder_writes_a_page_each_and_an_index(folder, tmp_path, command):
+    pages = tmp_path / "pages"
+    command("report", folder, "-o", pages, code=1)
+    assert sorted(page.name for page in pages.iterdir()) == ["a-2.html", "a.html", "index.html"]
+    index = (pages / "index.html").read_text()
+    assert Links(index).found == ["a.html", "a-2.html"]
+    assert "not an MCAP file" in index
+    assert "exists already" in command("report", folder, "-o", pages, code=2).err
+    alone = tmp_path / "alone.html"
+    command("report", folder / "a.mcap", "-o", alone)
+    assert (pages / "a.html").read_text() == alone.read_text()
+
+
+def test_one_session_needs_a_page_not_a_folder(folder, tmp_path, command):
+    assert (
+        "end its name in .html" in command("report", folder / "a.mcap", "-o", tmp_path, code=2).err
+    )
+
+
+def test_dry_runs_of_several_motions_are_a_table(folder, command):
+    words = ("--on", "can:virtual:x", "--duration", "0.1")
+    shown = command("drive", "flat", folder, "nothere.toml", *words, code=1).out.splitlines()
+    assert [line.split()[0].rpartition("/")[2] for line in shown] == [
+        *("session", "flat", "a.mcap", "bad.mcap", "a.mcap", "nothere.toml")
+    ]
+    assert "would run" in shown[1]
+    assert "without --arm" in command("drive", "flat", "twist", "--arm", *words, code=2).err

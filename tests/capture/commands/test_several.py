@@ -1,0 +1,73 @@
+"""Several logs in one command: what is found in folders and patterns, and the table."""
+
+import shutil
+
+import pytest
+
+from support.paths import ROOT
+from undulog.capture.commands.several import first_sentence, sessions_of
+
+GOLDEN = ROOT / "tests/replay/golden/session.mcap"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two sessions, one of them in a folder, a file that is none, and what is no session's."""
+    (tmp_path / "sub").mkdir()
+    (tmp_path / ".hidden").mkdir()
+    for place in ("a.mcap", "sub/b.mcap", ".hidden/c.mcap"):
+        shutil.copy(GOLDEN, tmp_path / place)
+    (tmp_path / "bad.mcap").write_text("junk")
+    (tmp_path / "notes.txt").write_text("none")
+    return tmp_path
+
+
+def test_a_folder_and_a_pattern_name_the_sessions_in_them(folder):
+    every = [folder / "a.mcap", folder / "bad.mcap", folder / "sub/b.mcap"]
+    assert sessions_of([folder]) == every
+    assert sessions_of([folder / "**/*.mcap"]) == every
+    assert sessions_of([folder / "[ab].mcap", folder]) == every
+    assert sessions_of([folder / "none*.mcap"]) == [folder / "none*.mcap"]
+
+
+def test_a_folder_of_one_session_stays_what_was_named(folder):
+    assert sessions_of([folder / "sub"]) == [folder / "sub"]
+
+
+def test_a_file_with_a_pattern_in_its_name_is_that_file(folder):
+    odd = folder / "a[1].mcap"
+    shutil.copy(GOLDEN, odd)
+    assert sessions_of([odd]) == [odd]
+
+
+def test_a_rosbag2_folder_is_one_session(folder):
+    (folder / "sub/metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+    shutil.copy(GOLDEN, folder / "sub/b_1.mcap")
+    assert sessions_of([folder])[-1] == folder / "sub"
+
+
+@pytest.mark.parametrize("verb", ["info", "check"])
+def test_one_bad_file_stops_nobody(verb, folder, command):
+    lines = command("log", verb, folder, code=1).out.splitlines()
+    assert lines[0].split()[:4] == ["session", "robot", "gait", "verdict"]
+    good, bad, other = (line.split() for line in lines[1:])
+    assert (good[0], good[1], good[3]) == ("a.mcap", "snake25", "good")
+    assert (bad[0], bad[3]) == ("bad.mcap", "failed")
+    assert "not an MCAP file" in lines[2]
+    assert other[0] == "b.mcap"
+
+
+def test_json_is_a_list_of_what_each_alone_gives(folder, report_of):
+    good, bad, _ = report_of("log", "info", folder, code=1)
+    assert good == report_of("log", "info", folder / "a.mcap")
+    assert bad["path"] == str(folder / "bad.mcap")
+    assert "not an MCAP file" in bad["error"]
+
+
+def test_good_files_alone_end_well(folder, command):
+    command("log", "info", folder / "a.mcap", folder / "sub/b.mcap")
+
+
+def test_the_first_sentence_ends_at_a_full_stop_not_at_a_number():
+    assert first_sentence("It is 1.5 m long. It moves.") == "It is 1.5 m long."
+    assert first_sentence("one line\nanother") == "one line"
