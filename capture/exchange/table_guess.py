@@ -44,6 +44,7 @@ _UNIT_WORDS |= {"degree": "deg", "degrees": "deg", "radian": "rad", "radians": "
 _UNIT_WORDS |= {"sec": "s", "seconds": "s", "secs": "s", "n·m": "N m", "n*m": "N m"}
 _BY_LOWER = {name.lower(): name for name in UNITS} | _UNIT_WORDS
 _WRAPS = (2 * math.pi, 4 * math.pi, 360.0, 720.0)
+_PLURAL = {Quantity.VELOCITY: "velocities"}
 _USUAL_HZ = 100.0
 _LEAST_JUMP = 0.8  # of the period, between two samples
 
@@ -114,6 +115,7 @@ def guess_map(
     samples: dict[str, Block] = {}
     for role, table in tables.items():
         samples[role] = sample = table.sample()
+        left_out += table.left_out
         time = _time_column(table, sample)
         times[role] = (time, _time_unit(table, time, sample[time], units, said))
         for name in (name for name in table.columns if name != time):
@@ -272,7 +274,7 @@ def _columns(
 ) -> list[Column]:
     columns: list[Column] = []
     taken: dict[tuple[str, Quantity], str] = {}
-    assumed: dict[str, str] = {}
+    assumed: dict[Quantity, str] = {}
     single = _single_joint(samples, found, names)
     for role, name, meaning in found:
         quantity = meaning.quantity
@@ -295,7 +297,7 @@ def _columns(
             said.append(f"{name} jumps by {wrap:.6g} {unit}: taken as wrapping around, undone")
         columns.append(Column(name, joint, quantity, unit, wrap=wrap, table=role))
     said += [
-        f"{quantity}s taken as {unit}: no unit given (--unit {quantity}=UNIT overrides)"
+        f"{_PLURAL.get(quantity, f'{quantity}s')} taken as {unit}: no unit given (--unit {quantity}=UNIT overrides)"
         for quantity, unit in assumed.items()
     ]
     return columns

@@ -172,7 +172,8 @@ def import_tables(
         guess = guess_map(found.tables, joints, units or {})
         column_map, notes = guess.column_map, [*map_lines(guess.column_map), *guess.said]
         if guess.left_out:
-            notes.append(f"columns without a place left out: {some_names(guess.left_out, 20)}")
+            names = list(dict.fromkeys(name.partition("[")[0] for name in guess.left_out))
+            notes.append(f"columns without a place left out: {some_names(names, 20)}")
     notes += [f"file left out: {name}" for name in found.left_out]
     if write_map is not None:
         write_text(write_map, column_map.toml())

@@ -49,6 +49,7 @@ class TableFile:
             the file has one.
         delimiter: What stands between the cells of a text.
         form: ``wide``, ``long`` or ``headerless``, or the kind of file.
+        left_out: Arrays of the file that are no columns.
     """
 
     path: Path
@@ -56,6 +57,7 @@ class TableFile:
     read: Callable[[Sequence[str], str], Iterator[Block]]
     delimiter: str = ","
     form: str = "wide"
+    left_out: tuple[str, ...] = ()
 
     def sample(self) -> Block:
         """Return the first block of all columns."""
@@ -105,7 +107,9 @@ def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> Tab
         for at in range(0, rows, _ROWS):
             yield {name: columns[name][at : at + _ROWS] for name in names}
 
-    return TableFile(path, tuple(columns), read, form=form)
+    kept = {name.partition("[")[0] for name in columns}
+    left_out = tuple(name for name in arrays if name not in kept)
+    return TableFile(path, tuple(columns), read, form=form, left_out=left_out)
 
 
 def _npz(path: Path) -> dict[str, NDArray[Any]]:

@@ -2,7 +2,8 @@
 
 The file is a zip: ``*/data.pkl`` names tensors by storage, shape and stride, ``*/data/KEY`` holds
 the raw numbers. The pickle's opcodes are followed by a small machine of its own, which knows
-dictionaries, lists, numbers, texts and the rebuilding of tensors; anything else is refused.
+dictionaries, lists, numbers, texts and the rebuilding of tensors; what a pickle would call besides
+is not run: its result is an object without a value.
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ _TENSOR = ("torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_tensor")
 _PARAMETER = "torch._utils _rebuild_parameter"
 _ORDERED = "collections OrderedDict"
 _MARK = object()
+_NOT_RUN = object()
 _PUSHED = {
-    "NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "FLOAT",
+    "NONE", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "FLOAT",
     "BINFLOAT", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINSTRING",
     "SHORT_BINSTRING", "STRING", "LONG4",
 }  # fmt: skip
@@ -66,6 +68,8 @@ class _Tensor:
 def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
     """Return the tensors that a file's dictionary names; those of nested ones as ``outer.inner``.
 
+    What is no tensor of numbers has an array that holds None.
+
     Raises:
         ImportFormatError: If it is no such zip, or its pickle does more than name tensors.
     """
@@ -79,6 +83,8 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
             value = _Machine(path).run(archive.read(pickle))
             return {
                 name: _array(path, archive, root, order, tensor)
+                if tensor is not None
+                else np.array(None)
                 for name, tensor in _named(value).items()
             }
     except ImportFormatError:
@@ -136,10 +142,10 @@ class _Machine:
         elif name in _GET:
             stack.append(self._memo[int(argument)])
         elif name == "GLOBAL":
-            stack.append(self._known(str(argument)))
+            stack.append(_Global(str(argument)))
         elif name == "STACK_GLOBAL":
             member, module = stack.pop(), stack.pop()
-            stack.append(self._known(f"{module} {member}"))
+            stack.append(_Global(f"{module} {member}"))
         elif name == "TUPLE":
             stack.append(tuple(self._marked()))
         elif name in _TUPLES:
@@ -163,16 +169,6 @@ class _Machine:
         else:
             raise ImportFormatError(self._path, f"its pickle has {name}, which names no tensor")
 
-    def _known(self, name: str) -> _Global:
-        module, _, member = name.partition(" ")
-        if name in {*_TENSOR, _PARAMETER, _ORDERED} or (module == "torch" and member in _DTYPES):
-            return _Global(name)
-        raise ImportFormatError(
-            self._path,
-            f"its pickle calls {name.replace(' ', '.')!r}, which is not run; save a dictionary of "
-            "tensors alone",
-        )
-
     def _marked(self) -> list[Any]:
         at = max(i for i, item in enumerate(self._stack) if item is _MARK)
         items = self._stack[at + 1 :]
@@ -183,7 +179,8 @@ class _Machine:
         kind, storage, key = words[0], words[1], words[2]
         if kind != "storage" or not isinstance(storage, _Global):
             raise ImportFormatError(self._path, "its pickle names something else than storages")
-        return _Storage(_DTYPES[storage.name.removeprefix("torch ")], str(key))
+        dtype = _DTYPES.get(storage.name.removeprefix("torch "), "")
+        return _Storage(dtype, str(key))
 
     def _rebuilt(self, function: Any, arguments: Any) -> object:
         name = function.name if isinstance(function, _Global) else ""
@@ -192,17 +189,17 @@ class _Machine:
         if name == _PARAMETER:
             return arguments[0]
         if name not in _TENSOR or not isinstance(arguments[0], _Storage):
-            raise ImportFormatError(self._path, "its pickle calls something else than tensors")
+            return _NOT_RUN
         shape, stride = (tuple(map(int, numbers)) for numbers in arguments[2:4])
         return _Tensor(arguments[0], int(arguments[1]), shape, stride)
 
 
-def _named(value: object, prefix: str = "") -> dict[str, _Tensor]:
+def _named(value: object, prefix: str = "") -> dict[str, _Tensor | None]:
     if isinstance(value, _Tensor):
-        return {prefix or "tensor": value}
+        return {prefix or "tensor": value if value.storage.dtype else None}
     if not isinstance(value, Mapping):
-        return {}
-    found: dict[str, _Tensor] = {}
+        return {prefix: None}
+    found: dict[str, _Tensor | None] = {}
     for key, inner in cast("Mapping[object, object]", value).items():
         found |= _named(inner, f"{prefix}.{key}" if prefix else str(key))
     return found
