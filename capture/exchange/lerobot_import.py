@@ -22,6 +22,7 @@ import numpy as np
 from ..common.arrays import NS
 from ..common.errors import ImportFormatError, LogError, UsageError, some_names
 from ..common.process import StopRequest
+from ..log.health.rules import TIMES_FROM_FPS
 from ..robot.bus_map import SESSION_UNIT
 from ..robot.description import numbered
 from ..robot.model import Quantity, Robot
@@ -29,9 +30,6 @@ from .can_import import ImportReport, file_digest
 from .column_map import STATES, Column, ColumnMap
 from .table_import import TableSet, import_tables
 from .tables import Block, TableFile, arrow, vectors_of
-
-TIMES_FROM_FPS = "import.times_from_fps"
-"""Metadata key: the frame rate [1/s] that the times were made from."""
 
 _FEATURES = {"action": Quantity.COMMAND, "observation.state": Quantity.POSITION}
 _MOST_INFO = 1 << 24  # bytes

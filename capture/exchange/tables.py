@@ -329,7 +329,7 @@ def _read_text(
             path, sep=r"\s+" if delimiter == " " else delimiter, decimal=decimal, names=raw,
             header=None, skiprows=skipped, usecols=wanted, dtype=cast("Any", texts),
             chunksize=_ROWS, skipinitialspace=True, encoding="utf-8-sig", index_col=False,
-            float_precision="round_trip", low_memory=False, on_bad_lines="error",
+            low_memory=False, on_bad_lines="error",
         ) as chunks:  # fmt: skip
             for chunk in cast("Iterator[pd.DataFrame]", chunks):
                 yield _text_block(path, chunk, vectors, skipped, names)
