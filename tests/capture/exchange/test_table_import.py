@@ -13,7 +13,6 @@ import pytest
 from scipy.io import savemat
 
 from support.paths import ARCSNAKE, SHARED
-from undulog import main
 from undulog.capture import Session
 from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.column_map import read_column_map
@@ -110,24 +109,22 @@ def test_vectors_in_cells_of_two_files_with_own_clocks(tmp_path):
     np.testing.assert_array_equal(stamps[0], np.rint(late * 1e9))
 
 
-def test_a_map_is_written_edited_and_given_back(tmp_path, capsys):
+def test_a_map_is_written_edited_and_given_back(tmp_path, command):
     frame().to_csv(tmp_path / "log.csv", index=False)
-    line = ["import", str(tmp_path / "log.csv"), "-o", str(tmp_path / "run.mcap"), "--write-map"]
+    line = ["import", tmp_path / "log.csv", "-o", tmp_path / "run.mcap"]
     path = tmp_path / "map.toml"
-    assert main([*line, str(path), "--unit", "position=deg"]) == 0
+    command(*line, "--write-map", path, "--unit", "position=deg")
     np.testing.assert_allclose(joints(tmp_path)[1], np.radians(Q))
-    assert main([*line, str(path), "--force"]) == 0  # nothing is replaced silently
-    edited = path.read_text().replace("joint1", "head").replace('unit = "rad"', 'unit = "mrad"')
-    path.write_text(edited)
-    assert {column.joint for column in read_column_map(path, None).columns} >= {"head"}
-    assert main([*line[:4], "--columns", str(path), "--force"]) == 0
+    command(*line, "--write-map", path, "--force")
+    edited = path.read_text().replace('joint = "joint1"', 'joint = "head"')
+    path.write_text(edited.replace('unit = "rad"', 'unit = "mrad"'))
+    command(*line, "--columns", path, "--force")
     names, values, _ = joints(tmp_path)
     assert names == ("head", "joint2", "joint3")
     np.testing.assert_allclose(values, Q * 1e-3)
-    assert main([*line[:4], "--write-map", str(path), "--force", "--json"]) == 0
-    capsys.readouterr()
-    assert main([*line[:3], str(tmp_path / "new.mcap"), "--write-map", str(path)]) == 2
-    assert "exists already" in capsys.readouterr().err
+    other = ["import", tmp_path / "log.csv", "-o", tmp_path / "new.mcap", "--write-map", path]
+    assert "exists already" in command(*other, code=2).err
+    assert not (tmp_path / "new.mcap").exists()
 
 
 def test_a_wrapped_angle_is_unwrapped_over_blocks(tmp_path):
@@ -179,7 +176,8 @@ def test_a_mat_of_version_7_3_is_named(tmp_path):
 
 
 def test_a_huge_declared_shape_is_refused(tmp_path):
-    head = b"\x93NUMPY\x01\x00v\x00" + b"{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999,), }"
+    shape = b"{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999,), }"
+    head = b"\x93NUMPY\x01\x00v\x00" + shape
     with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
         archive.writestr("time.npy", head.ljust(127) + b"\n" + bytes(80))
     with pytest.raises(ImportFormatError, match="more than it holds"):
@@ -225,10 +223,9 @@ def test_the_tensors_of_a_quadruped(tmp_path):
 
 
 @pytest.mark.skipif(not ARCSNAKE.exists(), reason=f"the ArcSnake data are not at {ARCSNAKE}")
-def test_the_joint_of_a_screw_snake_has_no_commands(tmp_path, capsys):
+def test_the_joint_of_a_screw_snake_has_no_commands(tmp_path, command):
     imported(ARCSNAKE / "joint7_no_load.csv", tmp_path)
     raw = np.genfromtxt(ARCSNAKE / "joint7_no_load.csv", delimiter=",", names=True)
     turns = (joints(tmp_path)[1][:, 0] - raw["s_pos"]) / (4 * np.pi)
     np.testing.assert_allclose(turns, np.rint(turns), atol=1e-9)
-    main(["analyse", str(tmp_path / "run.mcap")])
-    assert "No command logged" in capsys.readouterr().out
+    assert "No command logged" in command("analyse", tmp_path / "run.mcap").out
