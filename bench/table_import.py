@@ -15,16 +15,19 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
+import pyarrow
 from measuring import arguments, verdict
-from pyarrow import parquet
+from pyarrow import parquet as arrow_parquet
 
 from undulog.capture.exchange.lerobot_import import import_lerobot
 from undulog.capture.exchange.table_import import import_tables, open_tables
 
+pa: Any = pyarrow  # its types are incomplete
+parquet: Any = arrow_parquet
 JOINTS = 25
 BAR = 4.0
 

@@ -148,7 +148,8 @@ def read_columns(
             spare = [one for one in others if one not in (command_topic, response_topic)]
             named = f" (other JointStates: {', '.join(spare)}; choose with {option})"
             logged = "no command logged: " if key == "command" else ""
-            warn(Lacking(f"{logged}no {kind} on {topic}: gain and lag are null{named if spare else ''}"))
+            nulls = f"gain and lag are null{named if spare else ''}"
+            warn(Lacking(f"{logged}no {kind} on {topic}: {nulls}"))
     accumulated = PowerTopic.MECHANICAL in found and PowerTopic.MECHANICAL_PLUS in found
     if not accumulated and ("velocity" not in found or "effort" not in found):
         lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)

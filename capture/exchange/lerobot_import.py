@@ -89,9 +89,7 @@ def open_lerobot(folder: Path) -> LeRobotDataset:
         info = json.loads(path.read_text(encoding="utf-8"))
         features = cast("dict[str, Any]", info["features"])
         fps = float(info["fps"])
-        names = {
-            name: _element_names(features[name]) for name in _FEATURES if name in features
-        }
+        names = {name: _element_names(features[name]) for name in _FEATURES if name in features}
         version, kind = str(info.get("codebase_version", "")), str(info.get("robot_type") or "")
         others = tuple(n for n in features if n not in _FEATURES and n not in _KNOWN)
     except LogError:
@@ -112,7 +110,7 @@ def _element_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     if not 1 <= count <= _MOST_JOINTS:
         raise ValueError(f"a feature of {count} elements")
     names: Any = feature.get("names")
-    while isinstance(names, Mapping) or (isinstance(names, list) and len(names) == 1 < count):
+    while isinstance(names, Mapping) or (isinstance(names, list) and _count(names) == 1 < count):
         mapping = cast("Any", names)
         names = next(iter(mapping.values())) if isinstance(names, Mapping) else mapping[0]
     if not isinstance(names, list) or len(cast("list[Any]", names)) != count:
@@ -123,6 +121,10 @@ def _element_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     ]
     plain = [name if name[:1].isalpha() else f"joint_{name}" for name in plain]
     return tuple(plain) if len(set(plain)) == count else tuple(numbered("joint", count))
+
+
+def _count(names: Any) -> int:
+    return len(names)
 
 
 def _column(parquet: Any, path: Path, name: str) -> Any:
@@ -194,9 +196,7 @@ def _map(dataset: LeRobotDataset, units: Mapping[str, str]) -> tuple[ColumnMap, 
             notes.append(
                 f"{feature} taken as {unit}: no unit given (--unit {quantity}=UNIT overrides)"
             )
-        columns += [
-            Column(f"{feature}[{i}]", name, quantity, unit) for i, name in enumerate(names)
-        ]
+        columns += [Column(f"{feature}[{i}]", name, quantity, unit) for i, name in enumerate(names)]
     if dataset.left_out:
         notes.append(f"features without a place left out: {some_names(dataset.left_out, 10)}")
     return ColumnMap("time", "ns", tuple(columns)), notes

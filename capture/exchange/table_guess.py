@@ -24,10 +24,10 @@ from ..robot.model import Quantity
 from .column_map import COMMANDS, STATES, Column, ColumnMap
 from .tables import Block, TableFile, is_time, words
 
-_COMMAND = set(
-    "cmd cmds command commands commanded des desired target targets goal ref reference setpoint "
-    "action actions control output".split()
-)
+_COMMAND = {
+    "cmd", "cmds", "command", "commands", "commanded", "des", "desired", "target", "targets",
+    "goal", "ref", "reference", "setpoint", "action", "actions", "control", "output",
+}  # fmt: skip
 _WORDS = {
     Quantity.POSITION: "pos position positions angle angles q qpos theta encoder state states",
     Quantity.VELOCITY: "vel velocity velocities speed speeds qvel dq qd rate",
@@ -37,11 +37,15 @@ _WORDS = {
     Quantity.TEMPERATURE: "temp temperature temperatures",
 }
 _QUANTITY = {word: quantity for quantity, text in _WORDS.items() for word in text.split()}
-_FILLERS = {"dof", "joint", "joints", "measured", "actual", "observation", "feedback", "present"}
-_FILLERS |= {"meas", "motor", "motors", "value", "values", "column"}
-_UNIT_WORDS = {"rads": "rad/s", "degs": "deg/s", "nm": "N m", "c": "degC", "celsius": "degC"}
-_UNIT_WORDS |= {"degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad", "°": "deg"}
-_UNIT_WORDS |= {"sec": "s", "seconds": "s", "secs": "s", "n·m": "N m", "n*m": "N m"}
+_FILLERS = {
+    "dof", "joint", "joints", "measured", "actual", "observation", "feedback", "present", "meas",
+    "motor", "motors", "value", "values", "column",
+}  # fmt: skip
+_UNIT_WORDS = {
+    "rads": "rad/s", "degs": "deg/s", "nm": "N m", "n·m": "N m", "n*m": "N m", "c": "degC",
+    "celsius": "degC", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad",
+    "°": "deg", "sec": "s", "seconds": "s", "secs": "s",
+}  # fmt: skip
 _BY_LOWER = {name.lower(): name for name in UNITS} | _UNIT_WORDS
 _WRAPS = (2 * math.pi, 4 * math.pi, 360.0, 720.0)
 _PLURAL = {Quantity.VELOCITY: "velocities"}
@@ -264,7 +268,7 @@ def _joint_names(
     return numbered("joint", count)
 
 
-def _columns(
+def _columns(  # noqa: PLR0917 - each is filled or read here
     found: Sequence[tuple[str, str, _Name]],
     names: Sequence[str],
     units: Mapping[str, str],

@@ -279,7 +279,9 @@ class _Source:
             raise ImportFormatError(self.table.path, "has no rows")
         return int(self._times(block[self._time][:1])[0])
 
-    def messages(self, writer: SessionWriter, offset: int, report: ImportReport) -> Iterator[Message]:
+    def messages(
+        self, writer: SessionWriter, offset: int, report: ImportReport
+    ) -> Iterator[Message]:
         """Yield the messages in order of time."""
         found = {(column.joint, column.quantity): column for column in self.columns}
         topics = [

@@ -95,7 +95,7 @@ def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> Tab
     rows = max(vectors or lengths, key=lambda n: (lengths.count(n), n))
     columns: Block = {}
     for name, each in plain.items():
-        upright = each.T if each.ndim == 2 and each.shape[0] != rows else each  # noqa: PLR2004
+        upright = each.T if each.ndim == 2 and each.shape[0] != rows else each
         if upright.shape[0] != rows or math.prod(upright.shape[1:]) > _WIDEST:
             continue
         if upright.ndim == 1:
@@ -150,7 +150,7 @@ def _mat(path: Path) -> dict[str, NDArray[Any]]:
     try:
         with path.open("rb") as stream:
             start = stream.read(128)
-        if start.startswith(b"MATLAB 7.3") or start.startswith(b"\x89HDF"):
+        if start.startswith((b"MATLAB 7.3", b"\x89HDF")):
             raise ImportFormatError(
                 path, "is a .mat of version 7.3 (HDF5), which is not supported; save with -v7"
             )
@@ -160,7 +160,7 @@ def _mat(path: Path) -> dict[str, NDArray[Any]]:
             raise ImportFormatError(path, f"declares {size} bytes of arrays; {MOST_BYTES} at most")
         numeric = ("double", "single", "logical", "int", "uint")
         names = [name for name, _, kind in listed if kind.startswith(numeric)]
-        found = cast("dict[str, Any]", loadmat(path, variable_names=names)) if names else {}
+        found = loadmat(path, variable_names=names) if names else {}
     except ImportFormatError:
         raise
     except Exception as error:  # scipy raises whatever a damaged file leads to
@@ -265,7 +265,7 @@ def _open_text(path: Path) -> TableFile:
     data = rows if headerless else rows[1:]
     decimal = "," if delimiter != "," and any("," in c and _decimal(c) for c in data[-1]) else "."
     vectors = {
-        name: len(_vector(cell))
+        name: _width(path, cell)
         for name, cell in zip(raw, (data or [[]])[0], strict=False)
         if cell.strip().startswith(("[", "("))
     }
@@ -277,6 +277,13 @@ def _open_text(path: Path) -> TableFile:
     read = partial(_read_text, path, raw, vectors, delimiter, decimal, skipped)
     table = TableFile(path, columns, read, delimiter, "headerless" if headerless else "wide")
     return _pivoted(table) or table
+
+
+def _width(path: Path, cell: str) -> int:
+    try:
+        return len(_vector(cell))
+    except ValueError as error:
+        raise ImportFormatError(path, f"{cell[:40]!r} is no vector of numbers") from error
 
 
 def _decimal(cell: str) -> bool:
@@ -312,7 +319,7 @@ def _sniffed(path: Path, lines: list[str]) -> tuple[str, list[list[str]]]:
     )
 
 
-def _read_text(
+def _read_text(  # noqa: PLR0917 - bound once, where the file was sniffed
     path: Path,
     raw: list[str],
     vectors: Mapping[str, int],
@@ -347,7 +354,7 @@ def _text_block(
         if name not in vectors:
             block[name] = chunk[name].to_numpy()
             continue
-        cells = cast("list[Any]", chunk[name].tolist())
+        cells = chunk[name].tolist()
         try:
             rows = _vectors(cells, vectors[name])
         except (ValueError, TypeError) as error:
@@ -383,7 +390,7 @@ def _pivoted(table: TableFile) -> TableFile | None:
     """Return a long table as a wide one: one whose rows each name their joint."""
     by_name = {name.lower(): name for name in table.columns}
     joint = next((by_name[name] for name in _JOINT_COLUMNS if name in by_name), None)
-    if joint is None or len(table.columns) < 3:  # noqa: PLR2004 - time, joint, value
+    if joint is None or len(table.columns) < 3:
         return None
     sample = table.sample()
     names = list(dict.fromkeys(map(str, sample[joint].tolist())))
@@ -441,4 +448,3 @@ def is_time(name: str) -> bool:
     """Return whether a column is named as times are."""
     found = words(re.sub(r"[\[(].*", "", name))
     return bool(found) and found[0] in _TIMES
-

@@ -36,9 +36,9 @@ _ORDERED = "collections OrderedDict"
 _MARK = object()
 _NOT_RUN = object()
 _PUSHED = {
-    "NONE", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "FLOAT",
-    "BINFLOAT", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINSTRING",
-    "SHORT_BINSTRING", "STRING", "LONG4",
+    "NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4",
+    "FLOAT", "BINFLOAT", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "STRING",
+    "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8",
 }  # fmt: skip
 _CONSTANT = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
 _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
@@ -209,7 +209,7 @@ def _array(
     path: Path, archive: zipfile.ZipFile, root: str, order: str, tensor: _Tensor
 ) -> NDArray[Any]:
     info = archive.getinfo(f"{root}data/{tensor.storage.key}")
-    dtype = np.dtype(tensor.storage.dtype).newbyteorder(order)
+    dtype = np.dtype(order + tensor.storage.dtype)
     last = tensor.offset + sum(
         (count - 1) * step for count, step in zip(tensor.shape, tensor.stride, strict=True)
     )

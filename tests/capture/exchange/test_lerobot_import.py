@@ -44,7 +44,11 @@ def dataset(folder, version):
     feature = {"dtype": "float32", "shape": [2], "names": JOINTS}
     info = {"codebase_version": version, "fps": FPS, "robot_type": "so101_follower"}
     video = {"dtype": "video", "shape": [480, 640, 3], "names": None}
-    info["features"] = {"action": feature, "observation.state": feature, "observation.images": video}
+    info["features"] = {
+        "action": feature,
+        "observation.state": feature,
+        "observation.images": video,
+    }
     data = folder / "data" / "chunk-000"
     for path in (data, folder / "meta"):
         path.mkdir(parents=True)

@@ -15,7 +15,6 @@ from scipy.io import savemat
 from support.paths import ARCSNAKE, SHARED
 from undulog.capture import Session
 from undulog.capture.common.errors import ImportFormatError
-from undulog.capture.exchange.column_map import read_column_map
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 from undulog.capture.exchange.table_import import import_tables, open_tables
 from undulog.capture.exchange.torch_zip import read_tensors
@@ -34,9 +33,11 @@ def imported(source, tmp_path, *, commands=None, **options):
 def joints(tmp_path, topic="/joint_states", field="position"):
     with Session.open(tmp_path / "run.mcap") as session:
         found = session.joints(topic, field)
-        return found.names, np.array([found.signal(n).values for n in found.names]).T, [
-            found.signal(n).t_ns - RELATIVE_EPOCH_NS for n in found.names
-        ]
+        return (
+            found.names,
+            np.array([found.signal(n).values for n in found.names]).T,
+            [found.signal(n).t_ns - RELATIVE_EPOCH_NS for n in found.names],
+        )
 
 
 def frame():
@@ -78,9 +79,7 @@ def test_commas_as_decimal_points(tmp_path):
 
 
 def test_a_long_table_becomes_a_wide_one(tmp_path):
-    rows = [
-        (t, f"j{k}", Q[i, k], C[i, k]) for i, t in enumerate(T.tolist()) for k in range(3)
-    ]
+    rows = [(t, f"j{k}", Q[i, k], C[i, k]) for i, t in enumerate(T.tolist()) for k in range(3)]
     with (tmp_path / "log.csv").open("w", newline="") as stream:
         csv.writer(stream).writerows([("time", "joint", "angle (rad)", "target (rad)"), *rows])
     imported(tmp_path / "log.csv", tmp_path)
