@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow
+import pyarrow as pa
 from measuring import arguments, verdict
 from pyarrow import parquet as arrow_parquet
 
 from undulog.capture.exchange.lerobot_import import import_lerobot
 from undulog.capture.exchange.table_import import import_tables, open_tables
 
-pa: Any = pyarrow  # its types are incomplete
+arrow: Any = pa  # its types are incomplete
 parquet: Any = arrow_parquet
 JOINTS = 25
 BAR = 4.0
@@ -53,9 +53,9 @@ def write_dataset(folder: Path, rows: int) -> Path:
     info = {"codebase_version": "v3.0", "fps": 30, "features": features}
     (meta / "info.json").write_text(json.dumps(info))
     values = np.sin(np.arange(rows * JOINTS) * 0.01).astype(np.float32)
-    vectors = pa.FixedSizeListArray.from_arrays(pa.array(values), JOINTS)
+    vectors = arrow.FixedSizeListArray.from_arrays(arrow.array(values), JOINTS)
     frames = {"action": vectors, "observation.state": vectors, "frame_index": np.arange(rows)}
-    table = pa.table(frames | {"episode_index": np.zeros(rows, dtype=np.int64)})
+    table = arrow.table(frames | {"episode_index": np.zeros(rows, dtype=np.int64)})
     parquet.write_table(table, data / "file-000.parquet")
     return data / "file-000.parquet"
 

@@ -30,6 +30,7 @@ from .can_import import ImportReport, file_digest
 from .column_map import STATES, Column, ColumnMap
 from .table_import import TableSet, import_tables
 from .tables import Block, TableFile, arrow, vectors_of
+from .torch_zip import refuse
 
 _FEATURES = {"action": Quantity.COMMAND, "observation.state": Quantity.POSITION}
 _MOST_INFO = 1 << 24  # bytes
@@ -240,9 +241,7 @@ def _frames(parquet: Any, path: Path, dataset: LeRobotDataset, number: int) -> B
         for name, names in dataset.names.items():
             vectors = vectors_of(table[name].combine_chunks())
             if vectors.shape != (len(frame), len(names)):
-                raise ImportFormatError(
-                    path, f"{name} has not {len(names)} elements in each frame, as info.json says"
-                )
+                refuse(path, f"{name} has not {len(names)} elements in each frame, as in info.json")
             block |= {f"{name}[{i}]": vectors[:, i] for i in range(len(names))}
     except LogError:
         raise

@@ -301,7 +301,8 @@ def _columns(  # noqa: PLR0917 - each is filled or read here
             said.append(f"{name} jumps by {wrap:.6g} {unit}: taken as wrapping around, undone")
         columns.append(Column(name, joint, quantity, unit, wrap=wrap, table=role))
     said += [
-        f"{_PLURAL.get(quantity, f'{quantity}s')} taken as {unit}: no unit given (--unit {quantity}=UNIT overrides)"
+        f"{_PLURAL.get(quantity, f'{quantity}s')} taken as {unit}: no unit given "
+        f"(--unit {quantity}=UNIT overrides)"
         for quantity, unit in assumed.items()
     ]
     return columns

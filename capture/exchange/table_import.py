@@ -7,6 +7,7 @@ import hashlib
 import heapq
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -271,12 +272,14 @@ class _Source:
         self._last_ns: int | None = None
         self._unwrapped: dict[str, tuple[float, float]] = {}
         self._missing: dict[str, int] = {}
+        self._blocks = table.read(self._wanted, self._time) if self.columns else iter(())
 
     def first_ns(self) -> int:
         """Return the time of the first row [ns]."""
-        block = next(iter(self.table.read(self._wanted, self._time)), None)
+        block = next(self._blocks, None)
         if block is None or not len(block[self._time]):
             raise ImportFormatError(self.table.path, "has no rows")
+        self._blocks = chain([block], self._blocks)
         return int(self._times(block[self._time][:1])[0])
 
     def messages(
@@ -288,7 +291,7 @@ class _Source:
             _Topic(writer, quantities, self.columns, report)
             for quantities in topics_of({quantity for _, quantity in found})
         ]
-        for block in self.table.read(self._wanted, self._time):
+        for block in self._blocks:
             t_ns = self._checked(self._times(block[self._time])) + offset
             values = {
                 (column.joint, column.quantity): self._converted(column, block[column.column])

@@ -25,7 +25,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError, MissingExtraError
-from .torch_zip import MOST_BYTES, read_tensors
+from .torch_zip import MOST_BYTES, read_tensors, refuse
 
 Block: TypeAlias = dict[str, NDArray[Any]]
 """Column to its cells, (n,): numbers, or texts where they are none."""
@@ -151,13 +151,11 @@ def _mat(path: Path) -> dict[str, NDArray[Any]]:
         with path.open("rb") as stream:
             start = stream.read(128)
         if start.startswith((b"MATLAB 7.3", b"\x89HDF")):
-            raise ImportFormatError(
-                path, "is a .mat of version 7.3 (HDF5), which is not supported; save with -v7"
-            )
+            refuse(path, "is a .mat of version 7.3 (HDF5), which is not supported; save with -v7")
         listed = whosmat(path)
         size = sum(8 * math.prod(shape) for _, shape, _ in listed)
         if size > MOST_BYTES:
-            raise ImportFormatError(path, f"declares {size} bytes of arrays; {MOST_BYTES} at most")
+            refuse(path, f"declares {size} bytes of arrays; {MOST_BYTES} at most")
         numeric = ("double", "single", "logical", "int", "uint")
         names = [name for name, _, kind in listed if kind.startswith(numeric)]
         found = loadmat(path, variable_names=names) if names else {}
@@ -187,7 +185,7 @@ def _open_parquet(path: Path) -> TableFile:
         file = parquet.ParquetFile(path)
         first = next(file.iter_batches(batch_size=_ROWS), None)
         if first is None:
-            raise ImportFormatError(path, "has no rows")
+            refuse(path, "has no rows")
         columns = tuple(_parquet_block(first))
         file.close()
     except ImportFormatError:

@@ -15,7 +15,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,11 @@ class _Tensor:
     stride: tuple[int, ...]
 
 
+def refuse(path: Path, why: str) -> NoReturn:
+    """Raise ImportFormatError."""
+    raise ImportFormatError(path, why)
+
+
 def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
     """Return the tensors that a file's dictionary names; those of nested ones as ``outer.inner``.
 
@@ -78,7 +83,7 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
             (pickle,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
             root = pickle.removesuffix("data.pkl")
             if archive.getinfo(pickle).file_size > MOST_BYTES // 64:
-                raise ImportFormatError(path, "its data.pkl is too large to name tensors only")
+                refuse(path, "its data.pkl is too large to name tensors only")
             order = _byte_order(archive, root)
             value = _Machine(path).run(archive.read(pickle))
             return {
