@@ -330,8 +330,8 @@ def _no_gait(known: list[Series], found: Groups | None, kind: str, duration_s: f
         return f"no gait: the {kind} never move; {nulls}"
     if found is None:
         return (
-            f"no gait: no rhythm of at least {MIN_CYCLES:g} cycles can be told from the {kind} in "
-            f"{duration_s:.3g} s; {nulls}"
+            f"no gait: not periodic: no rhythm of at least {MIN_CYCLES:g} cycles can be told from "
+            f"the {kind} in {duration_s:.3g} s; {nulls}"
         )
     frequencies = ", ".join(f"{one.omega / (2 * np.pi):.3g} Hz" for one in found.rhythms)
     one = len(found.rhythms) == 1

@@ -366,4 +366,6 @@ def _why_not(facts: Facts, lacking: str) -> str:
         return "The result gives no reason."
     verdict = [one for one in facts.warnings if lacking in one and "held still" not in one]
     about = [warning for warning in facts.warnings if "gait" in warning.lower()]
-    return formats.sentence((verdict or about or facts.warnings)[0])
+    made = [one for one in facts.warnings if one.startswith("times made from fps")]
+    chosen = (verdict or about or facts.warnings)[0]
+    return " ".join(formats.sentence(one) for one in dict.fromkeys([chosen, *made]))

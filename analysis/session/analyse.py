@@ -13,6 +13,7 @@ from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
+from undulog.capture.log.health.rules import judge_made_times
 from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
@@ -165,6 +166,8 @@ def measure_session(
     session = fetched_part(session, options, warn)
     topics = (options.command_topic, options.response_topic)
     columns = read_columns(session, *topics, warn, reference_topic=options.reference_topic)
+    for finding in judge_made_times(session.metadata.get("undulog", {})):
+        warn(finding.sentence)
     columns, left_out = without_breaks(session, columns, options, warn)
     session.forget()  # what each step has looked at need not stay in memory beside the next one's
     artefacts = find_artefacts(session, columns)

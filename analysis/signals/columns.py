@@ -147,7 +147,9 @@ def read_columns(
             option = "--command-topic" if key == "command" else "--response-topic"
             spare = [one for one in others if one not in (command_topic, response_topic)]
             named = f" (other JointStates: {', '.join(spare)}; choose with {option})"
-            warn(Lacking(f"no {kind} on {topic}: gain and lag are null{named if spare else ''}"))
+            logged = "no command logged: " if key == "command" else ""
+            nulls = f"gain and lag are null{named if spare else ''}"
+            warn(Lacking(f"{logged}no {kind} on {topic}: {nulls}"))
     accumulated = PowerTopic.MECHANICAL in found and PowerTopic.MECHANICAL_PLUS in found
     if not accumulated and ("velocity" not in found or "effort" not in found):
         lacking = " and ".join(key for key in ("effort", "velocity") if key not in found)

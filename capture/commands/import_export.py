@@ -14,7 +14,7 @@ from ..common.files import check_output, is_file
 
 if TYPE_CHECKING:
     from ..exchange.can_import import ImportReport
-    from ..exchange.csv_import import ColumnMap
+    from ..exchange.column_map import ColumnMap
     from ..robot.model import Robot
 
 
@@ -23,9 +23,13 @@ def import_log(
     /,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
-    robot: Annotated[str, Parameter(name=["--robot", "-r"])],
+    robot: Annotated[str | None, Parameter(name=["--robot", "-r"])] = None,
+    commands: Path | None = None,
     columns: Path | None = None,
     map_: Annotated[tuple[str, ...], Parameter(name="--map", show_default=False)] = (),
+    unit: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
+    write_map: Path | None = None,
+    episode: int | None = None,
     bus: str | None = None,
     force: bool = False,
     json: bool = False,
@@ -34,20 +38,31 @@ def import_log(
 
     CAN traces (candump .log, .asc, .blf, .trc, python-can .csv and .db, .mf4) keep every frame and
     its direction; the robot's bus map defines which of them are joint commands, states and sensor
-    values. Any other CSV needs a column map, as a file or as --map options.
+    values. Tables (CSV, .npz, .mat, .parquet, .pt), folders of them and LeRobot datasets need no
+    robot: what their columns mean is guessed and shown, or given by --columns or --map.
 
     Example: `undulog import trace.log -o run.mcap --robot arcsnake-joint`
 
-    A CSV: `undulog import joint.csv -o run.mcap --robot arcsnake-joint --map time=time:s
+    A table, with its commands in another: `undulog import states.csv --commands commands.csv
+    -o run.mcap --write-map map.toml`, then, edited: `--columns map.toml`
+
+    A LeRobot dataset, a session an episode: `undulog import DATASET -o sessions`
+
+    A CSV by options: `undulog import joint.csv -o run.mcap --robot arcsnake-joint --map time=time:s
     --map angle=joint01.position:deg,wrap=360`
 
     Args:
-        log: The foreign log.
-        output: The session to write, `.mcap`.
-        robot: A shipped robot (snake25, snake13, snake13-planar, arcsnake-joint) or a robot TOML.
-        columns: Column map of a CSV, as TOML.
-        map_: One column of a CSV: `COLUMN=time:UNIT`, or `COLUMN=JOINT.QUANTITY:UNIT` with
+        log: The foreign log: a file, a folder of tables, or a LeRobot dataset.
+        output: The session to write, `.mcap`; a folder for the episodes of a dataset.
+        robot: A shipped robot (snake25, snake13, snake13-planar, arcsnake-joint) or a robot TOML;
+            required for CAN traces.
+        commands: A table of commands, where `log` is one of states alone.
+        columns: Column map of a table, as TOML.
+        map_: One column of a table: `COLUMN=time:UNIT`, or `COLUMN=JOINT.QUANTITY:UNIT` with
             `,wrap=PERIOD`, `,scale=FACTOR`, `,offset=VALUE` where needed. May be repeated.
+        unit: Unit for the guess, `QUANTITY=UNIT`: `position=deg`, `time=ms`. May be repeated.
+        write_map: Write the guessed map here, to be edited.
+        episode: The one episode of a LeRobot dataset to import.
         bus: The bus to decode, where the log has several; the first one by default.
         force: Replace an existing output.
         json: Report as one JSON object.
@@ -55,21 +70,51 @@ def import_log(
     from ..common.process import interruptible
     from ..exchange.can_import import import_can
     from ..exchange.csv_import import import_csv
+    from ..exchange.lerobot_import import import_lerobot, is_lerobot
+    from ..exchange.table_guess import parse_units
+    from ..exchange.table_import import import_tables, open_tables
     from ..robot.description import load_robot
 
-    why = f"a session is an .mcap file, not {output.suffix or 'nameless'}"
-    check_output(output, (".mcap",), why, force=force)
-    described = load_robot(robot)
-    column_map = _column_map(log, described, columns, map_)
-    if column_map is not None and bus is not None:
+    if not log.is_dir() and not is_file(log):
+        raise ImportFormatError(log, "no such file")
+    dataset = log.is_dir() and is_lerobot(log)
+    if not dataset or output.suffix:
+        why = f"a session is an .mcap file, not {output.suffix or 'nameless'}"
+        check_output(output, (".mcap",), why, force=force)
+    described = load_robot(robot) if robot is not None else None
+    table = _is_table(log)
+    if not table and (columns is not None or map_ or unit or write_map is not None):
+        raise UsageError(f"{log} holds CAN frames; --columns and --map are for other CSV logs")
+    if table and bus is not None:
         raise UsageError(f"{log} holds no CAN frames; --bus is for those")
+    if episode is not None and not dataset:
+        raise UsageError(f"{log} is no LeRobot dataset; --episode is for those")
+    units = parse_units(unit)
+    column_map = _column_map(described, columns, map_)
     with interruptible() as stop:
-        if column_map is None:
-            report = import_can(log, output, described, bus=bus, force=force, stop=stop)
+        if dataset:
+            if column_map is not None or commands is not None or write_map is not None:
+                raise UsageError(f"{log} is a LeRobot dataset, which names its columns itself")
+            reports = import_lerobot(
+                log, output, episode=episode, robot=described, units=units, force=force, stop=stop
+            )
+        elif not table:
+            if described is None:
+                raise UsageError(f"{log} holds CAN frames: --robot says what they mean")
+            reports = [import_can(log, output, described, bus=bus, force=force, stop=stop)]
+        elif described and column_map and log.suffix.lower() == ".csv" and commands is None:
+            reports = [import_csv(log, output, described, column_map, force=force, stop=stop)]
         else:
-            report = import_csv(log, output, described, column_map, force=force, stop=stop)
-    emit(report.as_json(), _import_lines(report), as_json=json)
-    return 0 if report.complete else 1
+            found = open_tables(log, commands)
+            report = import_tables(
+                found, output, robot=described, column_map=column_map, units=units,
+                write_map=write_map, force=force, stop=stop,
+            )  # fmt: skip
+            reports = [report]
+    facts = [report.as_json() for report in reports]
+    answer = facts[0] if len(facts) == 1 else {"sessions": facts}
+    emit(answer, (line for report in reports for line in _import_lines(report)), as_json=json)
+    return 0 if all(report.complete for report in reports) else 1
 
 
 def export_log(
@@ -136,24 +181,25 @@ def export_log(
     emit(facts, lines, as_json=json)
 
 
-def _column_map(
-    log: Path, robot: Robot, columns: Path | None, options: tuple[str, ...]
-) -> ColumnMap | None:
-    """Return the column map of a CSV log; None for a log of CAN frames."""
-    from ..exchange.csv_import import column_map_from_options, is_frame_csv, read_column_map
+def _is_table(log: Path) -> bool:
+    """Return whether a log is a table, or a folder of tables, and no log of CAN frames."""
+    from ..exchange.csv_import import is_frame_csv
+    from ..exchange.tables import TABLE_SUFFIXES
 
-    if not is_file(log):
-        raise ImportFormatError(log, "no such file")
-    if log.suffix.lower() != ".csv" or is_frame_csv(log):
-        if columns is not None or options:
-            raise UsageError(f"{log} holds CAN frames; --columns and --map are for other CSV logs")
-        return None
-    if (columns is None) == (not options):
-        given = "not both" if options else "to describe its columns"
-        raise UsageError(f"{log} needs --columns MAP.toml or --map options, {given}")
+    return log.is_dir() or (log.suffix.lower() in TABLE_SUFFIXES and not is_frame_csv(log))
+
+
+def _column_map(
+    robot: Robot | None, columns: Path | None, options: tuple[str, ...]
+) -> ColumnMap | None:
+    """Return the column map that was given; None if it is to be guessed."""
+    from ..exchange.column_map import column_map_from_options, read_column_map
+
+    if columns is not None and options:
+        raise UsageError("--columns MAP.toml or --map options, not both")
     if columns is not None:
         return read_column_map(columns, robot)
-    return column_map_from_options(options, robot)
+    return column_map_from_options(options, robot) if options else None
 
 
 def _import_lines(report: ImportReport) -> Iterator[str]:

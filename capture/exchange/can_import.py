@@ -90,11 +90,12 @@ def file_digest(path: Path) -> str:
 def imported_session(
     source: Path,
     output: Path,
-    robot: Robot,
+    robot: Robot | None,
     *,
     epoch_ns: int,
     facts: Mapping[str, str],
     force: bool,
+    digest: str | None = None,
 ) -> Generator[SessionWriter]:
     """Write an imported session, which appears under its name only when it is whole.
 
@@ -102,16 +103,17 @@ def imported_session(
     no path of this machine enters the file.
 
     Args:
-        robot: The robot that made the log.
+        robot: The robot that made the log, if it is known.
         epoch_ns: Time of its first sample [Unix ns].
         facts: For the session's metadata.
+        digest: Of the log, where that is more than the file ``source``.
 
     Raises:
         OutputExistsError: If the output is there and ``force`` is not given.
         LogWriteError: If it can't be written; nothing is left behind then.
     """
     refuse_existing(output, force=force)
-    digest = file_digest(source)
+    digest = digest or file_digest(source)
     with (
         part_file(output) as part,
         SessionWriter(
@@ -119,7 +121,7 @@ def imported_session(
             session_id=f"import-{digest[:16]}",
             epoch_ns=epoch_ns,
             robot=robot,
-            clock={"log": str(robot.clock)},
+            clock={"log": str(robot.clock)} if robot else {},
             metadata={"source": source.name, "source.sha256": digest, **facts},
             force=True,
         ) as writer,

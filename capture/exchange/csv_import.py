@@ -1,225 +1,39 @@
-"""CSV logs into sessions, by a column map.
-
-What the columns of a CSV log mean.
-
-A map is a TOML file::
-
-    [time]
-    column = "time"
-    unit = "s"
-
-    [[columns]]
-    column = "s_pos"
-    joint = "joint01"
-    quantity = "position"
-    unit = "rad"
-    wrap = 12.566370614359172           # the cell jumps by this period, in `unit`; undone first
-    scale = 0.045454545454545456        # then value = scale * cell + offset, in `unit`
-    offset = 0.0
-
-or the same as options, ``time=time:s`` and
-``s_pos=joint01.position:rad,wrap=12.566370614359172,scale=0.045454545454545456``.
-"""
+"""CSV logs into sessions, by a column map (:mod:`.capture.exchange.column_map`)."""
 
 from __future__ import annotations
 
 import csv
-import json
 import math
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import TextIO
 
 import numpy as np
 
 from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import FloatArray, IntArray
-from ..common.config import Positive, read_field
 from ..common.console import progress
-from ..common.errors import Fault, FaultyFileError, ImportFormatError, UsageError
-from ..common.files import read_input
+from ..common.errors import ImportFormatError
 from ..common.process import StopRequest
-from ..common.strict_table import NONZERO, Faults, Table, listed, read_toml
+from ..common.strict_table import listed
 from ..log.write.writer import SessionWriter
-from ..robot.bus_map import JOINT_QUANTITIES, SESSION_UNIT, TIME_UNITS, unit_for, valid_units
+from ..robot.bus_map import SESSION_UNIT, TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
 from .can_import import ImportReport, imported_session
 from .can_logs import CSV_HEADER
+from .column_map import Column, ColumnMap
 from .frame_log import LATEST_NS, RELATIVE_EPOCH_NS
 
-_DELIMITERS = (",", ";", "\t", " ")
-_OPTION_FORM = (
-    "COLUMN=time:UNIT or COLUMN=JOINT.QUANTITY:UNIT[,wrap=PERIOD][,scale=FACTOR][,offset=VALUE]"
-)
+EARLIEST_NS = 10**17
+"""1973 [ns]: less is no date but a time since the log's start."""
 
-
-@dataclass(frozen=True)
-class Column:
-    """One column that is read.
-
-    Attributes:
-        column: Its name in the header.
-        joint: The joint it belongs to.
-        quantity: What it is of that joint.
-        wrap: Period of its jumps, in ``unit``; 0 if it doesn't wrap around.
-        scale: Applied to the unwrapped cell.
-        offset: Added after ``scale``, in ``unit``.
-    """
-
-    column: str
-    joint: str
-    quantity: Quantity
-    unit: str
-    wrap: Positive = 0.0
-    scale: Annotated[float, NONZERO] = 1.0
-    offset: float = 0.0
-
-
-@dataclass(frozen=True)
-class ColumnMap:
-    """The columns of a CSV log.
-
-    Attributes:
-        time_column: Name of the column of times.
-        time_unit: ``s``, ``ms``, ``us`` or ``ns``.
-        columns: The others; columns that are not named are not read.
-        delimiter: What stands between the cells.
-    """
-
-    time_column: str
-    time_unit: str
-    columns: tuple[Column, ...]
-    delimiter: str = ","
-
-    def toml(self) -> str:
-        """Return the map as a TOML file, for the session's attachments."""
-        lines = [f"delimiter = {json.dumps(self.delimiter)}", "", "[time]"]
-        lines += [f"column = {json.dumps(self.time_column)}", f'unit = "{self.time_unit}"']
-        for column in self.columns:
-            lines += ["", "[[columns]]", f"column = {json.dumps(column.column)}"]
-            lines += [f'joint = "{column.joint}"', f'quantity = "{column.quantity}"']
-            lines += [f'unit = "{column.unit}"', f"scale = {column.scale!r}"]
-            lines += [f"offset = {column.offset!r}"]
-            lines += [f"wrap = {column.wrap!r}"] if column.wrap else []
-        return "\n".join(lines) + "\n"
-
-
-def read_column_map(path: Path, robot: Robot) -> ColumnMap:
-    """Read a map from its TOML file.
-
-    Raises:
-        InputFileError: If the file isn't there or can't be read.
-        FaultyFileError: If it has faults; lists all of them.
-    """
-    try:
-        values = read_toml(read_input(path).decode("utf-8"))
-    except ValueError as error:
-        raise FaultyFileError(path, [Fault("syntax", str(error), "TOML 1.0")]) from error
-    column_map, faults = _parse(values, robot)
-    if faults:
-        raise FaultyFileError(path, faults)
-    return column_map
-
-
-def column_map_from_options(options: Sequence[str], robot: Robot) -> ColumnMap:
-    """Read a map from command line options.
-
-    Args:
-        options: One a column, as the module describes.
-        robot: The robot whose joints they name.
-
-    Raises:
-        UsageError: If they have faults; lists all of them.
-    """
-    values: dict[str, Any] = {"columns": []}
-    for option in options:
-        column, equals, meaning = option.rpartition("=") if "," not in option else _cut(option)
-        head, *extras = meaning.split(",")
-        target, colon, unit = head.partition(":")
-        joint, dot, quantity = target.partition(".")
-        if not (equals and colon and column) or (target != "time" and not dot):
-            raise UsageError(f"--map {option!r} is not of the form {_OPTION_FORM}")
-        if target == "time":
-            values["time"] = {"column": column, "unit": unit}
-            continue
-        entry: dict[str, Any] = {"column": column, "joint": joint, "quantity": quantity}
-        entry["unit"] = unit
-        for extra in extras:
-            key, _, number = extra.partition("=")
-            try:
-                entry[key.strip()] = float(number)
-            except ValueError as error:
-                raise UsageError(f"--map {option!r}: {extra!r} is not KEY=NUMBER") from error
-        values["columns"].append(entry)
-    column_map, faults = _parse(values, robot)
-    if faults:
-        raise UsageError("\n  ".join(["--map has faults:", *map(str, faults)]))
-    return column_map
-
-
-def _cut(option: str) -> tuple[str, str, str]:
-    """Split at the last equals sign before the first comma: a column's name may have others."""
-    head, comma, extras = option.partition(",")
-    column, equals, meaning = head.rpartition("=")
-    return column, equals, meaning + comma + extras
-
-
-def _parse(values: dict[str, Any], robot: Robot) -> tuple[ColumnMap, tuple[Fault, ...]]:
-    faults = Faults()
-    top = Table(values, "", faults)
-    delimiter = top.text("delimiter", ",")
-    if delimiter not in _DELIMITERS:
-        top.fault("delimiter", " ".join(json.dumps(each) for each in _DELIMITERS))
-    time = top.table("time")
-    time_column, time_unit = time.text("column"), time.text("unit")
-    if time_unit not in TIME_UNITS:
-        time.fault("unit", listed(TIME_UNITS, time_unit))
-    time.close()
-    entries = top.tables("columns")
-    if not entries:
-        top.fault("columns", "at least one column")
-    columns = tuple(_column(entry, robot.joint_names) for entry in entries)
-    top.close()
-    _note_repeated(faults, columns)
-    return ColumnMap(time_column, time_unit, columns, delimiter), faults.all()
-
-
-def _column(table: Table, joints: Iterable[str]) -> Column:
-    name, joint = table.text("column"), table.text("joint")
-    if joint and joint not in joints:
-        table.fault("joint", listed(joints, joint))
-    quantity, unit = table.choice("quantity", JOINT_QUANTITIES), table.text("unit")
-    if quantity is not None:
-        try:
-            unit_for(unit, quantity)
-        except UsageError:
-            table.fault("unit", f"for {quantity}: {listed(valid_units(quantity), unit)}")
-    column = Column(
-        column=name,
-        joint=joint,
-        quantity=quantity or Quantity.POSITION,
-        unit=unit,
-        wrap=read_field(table, Column, "wrap"),
-        scale=read_field(table, Column, "scale"),
-        offset=read_field(table, Column, "offset"),
-    )
-    table.close()
-    return column
-
-
-def _note_repeated(faults: Faults, columns: Sequence[Column]) -> None:
-    targets = [f"{column.joint}.{column.quantity}" for column in columns]
-    for target in sorted({target for target in targets if targets.count(target) > 1}):
-        faults.add("columns", f"{targets.count(target)} columns for {target}", "one at most")
-
-
-_EARLIEST_NS = 10**17  # 1973: less is no date but a time since the log's start
 _ROWS_PER_UPDATE = 4096
-_WITH_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
+WITH_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
+"""What stands beside a position of the same row."""
 
 
 def is_frame_csv(path: Path) -> bool:
@@ -258,7 +72,7 @@ def import_csv(
         LogWriteError: If the output can't be written.
     """
     table = _read(source, column_map)
-    relative = abs(int(table.t_ns[0])) < _EARLIEST_NS
+    relative = abs(int(table.t_ns[0])) < EARLIEST_NS
     t_ns = table.t_ns + (RELATIVE_EPOCH_NS if relative else 0)
     report = ImportReport(
         source, output, robot.name, start_ns=int(t_ns[0]), end_ns=int(t_ns[-1]), notes=table.notes
@@ -278,7 +92,7 @@ def import_csv(
         writer.attach("columns.toml", "application/toml", column_map.toml().encode())
         topics = [
             _Topic(writer, robot, quantities, column_map.columns, table.values)
-            for quantities in _topics_of({column.quantity for column in column_map.columns})
+            for quantities in topics_of({column.quantity for column in column_map.columns})
         ]
         for i, t in enumerate(t_ns.tolist()):
             if i % _ROWS_PER_UPDATE == 0:
@@ -340,15 +154,15 @@ class _Topic:
             return
         velocity, effort = (
             self._rest[quantity][row] if quantity in self._rest else ()
-            for quantity in _WITH_POSITION
+            for quantity in WITH_POSITION
         )
         self._channel.write(t_ns, self._position[row], velocity, effort)
         self.count += 1
 
 
-def _topics_of(present: set[Quantity]) -> Iterator[tuple[Quantity, ...]]:
+def topics_of(present: set[Quantity]) -> Iterator[tuple[Quantity, ...]]:
     """Yield the quantities of each topic; a row's velocity and effort belong to its position."""
-    together = [q for q in _WITH_POSITION if q in present and Quantity.POSITION in present]
+    together = [q for q in WITH_POSITION if q in present and Quantity.POSITION in present]
     for quantity in JOINT_TOPIC:
         if quantity is Quantity.POSITION and quantity in present:
             yield (quantity, *together)
@@ -380,7 +194,7 @@ def _read_stream(source: Path, stream: TextIO, column_map: ColumnMap) -> _TimedC
                 source, f"row {reader.line_num} has {len(row)} cells, the header {len(header)}"
             )
         where = partial(_fault, source, reader.line_num)
-        t_ns = _time_ns(row[places[0]], unit_ns, where, wanted[0])
+        t_ns = time_ns(row[places[0]], unit_ns, where, wanted[0])
         if times and t_ns < times[-1]:
             raise where(wanted[0], f"time goes back, from {times[-1] / unit_ns:g}")
         times.append(t_ns)
@@ -409,7 +223,7 @@ def _place(source: Path, header: list[str], name: str) -> int:
     return header.index(name)
 
 
-def _time_ns(
+def time_ns(
     cell: str, unit_ns: int, where: Callable[[str, str], ImportFormatError], name: str
 ) -> int:
     """Parse a time [ns] in decimal: a double can't hold Unix times to the ns."""

@@ -43,6 +43,13 @@ COMMANDS = {
         (1, "import {file} -o new.mcap -r snake4.toml --json"),
     ],
     "table": [(1, "import {file} -o new.mcap -r snake4.toml --columns columns.toml")],
+    "columns": [
+        (3, "import {file} -o new.mcap"),
+        (1, "import {file} -o new.mcap --json --write-map new.toml --unit time=ms"),
+    ],
+    "apart": [(1, "import {file} -o new.mcap --commands commands.csv")],
+    "arrays": [(1, "import {file} -o new.mcap")],
+    "dataset": [(2, "import {file} -o new"), (1, "import {file} -o new.mcap --episode 1")],
     "robot": [
         (2, "import {file} -o new.mcap -r snake4.toml"),
         (1, "sim run scenario.toml -o new.mcap"),
@@ -63,7 +70,8 @@ COMMANDS = {
 """Kind to command lines and their weights; ``{file}`` is the base's file, faults in it."""
 
 WEIGHTS = {
-    "log": 10, "unfinished": 4, "split": 2, "trace": 6, "table": 2, "robot": 2, "scenario": 2,
+    "log": 10, "unfinished": 4, "split": 2, "trace": 6, "table": 2, "columns": 2,
+    "apart": 1, "arrays": 3, "dataset": 1, "robot": 2, "scenario": 2,
     "plan": 1, "settings": 1, "result": 0.5,
 }  # fmt: skip
 """How often each kind comes."""

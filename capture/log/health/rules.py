@@ -6,7 +6,7 @@ recording. Every threshold has a name and a reason.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from ...following.fault import Fault as JointFault
@@ -190,6 +190,23 @@ def judge_file(health: FileHealth) -> list[Finding]:
             )
         )
     return found
+
+
+TIMES_FROM_FPS = "import.times_from_fps"
+"""Metadata key: the frame rate [1/s] that a data set's times were made from."""
+
+
+def judge_made_times(facts: Mapping[str, str]) -> list[Finding]:
+    """Note that times were made from a frame rate: what their rhythm would show is not in them."""
+    if TIMES_FROM_FPS not in facts:
+        return []
+    return [
+        Finding(
+            0,
+            f"times made from fps = {facts[TIMES_FROM_FPS]}: jitter, gaps and lost samples can't "
+            "be told, and lags are in error by up to a frame",
+        )
+    ]
 
 
 def judge_channel(health: ChannelHealth) -> list[Fault]:

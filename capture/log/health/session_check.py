@@ -30,7 +30,7 @@ from ..mcap.chunk import MAGIC, PREFIX_SIZE, Block, chunk_at, read_message_heads
 from ..mcap.file import McapFile
 from ..read.open_log import OpenLog
 from ..read.session import SessionView
-from .rules import Finding, judge_file, judge_following, verdict_of
+from .rules import Finding, judge_file, judge_following, judge_made_times, verdict_of
 from .session_scan import SessionMeasures, SessionScan
 from .tallies import FileHealth
 
@@ -181,7 +181,9 @@ class _Check:
 
     def run(self, on_part: Callable[[float], None]) -> SessionHealth:
         file = self._against_summary(self._read(on_part))
-        found = self._scan.result(*self._file.limits, judge_file(file))
+        facts = self._file.metadata.get("undulog", {})
+        notes = [*judge_file(file), *judge_made_times(facts)]
+        found = self._scan.result(*self._file.limits, notes)
         stored = self._file.metadata.get("undulog.health", {})
         return SessionHealth(
             **{each.name: getattr(found, each.name) for each in fields(found)},

@@ -60,7 +60,7 @@ WRONG = [
     (1, "{dir}/no.log -o {dir}/x.mcap -r snake25", "no.log: no such file"),
     (2, "{log} -o {log} -r snake25", "a session is an .mcap file, not .log"),
     (2, "{log} -o {dir}/no/x.mcap -r snake25", "no doesn't exist"),
-    (2, "{dir}/a.csv -o {dir}/x.mcap -r snake25", "needs --columns MAP.toml or --map options"),
+    (1, "{dir}/a.csv -o {dir}/x.mcap -r snake25", "name them by --columns or --map"),
     (2, "{log} -o {dir}/x.mcap -r snake25 --map t=time:s", "--map are for other CSV logs"),
     (1, "{dir}/bad.log -o {dir}/x.mcap -r snake25", "is not a candump log"),
     (1, "{log} -o {dir}/x.mcap -r snake25 --bus can7", "has no frames of bus can7; it has can0"),

@@ -12,7 +12,8 @@ from support.written_sessions import joint_state, write_foreign
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError, MissingChannelError, MissingExtraError
 from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.csv_import import column_map_from_options, import_csv
+from undulog.capture.exchange.column_map import column_map_from_options
+from undulog.capture.exchange.csv_import import import_csv
 from undulog.capture.exchange.export import TABLE_FORMATS, export_columns
 
 S = 1_000_000_000

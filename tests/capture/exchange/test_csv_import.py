@@ -10,6 +10,7 @@ from support.paths import ARCSNAKE
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import FaultyFileError, ImportFormatError, UsageError
 from undulog.capture.common.process import StopRequest
+from undulog.capture.exchange import column_map
 from undulog.capture.exchange import csv_import as csv
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 
@@ -38,7 +39,7 @@ unit = "A"
 def load(source, tmp_path):
     (tmp_path / "map.toml").write_text(JOINT7)
     robot = load_robot("arcsnake-joint")
-    columns = csv.read_column_map(tmp_path / "map.toml", robot)
+    columns = column_map.read_column_map(tmp_path / "map.toml", robot)
     return csv.import_csv(source, tmp_path / "run.mcap", robot, columns)
 
 
@@ -83,7 +84,7 @@ def csv_file(tmp_path, text):
 
 def run(tmp_path, text, *options, time="s", **more):
     robot = load_robot("snake13")
-    columns = csv.column_map_from_options((f"t=time:{time}", *options), robot)
+    columns = column_map.column_map_from_options((f"t=time:{time}", *options), robot)
     return csv.import_csv(csv_file(tmp_path, text), tmp_path / "run.mcap", robot, columns, **more)
 
 
@@ -156,7 +157,7 @@ def test_faults_of_a_log_name_file_row_and_column(text, message, tmp_path):
 def test_all_faults_of_a_map_are_listed(tmp_path):
     (tmp_path / "map.toml").write_text(MAP)
     with pytest.raises(FaultyFileError) as caught:
-        csv.read_column_map(tmp_path / "map.toml", load_robot("arcsnake-joint"))
+        column_map.read_column_map(tmp_path / "map.toml", load_robot("arcsnake-joint"))
     assert [str(fault) for fault in caught.value.faults] == MAP_FAULTS.splitlines()
 
 
@@ -184,7 +185,7 @@ columns[0].joint: found "joint99"; valid: joint01 (did you mean joint01?)
 columns[0].quantity: found "positon"; valid: command, position, velocity, effort, current, voltage, temperature (did you mean position?)
 columns[1].unit: found "deg"; valid: for velocity: rad/s, deg/s, rev/s, rpm (did you mean deg/s?)
 columns[1].wrap: found -1; valid: a finite number > 0
-columns[1].gain: found an unknown key; valid: column, joint, quantity, unit, wrap, scale, offset
+columns[1].gain: found an unknown key; valid: column, joint, quantity, unit, table, wrap, scale, offset
 """  # noqa: E501  a fault is a line
 
 
@@ -203,16 +204,16 @@ columns[1].gain: found an unknown key; valid: column, joint, quantity, unit, wra
 )
 def test_faults_of_options(option, message):
     with pytest.raises(UsageError, match=re.escape(message)):
-        csv.column_map_from_options(("t=time:s", option), load_robot("snake13"))
+        column_map.column_map_from_options(("t=time:s", option), load_robot("snake13"))
 
 
 def test_options_and_file_say_the_same(tmp_path):
     robot = load_robot("snake13")
     given = ("t [s]=time:ms", "a=b=joint01.position:deg,wrap=360,scale=0.5,offset=-1")
-    options = csv.column_map_from_options(given, robot)
+    options = column_map.column_map_from_options(given, robot)
     assert options.columns[0].column == "a=b"
     (tmp_path / "map.toml").write_text(options.toml())
-    assert csv.read_column_map(tmp_path / "map.toml", robot) == options
+    assert column_map.read_column_map(tmp_path / "map.toml", robot) == options
 
 
 def test_a_csv_of_can_frames_is_reported_from_others(tmp_path):

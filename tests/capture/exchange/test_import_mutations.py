@@ -10,7 +10,8 @@ from support.written_frames import log_messages
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.exchange.can_import import import_can
-from undulog.capture.exchange.csv_import import column_map_from_options, import_csv
+from undulog.capture.exchange.column_map import column_map_from_options
+from undulog.capture.exchange.csv_import import import_csv
 
 SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db")
 LARGE = ("1e308", "-1e308", "1e19", "1e999999999", "9" * 400)

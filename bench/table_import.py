@@ -1,0 +1,105 @@
+"""Import of tables, against the readers of the same files: pandas.read_csv, and pyarrow.
+
+Each pair reads the same file in the same run, in turn; the ratio of the medians of processor time
+counts. The peer only reads; the import also writes a session, one message a row.
+
+Run: python bench/table_import.py [--rows 60000] [--runs 3]
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+from measuring import arguments, verdict
+from pyarrow import parquet as arrow_parquet
+
+from undulog.capture.exchange.lerobot_import import import_lerobot
+from undulog.capture.exchange.table_import import import_tables, open_tables
+
+arrow: Any = pa  # its types are incomplete
+parquet: Any = arrow_parquet
+JOINTS = 25
+BAR = 4.0
+
+
+def write_csv(path: Path, rows: int) -> None:
+    """Write times, and position and command of each joint."""
+    t = np.arange(rows) * 0.01
+    q = np.sin(t[:, None] - 0.5 * np.arange(JOINTS))
+    columns = {"time_s": t}
+    for k in range(JOINTS):
+        columns[f"joint{k + 1:02d}_pos_rad"] = q[:, k]
+        columns[f"joint{k + 1:02d}_cmd_rad"] = 1.1 * q[:, k]
+    pd.DataFrame(columns).to_csv(path, index=False)
+
+
+def write_dataset(folder: Path, rows: int) -> Path:
+    """Write a data set of one episode; return its file of frames."""
+    data, meta = folder / "data" / "chunk-000", folder / "meta"
+    data.mkdir(parents=True)
+    meta.mkdir()
+    feature = {"dtype": "float32", "shape": [JOINTS], "names": None}
+    features = {"action": feature, "observation.state": feature}
+    info = {"codebase_version": "v3.0", "fps": 30, "features": features}
+    (meta / "info.json").write_text(json.dumps(info))
+    values = np.sin(np.arange(rows * JOINTS) * 0.01).astype(np.float32)
+    vectors = arrow.FixedSizeListArray.from_arrays(arrow.array(values), JOINTS)
+    frames = {"action": vectors, "observation.state": vectors, "frame_index": np.arange(rows)}
+    table = arrow.table(frames | {"episode_index": np.zeros(rows, dtype=np.int64)})
+    parquet.write_table(table, data / "file-000.parquet")
+    return data / "file-000.parquet"
+
+
+def compare(ours: Callable[[], object], peer: Callable[[], object], runs: int) -> list[float]:
+    """Return the medians of processor time [s] of both."""
+    took: list[list[float]] = [[], []]
+    for _ in range(runs):
+        for seconds, work in zip(took, (ours, peer), strict=True):
+            start = time.process_time()
+            work()
+            seconds.append(time.process_time() - start)
+    return [statistics.median(seconds) for seconds in took]
+
+
+def main() -> int:
+    """Write, import and read in turn, print."""
+    parser = arguments(__doc__)
+    parser.add_argument("--rows", type=int, default=60_000)
+    parser.add_argument("--runs", type=int, default=3)
+    options = parser.parse_args()
+    good = True
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        log, out, columns = folder / "log.csv", folder / "run.mcap", ["action", "observation.state"]
+        write_csv(log, options.rows)
+        frames = write_dataset(folder / "set", options.rows)
+        for what, ours, peer in (
+            (
+                "CSV import / pandas.read_csv",
+                lambda: import_tables(open_tables(log), out, force=True),
+                lambda: pd.read_csv(log),
+            ),
+            (
+                "LeRobot import / pyarrow reading the same columns",
+                lambda: import_lerobot(folder / "set", out, force=True),
+                lambda: parquet.read_table(frames, columns=columns),
+            ),
+        ):
+            mine, theirs = compare(ours, peer, options.runs)
+            good &= verdict(what, mine / theirs, BAR, "times")
+            print(f"      {mine:.3f} s and {theirs:.3f} s for {options.rows} rows, {JOINTS} joints")
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

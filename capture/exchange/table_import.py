@@ -1,0 +1,457 @@
+"""Tables and arrays into sessions: one file, states and commands apart, or a folder of them."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import heapq
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal
+from itertools import chain
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bus.decoded_topics import JOINT_TOPIC
+from ..common.arrays import FloatArray, IntArray
+from ..common.console import progress, refuse_existing
+from ..common.errors import ImportFormatError, UsageError, some_names
+from ..common.files import write_text
+from ..common.process import StopRequest
+from ..log.write.writer import SessionWriter
+from ..robot.bus_map import SESSION_UNIT, TIME_UNITS, unit_for
+from ..robot.model import Quantity, Robot
+from .can_import import ImportReport, file_digest, imported_session
+from .column_map import COMMANDS, STATES, Column, ColumnMap
+from .csv_import import EARLIEST_NS, WITH_POSITION, topics_of
+from .frame_log import LATEST_NS, RELATIVE_EPOCH_NS
+from .table_guess import guess_map
+from .tables import TABLE_SUFFIXES, TableFile, is_time, open_table, words
+
+_COMMAND_FILES = {"control", "command", "commands", "cmd", "action", "actions", "target", "targets"}
+_STATE_FILES = {"state", "states", "measured", "response", "feedback", "joint", "joints", "motor"}
+_EVENT_FILES = {"event", "events"}
+_MOST_NAMES = 1 << 16  # bytes of a list of joints
+
+Message: TypeAlias = tuple[int, int, Callable[[], None]]
+"""Time [ns], order among those of one time, and what writes it."""
+
+
+@dataclass(frozen=True)
+class TableSet:
+    """The files of one recording.
+
+    Attributes:
+        tables: ``states``, ``commands`` or both.
+        joints: Names in the order of vectors, if a file lists them.
+        events: A table of times and texts, if there is one.
+        digest: Of all files' bytes.
+        left_out: Names of files that were not read.
+        facts: For the session's metadata, beside those of any import.
+    """
+
+    source: Path
+    tables: dict[str, TableFile]
+    joints: tuple[str, ...] = ()
+    events: Path | None = None
+    digest: str = ""
+    left_out: tuple[str, ...] = ()
+    facts: Mapping[str, str] = field(default_factory=dict[str, str])
+
+
+def open_tables(source: Path, commands: Path | None = None) -> TableSet:
+    """Find the tables of a recording.
+
+    Args:
+        source: A table of states, or a folder with tables of states and commands, their names as
+            ``control.csv`` and ``state_motor.csv``, with ``joint_list.txt`` and ``event.csv``.
+        commands: A table of commands.
+
+    Raises:
+        ImportFormatError: If a file is no table, or the folder has none, or too many.
+    """
+    if source.is_dir():
+        if commands is not None:
+            raise UsageError(f"{source} is a folder; --commands goes with a table of states")
+        return _open_folder(source)
+    tables = {STATES: open_table(source)}
+    if commands is not None:
+        tables[COMMANDS] = open_table(commands)
+    files = [source, *([commands] if commands is not None else [])]
+    return TableSet(source, tables, digest=_digest(files))
+
+
+def _open_folder(folder: Path) -> TableSet:
+    found: dict[str, list[Path]] = {STATES: [], COMMANDS: [], "events": [], "names": []}
+    others: list[str] = []
+    for path in sorted(folder.iterdir()):
+        said = set(words(path.stem))
+        if path.suffix.lower() == ".txt" and {"list", "names"} & said:
+            found["names"].append(path)
+        elif path.suffix.lower() not in TABLE_SUFFIXES:
+            others.append(path.name)
+        elif said & _EVENT_FILES:
+            found["events"].append(path)
+        elif said & _COMMAND_FILES:
+            found[COMMANDS].append(path)
+        elif said & _STATE_FILES:
+            found[STATES].append(path)
+        else:
+            others.append(path.name)
+    for role in (STATES, COMMANDS):
+        if len(found[role]) > 1:
+            names = ", ".join(path.name for path in found[role])
+            raise ImportFormatError(
+                folder, f"has several tables of {role}: {names}; give one, and --commands"
+            )
+    tables = {role: open_table(found[role][0]) for role in (STATES, COMMANDS) if found[role]}
+    if not tables:
+        raise ImportFormatError(
+            folder,
+            "has no table named as states or commands (state*.csv, control.csv); it has "
+            f"{some_names(others, 10) or 'nothing'}",
+        )
+    events = found["events"][0] if found["events"] else None
+    files = [path for paths in found.values() for path in paths]
+    joints = _names(found["names"][0]) if found["names"] else ()
+    return TableSet(folder, tables, joints, events, _digest(files), tuple(others))
+
+
+def _names(path: Path) -> tuple[str, ...]:
+    try:
+        if path.stat().st_size > _MOST_NAMES:
+            raise ImportFormatError(path, "is no list of joints: too long")
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ImportFormatError(path, f"can't be read: {error}") from error
+    return tuple(word for word in text.replace(",", "\n").split() if word)
+
+
+def _digest(files: Sequence[Path]) -> str:
+    if len(files) == 1:
+        return file_digest(files[0])
+    parts = "".join(f"{path.name} {file_digest(path)}\n" for path in files)
+    return hashlib.sha256(parts.encode()).hexdigest()
+
+
+def import_tables(
+    found: TableSet,
+    output: Path,
+    *,
+    robot: Robot | None = None,
+    column_map: ColumnMap | None = None,
+    units: Mapping[str, str] | None = None,
+    said: Sequence[str] = (),
+    write_map: Path | None = None,
+    force: bool = False,
+    stop: StopRequest | None = None,
+) -> ImportReport:
+    """Turn tables into a session; what was guessed is in the report's notes.
+
+    Args:
+        robot: The robot that made them; without it joints are named by the columns.
+        column_map: What the columns mean; guessed if None.
+        units: Quantity, or ``time``, to unit, for the guess.
+        said: Notes on a map that is given.
+        write_map: Where to write the map.
+        stop: Ends the import early, with a whole file of what was written so far.
+
+    Raises:
+        ImportFormatError: If a table lacks a column or has a cell that is no number.
+        OutputExistsError: If the output or the map is there and ``force`` is not given.
+        LogWriteError: If the output can't be written.
+    """
+    if write_map is not None:
+        refuse_existing(write_map, force=force)
+    refuse_existing(output, force=force)
+    notes: list[str] = list(said)
+    if column_map is None:
+        joints = found.joints or (robot.joint_names if robot else ())
+        guess = guess_map(found.tables, joints, units or {})
+        column_map, notes = guess.column_map, [*map_lines(guess.column_map), *guess.said]
+        if guess.left_out:
+            names = list(dict.fromkeys(name.partition("[")[0] for name in guess.left_out))
+            notes.append(f"columns without a place left out: {some_names(names, 20)}")
+    notes += [f"file left out: {name}" for name in found.left_out]
+    if write_map is not None:
+        write_text(write_map, column_map.toml())
+        notes.append(f"map written to {write_map}; edit it and give it back by --columns")
+    unknown = {column.table for column in column_map.columns} - found.tables.keys()
+    if unknown:
+        raise UsageError(f"the map has columns of {', '.join(unknown)}, but no such table is given")
+    report = ImportReport(found.source, output, robot.name if robot else "unknown robot")
+    report.notes = notes
+    _write(found, column_map, robot, report, force=force, stop=stop)
+    return report
+
+
+def _write(
+    found: TableSet,
+    column_map: ColumnMap,
+    robot: Robot | None,
+    report: ImportReport,
+    *,
+    force: bool,
+    stop: StopRequest | None,
+) -> None:
+    sources = [
+        source
+        for role, table in found.tables.items()
+        if (source := _Source(table, role, column_map)).columns
+    ]
+    first_ns = min(source.first_ns() for source in sources)
+    relative = abs(first_ns) < EARLIEST_NS
+    offset = RELATIVE_EPOCH_NS if relative else 0
+    report.start_ns = report.end_ns = first_ns + offset
+    form = next(iter(found.tables.values()))
+    facts = {
+        "import.format": form.path.suffix.removeprefix(".").lower() or "csv",
+        "import.time": "counted from the log's start, put at 2000-01-01T00:00:00Z"
+        if relative
+        else "as recorded",
+        **found.facts,
+    }
+    with (
+        imported_session(
+            found.source, report.output, robot, epoch_ns=report.start_ns, facts=facts, force=force,
+            digest=found.digest,
+        ) as writer,
+        progress(f"import {found.source.name}", 1.0),
+    ):  # fmt: skip
+        writer.attach("columns.toml", "application/toml", column_map.toml().encode())
+        streams = [source.messages(writer, offset, report) for source in sources]
+        if found.events is not None:
+            unit = column_map.time_of(COMMANDS if COMMANDS in found.tables else STATES)[1]
+            streams.append(_events(found.events, unit, offset, writer, report))
+        for count, (t_ns, _, write) in enumerate(
+            heapq.merge(*streams, key=lambda message: message[:2]) if len(streams) > 1
+            else streams[0]
+        ):  # fmt: skip
+            if not count % 4096 and stop is not None and stop.requested:
+                report.complete = False
+                break
+            write()
+            report.end_ns = max(report.end_ns, t_ns)
+        if not report.samples:
+            raise ImportFormatError(found.source, "has no row with a value of a mapped column")
+        for source in sources:
+            report.notes += source.missing()
+        writer.set_verdict(report.verdict, [*report.problems, *report.notes])
+
+
+def map_lines(column_map: ColumnMap) -> list[str]:
+    """Return what each quantity was taken from, one sentence each."""
+    lines: list[str] = []
+    for quantity in dict.fromkeys(column.quantity for column in column_map.columns):
+        mine = [column for column in column_map.columns if column.quantity is quantity]
+        pairs = [f"{column.column} -> {column.joint}" for column in mine]
+        table = f" of {mine[0].table}" if column_map.commands_time or len(mine) > 1 else ""
+        lines.append(f"{quantity} [{mine[0].unit}]{table}: {some_names(pairs, 6)}")
+    return lines
+
+
+class _Source:
+    """One table on its way into the session, block by block."""
+
+    def __init__(self, table: TableFile, role: str, column_map: ColumnMap) -> None:
+        self.table = table
+        self.columns = [column for column in column_map.columns if column.table == role]
+        self._time, unit = column_map.time_of(role)
+        self._unit_ns = TIME_UNITS[unit]
+        wanted = [self._time, *(column.column for column in self.columns)]
+        for name in wanted if self.columns else ():
+            if name not in table.columns:
+                raise ImportFormatError(
+                    table.path, f"has no column {name!r}; it has {some_names(table.columns, 20)}"
+                )
+        self._wanted = list(dict.fromkeys(wanted))
+        self._order = 0 if role == COMMANDS else 1
+        self._last_ns: int | None = None
+        self._unwrapped: dict[str, tuple[float, float]] = {}
+        self._missing: dict[str, int] = {}
+        self._blocks = table.read(self._wanted, self._time) if self.columns else iter(())
+
+    def first_ns(self) -> int:
+        """Return the time of the first row [ns]."""
+        block = next(self._blocks, None)
+        if block is None or not len(block[self._time]):
+            raise ImportFormatError(self.table.path, "has no rows")
+        self._blocks = chain([block], self._blocks)
+        return int(self._times(block[self._time][:1])[0])
+
+    def messages(
+        self, writer: SessionWriter, offset: int, report: ImportReport
+    ) -> Iterator[Message]:
+        """Yield the messages in order of time."""
+        found = {(column.joint, column.quantity): column for column in self.columns}
+        topics = [
+            _Topic(writer, quantities, self.columns, report)
+            for quantities in topics_of({quantity for _, quantity in found})
+        ]
+        for block in self._blocks:
+            t_ns = self._checked(self._times(block[self._time])) + offset
+            values = {
+                (column.joint, column.quantity): self._converted(column, block[column.column])
+                for column in self.columns
+            }
+            writes = [topic.rows(t_ns, values) for topic in topics]
+            stamps: list[int] = t_ns.tolist()
+            for row, stamp in enumerate(stamps):
+                yield stamp, self._order, _writing(writes, row)
+
+    def missing(self) -> list[str]:
+        """Return how many cells of each column had no value."""
+        return [f"column {n!r}: {c} cells without a value" for n, c in self._missing.items() if c]
+
+    def _times(self, cells: NDArray[Any]) -> IntArray:
+        unit, path = self._unit_ns, self.table.path
+        try:
+            if cells.dtype.kind in "iu":
+                t_ns = np.array([int(t) * unit for t in cells.tolist()])
+            elif cells.dtype.kind == "f":
+                t_ns = np.rint(cells.astype(float) * unit)
+            else:
+                texts = [str(cell).replace(",", ".") for cell in cells]
+                t_ns = np.array([round(Decimal(text) * unit) for text in texts])
+            if len(t_ns) and not np.all(np.abs(t_ns.astype(float)) < LATEST_NS):
+                raise ImportFormatError(path, f"column {self._time!r}: no time before 2038")
+            return t_ns.astype(np.int64)
+        except (ArithmeticError, ValueError, TypeError) as error:
+            if isinstance(error, ImportFormatError):
+                raise
+            raise ImportFormatError(path, f"column {self._time!r} holds no times") from error
+
+    def _checked(self, t_ns: IntArray) -> IntArray:
+        before = self._last_ns if self._last_ns is not None else int(t_ns[0])
+        back = np.flatnonzero(np.diff(t_ns, prepend=before) < 0)
+        if len(back):
+            raise ImportFormatError(
+                self.table.path,
+                f"column {self._time!r}: time goes back, to {int(t_ns[back[0]]) / 1e9:g} s",
+            )
+        self._last_ns = int(t_ns[-1])
+        return t_ns
+
+    def _converted(self, column: Column, cells: NDArray[Any]) -> FloatArray:
+        """Convert cells to the session's unit: unwrapped over blocks, scaled and offset."""
+        path, name = self.table.path, column.column
+        try:
+            values = cells.astype(np.float64)
+        except (ValueError, TypeError) as error:
+            bad = next((str(cell)[:40] for cell in cells if not _is_number(cell)), "")
+            raise ImportFormatError(path, f"column {name!r}: {bad!r} is not a number") from error
+        known = ~np.isnan(values)
+        if np.isinf(values).any():
+            raise ImportFormatError(path, f"column {name!r} has a number that is not finite")
+        self._missing[name] = self._missing.get(name, 0) + int(len(values) - known.sum())
+        if column.wrap and known.any():
+            raw = values[known]
+            before = self._unwrapped.get(name, (raw[0], raw[0]))
+            turns = np.unwrap(np.concatenate([[before[0]], raw]), period=column.wrap)
+            values[known] = turns[1:] + (before[1] - before[0])
+            self._unwrapped[name] = (raw[-1], values[known][-1])
+        unit = unit_for(column.unit, column.quantity)
+        return unit.convert(column.scale * values + column.offset)
+
+
+def _is_number(cell: object) -> bool:
+    try:
+        float(str(cell))
+    except ValueError:
+        return False
+    return True
+
+
+def _writing(writes: Sequence[Callable[[int], None]], row: int) -> Callable[[], None]:
+    def write() -> None:
+        for each in writes:
+            each(row)
+
+    return write
+
+
+class _Topic:
+    """One JointState topic of a table."""
+
+    def __init__(
+        self,
+        writer: SessionWriter,
+        quantities: Sequence[Quantity],
+        columns: Iterable[Column],
+        report: ImportReport,
+    ) -> None:
+        self._quantities = quantities
+        self._names = list(dict.fromkeys(c.joint for c in columns if c.quantity in quantities))
+        self._name = JOINT_TOPIC[quantities[0]]
+        self._samples = report.samples
+        self._channel = writer.joint_state(
+            self._name,
+            self._names,
+            unit=SESSION_UNIT[quantities[0]],
+            velocity=Quantity.VELOCITY in quantities[1:],
+            effort=Quantity.EFFORT in quantities[1:],
+        )
+
+    def rows(
+        self, t_ns: IntArray, values: dict[tuple[str, Quantity], FloatArray]
+    ) -> Callable[[int], None]:
+        """Return what writes a row of a block; a row without any value is no message."""
+        missing = np.full(len(t_ns), np.nan)
+        fields = [
+            np.stack([values.get((name, each), missing) for name in self._names], axis=1)
+            for each in self._quantities
+        ]
+        filled = np.any([~np.isnan(each).all(axis=1) for each in fields], axis=0)
+        none: list[tuple[()]] = [()] * len(t_ns)
+        velocity, effort = (
+            fields[self._quantities.index(each)] if each in self._quantities[1:] else none
+            for each in WITH_POSITION
+        )
+        stamps: list[int] = t_ns.tolist()
+        position, send = fields[0], self._channel.write
+
+        def write(row: int) -> None:
+            if filled[row]:
+                send(stamps[row], position[row], velocity[row], effort[row])
+                self._samples[self._name] = self._samples.get(self._name, 0) + 1
+
+        return write
+
+
+def _events(
+    path: Path, unit: str, offset: int, writer: SessionWriter, report: ImportReport
+) -> Iterator[Message]:
+    """Yield the events of a table, a time and a text a row, in order of time."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            rows = list(csv.reader(stream))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ImportFormatError(path, f"can't be read: {error}") from error
+    head = rows[0] if rows else []
+    time = next((i for i, name in enumerate(head) if is_time(name)), None)
+    if time is None:
+        raise ImportFormatError(path, "has no column of times")
+    text = next((i for i, name in enumerate(head) if "event" in words(name)), len(head) - 1)
+    log = writer.log()
+    found: list[tuple[int, str]] = []
+    for row in rows[1:]:
+        try:
+            t_ns = round(Decimal(row[time]) * TIME_UNITS[unit]) + offset
+            if not 0 <= t_ns < LATEST_NS:
+                raise ImportFormatError(path, f"{row[time]!r} is no time before 2038")
+            found.append((t_ns, row[text]))
+        except (ArithmeticError, LookupError) as error:
+            raise ImportFormatError(path, f"row {row!r} has no time and event") from error
+
+    def writing(t_ns: int, words_of: str) -> Callable[[], None]:
+        def write() -> None:
+            log.write(t_ns, "info", path.stem, words_of)
+            report.samples["/rosout"] = report.samples.get("/rosout", 0) + 1
+
+        return write
+
+    for t_ns, event in sorted(found):
+        yield t_ns, 2, writing(t_ns, event)

@@ -1,0 +1,448 @@
+"""Tables and arrays of other tools, as blocks of named columns.
+
+A column that holds vectors, be it an array of two dimensions, a list in a cell or ``[0.1, 0.2]`` in
+a text, stands for one column an element: ``positions[0]``, ``positions[1]``. A long table, a row a
+joint, stands for the wide one: ``angle[joint01]``. A table without a header has ``column1`` on.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import re
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ..common.errors import ImportFormatError, MissingExtraError
+from .torch_zip import MOST_BYTES, read_tensors, refuse
+
+Block: TypeAlias = dict[str, NDArray[Any]]
+"""Column to its cells, (n,): numbers, or texts where they are none."""
+
+TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".mat", ".parquet", ".pt", ".pth")
+ARRAY_SUFFIXES = TABLE_SUFFIXES[3:]
+
+_ROWS = 16384  # of a block
+_WIDEST = 4096
+_JOINT_COLUMNS = ("joint", "joint_name", "jointname", "motor", "servo", "name", "motor_id", "id")
+_SNIFFED = 1 << 16
+
+
+@dataclass(frozen=True)
+class TableFile:
+    """One table.
+
+    Attributes:
+        columns: Its columns, vectors taken apart.
+        read: Yields the blocks of the columns named; times, named second, keep their text where
+            the file has one.
+        delimiter: What stands between the cells of a text.
+        form: ``wide``, ``long`` or ``headerless``, or the kind of file.
+        left_out: Arrays of the file that are no columns.
+    """
+
+    path: Path
+    columns: tuple[str, ...]
+    read: Callable[[Sequence[str], str], Iterator[Block]]
+    delimiter: str = ","
+    form: str = "wide"
+    left_out: tuple[str, ...] = ()
+
+    def sample(self) -> Block:
+        """Return the first block of all columns."""
+        first = next(iter(self.read(self.columns, "")), None)
+        if first is None or not len(next(iter(first.values()), ())):
+            raise ImportFormatError(self.path, "has no rows")
+        return first
+
+
+def open_table(path: Path) -> TableFile:
+    """Open a table by its suffix.
+
+    Raises:
+        ImportFormatError: If it is none, or damaged.
+        MissingExtraError: If pyarrow is needed and not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".parquet":
+        return _open_parquet(path)
+    if suffix not in ARRAY_SUFFIXES:
+        return _open_text(path)
+    readers = {".npz": _npz, ".mat": _mat}
+    arrays = readers.get(suffix, read_tensors)(path)
+    return _of_arrays(path, arrays, suffix.removeprefix("."))
+
+
+def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> TableFile:
+    """Take the arrays as columns whose first axis is the longest common one."""
+    plain = {name: np.squeeze(each) for name, each in arrays.items() if each.dtype.kind in "fiub"}
+    plain = {name: each for name, each in plain.items() if each.ndim in {1, 2} and each.size > 1}
+    if not plain:
+        raise ImportFormatError(path, "holds no arrays of numbers with one or two dimensions")
+    vectors = [each.shape[0] for each in plain.values() if each.ndim == 1]
+    lengths = [max(each.shape) for each in plain.values()]
+    rows = max(vectors or lengths, key=lambda n: (lengths.count(n), n))
+    columns: Block = {}
+    for name, each in plain.items():
+        upright = each.T if each.ndim == 2 and each.shape[0] != rows else each
+        if upright.shape[0] != rows or math.prod(upright.shape[1:]) > _WIDEST:
+            continue
+        if upright.ndim == 1:
+            columns[name] = upright
+        else:
+            columns |= {f"{name}[{i}]": upright[:, i] for i in range(upright.shape[1])}
+
+    def read(names: Sequence[str], time: str) -> Iterator[Block]:  # noqa: ARG001
+        for at in range(0, rows, _ROWS):
+            yield {name: columns[name][at : at + _ROWS] for name in names}
+
+    kept = {name.partition("[")[0] for name in columns}
+    left_out = tuple(name for name in arrays if name not in kept)
+    return TableFile(path, tuple(columns), read, form=form, left_out=left_out)
+
+
+def _npz(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(info.file_size for info in archive.infolist())
+            if size > MOST_BYTES:
+                raise ImportFormatError(path, f"holds {size} bytes of arrays; {MOST_BYTES} at most")
+            return {
+                info.filename.removesuffix(".npy"): array
+                for info in archive.infolist()
+                if (array := _npy(archive.read(info), info.filename)) is not None
+            }
+    except (OSError, ValueError, zipfile.BadZipFile, zlib.error, EOFError) as error:
+        raise ImportFormatError(path, f"can't be read as .npz: {error}") from error
+    except (NotImplementedError, RuntimeError) as error:
+        raise ImportFormatError(path, f"can't be read as .npz: {error}") from error
+
+
+def _npy(data: bytes, name: str) -> NDArray[Any] | None:
+    """Return one array, None for objects: those would be unpickled."""
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
+    shape, fortran, dtype = (header or np.lib.format.read_array_header_2_0)(stream)
+    if dtype.hasobject:
+        return None
+    count = math.prod(shape)
+    if min(shape, default=0) < 0 or count * dtype.itemsize > len(data) - stream.tell():
+        raise ValueError(f"{name} declares shape {shape}, more than it holds")
+    flat = np.frombuffer(data, dtype, count, stream.tell()) if count else np.zeros(0, dtype)
+    return flat.reshape(shape, order="F" if fortran else "C")
+
+
+def _mat(path: Path) -> dict[str, NDArray[Any]]:
+    from scipy.io import loadmat, whosmat
+
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(128)
+        if start.startswith((b"MATLAB 7.3", b"\x89HDF")):
+            refuse(path, "is a .mat of version 7.3 (HDF5), which is not supported; save with -v7")
+        listed = whosmat(path)
+        size = sum(8 * math.prod(shape) for _, shape, _ in listed)
+        if size > MOST_BYTES:
+            refuse(path, f"declares {size} bytes of arrays; {MOST_BYTES} at most")
+        numeric = ("double", "single", "logical", "int", "uint")
+        names = [name for name, _, kind in listed if kind.startswith(numeric)]
+        found = loadmat(path, variable_names=names) if names else {}
+    except ImportFormatError:
+        raise
+    except Exception as error:  # scipy raises whatever a damaged file leads to
+        raise ImportFormatError(path, f"can't be read as .mat: {error}") from error
+    return {name: found[name] for name in names if isinstance(found.get(name), np.ndarray)}
+
+
+def arrow(what: str) -> Any:
+    """Return pyarrow.parquet; its types are incomplete.
+
+    Raises:
+        MissingExtraError: If it is not installed.
+    """
+    try:
+        from pyarrow import parquet
+    except ImportError as error:
+        raise MissingExtraError(what, "parquet", "pyarrow") from error
+    return parquet
+
+
+def _open_parquet(path: Path) -> TableFile:
+    parquet = arrow("a .parquet table")
+    try:
+        file = parquet.ParquetFile(path)
+        first = next(file.iter_batches(batch_size=_ROWS), None)
+        if first is None:
+            refuse(path, "has no rows")
+        columns = tuple(_parquet_block(first))
+        file.close()
+    except ImportFormatError:
+        raise
+    except Exception as error:  # pyarrow has errors of many bases
+        raise ImportFormatError(path, f"can't be read as Parquet: {error}") from error
+
+    def read(names: Sequence[str], time: str) -> Iterator[Block]:  # noqa: ARG001
+        wanted = list(dict.fromkeys(re.sub(r"\[\d+\]$", "", name) for name in names))
+        try:
+            with parquet.ParquetFile(path) as file:
+                present = [
+                    name for name in (*wanted, *names) if name in set(file.schema_arrow.names)
+                ]
+                chosen = list(dict.fromkeys(present))
+                for batch in file.iter_batches(batch_size=_ROWS, columns=chosen):
+                    block = _parquet_block(batch)
+                    yield {name: block[name] for name in names}
+        except KeyError as error:
+            raise ImportFormatError(path, f"rows have no {error}") from error
+        except Exception as error:
+            raise ImportFormatError(path, f"can't be read as Parquet: {error}") from error
+
+    table = TableFile(path, columns, read, form="parquet")
+    return _pivoted(table) or table
+
+
+def _parquet_block(batch: Any) -> Block:
+    block: Block = {}
+    for name, column in zip(batch.schema.names, batch.columns, strict=True):
+        kind = str(column.type)
+        if kind.startswith(("list", "fixed_size_list", "large_list")):
+            block |= _spread(name, vectors_of(column))
+        elif kind.startswith("timestamp"):
+            block[name] = column.cast("timestamp[ns]").cast("int64").to_numpy(zero_copy_only=False)
+        else:
+            block[name] = column.to_numpy(zero_copy_only=False)
+    return block
+
+
+def vectors_of(column: Any) -> NDArray[Any]:
+    """Return a column of lists as (n, m).
+
+    Raises:
+        ValueError: If their lengths differ or they hold no numbers.
+    """
+    flat = column.flatten().to_numpy(zero_copy_only=False)
+    rows = len(column)
+    if flat.dtype.kind not in "fiub" or not rows or len(flat) % rows or len(flat) > rows * _WIDEST:
+        return np.zeros((rows, 0))
+    return flat.reshape(rows, -1)
+
+
+def _spread(name: str, vectors: NDArray[Any]) -> Block:
+    return {f"{name}[{i}]": vectors[:, i] for i in range(vectors.shape[1])}
+
+
+def _open_text(path: Path) -> TableFile:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            head = stream.read(_SNIFFED)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ImportFormatError(path, f"can't be read: {error}") from error
+    lines = head.splitlines()
+    lines = lines[:-1] if len(head) == _SNIFFED and len(lines) > 1 else lines
+    skipped = next((i for i, line in enumerate(lines) if line.strip(" \t#%")), len(lines))
+    delimiter, rows = _sniffed(path, [line for line in lines[skipped : skipped + 50] if line])
+    first = [cell.strip(" #%\t") for cell in rows[0]]
+    headerless = all(_is_number(cell) for cell in first if cell)
+    raw = [f"column{i + 1}" for i in range(len(first))] if headerless else first
+    repeated = [name for name in raw if raw.count(name) > 1]
+    if repeated or not all(raw):
+        raise ImportFormatError(path, f"has several columns {(repeated or [''])[0]!r}")
+    skipped += not headerless
+    data = rows if headerless else rows[1:]
+    decimal = "," if delimiter != "," and any("," in c and _decimal(c) for c in data[-1]) else "."
+    vectors = {
+        name: _width(path, cell)
+        for name, cell in zip(raw, (data or [[]])[0], strict=False)
+        if cell.strip().startswith(("[", "("))
+    }
+    columns = tuple(
+        each
+        for name in raw
+        for each in ([f"{name}[{i}]" for i in range(vectors[name])] if name in vectors else [name])
+    )
+    read = partial(_read_text, path, raw, vectors, delimiter, decimal, skipped)
+    table = TableFile(path, columns, read, delimiter, "headerless" if headerless else "wide")
+    return _pivoted(table) or table
+
+
+def _width(path: Path, cell: str) -> int:
+    try:
+        return len(_vector(cell))
+    except ValueError as error:
+        raise ImportFormatError(path, f"{cell[:40]!r} is no vector of numbers") from error
+
+
+def _decimal(cell: str) -> bool:
+    return re.fullmatch(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*", cell) is not None
+
+
+def _is_number(cell: str) -> bool:
+    if cell.startswith(("[", "(")):
+        return True
+    try:
+        float(cell.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _sniffed(path: Path, lines: list[str]) -> tuple[str, list[list[str]]]:
+    """Return the delimiter that cuts all lines alike, and their cells."""
+    for delimiter in (";", "\t", ",", " "):
+        try:
+            if delimiter == " ":
+                rows = [line.strip("# ").split() for line in lines]
+            else:
+                rows = list(csv.reader(lines, delimiter=delimiter, skipinitialspace=True))
+        except csv.Error as error:
+            raise ImportFormatError(path, f"is no table: {error}") from error
+        if rows and len({len(row) for row in rows}) == 1 and len(rows[0]) > 1:
+            if len(rows[0]) > _WIDEST:
+                raise ImportFormatError(path, f"has {len(rows[0])} columns; {_WIDEST} at most")
+            return delimiter, rows
+    raise ImportFormatError(
+        path, "is no table: no comma, semicolon, tab or space cuts its first lines alike"
+    )
+
+
+def _read_text(  # noqa: PLR0917 - bound once, where the file was sniffed
+    path: Path,
+    raw: list[str],
+    vectors: Mapping[str, int],
+    delimiter: str,
+    decimal: str,
+    skipped: int,
+    names: Sequence[str],
+    time: str,
+) -> Iterator[Block]:
+    wanted = [name for name in raw if name in names or f"{name}[0]" in names]
+    texts = {name: str for name in (*vectors, time) if name in wanted}
+    try:
+        with pd.read_csv(  # pyright: ignore[reportCallIssue, reportUnknownMemberType]
+            path, sep=r"\s+" if delimiter == " " else delimiter, decimal=decimal, names=raw,
+            header=None, skiprows=skipped, usecols=wanted, dtype=cast("Any", texts),
+            chunksize=_ROWS, skipinitialspace=True, encoding="utf-8-sig", index_col=False,
+            low_memory=False, on_bad_lines="error",
+        ) as chunks:  # fmt: skip
+            for chunk in cast("Iterator[pd.DataFrame]", chunks):
+                yield _text_block(path, chunk, vectors, skipped, names)
+    except ImportFormatError:
+        raise
+    except (OSError, ValueError, pd.errors.ParserError, OverflowError) as error:
+        raise ImportFormatError(path, f"can't be read: {str(error).strip()}") from error
+
+
+def _text_block(
+    path: Path, chunk: pd.DataFrame, vectors: Mapping[str, int], skipped: int, names: Sequence[str]
+) -> Block:
+    block: Block = {}
+    for name in map(str, chunk.columns):
+        if name not in vectors:
+            block[name] = chunk[name].to_numpy()
+            continue
+        cells = chunk[name].tolist()
+        try:
+            rows = _vectors(cells, vectors[name])
+        except (ValueError, TypeError) as error:
+            row = int(chunk.index[0]) + skipped + 1
+            raise ImportFormatError(
+                path, f"column {name!r}, from row {row}: vectors of other lengths or no numbers"
+            ) from error
+        block |= _spread(name, rows)
+    return {name: block[name] for name in names}
+
+
+def _vectors(cells: list[Any], width: int) -> NDArray[Any]:
+    """Parse vectors in cells, all at once where they are JSON; an empty cell has no numbers."""
+    if all(isinstance(cell, str) for cell in cells):
+        try:
+            rows = np.array(json.loads(f"[{','.join(cells)}]"), dtype=float)
+            if rows.shape == (len(cells), width):
+                return rows
+        except (ValueError, RecursionError):
+            pass
+    rows = np.full((len(cells), width), np.nan)
+    for i, cell in enumerate(cells):
+        if isinstance(cell, str) and (numbers := _vector(cell)):
+            rows[i] = numbers
+    return rows
+
+
+def _vector(cell: str) -> list[float]:
+    return [float(word) for word in re.split(r"[,;\s]+", cell.strip(" []()")) if word]
+
+
+def _pivoted(table: TableFile) -> TableFile | None:
+    """Return a long table as a wide one: one whose rows each name their joint."""
+    by_name = {name.lower(): name for name in table.columns}
+    joint = next((by_name[name] for name in _JOINT_COLUMNS if name in by_name), None)
+    if joint is None or len(table.columns) < 3:
+        return None
+    sample = table.sample()
+    names = list(dict.fromkeys(map(str, sample[joint].tolist())))
+    if not 1 <= len(names) < min(_WIDEST, max(2, len(sample[joint]) // 2 + 1)):
+        return None
+    values = [name for name in table.columns if name != joint and sample[name].dtype.kind in "fiub"]
+    time = next((n for n in values if is_time(n)), None)
+    values = [name for name in values if name != time]
+    if time is None or not values:
+        return None
+
+    def read(wanted: Sequence[str], exact: str) -> Iterator[Block]:  # noqa: ARG001
+        blocks = list(table.read([time, joint, *values], ""))
+        yield from _wide(blocks, time, joint, values, wanted)
+
+    seen: list[str] = []
+    for block in table.read([joint], ""):
+        seen = list(dict.fromkeys([*seen, *map(str, np.unique(block[joint].astype(str)))]))
+    order = sorted(seen, key=lambda n: (names.index(n) if n in names else len(names), n))
+    columns = (time, *(f"{value}[{name}]" for value in values for name in order))
+    if len(columns) > _WIDEST:
+        return None
+    return TableFile(table.path, columns, read, table.delimiter, "long")
+
+
+def _wide(
+    blocks: list[Block], time: str, joint: str, values: list[str], wanted: Sequence[str]
+) -> Iterator[Block]:
+    """Put the rows of one time side by side; the table is held whole, in order of time."""
+    t, who = (np.concatenate([block[name] for block in blocks]) for name in (time, joint))
+    stamps, row = np.unique(t, return_inverse=True)
+    names = who.astype(str)
+    result: Block = {time: stamps}
+    for value in values:
+        cells = np.concatenate([block[value] for block in blocks]).astype(float)
+        for column in wanted:
+            if column.startswith(f"{value}[") and column.endswith("]"):
+                mine = (names == column[len(value) + 1 : -1]) & ~np.isnan(cells)
+                result[column] = np.full(len(stamps), np.nan)
+                result[column][row[mine]] = cells[mine]
+    for at in range(0, len(stamps), _ROWS):
+        yield {name: result[name][at : at + _ROWS] for name in wanted}
+
+
+_TIMES = ("time", "timestamp", "stamp", "t", "secs", "seconds", "epoch", "ts", "datetime")
+
+
+def words(name: str) -> list[str]:
+    """Return the words of a column's name in lower case: ``des_dofPos`` is des, dof, pos."""
+    apart = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
+    return re.findall(r"[a-z]+", apart.lower())
+
+
+def is_time(name: str) -> bool:
+    """Return whether a column is named as times are."""
+    found = words(re.sub(r"[\[(].*", "", name))
+    return bool(found) and found[0] in _TIMES

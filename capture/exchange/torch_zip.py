@@ -1,0 +1,232 @@
+"""Tensors of a ``.pt`` file of PyTorch, read without running what its pickle names.
+
+The file is a zip: ``*/data.pkl`` names tensors by storage, shape and stride, ``*/data/KEY`` holds
+the raw numbers. The pickle's opcodes are followed by a small machine of its own, which knows
+dictionaries, lists, numbers, texts and the rebuilding of tensors; what a pickle would call besides
+is not run: its result is an object without a value.
+"""
+
+from __future__ import annotations
+
+import math
+import pickletools
+import sys
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.errors import ImportFormatError
+
+MOST_BYTES = 1 << 29
+"""More bytes of numbers than this in a file of arrays are refused [B]: they are read at once."""
+
+_DTYPES = {
+    "FloatStorage": "f4", "DoubleStorage": "f8", "HalfStorage": "f2", "LongStorage": "i8",
+    "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1",
+    "BoolStorage": "?",
+}  # fmt: skip
+_TENSOR = ("torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_tensor")
+_PARAMETER = "torch._utils _rebuild_parameter"
+_ORDERED = "collections OrderedDict"
+_MARK = object()
+_NOT_RUN = object()
+_PUSHED = {
+    "NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4",
+    "FLOAT", "BINFLOAT", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "STRING",
+    "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8",
+}  # fmt: skip
+_CONSTANT = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
+_TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+_PUT = {"PUT", "BINPUT", "LONG_BINPUT"}
+_GET = {"GET", "BINGET", "LONG_BINGET"}
+
+
+@dataclass(frozen=True)
+class _Global:
+    name: str
+
+
+@dataclass(frozen=True)
+class _Storage:
+    dtype: str
+    key: str
+
+
+@dataclass(frozen=True)
+class _Tensor:
+    storage: _Storage
+    offset: int
+    shape: tuple[int, ...]
+    stride: tuple[int, ...]
+
+
+def refuse(path: Path, why: str) -> NoReturn:
+    """Raise ImportFormatError."""
+    raise ImportFormatError(path, why)
+
+
+def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the tensors that a file's dictionary names; those of nested ones as ``outer.inner``.
+
+    What is no tensor of numbers has an array that holds None.
+
+    Raises:
+        ImportFormatError: If it is no such zip, or its pickle does more than name tensors.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            (pickle,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
+            root = pickle.removesuffix("data.pkl")
+            if archive.getinfo(pickle).file_size > MOST_BYTES // 64:
+                refuse(path, "its data.pkl is too large to name tensors only")
+            order = _byte_order(archive, root)
+            value = _Machine(path).run(archive.read(pickle))
+            return {
+                name: _array(path, archive, root, order, tensor)
+                if tensor is not None
+                else np.array(None)
+                for name, tensor in _named(value).items()
+            }
+    except ImportFormatError:
+        raise
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:
+        raise ImportFormatError(path, f"is no file of tensors by torch.save: {error}") from error
+    except (zipfile.BadZipFile, NotImplementedError, EOFError, RecursionError) as error:
+        raise ImportFormatError(path, f"is no zip by torch.save: {error}") from error
+    except zlib_error() as error:
+        raise ImportFormatError(path, f"is damaged: {error}") from error
+
+
+def zlib_error() -> type[Exception]:
+    """Return the error of a damaged compressed member."""
+    import zlib
+
+    return zlib.error
+
+
+def _byte_order(archive: zipfile.ZipFile, root: str) -> str:
+    if f"{root}byteorder" not in archive.namelist():
+        return "<" if sys.byteorder == "little" else ">"
+    return ">" if archive.read(f"{root}byteorder") == b"big" else "<"
+
+
+class _Machine:
+    """The opcodes of a pickle that names tensors."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._stack: list[Any] = []
+        self._memo: dict[int, Any] = {}
+
+    def run(self, data: bytes) -> object:
+        for opcode, argument, _ in pickletools.genops(data):
+            if opcode.name == "STOP":
+                break
+            self._step(opcode.name, argument)
+        return self._stack.pop()
+
+    def _step(self, name: str, argument: Any) -> None:  # noqa: C901, PLR0912 - a table of opcodes
+        stack = self._stack
+        if name in {"PROTO", "FRAME"}:
+            return
+        if name in _PUSHED:
+            stack.append(_CONSTANT.get(name, argument))
+        elif name == "MARK":
+            stack.append(_MARK)
+        elif name in {"EMPTY_DICT", "EMPTY_LIST", "EMPTY_TUPLE"}:
+            stack.append({"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple}[name]())
+        elif name in _PUT:
+            self._memo[int(argument)] = stack[-1]
+        elif name == "MEMOIZE":
+            self._memo[len(self._memo)] = stack[-1]
+        elif name in _GET:
+            stack.append(self._memo[int(argument)])
+        elif name == "GLOBAL":
+            stack.append(_Global(str(argument)))
+        elif name == "STACK_GLOBAL":
+            member, module = stack.pop(), stack.pop()
+            stack.append(_Global(f"{module} {member}"))
+        elif name == "TUPLE":
+            stack.append(tuple(self._marked()))
+        elif name in _TUPLES:
+            count = _TUPLES[name]
+            items = tuple(stack[-count:])
+            del stack[-count:]
+            stack.append(items)
+        elif name in {"APPEND", "APPENDS"}:
+            items = [stack.pop()] if name == "APPEND" else self._marked()
+            cast("list[Any]", stack[-1]).extend(items)
+        elif name in {"SETITEM", "SETITEMS"}:
+            items = [stack.pop(-2), stack.pop()] if name == "SETITEM" else self._marked()
+            cast("dict[Any, Any]", stack[-1]).update(zip(items[::2], items[1::2], strict=True))
+        elif name == "BINPERSID":
+            stack.append(self._storage(stack.pop()))
+        elif name == "REDUCE":
+            arguments = stack.pop()
+            stack.append(self._rebuilt(stack.pop(), arguments))
+        elif name == "BUILD":  # the state of a dictionary of weights: metadata only
+            stack.pop()
+        else:
+            raise ImportFormatError(self._path, f"its pickle has {name}, which names no tensor")
+
+    def _marked(self) -> list[Any]:
+        at = max(i for i, item in enumerate(self._stack) if item is _MARK)
+        items = self._stack[at + 1 :]
+        del self._stack[at:]
+        return items
+
+    def _storage(self, words: Any) -> _Storage:
+        kind, storage, key = words[0], words[1], words[2]
+        if kind != "storage" or not isinstance(storage, _Global):
+            raise ImportFormatError(self._path, "its pickle names something else than storages")
+        dtype = _DTYPES.get(storage.name.removeprefix("torch "), "")
+        return _Storage(dtype, str(key))
+
+    def _rebuilt(self, function: Any, arguments: Any) -> object:
+        name = function.name if isinstance(function, _Global) else ""
+        if name == _ORDERED:
+            return {}
+        if name == _PARAMETER:
+            return arguments[0]
+        if name not in _TENSOR or not isinstance(arguments[0], _Storage):
+            return _NOT_RUN
+        shape, stride = (tuple(map(int, numbers)) for numbers in arguments[2:4])
+        return _Tensor(arguments[0], int(arguments[1]), shape, stride)
+
+
+def _named(value: object, prefix: str = "") -> dict[str, _Tensor | None]:
+    if isinstance(value, _Tensor):
+        return {prefix or "tensor": value if value.storage.dtype else None}
+    if not isinstance(value, Mapping):
+        return {prefix: None}
+    found: dict[str, _Tensor | None] = {}
+    for key, inner in cast("Mapping[object, object]", value).items():
+        found |= _named(inner, f"{prefix}.{key}" if prefix else str(key))
+    return found
+
+
+def _array(
+    path: Path, archive: zipfile.ZipFile, root: str, order: str, tensor: _Tensor
+) -> NDArray[Any]:
+    info = archive.getinfo(f"{root}data/{tensor.storage.key}")
+    dtype = np.dtype(order + tensor.storage.dtype)
+    last = tensor.offset + sum(
+        (count - 1) * step for count, step in zip(tensor.shape, tensor.stride, strict=True)
+    )
+    numbers = info.file_size // dtype.itemsize
+    sound = min((*tensor.shape, *tensor.stride, tensor.offset), default=0) >= 0
+    size = math.prod(tensor.shape)
+    if not sound or last >= max(numbers, 1) or size > max(numbers, 1):
+        raise ImportFormatError(path, f"a tensor of shape {tensor.shape} exceeds its storage")
+    if info.file_size > MOST_BYTES:
+        raise ImportFormatError(path, f"a tensor of {info.file_size} bytes; {MOST_BYTES} at most")
+    if not size:
+        return np.zeros(tensor.shape, dtype)
+    flat = np.frombuffer(archive.read(info), dtype, numbers)[tensor.offset :]
+    strides = tuple(step * dtype.itemsize for step in tensor.stride)
+    return np.lib.stride_tricks.as_strided(flat, tensor.shape, strides, writeable=False)
