@@ -1,0 +1,257 @@
+"""A line of serial servos, listened to: ``serial:/dev/ttyUSB0?protocol=feetech&baud=1000000``.
+
+Never a byte is written. A packet's time is that of its last byte: the time of the read minus ten bit
+times for each byte behind it. Records are those of CAN FD frames
+(:data:`.capture.log.messages.frames.FD_FRAME_DTYPE`), on ``/serial/NAME``: the servo's number in the
+place of the identifier, at most 64 bytes each, with the flags :data:`.SERIAL_MORE` and
+:data:`.SERIAL_NOISE`.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import stat
+import termios
+import time
+from bisect import bisect_left
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from ..common.errors import SourceError, UsageError
+from ..common.strict_table import listed
+from ..log.messages.frames import SERIAL_MORE, SERIAL_NOISE, FrameArray
+from ..robot.model import ClockDomain
+from .contract import SourceAddress, fd_records, number, only, pack_fd_record
+from .events import Tally
+from .link import LinkedSource
+from .reader_thread import DrainedLink
+from .servo_packets import PROTOCOLS, PacketSplitter, Piece
+
+DEFAULT_BAUD = 1_000_000
+"""Of both families' servos in robots [bit/s]."""
+
+BITS_A_BYTE = 10
+"""Start bit, eight data bits, stop bit."""
+
+_RECORD = 64
+_CHUNK = 4096
+_PAUSE_S = 0.0002
+_SILENCE_NS = 50_000_000  # no adapter holds bytes back for longer
+_OTHER = "another one (hold it once, or record through 'undulog record tap')"
+
+
+class PacketClock:
+    """The packets of a stream that is read in chunks, each at the time of its last byte."""
+
+    def __init__(self, protocol: str, baud: int, direction: int = 0) -> None:
+        """Start.
+
+        Args:
+            protocol: One of :data:`.PROTOCOLS`.
+            baud: [bit/s].
+            direction: ``dir`` of the records.
+        """
+        self._splitter = PacketSplitter(protocol)
+        self._id_at = PROTOCOLS[protocol].id_at
+        self._byte_ns = BITS_A_BYTE * 1e9 / baud
+        self._direction = direction
+        self._stops: list[int] = []  # of the chunks that unfinished packets may lie in
+        self._times_ns: list[int] = []
+
+    def feed(self, chunk: bytes, t_ns: int, tally: Tally) -> FrameArray:
+        """Take bytes that were read at ``t_ns`` [Unix ns]; none after a silence.
+
+        Returns:
+            The records of what is complete now.
+        """
+        stop = (self._stops[-1] if self._stops else 0) + len(chunk)
+        if chunk:
+            self._stops.append(stop)
+            self._times_ns.append(t_ns)
+        pieces = self._splitter.feed(chunk, silence=not chunk)
+        packed = [record for piece in pieces for record in self._records(piece)]
+        tally.malformed("bytes that belong to no packet", sum(not piece.valid for piece in pieces))
+        keep = bisect_left(self._stops, pieces[-1].stop) if pieces else 0
+        del self._stops[:keep], self._times_ns[:keep]
+        return fd_records(packed)
+
+    def _records(self, piece: Piece) -> list[bytes]:
+        data, servo = piece.data, piece.data[self._id_at] if piece.valid else 0
+        flags = 0 if piece.valid else SERIAL_NOISE
+        chunk = bisect_left(self._stops, piece.stop)
+        behind = self._stops[chunk] - piece.stop
+        t_ns = self._times_ns[chunk] - round(behind * self._byte_ns)
+        records: list[bytes] = []
+        for at in range(0, len(data), _RECORD):
+            part = data[at : at + _RECORD]
+            more = SERIAL_MORE if at + _RECORD < len(data) else 0
+            records.append(
+                pack_fd_record(t_ns, t_ns, servo, len(part), self._direction, flags | more, part)
+            )
+        return records
+
+
+class SerialLink:
+    """An open port."""
+
+    def __init__(self, fileno: int, clock: PacketClock, tally: Tally, detail: str) -> None:
+        """Take over a terminal device."""
+        self.detail = detail
+        self._fileno: int | None = fileno
+        self._clock, self._tally = clock, tally
+        self._last_ns = 0
+        self._error: OSError | None = None
+
+    def read(self, now_ns: int) -> Sequence[FrameArray]:
+        """See :meth:`Link.read`."""
+        if self._error is not None or self._fileno is None:
+            raise self._error or OSError(errno.EBADF, "closed")
+        try:
+            chunk = os.read(self._fileno, _CHUNK)
+        except BlockingIOError:
+            if now_ns - self._last_ns < _SILENCE_NS or not self._last_ns:
+                return ()
+            self._last_ns = 0
+            return (self._clock.feed(b"", now_ns, self._tally),)
+        except OSError as error:
+            self._error = error
+            chunk = b""
+        if chunk:
+            now_ns = self._last_ns = self._tally.now_ns()
+        elif self._error is None:
+            self._error = OSError(errno.EIO, "the device hung up")
+        return (self._clock.feed(chunk, now_ns, self._tally),)
+
+    def fileno(self) -> int:
+        """The device."""
+        return -1 if self._fileno is None else self._fileno
+
+    def close(self) -> None:
+        """Release the device."""
+        if self._fileno is not None:
+            fileno, self._fileno = self._fileno, None
+            with suppress(OSError):
+                fcntl.ioctl(fileno, termios.TIOCNXCL)
+            os.close(fileno)
+
+
+class SerialSource(LinkedSource):
+    """A source of servo packets, which are kept on ``/serial/NAME``."""
+
+
+def holders(path: str | Path) -> list[str]:
+    """Return the processes that have a device open, as ``NAME (PID)``, without this one.
+
+    Those of other users can't be seen.
+    """
+    found: list[str] = []
+    wanted = Path(path).resolve()
+    for process in Path("/proc").glob("[0-9]*"):
+        if int(process.name) == os.getpid():
+            continue
+        with suppress(OSError):
+            links = {(process / "fd" / name).readlink() for name in os.listdir(process / "fd")}
+            if wanted in links:
+                name = (process / "comm").read_text().strip()
+                found.append(f"{name} ({process.name})")
+    return sorted(found)
+
+
+def open_exclusively(path: str, baud: int, *, write: bool = False) -> int:
+    """Open a port raw, for this process alone; return its file number.
+
+    Args:
+        baud: [bit/s].
+        write: Open it for writing too.
+
+    Raises:
+        OSError: If it isn't there.
+        SourceError: If another process holds it, named as far as it can be seen, or it is no
+            terminal device.
+    """
+    if held := holders(path):
+        raise SourceError(path, f"is held by {', '.join(held)}; end that, or tap the line")
+    way = os.O_RDWR if write else os.O_RDONLY
+    try:
+        fileno = os.open(path, way | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        if error.errno == errno.EBUSY:  # TIOCEXCL
+            raise SourceError(path, f"is held by {_OTHER}") from error
+        raise
+    try:
+        fcntl.flock(fileno, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.ioctl(fileno, termios.TIOCEXCL)
+        make_raw(fileno, baud)
+    except termios.error as error:
+        os.close(fileno)
+        raise SourceError(path, "is no serial device") from error
+    except OSError as error:
+        os.close(fileno)
+        if error.errno == errno.ENOTTY:
+            raise SourceError(path, "is no serial device") from error
+        if isinstance(error, BlockingIOError):
+            raise SourceError(path, f"is held by {_OTHER}") from error
+        raise
+    return fileno
+
+
+def make_raw(fileno: int, baud: int) -> None:
+    """Set a terminal device raw, 8N1 at ``baud`` [bit/s]."""
+    speed = getattr(termios, f"B{baud}")
+    characters = termios.tcgetattr(fileno)[6]
+    characters[termios.VMIN], characters[termios.VTIME] = 1, 0
+    flags = termios.CS8 | termios.CREAD | termios.CLOCAL
+    termios.tcsetattr(
+        fileno, termios.TCSANOW, [termios.IGNBRK, 0, flags, 0, speed, speed, characters]
+    )
+
+
+def bauds() -> list[int]:
+    """Return the speeds that a port can have [bit/s]."""
+    names = (name[1:] for name in dir(termios) if name.startswith("B"))
+    return sorted(int(name) for name in names if name.isdigit() and name != "0")
+
+
+def line_settings(address: SourceAddress) -> tuple[str, int]:
+    """Return protocol and speed [bit/s] of an address.
+
+    Raises:
+        UsageError: If one is missing or isn't valid.
+    """
+    protocol, baud = address.options.get("protocol", ""), number(address, "baud", DEFAULT_BAUD)
+    if protocol not in PROTOCOLS:
+        valid = listed(PROTOCOLS, protocol or None)
+        raise UsageError(f"{address.text!r}: give the servos' protocol=...; valid: {valid}")
+    if baud not in bauds():
+        raise UsageError(f"{address.text!r}: baud {baud} is not one of {bauds()}")
+    return protocol, baud
+
+
+def open_serial(address: SourceAddress) -> SerialSource:
+    """Make the source of a serial line; nothing is opened.
+
+    Raises:
+        UsageError: If an option is unknown or has no valid value.
+        SourceError: If the path is not that of a device.
+    """
+    only(address, ("protocol", "baud"))
+    protocol, baud = line_settings(address)
+    path = address.rest
+    if Path(path).exists() and not stat.S_ISCHR(Path(path).stat().st_mode):
+        raise SourceError(address.text, f"{path} is no serial device")
+
+    def open_link(tally: Tally) -> DrainedLink:
+        fileno = open_exclusively(path, baud)
+        link = SerialLink(fileno, PacketClock(protocol, baud), tally, f"never writes, {baud} baud")
+        return DrainedLink(link, tally, pause_s=_PAUSE_S, longest_s=_SILENCE_NS / 1e9)
+
+    return SerialSource(
+        address,
+        open_link,
+        place=path,
+        clock=ClockDomain.HOST,
+        facts={"interface": "serial", "port": path, "protocol": protocol, "baud": str(baud)},
+    )
