@@ -57,11 +57,12 @@ def dynamixel_packet(servo: int, instruction: int, parameters: bytes = b"") -> b
 MORE, FAULTY = -1, 0
 """A judgement: more bytes are needed; no packet begins here."""
 
-Judge = Callable[[bytes, int], int]
-"""Returns the size of the packet that begins at an offset of a buffer, or MORE, or FAULTY."""
+Judge = Callable[[bytes, int, bool], int]
+"""Returns the size of the packet that begins at an offset of a buffer, or MORE, or FAULTY; with the
+last argument no more bytes will come."""
 
 
-def _judge_feetech(data: bytes, at: int) -> int:
+def _judge_feetech(data: bytes, at: int, ended: bool) -> int:
     end = len(data)
     if at + 4 > end:
         return FAULTY if at + 2 < end and data[at + 2] == 0xFF else MORE
@@ -75,9 +76,11 @@ def _judge_feetech(data: bytes, at: int) -> int:
     # One in 256 packets that were cut passes with bytes of the next one: that has its own checksum.
     inside = data.find(b"\xff\xff", at + 4, at + size)
     while inside >= 0:
-        other = _judge_feetech(data, inside)
-        if other == MORE or (other and inside + other >= at + size):
-            return MORE if other == MORE else FAULTY
+        other = _judge_feetech(data, inside, ended)
+        if other == MORE and not ended:
+            return MORE
+        if other > 0 and inside + other >= at + size:
+            return FAULTY
         inside = data.find(b"\xff\xff", inside + 1, at + size)
     return size
 
@@ -85,7 +88,7 @@ def _judge_feetech(data: bytes, at: int) -> int:
 _LONGEST = 4096  # of a Dynamixel packet; its length field holds 65535
 
 
-def _judge_dynamixel(data: bytes, at: int) -> int:
+def _judge_dynamixel(data: bytes, at: int, ended: bool) -> int:  # noqa: ARG001
     end = len(data)
     if at + 7 > end:
         return MORE
@@ -153,7 +156,7 @@ class PacketSplitter:
         pieces: list[Piece] = []
         start = at = 0  # of what is not handed out yet, of the search
         while (found := data.find(header, at)) >= 0:
-            size = judge(data, found)
+            size = judge(data, found, silence)
             if size == MORE and not silence:
                 break
             if size <= 0:
