@@ -44,7 +44,8 @@ def import_log(
     Args:
         log: The foreign log.
         output: The session to write, `.mcap`.
-        robot: A shipped robot (snake25, snake13, snake13-planar, arcsnake-joint) or a robot TOML.
+        robot: A shipped robot (snake25, snake13, snake13-planar, snake12-sts3215, so101,
+            arcsnake-joint) or a robot TOML.
         columns: Column map of a CSV, as TOML.
         map_: One column of a CSV: `COLUMN=time:UNIT`, or `COLUMN=JOINT.QUANTITY:UNIT` with
             `,wrap=PERIOD`, `,scale=FACTOR`, `,offset=VALUE` where needed. May be repeated.

@@ -67,7 +67,8 @@ def record(
     Args:
         sources: What to record.
         output: The session to write, `.mcap`; `{time}` in it becomes the time of the start.
-        robot: A shipped robot (snake25, snake13, snake13-planar, arcsnake-joint) or a robot TOML:
+        robot: A shipped robot (snake25, snake13, snake13-planar, snake12-sts3215, so101,
+            arcsnake-joint) or a robot TOML:
             its bus map defines the frames. A twin brings its own.
         bus: Name of the source that is the robot's bus, where there are several.
         duration: End by itself after this time, e.g. `30s`, `1h30min`.

@@ -125,6 +125,7 @@ class BusRecorder:
         """
         self._name, self._writer = name, writer
         self._raw_fd: FrameChannel | None = None
+        self._serial = serial
         if serial:
             self._raw = self._raw_fd = writer.fd_frames(SERIAL_TOPIC_PREFIX + name)
         else:
@@ -195,6 +196,9 @@ class BusRecorder:
             self._raw_fd.write(now_ns(), batch)
         # Sources return the kinds one after the other; on the bus they are mixed.
         both = in_one(fresh)
+        if self._serial:  # their order is the line's: a reply belongs to the request before it
+            self._wait(both)
+            return
         self._wait(both[np.lexsort((both["t_device_ns"], both["t_host_ns"]))])
 
     def _wait(self, frames: FrameArray) -> None:

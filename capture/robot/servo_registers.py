@@ -51,8 +51,12 @@ class Register:
         return number
 
     def bytes_of(self, value: float) -> bytes:
-        """Return the bytes of a value in ``unit``; the inverse of :meth:`raw`, scaled."""
+        """Return the bytes of a value in ``unit``, or of the nearest that they can hold."""
         number = round((value - self.offset) / self.scale)
+        bits = 8 * self.size - self.signed if self.sign_bit is None else self.sign_bit
+        most = (1 << bits) - 1
+        negative = self.signed or self.sign_bit is not None
+        number = max(-most if negative else 0, min(number, most))
         if self.sign_bit is not None and number < 0:
             number = (1 << self.sign_bit) - number
         order = "big" if self.big_endian else "little"

@@ -185,6 +185,7 @@ def open_exclusively(path: str, baud: int, *, write: bool = False) -> int:
         fcntl.flock(fileno, fcntl.LOCK_EX | fcntl.LOCK_NB)
         fcntl.ioctl(fileno, termios.TIOCEXCL)
         make_raw(fileno, baud)
+        termios.tcflush(fileno, termios.TCIFLUSH)  # what was said before is not of this session
     except termios.error as error:
         os.close(fileno)
         raise SourceError(path, "is no serial device") from error
