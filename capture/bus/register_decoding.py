@@ -259,4 +259,3 @@ class RegisterDecoder:
             offset = signal.scale * register.offset + signal.offset
             found.append((factor, offset * unit.factor + unit.offset))
         return np.array(found, dtype=np.float64).reshape(-1, 2)
-

@@ -81,9 +81,7 @@ def read_family(
     return Bus(names_of, bitrate, signals, family=family, motors=motors), databases
 
 
-def _motors(
-    table: Table, joints: tuple[Joint, ...], models: tuple[str, ...]
-) -> tuple[Motor, ...]:
+def _motors(table: Table, joints: tuple[Joint, ...], models: tuple[str, ...]) -> tuple[Motor, ...]:
     names = [joint.name for joint in joints]
     usual = table.text("model", models[0]) if models else ""
     if models and usual not in models:
@@ -140,9 +138,7 @@ def _signals(
     return tuple(signals), joined
 
 
-def _one_an_identifier(
-    frames: dict[str, Frame], signals: list[BusSignal]
-) -> dict[str, Frame]:
+def _one_an_identifier(frames: dict[str, Frame], signals: list[BusSignal]) -> dict[str, Frame]:
     """Join the messages of motors that share an identifier; each motor's fields get own names."""
     first: dict[tuple[Direction, int, bool], str] = {}
     joined: dict[str, Frame] = {}

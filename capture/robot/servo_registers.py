@@ -43,9 +43,7 @@ class Register:
 
     def raw(self, data: bytes) -> int:
         """Return the number in a register's bytes."""
-        number = int.from_bytes(
-            data, "big" if self.big_endian else "little", signed=self.signed
-        )
+        number = int.from_bytes(data, "big" if self.big_endian else "little", signed=self.signed)
         if self.sign_bit is not None and number >> self.sign_bit & 1:
             return (1 << self.sign_bit) - number
         return number
@@ -95,9 +93,7 @@ _X = (
 
 
 def _x_with_current(milliampere: float) -> tuple[Register, ...]:
-    current = Register(
-        "present_current", 126, 2, Quantity.CURRENT, "mA", milliampere, signed=True
-    )
+    current = Register("present_current", 126, 2, Quantity.CURRENT, "mA", milliampere, signed=True)
     return (*_X, current)
 
 

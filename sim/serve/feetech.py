@@ -96,7 +96,9 @@ class ServoChain:
                 self._write(parameters[at], parameters[0], parameters[at + 1 : at + size])
             return b""
         if instruction == SYNC_READ and len(parameters) > 2:
-            return b"".join(self._read(one, *parameters[:2]) for one in parameters[2:] if one in own)
+            return b"".join(
+                self._read(one, *parameters[:2]) for one in parameters[2:] if one in own
+            )
         if instruction == ACTION:
             for one in own if servo == BROADCAST else (servo,):
                 if one in self._staged:

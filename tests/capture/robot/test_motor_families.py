@@ -145,9 +145,7 @@ def mit(values_bits):
     return number.to_bytes(total // 8, "big")
 
 
-@pytest.mark.parametrize(
-    ("family", "models"), [(f, models_of(f)) for f in ("damiao", "tmotor-ak")]
-)
+@pytest.mark.parametrize(("family", "models"), [(f, models_of(f)) for f in ("damiao", "tmotor-ak")])
 def test_mit_mode_of_every_model(family, models):
     """No manual prints a frame with its values; the packing is that of the libraries' function."""
     ranges = {"dm4310": (30, 10), "dm8009": (45, 54), "ak80-9": (50, 18), "ak10-9": (50, 65)}
@@ -259,7 +257,9 @@ def test_moteus_by_plug_in():
     frames = empty_fd_frames(2)
     frames["id_flags"] = 0x8001, 0x0100
     frames["dir"] = 1, 0
-    for k, data in enumerate(("01000a07206000200150ff140400130d", "2404000a005000000170ff230d181400")):
+    for k, data in enumerate(
+        ("01000a07206000200150ff140400130d", "2404000a005000000170ff230d181400")
+    ):
         data = bytes.fromhex(data)
         frames["len"][k] = len(data)
         frames["data"][k, : len(data)] = list(data)

@@ -45,9 +45,7 @@ def packets_in(records):
 
 
 @pytest.mark.parametrize("protocol", ["feetech", "dynamixel2"])
-def test_nothing_is_lost_at_1_mbaud_with_noise_cuts_and_a_silence(
-    tmp_path, listen, line, protocol
-):
+def test_nothing_is_lost_at_1_mbaud_with_noise_cuts_and_a_silence(tmp_path, listen, line, protocol):
     make = feetech_packet if protocol == "feetech" else dynamixel_packet
     reader = listen(source_at(tmp_path, f"protocol={protocol}"))
     reader.until_event("connected")
@@ -119,7 +117,10 @@ def test_it_is_opened_for_one_alone(tmp_path, listen, line):
         "except Exception as error: print(error)"
     )
     said = subprocess.run(
-        [sys.executable, "-c", code, tmp_path / "ttyUSB0"], capture_output=True, text=True, check=True
+        [sys.executable, "-c", code, tmp_path / "ttyUSB0"],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert f"({os.getpid()})" in said.stdout
 

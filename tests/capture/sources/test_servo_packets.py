@@ -77,7 +77,9 @@ def test_packets_of_the_manual(protocol):
 def sdk_packets(protocol, draw):
     """Random requests and writes, encoded by the vendor's SDK."""
     port, servo = Captured(), draw.randrange(1, 20)
-    data = [draw.choice((0xFF, 0xFF, 0xFD, draw.randrange(256))) for _ in range(draw.randrange(1, 9))]
+    data = [
+        draw.choice((0xFF, 0xFF, 0xFD, draw.randrange(256))) for _ in range(draw.randrange(1, 9))
+    ]
     if protocol == "feetech":
         SCS_SETEND(0)
         sdk = Feetech(0)
@@ -157,7 +159,13 @@ def test_a_packet_has_the_time_of_its_last_byte_exactly(baud):
     """Reads of 16 ms with several packets each, one of them across two reads."""
     packets = [feetech_packet(k % 6 + 1, 0, bytes(range(k % 9 + 1))) for k in range(60)]
     stream = b"".join(packets)
-    clock, tally, t_ns, found, stamps = PacketClock("feetech", baud), Tally(lambda: 0), 10**18, [], []
+    clock, tally, t_ns, found, stamps = (
+        PacketClock("feetech", baud),
+        Tally(lambda: 0),
+        10**18,
+        [],
+        [],
+    )
     ends = np.cumsum([len(packet) for packet in packets])
     reads = list(range(0, len(stream), 117))
     for start in reads:
