@@ -1,7 +1,7 @@
 """Decoder of mjbots moteus: CAN FD frames whose bytes say which registers follow, and in what type.
 
-Source: moteus, ``docs/protocol/can.md`` and ``registers.md``. A DBC has no words for it, so this is a
-plug-in of the entry point group ``undulog.decoders``, as one of another package would be.
+Source: moteus, ``docs/protocol/can.md`` and ``registers.md``. A DBC has no words for it, so this is
+a plug-in of the entry point group ``undulog.decoders``, as one of another package would be.
 """
 
 from __future__ import annotations
@@ -106,7 +106,9 @@ class MoteusDecoder:
         tally = FrameTally(len(frames))
         samples: dict[Quantity, list[tuple[int, int, float]]] = {}
         sizes = data_lengths(frames).tolist()
-        for row, (identifier, size) in enumerate(zip(frames["id_flags"].tolist(), sizes)):
+        for row, (identifier, size) in enumerate(
+            zip(frames["id_flags"].tolist(), sizes, strict=True)
+        ):
             source, target = identifier >> 8 & 0x7F, identifier & 0x7F
             before = sum(map(len, samples.values()))
             try:

@@ -1,10 +1,12 @@
 """A line of serial servos, listened to: ``serial:/dev/ttyUSB0?protocol=feetech&baud=1000000``.
 
-Never a byte is written. A packet's time is that of its last byte: the time of the read minus ten bit
-times for each byte behind it. Records are those of CAN FD frames
-(:data:`.capture.log.messages.frames.FD_FRAME_DTYPE`), on ``/serial/NAME``: the servo's number in the
-place of the identifier, at most 64 bytes each, with the flags :data:`.SERIAL_MORE` and
-:data:`.SERIAL_NOISE`.
+Never a byte is written, unless ``tap=PATH`` has the source own the port and give the driver a
+pseudo-terminal at that path: bytes then pass both ways unchanged, and each packet has a direction.
+
+A packet's time is that of its last byte: the time of the read minus ten bit times for each byte
+behind it. Records are those of CAN FD frames (:data:`.FD_FRAME_DTYPE`), on ``/serial/NAME``: the
+servo's number in the place of the identifier, at most 64 bytes each, with the flags
+:data:`.SERIAL_MORE` and :data:`.SERIAL_NOISE`.
 """
 
 from __future__ import annotations
@@ -12,17 +14,21 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import select
 import stat
 import termios
-import time
+import threading
+import tty
 from bisect import bisect_left
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from ..common.errors import SourceError, UsageError
+from ..common.process import share_priority
 from ..common.strict_table import listed
-from ..log.messages.frames import SERIAL_MORE, SERIAL_NOISE, FrameArray
+from ..log.messages.frames import DIR_TX, SERIAL_MORE, SERIAL_NOISE, FrameArray
 from ..robot.model import ClockDomain
 from .contract import SourceAddress, fd_records, number, only, pack_fd_record
 from .events import Tally
@@ -40,7 +46,7 @@ _RECORD = 64
 _CHUNK = 4096
 _PAUSE_S = 0.0002
 _SILENCE_NS = 50_000_000  # no adapter holds bytes back for longer
-_OTHER = "another one (hold it once, or record through 'undulog record tap')"
+_OTHER = "another process (of another user, or one that took it for itself)"
 
 
 class PacketClock:
@@ -138,6 +144,97 @@ class SerialLink:
             os.close(fileno)
 
 
+class TapLink:
+    """An open port whose driver has a pseudo-terminal; bytes pass in a thread, as they come."""
+
+    def __init__(
+        self,
+        fileno: int,
+        path: Path,
+        clocks: tuple[PacketClock, PacketClock],
+        tally: Tally,
+    ) -> None:
+        """Take over a port, and make the driver's.
+
+        Args:
+            path: Where the driver finds its port, a link.
+            clocks: Of what the servos send, and of what the driver sends.
+
+        Raises:
+            SourceError: If something else than a link is at the path.
+        """
+        if os.path.lexists(path) and not path.is_symlink():
+            raise SourceError(str(path), "is there and no link; give another tap=PATH")
+        self.detail = f"tapped, the driver's port is {path}"
+        self._path, self._clocks, self._tally = path, clocks, tally
+        self._port: int | None = fileno
+        self._master, slave = os.openpty()
+        tty.setraw(slave)
+        self._slave = slave  # held, so that the driver may come and go
+        os.set_blocking(self._master, False)
+        path.unlink(missing_ok=True)
+        path.symlink_to(os.ttyname(slave))
+        self._held: deque[FrameArray] = deque()
+        self._error: OSError | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="undulog-tap", daemon=True)
+        self._thread.start()
+
+    def read(self, now_ns: int) -> Sequence[FrameArray]:  # noqa: ARG002 (stamped by the thread)
+        """See :meth:`Link.read`."""
+        error = self._error
+        found: list[FrameArray] = []
+        while self._held:
+            found.append(self._held.popleft())
+        if not found and error is not None:
+            raise error
+        return found
+
+    def close(self) -> None:
+        """End the thread, close both ports and remove the link."""
+        if self._port is None:
+            return
+        self._stop.set()
+        self._thread.join(1.0)
+        for fileno in (self._port, self._master, self._slave):
+            with suppress(OSError):
+                os.close(fileno)
+        self._port = None
+        self._path.unlink(missing_ok=True)
+
+    def _run(self) -> None:
+        share_priority()
+        ways = {self._port: (self._master, 0), self._master: (self._port, 1)}
+        try:
+            while not self._stop.is_set():
+                ready = select.select(list(ways), [], [], _SILENCE_NS / 1e9)[0]
+                for source in ready:
+                    target, way = ways[source]
+                    self._pass(source, target, self._clocks[way])
+                if not ready:
+                    for clock in self._clocks:
+                        self._held.append(clock.feed(b"", 0, self._tally))
+        except OSError as error:
+            self._error = error
+
+    def _pass(self, source: int | None, target: int | None, clock: PacketClock) -> None:
+        assert source is not None  # noqa: S101 - closed after the thread
+        assert target is not None  # noqa: S101
+        chunk = os.read(source, _CHUNK)
+        now_ns = self._tally.now_ns()
+        if not chunk:
+            raise OSError(errno.EIO, "the device hung up")
+        rest = chunk
+        while rest and not self._stop.is_set():
+            try:
+                rest = rest[os.write(target, rest) :]
+            except BlockingIOError:
+                if target == self._master:
+                    break  # nobody reads the driver's port
+                select.select([], [target], [], _SILENCE_NS / 1e9)
+        self._held.append(clock.feed(chunk, now_ns, self._tally))
+
+
 class SerialSource(LinkedSource):
     """A source of servo packets, which are kept on ``/serial/NAME``."""
 
@@ -153,8 +250,7 @@ def holders(path: str | Path) -> list[str]:
         if int(process.name) == os.getpid():
             continue
         with suppress(OSError):
-            links = {(process / "fd" / name).readlink() for name in os.listdir(process / "fd")}
-            if wanted in links:
+            if wanted in {link.readlink() for link in (process / "fd").iterdir()}:
                 name = (process / "comm").read_text().strip()
                 found.append(f"{name} ({process.name})")
     return sorted(found)
@@ -173,7 +269,10 @@ def open_exclusively(path: str, baud: int, *, write: bool = False) -> int:
             terminal device.
     """
     if held := holders(path):
-        raise SourceError(path, f"is held by {', '.join(held)}; end that, or tap the line")
+        raise SourceError(
+            path,
+            f"is held by {', '.join(held)}; end that, or give its driver the path of ?tap=PATH",
+        )
     way = os.O_RDWR if write else os.O_RDONLY
     try:
         fileno = os.open(path, way | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -238,14 +337,23 @@ def open_serial(address: SourceAddress) -> SerialSource:
         UsageError: If an option is unknown or has no valid value.
         SourceError: If the path is not that of a device.
     """
-    only(address, ("protocol", "baud"))
+    only(address, ("protocol", "baud", "tap"))
     protocol, baud = line_settings(address)
     path = address.rest
     if Path(path).exists() and not stat.S_ISCHR(Path(path).stat().st_mode):
         raise SourceError(address.text, f"{path} is no serial device")
 
-    def open_link(tally: Tally) -> DrainedLink:
-        fileno = open_exclusively(path, baud)
+    tap = address.options.get("tap")
+
+    def open_link(tally: Tally) -> DrainedLink | TapLink:
+        fileno = open_exclusively(path, baud, write=tap is not None)
+        if tap is not None:
+            both = PacketClock(protocol, baud), PacketClock(protocol, baud, DIR_TX)
+            try:
+                return TapLink(fileno, Path(tap), both, tally)
+            except BaseException:
+                os.close(fileno)
+                raise
         link = SerialLink(fileno, PacketClock(protocol, baud), tally, f"never writes, {baud} baud")
         return DrainedLink(link, tally, pause_s=_PAUSE_S, longest_s=_SILENCE_NS / 1e9)
 
@@ -255,4 +363,5 @@ def open_serial(address: SourceAddress) -> SerialSource:
         place=path,
         clock=ClockDomain.HOST,
         facts={"interface": "serial", "port": path, "protocol": protocol, "baud": str(baud)},
+        directions=tap is not None,
     )

@@ -1,10 +1,11 @@
 """Packets of serial servos: where they begin and end in a stream of bytes, and their checksums.
 
 Feetech's SCS and STS servos: ``FF FF ID LENGTH INSTRUCTION PARAMETERS CHECKSUM``; the checksum is
-the inverted sum of all bytes from the ID (SCServo communication protocol manual). Dynamixel protocol
-2.0: ``FF FF FD 00 ID LENGTH(2) INSTRUCTION PARAMETERS CRC(2)``; the CRC is CRC-16 with polynomial
-0x8005, start 0, over all bytes before it, and ``FF FF FD`` inside a packet has a ``FD`` stuffed
-behind it (ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0").
+the inverted sum of all bytes from the ID (SCServo communication protocol manual).
+
+Dynamixel protocol 2.0: ``FF FF FD 00 ID LENGTH(2) INSTRUCTION PARAMETERS CRC(2)``; the CRC is
+CRC-16 with polynomial 0x8005, start 0, over all bytes before it, and ``FF FF FD`` inside a packet
+has a ``FD`` stuffed behind it (ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0").
 """
 
 from __future__ import annotations
@@ -62,11 +63,13 @@ Judge = Callable[[bytes, int, bool], int]
 last argument no more bytes will come."""
 
 
-def _judge_feetech(data: bytes, at: int, ended: bool) -> int:
+def _judge_feetech(data: bytes, at: int, ended: bool) -> int:  # noqa: PLR0911
     end = len(data)
+    if at + 2 < end and data[at + 2] == 0xFF:
+        return FAULTY
     if at + 4 > end:
-        return FAULTY if at + 2 < end and data[at + 2] == 0xFF else MORE
-    if data[at + 2] == 0xFF or not 2 <= data[at + 3] <= 251:
+        return MORE
+    if not 2 <= data[at + 3] <= 251:
         return FAULTY
     size = data[at + 3] + 4
     if at + size > end:

@@ -44,23 +44,23 @@ class Captured:
         self.is_using = False
         self.written = b""
 
-    def clearPort(self):
+    def clearPort(self):  # noqa: N802
         """Nothing waits."""
 
-    def writePort(self, packet):
+    def writePort(self, packet):  # noqa: N802
         self.written += bytes(packet)
         return len(packet)
 
-    def readPort(self, length):
+    def readPort(self, length):  # noqa: N802
         return b""
 
-    def setPacketTimeout(self, length):
+    def setPacketTimeout(self, length):  # noqa: N802
         """Answers never come."""
 
-    def setPacketTimeoutMillis(self, msec):
+    def setPacketTimeoutMillis(self, msec):  # noqa: N802
         """Answers never come."""
 
-    def isPacketTimeout(self):
+    def isPacketTimeout(self):  # noqa: N802
         return True
 
     def take(self):

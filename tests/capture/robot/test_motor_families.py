@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from support.paths import TRACE
-from undulog.capture.bus.decoding import open_decoder
 from undulog.capture import Session
+from undulog.capture.bus.decoding import open_decoder
 from undulog.capture.common.errors import RobotFileError
 from undulog.capture.log.messages.frames import EXTENDED_FLAG, empty_fd_frames, empty_frames
 from undulog.capture.robot.description import load_robot, parse_robot
@@ -260,9 +260,8 @@ def test_moteus_by_plug_in():
     for k, data in enumerate(
         ("01000a07206000200150ff140400130d", "2404000a005000000170ff230d181400")
     ):
-        data = bytes.fromhex(data)
-        frames["len"][k] = len(data)
-        frames["data"][k, : len(data)] = list(data)
+        frames["len"][k] = len(data) // 2
+        frames["data"][k, : len(data) // 2] = list(bytes.fromhex(data))
     values, _ = decoded(arm, frames)
     assert values == pytest.approx(
         {

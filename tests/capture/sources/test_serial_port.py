@@ -4,12 +4,15 @@ import contextlib
 import fcntl
 import os
 import random
+import select
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scservo_sdk import PortHandler
 
 from support.serial_lines import Line
 from undulog.capture.common.errors import SourceError, UsageError
@@ -84,11 +87,11 @@ def test_it_never_writes(tmp_path, listen, line):
 
 def _only_readers(path):
     """File numbers of this process that can only read a device."""
-    for name in os.listdir("/proc/self/fd"):
+    for one in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):
-            same = os.readlink(f"/proc/self/fd/{name}") == os.path.realpath(path)
-            if same and fcntl.fcntl(int(name), fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
-                yield int(name)
+            same = one.readlink() == path.resolve()
+            if same and fcntl.fcntl(int(one.name), fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+                yield int(one.name)
 
 
 HOLD = "import os, sys, time; os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY); print(1, flush=True)"
@@ -160,3 +163,35 @@ def test_no_device(tmp_path):
     (tmp_path / "ttyUSB0").write_text("")
     with pytest.raises(SourceError, match="no serial device"):
         source_at(tmp_path)
+
+
+def test_a_tap_passes_bytes_both_ways_unchanged_and_knows_the_direction(tmp_path, listen, line):
+    reader = listen(source_at(tmp_path, f"protocol=feetech&tap={tmp_path}/ttyTAP"))
+    reader.until_event("tapped")
+    port = PortHandler(str(tmp_path / "ttyTAP"))
+    assert port.openPort()
+    draw, asked, answered = random.Random(2), [], []
+    for k in range(200):
+        size = draw.randrange(1, 16)
+        request = feetech_packet(k % 6 + 1, 2, bytes((56, size)))
+        reply = feetech_packet(k % 6 + 1, draw.choice((0, 2)), draw.randbytes(size))
+        port.writePort(request)
+        heard = b""
+        while len(heard) < len(request):
+            select.select([line.master], [], [], 5)
+            heard += os.read(line.master, 100)
+        assert heard == request
+        line.send(reply)
+        back = b""
+        while len(back) < len(reply):
+            back += port.readPort(len(reply) - len(back))
+        assert back == reply
+        asked.append(request)
+        answered.append(reply)
+    reader.until(lambda: len(reader.fd_frames) == 400)
+    port.closePort()
+    records = reader.fd_frames
+    assert packets_in(records[records["dir"] == 1])[0] == asked
+    assert packets_in(records[records["dir"] == 0])[0] == answered
+    reader.source.stop()
+    assert not (tmp_path / "ttyTAP").is_symlink()

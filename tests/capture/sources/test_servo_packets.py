@@ -5,8 +5,8 @@ import random
 import numpy as np
 import pytest
 from dynamixel_sdk import Protocol2PacketHandler
-from scservo_sdk import PacketHandler as Feetech
 from scservo_sdk import SCS_SETEND
+from scservo_sdk import PacketHandler as Feetech
 
 from support.serial_lines import Captured
 from undulog.capture.log.messages.frames import SERIAL_MORE, SERIAL_NOISE
@@ -21,8 +21,8 @@ from undulog.capture.sources.servo_packets import (
 )
 
 MANUAL = {
-    # ROBOTIS e-Manual, DYNAMIXEL Protocol 2.0: ping, its status, read, its status, write, sync read,
-    # sync write.
+    # ROBOTIS e-Manual, DYNAMIXEL Protocol 2.0: ping, its status, read, its status, write, sync
+    # read, sync write.
     "dynamixel2": [
         "FFFFFD0001030001194E",
         "FFFFFD000107005500060426655D",

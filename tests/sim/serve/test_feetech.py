@@ -1,4 +1,4 @@
-"""The virtual robot as Feetech servos: driven by the vendor's SDK, recorded by a second listener."""
+"""The virtual robot as Feetech servos: driven by the vendor's SDK, recorded by a listener."""
 
 import json
 import math
@@ -35,7 +35,7 @@ def served(tmp_path):
 
 
 def test_the_vendors_sdk_drives_it_and_a_second_adapter_records_it(tmp_path, served):
-    robot, ready = served
+    _, ready = served
     log = tmp_path / "run.mcap"
     listener = f"sts=serial:{ready['listen']}?protocol=feetech"
     with recorders.recording(log, listener, "--robot", "snake12-sts3215") as recorder:
