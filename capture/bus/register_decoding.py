@@ -165,6 +165,7 @@ class RegisterDecoder:
         self._members = {
             quantity: tuple(self._members_of(quantity)) for quantity in JOINT_QUANTITIES
         }
+        self._scales = {quantity: self._factors(quantity) for quantity in self._members}
         self._plans: dict[tuple[int, int, int, bool], list[_Place]] = {}
         self._begun = b""
 
@@ -244,7 +245,7 @@ class RegisterDecoder:
         members = self._members[quantity]
         row, member = np.array([one[:2] for one in samples], dtype=np.int64).T
         raw = np.array([one[2] for one in samples], dtype=np.float64)
-        factors = self._factors(quantity)
+        factors = self._scales[quantity]
         values: FloatArray = raw * factors[member, 0] + factors[member, 1]
         return DecodedSignals(members, SESSION_UNIT[quantity], row, member, t_ns[row], values)
 
@@ -252,7 +253,7 @@ class RegisterDecoder:
         """Return factor and offset from raw number to session unit of each member, shape (m, 2)."""
         found: list[tuple[float, float]] = []
         for signal in self._members[quantity]:
-            servo = next(s for (q, s), one in self._signals.items() if one is signal)
+            servo = next(key[1] for key, one in self._signals.items() if one is signal)
             register = self._registers[servo][signal.signal]
             unit: Unit = unit_for(signal.unit, quantity)
             factor = signal.scale * register.scale * unit.factor
