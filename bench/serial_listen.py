@@ -137,9 +137,9 @@ def delays_s(packets: list[bytes]) -> np.ndarray[tuple[int], np.dtype[np.float64
             written: list[int] = []
 
             def send() -> None:
-                due = time.monotonic_ns()
+                due = 0
                 for packet in packets:
-                    due += len(packet) * 10_000
+                    due = max(due, time.monotonic_ns()) + len(packet) * 10_000
                     while time.monotonic_ns() < due:
                         pass
                     os.write(master, packet)

@@ -7,14 +7,16 @@ the map lies in is counted.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.arrays import FloatArray, IntArray
 from ..common.errors import DataError
 from ..log.messages.frames import DIR_TX, SERIAL_MORE, SERIAL_NOISE, FrameArray
-from ..robot.bus_map import JOINT_QUANTITIES, SESSION_UNIT, Unit, unit_for
+from ..robot.bus_map import SESSION_UNIT, unit_for
 from ..robot.families import is_serial
 from ..robot.model import BusSignal, Quantity, Robot
 from ..robot.servo_registers import SERVOS, Register
@@ -37,6 +39,7 @@ from .decoding import Carrier, DecodedSignals, FrameTally
 Block = tuple[int, int, bytes, bool]
 """Registers on the line: servo, first address, bytes, whether they are written."""
 
+_MOST_REQUESTS = 1024
 _REQUESTS = (READ, SYNC_READ, BULK_READ)
 
 
@@ -47,6 +50,7 @@ class RequestMatcher:
         """Start without a request."""
         self._wide = protocol == "dynamixel2"  # addresses and lengths have two bytes
         self._asked: dict[int, tuple[int, int]] = {}
+        self._requests: dict[bytes, dict[int, tuple[int, int]]] = {}  # a driver repeats its own
         self._staged: dict[int, Block] = {}
 
     def blocks(self, packet: bytes, sent: bool | None = None) -> list[Block] | None:
@@ -58,14 +62,22 @@ class RequestMatcher:
         """
         if self._wide:
             servo, instruction = packet[4], packet[7]
-            parameters = packet[8:-2].replace(STUFFED, PLAIN)
             if instruction == STATUS:
-                return self._reply(servo, parameters[1:])
+                return self._reply(servo, packet[8:-2].replace(STUFFED, PLAIN)[1:])
         else:
-            servo, instruction, parameters = packet[2], packet[4], packet[5:-1]
+            servo, instruction = packet[2], packet[4]
             if sent is False or (sent is None and self._answers(servo, packet)):
-                return self._reply(servo, parameters)
-        return self._instruction(servo, instruction, parameters)
+                return self._reply(servo, packet[5:-1])
+        if (asked := self._requests.get(packet)) is not None:
+            self._asked = asked.copy()
+            return None
+        parameters = packet[8:-2].replace(STUFFED, PLAIN) if self._wide else packet[5:-1]
+        if instruction not in _REQUESTS:
+            return self._instruction(servo, instruction, parameters)
+        self._asked = self._request(servo, instruction, parameters)
+        if len(self._requests) < _MOST_REQUESTS:
+            self._requests[packet] = self._asked.copy()
+        return None
 
     def _answers(self, servo: int, packet: bytes) -> bool:
         """Whether a Feetech packet is the reply that is due: of a length that was asked for.
@@ -76,7 +88,7 @@ class RequestMatcher:
         asked = self._asked.get(servo)
         if asked is None or packet[3] != asked[1] + 2:
             return False
-        return not (packet[4] == READ and tuple(packet[5:-1]) == asked)
+        return packet[4] != READ or tuple(packet[5:-1]) != asked
 
     def _reply(self, servo: int, data: bytes) -> list[Block] | None:
         asked = self._asked.pop(servo, None)
@@ -87,9 +99,6 @@ class RequestMatcher:
     def _instruction(self, servo: int, instruction: int, parameters: bytes) -> list[Block] | None:
         number = self._numbers
         size = 2 if self._wide else 1
-        if instruction in _REQUESTS:
-            self._asked = self._request(servo, instruction, parameters)
-            return None
         self._asked = {}
         if instruction in (WRITE, REG_WRITE) and len(parameters) > size:
             block = (servo, number(parameters, 0), parameters[size:], True)
@@ -136,8 +145,17 @@ def _rows(data: bytes, size: int) -> list[bytes]:
     return [data[at : at + size] for at in range(0, whole, size)]
 
 
-_Place = tuple[int, int, int, Register]
-"""Member, first byte, byte behind it, register."""
+@dataclass(eq=False)
+class _Layout:
+    """Blocks of one address and length, of all servos of a model.
+
+    Attributes:
+        places: First byte of each register of the map that lies in them.
+        samples: Row, index of the motor and bytes of each block of this call.
+    """
+
+    places: tuple[tuple[int, Register], ...]
+    samples: list[tuple[int, int, bytes]] = field(default_factory=list[tuple[int, int, bytes]])
 
 
 class RegisterDecoder:
@@ -154,27 +172,37 @@ class RegisterDecoder:
             raise DataError(f"the robot {robot.name} has no serial servos")
         self._matcher = RequestMatcher(bus.family)
         self._wide = bus.family == "dynamixel2"
-        self._registers = {
-            motor.id: {one.name: one for one in SERVOS[bus.family][motor.model]}
-            for motor in bus.motors
-        }
-        self._signals: dict[tuple[Quantity, int], BusSignal] = {}
-        servo_of = {motor.joint: motor.id for motor in bus.motors}
+        self._motors = {motor.id: (k, motor.model) for k, motor in enumerate(bus.motors)}
+        self._maps = SERVOS[bus.family]
+        joints = [motor.joint for motor in bus.motors]
+        signals: dict[Quantity, list[BusSignal]] = {}
         for signal in bus.signals:
-            self._signals[signal.quantity, servo_of[signal.target]] = signal
-        self._members = {
-            quantity: tuple(self._members_of(quantity)) for quantity in JOINT_QUANTITIES
-        }
-        self._scales = {quantity: self._factors(quantity) for quantity in self._members}
-        self._plans: dict[tuple[int, int, int, bool], list[_Place]] = {}
+            signals.setdefault(signal.quantity, []).append(signal)
+        self._signals = {quantity: tuple(own) for quantity, own in signals.items()}
+        self._member: dict[Quantity, IntArray] = {}
+        self._scales: dict[Quantity, FloatArray] = {}
+        for quantity, own in self._signals.items():
+            member = np.full(len(joints), -1)
+            motor_of = [joints.index(signal.target) for signal in own]
+            member[motor_of] = np.arange(len(own))
+            self._member[quantity] = member
+            models = [bus.motors[k].model for k in motor_of]
+            pairs = [self._scale(*pair) for pair in zip(own, models, strict=True)]
+            self._scales[quantity] = np.array(pairs, dtype=np.float64)
+        self._layouts: dict[tuple[str, int, int, bool], _Layout] = {}
         self._begun = b""
 
-    def _members_of(self, quantity: Quantity) -> Iterable[BusSignal]:
-        return (one for (own, _), one in self._signals.items() if own is quantity)
+    def _scale(self, signal: BusSignal, model: str) -> tuple[float, float]:
+        """Return factor and offset from a raw number to the session's unit."""
+        register = next(one for one in self._maps[model] if one.name == signal.signal)
+        unit = unit_for(signal.unit, signal.quantity)
+        offset = signal.scale * register.offset + signal.offset
+        factor = signal.scale * register.scale * unit.factor
+        return factor, offset * unit.factor + unit.offset
 
     def carriers(self, target: str, quantity: Quantity) -> frozenset[Carrier]:
         """Return a kind of packet for each quantity: which are read together is the driver's."""
-        found = any(signal.target == target for signal in self._members.get(quantity, ()))
+        found = any(signal.target == target for signal in self._signals.get(quantity, ()))
         kind = (tuple(Quantity).index(quantity),)
         return frozenset({(0, (kind,))}) if found else frozenset()
 
@@ -186,77 +214,90 @@ class RegisterDecoder:
                 shape (n,).
         """
         tally = FrameTally(len(frames))
-        rows: dict[Quantity, list[tuple[int, int, float]]] = {}
-        data, sizes = frames["data"].tobytes(), frames["len"].tolist()
-        flags, ways = frames["fd_flags"].tolist(), frames["dir"].tolist()
-        width = frames["data"].shape[1] if len(frames) else 0
+        used: dict[int, _Layout] = {}
+        ways = frames["dir"].tolist()
         known = any(ways)
-        for row, size in enumerate(sizes):
-            part = self._begun + data[row * width : row * width + size]
+        for row, packet in self._packets(frames, tally):
+            blocks = self._matcher.blocks(packet, ways[row] == DIR_TX if known else None)
+            if not blocks:
+                self._count(packet[4 if self._wide else 2], tally)
+                continue
+            carries = False
+            for servo, address, data, written in blocks:
+                motor, model = self._motors.get(servo, (-1, ""))
+                layout = self._layout(model, address, len(data), written)
+                if layout.places:
+                    layout.samples.append((row, motor, data))
+                    used[id(layout)] = layout
+                    carries = True
+                else:
+                    counter = tally.silent if model else tally.unknown
+                    counter[f"servo {servo} register {address}"] += 1
+            tally.decoded += carries
+        t_ns = frames["t_host_ns"].astype(np.int64)
+        return tuple(one for each in used.values() for one in self._decoded(each, t_ns)), tally
+
+    def _packets(self, frames: FrameArray, tally: FrameTally) -> Iterator[tuple[int, bytes]]:
+        """Yield the packets, joined from their records, with the row of the last one."""
+        data, width = frames["data"].tobytes(), frames["data"].shape[1]
+        flags = frames["fd_flags"].tolist()
+        for row, size in enumerate(frames["len"].tolist()):
+            part = data[row * width : row * width + size]
+            if not flags[row] and not self._begun:  # nearly always
+                yield row, part
+                continue
+            part = self._begun + part
             self._begun = part if flags[row] & SERIAL_MORE else b""
             if self._begun:
                 continue
             if flags[row] & SERIAL_NOISE:
                 tally.errors += 1
-                continue
-            blocks = self._matcher.blocks(part, ways[row] == DIR_TX if known else None)
-            servo = part[4 if self._wide else 2]
-            carries = False
-            for block in blocks or ():
-                places = self._places(block)
-                carries = carries or bool(places)
-                self._count(block, places, tally)
-                for member, start, stop, register in places:
-                    sample = (row, member, register.raw(block[2][start:stop]))
-                    rows.setdefault(register.quantity, []).append(sample)
-            tally.decoded += carries
-            if not blocks and servo != BROADCAST and servo not in self._registers:
-                tally.unknown[f"servo {servo}"] += 1
-            elif not blocks:
-                tally.silent[f"servo {servo}" if servo != BROADCAST else "all servos"] += 1
-        t_ns = frames["t_host_ns"].astype(np.int64)
-        return tuple(self._decoded(quantity, own, t_ns) for quantity, own in rows.items()), tally
+            else:
+                yield row, part
 
-    def _count(self, block: Block, places: list[_Place], tally: FrameTally) -> None:
-        """Count a block that no register of the map lies in."""
-        if places:
-            return
-        servo, address, _, _ = block
-        counter = tally.silent if servo in self._registers else tally.unknown
-        counter[f"servo {servo} register {address}"] += 1
+    def _count(self, servo: int, tally: FrameTally) -> None:
+        """Count a packet without registers: a request, a ping, a reply to nothing."""
+        if servo == BROADCAST:
+            tally.silent["all servos"] += 1
+        else:
+            counter = tally.silent if servo in self._motors else tally.unknown
+            counter[f"servo {servo}"] += 1
 
-    def _places(self, block: Block) -> list[_Place]:
-        servo, address, data, written = block
-        key = (servo, address, len(data), written)
-        found = self._plans.get(key)
+    def _layout(self, model: str, address: int, size: int, written: bool) -> _Layout:
+        key = (model, address, size, written)
+        found = self._layouts.get(key)
         if found is None:
-            found = self._plans[key] = [
-                (self._members[one.quantity].index(signal), at, at + one.size, one)
-                for one in self._registers.get(servo, {}).values()
-                if (signal := self._signals.get((one.quantity, servo))) is not None
-                and (one.quantity is Quantity.COMMAND) is written
-                and 0 <= (at := one.address - address) <= len(data) - one.size
-            ]
+            places = tuple(
+                (at, one)
+                for one in self._maps.get(model, ())
+                if (one.quantity is Quantity.COMMAND) is written
+                and 0 <= (at := one.address - address) <= size - one.size
+            )
+            found = self._layouts[key] = _Layout(places)
         return found
 
-    def _decoded(
-        self, quantity: Quantity, samples: list[tuple[int, int, float]], t_ns: IntArray
-    ) -> DecodedSignals:
-        members = self._members[quantity]
-        row, member = np.array([one[:2] for one in samples], dtype=np.int64).T
-        raw = np.array([one[2] for one in samples], dtype=np.float64)
-        factors = self._scales[quantity]
-        values: FloatArray = raw * factors[member, 0] + factors[member, 1]
-        return DecodedSignals(members, SESSION_UNIT[quantity], row, member, t_ns[row], values)
+    def _decoded(self, layout: _Layout, t_ns: IntArray) -> Iterator[DecodedSignals]:
+        row, motor = np.array([one[:2] for one in layout.samples], dtype=np.int64).T
+        data = np.frombuffer(b"".join(one[2] for one in layout.samples), np.uint8)
+        data = data.reshape(len(row), -1)
+        layout.samples = []
+        times = t_ns[row]
+        for at, register in layout.places:
+            quantity = register.quantity
+            member = self._member[quantity][motor]
+            factor, offset = self._scales[quantity][member].T
+            values: FloatArray = raw_numbers(register, data[:, at : at + register.size])
+            unit, signals = SESSION_UNIT[quantity], self._signals[quantity]
+            yield DecodedSignals(signals, unit, row, member, times, values * factor + offset)
 
-    def _factors(self, quantity: Quantity) -> FloatArray:
-        """Return factor and offset from raw number to session unit of each member, shape (m, 2)."""
-        found: list[tuple[float, float]] = []
-        for signal in self._members[quantity]:
-            servo = next(key[1] for key, one in self._signals.items() if one is signal)
-            register = self._registers[servo][signal.signal]
-            unit: Unit = unit_for(signal.unit, quantity)
-            factor = signal.scale * register.scale * unit.factor
-            offset = signal.scale * register.offset + signal.offset
-            found.append((factor, offset * unit.factor + unit.offset))
-        return np.array(found, dtype=np.float64).reshape(-1, 2)
+
+def raw_numbers(register: Register, data: NDArray[np.uint8]) -> FloatArray:
+    """Return :meth:`.Register.raw` of the bytes of many samples, shape (n, size), as floats."""
+    order = data[:, ::-1] if register.big_endian else data
+    number = order.astype(np.int64) @ (1 << 8 * np.arange(register.size))
+    if register.signed:
+        number -= (number >> (8 * register.size - 1)) << 8 * register.size
+    elif register.sign_bit is not None:
+        magnitude = number & ((1 << register.sign_bit) - 1)
+        number = np.where(number >> register.sign_bit & 1, -magnitude, number)
+    return number.astype(np.float64)

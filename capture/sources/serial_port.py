@@ -34,7 +34,7 @@ from .contract import SourceAddress, fd_records, number, only, pack_fd_record
 from .events import Tally
 from .link import LinkedSource
 from .reader_thread import DrainedLink
-from .servo_packets import PROTOCOLS, PacketSplitter, Piece
+from .servo_packets import PROTOCOLS, PacketSplitter
 
 DEFAULT_BAUD = 1_000_000
 """Of both families' servos in robots [bit/s]."""
@@ -78,26 +78,23 @@ class PacketClock:
             self._stops.append(stop)
             self._times_ns.append(t_ns)
         pieces = self._splitter.feed(chunk, silence=not chunk)
-        packed = [record for piece in pieces for record in self._records(piece)]
-        tally.malformed("bytes that belong to no packet", sum(not piece.valid for piece in pieces))
-        keep = bisect_left(self._stops, pieces[-1].stop) if pieces else 0
-        del self._stops[:keep], self._times_ns[:keep]
+        stops, times_ns, way = self._stops, self._times_ns, self._direction
+        packed: list[bytes] = []
+        faulty = 0
+        for data, end, valid in pieces:
+            read = bisect_left(stops, end)
+            t_ns = times_ns[read] - round((stops[read] - end) * self._byte_ns)
+            servo, flags = (data[self._id_at], 0) if valid else (0, SERIAL_NOISE)
+            faulty += not valid
+            while len(data) > _RECORD:
+                more = flags | SERIAL_MORE
+                packed.append(pack_fd_record(t_ns, t_ns, servo, _RECORD, way, more, data[:_RECORD]))
+                data = data[_RECORD:]  # noqa: PLW2901 (its rest)
+            packed.append(pack_fd_record(t_ns, t_ns, servo, len(data), way, flags, data))
+        tally.malformed("bytes that belong to no packet", faulty)
+        keep = bisect_left(stops, pieces[-1].stop) if pieces else 0
+        del stops[:keep], times_ns[:keep]
         return fd_records(packed)
-
-    def _records(self, piece: Piece) -> list[bytes]:
-        data, servo = piece.data, piece.data[self._id_at] if piece.valid else 0
-        flags = 0 if piece.valid else SERIAL_NOISE
-        chunk = bisect_left(self._stops, piece.stop)
-        behind = self._stops[chunk] - piece.stop
-        t_ns = self._times_ns[chunk] - round(behind * self._byte_ns)
-        records: list[bytes] = []
-        for at in range(0, len(data), _RECORD):
-            part = data[at : at + _RECORD]
-            more = SERIAL_MORE if at + _RECORD < len(data) else 0
-            records.append(
-                pack_fd_record(t_ns, t_ns, servo, len(part), self._direction, flags | more, part)
-            )
-        return records
 
 
 class SerialLink:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 PING, READ, WRITE, REG_WRITE, ACTION = 1, 2, 3, 4, 5
 STATUS, SYNC_READ, SYNC_WRITE, BULK_READ, BULK_WRITE = 0x55, 0x82, 0x83, 0x92, 0x93
@@ -65,26 +66,25 @@ last argument no more bytes will come."""
 
 def _judge_feetech(data: bytes, at: int, ended: bool) -> int:  # noqa: PLR0911
     end = len(data)
-    if at + 2 < end and data[at + 2] == 0xFF:
-        return FAULTY
     if at + 4 > end:
-        return MORE
-    if not 2 <= data[at + 3] <= 251:
-        return FAULTY
+        return FAULTY if data[at + 2 : at + 3] == b"\xff" else MORE
     size = data[at + 3] + 4
-    if at + size > end:
+    if data[at + 2] == 0xFF or not 6 <= size <= 255:
+        return FAULTY
+    stop = at + size
+    if stop > end:
         return MORE
-    if ~sum(data[at + 2 : at + size - 1]) & 0xFF != data[at + size - 1]:
+    if sum(data[at + 2 : stop]) & 0xFF != 0xFF:  # the checksum is the inverted sum of the others
         return FAULTY
     # One in 256 packets that were cut passes with bytes of the next one: that has its own checksum.
-    inside = data.find(b"\xff\xff", at + 4, at + size)
+    inside = data.find(b"\xff\xff", at + 4, stop)
     while inside >= 0:
         other = _judge_feetech(data, inside, ended)
         if other == MORE and not ended:
             return MORE
-        if other > 0 and inside + other >= at + size:
+        if other > 0 and inside + other >= stop:
             return FAULTY
-        inside = data.find(b"\xff\xff", inside + 1, at + size)
+        inside = data.find(b"\xff\xff", inside + 1, stop)
     return size
 
 
@@ -122,8 +122,7 @@ PROTOCOLS: Mapping[str, Protocol] = {
 }
 
 
-@dataclass(frozen=True)
-class Piece:
+class Piece(NamedTuple):
     """Bytes of the stream: a packet with a valid checksum, or bytes of none.
 
     Attributes:
@@ -166,13 +165,13 @@ class PacketSplitter:
                 at = found + 1
                 continue
             if found > start:
-                pieces.append(Piece(data[start:found], self._done + found, valid=False))
+                pieces.append(Piece(data[start:found], self._done + found, False))
             start = at = found + size
-            pieces.append(Piece(data[found:start], self._done + start, valid=True))
+            pieces.append(Piece(data[found:start], self._done + start, True))
         if found < 0:
             found = len(data) if silence else _header_begins(data, at, header)
         if found > start:
-            pieces.append(Piece(data[start:found], self._done + found, valid=False))
+            pieces.append(Piece(data[start:found], self._done + found, False))
         self._done += max(found, start)
         self._rest = data[max(found, start) :]
         return pieces
