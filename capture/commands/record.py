@@ -49,7 +49,8 @@ def record(
     """Record a robot, or its twin, into a session that loses nothing.
 
     A SOURCE is `can:INTERFACE:CHANNEL` (any interface of python-can; it only listens and never
-    transmits), `unix:PATH` (frames from other processes) or `twin:SCENARIO`; `NAME=` before it
+    transmits), `serial:PORT?protocol=feetech` or `dynamixel2` (a line of servos, never written to),
+    `unix:PATH` (frames from other processes) or `twin:SCENARIO`; `NAME=` before it
     names it in the session. What was accepted survives the death of the recorder: it is in a
     write-ahead log beside the file. Ctrl-C, SIGTERM and SIGHUP end the recording with a whole
     file. `undulog record status`, `mark`, `note`, `split` and `stop` control it meanwhile.
@@ -58,6 +59,9 @@ def record(
 
     Two buses, a new file every 10 minutes: `undulog record front=can:socketcan:can0
     rear=can:socketcan:can1 --robot snake25 --bus front --split-time 10min -o run.mcap`
+
+    Servos on a serial line: `undulog record 'serial:/dev/ttyUSB1?protocol=feetech' --robot so101
+    -o run.mcap`
 
     The twin, in real time: `undulog record twin:flat -o twin.mcap --duration 20s`
 
