@@ -7,6 +7,7 @@ the map lies in is counted.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -217,10 +218,11 @@ class RegisterDecoder:
         used: dict[int, _Layout] = {}
         ways = frames["dir"].tolist()
         known = any(ways)
+        plain, at = list[int](), 4 if self._wide else 2
         for row, packet in self._packets(frames, tally):
             blocks = self._matcher.blocks(packet, ways[row] == DIR_TX if known else None)
             if not blocks:
-                self._count(packet[4 if self._wide else 2], tally)
+                plain.append(packet[at])
                 continue
             carries = False
             for servo, address, data, written in blocks:
@@ -234,6 +236,7 @@ class RegisterDecoder:
                     counter = tally.silent if model else tally.unknown
                     counter[f"servo {servo} register {address}"] += 1
             tally.decoded += carries
+        self._count(Counter(plain), tally)
         t_ns = frames["t_host_ns"].astype(np.int64)
         return tuple(one for each in used.values() for one in self._decoded(each, t_ns)), tally
 
@@ -255,13 +258,12 @@ class RegisterDecoder:
             else:
                 yield row, part
 
-    def _count(self, servo: int, tally: FrameTally) -> None:
-        """Count a packet without registers: a request, a ping, a reply to nothing."""
-        if servo == BROADCAST:
-            tally.silent["all servos"] += 1
-        else:
-            counter = tally.silent if servo in self._motors else tally.unknown
-            counter[f"servo {servo}"] += 1
+    def _count(self, plain: Counter[int], tally: FrameTally) -> None:
+        """Count packets without registers, by servo: requests, pings, replies to nothing."""
+        for servo, count in plain.items():
+            known = servo == BROADCAST or servo in self._motors
+            counter = tally.silent if known else tally.unknown
+            counter["all servos" if servo == BROADCAST else f"servo {servo}"] += count
 
     def _layout(self, model: str, address: int, size: int, written: bool) -> _Layout:
         key = (model, address, size, written)
