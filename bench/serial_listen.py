@@ -25,7 +25,7 @@ from measuring import arguments, verdict
 from scservo_sdk import PacketHandler
 
 from undulog.capture import SessionWriter
-from undulog.capture.bus.decoding import open_decoder
+from undulog.capture.bus.decoders import open_decoder
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.sources.contract import SourceContext, open_source, parse_address
 from undulog.capture.sources.events import Tally

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, fields
-from importlib.metadata import entry_points
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -27,7 +26,6 @@ from ..log.messages.frames import (
     identifier_text,
 )
 from ..robot.bus_map import SESSION_UNIT
-from ..robot.families import DECODERS, is_serial
 from ..robot.model import BusSignal, Direction, Quantity, Robot
 from .map_entry import MapEntry, bus_messages, compile_entry, frame_id
 
@@ -138,22 +136,6 @@ class Decoder(Protocol):
     def decode(self, frames: FrameArray) -> tuple[tuple[DecodedSignals, ...], FrameTally]:
         """See :meth:`BusDecoder.decode`."""
         ...
-
-
-def open_decoder(robot: Robot, *, directions: bool = True) -> Decoder:
-    """Return the decoder of a robot's bus: by registers, by plug-in, or by databases.
-
-    Raises:
-        DataError: As :class:`BusDecoder`.
-    """
-    family = robot.bus.family if robot.bus is not None else ""
-    if is_serial(robot.bus):
-        from .register_decoding import RegisterDecoder
-
-        return RegisterDecoder(robot)
-    for plugin in entry_points(group=DECODERS, name=family) if family else ():
-        return plugin.load()(robot)
-    return BusDecoder(robot, directions=directions)
 
 
 def robstride_keys(keys: IntArray) -> IntArray:

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from ..bus.decoded_topics import DecodedTopics, Message
-from ..bus.decoding import DecodedSignals, FrameTally, open_decoder
+from ..bus.decoders import open_decoder
+from ..bus.decoding import DecodedSignals, FrameTally
 from ..common.arrays import NS, IntArray
 from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError

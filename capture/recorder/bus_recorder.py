@@ -15,7 +15,8 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from ..bus.decoded_topics import DecodedTopics, Message
-from ..bus.decoding import FrameTally, open_decoder
+from ..bus.decoders import open_decoder
+from ..bus.decoding import FrameTally
 from ..common.errors import LogWriteError, UsageError
 from ..log.messages.frames import (
     FD_TOPIC_PREFIX,

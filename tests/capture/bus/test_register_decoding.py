@@ -15,7 +15,7 @@ from dynamixel_sdk import (
 from scservo_sdk import PacketHandler as Feetech
 
 from support.serial_lines import Captured
-from undulog.capture.bus.decoding import open_decoder
+from undulog.capture.bus.decoders import open_decoder
 from undulog.capture.robot.description import load_robot, parse_robot
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.serial_port import PacketClock

@@ -9,7 +9,7 @@ import pytest
 
 from support.paths import TRACE
 from undulog.capture import Session
-from undulog.capture.bus.decoding import open_decoder
+from undulog.capture.bus.decoders import open_decoder
 from undulog.capture.common.errors import RobotFileError
 from undulog.capture.log.messages.frames import EXTENDED_FLAG, empty_fd_frames, empty_frames
 from undulog.capture.robot.description import load_robot, parse_robot
