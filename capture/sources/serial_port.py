@@ -201,7 +201,9 @@ class TapLink:
 
     def _run(self) -> None:
         share_priority()
-        ways = {self._port: (self._master, 0), self._master: (self._port, 1)}
+        port = self._port
+        assert port is not None  # noqa: S101 - closed after this thread
+        ways = {port: (self._master, 0), self._master: (port, 1)}
         try:
             while not self._stop.is_set():
                 ready = select.select(list(ways), [], [], _SILENCE_NS / 1e9)[0]
@@ -214,9 +216,7 @@ class TapLink:
         except OSError as error:
             self._error = error
 
-    def _pass(self, source: int | None, target: int | None, clock: PacketClock) -> None:
-        assert source is not None  # noqa: S101 - closed after the thread
-        assert target is not None  # noqa: S101
+    def _pass(self, source: int, target: int, clock: PacketClock) -> None:
         chunk = os.read(source, _CHUNK)
         now_ns = self._tally.now_ns()
         if not chunk:
