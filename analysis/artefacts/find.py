@@ -373,8 +373,8 @@ def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Fo
 
 def _linear(position: Series, command: Series) -> Series:
     """Return what a joint makes of a command that is no rhythm; a rhythm as it is."""
-    both = (Samples(one.t_s, one.values) for one in (command, position))
-    own = linearised(JointMotion(command.name, *both)).command
+    asked, moved = (Samples(one.t_s, one.values) for one in (command, position))
+    own = linearised(JointMotion(command.name, asked, moved)).command
     return command if own.t_s is command.t_s else Series(command.name, own.t_s, own.values)
 
 

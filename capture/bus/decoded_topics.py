@@ -25,7 +25,7 @@ from ..log.write.writer import SessionWriter, open_sensor
 from ..robot.bus_map import SESSION_UNIT
 from ..robot.model import BusSignal, Quantity, Robot, Sensor, SensorKind
 from .cycles import RoundGatherer, Rounds
-from .decoding import BusDecoder, DecodedSignals
+from .decoding import DecodedSignals, Decoder
 
 _SAMPLE_OFFSET_TOPIC = "/joint_sample_offset"  # sample time minus stamp of measurements [s]
 _COMMAND_OFFSET_TOPIC = "/joint_command_offset"  # send time minus stamp of commands [s]
@@ -63,7 +63,7 @@ class Message:
 class DecodedTopics:
     """Turns decoded signals into messages, block by block."""
 
-    def __init__(self, writer: SessionWriter, robot: Robot, decoder: BusDecoder) -> None:
+    def __init__(self, writer: SessionWriter, robot: Robot, decoder: Decoder) -> None:
         """Plan the topics; each is opened when its first sample comes."""
         joints = robot.joint_names
         sampled = _OffsetTopic(writer, _SAMPLE_OFFSET_TOPIC, joints)
@@ -305,7 +305,7 @@ class _JointTopic:
         return [Message(topic, sampled_ns, write)]
 
 
-def _groups_of(decoder: BusDecoder, joints: tuple[str, ...]) -> list[list[tuple[Quantity, ...]]]:
+def _groups_of(decoder: Decoder, joints: tuple[str, ...]) -> list[list[tuple[Quantity, ...]]]:
     """Return the JointState topics, as their quantities, grouped by the frames that bring them.
 
     Position comes first where velocity or effort come with it.
@@ -322,7 +322,7 @@ def _groups_of(decoder: BusDecoder, joints: tuple[str, ...]) -> list[list[tuple[
     return groups
 
 
-def _topics_of(decoder: BusDecoder, joints: tuple[str, ...]) -> list[tuple[Quantity, ...]]:
+def _topics_of(decoder: Decoder, joints: tuple[str, ...]) -> list[tuple[Quantity, ...]]:
     """Return the quantities of each JointState topic; position first where others come with it."""
     with_position = [
         quantity
@@ -337,7 +337,7 @@ def _topics_of(decoder: BusDecoder, joints: tuple[str, ...]) -> list[tuple[Quant
 
 
 def _comes_with(
-    decoder: BusDecoder, joints: tuple[str, ...], quantity: Quantity, other: Quantity
+    decoder: Decoder, joints: tuple[str, ...], quantity: Quantity, other: Quantity
 ) -> bool:
     """Return whether every joint that has the quantity has it in the frames of the other one."""
     own = [(joint, decoder.carriers(joint, quantity)) for joint in joints]

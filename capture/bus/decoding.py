@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, fields
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,6 +126,34 @@ class _Family:
     names: tuple[str, ...]
 
 
+class Decoder(Protocol):
+    """What turns frames into quantities; a plug-in of :data:`.DECODERS` has these methods."""
+
+    def carriers(self, target: str, quantity: Quantity) -> frozenset[Carrier]:
+        """See :meth:`BusDecoder.carriers`."""
+        ...
+
+    def decode(self, frames: FrameArray) -> tuple[tuple[DecodedSignals, ...], FrameTally]:
+        """See :meth:`BusDecoder.decode`."""
+        ...
+
+
+def robstride_keys(keys: IntArray) -> IntArray:
+    """Return identifiers of the RobStride protocol with what names type and motor only.
+
+    Type 2, and 24 in the same layout, has faults and mode in bits 16 to 23 and the host in bits 0
+    to 7; type 1 the torque in bits 8 to 23, others the host there.
+
+    Args:
+        keys: Identifiers with the bits for extended and sent ones, shape (n,).
+    """
+    kind = keys >> 24 & 0x1F
+    flags = keys & ~np.int64(ID_MASK)
+    feedback = (kind == 2) | (kind == 24)
+    return flags | np.where(feedback, 2 << 24 | keys & 0xFF00, kind << 24 | keys & 0xFF)
+
+
+_KEYS = {"robstride": robstride_keys, "cybergear": robstride_keys}
 _SILENT, _UNDIRECTED = -1, -2
 
 
@@ -144,6 +172,7 @@ class BusDecoder:
             DataError: If the robot has no bus, or not the databases that its map needs.
         """
         bus, messages = bus_messages(robot)
+        self._normal = _KEYS.get(bus.family)
         self._carried: dict[int, list[tuple[BusSignal, MapEntry]]] = {}
         for signal in bus.signals:
             message = messages[signal.message]
@@ -203,8 +232,9 @@ class BusDecoder:
         if not len(self._keys):
             tally.unknown.update(map(_name, keys.tolist()))
             return (), tally
-        place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
-        is_known = self._keys[place] == keys
+        asked = keys if self._normal is None else self._normal(keys)
+        place = np.minimum(np.searchsorted(self._keys, asked), len(self._keys) - 1)
+        is_known = self._keys[place] == asked
         family = np.where(is_known, self._family[place], _SILENT)
         for counter, chosen in (
             (tally.unknown, ~is_known),

@@ -54,8 +54,8 @@ def import_log(
     Args:
         log: The foreign log: a file, a folder of tables, or a LeRobot dataset.
         output: The session to write, `.mcap`; a folder for the episodes of a dataset.
-        robot: A shipped robot (snake25, snake13, snake13-planar, arcsnake-joint) or a robot TOML;
-            required for CAN traces.
+        robot: A shipped robot (snake25, snake13, snake13-planar, snake12-sts3215, so101,
+            arcsnake-joint) or a robot TOML; required for CAN traces.
         commands: A table of commands, where `log` is one of states alone.
         columns: Column map of a table, as TOML.
         map_: One column of a table: `COLUMN=time:UNIT`, or `COLUMN=JOINT.QUANTITY:UNIT` with

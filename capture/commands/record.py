@@ -49,7 +49,8 @@ def record(
     """Record a robot, or its twin, into a session that loses nothing.
 
     A SOURCE is `can:INTERFACE:CHANNEL` (any interface of python-can; it only listens and never
-    transmits), `unix:PATH` (frames from other processes) or `twin:SCENARIO`; `NAME=` before it
+    transmits), `serial:PORT?protocol=feetech` or `dynamixel2` (a line of servos, never written to),
+    `unix:PATH` (frames from other processes) or `twin:SCENARIO`; `NAME=` before it
     names it in the session. What was accepted survives the death of the recorder: it is in a
     write-ahead log beside the file. Ctrl-C, SIGTERM and SIGHUP end the recording with a whole
     file. `undulog record status`, `mark`, `note`, `split` and `stop` control it meanwhile.
@@ -59,6 +60,9 @@ def record(
     Two buses, a new file every 10 minutes: `undulog record front=can:socketcan:can0
     rear=can:socketcan:can1 --robot snake25 --bus front --split-time 10min -o run.mcap`
 
+    Servos on a serial line: `undulog record 'serial:/dev/ttyUSB1?protocol=feetech' --robot so101
+    -o run.mcap`
+
     The twin, in real time: `undulog record twin:flat -o twin.mcap --duration 20s`
 
     Every option can stand in a settings file, table `[record]`, or in the environment as
@@ -67,7 +71,8 @@ def record(
     Args:
         sources: What to record.
         output: The session to write, `.mcap`; `{time}` in it becomes the time of the start.
-        robot: A shipped robot (snake25, snake13, snake13-planar, arcsnake-joint) or a robot TOML:
+        robot: A shipped robot (snake25, snake13, snake13-planar, snake12-sts3215, so101,
+            arcsnake-joint) or a robot TOML:
             its bus map defines the frames. A twin brings its own.
         bus: Name of the source that is the robot's bus, where there are several.
         duration: End by itself after this time, e.g. `30s`, `1h30min`.

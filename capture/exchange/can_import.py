@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from ..bus.decoded_topics import DecodedTopics, Message
-from ..bus.decoding import BusDecoder, DecodedSignals, FrameTally
+from ..bus.decoders import open_decoder
+from ..bus.decoding import DecodedSignals, FrameTally
 from ..common.arrays import NS, IntArray
 from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError
@@ -201,7 +202,7 @@ class _Import:
         self, writer: SessionWriter, robot: Robot, log: FrameLog, chosen: str, report: ImportReport
     ) -> None:
         self._writer, self._log, self._chosen, self._report = writer, log, chosen, report
-        self._decoder = BusDecoder(robot, directions=log.directions) if robot.bus else None
+        self._decoder = open_decoder(robot, directions=log.directions) if robot.bus else None
         self._topics = DecodedTopics(writer, robot, self._decoder) if self._decoder else None
         self._channels: dict[str, FrameChannel] = {}
         self._tally = FrameTally()

@@ -15,14 +15,24 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from ..bus.decoded_topics import DecodedTopics, Message
-from ..bus.decoding import BusDecoder, FrameTally
+from ..bus.decoders import open_decoder
+from ..bus.decoding import FrameTally
 from ..common.errors import LogWriteError, UsageError
-from ..log.messages.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd, in_one
+from ..log.messages.frames import (
+    FD_TOPIC_PREFIX,
+    FRAME_TOPIC_PREFIX,
+    SERIAL_TOPIC_PREFIX,
+    FrameArray,
+    holds_fd,
+    in_one,
+)
 from ..log.write.channels import FrameChannel
 from ..log.write.writer import SessionWriter
 from ..robot.description import load_robot
+from ..robot.families import is_serial
 from ..robot.model import Robot
 from ..sources.contract import Source
+from ..sources.serial_port import SerialSource
 from .settings import RecordSettings
 from .source_clock import SourceClock
 
@@ -56,14 +66,22 @@ def decoded_source(
     Raises:
         UsageError: If there is no such source, or several are possible.
     """
-    buses = [source.name for source in sources if source.robot is None]
+    own = [source for source in sources if source.robot is None]
+    serial = is_serial(robot.bus if robot is not None else None)
+    if robot is not None and robot.bus is not None:
+        fitting = [source for source in own if isinstance(source, SerialSource) is serial]
+        if own and not fitting:
+            kind = "a serial line (serial:PORT?protocol=...)" if serial else "a CAN bus"
+            raise UsageError(f"the motors of {robot.name} are on {kind}, and no source is one")
+        own = fitting
+    buses = [source.name for source in own]
     if settings.bus is not None:
         if settings.bus not in buses:
             raise UsageError(f"--bus {settings.bus}: no such bus; there are: {', '.join(buses)}")
         if robot is None or robot.bus is None:
             raise UsageError(f"--bus {settings.bus} needs a robot with a bus map (--robot)")
         return settings.bus
-    if robot is None or robot.bus is None or len(buses) < len(sources):
+    if robot is None or robot.bus is None or any(s.robot is not None for s in sources):
         return None
     if len(buses) > 1:
         raise UsageError(
@@ -93,6 +111,7 @@ class BusRecorder:
         robot: Robot | None,
         *,
         directions: bool,
+        serial: bool = False,
     ) -> None:
         """Open the bus.
 
@@ -100,17 +119,22 @@ class BusRecorder:
             clock: Maps the device's times onto the session's clock.
             robot: Its bus map decodes the frames; None to keep them raw only.
             directions: Whether the frames distinguish sent from received.
+            serial: Whether they are packets of serial servos, on ``/serial/NAME``.
 
         Raises:
             DataError: If the robot has no bus map.
         """
         self._name, self._writer = name, writer
-        self._raw = writer.frames(FRAME_TOPIC_PREFIX + name)
         self._raw_fd: FrameChannel | None = None
+        self._serial = serial
+        if serial:
+            self._raw = self._raw_fd = writer.fd_frames(SERIAL_TOPIC_PREFIX + name)
+        else:
+            self._raw = writer.frames(FRAME_TOPIC_PREFIX + name)
         self._clock = clock
         self._decoder = self._topics = None
         if robot is not None:
-            self._decoder = BusDecoder(robot, directions=directions)
+            self._decoder = open_decoder(robot, directions=directions)
             self._topics = DecodedTopics(writer, robot, self._decoder)
         self._fresh: list[FrameArray] = []
         self._waiting: deque[FrameArray] = deque()
@@ -173,6 +197,9 @@ class BusRecorder:
             self._raw_fd.write(now_ns(), batch)
         # Sources return the kinds one after the other; on the bus they are mixed.
         both = in_one(fresh)
+        if self._serial:  # their order is the line's: a reply belongs to the request before it
+            self._wait(both)
+            return
         self._wait(both[np.lexsort((both["t_device_ns"], both["t_host_ns"]))])
 
     def _wait(self, frames: FrameArray) -> None:

@@ -22,7 +22,7 @@ from ..log.health.session_scan import ChannelMeasures, SessionMeasures, SessionS
 from ..log.health.tallies import BusHealth, JointHealth
 from ..log.mcap.chunk import BODY_AT, FIXED_SIZE, HEAD
 from ..log.messages.definitions import parse_message_type
-from ..log.messages.frames import FRAME_TOPIC_PREFIX, FRAME_TOPIC_PREFIXES
+from ..log.messages.frames import FRAME_TOPIC_PREFIX, FRAME_TOPIC_PREFIXES, SERIAL_TOPIC_PREFIX
 from ..log.sinks.mcap_sink import Description
 from ..robot.model import Robot
 from ..sources.contract import Source
@@ -222,7 +222,7 @@ class LiveHealth:
         self, topic: _Topic, measured: ChannelMeasures, joints: list[JointHealth]
     ) -> TopicSnapshot:
         # Messages of frames are written per batch, without a rhythm of their own.
-        framed = topic.name.startswith(FRAME_TOPIC_PREFIXES)
+        framed = topic.name.startswith((*FRAME_TOPIC_PREFIXES, SERIAL_TOPIC_PREFIX))
         timings = [] if framed else [series.timing for series in measured.series]
         steady = [timing for timing in timings if timing.regular]
         jitters = [(timing.std_s or 0.0) / timing.median_s for timing in steady if timing.median_s]
@@ -249,7 +249,8 @@ class LiveHealth:
             clock: Maps its times; None for a source that writes its own channels.
         """
         counts = source.counts
-        topics = [prefix + source.name for prefix in FRAME_TOPIC_PREFIXES]
+        prefixes = (*FRAME_TOPIC_PREFIXES, SERIAL_TOPIC_PREFIX)
+        topics = [prefix + source.name for prefix in prefixes]
         buses: list[BusHealth] = [bus for bus in self.result().buses if bus.topic in topics]
         frames = None if source.robot is not None and not counts.frames else counts.frames
         recent = self._sources.setdefault(source.name, _Topic(source.name))

@@ -22,6 +22,7 @@ from ..log.write.channels import TimeReferenceChannel
 from ..log.write.writer import SessionWriter
 from ..robot.model import Robot
 from ..sources.contract import EndingSource, Polled, Source, SourceContext
+from ..sources.serial_port import SerialSource
 from .bus_recorder import BusRecorder
 from .source_clock import SourceClock
 from .status import EachSecond, SessionClock, TickTally
@@ -338,6 +339,7 @@ class Recorder:
             self.clocks[source.name],
             robot,
             directions=source.directions,
+            serial=isinstance(source, SerialSource),
         )
 
     def _write_clocks(self) -> None:

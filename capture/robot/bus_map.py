@@ -17,6 +17,7 @@ from ..common.arrays import FloatArray
 from ..common.config import read_field
 from ..common.errors import UsageError
 from ..common.strict_table import Faults, Table, finite_number, listed
+from .families import read_family
 from .model import Bus, BusPoll, BusSignal, Direction, Joint, Quantity, Sensor, SensorKind
 
 if TYPE_CHECKING:
@@ -185,6 +186,8 @@ def read_bus(
         sensors: The robot's sensors.
         read_database: Text of a DBC file by name, None where there is none.
     """
+    if "family" in table:
+        return read_family(table, joints, {name: unit.factor for name, unit in UNITS.items()})
     databases: dict[str, str] = {}
     names = table.words("databases")
     if not names:

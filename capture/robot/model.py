@@ -24,7 +24,7 @@ import numpy as np
 
 from ..common.arrays import FloatArray, IntArray, frozen
 from ..common.config import Count, Name, NonNegative, Positive
-from ..common.strict_table import NONZERO, above, at_most
+from ..common.strict_table import NONZERO, above, at_least, at_most
 
 JOINT_LIMITS = (
     "max_rate",
@@ -316,6 +316,27 @@ class BusPoll:
 
 
 @dataclass(frozen=True)
+class Motor:
+    """One motor of a family of :mod:`.capture.robot.families`.
+
+    Attributes:
+        joint: The joint that it turns.
+        id: Its number on the bus.
+        model: Model of its family; empty where all are alike.
+        reply_id: Identifier of its replies, where that is a setting; None for the usual one.
+        scale: Joint angle to motor angle (gear ratio, sign); of commands, positions and velocities.
+        offset: Added after ``scale`` to commands and positions [rad].
+    """
+
+    joint: str
+    id: Annotated[int, at_least(0)]
+    model: str = ""
+    reply_id: Annotated[int, at_least(0)] | None = None
+    scale: Annotated[float, NONZERO] = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
 class Bus:
     """The robot's bus: databases and the map from signals to quantities.
 
@@ -323,12 +344,16 @@ class Bus:
         databases: DBC file names, relative to the robot TOML.
         bitrate: [bit/s].
         polls: Requests of each control tick; empty where the robot sends unrequested.
+        family: Family of the motors that the map was made for; empty for a map of its own.
+        motors: The motors of a family.
     """
 
     databases: tuple[str, ...]
     bitrate: Count
     signals: tuple[BusSignal, ...]
     polls: tuple[BusPoll, ...] = ()
+    family: str = ""
+    motors: tuple[Motor, ...] = ()
 
 
 @dataclass(frozen=True)

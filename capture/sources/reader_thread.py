@@ -48,7 +48,9 @@ class LinkWithFile(Link, Protocol):
 class DrainedLink:
     """The :class:`.capture.sources.link.Link` that reads another one in a thread."""
 
-    def __init__(self, link: LinkWithFile, tally: Tally, *, pause_s: float) -> None:
+    def __init__(
+        self, link: LinkWithFile, tally: Tally, *, pause_s: float, longest_s: float | None = None
+    ) -> None:
         """Take over an open link, and begin.
 
         Args:
@@ -56,9 +58,11 @@ class DrainedLink:
             tally: Counts lost frames; the link may have the same.
             pause_s: Pause after each read [s]: frames without a time are stamped at most this much
                 later.
+            longest_s: Read again after so long without a byte [s], so that the link notices.
         """
         self.detail = link.detail
         self._link, self._tally, self._pause_s = link, tally, pause_s
+        self._longest_s = longest_s
         self._held: deque[FrameArray] = deque()
         self._count = self._taken = 0
         self._error: Exception | None = None
@@ -98,7 +102,7 @@ class DrainedLink:
                 for frames in self._link.read(self._tally.now_ns()):  # some may be there already
                     self._hold(frames)
                 self._stop.wait(self._pause_s)
-                select.select([fileno, self._wake[0]], [], [])
+                select.select([fileno, self._wake[0]], [], [], self._longest_s)
         except Exception as error:  # noqa: BLE001 (raised again by read(), in the recorder's thread)
             self._error = error
 

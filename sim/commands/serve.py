@@ -34,6 +34,7 @@ def serve(
     *,
     socketcand: str | None = None,
     unix: Path | None = None,
+    feetech: Path | None = None,
     bus: str = "can0",
     duration: float | None = None,
     wait: bool = False,
@@ -55,10 +56,15 @@ def serve(
     Then, in other terminals: `undulog record
     'can:socketcand:can0?port=29536' --robot snake25 -o run.mcap`, and a controller.
 
+    As servos on a serial line: `undulog sim serve flat --feetech /tmp/ttySNAKE`, heard by
+    `undulog record 'serial:/tmp/ttySNAKE.listen?protocol=feetech' --robot MINE.toml -o run.mcap`
+
     Args:
         scenario: Name of a shipped scenario (see `undulog sim list`), or a TOML file.
         socketcand: Serve clients at this `[HOST:]PORT` of the loopback; port 0 for any.
         unix: Send all frames to the recorder that listens at this path, once it is there.
+        feetech: Be STS3215 servos 1, 2, ... on a pseudo-terminal at this path; everything on the
+            line comes out at the path with `.listen`, too.
         bus: Name of the bus.
         duration: Simulated seconds to live, rather than until it is stopped.
         wait: Begin with the first command, so that no client misses anything.
@@ -77,8 +83,12 @@ def serve(
     from ..scenario.scenario import LONGEST_S
     from ..scenario.scenario_file import load_scenario
 
-    if socketcand is None and unix is None:
-        raise UsageError("this robot could not be reached: give --socketcand PORT or --unix PATH")
+    if socketcand is None and unix is None and feetech is None:
+        raise UsageError(
+            "this robot could not be reached: give --socketcand PORT, --unix PATH or --feetech PATH"
+        )
+    if feetech is not None and (socketcand or unix or lockstep or fault):
+        raise UsageError("--feetech is a line of its own: without --socketcand, --unix, --lockstep")
     if lockstep and socketcand is None:
         raise UsageError("in lockstep the robot waits for commands: give --socketcand PORT")
     if fast and not lockstep:
@@ -86,6 +96,8 @@ def serve(
     chosen = load_scenario(scenario).changed(
         duration_s=LONGEST_S if duration is None else duration, seed=seed
     )
+    if feetech is not None:
+        return _run_feetech(chosen, feetech, wait=wait, json=json)
     if chosen.robot.bus is None:
         raise UsageError(f"{chosen.robot.name} has no bus map, so it has no frames for a bus")
     plan = _Plan(
@@ -100,6 +112,38 @@ def serve(
         json=json,
     )
     return _run(plan)
+
+
+def _run_feetech(scenario: Scenario, path: Path, *, wait: bool, json: bool) -> int:
+    from undulog.capture.common.process import interruptible
+    from undulog.capture.sources.events import EventLog
+
+    from ..serve.feetech import FeetechRobot
+
+    events = EventLog(time.monotonic_ns)
+    with interruptible() as stop:
+        robot = FeetechRobot(scenario, path, wait=wait, log_event=events.log_event)
+        port, listen = map(str, robot.ports.paths)
+        name, count = scenario.robot.name, len(scenario.robot.joints)
+        ready = {"event": "ready", "robot": name, "port": port, "listen": listen, "waits": wait}
+        line = f"{name} is {count} STS3215 servos at {port}; listen at {listen}"
+        try:
+            duration_s = robot.run(lambda: echo(*([dumps(ready)] if json else [line])), stop)
+        finally:
+            robot.ports.close()
+            _complain(events.flush())
+    facts = {
+        "event": "end",
+        "duration_s": duration_s,
+        **asdict(robot.pace),
+        "commands": robot.chain.commands,
+        "bytes_received": robot.ports.received,
+        "bytes_sent": robot.ports.sent,
+    }
+    late = f"{1e3 * robot.pace.worst_s:.2g} ms late at worst"
+    line = f"{name} ran for {duration_s:g} s, {late}; {robot.chain.commands} commands taken"
+    echo(*([dumps(facts)] if json else [line]))
+    return 0
 
 
 @dataclass(frozen=True)

@@ -66,6 +66,13 @@ FRAME_TOPIC_PREFIX = "/can/"
 FD_TOPIC_PREFIX = "/can_fd/"
 """CAN FD frames of bus ``can0`` are on ``/can_fd/can0``."""
 
+SERIAL_TOPIC_PREFIX = "/serial/"
+"""Packets of serial servos on line ``ttyUSB0`` are on ``/serial/ttyUSB0``."""
+SERIAL_MORE = 0x40
+"""``fd_flags`` of a serial record: the packet goes on in the next record."""
+SERIAL_NOISE = 0x80
+"""``fd_flags`` of a serial record: bytes that belong to no packet with a valid checksum."""
+
 FRAME_TOPIC_PREFIXES = (FRAME_TOPIC_PREFIX, FD_TOPIC_PREFIX)
 """How the topics of raw frames begin."""
 

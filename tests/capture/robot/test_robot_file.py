@@ -36,7 +36,14 @@ def faults_of(text, databases=None):
 
 
 def test_shipped_robots_are_listed():
-    assert robot_names() == ("arcsnake-joint", "snake13", "snake13-planar", "snake25")
+    assert robot_names() == (
+        "arcsnake-joint",
+        "snake12-sts3215",
+        "snake13",
+        "snake13-planar",
+        "snake25",
+        "so101",
+    )
 
 
 def test_snake25_is_the_robot_of_the_paper():

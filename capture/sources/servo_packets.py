@@ -1,0 +1,185 @@
+"""Packets of serial servos: where they begin and end in a stream of bytes, and their checksums.
+
+Feetech's SCS and STS servos: ``FF FF ID LENGTH INSTRUCTION PARAMETERS CHECKSUM``; the checksum is
+the inverted sum of all bytes from the ID (SCServo communication protocol manual).
+
+Dynamixel protocol 2.0: ``FF FF FD 00 ID LENGTH(2) INSTRUCTION PARAMETERS CRC(2)``; the CRC is
+CRC-16 with polynomial 0x8005, start 0, over all bytes before it, and ``FF FF FD`` inside a packet
+has a ``FD`` stuffed behind it (ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+PING, READ, WRITE, REG_WRITE, ACTION = 1, 2, 3, 4, 5
+STATUS, SYNC_READ, SYNC_WRITE, BULK_READ, BULK_WRITE = 0x55, 0x82, 0x83, 0x92, 0x93
+BROADCAST = 0xFE
+"""Instructions, and the identifier that all servos take for their own."""
+
+STUFFED, PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
+
+
+def _crc_table() -> tuple[int, ...]:
+    table: list[int] = []
+    for byte in range(256):
+        value = byte << 8
+        for _ in range(8):
+            value = (value << 1) ^ (0x8005 if value & 0x8000 else 0)
+        table.append(value & 0xFFFF)
+    return tuple(table)
+
+
+_TABLE = _crc_table()
+
+
+def crc16(data: bytes) -> int:
+    """Return the CRC of a Dynamixel 2.0 packet without its last two bytes."""
+    value = 0
+    for byte in data:
+        value = (value << 8 & 0xFF00) ^ _TABLE[value >> 8 ^ byte]
+    return value
+
+
+def feetech_packet(servo: int, instruction: int, parameters: bytes = b"") -> bytes:
+    """Build a Feetech packet; of a reply, ``instruction`` is its error byte."""
+    body = bytes((servo, len(parameters) + 2, instruction)) + parameters
+    return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
+
+
+def dynamixel_packet(servo: int, instruction: int, parameters: bytes = b"") -> bytes:
+    """Build a Dynamixel 2.0 packet; a reply's parameters begin with its error byte."""
+    body = (bytes((instruction,)) + parameters).replace(PLAIN, STUFFED)
+    whole = b"\xff\xff\xfd\x00" + bytes((servo,)) + (len(body) + 2).to_bytes(2, "little") + body
+    return whole + crc16(whole).to_bytes(2, "little")
+
+
+MORE, FAULTY = -1, 0
+"""A judgement: more bytes are needed; no packet begins here."""
+
+Judge = Callable[[bytes, int, bool], int]
+"""Returns the size of the packet that begins at an offset of a buffer, or MORE, or FAULTY; with the
+last argument no more bytes will come."""
+
+
+def _judge_feetech(data: bytes, at: int, ended: bool) -> int:  # noqa: PLR0911
+    end = len(data)
+    if at + 4 > end:
+        return FAULTY if data[at + 2 : at + 3] == b"\xff" else MORE
+    size = data[at + 3] + 4
+    if data[at + 2] == 0xFF or not 6 <= size <= 255:
+        return FAULTY
+    stop = at + size
+    if stop > end:
+        return MORE
+    if sum(data[at + 2 : stop]) & 0xFF != 0xFF:  # the checksum is the inverted sum of the others
+        return FAULTY
+    # One in 256 packets that were cut passes with bytes of the next one: that has its own checksum.
+    inside = data.find(b"\xff\xff", at + 4, stop)
+    while inside >= 0:
+        other = _judge_feetech(data, inside, ended)
+        if other == MORE and not ended:
+            return MORE
+        if other > 0 and inside + other >= stop:
+            return FAULTY
+        inside = data.find(b"\xff\xff", inside + 1, stop)
+    return size
+
+
+_LONGEST = 4096  # of a Dynamixel packet; its length field holds 65535
+
+
+def _judge_dynamixel(data: bytes, at: int, ended: bool) -> int:  # noqa: ARG001
+    end = len(data)
+    if at + 7 > end:
+        return MORE
+    size = int.from_bytes(data[at + 5 : at + 7], "little") + 7
+    if not 10 <= size <= _LONGEST or data[at + 4] == 0xFF:
+        return FAULTY
+    if data.find(b"\xff\xff\xfd\x00", at + 4, at + size) >= 0:
+        return FAULTY  # inside a packet a FD would be stuffed there
+    if at + size > end:
+        return MORE
+    crc = int.from_bytes(data[at + size - 2 : at + size], "little")
+    return size if crc16(data[at : at + size - 2]) == crc else FAULTY
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How packets of a protocol are found in a stream, and built."""
+
+    header: bytes
+    judge: Judge
+    packet: Callable[[int, int, bytes], bytes]
+    id_at: int
+
+
+PROTOCOLS: Mapping[str, Protocol] = {
+    "feetech": Protocol(b"\xff\xff", _judge_feetech, feetech_packet, 2),
+    "dynamixel2": Protocol(b"\xff\xff\xfd\x00", _judge_dynamixel, dynamixel_packet, 4),
+}
+
+
+class Piece(NamedTuple):
+    """Bytes of the stream: a packet with a valid checksum, or bytes of none.
+
+    Attributes:
+        stop: Number of bytes of the stream up to its end.
+    """
+
+    data: bytes
+    stop: int
+    valid: bool
+
+
+class PacketSplitter:
+    """Cuts a stream into packets and bytes that belong to none; nothing is dropped.
+
+    Behind a faulty packet the search goes on at its second byte, so a cut one doesn't take the next
+    with it.
+    """
+
+    def __init__(self, protocol: str) -> None:
+        """Start at any place of a stream of a protocol of :data:`PROTOCOLS`."""
+        self._protocol = PROTOCOLS[protocol]
+        self._rest = b""
+        self._done = 0
+
+    def feed(self, chunk: bytes, *, silence: bool = False) -> list[Piece]:
+        """Add bytes, and return what is complete now.
+
+        Args:
+            silence: No byte has come for long: an unfinished packet was cut.
+        """
+        data = self._rest + chunk
+        header, judge = self._protocol.header, self._protocol.judge
+        pieces: list[Piece] = []
+        start = at = 0  # of what is not handed out yet, of the search
+        while (found := data.find(header, at)) >= 0:
+            size = judge(data, found, silence)
+            if size == MORE and not silence:
+                break
+            if size <= 0:
+                at = found + 1
+                continue
+            if found > start:
+                pieces.append(Piece(data[start:found], self._done + found, False))
+            start = at = found + size
+            pieces.append(Piece(data[found:start], self._done + start, True))
+        if found < 0:
+            found = len(data) if silence else _header_begins(data, at, header)
+        if found > start:
+            pieces.append(Piece(data[start:found], self._done + found, False))
+        self._done += max(found, start)
+        self._rest = data[max(found, start) :]
+        return pieces
+
+
+def _header_begins(data: bytes, at: int, header: bytes) -> int:
+    """Return where the beginning of a header ends the data; the data's length if nowhere."""
+    for size in range(min(len(header) - 1, len(data) - at), 0, -1):
+        if data.endswith(header[:size]):
+            return len(data) - size
+    return len(data)
