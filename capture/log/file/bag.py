@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Reader
 
-_PER_MESSAGE = re.compile(r"^\s*compression_mode:\s*['\"]?message\b", re.I | re.M)
+_PER_MESSAGE = re.compile(r"^\s*compression_mode:\s*['\"]?message\b", re.IGNORECASE | re.MULTILINE)
 _COPY = "session.mcap"
 
 
@@ -68,7 +68,9 @@ class BagCopy:
             self.close()
             why = " ".join(str(error).split()) or type(error).__name__
             fix = "check metadata.yaml and the files it names, or run 'ros2 bag reindex'"
-            raise NotALogError(path, f"can't be read as a rosbag2 recording: {why}; {fix}") from error
+            raise NotALogError(
+                path, f"can't be read as a rosbag2 recording: {why}; {fix}"
+            ) from error
         except BaseException:
             self.close()
             raise
@@ -83,7 +85,7 @@ def _check_room(path: Path, folder: Path) -> None:
     size = sum(each.stat().st_size for each in files)
     free = shutil.disk_usage(folder).free
     if free < size:
-        why = f"its copy needs at least {size} bytes, {folder} has {free}; set TMPDIR to a larger disk"
+        why = f"its copy needs {size} bytes, {folder} has {free}; set TMPDIR to a larger disk"
         raise LogError(path, why)
 
 

@@ -42,11 +42,8 @@ def check(path):
     with Session.open(path) as session:
         found = session.joints("/joint_states")
         assert session.path == path
-        for joint in range(2):
-            t_ns, values = np.asarray(found.t_ns), np.asarray(found.values)
-            t_ns = t_ns[:, joint] if t_ns.ndim == 2 else t_ns
-            np.testing.assert_array_equal(t_ns, TIMES_NS)
-            np.testing.assert_array_equal(values[:, joint], TRUTH[:, joint])
+        np.testing.assert_array_equal(found.t_ns, np.stack([TIMES_NS, TIMES_NS]))
+        np.testing.assert_array_equal(found.values, TRUTH.T)
 
 
 @pytest.fixture(autouse=True)
