@@ -10,7 +10,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from undulog.capture import Session
-from undulog.capture.common.errors import NotALogError
+from undulog.capture.common.errors import NotALogError, UndulogError
 
 EPOCH_NS = 1_700_000_000_000_000_000
 KIND = "sensor_msgs/msg/JointState"
@@ -99,3 +99,22 @@ def test_a_damaged_bag_is_named_with_the_fix(damage, tmp_path):
             data.unlink()
     with pytest.raises(NotALogError, match="ros2 bag reindex"):
         Session.open(bag)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("storage", StoragePlugin)
+def test_a_mutated_bag_reads_or_is_refused_in_words(storage, mode, tmp_path):
+    bag, draw = write(tmp_path / "bag", storage, mode), np.random.default_rng(11)
+    whole = {path: path.read_bytes() for path in sorted(bag.iterdir())}
+    for case in range(10):
+        path = list(whole)[case % len(whole)]
+        data = bytearray(whole[path])
+        for place in draw.integers(len(data), size=1 + case):
+            data[place] = draw.integers(256)
+        path.write_bytes(data)
+        try:
+            with Session.open(bag) as session:
+                session.joints("/joint_states")
+        except UndulogError as error:
+            assert str(bag) in str(error)
+        path.write_bytes(whole[path])
