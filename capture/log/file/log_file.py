@@ -28,6 +28,7 @@ from ...common.remote import as_path
 from ..mcap.chunk import LAST_NS, Block, read_message_heads
 from ..mcap.file import McapFile
 from ..wal.reader import MessageKey, WalContents, WalTail, beyond, read_wal
+from .bag import BagCopy, is_bag
 from .parts import PART_RECORD, PartFiles, first_part, open_parts
 
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
@@ -171,8 +172,13 @@ class LogFile:
         """Open a session.
 
         Args:
+<<<<<<< HEAD
             path: Its file, any of its parts, or a folder that holds it and no other; or the URL of
                 a file.
+=======
+            path: Its file, any of its parts, or a folder that holds it and no other; a rosbag2
+                folder or a ``.db3`` file.
+>>>>>>> h_bags2
             column_folder: Folder for large columns in files; None for memory.
 
         Raises:
@@ -195,7 +201,8 @@ class LogFile:
         self._sources: list[McapFile | WalTail] = []
         self.scratch: list[mmap.mmap] = []  # used memory, which costs no page faults
         self.pages = None if column_folder is None else FilePages(column_folder)
-        first = first_part(path)
+        self._bag = BagCopy(path, column_folder) if is_bag(path) else None
+        first = first_part(path if self._bag is None else self._bag.path)
         wal = read_wal(first)  # before the files: segments released meanwhile are in the files
         self.parts: PartFiles = open_parts(first, bare=wal is not None)
         try:
@@ -241,6 +248,8 @@ class LogFile:
         """Release everything."""
         self.scratch.clear()
         self.parts.close()
+        if self._bag is not None:
+            self._bag.close()
 
     def forget(self) -> None:
         """Release the data read; it is read again when needed."""
