@@ -172,13 +172,8 @@ class LogFile:
         """Open a session.
 
         Args:
-<<<<<<< HEAD
-            path: Its file, any of its parts, or a folder that holds it and no other; or the URL of
-                a file.
-=======
             path: Its file, any of its parts, or a folder that holds it and no other; a rosbag2
-                folder or a ``.db3`` file.
->>>>>>> h_bags2
+                folder or a ``.db3`` file; or the URL of a file.
             column_folder: Folder for large columns in files; None for memory.
 
         Raises:

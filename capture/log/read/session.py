@@ -463,13 +463,8 @@ class Session(SessionView):
         """Open a session; the same as calling the class.
 
         Args:
-<<<<<<< HEAD
             path: The MCAP file, or its URL; of a split session any part, or the folder that holds
-                it.
-=======
-            path: The MCAP file; of a split session any part, or the folder that holds it; a rosbag2
-                folder of any storage or a ``.db3`` file (extra ``bags``).
->>>>>>> h_bags2
+                it; a rosbag2 folder of any storage or a ``.db3`` file (extra ``bags``).
             threads: Number of decompressing threads; None for one per core that this process may
                 use, at most four.
             column_folder: A folder on a disk for large columns, in files without names, so that
