@@ -26,13 +26,15 @@ CYCLES = 8  # of the command, that show it
 TAPS = 40
 MEMORY_S = 0.8  # that the taps span at least, and two thirds of a cycle
 EXPLAINED = 0.8  # share of the position's variance that makes it the joint's response
+_SLOWEST = 0.005  # share of the command's power that is slower
+_OPPOSITE = 0.5  # cosine: within 60 degrees of half a turn
 _ROWS = 20_000  # that the fit takes
 
 
 def linearised(motion: JointMotion) -> JointMotion:
     """Return a joint whose command, if it is no rhythm, is replaced by its linear response.
 
-    A response with a negative gain at rest is turned round, so that the joint moves against it.
+    A response opposite to slow commands is turned round, so that the joint moves against it.
     """
     command, position = motion.command, motion.position
     if position.t_s.size < 4 * TAPS or not _is_swept(command):
@@ -40,14 +42,29 @@ def linearised(motion: JointMotion) -> JointMotion:
     step = max(max(MEMORY_S, cycle_s(command) * 2 / 3) / TAPS, position.period_s)
     rows = slice(None, None, -(-position.t_s.size // _ROWS))
     design = _design(command, position.t_s, step)
-    taps = np.linalg.lstsq(design[rows], position.values[rows], rcond=1e-9)[0]
+    found = np.linalg.lstsq(design[rows], position.values[rows], rcond=1e-9)[0]
+    taps = np.asarray(found, dtype=np.float64)
     response = np.asarray(design @ taps, dtype=np.float64)
     left = float(np.var(position.values - response))
     if left > (1 - EXPLAINED) * float(np.var(position.values)):
         return motion
-    if float(taps[:-1].sum()) < 0:
+    if _turned_round(command, taps[:-1], step):
         response = 2 * response.mean() - response
     return replace(motion, command=Samples(position.t_s, response))
+
+
+def _turned_round(command: Samples, taps: FloatArray, step_s: float) -> bool:
+    """Return whether the response is opposite where the command is slowest.
+
+    At rest a sound joint has a positive gain, but a command without a mean doesn't show it.
+    """
+    values = command.values - command.values.mean()
+    power: FloatArray = np.abs(np.fft.rfft(values * np.hanning(values.size))) ** 2
+    slow = int(np.count_nonzero(np.cumsum(power) < _SLOWEST * float(power.sum())))
+    turn = 2 * np.pi * slow / (command.t_s[-1] - command.t_s[0]) * step_s
+    phase = turn * np.arange(taps.size)
+    real, imaginary = float(taps @ np.cos(phase)), float(taps @ np.sin(phase))
+    return real < -_OPPOSITE * float(np.hypot(real, imaginary))
 
 
 def _design(command: Samples, t_s: FloatArray, step_s: float) -> FloatArray:
