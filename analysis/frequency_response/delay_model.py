@@ -119,7 +119,9 @@ def fit_delay(
         p = float(stats.f.sf(float(ratio), left, 2 * freedom * omega.size))
         best = max(best, p)
         sd = _delay_sd(found.jac)
-        if sd is None or found.x[0] < -2 * sd:  # an effect before its cause
+        if sd is None or sd * abs(lines.s[-1]) > np.pi:  # not determined
+            continue
+        if found.x[0] < -2 * sd:  # an effect before its cause
             continue
         if p >= LEVEL:
             x = np.asarray(found.x, dtype=np.float64)

@@ -62,6 +62,7 @@ class Facts:
         warnings: Of the analysis: they hold the reason where there is no answer.
         swept: Frequency responses, where there is no gait.
         left_out: What of a session with a break is analysed; empty without a break.
+        motion: Amplitude of each joint [rad] where no command is logged, else None.
     """
 
     gait: GaitFacts
@@ -72,6 +73,7 @@ class Facts:
     warnings: tuple[str, ...]
     swept: tuple[JointFrequencyResponse, ...] = ()
     left_out: str = ""
+    motion: Mapping[str, float] | None = None
 
 
 def compose(facts: Facts) -> Answer:
@@ -219,17 +221,39 @@ def _size_in_words(quantity: str, value: float, ci95: Interval) -> str:
 def _rest(facts: Facts, known: Sequence[JointResult]) -> tuple[Verdict, str, str]:
     """Verdict, sentence and detail on the joints that are not named."""
     named = bool(facts.not_following or facts.findings.stand_out or facts.findings.undecided)
-    if facts.gait.frequency_hz.value is None:
-        if facts.swept:
-            return Verdict.NOTHING, _swept(facts.swept), _why_not(facts, "no gait")
-        lead = "No gait was found in this session, so there is no gain and no lag to compare."
-        return Verdict.NOTHING, lead, _why_not(facts, "no gait")
+    if facts.motion is not None or facts.gait.frequency_hz.value is None:
+        about = "no command" if facts.motion is not None else "no gait"
+        return Verdict.NOTHING, _without_gait(facts), _why_not(facts, about)
     if not known:
         lead = "No joint could be compared with its command."
         return Verdict.NOTHING, lead, _why_not(facts, "gain and lag are null")
     if len(known) == 1:
         return _single(facts, known[0], named=named)
     return *_compared(facts, named=named), _responding(facts, known) + _caveat(facts.joints)
+
+
+def _without_gait(facts: Facts) -> str:
+    """Return the sentence on a session without commands or without a gait."""
+    if facts.motion is not None:
+        return _motion(facts, facts.motion)
+    if made := [one for one in facts.warnings if one.startswith("times made from fps")]:
+        return f"Not periodic, {made[0].split(':')[0]}: no gain and no lag to compare."
+    if facts.swept:
+        return _swept(facts.swept)
+    return "No gait was found in this session, so there is no gain and no lag to compare."
+
+
+def _motion(facts: Facts, amplitudes: Mapping[str, float]) -> str:
+    """Return the sentence on a motion without commands."""
+    if not amplitudes:
+        return "No command logged, and no single frequency in the motion."
+    sizes = [
+        f"{plain(name)} {formats.number(math.degrees(size), 2)}°"
+        for name, size in list(amplitudes.items())[:NAMED]
+    ]
+    more = f" and {len(amplitudes) - NAMED} more" if len(amplitudes) > NAMED else ""
+    gait = formats.gait_frequency(facts.gait)
+    return f"No command logged; the motion has {gait} and an amplitude of {', '.join(sizes)}{more}."
 
 
 def _swept(found: Sequence[JointFrequencyResponse]) -> str:

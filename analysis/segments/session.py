@@ -12,7 +12,7 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.following.fault import Fault
 from undulog.capture.following.find import joints_not_following
 from undulog.capture.following.motion import BLOCKS, COHERENT, JointMotion, Samples
-from undulog.capture.following.session import motions_of
+from undulog.capture.following.session import motions_of, times_made
 from undulog.capture.robot.model import Robot
 
 from ..response.fitting import GaitFit
@@ -82,7 +82,7 @@ def following(session: SessionView, columns: Columns, window: Stretch) -> Follow
         (window.start_ns, window.stop_ns),
     )
     return Following(
-        joints_not_following(motions),
+        () if times_made(session) else joints_not_following(motions),
         {each.name: _offsets(each) for each in motions if each.position.t_s.size > 1},
         {each.name: each for each in motions},
     )

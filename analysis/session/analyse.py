@@ -13,6 +13,7 @@ from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
+from undulog.capture.following.session import times_made
 from undulog.capture.log.health.rules import judge_made_times
 from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
@@ -29,6 +30,7 @@ from ..energy import (
     joint_energies,
     transport,
 )
+from ..estimators.harmonic import fit_at
 from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..estimators.series import Series, clean_together, coverage
 from ..estimators.spectrum import BINS_PER_SIDE
@@ -187,7 +189,10 @@ def measure_session(
     sound = {name: one for name, one in responses.items() if name not in falsified}
     gait = fit_gait(commands, sound, stretch.duration_s, warn)
     span = _span(stretch, origin_ns, gait)
-    faulty = not_following(follows, held, columns.names, whole.duration_s)
+    # A frame of made times repeats what is sampled more slowly.
+    faulty = (
+        () if times_made(session) else not_following(follows, held, columns.names, whole.duration_s)
+    )
     broken = stopped(faulty)  # whose plateaus are no dead bands
     moving = {name: one for name, one in sound.items() if name not in broken}
     dead = dead_bands(columns, commands, moving, gait, origin_ns) if with_dead_bands else {}
@@ -257,9 +262,19 @@ def measure_session(
         analysis.warnings,
         swept=swept,
         left_out=left_out,
+        motion=None if columns.command else _motion(responses, gait),
     )
     analysis = dataclasses.replace(analysis, answer=compose(facts))
     return SessionMeasurement(analysis, gait, sound, energies, span, follows.offsets)
+
+
+def _motion(responses: Mapping[str, Series], gait: GaitFit | None) -> dict[str, float]:
+    """Return the amplitude of each joint at the frequency of a motion without commands [rad]."""
+    if gait is None or not responses:
+        return {}
+    series = tuple(responses.values())
+    fit = fit_at(series, gait.fit.omega)
+    return {one.name: float(abs(a)) for one, a in zip(series, fit.fundamental, strict=True)}
 
 
 def _series(

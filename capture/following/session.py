@@ -58,7 +58,16 @@ def faults_in_session(session: SessionView) -> tuple[Fault, ...]:
     if whole is None:
         return ()
     window_ns = (whole.start_ns, whole.last_ns + 1) if whole.others else None
-    return joints_not_following(motions_of(session, columns, columns["command"], window_ns))
+    motions = motions_of(session, columns, columns["command"], window_ns)
+    return () if times_made(session) else joints_not_following(motions)
+
+
+def times_made(session: SessionView) -> bool:
+    """Whether times were made from a frame rate, so that no joint can be judged by its lag.
+
+    A frame holds what was sampled at times of its own, commands and positions alike.
+    """
+    return "import.times_from_fps" in session.metadata.get("undulog", {})
 
 
 def motions_of(
