@@ -67,6 +67,8 @@ def import_log(
         force: Replace an existing output.
         json: Report as one JSON object.
     """
+    if map_ and log.is_dir():
+        raise UsageError(f"{log} is a folder; --map is for one table")
     from ..common.process import interruptible
     from ..exchange.can_import import import_can
     from ..exchange.csv_import import import_csv
