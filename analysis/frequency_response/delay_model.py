@@ -27,8 +27,9 @@ ORDERS = ((0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (1, 3), (2, 3))
 LEVEL = 0.01
 """A model is refused where its residual is larger with a probability below this."""
 
-_DELAYS = 41
-_ITERATIONS = 8
+_DELAYS = 21
+_ITERATIONS = 4
+_HOPELESS = 30.0  # mean square of the residual, in variances, from which no step makes it pass
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ def _delay_sd(jacobian: Any) -> float | None:
 
 
 def _fit(lines: _Lines, top: int, bottom: int) -> Any:
-    """Fit one pair of orders from the best start over a grid of delays; None if it isn't stable."""
+    """Fit one pair of orders from the best start over a grid of delays; None if none may pass."""
     highest = np.abs(lines.s[-1])
     best = None
     for tau in np.linspace(0.0, 2 * np.pi, _DELAYS) / highest:
@@ -169,7 +170,7 @@ def _fit(lines: _Lines, top: int, bottom: int) -> Any:
         cost = float(np.sum(lines.residual(start, top) ** 2))
         if np.isfinite(cost) and (best is None or cost < best[0]):
             best = cost, start
-    if best is None:
+    if best is None or best[0] > _HOPELESS * 2 * lines.s.size:
         return None
     found: Any = optimize.least_squares(
         lines.residual, best[1], args=(top,), method="lm", max_nfev=400

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import islice
 
 import numpy as np
 from scipy import stats
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
+from undulog.capture.common.console import Warn
 
 from ..estimators.series import Series
 from ..results.estimate import Estimate, Interval
@@ -15,7 +17,7 @@ from ..results.frequency_response import JointFrequencyResponse
 from .delay_model import DelayModel, fit_delay
 from .excitation import Excitation, Kind, excited_bins, find_excitation
 from .local_polynomial import local_response, window
-from .periodic import excited_lines
+from .periodic import excited_lines, line_power
 from .tones import LineResponse, resampled, tone_response
 
 LINES = 40
@@ -24,16 +26,20 @@ LINES = 40
 SAME_COMMAND = 0.999
 """Commands that correlate so much are one input."""
 
+MOST_JOINTS = 128
+"""Responses of more joints are not estimated: each takes tens of milliseconds."""
+
 LEAST_PERIODS = 2
 _FREEDOM = 12  # of the noise, complex
 _HIGHEST = 0.25  # of the sampling rate: beyond it splines are not exact
 _HALF_POWER = 1 / np.sqrt(2)
 _ROUNDING = 1e-9  # of a gain
 _LONG_GAP = 0.01  # of the record
+_COMPARED = 4096  # samples by which commands are compared
 
 
 def frequency_responses(
-    commands: Mapping[str, Series], responses: Mapping[str, Series]
+    commands: Mapping[str, Series], responses: Mapping[str, Series], warn: Warn
 ) -> tuple[JointFrequencyResponse, ...]:
     """Estimate the response of each joint to its own command.
 
@@ -42,10 +48,13 @@ def frequency_responses(
         responses: By joint; those without a command that moves are left out.
 
     Returns:
-        One result a joint, in the order of the commands.
+        One result a joint, in the order of the commands, of the first :data:`MOST_JOINTS`.
     """
-    moving = [name for name, one in commands.items() if one.count and np.ptp(one.values) > 0]
-    known = [name for name in moving if name in responses and responses[name].count]
+    moving = (name for name, one in commands.items() if one.count and np.ptp(one.values) > 0)
+    answered = (name for name in moving if name in responses and responses[name].count)
+    known = list(islice(answered, MOST_JOINTS))
+    if next(answered, None) is not None:
+        warn(f"frequency responses are those of the first {MOST_JOINTS} joints that are driven")
     sharing = _same_commands({name: commands[name] for name in known})
     results = list[JointFrequencyResponse]()
     for name in known:
@@ -128,7 +137,8 @@ def _same_commands(commands: Mapping[str, Series]) -> dict[str, tuple[str, ...]]
     if not names:
         return {}
     first = commands[names[0]]
-    table = np.array([commands[name].at(first.t_s) for name in names])
+    t_s = first.t_s[:: -(-first.count // _COMPARED)]
+    table = np.array([commands[name].at(t_s) for name in names])
     with np.errstate(invalid="ignore"):
         correlation = np.abs(np.atleast_2d(np.corrcoef(table)))
     return {
@@ -227,14 +237,12 @@ def _distortion(command: Series, response: Series, excitation: Excitation) -> fl
     shape = (periods, length)
     u, y = (np.fft.rfft(resampled(one, t_s).reshape(shape)) for one in (command, response))
     lines = excited_lines(u.mean(axis=0)[None])
-    free = np.array(sorted({*range(int(lines[0]), int(lines[-1]))} - {*lines.tolist()}))
+    power = line_power(y[None])
+    free = np.setdiff1d(np.arange(int(lines[0]), int(lines[-1])), lines, assume_unique=True)
     if not free.size:
         return None
-    mean = y.mean(axis=0)
-    noise = np.sum(np.abs(y - mean) ** 2, axis=0) / (periods - 1) / periods
-    power = np.abs(mean) ** 2 - noise
-    share = power[free].mean() / power[lines].mean()
-    return float(np.sqrt(max(share, 0.0)))
+    share = float(power[free].mean() / power[lines].mean())
+    return max(share, 0.0) ** 0.5
 
 
 def _halves(command: Series, response: Series, excitation: Excitation) -> tuple[int, int] | None:

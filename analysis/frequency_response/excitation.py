@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy import signal
 
 from undulog.capture.common.arrays import FloatArray, IntArray
 
@@ -42,13 +41,11 @@ class Excitation:
     Attributes:
         tones_hz: Frequencies [Hz], where lines apart from each other make up the command.
         period_s: Of a command that repeats at least twice [s], else NaN.
-        band_hz: Lowest and highest frequency with power [Hz].
     """
 
     kind: Kind
     tones_hz: FloatArray
     period_s: float
-    band_hz: tuple[float, float]
 
 
 def find_excitation(command: Series) -> Excitation | None:
@@ -74,10 +71,8 @@ def find_excitation(command: Series) -> Excitation | None:
     elif np.unique(command.values).size <= LEVELS:
         kind = Kind.STEPS
     else:
-        kind = Kind.CHIRP if _is_swept(values) else Kind.NOISE
-    if tones is None:
-        return Excitation(kind, np.zeros(0), period_s, _band(values, command.period_s))
-    return Excitation(kind, tones, period_s, (float(tones[0]), float(tones[-1])))
+        kind = Kind.CHIRP if _is_chirp(values) else Kind.NOISE
+    return Excitation(kind, np.zeros(0) if tones is None else tones, period_s)
 
 
 def excited_bins(spectrum: FloatArray) -> IntArray:
@@ -89,13 +84,6 @@ def excited_bins(spectrum: FloatArray) -> IntArray:
     smooth = np.convolve(spectrum, np.ones(_SMOOTHING) / _SMOOTHING, mode="same")
     smooth[:1] = 0.0
     return np.flatnonzero(smooth > _POWER * smooth.max())
-
-
-def _band(values: FloatArray, period_s: float) -> tuple[float, float]:
-    tapered = signal.detrend(values) * signal.windows.hann(values.size)
-    bins = excited_bins(np.abs(np.fft.rfft(tapered)) ** 2)
-    scale = 1.0 / (values.size * period_s)
-    return float(bins[0] * scale), float(bins[-1] * scale)
 
 
 def _period(values: FloatArray) -> int | None:
@@ -117,7 +105,7 @@ def _period(values: FloatArray) -> int | None:
     return int(lags[run[np.argmin(differ[run])]])
 
 
-def _is_swept(values: FloatArray) -> bool:
+def _is_chirp(values: FloatArray) -> bool:
     """Whether the instantaneous frequency rises or falls all the time."""
     from scipy.stats import spearmanr
 

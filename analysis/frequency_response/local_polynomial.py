@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 
 ORDER = 2
 """Of the polynomials: the lowest that follows a curved response and an odd transient alike."""
@@ -29,7 +29,7 @@ LEAST_FREEDOM = 6
 """Complex residuals at least left over: their power is known to 40 %."""
 
 _SMALLEST_PIVOT = 1e-6
-"""Relative; below it the inputs can't be told apart in a window."""
+"""Relative; below it the inputs of a window can't be separated."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class LocalResponse:
 
     Attributes:
         bins: The bins, shape (c,).
-        value: G, output over input, shape (c, m); NaN where the inputs can't be told apart.
+        value: G, output over input, shape (c, m); NaN where the inputs can't be separated.
         covariance: E[e e^H] of the error e of ``value``, shape (c, m, m); circular.
         noise: E|V|^2 at the output, in the DFT's scale, shape (c,).
         freedom: Complex degrees of freedom of ``noise``.
@@ -76,7 +76,6 @@ def local_response(
     half: int,
     *,
     order: int = ORDER,
-    usable: BoolArray | None = None,
 ) -> LocalResponse:
     """Fit equation (1) around each of some bins.
 
@@ -85,7 +84,6 @@ def local_response(
         inputs: Spectra U, shape (m, n).
         bins: Centres k, shape (c,). Near the ends the window is moved inwards.
         half: Half width n of the window.
-        usable: Bins that the fit may use, shape (n,); all but the constant by default.
 
     Returns:
         The responses.
@@ -100,20 +98,19 @@ def local_response(
     first = np.clip(bins - half, 1, length - width)
     index = first[:, None] + np.arange(width)  # (c, w)
     powers = ((index - bins[:, None]) / half)[:, :, None] ** np.arange(order + 1)  # (c, w, R+1)
-    weight = np.ones(index.shape) if usable is None else usable[index].astype(np.float64)
     local = inputs[:, index]  # (m, c, w)
     scale = np.sqrt(np.mean(np.abs(local) ** 2, axis=2)) + np.finfo(float).tiny  # (m, c)
     columns = [local[i, :, :, None] / scale[i, :, None, None] * powers for i in range(m)]
-    design = np.concatenate([*columns, powers.astype(np.complex128)], axis=2) * weight[:, :, None]
+    design = np.concatenate([*columns, powers.astype(np.complex128)], axis=2)
     q, r = np.linalg.qr(design)
     pivots = np.abs(np.einsum("cii->ci", r))
     sound = pivots.min(axis=1) > _SMALLEST_PIVOT * pivots.max(axis=1)
     r[~sound] = np.eye(unknowns)
-    data = output[index] * weight
+    data = output[index]
     projected = np.einsum("cwp,cw->cp", q.conj(), data)
     residual = data - np.einsum("cwp,cp->cw", q, projected)
-    freedom = int(np.median(weight.sum(axis=1))) - unknowns
-    noise = np.sum(np.abs(residual) ** 2, axis=1) / (weight.sum(axis=1) - unknowns)
+    freedom = width - unknowns
+    noise = np.sum(np.abs(residual) ** 2, axis=1) / freedom
     inverse = np.asarray(np.linalg.inv(r), dtype=np.complex128)
     solution: ComplexArray = np.einsum("cpq,cq->cp", inverse, projected)
     at: IntArray = np.arange(m, dtype=np.int64) * (order + 1)  # the constants of the G_i

@@ -37,7 +37,7 @@ class BestLinearApproximation:
         total: E|e|^2 of ``value`` made by noise and distortion, shape (k,); NaN from one
             realisation.
         distortion: E|S / U|^2 of one realisation, shape (k,); NaN from one realisation or period,
-            where it can't be told from noise.
+            where it can't be separated from noise.
         realisations: M.
         periods: P.
     """
@@ -109,12 +109,10 @@ class DetectionLines:
     Attributes:
         odd: E|S|^2 at odd lines, in the output's unit squared; NaN where there are none.
         even: The same of even lines.
-        noise: E|V|^2 of the mean over periods at these lines.
     """
 
     odd: float
     even: float
-    noise: float
 
 
 def detection_lines(outputs: FloatArray, lines: IntArray) -> DetectionLines:
@@ -124,11 +122,9 @@ def detection_lines(outputs: FloatArray, lines: IntArray) -> DetectionLines:
         outputs: Samples of whole steady periods, shape (M, P, n), P at least 2.
         lines: Excited lines, all odd; lines up to the highest are looked at.
     """
-    _, periods, length = outputs.shape
+    length = outputs.shape[2]
     y = np.fft.rfft(outputs, axis=2)[:, :, : int(lines.max()) + 1] / length
-    mean = y.mean(axis=1)
-    scatter = np.sum(np.abs(y - mean[:, None]) ** 2, axis=1) / (periods - 1) / periods
-    power = np.mean(np.abs(mean) ** 2 - scatter, axis=0)
+    power = line_power(y)
     unexcited = np.ones(power.size, dtype=bool)
     unexcited[[0, *lines]] = False
     free = np.flatnonzero(unexcited)
@@ -137,4 +133,19 @@ def detection_lines(outputs: FloatArray, lines: IntArray) -> DetectionLines:
         chosen = free[free % 2 == parity]
         return float(power[chosen].mean()) if chosen.size else float("nan")
 
-    return DetectionLines(level(1), level(0), float(scatter[:, free].mean()))
+    return DetectionLines(level(1), level(0))
+
+
+def line_power(spectra: ComplexArray) -> FloatArray:
+    """Return the power of each line without that of the noise, which may leave less than zero.
+
+    Args:
+        spectra: Of each of P periods of M realisations, shape (M, P, n), P at least 2.
+
+    Returns:
+        Mean over the realisations, shape (n,).
+    """
+    periods = spectra.shape[1]
+    mean = spectra.mean(axis=1)
+    scatter = np.sum(np.abs(spectra - mean[:, None]) ** 2, axis=1) / (periods - 1) / periods
+    return np.mean(np.abs(mean) ** 2 - scatter, axis=0)

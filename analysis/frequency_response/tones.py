@@ -32,6 +32,7 @@ SEPARATION = 4.0
 """Least distance of two tones, in bins of the record: half the main lobe of the window."""
 
 NOISE_BINS = 12
+_MOST_CELLS = 1 << 22  # samples times tones: beyond it the fit would fill the memory
 _DRIFT = 2  # order of the polynomial
 _STEPS = 4
 _SHIFT = 1.5  # bins from a tone to the first bin of noise
@@ -86,6 +87,8 @@ def find_tones(command: Series) -> FloatArray | None:
     spectrum = np.abs(np.fft.rfft(values * signal.windows.blackmanharris(values.size)))
     peaks, _ = signal.find_peaks(spectrum, height=LEAST_AMPLITUDE * spectrum.max())
     peaks = peaks[peaks >= SEPARATION]  # below it is the drift
+    if peaks.size * values.size > _MOST_CELLS:
+        return None
     if not 0 < peaks.size <= MOST_TONES or (np.diff(peaks) < SEPARATION).any():
         return None
     found = peaks / (values.size * command.period_s)

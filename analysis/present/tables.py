@@ -168,7 +168,7 @@ def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequ
             lambda one: scaled(Estimate(one.distortion), 100.0),
             (2, 2),
             spare=3,
-            note="nonlinear, of the response; a dash where it can't be told from noise",
+            note="nonlinear, of the response; a dash where it can't be separated from noise",
         ),
         Column("halves agree", "halves agree", agree, kind="word", spare=1),
     ]

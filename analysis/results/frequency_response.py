@@ -14,7 +14,7 @@ class JointFrequencyResponse:
     Attributes:
         excitation: ``sum of sines``, ``periodic multisine``, ``chirp``, ``steps`` or ``broadband``.
         shares_command: Other joints with the same command but for its sign and scale. Their
-            responses are to one input: what each would do alone can't be told.
+            responses are to one input: what each would do alone is unknown.
         frequency_hz: Ascending.
         gain: Response over command.
         lag_rad: Lag of the response, in (-pi, pi], positive = late.
@@ -28,7 +28,7 @@ class JointFrequencyResponse:
         resonance_hz: Frequency of the largest gain, where it exceeds that of the lowest line by
             more than both intervals; else None.
         distortion: Standard deviation of the nonlinear distortion over the gain, root mean square
-            over the lines; None where it can't be told from noise.
+            over the lines; None where it can't be separated from noise.
         halves_agree: Lines whose two halves differ by no more than their combined 95 % interval,
             and lines compared; None where halves can't be compared.
     """

@@ -60,7 +60,7 @@ class Facts:
         not_following: Joints that do not follow, in chain order.
         findings: Joints that stand out, and the shape of the rest.
         warnings: Of the analysis: they hold the reason where there is no answer.
-        swept: Frequency responses, where there is no gait.
+        frequency_response: Frequency responses, where there is no gait.
         left_out: What of a session with a break is analysed; empty without a break.
         motion: Amplitude of each joint [rad] where no command is logged, else None.
     """
@@ -71,7 +71,7 @@ class Facts:
     not_following: tuple[NotFollowing, ...]
     findings: Findings
     warnings: tuple[str, ...]
-    swept: tuple[JointFrequencyResponse, ...] = ()
+    frequency_response: tuple[JointFrequencyResponse, ...] = ()
     left_out: str = ""
     motion: Mapping[str, float] | None = None
 
@@ -238,8 +238,8 @@ def _without_gait(facts: Facts) -> str:
         return _motion(facts, facts.motion)
     if made := [one for one in facts.warnings if one.startswith("times made from fps")]:
         return f"Not periodic, {made[0].split(':')[0]}: no gain and no lag to compare."
-    if facts.swept:
-        return _swept(facts.swept)
+    if facts.frequency_response:
+        return _swept(facts.frequency_response)
     return "No gait was found in this session, so there is no gain and no lag to compare."
 
 
@@ -266,7 +266,7 @@ def _swept(found: Sequence[JointFrequencyResponse]) -> str:
     delays = [1e3 * one.delay_s.value for one in found if one.delay_s.value is not None]
     text += f", -3 dB at {_range(edges)} Hz" if edges else ""
     text += f", delay {_range(delays)} ms" if delays else ""
-    shared = all(one.shares_command for one in found)
+    shared = len(found) > 1 and len(found[0].shares_command) == len(found) - 1
     return text + (". All joints share one command: it is the response to that." if shared else ".")
 
 
@@ -390,6 +390,4 @@ def _why_not(facts: Facts, lacking: str) -> str:
         return "The result gives no reason."
     verdict = [one for one in facts.warnings if lacking in one and "held still" not in one]
     about = [warning for warning in facts.warnings if "gait" in warning.lower()]
-    made = [one for one in facts.warnings if one.startswith("times made from fps")]
-    chosen = (verdict or about or facts.warnings)[0]
-    return " ".join(formats.sentence(one) for one in dict.fromkeys([chosen, *made]))
+    return formats.sentence((verdict or about or facts.warnings)[0])

@@ -196,7 +196,7 @@ def measure_session(
     broken = stopped(faulty)  # whose plateaus are no dead bands
     moving = {name: one for name, one in sound.items() if name not in broken}
     dead = dead_bands(columns, commands, moving, gait, origin_ns) if with_dead_bands else {}
-    swept = frequency_responses(commands, sound) if gait is None else ()
+    swept = frequency_responses(commands, sound, warn) if gait is None else ()
     del commands
     session.forget()
     energies = joint_energies(session, columns, held, span, warn)
@@ -260,7 +260,7 @@ def measure_session(
         faulty,
         findings,
         analysis.warnings,
-        swept=swept,
+        frequency_response=swept,
         left_out=left_out,
         motion=None if columns.command else _motion(responses, gait),
     )

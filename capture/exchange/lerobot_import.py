@@ -10,6 +10,7 @@ Layout: https://github.com/huggingface/lerobot, ``lerobot/datasets``.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +23,7 @@ import numpy as np
 from ..common.arrays import NS
 from ..common.errors import ImportFormatError, LogError, UsageError, some_names
 from ..common.process import StopRequest
-from ..log.health.rules import TIMES_FROM_FPS
+from ..log.read.facts import TIMES_FROM_FPS
 from ..robot.bus_map import SESSION_UNIT
 from ..robot.description import numbered
 from ..robot.model import Quantity, Robot
@@ -35,7 +36,8 @@ from .torch_zip import refuse
 _FEATURES = {"action": Quantity.COMMAND, "observation.state": Quantity.POSITION}
 _MOST_INFO = 1 << 24  # bytes
 _MOST_JOINTS = 1024
-_FRAMES = ("episode_index", "frame_index")
+_KNOWN = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
+"""Features of every dataset that number its frames."""
 
 
 @dataclass(frozen=True)
@@ -102,30 +104,25 @@ def open_lerobot(folder: Path) -> LeRobotDataset:
     return LeRobotDataset(folder, version, kind, fps, names, others)
 
 
-_KNOWN = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
-
-
 def _element_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the names of a feature's elements: a list, a list in a list, or in a table."""
     count = int(feature["shape"][0])
     if not 1 <= count <= _MOST_JOINTS:
         raise ValueError(f"a feature of {count} elements")
     names: Any = feature.get("names")
-    while isinstance(names, Mapping) or (isinstance(names, list) and _count(names) == 1 < count):
-        mapping = cast("Any", names)
-        names = next(iter(mapping.values())) if isinstance(names, Mapping) else mapping[0]
-    if not isinstance(names, list) or len(cast("list[Any]", names)) != count:
+    while isinstance(names, Mapping):
+        names = next(iter(cast("Mapping[str, Any]", names).values()), None)
+    listed = cast("list[Any]", names) if isinstance(names, list) else []
+    if len(listed) == 1 < count and isinstance(listed[0], list):
+        listed = cast("list[Any]", listed[0])
+    if len(listed) != count:
         return tuple(numbered("joint", count))
     plain = [
         re.sub(r"[^A-Za-z0-9_-]+", "_", str(name).removesuffix(".pos")).strip("_")
-        for name in cast("list[Any]", names)
+        for name in listed
     ]
     plain = [name if name[:1].isalpha() else f"joint_{name}" for name in plain]
     return tuple(plain) if len(set(plain)) == count else tuple(numbered("joint", count))
-
-
-def _count(names: Any) -> int:
-    return len(names)
 
 
 def _column(parquet: Any, path: Path, name: str) -> Any:
@@ -222,9 +219,8 @@ def _episode(dataset: LeRobotDataset, number: int, paths: Sequence[Path]) -> Tab
         "import.robot_type": dataset.robot_type,
         **({"import.task": task} if task else {}),
     }
-    digest = f"{file_digest(paths[0])[:56]}{number & 0xFFFFFFFF:08x}"
-    if len(np.unique(_column(parquet, paths[0], "episode_index"))) > 1:
-        digest = f"{number & 0xFFFFFFFF:08x}{digest[:56]}"  # else episodes of a file share an id
+    # A file may hold several episodes, and each is a session of its own.
+    digest = hashlib.sha256(f"{file_digest(paths[0])} {number}".encode()).hexdigest()
     return TableSet(dataset.folder, {STATES: table}, digest=digest, facts=facts)
 
 

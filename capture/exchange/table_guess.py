@@ -279,7 +279,7 @@ def _columns(  # noqa: PLR0917 - each is filled or read here
     columns: list[Column] = []
     taken: dict[tuple[str, Quantity], str] = {}
     assumed: dict[Quantity, str] = {}
-    single = _single_joint(samples, found, names)
+    single = _single_joint(found, names)
     for role, name, meaning in found:
         quantity = meaning.quantity
         if quantity is None:
@@ -313,7 +313,6 @@ def _fits(unit: str, quantity: Quantity) -> bool:
 
 
 def _single_joint(
-    samples: Mapping[str, Block],  # noqa: ARG001
     found: Sequence[tuple[str, str, _Name]],
     names: Sequence[str],
 ) -> str:

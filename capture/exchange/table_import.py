@@ -219,7 +219,7 @@ def _write(
             found.source, report.output, robot, epoch_ns=report.start_ns, facts=facts, force=force,
             digest=found.digest,
         ) as writer,
-        progress(f"import {found.source.name}", 1.0),
+        progress(f"import {found.source.name}", 1.0) as bar,
     ):  # fmt: skip
         writer.attach("columns.toml", "application/toml", column_map.toml().encode())
         streams = [source.messages(writer, offset, report) for source in sources]
@@ -230,9 +230,11 @@ def _write(
             heapq.merge(*streams, key=lambda message: message[:2]) if len(streams) > 1
             else streams[0]
         ):  # fmt: skip
-            if not count % 4096 and stop is not None and stop.requested:
-                report.complete = False
-                break
+            if not count % 4096:
+                bar.update(0.0, note=f"{count} messages")
+                if stop is not None and stop.requested:
+                    report.complete = False
+                    break
             write()
             report.end_ns = max(report.end_ns, t_ns)
         if not report.samples:

@@ -13,7 +13,6 @@ import json
 import math
 import re
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -25,7 +24,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError, MissingExtraError
-from .torch_zip import MOST_BYTES, read_tensors, refuse
+from .torch_zip import MOST_BYTES, UNZIPPING, read_tensors, refuse
 
 Block: TypeAlias = dict[str, NDArray[Any]]
 """Column to its cells, (n,): numbers, or texts where they are none."""
@@ -123,9 +122,7 @@ def _npz(path: Path) -> dict[str, NDArray[Any]]:
                 for info in archive.infolist()
                 if (array := _npy(archive.read(info), info.filename)) is not None
             }
-    except (OSError, ValueError, zipfile.BadZipFile, zlib.error, EOFError) as error:
-        raise ImportFormatError(path, f"can't be read as .npz: {error}") from error
-    except (NotImplementedError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError, *UNZIPPING) as error:
         raise ImportFormatError(path, f"can't be read as .npz: {error}") from error
 
 

@@ -12,6 +12,7 @@ import math
 import pickletools
 import sys
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,9 @@ from ..common.errors import ImportFormatError
 
 MOST_BYTES = 1 << 29
 """More bytes of numbers than this in a file of arrays are refused [B]: they are read at once."""
+
+UNZIPPING = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError)
+"""Errors of a damaged zip, the last of a kind of compression that its header invents."""
 
 _DTYPES = {
     "FloatStorage": "f4", "DoubleStorage": "f8", "HalfStorage": "f2", "LongStorage": "i8",
@@ -96,17 +100,8 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
         raise
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:
         raise ImportFormatError(path, f"is no file of tensors by torch.save: {error}") from error
-    except (zipfile.BadZipFile, NotImplementedError, EOFError, RecursionError) as error:
+    except (*UNZIPPING, RecursionError) as error:
         raise ImportFormatError(path, f"is no zip by torch.save: {error}") from error
-    except zlib_error() as error:
-        raise ImportFormatError(path, f"is damaged: {error}") from error
-
-
-def zlib_error() -> type[Exception]:
-    """Return the error of a damaged compressed member."""
-    import zlib
-
-    return zlib.error
 
 
 def _byte_order(archive: zipfile.ZipFile, root: str) -> str:

@@ -37,14 +37,17 @@ def linearised(motion: JointMotion) -> JointMotion:
     A response opposite to slow commands is turned round, so that the joint moves against it.
     """
     command, position = motion.command, motion.position
-    if position.t_s.size < 4 * TAPS or not _is_swept(command):
+    if position.t_s.size < 4 * TAPS or _is_rhythm(command):
         return motion
     step = max(max(MEMORY_S, cycle_s(command) * 2 / 3) / TAPS, position.period_s)
     rows = slice(None, None, -(-position.t_s.size // _ROWS))
-    design = _design(command, position.t_s, step)
-    found = np.linalg.lstsq(design[rows], position.values[rows], rcond=1e-9)[0]
+    late = [_late(command, position.t_s[rows], k, step) for k in range(TAPS)]
+    design = np.stack([*late, np.ones(late[0].size)], axis=1)
+    found = np.linalg.lstsq(design, position.values[rows], rcond=1e-9)[0]
     taps = np.asarray(found, dtype=np.float64)
-    response = np.asarray(design @ taps, dtype=np.float64)
+    response = np.full(position.t_s.size, taps[-1])
+    for k, tap in enumerate(taps[:-1].tolist()):  # one at a time: a long record fills the memory
+        response += tap * _late(command, position.t_s, k, step)
     left = float(np.var(position.values - response))
     if left > (1 - EXPLAINED) * float(np.var(position.values)):
         return motion
@@ -67,17 +70,16 @@ def _turned_round(command: Samples, taps: FloatArray, step_s: float) -> bool:
     return real < -_OPPOSITE * float(np.hypot(real, imaginary))
 
 
-def _design(command: Samples, t_s: FloatArray, step_s: float) -> FloatArray:
-    """Return c(t - i D) and a constant, shape (n, taps + 1)."""
-    late = [command.at(t_s - k * step_s) for k in range(TAPS)]
-    return np.stack([*late, np.ones(t_s.size)], axis=1)
+def _late(command: Samples, t_s: FloatArray, k: int, step_s: float) -> FloatArray:
+    """Return c(t - k D), shape (n,)."""
+    return command.at(t_s - k * step_s)
 
 
-def _is_swept(command: Samples) -> bool:
-    """Return whether cycles of the command, from one rise through its middle to the next, vary."""
+def _is_rhythm(command: Samples) -> bool:
+    """Return whether cycles, from one rise through the middle to the next, are alike or too few."""
     above = command.values > np.median(command.values)
     rises = command.t_s[1:][above[1:] & ~above[:-1]]
     if rises.size <= CYCLES:
-        return False
+        return True
     short, long = np.percentile(np.diff(rises), (10, 90))
-    return bool(long > SWEPT * short)
+    return bool(long <= SWEPT * short)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..common.arrays import FloatArray, IntArray
 from ..common.errors import DataError, LogError, MissingChannelError
+from ..log.read.facts import TIMES_FROM_FPS
 from ..log.read.sample_times import LARGEST, Signal, longest_unbroken
 from ..log.read.session import SessionView
 from .fault import Fault
@@ -67,7 +68,7 @@ def times_made(session: SessionView) -> bool:
 
     A frame holds what was sampled at times of its own, commands and positions alike.
     """
-    return "import.times_from_fps" in session.metadata.get("undulog", {})
+    return TIMES_FROM_FPS in session.metadata.get("undulog", {})
 
 
 def motions_of(

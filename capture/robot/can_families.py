@@ -1,7 +1,7 @@
 """Motor families on CAN, as DBC databases and map entries made from the motors' numbers.
 
-Layouts are those of the manufacturers' manuals and libraries, named at each function; which of them
-publish frames with their values is in ``docs/motor-families.md``.
+Layouts follow the manufacturers' manuals and libraries, named at each function. What they were
+checked against, and which ranges are in doubt, is in ``docs/motor-families.md``.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ _DAMIAO: Mapping[str, tuple[float, float, float]] = {
     "dm8009": (12.5, 45, 54), "dm10010l": (12.5, 25, 200), "dm10010": (12.5, 20, 200),
     "dmh3510": (12.5, 280, 1), "dmh6215": (12.5, 45, 10), "dmg6220": (12.5, 45, 10),
 }  # fmt: skip
-"""Model to PMAX [rad], VMAX [rad/s], TMAX [N m]: the defaults of DM_Control_Python; all three are
+"""Model to PMAX [rad], VMAX [rad/s], TMAX [N m], as DM_Control_Python lists them; all three are
 settings of the motor."""
 
 
@@ -196,7 +196,7 @@ def rmd(motor: Motor) -> tuple[Frame, ...]:
     """MyActuator RMD: byte 0 is the command; a reply repeats it.
 
     Model ``v3`` is the protocol of V3 and V4 (replies at 0x240 + id), ``v2`` the older one, whose
-    requests and replies share the identifier 0x140 + id: only their direction tells them apart.
+    requests and replies share the identifier 0x140 + id: they differ in direction only.
     """
     old = motor.model == "v2"
     reply = motor.reply_id if motor.reply_id is not None else (0x140 if old else 0x240) + motor.id

@@ -1,6 +1,6 @@
 """Register maps of serial servos: address, size and meaning of what a session holds.
 
-Sources: Feetech's memory tables of STS3215 and SCS0009; ROBOTIS e-Manual, control tables of
+After Feetech's memory tables of STS3215 and SCS0009 and the ROBOTIS e-Manual, control tables of
 XL430-W250, XL330-M288, XM430-W350 and XM540-W270.
 """
 

@@ -339,7 +339,6 @@ def open_serial(address: SourceAddress) -> SerialSource:
     path = address.rest
     if Path(path).exists() and not stat.S_ISCHR(Path(path).stat().st_mode):
         raise SourceError(address.text, f"{path} is no serial device")
-
     tap = address.options.get("tap")
 
     def open_link(tally: Tally) -> DrainedLink | TapLink:

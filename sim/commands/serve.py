@@ -85,7 +85,8 @@ def serve(
 
     if socketcand is None and unix is None and feetech is None:
         raise UsageError(
-            "this robot could not be reached: give --socketcand PORT, --unix PATH or --feetech PATH"
+            "this robot could not be reached: give --socketcand PORT or --unix PATH, "
+            "or --feetech PATH"
         )
     if feetech is not None and (socketcand or unix or lockstep or fault):
         raise UsageError("--feetech is a line of its own: without --socketcand, --unix, --lockstep")

@@ -1,4 +1,4 @@
-"""Robots of one joint whose bus map a test gives."""
+"""Robots of one or two joints whose bus map a test gives."""
 
 from undulog.capture.robot.description import parse_robot
 
@@ -13,6 +13,16 @@ HEAD = """
 name = "one"
 clock = "host"
 joints = [{ name = "joint01", plane = "horizontal" }]
+"""
+TWO_JOINTS = """name = "arm"
+clock = "host"
+assumed = ["links", "joints", "servo"]
+joints = [{ name = "joint01", plane = "horizontal" }, { name = "joint02", plane = "vertical" }]
+[defaults.link]
+length = 0.1
+radius = 0.05
+mass = 1.0
+inertia = [1.3e-3, 1.5e-3, 1.5e-3]
 """
 
 

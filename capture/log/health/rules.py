@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from ...following.fault import Fault as JointFault
 from ..messages.frames import FRAME_TOPIC_PREFIXES, bus_of
+from ..read.facts import TIMES_FROM_FPS
 from .freeze import FROZEN_SAMPLES
 from .tallies import (
     NS,
@@ -190,10 +191,6 @@ def judge_file(health: FileHealth) -> list[Finding]:
             )
         )
     return found
-
-
-TIMES_FROM_FPS = "import.times_from_fps"
-"""Metadata key: the frame rate [1/s] that a data set's times were made from."""
 
 
 def judge_made_times(facts: Mapping[str, str]) -> list[Finding]:

@@ -32,6 +32,10 @@ _METADATA = ("undulog", "undulog.health", "undulog.part")
 _FOOTER = 1 + 8 + 20 + len(MAGIC)
 
 
+TIMES_FROM_FPS = "import.times_from_fps"
+"""Key of the record ``undulog``: the frame rate [1/s] that a data set's times were made from."""
+
+
 @dataclass(frozen=True)
 class LogFacts:
     """What the first and last bytes of a log say.

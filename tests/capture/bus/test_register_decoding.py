@@ -14,6 +14,7 @@ from dynamixel_sdk import (
 )
 from scservo_sdk import PacketHandler as Feetech
 
+from support.bus_robots import TWO_JOINTS
 from support.serial_lines import Captured
 from undulog.capture.bus.decoders import open_decoder
 from undulog.capture.robot.description import load_robot, parse_robot
@@ -21,20 +22,11 @@ from undulog.capture.sources.events import Tally
 from undulog.capture.sources.serial_port import PacketClock
 from undulog.capture.sources.servo_packets import dynamixel_packet, feetech_packet
 
-ARM = """name = "arm"
-clock = "host"
-assumed = ["links", "joints", "servo"]
-joints = [{ name = "joint01", plane = "horizontal" }, { name = "joint02", plane = "vertical" }]
-[defaults.link]
-length = 0.1
-radius = 0.05
-mass = 1.0
-inertia = [1.3e-3, 1.5e-3, 1.5e-3]
-[bus]
+ARM = f"""{TWO_JOINTS}[bus]
 family = "dynamixel2"
 motors = [
-  { joint = "joint01", id = 11, model = "xm430" },
-  { joint = "joint02", id = 12, model = "xl430", scale = -1.0, offset = 0.25 },
+  {{ joint = "joint01", id = 11, model = "xm430" }},
+  {{ joint = "joint02", id = 12, model = "xl430", scale = -1.0, offset = 0.25 }},
 ]
 """
 STEP = math.tau / 4096

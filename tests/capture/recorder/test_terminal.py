@@ -15,6 +15,7 @@ from dataclasses import replace
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.cells import cell_len
 from rich.console import Console
 
 from support.paths import ROOT
@@ -131,7 +132,7 @@ def test_no_screen_is_wider_than_the_terminal_whatever_names_say(width, height, 
         sources=(replace(CAN, name=said), IMU),
     )
     lines = rows(snapshot, width, height)
-    assert max(map(len, lines)) <= width
+    assert max(map(cell_len, lines)) <= width
     assert all(line.isprintable() for line in lines)
     console = Console(file=io.StringIO(), width=width, force_terminal=True)
     console.print(screen(snapshot, width, height))

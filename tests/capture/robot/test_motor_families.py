@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 
+from support.bus_robots import TWO_JOINTS
 from support.paths import TRACE
 from undulog.capture import Session
 from undulog.capture.bus.decoders import open_decoder
@@ -15,17 +16,7 @@ from undulog.capture.log.messages.frames import EXTENDED_FLAG, empty_fd_frames, 
 from undulog.capture.robot.description import load_robot, parse_robot
 from undulog.capture.robot.families import models_of
 
-HEAD = """name = "arm"
-clock = "host"
-assumed = ["links", "joints", "servo"]
-joints = [{ name = "joint01", plane = "horizontal" }, { name = "joint02", plane = "vertical" }]
-[defaults.link]
-length = 0.1
-radius = 0.05
-mass = 1.0
-inertia = [1.3e-3, 1.5e-3, 1.5e-3]
-[bus]
-"""
+HEAD = f"{TWO_JOINTS}[bus]\n"
 RMD = """name = "arcsnake-rmd"
 clock = "host"
 assumed = ["links", "joints", "servo"]

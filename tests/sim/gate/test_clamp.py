@@ -76,8 +76,8 @@ def test_a_ramp_arrives_and_no_joint_is_faster_than_it_may(start, target, rate):
     np.testing.assert_allclose(ramp.at(ramp.duration_s), target, atol=1e-15)
     t = np.linspace(0.0, ramp.duration_s, 500)
     step = np.abs(np.diff(np.array([ramp.at(each) for each in t]), axis=0)).max(axis=0)
-    smallest = 1e-300  # ways below the normal numbers have no relative precision
-    assert (step <= rate * (1 + 1e-6) * t[1] + smallest).all()
+    rounding = np.spacing(np.maximum(np.abs(start), np.abs(target)))  # of the angles themselves
+    assert (step <= rate * (1 + 1e-6) * t[1] + rounding).all()
 
 
 @pytest.mark.parametrize("how", list(OnFault))
