@@ -1,0 +1,39 @@
+"""The page on other robots' recordings shows what the commands print."""
+
+import re
+import shlex
+import sys
+
+import pytest
+
+from support.paths import DOCS, SHARED
+from support.processes import run
+
+PAGE = (DOCS / "other-robots.md").read_text()
+BLOCKS = re.findall(r"```console\n(.*?)```", PAGE, re.DOTALL)
+
+
+def test_the_page_names_no_other_folder_than_data():
+    assert len(BLOCKS) == 6
+    for block in BLOCKS:
+        assert block.startswith("$ undulog import DATA/")
+    assert not re.search(r"(?:\.\./|/home/|/work/|/tmp/)", PAGE)
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.split("\n")[0].split("/")[-1])
+def test_each_block_of_the_page_is_what_is_printed(block, tmp_path):
+    if not SHARED.is_dir():
+        pytest.skip(f"the real recordings {SHARED.name} are not beside this checkout")
+    (tmp_path / "DATA").symlink_to(SHARED)
+    for command, *shown in (part.split("\n") for part in block.removeprefix("$ ").split("\n$ ")):
+        program, *words = shlex.split(command)
+        assert program == "undulog"
+        done = run(sys.executable, "-m", "undulog", *words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        expected = [line for line in shown if line]
+        printed = [line.rstrip() for line in done.stdout.splitlines() if line.strip()]
+        if expected[-1] == "...":
+            expected.pop()
+            assert len(printed) > len(expected)
+            printed = printed[: len(expected)]
+        assert printed == expected
