@@ -20,6 +20,7 @@ from ..results.comparison import BODY, Comparison, Difference, NamedJoint, Wavef
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, MirrorJoint, Reversal, Run
 from ..results.formats import degrees, scaled
+from ..results.free_motion import BodyWave, JointMotion
 from ..results.frequency_response import JointFrequencyResponse
 
 Row = TypeVar("Row")
@@ -171,6 +172,74 @@ def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequ
             note="nonlinear, of the response; a dash where it can't be separated from noise",
         ),
         Column("halves agree", "halves agree", agree, kind="word", spare=1),
+    ]
+    return Table(columns, found)
+
+
+def motion_table(found: Sequence[JointMotion]) -> Table[JointMotion]:
+    """Return amplitude, offset and lag of joints that move without commands."""
+    with_planes = any(one.plane for one in found)
+    angle = (_typical(2), _typical(4))
+    columns: list[Column[JointMotion]] = [
+        Column("joint", "joint", lambda one: one.name, kind="word"),
+        *([Column("plane", "plane", lambda one: one.plane, kind="word")] if with_planes else []),
+        Column("amplitude° (95 %)", "amplitude [°]", lambda one: degrees(one.amplitude_rad), angle),
+        Column("offset° (95 %)", "offset [°]", lambda one: degrees(one.offset_rad), angle, spare=1),
+        Column(
+            "lag behind the one before° (95 %)",
+            "lag behind the one before [°]",
+            lambda one: degrees(one.lag_rad),
+            angle,
+        ),
+    ]
+    return Table(columns, found)
+
+
+def wave_table(found: Sequence[BodyWave]) -> Table[BodyWave]:
+    """Return the waves along the body, one a plane."""
+
+    def way(one: BodyWave) -> str:
+        first, last = one.joints[0], one.joints[-1]
+        if one.direction == "undecided":
+            return f"undecided, {first} and {last}"
+        return f"{first} to {last}" if one.direction == "first-to-last" else f"{last} to {first}"
+
+    columns: list[Column[BodyWave]] = [
+        *(
+            [Column("plane", "plane", lambda one: one.plane, kind="word")]
+            if any(one.plane for one in found)
+            else []
+        ),
+        Column("wave", "wave", way, kind="word"),
+        Column(
+            "°/joint (95 %)",
+            "wave number [°/joint]",
+            lambda one: degrees(one.wave_number),
+            (_typical(2), _typical(4)),
+            note="lag from joint to joint, of a line through the phases",
+        ),
+        Column("waves (95 %)", "waves", lambda one: one.waves, (_typical(3), _typical(4))),
+        Column(
+            "joints/s (95 %)", "speed [joints/s]", lambda one: one.speed, (_typical(2), _typical(3))
+        ),
+        Column(
+            "m/s", "speed [m/s]", lambda one: one.speed_m_s, (_typical(3), _typical(4)), spare=1
+        ),
+        Column(
+            "travelling (95 %)",
+            "travelling index [1]",
+            lambda one: one.travelling_index,
+            (_typical(3), _typical(4)),
+            note="1 of a travelling, 0 of a standing wave",
+        ),
+        Column(
+            "off the line°",
+            "off the line [°]",
+            lambda one: math.degrees(one.deviation_rad),
+            (1, 2),
+            spare=2,
+            note="root mean square of the phases about the line",
+        ),
     ]
     return Table(columns, found)
 

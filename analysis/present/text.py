@@ -226,6 +226,10 @@ def render(analysis: Analysis, *, width: int = UNLIMITED, color: bool = False) -
     shown: list[tables.AnyTable] = [tables.joint_table(analysis, moved or analysis.joints)]
     if analysis.frequency_response:
         shown = [tables.frequency_table(analysis.frequency_response)]
+    if analysis.free_motion is not None and analysis.free_motion.joints:
+        shown = [tables.motion_table(analysis.free_motion.joints)]
+        if analysis.free_motion.waves:
+            shown.append(tables.wave_table(analysis.free_motion.waves))
     if analysis.body is not None:
         shown.append(tables.body_table(analysis.body))
     if any(one.value is not None for one in analysis.heterogeneity.values()):

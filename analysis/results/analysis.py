@@ -16,6 +16,7 @@ from .answer import Answer
 from .artefact import Artefact, DeadBand, Span
 from .coupling import Coupling
 from .estimate import Estimate, Provenance, WithInterval
+from .free_motion import FreeMotion
 from .frequency_response import JointFrequencyResponse
 from .shown import PresentedResult
 
@@ -360,6 +361,7 @@ class Analysis(PresentedResult):
             oscillator's phase was logged.
         frequency_response: Of joints whose commands are no gait but excite a band or several
             frequencies.
+        free_motion: Where no commands were logged: amplitudes, lags and waves of the motion.
         answer: Which joints do not follow or stand out, and the shape of the rest, in words.
         notes: One sentence each: what was not recorded, does not apply or was assumed.
     """
@@ -375,6 +377,7 @@ class Analysis(PresentedResult):
     energy: EnergyResult | None = None
     oscillators: tuple[ChainCoupling, ...] = ()
     frequency_response: tuple[JointFrequencyResponse, ...] = ()
+    free_motion: FreeMotion | None = None
     artefacts: tuple[Artefact, ...] = ()
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
@@ -392,6 +395,7 @@ class Analysis(PresentedResult):
             "body": None if self.body is None else _body_dict(self.body),
             "energy": None if self.energy is None else _energy_dict(self.energy),
             "frequency_response": [_record(one) for one in self.frequency_response],
+            "free_motion": None if self.free_motion is None else _motion_dict(self.free_motion),
             "artefacts": [dataclasses.asdict(one) | {"about": one.about} for one in self.artefacts],
             "warnings": list(self.warnings),
             "notes": list(self.notes),
@@ -408,6 +412,7 @@ def interval_key(key: str) -> str:
         For example ``lag_ci95``.
     """
     with_unit = {"lag_rad", "frequency_hz", "phase_rad", "amplitude_m", "distance_m"}
+    with_unit |= {"amplitude_rad", "offset_rad"}
     return f"{key.rsplit('_', 1)[0] if key in with_unit else key}_ci95"
 
 
@@ -429,6 +434,11 @@ def _energy_dict(energy: EnergyResult) -> dict[str, Any]:
     cost = energy.transport
     known = {"mass_kg": cost.mass_kg, "why": cost.why} | _estimates(cost)
     return dataclasses.asdict(energy) | {"transport": known}
+
+
+def _motion_dict(motion: FreeMotion) -> dict[str, Any]:
+    waves = [_record(one) | {"direction": one.direction} for one in motion.waves]
+    return {"joints": [_record(one) for one in motion.joints], "waves": waves}
 
 
 def _body_dict(body: BodyResult) -> dict[str, Any]:

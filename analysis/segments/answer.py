@@ -19,6 +19,7 @@ from ..results import formats
 from ..results.analysis import GaitFacts, Index, JointResult
 from ..results.answer import Answer, NotFollowing, Shape, StandOut, Verdict
 from ..results.estimate import Estimate, Interval
+from ..results.free_motion import BodyWave, FreeMotion
 from ..results.frequency_response import JointFrequencyResponse
 from .examine import Findings
 
@@ -62,7 +63,7 @@ class Facts:
         warnings: Of the analysis: they hold the reason where there is no answer.
         frequency_response: Frequency responses, where there is no gait.
         left_out: What of a session with a break is analysed; empty without a break.
-        motion: Amplitude of each joint [rad] where no command is logged, else None.
+        motion: Where no command is logged, else None.
     """
 
     gait: GaitFacts
@@ -73,7 +74,7 @@ class Facts:
     warnings: tuple[str, ...]
     frequency_response: tuple[JointFrequencyResponse, ...] = ()
     left_out: str = ""
-    motion: Mapping[str, float] | None = None
+    motion: FreeMotion | None = None
 
 
 def compose(facts: Facts) -> Answer:
@@ -243,17 +244,36 @@ def _without_gait(facts: Facts) -> str:
     return "No gait was found in this session, so there is no gain and no lag to compare."
 
 
-def _motion(facts: Facts, amplitudes: Mapping[str, float]) -> str:
+def _motion(facts: Facts, motion: FreeMotion) -> str:
     """Return the sentence on a motion without commands."""
-    if not amplitudes:
+    if not motion.joints:
         return "No command logged, and no single frequency in the motion."
-    sizes = [
-        f"{plain(name)} {formats.number(math.degrees(size), 2)}°"
-        for name, size in list(amplitudes.items())[:NAMED]
-    ]
-    more = f" and {len(amplitudes) - NAMED} more" if len(amplitudes) > NAMED else ""
     gait = formats.gait_frequency(facts.gait)
-    return f"No command logged; the motion has {gait} and an amplitude of {', '.join(sizes)}{more}."
+    lead = f"No command logged; the motion has {gait} and an amplitude"
+    whole = [one for one in motion.waves if one.direction != "undecided"]
+    if not whole or len(motion.joints) <= NAMED:
+        sizes = [
+            f"{plain(one.name)} {formats.estimate(formats.degrees(one.amplitude_rad), '°')}"
+            for one in motion.joints[:NAMED]
+        ]
+        more = f" and {len(motion.joints) - NAMED} more" if len(motion.joints) > NAMED else ""
+        lead = f"{lead} of {', '.join(sizes)}{more}"
+    else:
+        sizes = [math.degrees(one.amplitude_rad.value or 0.0) for one in motion.joints]
+        lead = f"{lead} of {min(sizes):.3g}° to {max(sizes):.3g}°"
+    return "; ".join((lead, *(_wave(one) for one in whole))) + "."
+
+
+def _wave(wave: BodyWave) -> str:
+    first, last = wave.joints[0], wave.joints[-1]
+    if wave.direction == "last-to-first":
+        first, last = last, first
+    plane = "" if wave.plane is None else f"{wave.plane} "
+    index = formats.estimate(wave.travelling_index)
+    return (
+        f"a {plane}wave runs from {plain(first)} to {plain(last)}, "
+        f"{formats.estimate(wave.waves)} wavelengths between them, travelling index {index}"
+    )
 
 
 def _swept(found: Sequence[JointFrequencyResponse]) -> str:

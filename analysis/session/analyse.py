@@ -30,10 +30,10 @@ from ..energy import (
     joint_energies,
     transport,
 )
-from ..estimators.harmonic import fit_at
 from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..estimators.series import Series, clean_together, coverage
 from ..estimators.spectrum import BINS_PER_SIDE
+from ..free_motion.estimate import free_motion
 from ..frequency_response.estimate import frequency_responses
 from ..oscillators.chain import session_couplings
 from ..response.fitting import GaitFit, fit_gait
@@ -50,6 +50,7 @@ from ..results.analysis import (
 from ..results.answer import Note, Remarks
 from ..results.artefact import KINDS, Artefact, DeadBand, flags_by_joint
 from ..results.estimate import Estimate, Provenance
+from ..results.free_motion import FreeMotion
 from ..segments.answer import Facts, compose
 from ..segments.session import (
     compare_joints,
@@ -111,6 +112,12 @@ def _warn_flags(
             "gain and lag are null"
         )
 
+
+UNDECIDED_ENDS = (
+    "without a robot description the order of the joints is that of the record, and which end is "
+    "the head is unknown; a lag from joint to joint is known up to whole turns, the smallest is "
+    "given"
+)
 
 _FEW = 1e-3
 """Up to one sample in a thousand left out is a note: no loss for a fit."""
@@ -197,6 +204,7 @@ def measure_session(
     moving = {name: one for name, one in sound.items() if name not in broken}
     dead = dead_bands(columns, commands, moving, gait, origin_ns) if with_dead_bands else {}
     swept = frequency_responses(commands, sound, warn) if gait is None else ()
+    motion = None if columns.command else _free_motion(session.robot, responses, gait, warn)
     del commands
     session.forget()
     energies = joint_energies(session, columns, held, span, warn)
@@ -250,6 +258,7 @@ def measure_session(
         over_time=over_time,
         energy=energy,
         frequency_response=swept,
+        free_motion=motion,
         oscillators=session_couplings(session, options.start_s, options.stop_s),
         notes=warn.notes,
     )
@@ -262,19 +271,27 @@ def measure_session(
         analysis.warnings,
         frequency_response=swept,
         left_out=left_out,
-        motion=None if columns.command else _motion(responses, gait),
+        motion=motion,
     )
     analysis = dataclasses.replace(analysis, answer=compose(facts))
     return SessionMeasurement(analysis, gait, sound, energies, span, follows.offsets)
 
 
-def _motion(responses: Mapping[str, Series], gait: GaitFit | None) -> dict[str, float]:
-    """Return the amplitude of each joint at the frequency of a motion without commands [rad]."""
-    if gait is None or not responses:
-        return {}
-    series = tuple(responses.values())
-    fit = fit_at(series, gait.fit.omega)
-    return {one.name: float(abs(a)) for one, a in zip(series, fit.fundamental, strict=True)}
+def _free_motion(
+    robot: Robot | None, angles: Mapping[str, Series], gait: GaitFit | None, warn: Warn
+) -> FreeMotion:
+    """Measure a motion without commands."""
+    if gait is None:
+        return FreeMotion()
+    motion, open_phases = free_motion(robot, angles, gait)
+    if open_phases:
+        warn(
+            f"{', '.join(open_phases)}: no motion at the common frequency that differs from noise: "
+            "its phase is null"
+        )
+    if motion.waves and robot is None:
+        warn(Note(UNDECIDED_ENDS))
+    return motion
 
 
 def _series(

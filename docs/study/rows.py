@@ -22,6 +22,17 @@ TEXTS = ("key", "setting", "session_id", "status", "error", "changes")
 DRIFT = re.compile(r"drifts by ([+-][\d.e-]+) % in gain and ([+-][\d.e-]+) degrees")
 
 
+def scatter(path: Path, folder: Path, source: str) -> None:
+    """Put gathered rows of a source where their sweeps find them, so that none is run again."""
+    if not path.is_file():
+        return
+    frame = pd.read_parquet(path)
+    for plan, rows in frame[frame["source"] == source].groupby("plan"):
+        there = folder / str(plan) / "rows"
+        there.mkdir(parents=True, exist_ok=True)
+        rows.assign(session="").to_parquet(there / "gathered.parquet", index=False)
+
+
 def gather(folder: Path, path: Path) -> None:
     """Write the finished rows of all sweeps under a folder into one Parquet file."""
     stores = sorted(one.parent for one in folder.glob("*/rows"))
@@ -30,7 +41,7 @@ def gather(folder: Path, path: Path) -> None:
         for one in folder.glob("*/settings/*.json")
     }
     found = [
-        {"plan": store.name, "source": sources[row["setting"]], **_kept(row)}
+        {"plan": store.name, "source": row.get("source") or sources[row["setting"]], **_kept(row)}
         for store in stores
         for row in RowStore(str(store)).rows()
     ]
@@ -50,7 +61,7 @@ def _kept(row: dict) -> dict:
     return {
         **{name: row.get(name) for name in (*TEXTS, *NUMBERS)},
         **lists,
-        "drift": max(worst, default=0.0),
+        "drift": row.get("drift", max(worst, default=0.0)),
         "duration_s": row.get("duration_s"),
         "run_wall": row.get("run_wall"),
     }

@@ -1,8 +1,9 @@
 """Run the study and write its page.
 
 ``make study`` is the short form: 5 and 9 yaw joints, a few minutes, page and rows under
-``out/study/quick``. ``make study LONG=1`` is the long form; it goes on where it stopped, gathers
-its rows into ``docs/study/rows/long.parquet`` and writes ``docs/study.md`` with its figures.
+``out/study/quick``. ``make study LONG=1`` is the long form; it goes on where it stopped, also from
+the rows in ``docs/study/rows/long.parquet`` where the code that determines them is the same,
+gathers its own there and writes ``docs/study.md`` with its figures.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from study.design import PLANS, stages
-from study.rows import gather
+from study.rows import gather, scatter
 from undulog.capture.common.process import StopRequest, interruptible
 from undulog.replay.sweep.rows import RowStore
+from undulog.replay.sweep.run import software
 from undulog.replay.sweep.sweep import prepare, run_sweep
 
 DOCS = Path(__file__).parents[1]
@@ -51,6 +53,9 @@ def main() -> int:
     parser.add_argument("--no-page", action="store_true", help="only run")
     chosen = parser.parse_args()
     folder: Path = chosen.out or OUT / ("quick" if chosen.quick else "long")
+    rows = folder / "rows.parquet" if chosen.quick else Path(__file__).parent / "rows/long.parquet"
+    if not chosen.quick and not chosen.no_runs:
+        scatter(rows, folder, software()["source"])
     with interruptible() as stop:
         if not chosen.no_runs and not run(folder, stop, quick=chosen.quick, workers=chosen.workers):
             return 1
@@ -58,7 +63,6 @@ def main() -> int:
         return 0
     from study.page import write_page
 
-    rows = folder / "rows.parquet" if chosen.quick else Path(__file__).parent / "rows/long.parquet"
     gather(folder, rows)
     page = folder / "study.md" if chosen.quick else DOCS / "study.md"
     write_page(rows, page, quick=chosen.quick)

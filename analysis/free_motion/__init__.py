@@ -1,0 +1,1 @@
+"""Motion without commands: of animals, of robots whose commands were not logged."""

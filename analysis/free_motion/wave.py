@@ -1,0 +1,185 @@
+"""The wave along a chain of joints, from their complex amplitudes at one frequency.
+
+Phases phi_k = arg a_k of the joints at places x_k are fitted by a line, phi = phi_0 - kappa x, with
+weights |a_k|^2. Where all joints have the same white noise that is maximum likelihood and reaches
+the Cramer-Rao bound; and where the phases aren't on a line, the slope is the same whatever the
+noise. The slope kappa is a contrast of the phases, so its interval comes from the same bins of the
+residual as that of any other contrast (:mod:`..estimators.intervals`), whatever noise the joints
+share.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import fdtri
+
+from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
+
+from ..estimators.intervals import CONFIDENCE, around, t_factor
+from ..estimators.spectrum import ResidualBins
+from ..results.estimate import Estimate
+
+_GRID = 16
+"""Trial wave numbers for each joint; the peak's width is one over the number of joints."""
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """m joints that move at one frequency.
+
+    Attributes:
+        amplitudes: Complex amplitudes at t = 0 [rad], shape (m,).
+        bins: Their residuals beside the frequency.
+        mean_time_s: Mean sampling time of each, shape (m,).
+        omega_variance: Of the common angular frequency [(rad/s)^2].
+    """
+
+    amplitudes: ComplexArray
+    bins: ResidualBins
+    mean_time_s: FloatArray
+    omega_variance: float
+
+    @property
+    def dof(self) -> float:
+        """Degrees of freedom of what the bins show."""
+        return 2.0 * self.bins.values.shape[1]
+
+    def select(self, chosen: BoolArray) -> Oscillation:
+        """Return some of the joints."""
+        index = np.flatnonzero(chosen)
+        return Oscillation(
+            self.amplitudes[index],
+            self.bins.select(index),
+            self.mean_time_s[index],
+            self.omega_variance,
+        )
+
+    def covariance(self, factors: ComplexArray) -> FloatArray:
+        """Return the covariance of p numbers Re sum_k factor_k da_k, da_k the amplitudes' errors.
+
+        Args:
+            factors: In the numbers' unit over that of the amplitudes, shape (p, m).
+
+        Returns:
+            Shape (p, p).
+        """
+        shown = (factors * np.sqrt(self.bins.spread)) @ self.bins.values
+        parts = np.stack([factors.real, -factors.imag], axis=-1)
+        own = np.einsum("pki,kij,qkj->pq", parts, self.bins.rounding, parts)
+        return (shown @ shown.conj().T).real / (2 * shown.shape[1]) + own
+
+    def error(self, factor: ComplexArray) -> float:
+        """Return the standard error of Re sum_k factor_k da_k, factor of shape (m,)."""
+        return float(self.covariance(factor[None])[0, 0]) ** 0.5
+
+    def turn(self, weight: FloatArray) -> float:
+        """Return the error of sum_k weight_k arg a_k that the frequency's error makes [rad].
+
+        Args:
+            weight: Shape (m,).
+        """
+        return abs(float(weight @ self.mean_time_s)) * self.omega_variance**0.5
+
+    def known_phases(self) -> BoolArray:
+        """Which joints have a phase: noise leaves their amplitude distinct from zero, (m,)."""
+        size = np.abs(self.amplitudes)
+        errors = np.sqrt(np.diag(self.covariance(np.eye(size.size) + 0j)))
+        return size > t_factor(self.dof) * errors
+
+
+def phase_lag(motion: Oscillation, joint: int, before: int) -> Estimate:
+    """Return the lag of a joint behind another [rad], in (-pi, pi].
+
+    Returns:
+        The estimate; empty where noise leaves it open.
+    """
+    lag = float(-np.angle(motion.amplitudes[joint] / motion.amplitudes[before]))
+    weight = np.zeros(motion.amplitudes.size)
+    weight[[joint, before]] = -1.0, 1.0
+    noise = motion.error(weight / (1j * motion.amplitudes))  # d arg a = Im(da / a)
+    sine = t_factor(motion.dof) * float(np.hypot(noise, motion.turn(weight)))
+    if not sine < 1:
+        return Estimate()
+    return Estimate(lag, around(lag, float(np.arcsin(sine))))
+
+
+@dataclass(frozen=True)
+class PhaseLine:
+    """A line through the phases of m joints.
+
+    Attributes:
+        slope: kappa [rad/unit of the places].
+        deviation_rad: Root mean square of the phases about it, weighted.
+    """
+
+    slope: Estimate
+    deviation_rad: float
+
+
+def phase_line(motion: Oscillation, index: FloatArray, place: FloatArray) -> PhaseLine:
+    """Fit a line to the phases.
+
+    Args:
+        motion: m joints with known phases, m > 1.
+        index: Number of each in the chain, ascending; the phase between neighbours is known up to
+            whole turns, and the fit takes the lag nearest to the mean one.
+        place: Place of each along the chain, in any unit, shape (m,).
+    """
+    weight = np.abs(motion.amplitudes) ** 2
+    weight = weight / weight.sum()
+    phase = _unwrapped(np.angle(motion.amplitudes), index, weight)
+    centred = place - weight @ place
+    contrast = -weight * centred / (weight @ centred**2)
+    slope = float(contrast @ phase)
+    left = phase - weight @ phase + slope * centred
+    # d kappa = contrast (Im(da / a) + 2 left Re(da / a)): amplitudes are the weights.
+    noise = motion.error(contrast * (2 * left - 1j) / motion.amplitudes)
+    half = t_factor(motion.dof) * float(np.hypot(noise, motion.turn(contrast)))
+    return PhaseLine(Estimate(slope, around(slope, half)), float(weight @ left**2) ** 0.5)
+
+
+def _unwrapped(phase: FloatArray, index: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the phases with each step as near to the mean step as whole turns allow."""
+    count = _GRID * (int(index[-1] - index[0]) + 1)
+    trial = np.linspace(-np.pi, np.pi, count, endpoint=False)
+    sums = np.abs((weight * np.exp(1j * phase)) @ np.exp(1j * np.outer(index, trial)))
+    mean = trial[np.argmax(sums)] * np.diff(index)
+    steps = np.diff(phase) + mean
+    return phase[0] + np.concatenate(
+        ([0.0], np.cumsum(np.angle(np.exp(1j * steps)) - mean, dtype=np.float64))
+    )
+
+
+def travelling_index(motion: Oscillation) -> Estimate:
+    """Return how much of a wave travels: 1 of a travelling, 0 of a standing one.
+
+    The complex amplitudes c + j d span a plane of shapes; with s1 >= s2 the singular values of the
+    matrix of c and d, the index is s2 / s1, one over its condition number (Feeny 2008). An error E
+    of the matrix changes s by u^T E v to first order. Of a standing wave s2 is all noise: the
+    length of E v2 across u1, whose square is compared with its mean by an F test (degrees of
+    freedom after Satterthwaite).
+
+    Args:
+        motion: At least two joints.
+
+    Returns:
+        The index; its interval reaches to 0 where s2 can't be told from noise.
+    """
+    a = motion.amplitudes
+    left, size, right = np.linalg.svd(np.stack([a.real, a.imag], axis=-1), full_matrices=False)
+    if size[0] == 0:
+        return Estimate()
+    # u^T E v = Re sum_k u_k conj(v) da_k, with v as a complex number.
+    turned = right[:, 0] - 1j * right[:, 1]
+    small, large = left[:, 1] * turned[1], left[:, 0] * turned[0]
+    index = float(size[1] / size[0])
+    half = t_factor(motion.dof) * motion.error((small - index * large) / size[0])
+    across = np.eye(a.size) - np.outer(left[:, 0], left[:, 0])
+    noise = motion.covariance(across * turned[1])
+    power = float(np.trace(noise))
+    freedom = power**2 / float(np.sum(noise**2)) if power > 0 else 1.0
+    alone = size[1] ** 2 <= power * float(fdtri(freedom, motion.dof, CONFIDENCE))
+    low = 0.0 if alone else max(0.0, index - half)
+    return Estimate(index, (low, min(1.0, index + half)))
