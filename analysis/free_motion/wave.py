@@ -85,7 +85,7 @@ class Oscillation:
     def known_phases(self) -> BoolArray:
         """Which joints have a phase: noise leaves their amplitude distinct from zero, (m,)."""
         size = np.abs(self.amplitudes)
-        errors = np.sqrt(np.diag(self.covariance(np.eye(size.size) + 0j)))
+        errors = np.sqrt(np.diag(self.covariance(np.eye(size.size, dtype=np.complex128))))
         return size > t_factor(self.dof) * errors
 
 
