@@ -5,29 +5,30 @@ from __future__ import annotations
 import csv
 import hashlib
 import heapq
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import FloatArray, IntArray
 from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError, UsageError, some_names
 from ..common.files import write_text
 from ..common.process import StopRequest
 from ..log.write.writer import SessionWriter
-from ..robot.bus_map import SESSION_UNIT, TIME_UNITS, unit_for
+from ..robot.bus_map import TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
 from .can_import import ImportReport, file_digest, imported_session
 from .column_map import COMMANDS, STATES, Column, ColumnMap
-from .csv_import import EARLIEST_NS, WITH_POSITION, topics_of
+from .csv_import import EARLIEST_NS
 from .frame_log import LATEST_NS, RELATIVE_EPOCH_NS
+from .joint_topics import JointTopic, topics_of
 from .table_guess import guess_map
 from .tables import TABLE_SUFFIXES, TableFile, is_time, open_table, words
 
@@ -36,8 +37,18 @@ _STATE_FILES = {"state", "states", "measured", "response", "feedback", "joint", 
 _EVENT_FILES = {"event", "events"}
 _MOST_NAMES = 1 << 16  # bytes of a list of joints
 
-Message: TypeAlias = tuple[int, int, Callable[[], None]]
-"""Time [ns], order among those of one time, and what writes it."""
+
+@dataclass(frozen=True)
+class _Messages:
+    """Messages of some time, and what writes them.
+
+    Attributes:
+        first: Time of the first one [ns], and the order among those of one time.
+    """
+
+    first: tuple[int, int]
+    last_ns: int
+    write: Callable[[], None]
 
 
 @dataclass(frozen=True)
@@ -226,17 +237,13 @@ def _write(
         if found.events is not None:
             unit = column_map.time_of(COMMANDS if COMMANDS in found.tables else STATES)[1]
             streams.append(_events(found.events, unit, offset, writer, report))
-        for count, (t_ns, _, write) in enumerate(
-            heapq.merge(*streams, key=lambda message: message[:2]) if len(streams) > 1
-            else streams[0]
-        ):  # fmt: skip
-            if not count % 4096:
-                bar.update(0.0, note=f"{count} messages")
-                if stop is not None and stop.requested:
-                    report.complete = False
-                    break
-            write()
-            report.end_ns = max(report.end_ns, t_ns)
+        for block in heapq.merge(*streams, key=lambda block: block.first):
+            block.write()
+            report.end_ns = max(report.end_ns, block.last_ns)
+            bar.update(0.0, note=f"{sum(report.samples.values())} messages")
+            if stop is not None and stop.requested:
+                report.complete = False
+                break
         if not report.samples:
             raise ImportFormatError(found.source, "has no row with a value of a mapped column")
         for source in sources:
@@ -286,23 +293,26 @@ class _Source:
 
     def messages(
         self, writer: SessionWriter, offset: int, report: ImportReport
-    ) -> Iterator[Message]:
-        """Yield the messages in order of time."""
+    ) -> Iterator[_Messages]:
+        """Yield the messages of each block, in order of time."""
         found = {(column.joint, column.quantity): column for column in self.columns}
         topics = [
-            _Topic(writer, quantities, self.columns, report)
+            JointTopic(writer, list(found), quantities)
             for quantities in topics_of({quantity for _, quantity in found})
         ]
         for block in self._blocks:
-            t_ns = self._checked(self._times(block[self._time])) + offset
+            if not len(block[self._time]):
+                continue
+            t_ns = self._checked(self._times(block[self._time]), offset)
             values = {
                 (column.joint, column.quantity): self._converted(column, block[column.column])
                 for column in self.columns
             }
-            writes = [topic.rows(t_ns, values) for topic in topics]
-            stamps: list[int] = t_ns.tolist()
-            for row, stamp in enumerate(stamps):
-                yield stamp, self._order, _writing(writes, row)
+            yield _Messages(
+                (int(t_ns[0]), self._order),
+                int(t_ns[-1]),
+                partial(_write_block, topics, t_ns, values, report),
+            )
 
     def missing(self) -> list[str]:
         """Return how many cells of each column had no value."""
@@ -326,7 +336,8 @@ class _Source:
                 raise
             raise ImportFormatError(path, f"column {self._time!r} holds no times") from error
 
-    def _checked(self, t_ns: IntArray) -> IntArray:
+    def _checked(self, t_ns: IntArray, offset: int) -> IntArray:
+        """Return the times of a session, which don't go back."""
         before = self._last_ns if self._last_ns is not None else int(t_ns[0])
         back = np.flatnonzero(np.diff(t_ns, prepend=before) < 0)
         if len(back):
@@ -335,7 +346,12 @@ class _Source:
                 f"column {self._time!r}: time goes back, to {int(t_ns[back[0]]) / 1e9:g} s",
             )
         self._last_ns = int(t_ns[-1])
-        return t_ns
+        stamps = t_ns + offset
+        if not 0 <= int(stamps[0]) <= int(stamps[-1]) < LATEST_NS:
+            raise ImportFormatError(
+                self.table.path, f"column {self._time!r}: not all times are from 1970 to 2038"
+            )
+        return stamps
 
     def _converted(self, column: Column, cells: NDArray[Any]) -> FloatArray:
         """Convert cells to the session's unit: unwrapped over blocks, scaled and offset."""
@@ -367,65 +383,20 @@ def _is_number(cell: object) -> bool:
     return True
 
 
-def _writing(writes: Sequence[Callable[[int], None]], row: int) -> Callable[[], None]:
-    def write() -> None:
-        for each in writes:
-            each(row)
-
-    return write
-
-
-class _Topic:
-    """One JointState topic of a table."""
-
-    def __init__(
-        self,
-        writer: SessionWriter,
-        quantities: Sequence[Quantity],
-        columns: Iterable[Column],
-        report: ImportReport,
-    ) -> None:
-        self._quantities = quantities
-        self._names = list(dict.fromkeys(c.joint for c in columns if c.quantity in quantities))
-        self._name = JOINT_TOPIC[quantities[0]]
-        self._samples = report.samples
-        self._channel = writer.joint_state(
-            self._name,
-            self._names,
-            unit=SESSION_UNIT[quantities[0]],
-            velocity=Quantity.VELOCITY in quantities[1:],
-            effort=Quantity.EFFORT in quantities[1:],
-        )
-
-    def rows(
-        self, t_ns: IntArray, values: dict[tuple[str, Quantity], FloatArray]
-    ) -> Callable[[int], None]:
-        """Return what writes a row of a block; a row without any value is no message."""
-        missing = np.full(len(t_ns), np.nan)
-        fields = [
-            np.stack([values.get((name, each), missing) for name in self._names], axis=1)
-            for each in self._quantities
-        ]
-        filled = np.any([~np.isnan(each).all(axis=1) for each in fields], axis=0)
-        none: list[tuple[()]] = [()] * len(t_ns)
-        velocity, effort = (
-            fields[self._quantities.index(each)] if each in self._quantities[1:] else none
-            for each in WITH_POSITION
-        )
-        stamps: list[int] = t_ns.tolist()
-        position, send = fields[0], self._channel.write
-
-        def write(row: int) -> None:
-            if filled[row]:
-                send(stamps[row], position[row], velocity[row], effort[row])
-                self._samples[self._name] = self._samples.get(self._name, 0) + 1
-
-        return write
+def _write_block(
+    topics: Sequence[JointTopic],
+    t_ns: IntArray,
+    values: Mapping[tuple[str, Quantity], FloatArray],
+    report: ImportReport,
+) -> None:
+    for topic in topics:
+        if count := topic.write(t_ns, values):
+            report.samples[topic.name] = report.samples.get(topic.name, 0) + count
 
 
 def _events(
     path: Path, unit: str, offset: int, writer: SessionWriter, report: ImportReport
-) -> Iterator[Message]:
+) -> Iterator[_Messages]:
     """Yield the events of a table, a time and a text a row, in order of time."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
@@ -456,4 +427,4 @@ def _events(
         return write
 
     for t_ns, event in sorted(found):
-        yield t_ns, 2, writing(t_ns, event)
+        yield _Messages((t_ns, 2), t_ns, writing(t_ns, event))

@@ -13,6 +13,7 @@ import json
 import math
 import re
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -24,7 +25,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError, MissingExtraError
-from .torch_zip import MOST_BYTES, UNZIPPING, read_tensors, refuse
+from .torch_zip import MOST_BYTES, UNZIPPING, read_entry, read_tensors, refuse
 
 Block: TypeAlias = dict[str, NDArray[Any]]
 """Column to its cells, (n,): numbers, or texts where they are none."""
@@ -32,8 +33,12 @@ Block: TypeAlias = dict[str, NDArray[Any]]
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".mat", ".parquet", ".pt", ".pth")
 ARRAY_SUFFIXES = TABLE_SUFFIXES[3:]
 
-_ROWS = 16384  # of a block
+_ROWS, _CELLS = 16384, 1 << 20  # most of a block
 _WIDEST = 4096
+_NARROW = 64  # rows that show how wide a table is
+_MANY_ROWS = 1 << 22
+_ROWS_A_BYTE = 4
+_SPARSE_CELLS, _SPARSEST = 1 << 24, 128
 _JOINT_COLUMNS = ("joint", "joint_name", "jointname", "motor", "servo", "name", "motor_id", "id")
 _SNIFFED = 1 << 16
 
@@ -66,6 +71,22 @@ class TableFile:
         return first
 
 
+def rows_of_block(columns: int) -> int:
+    """Return how many rows a block of so many columns has."""
+    return max(1, min(_ROWS, _CELLS // max(1, columns)))
+
+
+def check_rows(path: Path, rows: int) -> None:
+    """Refuse a file that packs far more rows than a recording has.
+
+    Raises:
+        ImportFormatError: If it has millions of rows and hardly a bit for each.
+    """
+    size = path.stat().st_size
+    if rows > max(_MANY_ROWS, _ROWS_A_BYTE * size):
+        refuse(path, f"has {rows} rows in {size} bytes: so many equal rows are no recording")
+
+
 def open_table(path: Path) -> TableFile:
     """Open a table by its suffix.
 
@@ -92,6 +113,7 @@ def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> Tab
     vectors = [each.shape[0] for each in plain.values() if each.ndim == 1]
     lengths = [max(each.shape) for each in plain.values()]
     rows = max(vectors or lengths, key=lambda n: (lengths.count(n), n))
+    check_rows(path, rows)
     columns: Block = {}
     for name, each in plain.items():
         upright = each.T if each.ndim == 2 and each.shape[0] != rows else each
@@ -103,8 +125,9 @@ def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> Tab
             columns |= {f"{name}[{i}]": upright[:, i] for i in range(upright.shape[1])}
 
     def read(names: Sequence[str], time: str) -> Iterator[Block]:  # noqa: ARG001
-        for at in range(0, rows, _ROWS):
-            yield {name: columns[name][at : at + _ROWS] for name in names}
+        step = rows_of_block(len(names))
+        for at in range(0, rows, step):
+            yield {name: columns[name][at : at + step] for name in names}
 
     kept = {name.partition("[")[0] for name in columns}
     left_out = tuple(name for name in arrays if name not in kept)
@@ -120,7 +143,7 @@ def _npz(path: Path) -> dict[str, NDArray[Any]]:
             return {
                 info.filename.removesuffix(".npy"): array
                 for info in archive.infolist()
-                if (array := _npy(archive.read(info), info.filename)) is not None
+                if (array := _npy(read_entry(archive, info), info.filename)) is not None
             }
     except (OSError, ValueError, RuntimeError, *UNZIPPING) as error:
         raise ImportFormatError(path, f"can't be read as .npz: {error}") from error
@@ -179,12 +202,17 @@ def arrow(what: str) -> Any:
 def _open_parquet(path: Path) -> TableFile:
     parquet = arrow("a .parquet table")
     try:
-        file = parquet.ParquetFile(path)
-        first = next(file.iter_batches(batch_size=_ROWS), None)
-        if first is None:
+        with parquet.ParquetFile(path) as file:
+            check_rows(path, file.metadata.num_rows)
+            repeated = [n for n, count in Counter(file.schema_arrow.names).items() if count > 1]
+            if repeated:
+                refuse(path, f"has several columns {repeated[0]!r}")
+            first = next(file.iter_batches(batch_size=_NARROW), None)
+        if first is None or not len(first):
             refuse(path, "has no rows")
         columns = tuple(_parquet_block(first))
-        file.close()
+        if len(columns) > _WIDEST:
+            refuse(path, f"has {len(columns)} columns; {_WIDEST} at most")
     except ImportFormatError:
         raise
     except Exception as error:  # pyarrow has errors of many bases
@@ -198,7 +226,8 @@ def _open_parquet(path: Path) -> TableFile:
                     name for name in (*wanted, *names) if name in set(file.schema_arrow.names)
                 ]
                 chosen = list(dict.fromkeys(present))
-                for batch in file.iter_batches(batch_size=_ROWS, columns=chosen):
+                step = rows_of_block(len(columns))
+                for batch in file.iter_batches(batch_size=step, columns=chosen):
                     block = _parquet_block(batch)
                     yield {name: block[name] for name in names}
         except KeyError as error:
@@ -269,6 +298,8 @@ def _open_text(path: Path) -> TableFile:
         for name in raw
         for each in ([f"{name}[{i}]" for i in range(vectors[name])] if name in vectors else [name])
     )
+    if len(columns) > _WIDEST:
+        refuse(path, f"has {len(columns)} columns; {_WIDEST} at most")
     read = partial(_read_text, path, raw, vectors, delimiter, decimal, skipped)
     table = TableFile(path, columns, read, delimiter, "headerless" if headerless else "wide")
     return _pivoted(table) or table
@@ -326,11 +357,12 @@ def _read_text(  # noqa: PLR0917 - bound once, where the file was sniffed
 ) -> Iterator[Block]:
     wanted = [name for name in raw if name in names or f"{name}[0]" in names]
     texts = {name: str for name in (*vectors, time) if name in wanted}
+    step = rows_of_block(len(raw) + sum(vectors.values()))
     try:
         with pd.read_csv(  # pyright: ignore[reportCallIssue, reportUnknownMemberType]
             path, sep=r"\s+" if delimiter == " " else delimiter, decimal=decimal, names=raw,
             header=None, skiprows=skipped, usecols=wanted, dtype=cast("Any", texts),
-            chunksize=_ROWS, skipinitialspace=True, encoding="utf-8-sig", index_col=False,
+            chunksize=step, skipinitialspace=True, encoding="utf-8-sig", index_col=False,
             low_memory=False, on_bad_lines="error",
         ) as chunks:  # fmt: skip
             for chunk in cast("Iterator[pd.DataFrame]", chunks):
@@ -398,36 +430,46 @@ def _pivoted(table: TableFile) -> TableFile | None:
         return None
 
     def read(wanted: Sequence[str], exact: str) -> Iterator[Block]:  # noqa: ARG001
-        blocks = list(table.read([time, joint, *values], ""))
-        yield from _wide(blocks, time, joint, values, wanted)
+        present = [value for value in values if any(n.startswith(f"{value}[") for n in wanted)]
+        blocks = list(table.read([time, joint, *present], ""))
+        yield from _wide(table.path, blocks, (time, joint, *present), wanted)
 
-    seen: list[str] = []
+    seen: dict[str, None] = {}
     for block in table.read([joint], ""):
-        seen = list(dict.fromkeys([*seen, *map(str, np.unique(block[joint].astype(str)))]))
+        seen |= dict.fromkeys(map(str, block[joint].tolist()))
+        if len(seen) * len(values) > _WIDEST:
+            return None
     order = sorted(seen, key=lambda n: (names.index(n) if n in names else len(names), n))
     columns = (time, *(f"{value}[{name}]" for value in values for name in order))
-    if len(columns) > _WIDEST:
-        return None
     return TableFile(table.path, columns, read, table.delimiter, "long")
 
 
 def _wide(
-    blocks: list[Block], time: str, joint: str, values: list[str], wanted: Sequence[str]
+    path: Path, blocks: list[Block], columns: Sequence[str], wanted: Sequence[str]
 ) -> Iterator[Block]:
-    """Put the rows of one time side by side; the table is held whole, in order of time."""
-    t, who = (np.concatenate([block[name] for block in blocks]) for name in (time, joint))
+    """Put the rows of one time side by side; the table is held whole, in order of time.
+
+    Args:
+        columns: Of the times, of the joints, and of the values.
+        wanted: The columns to yield.
+    """
+    t, who, *cells = (np.concatenate([block[name] for block in blocks]) for name in columns)
     stamps, row = np.unique(t, return_inverse=True)
-    names = who.astype(str)
-    result: Block = {time: stamps}
-    for value in values:
-        cells = np.concatenate([block[value] for block in blocks]).astype(float)
-        for column in wanted:
-            if column.startswith(f"{value}[") and column.endswith("]"):
-                mine = (names == column[len(value) + 1 : -1]) & ~np.isnan(cells)
-                result[column] = np.full(len(stamps), np.nan)
-                result[column][row[mine]] = cells[mine]
-    for at in range(0, len(stamps), _ROWS):
-        yield {name: result[name][at : at + _ROWS] for name in wanted}
+    codes, names = pd.factorize(np.array(list(map(str, who.tolist())), dtype=object))
+    if len(stamps) * len(names) > max(_SPARSE_CELLS, _SPARSEST * len(t)):
+        refuse(path, f"names {len(names)} joints that seldom share a time; is {columns[1]!r} one?")
+    order = np.argsort(row, kind="stable")
+    step = rows_of_block(len(cells) * len(names))
+    ends = np.searchsorted(row[order], np.arange(0, len(stamps) + step, step))
+    for k, at in enumerate(range(0, len(stamps), step)):
+        mine = order[ends[k] : ends[k + 1]]
+        block: Block = {columns[0]: stamps[at : at + step]}
+        for value, numbers in zip(columns[2:], cells, strict=True):
+            dense = np.full((len(block[columns[0]]), len(names)), np.nan)
+            known = mine[~np.isnan(numbers[mine].astype(float))]
+            dense[row[known] - at, codes[known]] = numbers[known]
+            block |= {f"{value}[{name}]": dense[:, i] for i, name in enumerate(names)}
+        yield {name: block[name] for name in wanted}
 
 
 _TIMES = ("time", "timestamp", "stamp", "t", "secs", "seconds", "epoch", "ts", "datetime")

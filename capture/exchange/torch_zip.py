@@ -26,6 +26,7 @@ from ..common.errors import ImportFormatError
 MOST_BYTES = 1 << 29
 """More bytes of numbers than this in a file of arrays are refused [B]: they are read at once."""
 
+_MOST_NAMES, _DEEPEST = 1 << 16, 64
 UNZIPPING = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError)
 """Errors of a damaged zip, the last of a kind of compression that its header invents."""
 
@@ -74,6 +75,18 @@ def refuse(path: Path, why: str) -> NoReturn:
     raise ImportFormatError(path, why)
 
 
+def read_entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
+    """Return the bytes of an entry, never more than its directory declares.
+
+    Raises:
+        ValueError: If it is packed by a method that has no bound on what it expands to.
+    """
+    if info.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+        raise ValueError(f"{info.filename} is neither stored nor deflated")
+    with archive.open(info) as stream:  # without a size, a stream is expanded whole
+        return stream.read(info.file_size)
+
+
 def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
     """Return the tensors that a file's dictionary names; those of nested ones as ``outer.inner``.
 
@@ -88,12 +101,10 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
             root = pickle.removesuffix("data.pkl")
             if archive.getinfo(pickle).file_size > MOST_BYTES // 64:
                 refuse(path, "its data.pkl is too large to name tensors only")
-            order = _byte_order(archive, root)
-            value = _Machine(path).run(archive.read(pickle))
+            value = _Machine(path).run(read_entry(archive, archive.getinfo(pickle)))
+            storages = _Storages(path, archive, root)
             return {
-                name: _array(path, archive, root, order, tensor)
-                if tensor is not None
-                else np.array(None)
+                name: storages.array(tensor) if tensor is not None else np.array(None)
                 for name, tensor in _named(value).items()
             }
     except ImportFormatError:
@@ -107,7 +118,7 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
 def _byte_order(archive: zipfile.ZipFile, root: str) -> str:
     if f"{root}byteorder" not in archive.namelist():
         return "<" if sys.byteorder == "little" else ">"
-    return ">" if archive.read(f"{root}byteorder") == b"big" else "<"
+    return ">" if read_entry(archive, archive.getinfo(f"{root}byteorder")) == b"big" else "<"
 
 
 class _Machine:
@@ -194,34 +205,64 @@ class _Machine:
         return _Tensor(arguments[0], int(arguments[1]), shape, stride)
 
 
-def _named(value: object, prefix: str = "") -> dict[str, _Tensor | None]:
-    if isinstance(value, _Tensor):
-        return {prefix or "tensor": value if value.storage.dtype else None}
-    if not isinstance(value, Mapping):
-        return {prefix: None}
+def _named(value: object) -> dict[str, _Tensor | None]:
+    """Return the tensors of nested dictionaries, by their path of keys.
+
+    Raises:
+        ValueError: If there are too many, as of dictionaries that hold each other many times.
+    """
     found: dict[str, _Tensor | None] = {}
-    for key, inner in cast("Mapping[object, object]", value).items():
-        found |= _named(inner, f"{prefix}.{key}" if prefix else str(key))
+    waiting: list[tuple[str, object, int]] = [("", value, 0)]
+    seen = 0
+    while waiting:
+        name, item, depth = waiting.pop()
+        seen += 1
+        if seen > _MOST_NAMES or depth > _DEEPEST:
+            raise ValueError(f"more than {_MOST_NAMES} names, or deeper than {_DEEPEST}")
+        if isinstance(item, _Tensor):
+            found[name or "tensor"] = item if item.storage.dtype else None
+        elif isinstance(item, Mapping):
+            inner = cast("Mapping[object, object]", item)
+            waiting += [
+                (f"{name}.{key}" if name else str(key), each, depth + 1)
+                for key, each in reversed(inner.items())
+            ]
+        else:
+            found[name] = None
     return found
 
 
-def _array(
-    path: Path, archive: zipfile.ZipFile, root: str, order: str, tensor: _Tensor
-) -> NDArray[Any]:
-    info = archive.getinfo(f"{root}data/{tensor.storage.key}")
-    dtype = np.dtype(order + tensor.storage.dtype)
-    last = tensor.offset + sum(
-        (count - 1) * step for count, step in zip(tensor.shape, tensor.stride, strict=True)
-    )
-    numbers = info.file_size // dtype.itemsize
-    sound = min((*tensor.shape, *tensor.stride, tensor.offset), default=0) >= 0
-    size = math.prod(tensor.shape)
-    if not sound or last >= max(numbers, 1) or size > max(numbers, 1):
-        raise ImportFormatError(path, f"a tensor of shape {tensor.shape} exceeds its storage")
-    if info.file_size > MOST_BYTES:
-        raise ImportFormatError(path, f"a tensor of {info.file_size} bytes; {MOST_BYTES} at most")
-    if not size:
-        return np.zeros(tensor.shape, dtype)
-    flat = np.frombuffer(archive.read(info), dtype, numbers)[tensor.offset :]
-    strides = tuple(step * dtype.itemsize for step in tensor.stride)
-    return np.lib.stride_tricks.as_strided(flat, tensor.shape, strides, writeable=False)
+class _Storages:
+    """The numbers of a file: each storage is read once, all together at most :data:`MOST_BYTES`."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile, root: str) -> None:
+        self._path, self._archive, self._root = path, archive, root
+        self._order = _byte_order(archive, root)
+        self._read: dict[str, bytes] = {}
+        self._size = 0
+
+    def array(self, tensor: _Tensor) -> NDArray[Any]:
+        """Return the view of its storage that a tensor is."""
+        dtype = np.dtype(self._order + tensor.storage.dtype)
+        data = self._bytes(tensor.storage.key)
+        numbers, size = len(data) // dtype.itemsize, math.prod(tensor.shape)
+        last = tensor.offset + sum(
+            (count - 1) * step for count, step in zip(tensor.shape, tensor.stride, strict=True)
+        )
+        sound = min((*tensor.shape, *tensor.stride, tensor.offset), default=0) >= 0
+        if not sound or last >= max(numbers, 1) or size > max(numbers, 1):
+            refuse(self._path, f"a tensor of shape {tensor.shape} exceeds its storage")
+        if not size or not numbers:
+            return np.zeros(tensor.shape, dtype)
+        flat = np.frombuffer(data, dtype, numbers)[tensor.offset :]
+        strides = tuple(step * dtype.itemsize for step in tensor.stride)
+        return np.lib.stride_tricks.as_strided(flat, tensor.shape, strides, writeable=False)
+
+    def _bytes(self, key: str) -> bytes:
+        if key not in self._read:
+            info = self._archive.getinfo(f"{self._root}data/{key}")
+            self._size += info.file_size
+            if self._size > MOST_BYTES:
+                refuse(self._path, f"tensors of {self._size} bytes; {MOST_BYTES} at most")
+            self._read[key] = read_entry(self._archive, info)
+        return self._read[key]

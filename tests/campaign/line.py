@@ -3,13 +3,14 @@
 import os
 import threading
 import tty
+from pathlib import Path
 
 
 def fed(work, data):
     """Run a function while a pseudo-terminal, ``line`` in the working folder, brings bytes."""
     master, slave = os.openpty()
     tty.setraw(slave)
-    os.symlink(os.ttyname(slave), "line")
+    Path("line").symlink_to(os.ttyname(slave))
     threading.Thread(target=_write, args=(master, data), daemon=True).start()
     work()
 

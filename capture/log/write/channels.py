@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...common.arrays import NS, FloatArray
+from ...common.arrays import NS, FloatArray, IntArray
 from ...common.errors import DataError
 from ..messages.cdr import Leaf, encode
 from ..messages.definitions import DiagnosticStatus, message_type
@@ -33,6 +33,9 @@ from ..messages.frames import (
 
 Send = Callable[[int, int, bytes], None]
 """Writes one message: log time [ns], publish time [ns], bytes."""
+
+SendRows = Callable[[IntArray, NDArray[np.uint8]], None]
+"""Writes messages of one size, at times of recording and sampling [ns], (n,), bytes (n, size)."""
 
 _TIME = struct.Struct("<iI")
 _POSE_STEP = 2.0**-14  # transforms are a view aid: rounded, they compress
@@ -51,6 +54,7 @@ class Template:
     message: bytearray
     leaves: dict[str, Leaf]
     send: Send
+    send_rows: SendRows
 
     def view(self, path: str) -> NDArray[Any]:
         """Return the numbers of one field, as a writable view of the message.
@@ -65,6 +69,36 @@ class Template:
         if leaf is None:
             return np.empty(0, dtype=np.float64)
         return np.frombuffer(self.message, dtype=leaf.dtype, count=leaf.count, offset=leaf.offset)
+
+    def emit_rows(self, t_ns: IntArray, values: Mapping[str, FloatArray]) -> None:
+        """Write many messages at once.
+
+        Args:
+            t_ns: Sampling time of each, and its time of recording [Unix ns], shape (n,).
+            values: Field path to numbers, shape (n, count) or (n,); the others are the template's.
+
+        Raises:
+            ValueError: If a shape doesn't fit the field.
+        """
+        stamp = ("header.stamp.sec", "header.stamp.nanosec")
+        leaves = [self.leaves[path] for path in (*stamp, *values)]
+        layout = np.dtype(
+            {
+                "names": [leaf.path for leaf in leaves],
+                "formats": [
+                    (leaf.dtype, (leaf.count,)) if leaf.is_array else leaf.dtype for leaf in leaves
+                ],
+                "offsets": [leaf.offset for leaf in leaves],
+                "itemsize": len(self.message),
+            }
+        )
+        bytes_of = np.empty((len(t_ns), len(self.message)), np.uint8)
+        bytes_of[:] = np.frombuffer(self.message, np.uint8)
+        rows = bytes_of.view(layout)[:, 0]
+        rows[stamp[0]], rows[stamp[1]] = np.divmod(t_ns, NS)
+        for path, numbers in values.items():
+            rows[path] = numbers
+        self.send_rows(t_ns, bytes_of)
 
     def emit(self, t_ns: int, log_time_ns: int | None, stamps: Sequence[int]) -> None:
         """Stamp and write the message.
@@ -129,6 +163,29 @@ class JointStateChannel(_Stamped):
         velocities[...] = velocity
         efforts[...] = effort
         self._emit(t_ns, log_time_ns)
+
+    def write_rows(
+        self, t_ns: IntArray, position: FloatArray, velocity: FloatArray, effort: FloatArray
+    ) -> None:
+        """Write many samples at once, each recorded when it was sampled; see :meth:`write`.
+
+        Args:
+            t_ns: Sampling times [Unix ns], shape (n,).
+            position: Shape (n, m).
+            velocity: [rad/s], shape (n, m), or (n, 0) if the channel has none.
+            effort: [N m], shape (n, m), or (n, 0) if the channel has none.
+
+        Raises:
+            ValueError: If a shape doesn't fit the channel.
+        """
+        given = zip(self._fields, (position, velocity, effort), self._views, strict=True)
+        values: dict[str, FloatArray] = {}
+        for path, numbers, view in given:
+            if numbers.shape != (len(t_ns), len(view)):
+                raise ValueError(f"{path} has the shape {numbers.shape}, not (n, {len(view)})")
+            if len(view):
+                values[path] = numbers
+        self._template.emit_rows(t_ns, values)
 
 
 class OdometryChannel(_Stamped):
