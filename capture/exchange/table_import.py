@@ -322,7 +322,9 @@ class _Source:
         unit, path = self._unit_ns, self.table.path
         try:
             if cells.dtype.kind in "iu":
-                t_ns = np.array([int(t) * unit for t in cells.tolist()])
+                if np.abs(cells.astype(float)).max(initial=0) * unit >= LATEST_NS:
+                    raise ImportFormatError(path, f"column {self._time!r}: no time before 2038")
+                t_ns = cells.astype(np.int64) * unit
             elif cells.dtype.kind == "f":
                 t_ns = np.rint(cells.astype(float) * unit)
             else:
@@ -371,8 +373,9 @@ class _Source:
             turns = np.unwrap(np.concatenate([[before[0]], raw]), period=column.wrap)
             values[known] = turns[1:] + (before[1] - before[0])
             self._unwrapped[name] = (raw[-1], values[known][-1])
-        unit = unit_for(column.unit, column.quantity)
-        return unit.convert(column.scale * values + column.offset)
+        if (column.scale, column.offset) != (1.0, 0.0):
+            values = column.scale * values + column.offset
+        return unit_for(column.unit, column.quantity).convert(values)
 
 
 def _is_number(cell: object) -> bool:

@@ -13,6 +13,7 @@ import json
 import math
 import re
 import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..common.errors import ImportFormatError, MissingExtraError
+from ..common.errors import ImportFormatError, LogError, MissingExtraError
 from .torch_zip import MOST_BYTES, UNZIPPING, read_entry, read_tensors, refuse
 
 Block: TypeAlias = dict[str, NDArray[Any]]
@@ -35,9 +36,12 @@ ARRAY_SUFFIXES = TABLE_SUFFIXES[3:]
 
 _ROWS, _CELLS = 16384, 1 << 20  # most of a block
 _WIDEST = 4096
+_COMPRESSED, _PIECE = 15, 1 << 16  # of .mat
+_NPY_HEADER = 1 << 17  # bytes
 _NARROW = 64  # rows that show how wide a table is
 _MANY_ROWS = 1 << 22
 _ROWS_A_BYTE = 4
+_MANY_CELLS, _CELLS_A_BYTE = 1 << 25, 16
 _SPARSE_CELLS, _SPARSEST = 1 << 24, 128
 _JOINT_COLUMNS = ("joint", "joint_name", "jointname", "motor", "servo", "name", "motor_id", "id")
 _SNIFFED = 1 << 16
@@ -85,6 +89,17 @@ def check_rows(path: Path, rows: int) -> None:
     size = path.stat().st_size
     if rows > max(_MANY_ROWS, _ROWS_A_BYTE * size):
         refuse(path, f"has {rows} rows in {size} bytes: so many equal rows are no recording")
+
+
+def check_cells(path: Path, cells: int) -> None:
+    """Refuse a file that packs far more numbers than a recording has into what is read at once.
+
+    Raises:
+        ImportFormatError: If there are millions, and hardly a bit for each.
+    """
+    size = path.stat().st_size
+    if cells > max(_MANY_CELLS, _CELLS_A_BYTE * size):
+        refuse(path, f"has {cells} numbers in {size} bytes: so many equal ones are no recording")
 
 
 def open_table(path: Path) -> TableFile:
@@ -139,22 +154,28 @@ def _npz(path: Path) -> dict[str, NDArray[Any]]:
         with zipfile.ZipFile(path) as archive:
             size = sum(info.file_size for info in archive.infolist())
             if size > MOST_BYTES:
-                raise ImportFormatError(path, f"holds {size} bytes of arrays; {MOST_BYTES} at most")
+                refuse(path, f"holds {size} bytes of arrays; {MOST_BYTES} at most")
+            check_cells(path, size // 8)
             return {
                 info.filename.removesuffix(".npy"): array
                 for info in archive.infolist()
                 if (array := _npy(read_entry(archive, info), info.filename)) is not None
             }
+    except ImportFormatError:
+        raise
     except (OSError, ValueError, RuntimeError, *UNZIPPING) as error:
         raise ImportFormatError(path, f"can't be read as .npz: {error}") from error
 
 
-def _npy(data: bytes, name: str) -> NDArray[Any] | None:
+def _npy(data: bytearray, name: str) -> NDArray[Any] | None:
     """Return one array, None for objects: those would be unpickled."""
-    stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
-    shape, fortran, dtype = (header or np.lib.format.read_array_header_2_0)(stream)
+    stream = io.BytesIO(memoryview(data)[:_NPY_HEADER])
+    try:
+        version = np.lib.format.read_magic(stream)
+        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
+        shape, fortran, dtype = (header or np.lib.format.read_array_header_2_0)(stream)
+    except Exception as error:  # it is a Python expression: its parser's errors have many bases
+        raise ValueError(f"{name} has no valid header: {error}") from error
     if dtype.hasobject:
         return None
     count = math.prod(shape)
@@ -172,10 +193,12 @@ def _mat(path: Path) -> dict[str, NDArray[Any]]:
             start = stream.read(128)
         if start.startswith((b"MATLAB 7.3", b"\x89HDF")):
             refuse(path, "is a .mat of version 7.3 (HDF5), which is not supported; save with -v7")
+        _check_mat(path)
         listed = whosmat(path)
         size = sum(8 * math.prod(shape) for _, shape, _ in listed)
         if size > MOST_BYTES:
             refuse(path, f"declares {size} bytes of arrays; {MOST_BYTES} at most")
+        check_cells(path, size // 8)
         numeric = ("double", "single", "logical", "int", "uint")
         names = [name for name, _, kind in listed if kind.startswith(numeric)]
         found = loadmat(path, variable_names=names) if names else {}
@@ -184,6 +207,30 @@ def _mat(path: Path) -> dict[str, NDArray[Any]]:
     except Exception as error:  # scipy raises whatever a damaged file leads to
         raise ImportFormatError(path, f"can't be read as .mat: {error}") from error
     return {name: found[name] for name in names if isinstance(found.get(name), np.ndarray)}
+
+
+def _check_mat(path: Path) -> None:
+    """Refuse a file of which an element expands too far; what the elements declare may be less.
+
+    Layout: MAT-File Format, "Level 5 MAT-Files": tags of type and size [byte], and zlib streams.
+    """
+    left = MOST_BYTES
+    with path.open("rb") as stream:
+        order = "little" if stream.read(128)[126:128] == b"IM" else "big"
+        while len(tag := stream.read(8)) == 8:
+            kind, size = (int.from_bytes(part, order) for part in (tag[:4], tag[4:]))
+            if kind != _COMPRESSED:
+                stream.seek(size, io.SEEK_CUR)
+                continue
+            packed, end = zlib.decompressobj(), stream.tell() + size
+            while left > 0 and not packed.eof and (some := stream.read(min(_PIECE, size))):
+                size -= len(some)
+                while left > 0 and some:
+                    left -= len(packed.decompress(some, _PIECE))
+                    some = packed.unconsumed_tail
+            if left <= 0:
+                refuse(path, f"expands to more than {MOST_BYTES} bytes")
+            stream.seek(end)
 
 
 def arrow(what: str) -> Any:
@@ -199,41 +246,62 @@ def arrow(what: str) -> Any:
     return parquet
 
 
-def _open_parquet(path: Path) -> TableFile:
+def read_parquet(
+    path: Path,
+    columns: Sequence[str] | None,
+    rows: int,
+    holds: Callable[[Any], bool] = lambda _: True,
+) -> Iterator[Any]:
+    """Yield the rows of some columns, so many at a time, as record batches.
+
+    Args:
+        columns: Their names; all of them if None.
+        holds: Whether a row group, by its metadata, is to be read.
+
+    Raises:
+        ImportFormatError: If the file is damaged, has no such column, has one twice, or packs far
+            more rows or numbers than a recording has.
+        MissingExtraError: If pyarrow is not installed.
+    """
     parquet = arrow("a .parquet table")
     try:
         with parquet.ParquetFile(path) as file:
-            check_rows(path, file.metadata.num_rows)
-            repeated = [n for n, count in Counter(file.schema_arrow.names).items() if count > 1]
-            if repeated:
-                refuse(path, f"has several columns {repeated[0]!r}")
-            first = next(file.iter_batches(batch_size=_NARROW), None)
-        if first is None or not len(first):
-            refuse(path, "has no rows")
-        columns = tuple(_parquet_block(first))
-        if len(columns) > _WIDEST:
-            refuse(path, f"has {len(columns)} columns; {_WIDEST} at most")
-    except ImportFormatError:
+            names = Counter(file.schema_arrow.names)
+            for name in names if columns is None else columns:
+                if names[name] != 1:
+                    refuse(
+                        path, f"has {names[name] or 'no'} column{'s' * (names[name] > 1)} {name!r}"
+                    )
+            metadata = file.metadata
+            check_rows(path, metadata.num_rows)
+            groups = [k for k in range(metadata.num_row_groups) if holds(metadata.row_group(k))]
+            for group in groups:
+                columns_of = map(metadata.row_group(group).column, range(metadata.num_columns))
+                check_cells(path, sum(column.num_values for column in columns_of))
+            yield from file.iter_batches(batch_size=rows, row_groups=groups, columns=columns)
+    except LogError:
         raise
     except Exception as error:  # pyarrow has errors of many bases
         raise ImportFormatError(path, f"can't be read as Parquet: {error}") from error
 
+
+def _open_parquet(path: Path) -> TableFile:
+    first = next(read_parquet(path, None, _NARROW), None)
+    if first is None or not len(first):
+        refuse(path, "has no rows")
+    columns = tuple(_parquet_block(first))
+    if len(columns) > _WIDEST:
+        refuse(path, f"has {len(columns)} columns; {_WIDEST} at most")
+    present = set(first.schema.names)
+
     def read(names: Sequence[str], time: str) -> Iterator[Block]:  # noqa: ARG001
-        wanted = list(dict.fromkeys(re.sub(r"\[\d+\]$", "", name) for name in names))
-        try:
-            with parquet.ParquetFile(path) as file:
-                present = [
-                    name for name in (*wanted, *names) if name in set(file.schema_arrow.names)
-                ]
-                chosen = list(dict.fromkeys(present))
-                step = rows_of_block(len(columns))
-                for batch in file.iter_batches(batch_size=step, columns=chosen):
-                    block = _parquet_block(batch)
-                    yield {name: block[name] for name in names}
-        except KeyError as error:
-            raise ImportFormatError(path, f"rows have no {error}") from error
-        except Exception as error:
-            raise ImportFormatError(path, f"can't be read as Parquet: {error}") from error
+        chosen = [n if n in present else re.sub(r"\[\d+\]$", "", n) for n in names]
+        batches = read_parquet(path, list(dict.fromkeys(chosen)), rows_of_block(len(columns)))
+        for batch in batches:
+            block = _parquet_block(batch)
+            if absent := [name for name in names if name not in block]:
+                refuse(path, f"has rows without {absent[0]}")
+            yield {name: block[name] for name in names}
 
     table = TableFile(path, columns, read, form="parquet")
     return _pivoted(table) or table

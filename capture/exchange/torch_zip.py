@@ -26,7 +26,8 @@ from ..common.errors import ImportFormatError
 MOST_BYTES = 1 << 29
 """More bytes of numbers than this in a file of arrays are refused [B]: they are read at once."""
 
-_MOST_NAMES, _DEEPEST = 1 << 16, 64
+_MOST_PICKLE, _MOST_NAMES, _LONGEST_NAME, _DEEPEST = 1 << 20, 1 << 16, 4096, 64
+_PIECE = 1 << 20
 UNZIPPING = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError)
 """Errors of a damaged zip, the last of a kind of compression that its header invents."""
 
@@ -75,7 +76,7 @@ def refuse(path: Path, why: str) -> NoReturn:
     raise ImportFormatError(path, why)
 
 
-def read_entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
+def read_entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytearray:
     """Return the bytes of an entry, never more than its directory declares.
 
     Raises:
@@ -83,8 +84,14 @@ def read_entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     """
     if info.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
         raise ValueError(f"{info.filename} is neither stored nor deflated")
+    data, at = bytearray(info.file_size), 0
     with archive.open(info) as stream:  # without a size, a stream is expanded whole
-        return stream.read(info.file_size)
+        while piece := stream.read(min(_PIECE, len(data) - at)):
+            data[at : at + len(piece)] = piece
+            at += len(piece)
+    if at < len(data):
+        raise ValueError(f"{info.filename} has {at} bytes of {len(data)}")
+    return data
 
 
 def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
@@ -99,9 +106,9 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
         with zipfile.ZipFile(path) as archive:
             (pickle,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
             root = pickle.removesuffix("data.pkl")
-            if archive.getinfo(pickle).file_size > MOST_BYTES // 64:
+            if archive.getinfo(pickle).file_size > _MOST_PICKLE:
                 refuse(path, "its data.pkl is too large to name tensors only")
-            value = _Machine(path).run(read_entry(archive, archive.getinfo(pickle)))
+            value = _Machine(path).run(bytes(read_entry(archive, archive.getinfo(pickle))))
             storages = _Storages(path, archive, root)
             return {
                 name: storages.array(tensor) if tensor is not None else np.array(None)
@@ -118,7 +125,8 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
 def _byte_order(archive: zipfile.ZipFile, root: str) -> str:
     if f"{root}byteorder" not in archive.namelist():
         return "<" if sys.byteorder == "little" else ">"
-    return ">" if read_entry(archive, archive.getinfo(f"{root}byteorder")) == b"big" else "<"
+    with archive.open(f"{root}byteorder") as stream:
+        return ">" if stream.read(4) == b"big" else "<"
 
 
 class _Machine:
@@ -181,7 +189,11 @@ class _Machine:
             raise ImportFormatError(self._path, f"its pickle has {name}, which names no tensor")
 
     def _marked(self) -> list[Any]:
-        at = max(i for i, item in enumerate(self._stack) if item is _MARK)
+        at = len(self._stack) - 1
+        while at >= 0 and self._stack[at] is not _MARK:
+            at -= 1
+        if at < 0:
+            raise ValueError("its pickle takes more than it gave")
         items = self._stack[at + 1 :]
         del self._stack[at:]
         return items
@@ -201,7 +213,9 @@ class _Machine:
             return arguments[0]
         if name not in _TENSOR or not isinstance(arguments[0], _Storage):
             return _NOT_RUN
-        shape, stride = (tuple(map(int, numbers)) for numbers in arguments[2:4])
+        shape, stride = (tuple(map(int, numbers[:_DEEPEST])) for numbers in arguments[2:4])
+        if max((*shape, *stride, int(arguments[1])), default=0) > MOST_BYTES:
+            raise ValueError(f"a tensor of more than {MOST_BYTES} numbers")
         return _Tensor(arguments[0], int(arguments[1]), shape, stride)
 
 
@@ -217,15 +231,15 @@ def _named(value: object) -> dict[str, _Tensor | None]:
     while waiting:
         name, item, depth = waiting.pop()
         seen += 1
-        if seen > _MOST_NAMES or depth > _DEEPEST:
-            raise ValueError(f"more than {_MOST_NAMES} names, or deeper than {_DEEPEST}")
+        if seen > _MOST_NAMES or depth > _DEEPEST or len(name) > _LONGEST_NAME:
+            raise ValueError(f"more than {_MOST_NAMES} names, or one of {name[:40]!r} is too long")
         if isinstance(item, _Tensor):
             found[name or "tensor"] = item if item.storage.dtype else None
         elif isinstance(item, Mapping):
-            inner = cast("Mapping[object, object]", item)
+            inner = list(cast("Mapping[object, object]", item).items())
             waiting += [
                 (f"{name}.{key}" if name else str(key), each, depth + 1)
-                for key, each in reversed(inner.items())
+                for key, each in inner[::-1]
             ]
         else:
             found[name] = None
@@ -238,7 +252,7 @@ class _Storages:
     def __init__(self, path: Path, archive: zipfile.ZipFile, root: str) -> None:
         self._path, self._archive, self._root = path, archive, root
         self._order = _byte_order(archive, root)
-        self._read: dict[str, bytes] = {}
+        self._read: dict[str, bytearray] = {}
         self._size = 0
 
     def array(self, tensor: _Tensor) -> NDArray[Any]:
@@ -258,7 +272,7 @@ class _Storages:
         strides = tuple(step * dtype.itemsize for step in tensor.stride)
         return np.lib.stride_tricks.as_strided(flat, tensor.shape, strides, writeable=False)
 
-    def _bytes(self, key: str) -> bytes:
+    def _bytes(self, key: str) -> bytearray:
         if key not in self._read:
             info = self._archive.getinfo(f"{self._root}data/{key}")
             self._size += info.file_size

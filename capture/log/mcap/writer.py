@@ -243,7 +243,7 @@ class McapWriter:
             entries[:, 0] = some["log_time"]
             entries[:, 1] = len(chunk.data) + length * np.arange(len(some))
             self._index(chunk, channel_id).frombytes(entries.tobytes())
-            chunk.data += memoryview(some).cast("B")
+            chunk.data += some.tobytes()
             self.messages += len(some)
             at += len(some)
             if len(chunk.data) > self._chunk_size:
