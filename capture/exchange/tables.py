@@ -266,7 +266,7 @@ def read_parquet(
     parquet = arrow("a .parquet table")
     try:
         with parquet.ParquetFile(path) as file:
-            names = Counter(file.schema_arrow.names)
+            names = Counter(cast("list[str]", file.schema_arrow.names))
             for name in names if columns is None else columns:
                 if names[name] != 1:
                     refuse(
