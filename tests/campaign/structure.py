@@ -315,7 +315,7 @@ def constant_parquet(rows, names):
 
 
 def _constant(data, rng):
-    return constant_parquet(rng.choice([1, 40]) * 1_000_000, ("time", "joint1_pos", "joint1_vel"))
+    return constant_parquet(rng.choice([1, 6]) * 1_000_000, ("time", "joint1_pos", "joint1_vel"))
 
 
 # -- .mat ----------------------------------------------------------------------------------
