@@ -22,6 +22,7 @@ from ..robot.bus_map import JOINT_QUANTITIES, SESSION_UNIT, TIME_UNITS, UNITS, v
 from ..robot.description import numbered
 from ..robot.model import Quantity
 from .column_map import COMMANDS, STATES, Column, ColumnMap
+from .frame_log import LATEST_NS
 from .tables import Block, TableFile, is_time, words
 
 _COMMAND = {
@@ -174,11 +175,11 @@ def _time_unit(
         return given
     if not _numeric(cells):
         raise ImportFormatError(table.path, f"column {name!r} holds no numbers, so no times")
-    steps = np.diff(np.unique(cells[np.isfinite(cells.astype(float))]).astype(float))
-    if not len(steps) or np.median(steps) <= 0:
+    known = np.unique(cells[np.abs(cells.astype(float)) < LATEST_NS]).astype(float)
+    step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+    if step <= 0:
         said.append(f"{table.path.name}: times ({name}) taken as s: no unit given")
         return "s"
-    step = float(np.median(steps))
     rates = {unit: 1e9 / (step * ns) for unit, ns in TIME_UNITS.items()}
     unit = min(rates, key=lambda u: abs(math.log(rates[u] / _USUAL_HZ)))
     said.append(
