@@ -163,7 +163,8 @@ def _time_column(table: TableFile, sample: Block) -> str:
 
 
 def _rises(cells: NDArray[Any]) -> bool:
-    steps = np.diff(cells.astype(float))
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = np.diff(cells.astype(float))
     return bool(len(steps) and np.all(steps >= 0) and np.any(steps > 0))
 
 
@@ -328,7 +329,8 @@ def _wrap(cells: NDArray[Any], quantity: Quantity, unit: str) -> float:
     """Return the period of an angle's jumps: several of one size, far above all other steps."""
     if quantity not in {Quantity.POSITION, Quantity.COMMAND} or unit not in {"rad", "deg"}:
         return 0.0
-    steps = np.abs(np.diff(cells.astype(float)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = np.abs(np.diff(cells.astype(float)))
     steps = steps[np.isfinite(steps)]
     for period in _WRAPS[:2] if unit == "rad" else _WRAPS[2:]:
         jumps = steps > _LEAST_JUMP * period

@@ -35,6 +35,7 @@ from .tables import TABLE_SUFFIXES, TableFile, is_time, open_table, words
 _COMMAND_FILES = {"control", "command", "commands", "cmd", "action", "actions", "target", "targets"}
 _STATE_FILES = {"state", "states", "measured", "response", "feedback", "joint", "joints", "motor"}
 _EVENT_FILES = {"event", "events"}
+_MOST = 1e200
 _MOST_NAMES = 1 << 16  # bytes of a list of joints
 
 
@@ -217,6 +218,8 @@ def _write(
     relative = abs(first_ns) < EARLIEST_NS
     offset = RELATIVE_EPOCH_NS if relative else 0
     report.start_ns = report.end_ns = first_ns + offset
+    if report.start_ns < 0:
+        raise ImportFormatError(found.source, "not all times are from 1970 to 2038")
     form = next(iter(found.tables.values()))
     facts = {
         "import.format": form.path.suffix.removeprefix(".").lower() or "csv",
@@ -326,10 +329,10 @@ class _Source:
                     raise ImportFormatError(path, f"column {self._time!r}: no time before 2038")
                 t_ns = cells.astype(np.int64) * unit
             elif cells.dtype.kind == "f":
-                t_ns = np.rint(cells.astype(float) * unit)
+                with np.errstate(over="ignore"):
+                    t_ns = np.rint(cells.astype(float) * unit)
             else:
-                texts = [str(cell).replace(",", ".") for cell in cells]
-                t_ns = np.array([round(Decimal(text) * unit) for text in texts])
+                t_ns = np.array([_exact_ns(str(cell).replace(",", "."), unit) for cell in cells])
             if len(t_ns) and not np.all(np.abs(t_ns.astype(float)) < LATEST_NS):
                 raise ImportFormatError(path, f"column {self._time!r}: no time before 2038")
             return t_ns.astype(np.int64)
@@ -364,8 +367,10 @@ class _Source:
             bad = next((str(cell)[:40] for cell in cells if not _is_number(cell)), "")
             raise ImportFormatError(path, f"column {name!r}: {bad!r} is not a number") from error
         known = ~np.isnan(values)
-        if np.isinf(values).any():
-            raise ImportFormatError(path, f"column {name!r} has a number that is not finite")
+        if not np.all(np.abs(values[known]) < _MOST):
+            raise ImportFormatError(
+                path, f"column {name!r} has a number that is not finite or beyond {_MOST:g}"
+            )
         self._missing[name] = self._missing.get(name, 0) + int(len(values) - known.sum())
         if column.wrap and known.any():
             raw = values[known]
@@ -376,6 +381,18 @@ class _Source:
         if (column.scale, column.offset) != (1.0, 0.0):
             values = column.scale * values + column.offset
         return unit_for(column.unit, column.quantity).convert(values)
+
+
+def _exact_ns(text: str, unit_ns: int) -> int:
+    """Parse a time [ns].
+
+    Raises:
+        ArithmeticError: If it is none, or no stamp can hold it.
+    """
+    t_ns = Decimal(text) * unit_ns
+    if not abs(t_ns) < LATEST_NS:  # before it is rounded: 1e999999999 has as many digits
+        raise OverflowError(f"{text[:40]} is no time before 2038")
+    return round(t_ns)
 
 
 def _is_number(cell: object) -> bool:
@@ -415,7 +432,7 @@ def _events(
     found: list[tuple[int, str]] = []
     for row in rows[1:]:
         try:
-            t_ns = round(Decimal(row[time]) * TIME_UNITS[unit]) + offset
+            t_ns = _exact_ns(row[time], TIME_UNITS[unit]) + offset
             if not 0 <= t_ns < LATEST_NS:
                 raise ImportFormatError(path, f"{row[time]!r} is no time before 2038")
             found.append((t_ns, row[text]))

@@ -311,7 +311,7 @@ def _parquet_block(batch: Any) -> Block:
     block: Block = {}
     for name, column in zip(batch.schema.names, batch.columns, strict=True):
         kind = str(column.type)
-        if kind.startswith(("list", "fixed_size_list", "large_list")):
+        if kind.startswith(_LISTS):
             block |= _spread(name, vectors_of(column))
         elif kind.startswith("timestamp"):
             block[name] = column.cast("timestamp[ns]").cast("int64").to_numpy(zero_copy_only=False)
@@ -320,15 +320,19 @@ def _parquet_block(batch: Any) -> Block:
     return block
 
 
-def vectors_of(column: Any) -> NDArray[Any]:
-    """Return a column of lists as (n, m).
+_LISTS = ("list", "fixed_size_list", "large_list")
 
-    Raises:
-        ValueError: If their lengths differ or they hold no numbers.
-    """
-    flat = column.flatten().to_numpy(zero_copy_only=False)
-    rows = len(column)
-    if flat.dtype.kind not in "fiub" or not rows or len(flat) % rows or len(flat) > rows * _WIDEST:
+
+def vectors_of(column: Any) -> NDArray[Any]:
+    """Return a column of lists as (n, m), of numbers as (n, 1), of anything else as (n, 0)."""
+    rows, lengths = len(column), np.ones(len(column))
+    if str(column.type).startswith(_LISTS):
+        lengths = column.value_lengths().to_numpy(zero_copy_only=False)  # NaN for a null
+        column = column.flatten()
+    flat = column.to_numpy(zero_copy_only=False)
+    if flat.dtype.kind not in "fiub" or not rows or not 1 <= lengths[0] <= _WIDEST:
+        return np.zeros((rows, 0))
+    if not np.all(lengths == lengths[0]):
         return np.zeros((rows, 0))
     return flat.reshape(rows, -1)
 

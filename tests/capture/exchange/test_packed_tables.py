@@ -1,6 +1,7 @@
 """Tables and arrays that pack or claim more than a recording has; each was found by an attack."""
 
 import io
+import json
 import struct
 import tracemalloc
 import zipfile
@@ -164,16 +165,63 @@ def test_a_long_table_in_any_order(tmp_path):
     assert angles == pytest.approx(expected, abs=1e-8)
 
 
+def dataset(folder, width=2, **columns):
+    """Write a data set of 20 frames with some other columns."""
+    meta, data = folder / "set" / "meta", folder / "set" / "data" / "chunk-000"
+    meta.mkdir(parents=True)
+    data.mkdir(parents=True)
+    feature = {"dtype": "float32", "shape": [width], "names": None}
+    (meta / "info.json").write_text(json.dumps({"fps": 30, "features": {"action": feature}}))
+    frames = {"action": [[0.1] * width] * 20, "episode_index": [0] * 20, "frame_index": range(20)}
+    table = pa.table({name: list(cells) for name, cells in (frames | columns).items()})
+    parquet.write_table(table, data / "file-000.parquet")
+    return folder / "set"
+
+
 @pytest.mark.parametrize("column", ["episode_index", "frame_index"])
 @pytest.mark.parametrize("cells", [[None, 1] * 10, ["a"] * 20, [[1]] * 20, [0.5] * 20])
 def test_frames_numbered_by_what_is_no_number(tmp_path, column, cells):
-    meta, data = tmp_path / "set" / "meta", tmp_path / "set" / "data" / "chunk-000"
-    meta.mkdir(parents=True)
-    data.mkdir(parents=True)
-    feature = '{"dtype": "float32", "shape": [2], "names": null}'
-    (meta / "info.json").write_text(f'{{"fps": 30, "features": {{"action": {feature}}}}}')
-    frames = {"action": [[0.1, 0.2]] * 20, "episode_index": [0] * 20, "frame_index": range(20)}
-    table = pa.table({name: list(cell) for name, cell in (frames | {column: cells}).items()})
-    parquet.write_table(table, data / "file-000.parquet")
     with pytest.raises(ImportFormatError, match=column):
-        import_lerobot(tmp_path / "set", tmp_path / "out")
+        import_lerobot(dataset(tmp_path, **{column: cells}), tmp_path / "out")
+
+
+@pytest.mark.parametrize("t", ["1e999999999", "1e308", "-1e308", "nan", "inf", "1e18", "-5e9"])
+def test_a_time_that_no_stamp_holds(tmp_path, t):
+    rows = [f"{k / 100},{k % 7}" for k in range(100)]
+    rows[50] = f"{t},1"
+    path = of_bytes(tmp_path / "x.csv", "\n".join(["time,joint1_pos", *rows]).encode())
+    with pytest.raises(ImportFormatError, match="time"):
+        import_tables(open_tables(path), tmp_path / "x.mcap")
+
+
+def test_times_before_1970(tmp_path):
+    rows = [f"{k - 2e8:.2f},{k % 7}" for k in range(100)]
+    path = of_bytes(tmp_path / "x.csv", "\n".join(["time,joint1_pos", *rows]).encode())
+    with pytest.raises(ImportFormatError, match="not all times are from 1970"):
+        import_tables(open_tables(path), tmp_path / "x.mcap", units={"time": "s"})
+
+
+@pytest.mark.parametrize("value", ["1e308", "inf", "-1e250"])
+def test_a_value_beyond_any_joint(tmp_path, value):
+    rows = [f"{k / 100},{value if k == 50 else k % 7}" for k in range(100)]
+    path = of_bytes(tmp_path / "x.csv", "\n".join(["time,joint1_pos_deg", *rows]).encode())
+    with pytest.raises(ImportFormatError, match="joint1_pos_deg"):
+        import_tables(open_tables(path), tmp_path / "x.mcap")
+
+
+UNEVEN = [[0.1], [0.1, 0.2, 0.3]] * 10, [[0.1, 0.2], None] * 10, [None, [0.1] * 4] * 10
+ODD = ["a", "b"] * 10, [[[1.0]]] * 20, [{"x": 1.0}] * 20, [None] * 20, [[]] * 20
+
+
+@pytest.mark.parametrize("cells", [*UNEVEN, *ODD])
+def test_actions_that_are_no_numbers(tmp_path, cells):
+    with pytest.raises(ImportFormatError, match="action"):
+        import_lerobot(dataset(tmp_path, action=cells), tmp_path / "out")
+
+
+def test_one_joint_has_no_vectors(tmp_path):
+    """LeRobot writes a feature of one element as plain numbers."""
+    cells = [k / 20 for k in range(20)]
+    import_lerobot(dataset(tmp_path, width=1, action=cells), tmp_path / "x.mcap")
+    found = decoded_of(tmp_path / "x.mcap", ["/joint_commands"])
+    assert [message.position for *_, message in found] == [[cell] for cell in cells]
