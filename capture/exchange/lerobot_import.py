@@ -30,9 +30,10 @@ from ..robot.description import numbered
 from ..robot.model import Quantity, Robot
 from .can_import import ImportReport, file_digest
 from .column_map import STATES, Column, ColumnMap
+from .packing import Block, refuse, rows_of_block
+from .parquet_files import read_parquet, vectors_of
 from .table_import import TableSet, import_tables
-from .tables import Block, TableFile, read_parquet, rows_of_block, vectors_of
-from .torch_zip import refuse
+from .tables import TableFile
 
 _FEATURES = {"action": Quantity.COMMAND, "observation.state": Quantity.POSITION}
 _MOST_INFO = 1 << 24  # bytes

@@ -8,40 +8,29 @@ joint, stands for the wide one: ``angle[joint01]``. A table without a header has
 from __future__ import annotations
 
 import csv
-import io
 import json
 import math
 import re
-import zipfile
-import zlib
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..common.errors import ImportFormatError, LogError, MissingExtraError
-from .torch_zip import MOST_BYTES, UNZIPPING, read_entry, read_tensors, refuse
-
-Block: TypeAlias = dict[str, NDArray[Any]]
-"""Column to its cells, (n,): numbers, or texts where they are none."""
+from ..common.errors import ImportFormatError
+from .array_files import read_mat, read_npz
+from .packing import WIDEST, Block, check_rows, refuse, rows_of_block, spread
+from .parquet_files import block_of, read_parquet
+from .torch_zip import read_tensors
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".mat", ".parquet", ".pt", ".pth")
 ARRAY_SUFFIXES = TABLE_SUFFIXES[3:]
 
-_ROWS, _CELLS = 16384, 1 << 20  # most of a block
-_WIDEST = 4096
-_COMPRESSED, _PIECE = 15, 1 << 16  # of .mat
-_NPY_HEADER = 1 << 17  # bytes
 _NARROW = 64  # rows that show how wide a table is
-_MANY_ROWS = 1 << 22
-_ROWS_A_BYTE = 4
-_MANY_CELLS, _CELLS_A_BYTE = 1 << 25, 16
 _SPARSE_CELLS, _SPARSEST = 1 << 24, 128
 _JOINT_COLUMNS = ("joint", "joint_name", "jointname", "motor", "servo", "name", "motor_id", "id")
 _SNIFFED = 1 << 16
@@ -75,33 +64,6 @@ class TableFile:
         return first
 
 
-def rows_of_block(columns: int) -> int:
-    """Return how many rows a block of so many columns has."""
-    return max(1, min(_ROWS, _CELLS // max(1, columns)))
-
-
-def check_rows(path: Path, rows: int) -> None:
-    """Refuse a file that packs far more rows than a recording has.
-
-    Raises:
-        ImportFormatError: If it has millions of rows and hardly a bit for each.
-    """
-    size = path.stat().st_size
-    if rows > max(_MANY_ROWS, _ROWS_A_BYTE * size):
-        refuse(path, f"has {rows} rows in {size} bytes: so many equal rows are no recording")
-
-
-def check_cells(path: Path, cells: int) -> None:
-    """Refuse a file that packs far more numbers than a recording has into what is read at once.
-
-    Raises:
-        ImportFormatError: If there are millions, and hardly a bit for each.
-    """
-    size = path.stat().st_size
-    if cells > max(_MANY_CELLS, _CELLS_A_BYTE * size):
-        refuse(path, f"has {cells} numbers in {size} bytes: so many equal ones are no recording")
-
-
 def open_table(path: Path) -> TableFile:
     """Open a table by its suffix.
 
@@ -114,7 +76,7 @@ def open_table(path: Path) -> TableFile:
         return _open_parquet(path)
     if suffix not in ARRAY_SUFFIXES:
         return _open_text(path)
-    readers = {".npz": _npz, ".mat": _mat}
+    readers = {".npz": read_npz, ".mat": read_mat}
     arrays = readers.get(suffix, read_tensors)(path)
     return _of_arrays(path, arrays, suffix.removeprefix("."))
 
@@ -132,7 +94,7 @@ def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> Tab
     columns: Block = {}
     for name, each in plain.items():
         upright = each.T if each.ndim == 2 and each.shape[0] != rows else each
-        if upright.shape[0] != rows or math.prod(upright.shape[1:]) > _WIDEST:
+        if upright.shape[0] != rows or math.prod(upright.shape[1:]) > WIDEST:
             continue
         if upright.ndim == 1:
             columns[name] = upright
@@ -149,196 +111,26 @@ def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> Tab
     return TableFile(path, tuple(columns), read, form=form, left_out=left_out)
 
 
-def _npz(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(info.file_size for info in archive.infolist())
-            if size > MOST_BYTES:
-                refuse(path, f"holds {size} bytes of arrays; {MOST_BYTES} at most")
-            check_cells(path, size // 8)
-            return {
-                info.filename.removesuffix(".npy"): array
-                for info in archive.infolist()
-                if (array := _npy(read_entry(archive, info), info.filename)) is not None
-            }
-    except ImportFormatError:
-        raise
-    except (OSError, ValueError, RuntimeError, *UNZIPPING) as error:
-        raise ImportFormatError(path, f"can't be read as .npz: {error}") from error
-
-
-def _npy(data: bytearray, name: str) -> NDArray[Any] | None:
-    """Return one array, None for objects: those would be unpickled."""
-    stream = io.BytesIO(memoryview(data)[:_NPY_HEADER])
-    try:
-        version = np.lib.format.read_magic(stream)
-        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
-        shape, fortran, dtype = (header or np.lib.format.read_array_header_2_0)(stream)
-    except Exception as error:  # it is a Python expression: its parser's errors have many bases
-        raise ValueError(f"{name} has no valid header: {error}") from error
-    if dtype.hasobject:
-        return None
-    count = math.prod(shape)
-    if min(shape, default=0) < 0 or count * dtype.itemsize > len(data) - stream.tell():
-        raise ValueError(f"{name} declares shape {shape}, more than it holds")
-    flat = np.frombuffer(data, dtype, count, stream.tell()) if count else np.zeros(0, dtype)
-    return flat.reshape(shape, order="F" if fortran else "C")
-
-
-def _mat(path: Path) -> dict[str, NDArray[Any]]:
-    from scipy.io import loadmat, whosmat
-
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(128)
-        if start.startswith((b"MATLAB 7.3", b"\x89HDF")):
-            refuse(path, "is a .mat of version 7.3 (HDF5), which is not supported; save with -v7")
-        _check_mat(path)
-        listed = whosmat(path)
-        size = sum(8 * math.prod(shape) for _, shape, _ in listed)
-        if size > MOST_BYTES:
-            refuse(path, f"declares {size} bytes of arrays; {MOST_BYTES} at most")
-        check_cells(path, size // 8)
-        numeric = ("double", "single", "logical", "int", "uint")
-        names = [name for name, _, kind in listed if kind.startswith(numeric)]
-        found = loadmat(path, variable_names=names) if names else {}
-    except ImportFormatError:
-        raise
-    except Exception as error:  # scipy raises whatever a damaged file leads to
-        raise ImportFormatError(path, f"can't be read as .mat: {error}") from error
-    return {name: found[name] for name in names if isinstance(found.get(name), np.ndarray)}
-
-
-def _check_mat(path: Path) -> None:
-    """Refuse a file of which an element expands too far; what the elements declare may be less.
-
-    Layout: MAT-File Format, "Level 5 MAT-Files": tags of type and size [byte], and zlib streams.
-    """
-    left = MOST_BYTES
-    with path.open("rb") as stream:
-        order = "little" if stream.read(128)[126:128] == b"IM" else "big"
-        while len(tag := stream.read(8)) == 8:
-            kind, size = (int.from_bytes(part, order) for part in (tag[:4], tag[4:]))
-            if kind != _COMPRESSED:
-                stream.seek(size, io.SEEK_CUR)
-                continue
-            packed, end = zlib.decompressobj(), stream.tell() + size
-            while left > 0 and not packed.eof and (some := stream.read(min(_PIECE, size))):
-                size -= len(some)
-                while left > 0 and some:
-                    left -= len(packed.decompress(some, _PIECE))
-                    some = packed.unconsumed_tail
-            if left <= 0:
-                refuse(path, f"expands to more than {MOST_BYTES} bytes")
-            stream.seek(end)
-
-
-def arrow(what: str) -> Any:
-    """Return pyarrow.parquet; its types are incomplete.
-
-    Raises:
-        MissingExtraError: If it is not installed.
-    """
-    try:
-        from pyarrow import parquet
-    except ImportError as error:
-        raise MissingExtraError(what, "parquet", "pyarrow") from error
-    return parquet
-
-
-def read_parquet(
-    path: Path,
-    columns: Sequence[str] | None,
-    rows: int,
-    holds: Callable[[Any], bool] = lambda _: True,
-) -> Iterator[Any]:
-    """Yield the rows of some columns, so many at a time, as record batches.
-
-    Args:
-        columns: Their names; all of them if None.
-        holds: Whether a row group, by its metadata, is to be read.
-
-    Raises:
-        ImportFormatError: If the file is damaged, has no such column, has one twice, or packs far
-            more rows or numbers than a recording has.
-        MissingExtraError: If pyarrow is not installed.
-    """
-    parquet = arrow("a .parquet table")
-    try:
-        with parquet.ParquetFile(path) as file:
-            names = Counter(cast("list[str]", file.schema_arrow.names))
-            for name in names if columns is None else columns:
-                if names[name] != 1:
-                    refuse(
-                        path, f"has {names[name] or 'no'} column{'s' * (names[name] > 1)} {name!r}"
-                    )
-            metadata = file.metadata
-            check_rows(path, metadata.num_rows)
-            groups = [k for k in range(metadata.num_row_groups) if holds(metadata.row_group(k))]
-            for group in groups:
-                columns_of = map(metadata.row_group(group).column, range(metadata.num_columns))
-                check_cells(path, sum(column.num_values for column in columns_of))
-            yield from file.iter_batches(batch_size=rows, row_groups=groups, columns=columns)
-    except LogError:
-        raise
-    except Exception as error:  # pyarrow has errors of many bases
-        raise ImportFormatError(path, f"can't be read as Parquet: {error}") from error
-
-
 def _open_parquet(path: Path) -> TableFile:
     first = next(read_parquet(path, None, _NARROW), None)
     if first is None or not len(first):
         refuse(path, "has no rows")
-    columns = tuple(_parquet_block(first))
-    if len(columns) > _WIDEST:
-        refuse(path, f"has {len(columns)} columns; {_WIDEST} at most")
+    columns = tuple(block_of(first))
+    if len(columns) > WIDEST:
+        refuse(path, f"has {len(columns)} columns; {WIDEST} at most")
     present = set(first.schema.names)
 
     def read(names: Sequence[str], time: str) -> Iterator[Block]:  # noqa: ARG001
         chosen = [n if n in present else re.sub(r"\[\d+\]$", "", n) for n in names]
         batches = read_parquet(path, list(dict.fromkeys(chosen)), rows_of_block(len(columns)))
         for batch in batches:
-            block = _parquet_block(batch)
+            block = block_of(batch)
             if absent := [name for name in names if name not in block]:
                 refuse(path, f"has rows without {absent[0]}")
             yield {name: block[name] for name in names}
 
     table = TableFile(path, columns, read, form="parquet")
     return _pivoted(table) or table
-
-
-def _parquet_block(batch: Any) -> Block:
-    block: Block = {}
-    for name, column in zip(batch.schema.names, batch.columns, strict=True):
-        kind = str(column.type)
-        if kind.startswith(_LISTS):
-            block |= _spread(name, vectors_of(column))
-        elif kind.startswith("timestamp"):
-            block[name] = column.cast("timestamp[ns]").cast("int64").to_numpy(zero_copy_only=False)
-        else:
-            block[name] = column.to_numpy(zero_copy_only=False)
-    return block
-
-
-_LISTS = ("list", "fixed_size_list", "large_list")
-
-
-def vectors_of(column: Any) -> NDArray[Any]:
-    """Return a column of lists as (n, m), of numbers as (n, 1), of anything else as (n, 0)."""
-    rows, lengths = len(column), np.ones(len(column))
-    if str(column.type).startswith(_LISTS):
-        lengths = column.value_lengths().to_numpy(zero_copy_only=False)  # NaN for a null
-        column = column.flatten()
-    flat = column.to_numpy(zero_copy_only=False)
-    if flat.dtype.kind not in "fiub" or not rows or not 1 <= lengths[0] <= _WIDEST:
-        return np.zeros((rows, 0))
-    if not np.all(lengths == lengths[0]):
-        return np.zeros((rows, 0))
-    return flat.reshape(rows, -1)
-
-
-def _spread(name: str, vectors: NDArray[Any]) -> Block:
-    return {f"{name}[{i}]": vectors[:, i] for i in range(vectors.shape[1])}
 
 
 def _open_text(path: Path) -> TableFile:
@@ -370,8 +162,8 @@ def _open_text(path: Path) -> TableFile:
         for name in raw
         for each in ([f"{name}[{i}]" for i in range(vectors[name])] if name in vectors else [name])
     )
-    if len(columns) > _WIDEST:
-        refuse(path, f"has {len(columns)} columns; {_WIDEST} at most")
+    if len(columns) > WIDEST:
+        refuse(path, f"has {len(columns)} columns; {WIDEST} at most")
     read = partial(_read_text, path, raw, vectors, delimiter, decimal, skipped)
     table = TableFile(path, columns, read, delimiter, "headerless" if headerless else "wide")
     return _pivoted(table) or table
@@ -409,8 +201,8 @@ def _sniffed(path: Path, lines: list[str]) -> tuple[str, list[list[str]]]:
         except csv.Error as error:
             raise ImportFormatError(path, f"is no table: {error}") from error
         if rows and len({len(row) for row in rows}) == 1 and len(rows[0]) > 1:
-            if len(rows[0]) > _WIDEST:
-                raise ImportFormatError(path, f"has {len(rows[0])} columns; {_WIDEST} at most")
+            if len(rows[0]) > WIDEST:
+                raise ImportFormatError(path, f"has {len(rows[0])} columns; {WIDEST} at most")
             return delimiter, rows
     raise ImportFormatError(
         path, "is no table: no comma, semicolon, tab or space cuts its first lines alike"
@@ -461,7 +253,7 @@ def _text_block(
             raise ImportFormatError(
                 path, f"column {name!r}, from row {row}: vectors of other lengths or no numbers"
             ) from error
-        block |= _spread(name, rows)
+        block |= spread(name, rows)
     return {name: block[name] for name in names}
 
 
@@ -493,7 +285,7 @@ def _pivoted(table: TableFile) -> TableFile | None:
         return None
     sample = table.sample()
     names = list(dict.fromkeys(map(str, sample[joint].tolist())))
-    if not 1 <= len(names) < min(_WIDEST, max(2, len(sample[joint]) // 2 + 1)):
+    if not 1 <= len(names) < min(WIDEST, max(2, len(sample[joint]) // 2 + 1)):
         return None
     values = [name for name in table.columns if name != joint and sample[name].dtype.kind in "fiub"]
     time = next((n for n in values if is_time(n)), None)
@@ -509,7 +301,7 @@ def _pivoted(table: TableFile) -> TableFile | None:
     seen: dict[str, None] = {}
     for block in table.read([joint], ""):
         seen |= dict.fromkeys(map(str, block[joint].tolist()))
-        if len(seen) * len(values) > _WIDEST:
+        if len(seen) * len(values) > WIDEST:
             return None
     order = sorted(seen, key=lambda n: (names.index(n) if n in names else len(names), n))
     columns = (time, *(f"{value}[{name}]" for value in values for name in order))

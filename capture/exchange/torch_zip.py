@@ -12,25 +12,18 @@ import math
 import pickletools
 import sys
 import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError
-
-MOST_BYTES = 1 << 29
-"""More bytes of numbers than this in a file of arrays are refused [B]: they are read at once."""
+from .packing import MOST_BYTES, UNZIPPING, read_entry, refuse
 
 _MOST_PICKLE, _MOST_NAMES, _LONGEST_NAME, _DEEPEST = 1 << 20, 1 << 16, 4096, 64
-_PIECE = 1 << 20
-UNZIPPING = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError)
-"""Errors of a damaged zip, the last of a kind of compression that its header invents."""
-
 _DTYPES = {
     "FloatStorage": "f4", "DoubleStorage": "f8", "HalfStorage": "f2", "LongStorage": "i8",
     "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1",
@@ -69,29 +62,6 @@ class _Tensor:
     offset: int
     shape: tuple[int, ...]
     stride: tuple[int, ...]
-
-
-def refuse(path: Path, why: str) -> NoReturn:
-    """Raise ImportFormatError."""
-    raise ImportFormatError(path, why)
-
-
-def read_entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytearray:
-    """Return the bytes of an entry, never more than its directory declares.
-
-    Raises:
-        ValueError: If it is packed by a method that has no bound on what it expands to.
-    """
-    if info.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
-        raise ValueError(f"{info.filename} is neither stored nor deflated")
-    data, at = bytearray(info.file_size), 0
-    with archive.open(info) as stream:  # without a size, a stream is expanded whole
-        while piece := stream.read(min(_PIECE, len(data) - at)):
-            data[at : at + len(piece)] = piece
-            at += len(piece)
-    if at < len(data):
-        raise ValueError(f"{info.filename} has {at} bytes of {len(data)}")
-    return data
 
 
 def read_tensors(path: Path) -> dict[str, NDArray[Any]]:

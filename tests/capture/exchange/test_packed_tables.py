@@ -14,7 +14,7 @@ from pyarrow import parquet
 from scipy.io import savemat
 
 from campaign.foreign import tensor
-from campaign.structure import MIB, constant_parquet, deflated_zeros, zip_of_stream
+from campaign.packed import MIB, constant_parquet, deflated_zeros, zip_of_stream
 from support.read_back import decoded_of
 from undulog.capture.common.errors import ImportFormatError
 from undulog.capture.exchange.lerobot_import import import_lerobot
