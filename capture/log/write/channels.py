@@ -38,6 +38,7 @@ SendRows = Callable[[IntArray, NDArray[np.uint8]], None]
 """Writes messages of one size, at times of recording and sampling [ns], (n,), bytes (n, size)."""
 
 _TIME = struct.Struct("<iI")
+_END_NS = 2**31 * NS
 _AT_ONCE = 1 << 18  # bytes of messages, which a processor's cache holds
 _POSE_STEP = 2.0**-14  # transforms are a view aid: rounded, they compress
 
@@ -79,8 +80,11 @@ class Template:
             values: Field path to numbers, shape (n, count) or (n,); the others are the template's.
 
         Raises:
+            DataError: If a time isn't from 1970 to 2038, which a stamp can hold.
             ValueError: If a shape doesn't fit the field.
         """
+        if len(t_ns) and not 0 <= int(t_ns.min()) <= int(t_ns.max()) < _END_NS:
+            raise DataError(f"times from {t_ns.min()} to {t_ns.max()} ns don't fit 32 bits of s")
         stamp = ("header.stamp.sec", "header.stamp.nanosec")
         leaves = [self.leaves[path] for path in (*stamp, *values)]
         layout = np.dtype(

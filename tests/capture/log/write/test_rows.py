@@ -8,6 +8,7 @@ from hypothesis.extra import numpy as arrays
 
 from support.read_back import decoded_of, messages_of
 from undulog.capture import SessionWriter
+from undulog.capture.common.errors import DataError
 from undulog.capture.log.sinks.durable_sink import DurableSink
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -94,3 +95,12 @@ def test_a_wrong_shape_is_refused(tmp_path):
             channel.write_rows(np.arange(3), np.zeros((3, 3)), none, none)
         with pytest.raises(ValueError, match="velocity has the shape"):
             channel.write_rows(np.arange(3), np.zeros((3, 2)), np.zeros((3, 2)), none)
+
+
+@pytest.mark.parametrize("t_ns", [-1, 2**31 * 10**9])
+def test_a_time_that_no_stamp_holds_is_refused(tmp_path, t_ns):
+    with SessionWriter(tmp_path / "x.mcap", **FACTS) as writer:
+        channel = writer.joint_state("/joint_states", ["a"], unit="rad")
+        none = np.empty((2, 0))
+        with pytest.raises(DataError, match="32 bits"):
+            channel.write_rows(np.array([5, t_ns]), np.zeros((2, 1)), none, none)
