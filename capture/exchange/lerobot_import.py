@@ -104,7 +104,9 @@ def open_lerobot(folder: Path) -> LeRobotDataset:
         others = tuple(n for n in features if n not in _FEATURES and n not in _KNOWN)
     except LogError:
         raise
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except (
+        OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError
+    ) as error:  # fmt: skip
         raise ImportFormatError(path, f"is no description of a LeRobot dataset: {error}") from error
     if not names or not 1e-3 <= fps <= 1e6:
         raise ImportFormatError(path, "names neither action nor observation.state, or no fps")
@@ -232,17 +234,9 @@ def _episode(dataset: LeRobotDataset, number: int, paths: Sequence[Path]) -> Tab
 
 
 def _of_episode(path: Path, number: int, columns: Sequence[str], rows: int) -> Iterator[Any]:
-    """Yield the frames of one episode in a file, as batches; only row groups that hold some."""
-
-    def holds(group: Any) -> bool:
-        chunks = (group.column(i) for i in range(group.num_columns))
-        found = next((c.statistics for c in chunks if c.path_in_schema == "episode_index"), None)
-        return found is None or not found.has_min_max or found.min <= number <= found.max
-
-    for batch in read_parquet(path, [*columns, "episode_index"], rows, holds):
-        mine = _integers(path, batch, "episode_index") == number
-        if mine.any():
-            yield batch if mine.all() else batch.filter(mine)
+    """Return the frames of one episode in a file, as batches; only row groups that hold some."""
+    where = "episode_index", number
+    return (batch for batch in read_parquet(path, columns, rows, where) if len(batch))
 
 
 def _frames(path: Path, dataset: LeRobotDataset, number: int, rows: int) -> Iterator[Block]:

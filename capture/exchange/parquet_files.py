@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError, LogError, MissingExtraError
-from .packing import WIDEST, Block, check_cells, check_rows, refuse, spread
+from .packing import WIDEST, Block, check_rows, refuse, spread
 
 
 def arrow(what: str) -> Any:
@@ -27,21 +27,28 @@ def arrow(what: str) -> Any:
     return parquet
 
 
+def _datasets() -> Any:
+    """Return pyarrow.dataset; its types are incomplete."""
+    from pyarrow import dataset
+
+    return dataset
+
+
 def read_parquet(
-    path: Path,
-    columns: Sequence[str] | None,
-    rows: int,
-    holds: Callable[[Any], bool] = lambda _: True,
+    path: Path, columns: Sequence[str] | None, rows: int, where: tuple[str, int] | None = None
 ) -> Iterator[Any]:
     """Yield the rows of some columns, so many at a time, as record batches.
 
+    The metadata of columns is left to pyarrow: read from Python, what a damaged file says there
+    ends the process.
+
     Args:
         columns: Their names; all of them if None.
-        holds: Whether a row group, by its metadata, is to be read.
+        where: A column and the number that rows have in it; other row groups aren't read.
 
     Raises:
         ImportFormatError: If the file is damaged, has no such column, has one twice, or packs far
-            more rows or numbers than a recording has.
+            more rows than a recording has.
         MissingExtraError: If pyarrow is not installed.
     """
     parquet = arrow("a .parquet table")
@@ -50,16 +57,16 @@ def read_parquet(
             names = Counter(cast("list[str]", file.schema_arrow.names))
             for name in names if columns is None else columns:
                 if names[name] != 1:
-                    refuse(
-                        path, f"has {names[name] or 'no'} column{'s' * (names[name] > 1)} {name!r}"
-                    )
-            metadata = file.metadata
-            check_rows(path, metadata.num_rows)
-            groups = [k for k in range(metadata.num_row_groups) if holds(metadata.row_group(k))]
-            for group in groups:
-                columns_of = map(metadata.row_group(group).column, range(metadata.num_columns))
-                check_cells(path, sum(column.num_values for column in columns_of))
-            yield from file.iter_batches(batch_size=rows, row_groups=groups, columns=columns)
+                    refuse(path, f"has {names[name] or 'no'} columns {name!r}")
+            check_rows(path, file.metadata.num_rows)
+            if where is None:
+                yield from file.iter_batches(batch_size=rows, columns=columns)
+                return
+        dataset = _datasets()
+        yield from dataset.dataset(path, format="parquet").to_batches(
+            columns=columns, filter=dataset.field(where[0]) == where[1],
+            batch_size=rows, batch_readahead=1, fragment_readahead=1,
+        )  # fmt: skip
     except LogError:
         raise
     except Exception as error:  # pyarrow has errors of many bases

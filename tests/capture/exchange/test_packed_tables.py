@@ -115,14 +115,6 @@ def test_a_table_of_constants_with_millions_of_rows(tmp_path):
         open_table(of_bytes(tmp_path / "x.parquet", data))
 
 
-def test_a_row_group_of_constant_vectors(tmp_path):
-    vectors = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(40_000_000, np.float32)), 4000)
-    path = tmp_path / "x.parquet"
-    parquet.write_table(pa.table({"time": np.arange(10_000), "q": vectors}), path)
-    with pytest.raises(ImportFormatError, match="40010000 numbers"):
-        open_table(path)
-
-
 def test_columns_of_one_name(tmp_path):
     path = tmp_path / "x.parquet"
     parquet.write_table(pa.table([T, T, T], names=["time", "q", "q"]), path)
