@@ -23,7 +23,8 @@ from ..robot.description import numbered
 from ..robot.model import Quantity
 from .column_map import COMMANDS, STATES, Column, ColumnMap
 from .frame_log import LATEST_NS
-from .tables import Block, TableFile, is_time, words
+from .packing import WIDEST, Block
+from .tables import TableFile, is_time, words
 
 _COMMAND = {
     "cmd", "cmds", "command", "commands", "commanded", "des", "desired", "target", "targets",
@@ -262,6 +263,8 @@ def _joint_names(
     """Return the names of joints that columns have by number only."""
     indices = [meaning.index for _, _, meaning in found if meaning.index is not None]
     count = max(indices, default=-1) + 1
+    if count > WIDEST:
+        raise ImportFormatError(path, f"has a joint of the number {count - 1}; {WIDEST} at most")
     if joints and count > len(joints):
         raise ImportFormatError(path, f"has {count} joints, the list of names {len(joints)}")
     if joints or not count:

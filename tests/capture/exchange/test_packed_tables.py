@@ -217,3 +217,11 @@ def test_one_joint_has_no_vectors(tmp_path):
     import_lerobot(dataset(tmp_path, width=1, action=cells), tmp_path / "x.mcap")
     found = decoded_of(tmp_path / "x.mcap", ["/joint_commands"])
     assert [message.position for *_, message in found] == [[cell] for cell in cells]
+
+
+def test_a_joint_of_a_number_beyond_any_robot(tmp_path):
+    """As many joints were named."""
+    rows = [f"{k},{j},0.5" for k in range(100) for j in (0, 1, 4294967296)]
+    path = of_bytes(tmp_path / "x.csv", "\n".join(["time,joint,angle", *rows]).encode())
+    with pytest.raises(ImportFormatError, match="number 4294967296"):
+        import_tables(open_tables(path), tmp_path / "x.mcap")
