@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
@@ -14,26 +14,23 @@ from typing import TextIO
 
 import numpy as np
 
-from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import FloatArray, IntArray
 from ..common.console import progress
 from ..common.errors import ImportFormatError
 from ..common.process import StopRequest
 from ..common.strict_table import listed
-from ..log.write.writer import SessionWriter
-from ..robot.bus_map import SESSION_UNIT, TIME_UNITS, unit_for
-from ..robot.model import Quantity, Robot
+from ..robot.bus_map import TIME_UNITS, unit_for
+from ..robot.model import Robot
 from .can_import import ImportReport, imported_session
 from .can_logs import CSV_HEADER
 from .column_map import Column, ColumnMap
 from .frame_log import LATEST_NS, RELATIVE_EPOCH_NS
+from .joint_topics import JointTopic, topics_of
 
 EARLIEST_NS = 10**17
 """1973 [ns]: less is no date but a time since the log's start."""
 
 _ROWS_PER_UPDATE = 4096
-WITH_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
-"""What stands beside a position of the same row."""
 
 
 def is_frame_csv(path: Path) -> bool:
@@ -90,19 +87,25 @@ def import_csv(
         progress(f"import {source.name}", len(t_ns)) as bar,
     ):
         writer.attach("columns.toml", "application/toml", column_map.toml().encode())
+        values = {
+            (column.joint, column.quantity): series
+            for column, series in zip(column_map.columns, table.values, strict=True)
+        }
+        chain = sorted(values, key=lambda key: robot.joint_names.index(key[0]))
         topics = [
-            _Topic(writer, robot, quantities, column_map.columns, table.values)
+            JointTopic(writer, chain, quantities)
             for quantities in topics_of({column.quantity for column in column_map.columns})
         ]
-        for i, t in enumerate(t_ns.tolist()):
-            if i % _ROWS_PER_UPDATE == 0:
-                bar.update(i)
-                if stop is not None and stop.requested:
-                    report.complete, report.end_ns = False, t
-                    break
+        report.samples = dict.fromkeys((topic.name for topic in topics), 0)
+        for at in range(0, len(t_ns), _ROWS_PER_UPDATE):
+            bar.update(at)
+            if stop is not None and stop.requested:
+                report.complete, report.end_ns = False, int(t_ns[at])
+                break
+            rows = slice(at, at + _ROWS_PER_UPDATE)
+            cells = {key: series[rows] for key, series in values.items()}
             for topic in topics:
-                topic.write(i, t)
-        report.samples = {topic.name: topic.count for topic in topics}
+                report.samples[topic.name] += topic.write(t_ns[rows], cells)
         writer.set_verdict(report.verdict, [*report.problems, *report.notes])
     return report
 
@@ -114,60 +117,6 @@ class _TimedColumns:
     t_ns: IntArray
     values: list[FloatArray]
     notes: list[str]
-
-
-class _Topic:
-    """One JointState topic: the joints that have a column for it, in chain order."""
-
-    def __init__(
-        self,
-        writer: SessionWriter,
-        robot: Robot,
-        quantities: Sequence[Quantity],
-        columns: Sequence[Column],
-        values: Sequence[FloatArray],
-    ) -> None:
-        found = {
-            (column.joint, column.quantity): series
-            for column, series in zip(columns, values, strict=True)
-        }
-        names = [n for n in robot.joint_names if any((n, q) in found for q in quantities)]
-        missing = np.full(len(values[0]), np.nan)
-        fields = [
-            np.stack([found.get((name, quantity), missing) for name in names], axis=1)
-            for quantity in quantities
-        ]
-        self.name = JOINT_TOPIC[quantities[0]]
-        self.count = 0
-        self._filled = ~np.all([np.isnan(field).all(axis=1) for field in fields], axis=0)
-        self._position, self._rest = fields[0], dict(zip(quantities[1:], fields[1:], strict=True))
-        self._channel = writer.joint_state(
-            self.name,
-            names,
-            unit=SESSION_UNIT[quantities[0]],
-            velocity=Quantity.VELOCITY in self._rest,
-            effort=Quantity.EFFORT in self._rest,
-        )
-
-    def write(self, row: int, t_ns: int) -> None:
-        if not self._filled[row]:
-            return
-        velocity, effort = (
-            self._rest[quantity][row] if quantity in self._rest else ()
-            for quantity in WITH_POSITION
-        )
-        self._channel.write(t_ns, self._position[row], velocity, effort)
-        self.count += 1
-
-
-def topics_of(present: set[Quantity]) -> Iterator[tuple[Quantity, ...]]:
-    """Yield the quantities of each topic; a row's velocity and effort belong to its position."""
-    together = [q for q in WITH_POSITION if q in present and Quantity.POSITION in present]
-    for quantity in JOINT_TOPIC:
-        if quantity is Quantity.POSITION and quantity in present:
-            yield (quantity, *together)
-        elif quantity in present and quantity not in together:
-            yield (quantity,)
 
 
 def _read(source: Path, column_map: ColumnMap) -> _TimedColumns:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.arrays import NS
 from ..common.errors import ImportFormatError, LogError, UsageError, some_names
@@ -29,13 +30,16 @@ from ..robot.description import numbered
 from ..robot.model import Quantity, Robot
 from .can_import import ImportReport, file_digest
 from .column_map import STATES, Column, ColumnMap
+from .packing import Block, refuse, rows_of_block
+from .parquet_files import read_parquet, vectors_of
 from .table_import import TableSet, import_tables
-from .tables import Block, TableFile, arrow, vectors_of
-from .torch_zip import refuse
+from .tables import TableFile
 
 _FEATURES = {"action": Quantity.COMMAND, "observation.state": Quantity.POSITION}
 _MOST_INFO = 1 << 24  # bytes
 _MOST_JOINTS = 1024
+_MOST_TASKS = 1 << 16
+_ROWS = 1 << 17
 _KNOWN = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
 """Features of every dataset that number its frames."""
 
@@ -63,12 +67,15 @@ class LeRobotDataset:
 
     def episodes(self) -> dict[int, list[Path]]:
         """Return the episodes that are there and the files that hold their frames."""
-        parquet = arrow("a LeRobot dataset")
         found: dict[int, list[Path]] = {}
         for path in self.files():
-            column = _column(parquet, path, "episode_index")
-            for episode in np.unique(column).tolist():
-                found.setdefault(int(episode), []).append(path)
+            numbers = {
+                number
+                for batch in read_parquet(path, ["episode_index"], _ROWS)
+                for number in np.unique(_integers(path, batch, "episode_index")).tolist()
+            }
+            for episode in numbers:
+                found.setdefault(episode, []).append(path)
         if not found:
             raise ImportFormatError(self.folder, "has no frames in data/*/*.parquet")
         return dict(sorted(found.items()))
@@ -97,7 +104,9 @@ def open_lerobot(folder: Path) -> LeRobotDataset:
         others = tuple(n for n in features if n not in _FEATURES and n not in _KNOWN)
     except LogError:
         raise
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except (
+        OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError
+    ) as error:  # fmt: skip
         raise ImportFormatError(path, f"is no description of a LeRobot dataset: {error}") from error
     if not names or not 1e-3 <= fps <= 1e6:
         raise ImportFormatError(path, "names neither action nor observation.state, or no fps")
@@ -125,11 +134,12 @@ def _element_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(plain) if len(set(plain)) == count else tuple(numbered("joint", count))
 
 
-def _column(parquet: Any, path: Path, name: str) -> Any:
-    try:
-        return parquet.read_table(path, columns=[name])[name].to_numpy()
-    except Exception as error:  # pyarrow has errors of many bases
-        raise ImportFormatError(path, f"has no column {name}: {error}") from error
+def _integers(path: Path, batch: Any, name: str) -> NDArray[Any]:
+    """Return a column of frame or episode numbers."""
+    numbers = batch.column(name).to_numpy(zero_copy_only=False)
+    if numbers.dtype.kind not in "iu":
+        refuse(path, f"{name} holds no whole numbers")
+    return numbers
 
 
 def import_lerobot(
@@ -201,16 +211,15 @@ def _map(dataset: LeRobotDataset, units: Mapping[str, str]) -> tuple[ColumnMap, 
 
 
 def _episode(dataset: LeRobotDataset, number: int, paths: Sequence[Path]) -> TableSet:
-    parquet = arrow("a LeRobot dataset")
     columns = tuple(f"{name}[{i}]" for name, n in dataset.names.items() for i in range(len(n)))
 
     def read(names: Sequence[str], time: str) -> Iterator[Block]:  # noqa: ARG001
         for path in paths:
-            block = _frames(parquet, path, dataset, number)
-            yield {name: block[name] for name in names}
+            for block in _frames(path, dataset, number, rows_of_block(len(columns))):
+                yield {name: block[name] for name in names}
 
     table = TableFile(paths[0], ("time", *columns), read, form="lerobot")
-    task = _task(parquet, dataset, paths[0], number)
+    task = _task(dataset, paths[0], number)
     facts = {
         "import.format": f"lerobot {dataset.version}",
         "import.time": f"made from the frame number and fps = {dataset.fps:g}",
@@ -224,41 +233,36 @@ def _episode(dataset: LeRobotDataset, number: int, paths: Sequence[Path]) -> Tab
     return TableSet(dataset.folder, {STATES: table}, digest=digest, facts=facts)
 
 
-def _frames(parquet: Any, path: Path, dataset: LeRobotDataset, number: int) -> Block:
-    """Return the frames of one episode in a file; only row groups that hold some are read."""
-    try:
-        table = parquet.read_table(
-            path,
-            columns=[*dataset.names, "frame_index"],
-            filters=[("episode_index", "=", number)],
-        )
-        frame = table["frame_index"].to_numpy()
+def _of_episode(path: Path, number: int, columns: Sequence[str], rows: int) -> Iterator[Any]:
+    """Return the frames of one episode in a file, as batches; only row groups that hold some."""
+    where = "episode_index", number
+    return (batch for batch in read_parquet(path, columns, rows, where) if len(batch))
+
+
+def _frames(path: Path, dataset: LeRobotDataset, number: int, rows: int) -> Iterator[Block]:
+    for batch in _of_episode(path, number, [*dataset.names, "frame_index"], rows):
+        frame = _integers(path, batch, "frame_index")
         block: Block = {"time": np.rint(frame * (NS / dataset.fps)).astype(np.int64)}
         for name, names in dataset.names.items():
-            vectors = vectors_of(table[name].combine_chunks())
+            vectors = vectors_of(batch.column(name))
             if vectors.shape != (len(frame), len(names)):
                 refuse(path, f"{name} has not {len(names)} elements in each frame, as in info.json")
             block |= {f"{name}[{i}]": vectors[:, i] for i in range(len(names))}
-    except LogError:
-        raise
-    except Exception as error:  # pyarrow has errors of many bases
-        raise ImportFormatError(path, f"can't be read: {error}") from error
-    return block
+        yield block
 
 
-def _task(parquet: Any, dataset: LeRobotDataset, path: Path, number: int) -> str:
+def _task(dataset: LeRobotDataset, path: Path, number: int) -> str:
     """Return the text of an episode's task; empty if the dataset does not say."""
     try:
-        table = parquet.read_table(
-            path, columns=["task_index"], filters=[("episode_index", "=", number)]
-        )
-        wanted = int(table["task_index"][0].as_py())
+        batch = next(_of_episode(path, number, ["task_index"], 1))
+        wanted = int(batch.column("task_index")[0].as_py())
         lines = dataset.folder / "meta" / "tasks.jsonl"
         if lines.is_file():
             with lines.open(encoding="utf-8") as stream:
-                entries = [json.loads(line) for line in stream if line.strip()]
-            return str(next(e["task"] for e in entries if e["task_index"] == wanted))
-        tasks = parquet.read_table(dataset.folder / "meta" / "tasks.parquet").to_pydict()
+                entries = (json.loads(line) for line in stream if line.strip())
+                return str(next(e["task"] for e in entries if e["task_index"] == wanted))
+        table = next(read_parquet(dataset.folder / "meta" / "tasks.parquet", None, _MOST_TASKS))
+        tasks = table.to_pydict()
         texts = next(values for name, values in tasks.items() if name != "task_index")
         return str(texts[tasks["task_index"].index(wanted)])
     except Exception:  # noqa: BLE001 - a text for people only, in files of many makes

@@ -22,7 +22,9 @@ from ..robot.bus_map import JOINT_QUANTITIES, SESSION_UNIT, TIME_UNITS, UNITS, v
 from ..robot.description import numbered
 from ..robot.model import Quantity
 from .column_map import COMMANDS, STATES, Column, ColumnMap
-from .tables import Block, TableFile, is_time, words
+from .frame_log import LATEST_NS
+from .packing import WIDEST, Block
+from .tables import TableFile, is_time, words
 
 _COMMAND = {
     "cmd", "cmds", "command", "commands", "commanded", "des", "desired", "target", "targets",
@@ -162,7 +164,8 @@ def _time_column(table: TableFile, sample: Block) -> str:
 
 
 def _rises(cells: NDArray[Any]) -> bool:
-    steps = np.diff(cells.astype(float))
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = np.diff(cells.astype(float))
     return bool(len(steps) and np.all(steps >= 0) and np.any(steps > 0))
 
 
@@ -174,11 +177,11 @@ def _time_unit(
         return given
     if not _numeric(cells):
         raise ImportFormatError(table.path, f"column {name!r} holds no numbers, so no times")
-    steps = np.diff(np.unique(cells[np.isfinite(cells.astype(float))]).astype(float))
-    if not len(steps) or np.median(steps) <= 0:
+    known = np.unique(cells[np.abs(cells.astype(float)) < LATEST_NS]).astype(float)
+    step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+    if step <= 0:
         said.append(f"{table.path.name}: times ({name}) taken as s: no unit given")
         return "s"
-    step = float(np.median(steps))
     rates = {unit: 1e9 / (step * ns) for unit, ns in TIME_UNITS.items()}
     unit = min(rates, key=lambda u: abs(math.log(rates[u] / _USUAL_HZ)))
     said.append(
@@ -260,6 +263,8 @@ def _joint_names(
     """Return the names of joints that columns have by number only."""
     indices = [meaning.index for _, _, meaning in found if meaning.index is not None]
     count = max(indices, default=-1) + 1
+    if count > WIDEST:
+        raise ImportFormatError(path, f"has a joint of the number {count - 1}; {WIDEST} at most")
     if joints and count > len(joints):
         raise ImportFormatError(path, f"has {count} joints, the list of names {len(joints)}")
     if joints or not count:
@@ -327,7 +332,8 @@ def _wrap(cells: NDArray[Any], quantity: Quantity, unit: str) -> float:
     """Return the period of an angle's jumps: several of one size, far above all other steps."""
     if quantity not in {Quantity.POSITION, Quantity.COMMAND} or unit not in {"rad", "deg"}:
         return 0.0
-    steps = np.abs(np.diff(cells.astype(float)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = np.abs(np.diff(cells.astype(float)))
     steps = steps[np.isfinite(steps)]
     for period in _WRAPS[:2] if unit == "rad" else _WRAPS[2:]:
         jumps = steps > _LEAST_JUMP * period

@@ -5,39 +5,51 @@ from __future__ import annotations
 import csv
 import hashlib
 import heapq
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import FloatArray, IntArray
 from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError, UsageError, some_names
 from ..common.files import write_text
 from ..common.process import StopRequest
 from ..log.write.writer import SessionWriter
-from ..robot.bus_map import SESSION_UNIT, TIME_UNITS, unit_for
+from ..robot.bus_map import TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
 from .can_import import ImportReport, file_digest, imported_session
 from .column_map import COMMANDS, STATES, Column, ColumnMap
-from .csv_import import EARLIEST_NS, WITH_POSITION, topics_of
+from .csv_import import EARLIEST_NS
 from .frame_log import LATEST_NS, RELATIVE_EPOCH_NS
+from .joint_topics import JointTopic, topics_of
 from .table_guess import guess_map
 from .tables import TABLE_SUFFIXES, TableFile, is_time, open_table, words
 
 _COMMAND_FILES = {"control", "command", "commands", "cmd", "action", "actions", "target", "targets"}
 _STATE_FILES = {"state", "states", "measured", "response", "feedback", "joint", "joints", "motor"}
 _EVENT_FILES = {"event", "events"}
+_MOST = 1e200
 _MOST_NAMES = 1 << 16  # bytes of a list of joints
 
-Message: TypeAlias = tuple[int, int, Callable[[], None]]
-"""Time [ns], order among those of one time, and what writes it."""
+
+@dataclass(frozen=True)
+class _Messages:
+    """Messages of some time, and what writes them.
+
+    Attributes:
+        first: Time of the first one [ns], and the order among those of one time.
+    """
+
+    first: tuple[int, int]
+    last_ns: int
+    write: Callable[[], None]
 
 
 @dataclass(frozen=True)
@@ -206,6 +218,8 @@ def _write(
     relative = abs(first_ns) < EARLIEST_NS
     offset = RELATIVE_EPOCH_NS if relative else 0
     report.start_ns = report.end_ns = first_ns + offset
+    if report.start_ns < 0:
+        raise ImportFormatError(found.source, "not all times are from 1970 to 2038")
     form = next(iter(found.tables.values()))
     facts = {
         "import.format": form.path.suffix.removeprefix(".").lower() or "csv",
@@ -226,17 +240,13 @@ def _write(
         if found.events is not None:
             unit = column_map.time_of(COMMANDS if COMMANDS in found.tables else STATES)[1]
             streams.append(_events(found.events, unit, offset, writer, report))
-        for count, (t_ns, _, write) in enumerate(
-            heapq.merge(*streams, key=lambda message: message[:2]) if len(streams) > 1
-            else streams[0]
-        ):  # fmt: skip
-            if not count % 4096:
-                bar.update(0.0, note=f"{count} messages")
-                if stop is not None and stop.requested:
-                    report.complete = False
-                    break
-            write()
-            report.end_ns = max(report.end_ns, t_ns)
+        for block in heapq.merge(*streams, key=lambda block: block.first):
+            block.write()
+            report.end_ns = max(report.end_ns, block.last_ns)
+            bar.update(0.0, note=f"{sum(report.samples.values())} messages")
+            if stop is not None and stop.requested:
+                report.complete = False
+                break
         if not report.samples:
             raise ImportFormatError(found.source, "has no row with a value of a mapped column")
         for source in sources:
@@ -286,23 +296,26 @@ class _Source:
 
     def messages(
         self, writer: SessionWriter, offset: int, report: ImportReport
-    ) -> Iterator[Message]:
-        """Yield the messages in order of time."""
+    ) -> Iterator[_Messages]:
+        """Yield the messages of each block, in order of time."""
         found = {(column.joint, column.quantity): column for column in self.columns}
         topics = [
-            _Topic(writer, quantities, self.columns, report)
+            JointTopic(writer, list(found), quantities)
             for quantities in topics_of({quantity for _, quantity in found})
         ]
         for block in self._blocks:
-            t_ns = self._checked(self._times(block[self._time])) + offset
+            if not len(block[self._time]):
+                continue
+            t_ns = self._checked(self._times(block[self._time]), offset)
             values = {
                 (column.joint, column.quantity): self._converted(column, block[column.column])
                 for column in self.columns
             }
-            writes = [topic.rows(t_ns, values) for topic in topics]
-            stamps: list[int] = t_ns.tolist()
-            for row, stamp in enumerate(stamps):
-                yield stamp, self._order, _writing(writes, row)
+            yield _Messages(
+                (int(t_ns[0]), self._order),
+                int(t_ns[-1]),
+                partial(_write_block, topics, t_ns, values, report),
+            )
 
     def missing(self) -> list[str]:
         """Return how many cells of each column had no value."""
@@ -312,12 +325,14 @@ class _Source:
         unit, path = self._unit_ns, self.table.path
         try:
             if cells.dtype.kind in "iu":
-                t_ns = np.array([int(t) * unit for t in cells.tolist()])
+                if np.abs(cells.astype(float)).max(initial=0) * unit >= LATEST_NS:
+                    raise ImportFormatError(path, f"column {self._time!r}: no time before 2038")
+                t_ns = cells.astype(np.int64) * unit
             elif cells.dtype.kind == "f":
-                t_ns = np.rint(cells.astype(float) * unit)
+                with np.errstate(over="ignore"):
+                    t_ns = np.rint(cells.astype(float) * unit)
             else:
-                texts = [str(cell).replace(",", ".") for cell in cells]
-                t_ns = np.array([round(Decimal(text) * unit) for text in texts])
+                t_ns = np.array([_exact_ns(str(cell).replace(",", "."), unit) for cell in cells])
             if len(t_ns) and not np.all(np.abs(t_ns.astype(float)) < LATEST_NS):
                 raise ImportFormatError(path, f"column {self._time!r}: no time before 2038")
             return t_ns.astype(np.int64)
@@ -326,7 +341,8 @@ class _Source:
                 raise
             raise ImportFormatError(path, f"column {self._time!r} holds no times") from error
 
-    def _checked(self, t_ns: IntArray) -> IntArray:
+    def _checked(self, t_ns: IntArray, offset: int) -> IntArray:
+        """Return the times of a session, which don't go back."""
         before = self._last_ns if self._last_ns is not None else int(t_ns[0])
         back = np.flatnonzero(np.diff(t_ns, prepend=before) < 0)
         if len(back):
@@ -335,7 +351,12 @@ class _Source:
                 f"column {self._time!r}: time goes back, to {int(t_ns[back[0]]) / 1e9:g} s",
             )
         self._last_ns = int(t_ns[-1])
-        return t_ns
+        stamps = t_ns + offset
+        if not 0 <= int(stamps[0]) <= int(stamps[-1]) < LATEST_NS:
+            raise ImportFormatError(
+                self.table.path, f"column {self._time!r}: not all times are from 1970 to 2038"
+            )
+        return stamps
 
     def _converted(self, column: Column, cells: NDArray[Any]) -> FloatArray:
         """Convert cells to the session's unit: unwrapped over blocks, scaled and offset."""
@@ -346,8 +367,10 @@ class _Source:
             bad = next((str(cell)[:40] for cell in cells if not _is_number(cell)), "")
             raise ImportFormatError(path, f"column {name!r}: {bad!r} is not a number") from error
         known = ~np.isnan(values)
-        if np.isinf(values).any():
-            raise ImportFormatError(path, f"column {name!r} has a number that is not finite")
+        if not np.all(np.abs(values[known]) < _MOST):
+            raise ImportFormatError(
+                path, f"column {name!r} has a number that is not finite or beyond {_MOST:g}"
+            )
         self._missing[name] = self._missing.get(name, 0) + int(len(values) - known.sum())
         if column.wrap and known.any():
             raw = values[known]
@@ -355,8 +378,21 @@ class _Source:
             turns = np.unwrap(np.concatenate([[before[0]], raw]), period=column.wrap)
             values[known] = turns[1:] + (before[1] - before[0])
             self._unwrapped[name] = (raw[-1], values[known][-1])
-        unit = unit_for(column.unit, column.quantity)
-        return unit.convert(column.scale * values + column.offset)
+        if (column.scale, column.offset) != (1.0, 0.0):
+            values = column.scale * values + column.offset
+        return unit_for(column.unit, column.quantity).convert(values)
+
+
+def _exact_ns(text: str, unit_ns: int) -> int:
+    """Parse a time [ns].
+
+    Raises:
+        ArithmeticError: If it is none, or no stamp can hold it.
+    """
+    t_ns = Decimal(text) * unit_ns
+    if not abs(t_ns) < LATEST_NS:  # before it is rounded: 1e999999999 has as many digits
+        raise OverflowError(f"{text[:40]} is no time before 2038")
+    return round(t_ns)
 
 
 def _is_number(cell: object) -> bool:
@@ -367,65 +403,20 @@ def _is_number(cell: object) -> bool:
     return True
 
 
-def _writing(writes: Sequence[Callable[[int], None]], row: int) -> Callable[[], None]:
-    def write() -> None:
-        for each in writes:
-            each(row)
-
-    return write
-
-
-class _Topic:
-    """One JointState topic of a table."""
-
-    def __init__(
-        self,
-        writer: SessionWriter,
-        quantities: Sequence[Quantity],
-        columns: Iterable[Column],
-        report: ImportReport,
-    ) -> None:
-        self._quantities = quantities
-        self._names = list(dict.fromkeys(c.joint for c in columns if c.quantity in quantities))
-        self._name = JOINT_TOPIC[quantities[0]]
-        self._samples = report.samples
-        self._channel = writer.joint_state(
-            self._name,
-            self._names,
-            unit=SESSION_UNIT[quantities[0]],
-            velocity=Quantity.VELOCITY in quantities[1:],
-            effort=Quantity.EFFORT in quantities[1:],
-        )
-
-    def rows(
-        self, t_ns: IntArray, values: dict[tuple[str, Quantity], FloatArray]
-    ) -> Callable[[int], None]:
-        """Return what writes a row of a block; a row without any value is no message."""
-        missing = np.full(len(t_ns), np.nan)
-        fields = [
-            np.stack([values.get((name, each), missing) for name in self._names], axis=1)
-            for each in self._quantities
-        ]
-        filled = np.any([~np.isnan(each).all(axis=1) for each in fields], axis=0)
-        none: list[tuple[()]] = [()] * len(t_ns)
-        velocity, effort = (
-            fields[self._quantities.index(each)] if each in self._quantities[1:] else none
-            for each in WITH_POSITION
-        )
-        stamps: list[int] = t_ns.tolist()
-        position, send = fields[0], self._channel.write
-
-        def write(row: int) -> None:
-            if filled[row]:
-                send(stamps[row], position[row], velocity[row], effort[row])
-                self._samples[self._name] = self._samples.get(self._name, 0) + 1
-
-        return write
+def _write_block(
+    topics: Sequence[JointTopic],
+    t_ns: IntArray,
+    values: Mapping[tuple[str, Quantity], FloatArray],
+    report: ImportReport,
+) -> None:
+    for topic in topics:
+        if count := topic.write(t_ns, values):
+            report.samples[topic.name] = report.samples.get(topic.name, 0) + count
 
 
 def _events(
     path: Path, unit: str, offset: int, writer: SessionWriter, report: ImportReport
-) -> Iterator[Message]:
+) -> Iterator[_Messages]:
     """Yield the events of a table, a time and a text a row, in order of time."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
@@ -441,7 +432,7 @@ def _events(
     found: list[tuple[int, str]] = []
     for row in rows[1:]:
         try:
-            t_ns = round(Decimal(row[time]) * TIME_UNITS[unit]) + offset
+            t_ns = _exact_ns(row[time], TIME_UNITS[unit]) + offset
             if not 0 <= t_ns < LATEST_NS:
                 raise ImportFormatError(path, f"{row[time]!r} is no time before 2038")
             found.append((t_ns, row[text]))
@@ -456,4 +447,4 @@ def _events(
         return write
 
     for t_ns, event in sorted(found):
-        yield t_ns, 2, writing(t_ns, event)
+        yield _Messages((t_ns, 2), t_ns, writing(t_ns, event))

@@ -8,32 +8,30 @@ joint, stands for the wide one: ``angle[joint01]``. A table without a header has
 from __future__ import annotations
 
 import csv
-import io
 import json
 import math
 import re
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..common.errors import ImportFormatError, MissingExtraError
-from .torch_zip import MOST_BYTES, UNZIPPING, read_tensors, refuse
-
-Block: TypeAlias = dict[str, NDArray[Any]]
-"""Column to its cells, (n,): numbers, or texts where they are none."""
+from ..common.errors import ImportFormatError
+from .array_files import read_mat, read_npz
+from .packing import WIDEST, Block, check_rows, refuse, rows_of_block, spread
+from .parquet_files import block_of, read_parquet
+from .torch_zip import read_tensors
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".mat", ".parquet", ".pt", ".pth")
 ARRAY_SUFFIXES = TABLE_SUFFIXES[3:]
 
-_ROWS = 16384  # of a block
-_WIDEST = 4096
+_NARROW = 64  # rows that show how wide a table is
+_SPARSE_CELLS, _SPARSEST = 1 << 24, 128
 _JOINT_COLUMNS = ("joint", "joint_name", "jointname", "motor", "servo", "name", "motor_id", "id")
 _SNIFFED = 1 << 16
 
@@ -78,7 +76,7 @@ def open_table(path: Path) -> TableFile:
         return _open_parquet(path)
     if suffix not in ARRAY_SUFFIXES:
         return _open_text(path)
-    readers = {".npz": _npz, ".mat": _mat}
+    readers = {".npz": read_npz, ".mat": read_mat}
     arrays = readers.get(suffix, read_tensors)(path)
     return _of_arrays(path, arrays, suffix.removeprefix("."))
 
@@ -92,10 +90,11 @@ def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> Tab
     vectors = [each.shape[0] for each in plain.values() if each.ndim == 1]
     lengths = [max(each.shape) for each in plain.values()]
     rows = max(vectors or lengths, key=lambda n: (lengths.count(n), n))
+    check_rows(path, rows)
     columns: Block = {}
     for name, each in plain.items():
         upright = each.T if each.ndim == 2 and each.shape[0] != rows else each
-        if upright.shape[0] != rows or math.prod(upright.shape[1:]) > _WIDEST:
+        if upright.shape[0] != rows or math.prod(upright.shape[1:]) > WIDEST:
             continue
         if upright.ndim == 1:
             columns[name] = upright
@@ -103,141 +102,35 @@ def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> Tab
             columns |= {f"{name}[{i}]": upright[:, i] for i in range(upright.shape[1])}
 
     def read(names: Sequence[str], time: str) -> Iterator[Block]:  # noqa: ARG001
-        for at in range(0, rows, _ROWS):
-            yield {name: columns[name][at : at + _ROWS] for name in names}
+        step = rows_of_block(len(names))
+        for at in range(0, rows, step):
+            yield {name: columns[name][at : at + step] for name in names}
 
     kept = {name.partition("[")[0] for name in columns}
     left_out = tuple(name for name in arrays if name not in kept)
     return TableFile(path, tuple(columns), read, form=form, left_out=left_out)
 
 
-def _npz(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(info.file_size for info in archive.infolist())
-            if size > MOST_BYTES:
-                raise ImportFormatError(path, f"holds {size} bytes of arrays; {MOST_BYTES} at most")
-            return {
-                info.filename.removesuffix(".npy"): array
-                for info in archive.infolist()
-                if (array := _npy(archive.read(info), info.filename)) is not None
-            }
-    except (OSError, ValueError, RuntimeError, *UNZIPPING) as error:
-        raise ImportFormatError(path, f"can't be read as .npz: {error}") from error
-
-
-def _npy(data: bytes, name: str) -> NDArray[Any] | None:
-    """Return one array, None for objects: those would be unpickled."""
-    stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
-    shape, fortran, dtype = (header or np.lib.format.read_array_header_2_0)(stream)
-    if dtype.hasobject:
-        return None
-    count = math.prod(shape)
-    if min(shape, default=0) < 0 or count * dtype.itemsize > len(data) - stream.tell():
-        raise ValueError(f"{name} declares shape {shape}, more than it holds")
-    flat = np.frombuffer(data, dtype, count, stream.tell()) if count else np.zeros(0, dtype)
-    return flat.reshape(shape, order="F" if fortran else "C")
-
-
-def _mat(path: Path) -> dict[str, NDArray[Any]]:
-    from scipy.io import loadmat, whosmat
-
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(128)
-        if start.startswith((b"MATLAB 7.3", b"\x89HDF")):
-            refuse(path, "is a .mat of version 7.3 (HDF5), which is not supported; save with -v7")
-        listed = whosmat(path)
-        size = sum(8 * math.prod(shape) for _, shape, _ in listed)
-        if size > MOST_BYTES:
-            refuse(path, f"declares {size} bytes of arrays; {MOST_BYTES} at most")
-        numeric = ("double", "single", "logical", "int", "uint")
-        names = [name for name, _, kind in listed if kind.startswith(numeric)]
-        found = loadmat(path, variable_names=names) if names else {}
-    except ImportFormatError:
-        raise
-    except Exception as error:  # scipy raises whatever a damaged file leads to
-        raise ImportFormatError(path, f"can't be read as .mat: {error}") from error
-    return {name: found[name] for name in names if isinstance(found.get(name), np.ndarray)}
-
-
-def arrow(what: str) -> Any:
-    """Return pyarrow.parquet; its types are incomplete.
-
-    Raises:
-        MissingExtraError: If it is not installed.
-    """
-    try:
-        from pyarrow import parquet
-    except ImportError as error:
-        raise MissingExtraError(what, "parquet", "pyarrow") from error
-    return parquet
-
-
 def _open_parquet(path: Path) -> TableFile:
-    parquet = arrow("a .parquet table")
-    try:
-        file = parquet.ParquetFile(path)
-        first = next(file.iter_batches(batch_size=_ROWS), None)
-        if first is None:
-            refuse(path, "has no rows")
-        columns = tuple(_parquet_block(first))
-        file.close()
-    except ImportFormatError:
-        raise
-    except Exception as error:  # pyarrow has errors of many bases
-        raise ImportFormatError(path, f"can't be read as Parquet: {error}") from error
+    first = next(read_parquet(path, None, _NARROW), None)
+    if first is None or not len(first):
+        refuse(path, "has no rows")
+    columns = tuple(block_of(first))
+    if len(columns) > WIDEST:
+        refuse(path, f"has {len(columns)} columns; {WIDEST} at most")
+    present = set(first.schema.names)
 
     def read(names: Sequence[str], time: str) -> Iterator[Block]:  # noqa: ARG001
-        wanted = list(dict.fromkeys(re.sub(r"\[\d+\]$", "", name) for name in names))
-        try:
-            with parquet.ParquetFile(path) as file:
-                present = [
-                    name for name in (*wanted, *names) if name in set(file.schema_arrow.names)
-                ]
-                chosen = list(dict.fromkeys(present))
-                for batch in file.iter_batches(batch_size=_ROWS, columns=chosen):
-                    block = _parquet_block(batch)
-                    yield {name: block[name] for name in names}
-        except KeyError as error:
-            raise ImportFormatError(path, f"rows have no {error}") from error
-        except Exception as error:
-            raise ImportFormatError(path, f"can't be read as Parquet: {error}") from error
+        chosen = [n if n in present else re.sub(r"\[\d+\]$", "", n) for n in names]
+        batches = read_parquet(path, list(dict.fromkeys(chosen)), rows_of_block(len(columns)))
+        for batch in batches:
+            block = block_of(batch)
+            if absent := [name for name in names if name not in block]:
+                refuse(path, f"has rows without {absent[0]}")
+            yield {name: block[name] for name in names}
 
     table = TableFile(path, columns, read, form="parquet")
     return _pivoted(table) or table
-
-
-def _parquet_block(batch: Any) -> Block:
-    block: Block = {}
-    for name, column in zip(batch.schema.names, batch.columns, strict=True):
-        kind = str(column.type)
-        if kind.startswith(("list", "fixed_size_list", "large_list")):
-            block |= _spread(name, vectors_of(column))
-        elif kind.startswith("timestamp"):
-            block[name] = column.cast("timestamp[ns]").cast("int64").to_numpy(zero_copy_only=False)
-        else:
-            block[name] = column.to_numpy(zero_copy_only=False)
-    return block
-
-
-def vectors_of(column: Any) -> NDArray[Any]:
-    """Return a column of lists as (n, m).
-
-    Raises:
-        ValueError: If their lengths differ or they hold no numbers.
-    """
-    flat = column.flatten().to_numpy(zero_copy_only=False)
-    rows = len(column)
-    if flat.dtype.kind not in "fiub" or not rows or len(flat) % rows or len(flat) > rows * _WIDEST:
-        return np.zeros((rows, 0))
-    return flat.reshape(rows, -1)
-
-
-def _spread(name: str, vectors: NDArray[Any]) -> Block:
-    return {f"{name}[{i}]": vectors[:, i] for i in range(vectors.shape[1])}
 
 
 def _open_text(path: Path) -> TableFile:
@@ -269,6 +162,8 @@ def _open_text(path: Path) -> TableFile:
         for name in raw
         for each in ([f"{name}[{i}]" for i in range(vectors[name])] if name in vectors else [name])
     )
+    if len(columns) > WIDEST:
+        refuse(path, f"has {len(columns)} columns; {WIDEST} at most")
     read = partial(_read_text, path, raw, vectors, delimiter, decimal, skipped)
     table = TableFile(path, columns, read, delimiter, "headerless" if headerless else "wide")
     return _pivoted(table) or table
@@ -306,8 +201,8 @@ def _sniffed(path: Path, lines: list[str]) -> tuple[str, list[list[str]]]:
         except csv.Error as error:
             raise ImportFormatError(path, f"is no table: {error}") from error
         if rows and len({len(row) for row in rows}) == 1 and len(rows[0]) > 1:
-            if len(rows[0]) > _WIDEST:
-                raise ImportFormatError(path, f"has {len(rows[0])} columns; {_WIDEST} at most")
+            if len(rows[0]) > WIDEST:
+                raise ImportFormatError(path, f"has {len(rows[0])} columns; {WIDEST} at most")
             return delimiter, rows
     raise ImportFormatError(
         path, "is no table: no comma, semicolon, tab or space cuts its first lines alike"
@@ -326,11 +221,12 @@ def _read_text(  # noqa: PLR0917 - bound once, where the file was sniffed
 ) -> Iterator[Block]:
     wanted = [name for name in raw if name in names or f"{name}[0]" in names]
     texts = {name: str for name in (*vectors, time) if name in wanted}
+    step = rows_of_block(len(raw) + sum(vectors.values()))
     try:
         with pd.read_csv(  # pyright: ignore[reportCallIssue, reportUnknownMemberType]
             path, sep=r"\s+" if delimiter == " " else delimiter, decimal=decimal, names=raw,
             header=None, skiprows=skipped, usecols=wanted, dtype=cast("Any", texts),
-            chunksize=_ROWS, skipinitialspace=True, encoding="utf-8-sig", index_col=False,
+            chunksize=step, skipinitialspace=True, encoding="utf-8-sig", index_col=False,
             low_memory=False, on_bad_lines="error",
         ) as chunks:  # fmt: skip
             for chunk in cast("Iterator[pd.DataFrame]", chunks):
@@ -357,7 +253,7 @@ def _text_block(
             raise ImportFormatError(
                 path, f"column {name!r}, from row {row}: vectors of other lengths or no numbers"
             ) from error
-        block |= _spread(name, rows)
+        block |= spread(name, rows)
     return {name: block[name] for name in names}
 
 
@@ -389,7 +285,7 @@ def _pivoted(table: TableFile) -> TableFile | None:
         return None
     sample = table.sample()
     names = list(dict.fromkeys(map(str, sample[joint].tolist())))
-    if not 1 <= len(names) < min(_WIDEST, max(2, len(sample[joint]) // 2 + 1)):
+    if not 1 <= len(names) < min(WIDEST, max(2, len(sample[joint]) // 2 + 1)):
         return None
     values = [name for name in table.columns if name != joint and sample[name].dtype.kind in "fiub"]
     time = next((n for n in values if is_time(n)), None)
@@ -398,36 +294,46 @@ def _pivoted(table: TableFile) -> TableFile | None:
         return None
 
     def read(wanted: Sequence[str], exact: str) -> Iterator[Block]:  # noqa: ARG001
-        blocks = list(table.read([time, joint, *values], ""))
-        yield from _wide(blocks, time, joint, values, wanted)
+        present = [value for value in values if any(n.startswith(f"{value}[") for n in wanted)]
+        blocks = list(table.read([time, joint, *present], ""))
+        yield from _wide(table.path, blocks, (time, joint, *present), wanted)
 
-    seen: list[str] = []
+    seen: dict[str, None] = {}
     for block in table.read([joint], ""):
-        seen = list(dict.fromkeys([*seen, *map(str, np.unique(block[joint].astype(str)))]))
+        seen |= dict.fromkeys(map(str, block[joint].tolist()))
+        if len(seen) * len(values) > WIDEST:
+            return None
     order = sorted(seen, key=lambda n: (names.index(n) if n in names else len(names), n))
     columns = (time, *(f"{value}[{name}]" for value in values for name in order))
-    if len(columns) > _WIDEST:
-        return None
     return TableFile(table.path, columns, read, table.delimiter, "long")
 
 
 def _wide(
-    blocks: list[Block], time: str, joint: str, values: list[str], wanted: Sequence[str]
+    path: Path, blocks: list[Block], columns: Sequence[str], wanted: Sequence[str]
 ) -> Iterator[Block]:
-    """Put the rows of one time side by side; the table is held whole, in order of time."""
-    t, who = (np.concatenate([block[name] for block in blocks]) for name in (time, joint))
+    """Put the rows of one time side by side; the table is held whole, in order of time.
+
+    Args:
+        columns: Of the times, of the joints, and of the values.
+        wanted: The columns to yield.
+    """
+    t, who, *cells = (np.concatenate([block[name] for block in blocks]) for name in columns)
     stamps, row = np.unique(t, return_inverse=True)
-    names = who.astype(str)
-    result: Block = {time: stamps}
-    for value in values:
-        cells = np.concatenate([block[value] for block in blocks]).astype(float)
-        for column in wanted:
-            if column.startswith(f"{value}[") and column.endswith("]"):
-                mine = (names == column[len(value) + 1 : -1]) & ~np.isnan(cells)
-                result[column] = np.full(len(stamps), np.nan)
-                result[column][row[mine]] = cells[mine]
-    for at in range(0, len(stamps), _ROWS):
-        yield {name: result[name][at : at + _ROWS] for name in wanted}
+    codes, names = pd.factorize(np.array(list(map(str, who.tolist())), dtype=object))
+    if len(stamps) * len(names) > max(_SPARSE_CELLS, _SPARSEST * len(t)):
+        refuse(path, f"names {len(names)} joints that seldom share a time; is {columns[1]!r} one?")
+    order = np.argsort(row, kind="stable")
+    step = rows_of_block(len(cells) * len(names))
+    ends = np.searchsorted(row[order], np.arange(0, len(stamps) + step, step))
+    for k, at in enumerate(range(0, len(stamps), step)):
+        mine = order[ends[k] : ends[k + 1]]
+        block: Block = {columns[0]: stamps[at : at + step]}
+        for value, numbers in zip(columns[2:], cells, strict=True):
+            dense = np.full((len(block[columns[0]]), len(names)), np.nan)
+            known = mine[~np.isnan(numbers[mine].astype(float))]
+            dense[row[known] - at, codes[known]] = numbers[known]
+            block |= {f"{value}[{name}]": dense[:, i] for i, name in enumerate(names)}
+        yield {name: block[name] for name in wanted}
 
 
 _TIMES = ("time", "timestamp", "stamp", "t", "secs", "seconds", "epoch", "ts", "datetime")

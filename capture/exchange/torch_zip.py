@@ -12,23 +12,18 @@ import math
 import pickletools
 import sys
 import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError
+from .packing import MOST_BYTES, UNZIPPING, read_entry, refuse
 
-MOST_BYTES = 1 << 29
-"""More bytes of numbers than this in a file of arrays are refused [B]: they are read at once."""
-
-UNZIPPING = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError)
-"""Errors of a damaged zip, the last of a kind of compression that its header invents."""
-
+_MOST_PICKLE, _MOST_NAMES, _LONGEST_NAME, _DEEPEST = 1 << 20, 1 << 16, 4096, 64
 _DTYPES = {
     "FloatStorage": "f4", "DoubleStorage": "f8", "HalfStorage": "f2", "LongStorage": "i8",
     "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1",
@@ -69,11 +64,6 @@ class _Tensor:
     stride: tuple[int, ...]
 
 
-def refuse(path: Path, why: str) -> NoReturn:
-    """Raise ImportFormatError."""
-    raise ImportFormatError(path, why)
-
-
 def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
     """Return the tensors that a file's dictionary names; those of nested ones as ``outer.inner``.
 
@@ -86,14 +76,12 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
         with zipfile.ZipFile(path) as archive:
             (pickle,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
             root = pickle.removesuffix("data.pkl")
-            if archive.getinfo(pickle).file_size > MOST_BYTES // 64:
+            if archive.getinfo(pickle).file_size > _MOST_PICKLE:
                 refuse(path, "its data.pkl is too large to name tensors only")
-            order = _byte_order(archive, root)
-            value = _Machine(path).run(archive.read(pickle))
+            value = _Machine(path).run(bytes(read_entry(archive, archive.getinfo(pickle))))
+            storages = _Storages(path, archive, root)
             return {
-                name: _array(path, archive, root, order, tensor)
-                if tensor is not None
-                else np.array(None)
+                name: storages.array(tensor) if tensor is not None else np.array(None)
                 for name, tensor in _named(value).items()
             }
     except ImportFormatError:
@@ -107,7 +95,8 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
 def _byte_order(archive: zipfile.ZipFile, root: str) -> str:
     if f"{root}byteorder" not in archive.namelist():
         return "<" if sys.byteorder == "little" else ">"
-    return ">" if archive.read(f"{root}byteorder") == b"big" else "<"
+    with archive.open(f"{root}byteorder") as stream:
+        return ">" if stream.read(4) == b"big" else "<"
 
 
 class _Machine:
@@ -170,7 +159,11 @@ class _Machine:
             raise ImportFormatError(self._path, f"its pickle has {name}, which names no tensor")
 
     def _marked(self) -> list[Any]:
-        at = max(i for i, item in enumerate(self._stack) if item is _MARK)
+        at = len(self._stack) - 1
+        while at >= 0 and self._stack[at] is not _MARK:
+            at -= 1
+        if at < 0:
+            raise ValueError("its pickle takes more than it gave")
         items = self._stack[at + 1 :]
         del self._stack[at:]
         return items
@@ -190,38 +183,70 @@ class _Machine:
             return arguments[0]
         if name not in _TENSOR or not isinstance(arguments[0], _Storage):
             return _NOT_RUN
-        shape, stride = (tuple(map(int, numbers)) for numbers in arguments[2:4])
+        shape, stride = (tuple(map(int, numbers[:_DEEPEST])) for numbers in arguments[2:4])
+        if max((*shape, *stride, int(arguments[1])), default=0) > MOST_BYTES:
+            raise ValueError(f"a tensor of more than {MOST_BYTES} numbers")
         return _Tensor(arguments[0], int(arguments[1]), shape, stride)
 
 
-def _named(value: object, prefix: str = "") -> dict[str, _Tensor | None]:
-    if isinstance(value, _Tensor):
-        return {prefix or "tensor": value if value.storage.dtype else None}
-    if not isinstance(value, Mapping):
-        return {prefix: None}
+def _named(value: object) -> dict[str, _Tensor | None]:
+    """Return the tensors of nested dictionaries, by their path of keys.
+
+    Raises:
+        ValueError: If there are too many, as of dictionaries that hold each other many times.
+    """
     found: dict[str, _Tensor | None] = {}
-    for key, inner in cast("Mapping[object, object]", value).items():
-        found |= _named(inner, f"{prefix}.{key}" if prefix else str(key))
+    waiting: list[tuple[str, object, int]] = [("", value, 0)]
+    seen = 0
+    while waiting:
+        name, item, depth = waiting.pop()
+        seen += 1
+        if seen > _MOST_NAMES or depth > _DEEPEST or len(name) > _LONGEST_NAME:
+            raise ValueError(f"more than {_MOST_NAMES} names, or one of {name[:40]!r} is too long")
+        if isinstance(item, _Tensor):
+            found[name or "tensor"] = item if item.storage.dtype else None
+        elif isinstance(item, Mapping):
+            inner = list(cast("Mapping[object, object]", item).items())
+            waiting += [
+                (f"{name}.{key}" if name else str(key), each, depth + 1)
+                for key, each in inner[::-1]
+            ]
+        else:
+            found[name] = None
     return found
 
 
-def _array(
-    path: Path, archive: zipfile.ZipFile, root: str, order: str, tensor: _Tensor
-) -> NDArray[Any]:
-    info = archive.getinfo(f"{root}data/{tensor.storage.key}")
-    dtype = np.dtype(order + tensor.storage.dtype)
-    last = tensor.offset + sum(
-        (count - 1) * step for count, step in zip(tensor.shape, tensor.stride, strict=True)
-    )
-    numbers = info.file_size // dtype.itemsize
-    sound = min((*tensor.shape, *tensor.stride, tensor.offset), default=0) >= 0
-    size = math.prod(tensor.shape)
-    if not sound or last >= max(numbers, 1) or size > max(numbers, 1):
-        raise ImportFormatError(path, f"a tensor of shape {tensor.shape} exceeds its storage")
-    if info.file_size > MOST_BYTES:
-        raise ImportFormatError(path, f"a tensor of {info.file_size} bytes; {MOST_BYTES} at most")
-    if not size:
-        return np.zeros(tensor.shape, dtype)
-    flat = np.frombuffer(archive.read(info), dtype, numbers)[tensor.offset :]
-    strides = tuple(step * dtype.itemsize for step in tensor.stride)
-    return np.lib.stride_tricks.as_strided(flat, tensor.shape, strides, writeable=False)
+class _Storages:
+    """The numbers of a file: each storage is read once, all together at most :data:`MOST_BYTES`."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile, root: str) -> None:
+        self._path, self._archive, self._root = path, archive, root
+        self._order = _byte_order(archive, root)
+        self._read: dict[str, bytearray] = {}
+        self._size = 0
+
+    def array(self, tensor: _Tensor) -> NDArray[Any]:
+        """Return the view of its storage that a tensor is."""
+        dtype = np.dtype(self._order + tensor.storage.dtype)
+        data = self._bytes(tensor.storage.key)
+        numbers, size = len(data) // dtype.itemsize, math.prod(tensor.shape)
+        last = tensor.offset + sum(
+            (count - 1) * step for count, step in zip(tensor.shape, tensor.stride, strict=True)
+        )
+        sound = min((*tensor.shape, *tensor.stride, tensor.offset), default=0) >= 0
+        if not sound or last >= max(numbers, 1) or size > max(numbers, 1):
+            refuse(self._path, f"a tensor of shape {tensor.shape} exceeds its storage")
+        if not size or not numbers:
+            return np.zeros(tensor.shape, dtype)
+        flat = np.frombuffer(data, dtype, numbers)[tensor.offset :]
+        strides = tuple(step * dtype.itemsize for step in tensor.stride)
+        return np.lib.stride_tricks.as_strided(flat, tensor.shape, strides, writeable=False)
+
+    def _bytes(self, key: str) -> bytearray:
+        if key not in self._read:
+            info = self._archive.getinfo(f"{self._root}data/{key}")
+            self._size += info.file_size
+            if self._size > MOST_BYTES:
+                refuse(self._path, f"tensors of {self._size} bytes; {MOST_BYTES} at most")
+            self._read[key] = read_entry(self._archive, info)
+        return self._read[key]

@@ -64,7 +64,12 @@ Judge = Callable[[bytes, int, bool], int]
 last argument no more bytes will come."""
 
 
-def _judge_feetech(data: bytes, at: int, ended: bool) -> int:  # noqa: PLR0911
+def _judge_feetech(data: bytes, at: int, ended: bool) -> int:
+    return _feetech(data, at, ended, {})
+
+
+def _feetech(data: bytes, at: int, ended: bool, known: dict[int, int]) -> int:  # noqa: PLR0911
+    """Judge a packet; ``known`` keeps the judgements of those inside, by where they begin."""
     end = len(data)
     if at + 4 > end:
         return FAULTY if data[at + 2 : at + 3] == b"\xff" else MORE
@@ -79,7 +84,9 @@ def _judge_feetech(data: bytes, at: int, ended: bool) -> int:  # noqa: PLR0911
     # One in 256 packets that were cut passes with bytes of the next one: that has its own checksum.
     inside = data.find(b"\xff\xff", at + 4, stop)
     while inside >= 0:
-        other = _judge_feetech(data, inside, ended)
+        other = known.get(inside)
+        if other is None:  # packets in packets: without `known` the time doubles with each
+            other = known[inside] = _feetech(data, inside, ended, known)
         if other == MORE and not ended:
             return MORE
         if other > 0 and inside + other >= stop:

@@ -3,18 +3,13 @@
 CAN traces are written by python-can, foreign logs by the ``mcap`` packages.
 """
 
-import json
 import shutil
-import zipfile
 from dataclasses import dataclass, field
 
 import can
 import numpy as np
-import pyarrow as pa
 from mcap.writer import CompressionType, IndexType
 from mcap_ros2.writer import Writer as RosWriter
-from pyarrow import parquet
-from scipy.io import savemat
 
 from support.foreign_logs import rewrite
 from support.twin_chains import snake4
@@ -229,7 +224,8 @@ def write_texts(folder):
     return {name: text.encode() for name, text in texts.items()}
 
 
-def _files_below(folder):
+def files_below(folder):
+    """Return the files of a folder: relative path to content."""
     found = sorted(path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in found}
 
@@ -253,70 +249,10 @@ def make_bases(folder, result_of):
         "settings": ("settings.toml", ("settings.toml",)),
     }
     bases += [Base(kind, name, trace, mutable) for kind, (name, mutable) in of_text.items()]
-    bases += foreign_tables(folder / "tables")
     result = result_of(folder / "gait.mcap")
     files = {"gait.mcap": logs["gait.mcap"], "result.json": result, **texts}
     bases.append(Base("result", "gait.mcap", files, ("result.json",)))
     return bases
-
-
-def foreign_tables(folder):
-    """Write tables, arrays and data sets of other tools, each by its format's own library."""
-    t = np.arange(300) * 0.01
-    q = np.stack([np.sin(3 * t + k) for k in range(3)], axis=1)
-    arrays = {"time": t, "dof_pos": q, "des_dof_pos": q + 0.01, "kp": np.ones(3)}
-    states, dataset = folder / "states", folder / "dataset"
-    for path in (states, dataset / "meta", dataset / "data" / "chunk-000"):
-        path.mkdir(parents=True)
-    head = "time,joint1_pos,joint2_vel,joint3_cmd"
-    np.savetxt(folder / "wide.csv", np.column_stack([t, q]), "%.9g", ",", header=head, comments="")
-    np.savetxt(folder / "bare.txt", np.column_stack([t, q]), "%.6f")
-    rows = [f"{t[i]:.2f};j{k};{q[i, k]:.6f}" for i in range(len(t)) for k in range(3)]
-    (folder / "long.csv").write_text("\n".join(["time;joint;angle", *rows]))
-    cells = [f'{x * 1e6:.1f},"{v.tolist()}"' for x, v in zip(t, q, strict=True)]
-    vectors = "\n".join(["timestamp,positions", *cells])
-    for name in ("states/state.csv", "states/control.csv", "commands.csv"):
-        (folder / name).write_text(vectors)
-    (states / "joint_list.txt").write_text("a\nb\nc\n")
-    (states / "event.csv").write_text("timestamp,event\n0,START\n")
-    np.savez_compressed(folder / "run.npz", **arrays)
-    savemat(folder / "run.mat", arrays, do_compression=True)
-    savemat(folder / "plain.mat", arrays)
-    vector = {name: v.tolist() for name, v in arrays.items() if len(v) == len(t)}
-    parquet.write_table(pa.table(vector), folder / "run.parquet")
-    _write_tensors(folder / "run.pt", {"time": t, "dof_pos": q})
-    feature = {"dtype": "float32", "shape": [3], "names": ["a", "b", "c"]}
-    features = {"action": feature, "observation.state": feature}
-    info = {"codebase_version": "v3.0", "fps": 30, "features": features}
-    (dataset / "meta" / "info.json").write_text(json.dumps(info))
-    number = np.arange(300)
-    frames = {"action": q.tolist(), "observation.state": q.tolist(), "frame_index": number % 150}
-    frames |= {"episode_index": number // 150, "task_index": 0 * number}
-    parquet.write_table(pa.table(frames), dataset / "data" / "chunk-000" / "file-000.parquet")
-    files = _files_below(folder)
-    bases = [Base("columns", n, files, (n,)) for n in ("wide.csv", "bare.txt", "long.csv")]
-    inside = tuple(name for name in files if name.startswith("states/"))
-    bases.append(Base("columns", "states", files, inside))
-    bases.append(Base("apart", "states/state.csv", files, ("commands.csv", "states/state.csv")))
-    names = ("run.npz", "run.mat", "plain.mat", "run.parquet", "run.pt")
-    bases += [Base("arrays", name, files, (name,)) for name in names]
-    inside = tuple(name for name in files if name.startswith("dataset/"))
-    return [*bases, Base("dataset", "dataset", files, inside)]
-
-
-def _write_tensors(path, arrays):
-    """Write the zip of ``torch.save``, by the opcodes of its pickle."""
-    text = b"\x80\x02}("
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, array in arrays.items():
-            shape = "".join(f"I{n}\n" for n in array.shape)
-            steps = "".join(f"I{n // array.itemsize}\n" for n in array.strides)
-            text += (
-                f"V{name}\nctorch._utils\n_rebuild_tensor_v2\n((Vstorage\nctorch\nDoubleStorage\n"
-                f"V{name}\nVcpu\nI{array.size}\ntQI0\n({shape}t({steps}tI00\n}}tR"
-            ).encode()
-            archive.writestr(f"run/data/{name}", array.tobytes())
-        archive.writestr("run/data.pkl", text + b"u.")
 
 
 def of_recorder(folder):
@@ -348,7 +284,7 @@ def of_recorder(folder):
 
     record(work / "run.mcap", 1 << 14, ("/joint_states", "/joint_commands"), copy)
     record(split / "run.mcap", 1 << 16, ("/joint_states",), divide)
-    unfinished, parts = _files_below(folder / "unfinished"), _files_below(split)
+    unfinished, parts = files_below(folder / "unfinished"), files_below(split)
     left = tuple(name for name in unfinished if name.startswith("run.mcap"))
     return [
         Base("unfinished", "run.mcap", unfinished, left),

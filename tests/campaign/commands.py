@@ -17,6 +17,7 @@ READS = [
     (0.5, "log export {file} -o new.blf"),
     (0.5, "log export {file} -o new.parquet"),
 ]
+LISTEN = "--duration 200ms --quiet --floor 1MB --socket c.sock -o new.mcap"
 COMMANDS = {
     "log": [
         *EDITS,
@@ -50,6 +51,20 @@ COMMANDS = {
     "apart": [(1, "import {file} -o new.mcap --commands commands.csv")],
     "arrays": [(1, "import {file} -o new.mcap")],
     "dataset": [(2, "import {file} -o new"), (1, "import {file} -o new.mcap --episode 1")],
+    "serial": [
+        *EDITS,
+        *READS,
+        (1, "log export {file} -o frames.mcap"),
+        (1, "view {file} --save new.rrd"),
+        (2, "api"),
+    ],
+    **{
+        f"{protocol} line": [
+            (1, f"record {LISTEN} 'serial:line?protocol={protocol}' -r arm.toml"),
+            (1, f"record {LISTEN} 'serial:line?protocol={protocol}&baud=9600' --json"),
+        ]
+        for protocol in ("feetech", "dynamixel2")
+    },
     "robot": [
         (2, "import {file} -o new.mcap -r snake4.toml"),
         (1, "sim run scenario.toml -o new.mcap"),
@@ -70,8 +85,13 @@ COMMANDS = {
 """Kind to command lines and their weights; ``{file}`` is the base's file, faults in it."""
 
 WEIGHTS = {
-    "log": 10, "unfinished": 4, "split": 2, "trace": 6, "table": 2, "columns": 2,
-    "apart": 1, "arrays": 3, "dataset": 1, "robot": 2, "scenario": 2,
-    "plan": 1, "settings": 1, "result": 0.5,
+    "mutated": {
+        "log": 10, "unfinished": 4, "split": 2, "trace": 6, "table": 2, "robot": 2, "scenario": 2,
+        "plan": 1, "settings": 1, "result": 0.5,
+    },
+    "tables": {"columns": 4, "apart": 1},
+    "arrays": {"arrays": 1},
+    "datasets": {"dataset": 1},
+    "serial": {"serial": 2, "feetech line": 1, "dynamixel2 line": 1},
 }  # fmt: skip
-"""How often each kind comes."""
+"""Part of the campaign to its kinds, and how often each of them comes."""

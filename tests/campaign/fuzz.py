@@ -20,11 +20,13 @@ from support.read_back import messages_of
 from .base import EPOCH_NS, write_files
 from .case import Result, front_door, judge, run_forked
 from .commands import COMMANDS, WEIGHTS
+from .line import fed
 from .mutate import mutate_bytes, mutate_text, remake_database, remake_log
+from .structure import STRUCTURE
 
 RECORDS_FOR_S = 12.0
 """A recorder with mutated settings may have been given an hour: it is ended then [s]."""
-TEXTS = {".toml", ".dbc", ".csv", ".log", ".asc", ".trc", ".json"}
+TEXTS = {".toml", ".dbc", ".csv", ".txt", ".log", ".asc", ".trc", ".json", ".jsonl"}
 FIELDS = ("position", "velocity", "effort")
 
 
@@ -58,6 +60,8 @@ class Case:
         work = front_door(self.words)
         if self.words[0] == "api":
             work = partial(try_session, folder / self.words[1])
+        elif "line.bin" in self.files:
+            work = partial(fed, work, self.files["line.bin"])
 
         def listed():
             try:
@@ -69,10 +73,10 @@ class Case:
         return run_forked(listed, folder, end_after_s=self.ended_after_s, end_by=signal.SIGTERM)
 
 
-def make_case(seed, bases, scratch):
-    """Return the case of a seed."""
-    rng = random.Random(seed)
-    kind = rng.choices(list(WEIGHTS), list(WEIGHTS.values()))[0]
+def make_case(seed, bases, scratch, part="mutated"):
+    """Return the case of a seed of a part of the campaign."""
+    rng, weights = random.Random(seed), WEIGHTS[part]
+    kind = rng.choices(list(weights), list(weights.values()))[0]
     base = rng.choice([one for one in bases if one.kind == kind])
     lines = COMMANDS[kind]
     line = rng.choices([text for _, text in lines], [weight for weight, _ in lines])[0]
@@ -88,10 +92,13 @@ def make_case(seed, bases, scratch):
     words = shlex.split(line.format(file=base.name))
     if words == ["api"]:
         words.append(base.name)
-    return Case(tuple(words), files, RECORDS_FOR_S if words[0] == "record" else None)
+    ends_itself = words[0] != "record" or "line.bin" in files
+    return Case(tuple(words), files, None if ends_itself else RECORDS_FOR_S)
 
 
 def _mutated(data, suffix, rng, scratch):
+    if suffix in STRUCTURE and rng.random() < 0.6:
+        return STRUCTURE[suffix](data, rng)
     if suffix in TEXTS:
         return mutate_text(data, rng)
     if suffix == ".db" and rng.random() < 0.7:
@@ -163,9 +170,9 @@ def run_case(case, folder, modules=None):
     return [*judge(outcome), *check_output(folder)], outcome
 
 
-def run_seed(seed, bases, folder):
-    """Make and run the case of a seed, in an empty folder."""
-    case = make_case(seed, bases, folder.parent / "scratch")
+def run_seed(seed, bases, folder, part):
+    """Make and run the case of a seed of a part, in an empty folder."""
+    case = make_case(seed, bases, folder.parent / "scratch", part)
     failures, outcome = run_case(case, folder)
     result = Result(" ".join(case.words), failures)
     result.measure(outcome)

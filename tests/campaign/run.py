@@ -18,6 +18,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 from . import contention, disks, gate, hostile, injection, kills, servers
@@ -46,10 +47,10 @@ class Part:
     alone: bool = False
 
 
-def mutated(seed, stage):
+def mutated(seed, stage, part="mutated"):
     """Run a command on a mutated file; minimise and store one failure of each kind."""
     with stage.fresh() as folder:
-        result, case = run_seed(seed, stage.bases, folder)
+        result, case = run_seed(seed, stage.bases, folder, part)
     for kind in dict.fromkeys(map(kind_of, result.failures)):
         name = "".join(c if c.isalnum() else "-" for c in f"{case.words[0]} {kind}")[:120]
         if stage.failing is not None and not (stage.failing / f"{name}.json").exists():
@@ -67,9 +68,13 @@ PARTS = {
     "disks": Part(disks.run, 400, 30),
     "kills": Part(kills.run, 1500, 40),
     "recorder": Part(kills.run_recorder, 50, 2),
-    "mutated": Part(mutated, 47_000, 350),
+    "tables": Part(partial(mutated, part="tables"), 3_000, 60),
+    "arrays": Part(partial(mutated, part="arrays"), 4_000, 60),
+    "datasets": Part(partial(mutated, part="datasets"), 3_000, 60),
+    "serial": Part(partial(mutated, part="serial"), 2_000, 60),
+    "mutated": Part(mutated, 35_214, 350),
 }
-LONG = 50_000
+LONG = sum(part.long for part in PARTS.values())
 
 _stage = None
 
@@ -85,13 +90,19 @@ def _work(part, seed):
 
 
 def plan(names, seed, cases, *, short):
-    """Return every case as (part, seed), those that need the machine alone first."""
+    """Return every case as (part, seed), those that need the machine alone first.
+
+    Args:
+        cases: In all, shared among the parts as in the long form; None for that form.
+        short: The form for continuous integration.
+    """
     jobs = []
+    whole = sum(PARTS[name].long for name in names)
     for name in sorted(names, key=lambda one: not PARTS[one].alone):
         part = PARTS[name]
         count = part.short if short else part.long
-        if cases is not None and name == "mutated":
-            count = max(0, cases - len(jobs))
+        if cases is not None:
+            count = max(1, round(cases * part.long / whole))
         jobs += [(name, seed * STEP + number) for number in range(count)]
     return jobs
 
@@ -177,7 +188,7 @@ def main():
     """Run the command line; return 1 where a case failed."""
     parser = argparse.ArgumentParser(prog="campaign", description=__doc__)
     parser.add_argument("--seed", type=int, help="of the campaign; a new one by default")
-    parser.add_argument("--cases", type=int, help=f"in all; {LONG} in the long form")
+    parser.add_argument("--cases", type=int, help=f"in all; {LONG} by default")
     parser.add_argument("--short", action="store_true", help="the form for continuous integration")
     parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--case", metavar="PART:SEED", help="one case again, with its output")
@@ -208,8 +219,7 @@ def _run(options, folder):
         seed = int(time.time()) % 10**9 if options.seed is None else options.seed
         records.add({"seed": seed, "short": options.short})
     seed = records.rows[0]["seed"]
-    cases = options.cases or (None if options.short or len(options.parts) < len(PARTS) else LONG)
-    jobs = plan(options.parts, seed, cases, short=options.short)
+    jobs = plan(options.parts, seed, options.cases, short=options.short)
     done = {(row["part"], row["seed"]) for row in records.cases}
     left = [job for job in jobs if job not in done]
     print(f"campaign {seed}: {len(jobs)} cases, {len(jobs) - len(left)} done before", flush=True)

@@ -10,9 +10,13 @@ from pathlib import Path
 from .base import make_bases
 from .case import run_command
 from .commands import COMMANDS
+from .foreign import foreign_bases
 from .fuzz import Case, warm
 
-WHOLE = {"log", "trace", "scenario", "robot"}
+WHOLE = {
+    "log", "trace", "scenario", "robot", "columns", "apart", "arrays", "dataset", "serial",
+    "feetech line", "dynamixel2 line",
+}  # fmt: skip
 """Kinds whose command lines end with exit code 0 on whole files."""
 
 
@@ -30,6 +34,7 @@ class Stage:
         self._number = 0
         (folder / "bases").mkdir()
         self.bases = make_bases(folder / "bases", self._result_of)
+        self.bases += foreign_bases(folder / "bases" / "foreign")
         self.warm_failures = self._warm()
 
     def _result_of(self, gait):
@@ -42,11 +47,11 @@ class Stage:
     def _warm(self):
         """Run every command line once on whole files, and import here what it imported."""
         cases, seen = [], set()
-        for kind, lines in COMMANDS.items():
-            base = next(one for one in self.bases if one.kind == kind)
+        firsts = {(one.kind, Path(one.name).suffix): one for one in reversed(self.bases)}
+        for (kind, suffix), base in firsts.items():
             files = base.files | {"gait0.mcap": self.files_of("lz4.mcap")["lz4.mcap"]}
-            for _, line in lines:
-                verb = tuple(line.split()[:2])
+            for _, line in COMMANDS[kind]:
+                verb = (*line.split()[:2], suffix)
                 left_out = "--null" in line or verb[0] in {"predict", "api"} or verb in seen
                 if kind in WHOLE and not left_out:
                     seen.add(verb)

@@ -16,7 +16,8 @@ import zlib
 from array import array
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from functools import cache
+from typing import Any, Protocol
 
 import numpy as np
 import zstandard
@@ -37,7 +38,9 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
+from numpy.typing import NDArray
 
+from ...common.arrays import IntArray
 from .chunk import FIXED_SIZE, MAGIC, MESSAGE
 
 CHUNK_SIZE = 1 << 20
@@ -198,10 +201,7 @@ class McapWriter:
         )
         index = chunk.index.get(channel_id)
         if index is None:
-            if not chunk.index:
-                chunk.began = self.messages
-                self._begun[chunk.group] = chunk
-            index = chunk.index[channel_id] = array("Q")
+            index = self._index(chunk, channel_id)
         records = chunk.data
         index.append(log_time)
         index.append(len(records))
@@ -212,6 +212,53 @@ class McapWriter:
             self._finish_chunk(chunk)
             if self._begun:
                 self._finish_behind(log_time)
+
+    def add_messages(
+        self, channel_id: int, times_ns: IntArray, payloads: NDArray[np.uint8], sequence: int = 0
+    ) -> None:
+        """Add messages of one size to the chunk of their channel; the same bytes as one by one.
+
+        Args:
+            channel_id: Their channel, which is registered.
+            times_ns: When each was sampled and recorded [Unix ns], from 0, shape (n,).
+            payloads: Shape (n, size).
+            sequence: The channel's own counter at the first one.
+
+        Raises:
+            OSError: If the stream can't take a chunk that is full now.
+        """
+        count, size = payloads.shape
+        records = np.empty(count, _record_of(size))
+        records["opcode"], records["length"] = _OPCODE, FIXED_SIZE + size
+        records["channel"] = channel_id
+        records["sequence"] = (sequence + np.arange(count)) & 0xFFFF_FFFF
+        records["log_time"] = records["publish_time"] = times_ns
+        records["payload"] = payloads
+        chunk, length = self._chunk_of[channel_id], records.itemsize
+        at = 0
+        while at < count:
+            room = max(0, self._chunk_size - len(chunk.data)) // length + 1
+            some = records[at : at + room]
+            entries = np.empty((len(some), 2), np.uint64)
+            entries[:, 0] = some["log_time"]
+            entries[:, 1] = len(chunk.data) + length * np.arange(len(some))
+            self._index(chunk, channel_id).frombytes(entries.tobytes())
+            chunk.data += some.tobytes()
+            self.messages += len(some)
+            at += len(some)
+            if len(chunk.data) > self._chunk_size:
+                self._finish_chunk(chunk)
+                self._finish_behind(int(some["log_time"][-1]))
+
+    def _index(self, chunk: _OpenChunk, channel_id: int) -> array[int]:
+        """Return the index of a channel in a chunk, which begins with its first message."""
+        index = chunk.index.get(channel_id)
+        if index is None:
+            if not chunk.index:
+                chunk.began = self.messages
+                self._begun[chunk.group] = chunk
+            index = chunk.index[channel_id] = array("Q")
+        return index
 
     def add_attachment(
         self, create_time: int, log_time: int, name: str, media_type: str, data: bytes
@@ -379,6 +426,16 @@ class McapWriter:
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )
+
+
+@cache
+def _record_of(size: int) -> np.dtype[Any]:
+    """Return the layout of a message's record, its payload of a constant size."""
+    fields = [
+        ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"),
+        ("log_time", "<u8"), ("publish_time", "<u8"), ("payload", "u1", (size,)),
+    ]  # fmt: skip
+    return np.dtype(fields)
 
 
 def _encoded(record: McapRecord) -> bytes:

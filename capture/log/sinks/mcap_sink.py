@@ -12,8 +12,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import BinaryIO, Protocol, TypeAlias
 
+import numpy as np
 from mcap.records import Attachment, Channel, Metadata, Schema
+from numpy.typing import NDArray
 
+from ...common.arrays import IntArray
 from ...common.errors import DataError, LogWriteError, OutputExistsError
 from ..mcap.writer import McapWriter
 
@@ -109,6 +112,16 @@ class McapSink:
         """See :meth:`MessageSink.write`."""
         channel_id, log_time_ns, publish_time_ns, sequence, payload = message
         self._writer.add_message(channel_id, log_time_ns, payload, publish_time_ns, sequence)
+
+    def write_rows(
+        self, channel_id: int, times_ns: IntArray, sequence: int, payloads: NDArray[np.uint8]
+    ) -> None:
+        """Store messages of one size at once; see :meth:`.McapWriter.add_messages`.
+
+        Raises:
+            LogWriteError: If they can't be stored.
+        """
+        self._writer.add_messages(channel_id, times_ns, payloads, sequence)
 
     def close(self, last: tuple[Metadata, ...]) -> None:
         """See :meth:`MessageSink.close`."""

@@ -12,9 +12,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
+import numpy as np
 from mcap.records import Attachment, Channel, Metadata, Schema
+from numpy.typing import NDArray
 
-from ...common.arrays import FloatArray
+from ...common.arrays import FloatArray, IntArray
 from ...common.errors import DataError, LogWriteError
 from ...robot.kinematics import mesh_type
 from ...robot.model import Robot, Sensor, SensorKind
@@ -31,6 +33,7 @@ from .channels import (
     OdometryChannel,
     RangeChannel,
     Send,
+    SendRows,
     StringChannel,
     Template,
     TimeReferenceChannel,
@@ -325,6 +328,12 @@ class SessionWriter:
         self, topic: str, type_name: str, metadata: Mapping[str, str] | None = None
     ) -> Send:
         """Register a channel and return the function that writes one message."""
+        return self._senders(topic, type_name, metadata)[0]
+
+    def _senders(
+        self, topic: str, type_name: str, metadata: Mapping[str, str] | None = None
+    ) -> tuple[Send, SendRows]:
+        """Register a channel; return the functions that write one message, and many of one size."""
         if topic in self._topics:
             raise DataError(f"{topic} is open already; a topic has one channel")
         if type_name not in self._schemas:
@@ -337,7 +346,8 @@ class SessionWriter:
         self._sink.define(Channel(channel_id, topic, "cdr", dict(metadata or {}), schema_id))
         self._topics.add(topic)
         sequence = 0
-        write = self._sink.write
+        sink = self._sink
+        write = sink.write
 
         def send(log_time_ns: int, stamp_ns: int, data: bytes) -> None:
             nonlocal sequence
@@ -346,7 +356,18 @@ class SessionWriter:
             write(channel_id, log_time_ns, stamp_ns, sequence, data)
             sequence = (sequence + 1) & 0xFFFF_FFFF
 
-        return send
+        def send_rows(times_ns: IntArray, payloads: NDArray[np.uint8]) -> None:
+            nonlocal sequence
+            if not isinstance(sink, McapSink):
+                for t_ns, payload in zip(times_ns.tolist(), payloads, strict=True):
+                    send(t_ns, t_ns, payload.tobytes())
+                return
+            if not self._open:
+                raise LogWriteError(self.path, f"{topic}: the session is closed")
+            sink.write_rows(channel_id, times_ns, sequence, payloads)
+            sequence = (sequence + len(times_ns)) & 0xFFFF_FFFF
+
+        return send, send_rows
 
     def _template(
         self,
@@ -358,7 +379,7 @@ class SessionWriter:
         kind = message_type(type_name)
         example = encode(kind, values)
         leaves = layout_of(kind, example).leaves
-        return Template(bytearray(example), leaves, self._sender(topic, type_name, metadata))
+        return Template(bytearray(example), leaves, *self._senders(topic, type_name, metadata))
 
 
 SensorWrite: TypeAlias = Callable[[FloatArray, int, int], None]

@@ -29,6 +29,10 @@ CALLS = st.lists(
             st.just("message"), st.integers(0, 9), NUMBER, st.binary(max_size=80), NUMBER,
             st.integers(0, 2**32 - 1),
         ),
+        st.tuples(
+            st.just("rows"), st.integers(0, 9), st.lists(NUMBER, max_size=12),
+            st.binary(max_size=80), st.integers(0, 2**32 - 20),
+        ),
         st.tuples(st.just("schema"), st.text(max_size=5), st.binary(max_size=30)),
         st.tuples(st.just("channel"), st.text(max_size=5)),
         st.tuples(st.just("attachment"), NUMBER, st.text(max_size=5), st.binary(max_size=50)),
@@ -48,6 +52,17 @@ def library_with_checksums():
         yield
 
 
+def add_rows(writer, channel, times, data, sequence):
+    """Add messages of one size: at once by our writer, one by one by the library."""
+    payloads = [bytes(b ^ k for b in data) for k in range(len(times))]
+    if isinstance(writer, McapWriter):
+        rows = np.frombuffer(b"".join(payloads), np.uint8).reshape(len(times), len(data))
+        writer.add_messages(channel, np.array(times, np.uint64), rows, sequence)
+        return
+    for k, (t_ns, payload) in enumerate(zip(times, payloads, strict=True)):
+        writer.add_message(channel, t_ns, payload, t_ns, sequence + k)
+
+
 def written(kind, calls, chunk_size):
     stream = io.BytesIO()
     writer = kind(stream, chunk_size=chunk_size)
@@ -59,6 +74,9 @@ def written(kind, calls, chunk_size):
             channel, log_time, data, publish_time, sequence = values
             channel = ids[channel % len(ids)]
             writer.add_message(channel, log_time, data, publish_time, sequence)
+        elif name == "rows":
+            channel, times, data, sequence = values
+            add_rows(writer, ids[channel % len(ids)], times, data, sequence)
         elif name == "schema":
             schema = writer.register_schema(values[0], "ros2msg", values[1])
         elif name == "channel":

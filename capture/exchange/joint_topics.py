@@ -1,0 +1,76 @@
+"""JointState topics of a table: which quantities share one, and its rows as messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from ..bus.decoded_topics import JOINT_TOPIC
+from ..common.arrays import FloatArray, IntArray
+from ..log.write.writer import SessionWriter
+from ..robot.bus_map import SESSION_UNIT
+from ..robot.model import Quantity
+
+_WITH_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
+"""What stands beside a position of the same row."""
+
+
+def topics_of(present: set[Quantity]) -> Iterator[tuple[Quantity, ...]]:
+    """Yield the quantities of each topic; a row's velocity and effort belong to its position."""
+    together = [q for q in _WITH_POSITION if q in present and Quantity.POSITION in present]
+    for quantity in JOINT_TOPIC:
+        if quantity is Quantity.POSITION and quantity in present:
+            yield (quantity, *together)
+        elif quantity in present and quantity not in together:
+            yield (quantity,)
+
+
+class JointTopic:
+    """One JointState topic of a table, with the joints that have a column for it."""
+
+    def __init__(
+        self,
+        writer: SessionWriter,
+        columns: Sequence[tuple[str, Quantity]],
+        quantities: Sequence[Quantity],
+    ) -> None:
+        """Open the topic.
+
+        Args:
+            columns: Joint and quantity of each column, the joints in their order in a message.
+            quantities: One of :func:`topics_of`.
+        """
+        self._joints = list(dict.fromkeys(joint for joint, each in columns if each in quantities))
+        self._fields = (quantities[0], *(q for q in _WITH_POSITION if q in quantities[1:]))
+        self._rest = [q in quantities[1:] for q in _WITH_POSITION]
+        self.name = JOINT_TOPIC[quantities[0]]
+        velocity, effort = self._rest
+        self._channel = writer.joint_state(
+            self.name, self._joints, unit=SESSION_UNIT[quantities[0]],
+            velocity=velocity, effort=effort,
+        )  # fmt: skip
+
+    def write(self, t_ns: IntArray, values: Mapping[tuple[str, Quantity], FloatArray]) -> int:
+        """Write the rows that have any value; a missing one is NaN.
+
+        Args:
+            t_ns: Times of the rows [Unix ns], shape (n,).
+            values: Joint and quantity to cells, (n,).
+
+        Returns:
+            Number of rows written.
+        """
+        fields = np.full((len(self._fields), len(t_ns), len(self._joints)), np.nan)
+        for field, quantity in zip(fields, self._fields, strict=True):
+            for k, joint in enumerate(self._joints):
+                if (cells := values.get((joint, quantity))) is not None:
+                    field[:, k] = cells
+        filled = ~np.isnan(fields).all(axis=(0, 2))
+        if not filled.all():
+            t_ns, fields = t_ns[filled], fields[:, filled]
+        none = np.empty((len(t_ns), 0))
+        rest = iter(fields[1:])
+        velocity, effort = (next(rest) if present else none for present in self._rest)
+        self._channel.write_rows(t_ns, fields[0], velocity, effort)
+        return len(t_ns)

@@ -1,0 +1,106 @@
+"""Many samples at once against one by one: mcap's readers find the same messages."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from support.read_back import decoded_of, messages_of
+from undulog.capture import SessionWriter
+from undulog.capture.common.errors import DataError
+from undulog.capture.log.sinks.durable_sink import DurableSink
+
+EPOCH_NS = 1_700_000_000_000_000_000
+FACTS = {"session_id": "s", "epoch_ns": EPOCH_NS}
+
+
+def session(path, names, times, fields, *, at_once, sink=None):
+    """Write one joint topic; return its messages: log time, publish time, sequence, bytes."""
+    _, velocity, effort = fields
+    options = {"velocity": velocity.shape[1] > 0, "effort": effort.shape[1] > 0}
+    with SessionWriter(path, **FACTS, sink=sink, force=True) as writer:
+        channel = writer.joint_state("/joint_states", names, unit="rad", **options)
+        if at_once:
+            for part in np.array_split(np.arange(len(times)), 3):
+                channel.write_rows(times[part], *(field[part] for field in fields))
+        else:
+            for row in zip(times.tolist(), *fields, strict=True):
+                channel.write(*row)
+    found = [message for *_, message in messages_of(path, log_time_order=False)]
+    return [(m.log_time, m.publish_time, m.sequence, m.data) for m in found]
+
+
+@st.composite
+def samples(draw):
+    names = draw(st.lists(st.text(max_size=9), min_size=1, max_size=6, unique=True))
+    rows = draw(st.integers(0, 20))
+    times = draw(arrays.arrays(np.int64, rows, elements=st.integers(0, 2**31 * 10**9 - 1)))
+    width = st.sampled_from([0, len(names)])
+    columns = len(names), draw(width), draw(width)
+    return names, times, [draw(arrays.arrays(np.float64, (rows, m))) for m in columns]
+
+
+@settings(max_examples=60, deadline=None)
+@given(case=samples())
+def test_the_same_messages(case, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rows")
+    one, many = (session(folder / f"{k}.mcap", *case, at_once=k) for k in (False, True))
+    assert many == one
+    assert len(one) == len(case[1])
+
+
+@pytest.fixture(scope="module")
+def long_run():
+    """Some chunks of messages; the values are told apart, and one of a thousand is none."""
+    names = [f"joint{k:02d}" for k in range(25)]
+    times = EPOCH_NS + np.arange(9000) * 10_000_000
+    fields = [np.arange(9000 * 25).reshape(9000, 25) * scale for scale in (1e-3, 1.0, -1.0)]
+    fields[0].ravel()[::1000] = np.nan
+    return names, times, fields
+
+
+def test_over_several_chunks(tmp_path, long_run):
+    one, many = (session(tmp_path / f"{k}.mcap", *long_run, at_once=k) for k in (False, True))
+    assert many == one
+    assert (tmp_path / "True.mcap").read_bytes() == (tmp_path / "False.mcap").read_bytes()
+
+
+def test_a_foreign_decoder_reads_the_values(tmp_path, long_run):
+    names, times, fields = long_run
+    session(tmp_path / "x.mcap", *long_run, at_once=True)
+    found = [(t_ns, message) for _, t_ns, message in decoded_of(tmp_path / "x.mcap")]
+    assert [t_ns for t_ns, _ in found] == times.tolist()
+    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in found]
+    assert stamps == times.tolist()
+    for name, field in zip(("position", "velocity", "effort"), fields, strict=True):
+        assert np.array_equal([getattr(m, name) for _, m in found], field, equal_nan=True)
+    assert found[-1][1].name == names
+
+
+def test_through_the_write_ahead_log(tmp_path, long_run):
+    names, times, fields = long_run
+    some = names, times[:200], [field[:200] for field in fields]
+    path = tmp_path / "run.mcap"
+    sink = DurableSink(path, segment_size=1 << 20, ballast=0)
+    through = session(path, *some, at_once=True, sink=sink)
+    assert through == session(tmp_path / "one.mcap", *some, at_once=False)
+
+
+def test_a_wrong_shape_is_refused(tmp_path):
+    with SessionWriter(tmp_path / "x.mcap", **FACTS) as writer:
+        channel = writer.joint_state("/joint_states", ["a", "b"], unit="rad")
+        none = np.empty((3, 0))
+        with pytest.raises(ValueError, match="position has the shape"):
+            channel.write_rows(np.arange(3), np.zeros((3, 3)), none, none)
+        with pytest.raises(ValueError, match="velocity has the shape"):
+            channel.write_rows(np.arange(3), np.zeros((3, 2)), np.zeros((3, 2)), none)
+
+
+@pytest.mark.parametrize("t_ns", [-1, 2**31 * 10**9])
+def test_a_time_that_no_stamp_holds_is_refused(tmp_path, t_ns):
+    with SessionWriter(tmp_path / "x.mcap", **FACTS) as writer:
+        channel = writer.joint_state("/joint_states", ["a"], unit="rad")
+        none = np.empty((2, 0))
+        with pytest.raises(DataError, match="32 bits"):
+            channel.write_rows(np.array([5, t_ns]), np.zeros((2, 1)), none, none)
