@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bus.decoded_topics import JOINT_TOPIC
-from ..common.arrays import FloatArray, IntArray
+from ..common.arrays import BoolArray, FloatArray, IntArray
 from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError, UsageError, some_names
 from ..common.files import write_text
 from ..common.process import StopRequest
+from ..log.write.channels import JointStateChannel
 from ..log.write.writer import SessionWriter
 from ..robot.bus_map import SESSION_UNIT, TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
@@ -35,6 +36,7 @@ _COMMAND_FILES = {"control", "command", "commands", "cmd", "action", "actions", 
 _STATE_FILES = {"state", "states", "measured", "response", "feedback", "joint", "joints", "motor"}
 _EVENT_FILES = {"event", "events"}
 _MOST_NAMES = 1 << 16  # bytes of a list of joints
+_MOST_PARTS = 128  # sets of joints that have a value together; further ones get NaN for the others
 
 Message: TypeAlias = tuple[int, int, Callable[[], None]]
 """Time [ns], order among those of one time, and what writes it."""
@@ -356,7 +358,8 @@ class _Source:
             values[known] = turns[1:] + (before[1] - before[0])
             self._unwrapped[name] = (raw[-1], values[known][-1])
         unit = unit_for(column.unit, column.quantity)
-        return unit.convert(column.scale * values + column.offset)
+        scaled = column.scale * values
+        return unit.convert(scaled + column.offset if column.offset else scaled)  # keeps -0.0
 
 
 def _is_number(cell: object) -> bool:
@@ -396,31 +399,49 @@ class _Topic:
             velocity=Quantity.VELOCITY in quantities[1:],
             effort=Quantity.EFFORT in quantities[1:],
         )
+        self._parts: dict[bytes, JointStateChannel] = {}
 
     def rows(
         self, t_ns: IntArray, values: dict[tuple[str, Quantity], FloatArray]
     ) -> Callable[[int], None]:
-        """Return what writes a row of a block; a row without any value is no message."""
+        """Return what writes a row of a block; a joint without any value in a row has no sample."""
         missing = np.full(len(t_ns), np.nan)
         fields = [
             np.stack([values.get((name, each), missing) for name in self._names], axis=1)
             for each in self._quantities
         ]
-        filled = np.any([~np.isnan(each).all(axis=1) for each in fields], axis=0)
+        sampled = np.any([~np.isnan(each) for each in fields], axis=0)
+        is_whole, is_empty = sampled.all(axis=1), ~sampled.any(axis=1)
         none: list[tuple[()]] = [()] * len(t_ns)
         velocity, effort = (
             fields[self._quantities.index(each)] if each in self._quantities[1:] else none
             for each in WITH_POSITION
         )
         stamps: list[int] = t_ns.tolist()
-        position, send = fields[0], self._channel.write
+        position = fields[0]
 
         def write(row: int) -> None:
-            if filled[row]:
-                send(stamps[row], position[row], velocity[row], effort[row])
-                self._samples[self._name] = self._samples.get(self._name, 0) + 1
+            if is_empty[row]:
+                return
+            cells = (position[row], velocity[row], effort[row])
+            channel = self._channel
+            if not is_whole[row]:
+                channel, which = self._part(sampled[row])
+                cells = tuple(np.asarray(each)[which[: len(each)]] for each in cells)
+            channel.write(stamps[row], *cells)
+            self._samples[self._name] = self._samples.get(self._name, 0) + 1
 
         return write
+
+    def _part(self, sampled: BoolArray) -> tuple[JointStateChannel, BoolArray]:
+        """Return the channel of some joints, and which they are; all if there are too many sets."""
+        key = sampled.tobytes()
+        if key not in self._parts and len(self._parts) < _MOST_PARTS:
+            names = [name for name, is_in in zip(self._names, sampled, strict=True) if is_in]
+            self._parts[key] = self._channel.part(names)
+        if key not in self._parts:
+            return self._channel, np.ones_like(sampled)
+        return self._parts[key], sampled
 
 
 def _events(

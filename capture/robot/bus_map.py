@@ -41,7 +41,8 @@ class Unit:
 
     def convert(self, values: FloatArray) -> FloatArray:
         """Return values in the session's unit, ``factor * values + offset``."""
-        return values * self.factor + self.offset
+        scaled = values * self.factor
+        return scaled + self.offset if self.offset else scaled  # keeps -0.0
 
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, 3rd CGPM 1901

@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...common.arrays import NS, FloatArray
 from ...common.errors import DataError
-from ..messages.cdr import Leaf, encode
-from ..messages.definitions import DiagnosticStatus, message_type
+from ..messages.cdr import Leaf, encode, layout_of
+from ..messages.definitions import JOINT_STATE, DiagnosticStatus, message_type
 from ..messages.frames import (
     FD_FRAME_DTYPE,
     FD_FRAME_LAYOUT,
@@ -129,6 +129,15 @@ class JointStateChannel(_Stamped):
         velocities[...] = velocity
         efforts[...] = effort
         self._emit(t_ns, log_time_ns)
+
+    def part(self, names: Sequence[str]) -> JointStateChannel:
+        """Return the channel for messages of some of the joints only, with the same fields."""
+        kind, zeros = message_type(JOINT_STATE), [0.0] * len(names)
+        fields = zip(self._fields, self._views, strict=True)
+        values = {field: zeros if len(view) else [] for field, view in fields}
+        example = encode(kind, {"name": list(names), **values})
+        leaves = layout_of(kind, example).leaves
+        return JointStateChannel(Template(bytearray(example), leaves, self._template.send))
 
 
 class OdometryChannel(_Stamped):
