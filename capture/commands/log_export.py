@@ -11,11 +11,12 @@ from cyclopts import Parameter
 
 from ..common.console import emit
 from ..common.errors import UsageError
+from .several import sessions_of
 
 if TYPE_CHECKING:
     from ..common.process import StopRequest
 
-Target = Literal["wide"]
+Target = Literal["wide", "lerobot"]
 
 
 def log_export(
@@ -24,6 +25,8 @@ def log_export(
     to: Target | None = None,
     bus: str | None = None,
     topics: Annotated[tuple[str, ...], Parameter(consume_multiple=True, show_default=False)] = (),
+    fps: int | None = None,
+    task: str | None = None,
     force: bool = False,
     json: bool = False,
 ) -> None:
@@ -34,7 +37,9 @@ def log_export(
     sample of a joint at its own time. What a format can't hold is reported in a warning.
 
     --to wide writes .csv or .parquet with a column for each joint and quantity, and a row for each
-    time at which a joint was sampled; nothing is resampled.
+    time at which a joint was sampled; nothing is resampled. --to lerobot writes a LeRobot dataset
+    v3, an episode a session: --fps frames a second, each with the last sample of every joint and
+    the time it was sampled.
 
     Example: `undulog log export run.mcap -o trace.log`
 
@@ -47,13 +52,17 @@ def log_export(
 
     A column a joint: `undulog log export run.mcap --to wide -o run.csv`
 
+    For training: `undulog log export runs/*.mcap --to lerobot --fps 50 -o dataset`
+
     Args:
-        sessions: The session.
-        output: The file to write.
+        sessions: The session; for LeRobot several, folders of them or patterns.
+        output: The file to write, or the folder.
         to: The format, where the suffix doesn't select it.
         bus: The bus whose frames to write; all by default.
         topics: The JointState topics whose columns to write; commands and whatever the joints
             measure by default.
+        fps: Frames a second of a LeRobot dataset.
+        task: What the robot does, for a LeRobot dataset; what the session states by default.
         force: Replace an existing output.
         json: Report as one JSON object.
     """
@@ -61,9 +70,11 @@ def log_export(
 
     if not sessions:
         raise UsageError("log export needs a session, e.g. undulog log export run.mcap -o run.csv")
-    options = _Options(bus, topics)
+    options = _Options(bus, topics, fps, task)
     name, target = _target(to, output)
     target.check(name, sessions, options)
+    if target.several:
+        sessions = tuple(sessions_of(sessions))
     with interruptible() as stop:
         written = target.write(_Request(sessions, output, options, force, stop))
     source: Any = [str(path) for path in sessions] if target.several else str(sessions[0])
@@ -79,6 +90,8 @@ class _Options:
 
     bus: str | None = None
     topics: tuple[str, ...] = ()
+    fps: int | None = None
+    task: str | None = None
 
 
 @dataclass(frozen=True)
@@ -180,10 +193,27 @@ def _wide(request: _Request) -> _Written:
     return _Written({"rows": table.rows, "columns": table.columns}, what, table.warnings)
 
 
-_FOR = {"bus": "CAN frames", "topics": "tables"}
+def _lerobot(request: _Request) -> _Written:
+    from ..exchange.lerobot_export import export_lerobot
+
+    options = request.options
+    if options.fps is None:
+        raise UsageError("--to lerobot needs --fps, the frames a second of the dataset")
+    report = export_lerobot(
+        request.sessions, request.output, fps=options.fps, task=options.task, **request.common
+    )
+    count = len(report.episodes)
+    what = f"{sum(report.episodes)} frames in {count} episode{'' if count == 1 else 's'}"
+    return _Written({"episodes": report.episodes, "fps": options.fps}, what, report.warnings)
+
+
+_FOR = {"bus": "CAN frames", "topics": "tables", "fps": "LeRobot", "task": "LeRobot"}
 """Option to the outputs that have it."""
 
 _FRAMES = _Target(_frames, "has CAN frames", frozenset({"bus"}))
 _TABLE = _Target(_table, "has joint columns", frozenset({"topics"}))
-_TARGETS = {"wide": _Target(_wide, "has joint columns", frozenset({"topics"}))}
+_TARGETS = {
+    "wide": _Target(_wide, "has joint columns", frozenset({"topics"})),
+    "lerobot": _Target(_lerobot, "has episodes", frozenset({"fps", "task"}), several=True),
+}
 """Value of ``--to`` to the kind of output."""

@@ -33,7 +33,8 @@ from .table_import import TableSet, import_tables
 from .tables import Block, TableFile, arrow, vectors_of
 from .torch_zip import refuse
 
-_FEATURES = {"action": Quantity.COMMAND, "observation.state": Quantity.POSITION}
+FEATURES = {"action": Quantity.COMMAND, "observation.state": Quantity.POSITION}
+"""Feature to what it is of each joint."""
 _MOST_INFO = 1 << 24  # bytes
 _MOST_JOINTS = 1024
 _KNOWN = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
@@ -92,9 +93,9 @@ def open_lerobot(folder: Path) -> LeRobotDataset:
         info = json.loads(path.read_text(encoding="utf-8"))
         features = cast("dict[str, Any]", info["features"])
         fps = float(info["fps"])
-        names = {name: _element_names(features[name]) for name in _FEATURES if name in features}
+        names = {name: _element_names(features[name]) for name in FEATURES if name in features}
         version, kind = str(info.get("codebase_version", "")), str(info.get("robot_type") or "")
-        others = tuple(n for n in features if n not in _FEATURES and n not in _KNOWN)
+        others = tuple(n for n in features if n not in FEATURES and n not in _KNOWN)
     except LogError:
         raise
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
@@ -187,7 +188,7 @@ def _map(dataset: LeRobotDataset, units: Mapping[str, str]) -> tuple[ColumnMap, 
     notes = [f"times made from the frame number and fps = {dataset.fps:g}, as the dataset has them"]
     columns: list[Column] = []
     for feature, names in dataset.names.items():
-        quantity = _FEATURES[feature]
+        quantity = FEATURES[feature]
         unit = units.get(quantity, "")
         if not unit:
             unit = SESSION_UNIT[quantity]
@@ -235,7 +236,9 @@ def _frames(parquet: Any, path: Path, dataset: LeRobotDataset, number: int) -> B
         frame = table["frame_index"].to_numpy()
         block: Block = {"time": np.rint(frame * (NS / dataset.fps)).astype(np.int64)}
         for name, names in dataset.names.items():
-            vectors = vectors_of(table[name].combine_chunks())
+            column = table[name].combine_chunks()
+            is_list = "list" in str(column.type)  # LeRobot has one element as a plain number
+            vectors = vectors_of(column) if is_list else column.to_numpy()[:, None]
             if vectors.shape != (len(frame), len(names)):
                 refuse(path, f"{name} has not {len(names)} elements in each frame, as in info.json")
             block |= {f"{name}[{i}]": vectors[:, i] for i in range(len(names))}
