@@ -16,7 +16,7 @@ from .several import sessions_of
 if TYPE_CHECKING:
     from ..common.process import StopRequest
 
-Target = Literal["wide", "lerobot"]
+Target = Literal["wide", "lerobot", "rosbag2"]
 
 
 def log_export(
@@ -39,7 +39,7 @@ def log_export(
     --to wide writes .csv or .parquet with a column for each joint and quantity, and a row for each
     time at which a joint was sampled; nothing is resampled. --to lerobot writes a LeRobot dataset
     v3, an episode a session: --fps frames a second, each with the last sample of every joint and
-    the time it was sampled.
+    the time it was sampled. --to rosbag2 writes a folder for ros2 bag, with the session's messages.
 
     Example: `undulog log export run.mcap -o trace.log`
 
@@ -207,6 +207,16 @@ def _lerobot(request: _Request) -> _Written:
     return _Written({"episodes": report.episodes, "fps": options.fps}, what, report.warnings)
 
 
+def _rosbag2(request: _Request) -> _Written:
+    from ..exchange.rosbag2_export import export_rosbag2
+
+    (session,) = request.sessions
+    report = export_rosbag2(session, request.output, **request.common)
+    count = sum(report.messages.values())
+    what = f"{count} messages of {len(report.messages)} topics"
+    return _Written({"messages": report.messages}, what, report.warnings)
+
+
 _FOR = {"bus": "CAN frames", "topics": "tables", "fps": "LeRobot", "task": "LeRobot"}
 """Option to the outputs that have it."""
 
@@ -215,5 +225,6 @@ _TABLE = _Target(_table, "has joint columns", frozenset({"topics"}))
 _TARGETS = {
     "wide": _Target(_wide, "has joint columns", frozenset({"topics"})),
     "lerobot": _Target(_lerobot, "has episodes", frozenset({"fps", "task"}), several=True),
+    "rosbag2": _Target(_rosbag2, "has all messages"),
 }
 """Value of ``--to`` to the kind of output."""
