@@ -16,7 +16,7 @@ from .several import sessions_of
 if TYPE_CHECKING:
     from ..common.process import StopRequest
 
-Target = Literal["wide", "lerobot", "rosbag2"]
+Target = Literal["wide", "lerobot", "rosbag2", "tum"]
 
 
 def log_export(
@@ -27,6 +27,7 @@ def log_export(
     topics: Annotated[tuple[str, ...], Parameter(consume_multiple=True, show_default=False)] = (),
     fps: int | None = None,
     task: str | None = None,
+    frame: str | None = None,
     force: bool = False,
     json: bool = False,
 ) -> None:
@@ -40,6 +41,7 @@ def log_export(
     time at which a joint was sampled; nothing is resampled. --to lerobot writes a LeRobot dataset
     v3, an episode a session: --fps frames a second, each with the last sample of every joint and
     the time it was sampled. --to rosbag2 writes a folder for ros2 bag, with the session's messages.
+    --to tum writes the pose of the base, or of --frame, as a TUM trajectory.
 
     Example: `undulog log export run.mcap -o trace.log`
 
@@ -63,6 +65,7 @@ def log_export(
             measure by default.
         fps: Frames a second of a LeRobot dataset.
         task: What the robot does, for a LeRobot dataset; what the session states by default.
+        frame: The frame of a trajectory; the base by default, whose pose is in /odom.
         force: Replace an existing output.
         json: Report as one JSON object.
     """
@@ -70,7 +73,7 @@ def log_export(
 
     if not sessions:
         raise UsageError("log export needs a session, e.g. undulog log export run.mcap -o run.csv")
-    options = _Options(bus, topics, fps, task)
+    options = _Options(bus, topics, fps, task, frame)
     name, target = _target(to, output)
     target.check(name, sessions, options)
     if target.several:
@@ -92,6 +95,7 @@ class _Options:
     topics: tuple[str, ...] = ()
     fps: int | None = None
     task: str | None = None
+    frame: str | None = None
 
 
 @dataclass(frozen=True)
@@ -217,7 +221,23 @@ def _rosbag2(request: _Request) -> _Written:
     return _Written({"messages": report.messages}, what, report.warnings)
 
 
-_FOR = {"bus": "CAN frames", "topics": "tables", "fps": "LeRobot", "task": "LeRobot"}
+def _tum(request: _Request) -> _Written:
+    from ..exchange.tum import export_tum
+
+    (session,), options = request.sessions, request.options
+    report = export_tum(session, request.output, frame=options.frame, **request.common)
+    what = f"{report.poses} poses of {report.frame} in {report.parent}, from {report.topic}"
+    facts = {"poses": report.poses, "frame": report.frame, "parent": report.parent}
+    return _Written(facts | {"topic": report.topic}, what, report.warnings)
+
+
+_FOR = {
+    "bus": "CAN frames",
+    "topics": "tables",
+    "fps": "LeRobot",
+    "task": "LeRobot",
+    "frame": "trajectories",
+}
 """Option to the outputs that have it."""
 
 _FRAMES = _Target(_frames, "has CAN frames", frozenset({"bus"}))
@@ -226,5 +246,6 @@ _TARGETS = {
     "wide": _Target(_wide, "has joint columns", frozenset({"topics"})),
     "lerobot": _Target(_lerobot, "has episodes", frozenset({"fps", "task"}), several=True),
     "rosbag2": _Target(_rosbag2, "has all messages"),
+    "tum": _Target(_tum, "has poses", frozenset({"frame"})),
 }
 """Value of ``--to`` to the kind of output."""
