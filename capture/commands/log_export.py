@@ -15,8 +15,9 @@ from .several import sessions_of
 
 if TYPE_CHECKING:
     from ..common.process import StopRequest
+    from ..exchange.plot_layouts import LayoutReport
 
-Target = Literal["wide", "lerobot", "rosbag2", "tum"]
+Target = Literal["wide", "lerobot", "rosbag2", "tum", "foxglove-layout", "plotjuggler-layout"]
 
 
 def log_export(
@@ -41,7 +42,8 @@ def log_export(
     time at which a joint was sampled; nothing is resampled. --to lerobot writes a LeRobot dataset
     v3, an episode a session: --fps frames a second, each with the last sample of every joint and
     the time it was sampled. --to rosbag2 writes a folder for ros2 bag, with the session's messages.
-    --to tum writes the pose of the base, or of --frame, as a TUM trajectory.
+    --to tum writes the pose of the base, or of --frame, as a TUM trajectory. --to foxglove-layout
+    (.json) and plotjuggler-layout (.xml) write a layout that plots command and state of each joint.
 
     Example: `undulog log export run.mcap -o trace.log`
 
@@ -231,9 +233,28 @@ def _tum(request: _Request) -> _Written:
     return _Written(facts | {"topic": report.topic}, what, report.warnings)
 
 
+def _layout(request: _Request, export: Callable[..., LayoutReport]) -> _Written:
+    (session,), options = request.sessions, request.options
+    report = export(session, request.output, topics=options.topics, force=request.force)
+    what = f"plots of {len(report.joints)} joints"
+    return _Written({"joints": report.joints}, what, report.warnings)
+
+
+def _foxglove(request: _Request) -> _Written:
+    from ..exchange.plot_layouts import export_foxglove_layout
+
+    return _layout(request, export_foxglove_layout)
+
+
+def _plotjuggler(request: _Request) -> _Written:
+    from ..exchange.plot_layouts import export_plotjuggler_layout
+
+    return _layout(request, export_plotjuggler_layout)
+
+
 _FOR = {
     "bus": "CAN frames",
-    "topics": "tables",
+    "topics": "tables and layouts",
     "fps": "LeRobot",
     "task": "LeRobot",
     "frame": "trajectories",
@@ -247,5 +268,7 @@ _TARGETS = {
     "lerobot": _Target(_lerobot, "has episodes", frozenset({"fps", "task"}), several=True),
     "rosbag2": _Target(_rosbag2, "has all messages"),
     "tum": _Target(_tum, "has poses", frozenset({"frame"})),
+    "foxglove-layout": _Target(_foxglove, "has plots", frozenset({"topics"})),
+    "plotjuggler-layout": _Target(_plotjuggler, "has plots", frozenset({"topics"})),
 }
 """Value of ``--to`` to the kind of output."""
