@@ -82,7 +82,7 @@ def analyse(
         why = "the result file is JSON; end its name in .json (a page is made by undulog report)"
         check_output(output, (".json",), why, force=force)
     if csv is not None:
-        from ..present.csv_tables import check_csv
+        from ..present.notebook.csv_tables import check_csv
 
         check_csv(csv, force=force)
     if len(paths) > 1 and (each or paths != [*map(as_path, files)]):
@@ -94,7 +94,7 @@ def analyse(
     if output is not None:
         result.save(output, force=True)  # refused before the work began, if it was there
     if csv is not None:
-        from ..present.csv_tables import write_csv
+        from ..present.notebook.csv_tables import write_csv
 
         write_csv([result], csv, force=force)
     if json:
@@ -156,7 +156,7 @@ def _table(
     work = partial(_line, options=options, robot=robot, found=None if csv is None else found)
     lines = each_session(paths, "analyse", work)
     if csv is not None:
-        from ..present.csv_tables import write_csv
+        from ..present.notebook.csv_tables import write_csv
 
         write_csv(found, csv, force=True)  # refused before the work began, if it was there
     if output is not None:

@@ -248,7 +248,8 @@ def plotjuggler_layout(plots: Sequence[JointPlot], duration_s: float) -> str:
         duration_s: Length of the time axes [s].
     """
     root = ET.Element("root")
-    window = ET.SubElement(root, "tabbed_widget", name="Main Window", parent="main_window")
+    names = {"name": "Main Window", "parent": "main_window"}
+    window = ET.SubElement(root, "tabbed_widget", names)
     for group in _groups(plots):
         tab = ET.SubElement(window, "Tab", tab_name=_title(group), containers="1")
         container = ET.SubElement(tab, "Container")

@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from mcap.records import Channel
 
@@ -178,16 +177,16 @@ def _metadata(log: RawLog, channels: list[Channel], copy: EditedLog, file: str) 
     return "\n".join(_yaml({"rosbag2_bagfile_information": facts})) + "\n"
 
 
-def _yaml(value: Mapping[str, Any] | list[Any], indent: str = "") -> list[str]:
+def _yaml(value: Any, indent: str = "") -> list[str]:
     """Return the lines of a tree as YAML; a text is written as in JSON, which YAML reads."""
     lines: list[str] = []
     if isinstance(value, list):
-        for item in value:
+        for item in cast("list[Any]", value):
             own = _yaml(item, indent + "  ") if isinstance(item, dict) else [json.dumps(item)]
             lines += [f"{indent}- {own[0].strip()}", *own[1:]]
         return lines
-    for key, item in value.items():
-        if isinstance(item, dict | list) and item:
+    for key, item in cast("dict[str, Any]", value).items():
+        if item and isinstance(item, dict | list):
             lines += [f"{indent}{key}:", *_yaml(item, indent + "  ")]
         else:
             lines.append(f"{indent}{key}: {json.dumps(item)}")

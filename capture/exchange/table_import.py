@@ -423,12 +423,11 @@ class _Topic:
         def write(row: int) -> None:
             if is_empty[row]:
                 return
-            cells = (position[row], velocity[row], effort[row])
-            channel = self._channel
+            channel, which = self._channel, slice(None)
             if not is_whole[row]:
                 channel, which = self._part(sampled[row])
-                cells = tuple(np.asarray(each)[which[: len(each)]] for each in cells)
-            channel.write(stamps[row], *cells)
+            cells: list[Any] = [position[row], velocity[row], effort[row]]
+            channel.write(stamps[row], *(each[which] if len(each) else each for each in cells))
             self._samples[self._name] = self._samples.get(self._name, 0) + 1
 
         return write

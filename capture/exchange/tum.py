@@ -110,7 +110,7 @@ def export_tum(
     if len(found.parents) > 1:
         warnings.append(f"the pose is given in several frames: {some_names(found.parents, 10)}")
     order = np.flatnonzero(usable)[np.argsort(found.t_ns[usable], kind="stable")]
-    parent = found.parents[0]
+    parent = next(iter(found.parents), "")
     with (
         part_file(output) as part,
         progress(f"export {output.name}", len(order)) as bar,

@@ -80,14 +80,14 @@ def wide_blocks(columns: Sequence[WideColumn], cells: int = _MOST_CELLS) -> Iter
     Args:
         cells: Rows times columns of a block, at most; a block has at least one sample a column.
     """
-    times = list({id(column.t_ns): column.t_ns for column in columns}.values())
+    times: list[IntArray] = list({id(each.t_ns): each.t_ns for each in columns}.values())
     step = max(1, cells // max(len(times) * len(columns), 1))
     at = dict.fromkeys(map(id, times), 0)
     total = sum(map(len, times))
     while any(at[id(t)] < len(t) for t in times):
         # The block ends where the first of the arrays has been read for one step. The n-th sample
         # of a time belongs to the n-th row of that time.
-        ends = [(int(t[k]), k - int(t.searchsorted(t[k])))
+        ends = [(int(t[k]), k - int(t.searchsorted(int(t[k]))))
                 for t in times if (k := at[id(t)] + step) < len(t)]  # fmt: skip
         stops = {id(t): _before(t, min(ends)) if ends else len(t) for t in times}
         parts = {id(t): slice(at[id(t)], stops[id(t)]) for t in times}
@@ -115,9 +115,10 @@ def _before(t_ns: IntArray, end: tuple[int, int]) -> int:
 def _rows(parts: Sequence[tuple[IntArray, slice]]) -> tuple[IntArray, list[IntArray]]:
     """Return the times of the rows of a block, and the rows of each part's samples."""
     t_ns = np.concatenate([t[part] for t, part in parts])
-    nth = np.concatenate(
-        [np.arange(part.start, part.stop) - t.searchsorted(t[part]) for t, part in parts]
-    )
+    each_nth: list[IntArray] = [
+        np.arange(part.start, part.stop) - t.searchsorted(t[part]) for t, part in parts
+    ]
+    nth = np.concatenate(each_nth)
     order = np.lexsort((nth, t_ns))
     is_new = np.ones(len(order), dtype=bool)
     is_new[1:] = (np.diff(t_ns[order]) != 0) | (np.diff(nth[order]) != 0)

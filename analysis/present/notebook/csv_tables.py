@@ -19,9 +19,9 @@ from undulog.capture.common.csv_text import as_text, csv_writer, number_cells
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import part_file
 
-from ..results.analysis import Analysis, GaitFacts, JointResult
-from ..results.experiment import Experiment
-from .notebook.frames import table
+from ...results.analysis import Analysis, GaitFacts, JointResult
+from ...results.experiment import Experiment
+from .frames import table
 
 SUFFIX = ".csv"
 
@@ -122,6 +122,6 @@ def _write(frame: pd.DataFrame, path: Path) -> None:
 def _cells(column: Any) -> list[object]:
     if column.dtype.kind == "f":
         return number_cells(column.to_numpy())
-    cells: list[object] = column.tolist()
+    cells: list[Any] = column.tolist()
     return ["" if pd.isna(cell) else as_text(cell) if isinstance(cell, str) else cell
             for cell in cells]  # fmt: skip
