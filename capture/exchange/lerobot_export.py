@@ -225,7 +225,7 @@ def _held(
         )
     if not np.isfinite(rounded).all():
         raise DataError(f"{session.path}: {topic}, {joint}: values that are too large for float32")
-    return HeldSignal(joint, t_ns[known], rounded)
+    return HeldSignal(joint, t_ns if known.all() else t_ns[known], rounded)
 
 
 def _losses(episode: Episode, fps: int) -> list[str]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,6 @@ from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.console import plain, refuse_existing
 from ..common.errors import DataError, MissingChannelError, UsageError, some_names
 from ..common.files import write_text
-from ..log.read.sample_times import JointSignals
 from ..log.read.session import Session
 from ..robot.model import Quantity
 
@@ -90,7 +89,7 @@ def export_foxglove_layout(
         LogWriteError: If the output can't be written.
     """
     _check(output, ".json", force=force)
-    plots, _, report = _plots(source, topics)
+    plots, _, report = _plots(source, output, topics)
     placed = [
         JointPlot(plot.joint, tuple(c for c in plot.curves if c.place is not None))
         for plot in plots
@@ -119,7 +118,7 @@ def export_plotjuggler_layout(
         force: Replace the file if it exists.
     """
     _check(output, ".xml", force=force)
-    plots, duration_s, report = _plots(source, topics)
+    plots, duration_s, report = _plots(source, output, topics)
     named = [plot for plot in plots if plain(plot.joint) == plot.joint]
     if odd := [plot.joint for plot in plots if plot not in named]:
         report.warnings.append(f"names that XML can't hold, left out: {some_names(odd, 10)}")
@@ -136,10 +135,12 @@ def _check(output: Path, suffix: str, *, force: bool) -> None:
     refuse_existing(output, force=force)
 
 
-def _plots(source: Path, topics: Sequence[str]) -> tuple[list[JointPlot], float, LayoutReport]:
+def _plots(
+    source: Path, output: Path, topics: Sequence[str]
+) -> tuple[list[JointPlot], float, LayoutReport]:
     """Return the plots of a session, its length [s], and the report to fill."""
     usual = [JOINT_TOPIC[Quantity.COMMAND], JOINT_TOPIC[Quantity.POSITION]]
-    with Session.open(source) as session:
+    with Session.open(source, column_folder=output.parent) as session:
         wanted = list(dict.fromkeys(topics)) or [t for t in usual if t in session.channels]
         if not wanted:
             missing = " and no ".join(usual)
@@ -148,7 +149,7 @@ def _plots(source: Path, topics: Sequence[str]) -> tuple[list[JointPlot], float,
         curves: dict[str, list[Curve]] = {}
         for number, topic in enumerate(wanted):
             signals = read[topic, "position"]
-            places = _places(session, signals)
+            places = _places(session.joint_orders(topic))
             color = _COLORS[number % len(_COLORS)]
             for joint, values in zip(signals.names, signals.values, strict=True):
                 finite = values[np.isfinite(values)]
@@ -160,18 +161,14 @@ def _plots(source: Path, topics: Sequence[str]) -> tuple[list[JointPlot], float,
     return [JointPlot(name, tuple(own)) for name, own in curves.items()], duration_s, report
 
 
-def _places(session: Session, signals: JointSignals) -> Mapping[str, int]:
+def _places(orders: Sequence[tuple[str, ...]]) -> dict[str, int]:
     """Return the place of each joint in the messages of a topic, if it is the same in all."""
-    paths = [f"name[{place}]" for place in range(len(signals.names))]
-    table = session.columns({}, {signals.topic: paths})[1][signals.topic]
-    places: dict[str, int] = {}
-    for place, path in enumerate(paths):
-        if path not in table:
-            continue
-        found = table[path].unique().tolist()
-        if len(found) == 1 and isinstance(found[0], str):
-            places[found[0]] = place
-    return places
+    first, *others = orders
+    return {
+        name: place
+        for place, name in enumerate(first)
+        if all(order[place : place + 1] == (name,) for order in others)
+    }
 
 
 def _groups(plots: Sequence[JointPlot]) -> Iterator[Sequence[JointPlot]]:

@@ -36,6 +36,7 @@ from .tables import arrow
 
 _MOST_COLUMNS = 2000
 _MOST_CELLS = 2_000_000  # of a block
+_FORGET_EVERY = 32  # blocks
 
 _QUANTITIES = {(topic, "position"): quantity for quantity, topic in JOINT_TOPIC.items()} | {
     (JOINT_TOPIC[Quantity.POSITION], "velocity"): Quantity.VELOCITY,
@@ -179,7 +180,9 @@ def export_wide(
             progress(f"export {output.name}", 1.0) as bar,
             open_table(part, names, start_ns) as write,
         ):
-            for block in wide_blocks(columns):
+            for number, block in enumerate(wide_blocks(columns)):
+                if number % _FORGET_EVERY == 0:
+                    session.forget()
                 write(block)
                 report.rows += len(block.t_ns)
                 bar.update(block.done)
