@@ -163,6 +163,8 @@ def part_folder(output: Path, *, marker: Path, force: bool) -> Generator[Path]:
             there.
         LogWriteError: If it can't be written; nothing is left behind then.
     """
+    if not output.name:
+        raise UsageError(f"{output}: name a folder to be made")
     part = output.with_name(f"{output.name}.part")
     if not output.is_dir():
         if output.exists():

@@ -16,7 +16,7 @@ import pandas as pd
 
 from undulog.capture.common.console import refuse_existing
 from undulog.capture.common.csv_text import as_text, csv_writer, number_cells
-from undulog.capture.common.errors import UsageError
+from undulog.capture.common.errors import OutputExistsError, UsageError
 from undulog.capture.common.files import part_file
 
 from ...results.analysis import Analysis, GaitFacts, JointResult
@@ -63,13 +63,18 @@ def check_csv(path: Path, *, force: bool) -> None:
         path: A name that ends in .csv, or a folder, which need not exist.
 
     Raises:
-        OutputExistsError: If the file is there and ``force`` is not given.
-        UsageError: If the name ends in anything else.
+        OutputExistsError: If the file, or one in the folder, is there and ``force`` is not given.
+        UsageError: If the name ends in anything else, or its folder doesn't exist.
     """
     if path.suffix.lower() == SUFFIX:
         refuse_existing(path, force=force)
     elif path.suffix and not path.is_dir():
         raise UsageError(f"{path}: end the name in .csv, or name a folder for all tables")
+    elif path.is_dir():
+        if not force and (there := next(path.glob(f"*{SUFFIX}"), None)):
+            raise OutputExistsError(there)
+    else:
+        refuse_existing(path, force=force)
 
 
 def write_csv(

@@ -180,6 +180,7 @@ def test_only_a_dataset_is_replaced(tmp_path, command, report_of):
     assert len(report_of(*line)["episodes"]) == 1
     assert "exists already" in command(*line, code=2).err
     command(*line, "--force")
+    assert "name a folder to be made" in command(*line[:-1], ".", code=2).err
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("x")
     other = (*line[:-1], tmp_path / "mine", "--force")

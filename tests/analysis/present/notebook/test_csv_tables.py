@@ -105,6 +105,7 @@ def test_what_is_refused(runs, tmp_path, command):
     line = ("analyse", runs / "r0.mcap", "--csv")
     assert "exists already" in command(*line, tmp_path / "x.csv", code=2).err
     assert "end the name in .csv" in command(*line, tmp_path / "x.xlsx", code=2).err
+    assert "doesn't exist" in command(*line, tmp_path / "no" / "all", code=2).err
     command(*line, tmp_path / "x.csv", "--force")
     snake = built_results.make_snake()
     with pytest.raises(UsageError, match="tables of 2 results"):
