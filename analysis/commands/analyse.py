@@ -81,11 +81,12 @@ def analyse(
     if output is not None:
         why = "the result file is JSON; end its name in .json (a page is made by undulog report)"
         check_output(output, (".json",), why, force=force)
+    one_by_one = len(paths) > 1 and (each or paths != [*map(as_path, files)])
     if csv is not None:
         from ..present.notebook.csv_tables import check_csv
 
-        check_csv(csv, force=force)
-    if len(paths) > 1 and (each or paths != [*map(as_path, files)]):
+        check_csv(csv, force=force, several=one_by_one)
+    if one_by_one:
         return _table(paths, options, robot, output, csv, as_json=json)
     if len(paths) == 1:
         result = _one(paths[0], options, null, robot)

@@ -109,11 +109,11 @@ class Episode:
     def frames(self, fps: int) -> int:
         """Return the number of frames."""
         end_ns = max(int(signal.t_ns[-1]) for signal in self._signals())
-        return (end_ns - self.start_ns) * fps // NS + 1
+        return ((end_ns - self.start_ns) * fps + fps // 2) // NS + 1
 
     def frame_ns(self, frames: IntArray, fps: int) -> IntArray:
-        """Return the times of frames [Unix ns], rounded down to a whole ns."""
-        return self.start_ns + frames * NS // fps
+        """Return the times of frames [Unix ns], rounded to a whole ns as an import has them."""
+        return self.start_ns + (frames * NS + fps // 2) // fps
 
     def names(self) -> dict[str, list[str]]:
         """Return the joints of each feature."""

@@ -56,11 +56,12 @@ def _windows(gait: GaitFacts, joint: JointResult) -> tuple[float, float, float]:
     return windows[0].start_s, windows[-1].stop_s, sum(one.cycles for one in windows)
 
 
-def check_csv(path: Path, *, force: bool) -> None:
+def check_csv(path: Path, *, force: bool, several: bool = False) -> None:
     """Check an output path before any work is done.
 
     Args:
         path: A name that ends in .csv, or a folder, which need not exist.
+        several: Whether several results go there, which takes a file.
 
     Raises:
         OutputExistsError: If the file, or one in the folder, is there and ``force`` is not given.
@@ -68,6 +69,8 @@ def check_csv(path: Path, *, force: bool) -> None:
     """
     if path.suffix.lower() == SUFFIX:
         refuse_existing(path, force=force)
+    elif several:
+        raise UsageError(f"{path}: a folder is for the tables of one result; end the name in .csv")
     elif path.suffix and not path.is_dir():
         raise UsageError(f"{path}: end the name in .csv, or name a folder for all tables")
     elif path.is_dir():
@@ -94,7 +97,7 @@ def write_csv(
         OutputExistsError: If a file is there and ``force`` is not given.
         LogWriteError: If one can't be written.
     """
-    check_csv(path, force=force)
+    check_csv(path, force=force, several=len(results) > 1)
     if path.suffix.lower() == SUFFIX:
         sessions = [
             one
@@ -102,11 +105,9 @@ def write_csv(
             for one in (result.sessions if isinstance(result, Experiment) else (result,))
         ]
         files = {path: joint_table(sessions)}
-    elif len(results) == 1:
+    else:
         path.mkdir(exist_ok=True)
         files = {path / f"{name}{SUFFIX}": frame for name, frame in results[0].frames().items()}
-    else:
-        raise UsageError(f"{path}: the tables of {len(results)} results; end the name in .csv")
     for file in files:
         refuse_existing(file, force=force)
     for file, frame in files.items():

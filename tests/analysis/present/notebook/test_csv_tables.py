@@ -106,9 +106,11 @@ def test_what_is_refused(runs, tmp_path, command):
     assert "exists already" in command(*line, tmp_path / "x.csv", code=2).err
     assert "end the name in .csv" in command(*line, tmp_path / "x.xlsx", code=2).err
     assert "doesn't exist" in command(*line, tmp_path / "no" / "all", code=2).err
+    every = ("analyse", runs, "--csv", tmp_path / "all")
+    assert "for the tables of one result" in command(*every, code=2).err
     command(*line, tmp_path / "x.csv", "--force")
     snake = built_results.make_snake()
-    with pytest.raises(UsageError, match="tables of 2 results"):
+    with pytest.raises(UsageError, match="tables of one result"):
         write_csv([snake, snake], tmp_path / "all")
     write_csv([snake], tmp_path / "all")
     with pytest.raises(OutputExistsError):
