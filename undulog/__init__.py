@@ -25,7 +25,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "record split": ("capture record_control:split", "Begin a new part of the recording."),
     "record stop": ("capture record_control:stop", "End the running recording in good order."),
     "record unit": ("capture record_control:unit", "Print a systemd unit for recordings."),
-    "import": ("capture import_export:import_log", "Bring in a foreign log: CAN traces, CSV."),
+    "import": ("capture import_log:import_log", "Bring in a foreign log: CAN traces, CSV."),
     "log info": ("capture log_info:log_info", "Show what a log holds."),
     "log check": (
         "capture log_info:log_check",
@@ -35,8 +35,8 @@ VERBS: dict[str, tuple[str, str]] = {
     "log cut": ("capture log_edit:log_cut", "Write a part of a log to a new file."),
     "log merge": ("capture log_edit:log_merge", "Put several logs into one new file."),
     "log export": (
-        "capture import_export:export_log",
-        "Write frames or joint columns for other tools.",
+        "capture log_export:log_export",
+        "Write sessions for other tools: frames, joints, datasets.",
     ),
     "robot list": ("capture robot:robot_list", "List the shipped robots."),
     "robot show": ("capture robot:robot_show", "Show a robot: joints, limits, sensors, bus."),

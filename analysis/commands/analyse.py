@@ -32,6 +32,7 @@ def analyse(
     *files: Path,
     json: bool = False,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    csv: Path | None = None,
     start: float | None = None,
     stop: float | None = None,
     command_topic: str = "/joint_commands",
@@ -52,11 +53,15 @@ def analyse(
 
     Example: `undulog analyse run.mcap --json -o run.json`
 
+    For a spreadsheet: `undulog analyse runs/ --csv joints.csv`
+
     Args:
         files: Sessions (MCAP), or their URLs; several are runs of one experiment. Folders of
             sessions or patterns, such as 'runs/**/*.mcap', give a table.
         json: Print the result as one JSON object; a table as a list of them.
         output: Write the JSON to this file too, a name that ends in .json.
+        csv: Write a row for each joint and session to this file, estimates with both ends of their
+            intervals; of one result a folder gets a file for each of its tables.
         start: Start of what is analysed, from the session's start [s]; chosen if not given.
         stop: Its end [s].
         command_topic: JointState topic of the commands.
@@ -76,14 +81,23 @@ def analyse(
     if output is not None:
         why = "the result file is JSON; end its name in .json (a page is made by undulog report)"
         check_output(output, (".json",), why, force=force)
-    if len(paths) > 1 and (each or paths != [*map(as_path, files)]):
-        return _table(paths, options, robot, output, as_json=json)
+    one_by_one = len(paths) > 1 and (each or paths != [*map(as_path, files)])
+    if csv is not None:
+        from ..present.notebook.csv_tables import check_csv
+
+        check_csv(csv, force=force, several=one_by_one)
+    if one_by_one:
+        return _table(paths, options, robot, output, csv, as_json=json)
     if len(paths) == 1:
         result = _one(paths[0], options, null, robot)
     else:
         result = _experiment(paths, options, robot, as_json=json)
     if output is not None:
         result.save(output, force=True)  # refused before the work began, if it was there
+    if csv is not None:
+        from ..present.notebook.csv_tables import write_csv
+
+        write_csv([result], csv, force=force)
     if json:
         emit_json(result.to_dict())
         return 0
@@ -134,24 +148,36 @@ def _table(
     options: Options,
     robot: str | None,
     output: Path | None,
+    csv: Path | None,
     *,
     as_json: bool,
 ) -> int:
     """Analyse sessions one by one and print a table, or a list of results."""
-    lines = each_session(paths, "analyse", partial(_line, options=options, robot=robot))
+    found: list[Analysis] = []
+    work = partial(_line, options=options, robot=robot, found=None if csv is None else found)
+    lines = each_session(paths, "analyse", work)
+    if csv is not None:
+        from ..present.notebook.csv_tables import write_csv
+
+        write_csv(found, csv, force=True)  # refused before the work began, if it was there
     if output is not None:
         facts = [line.facts for line in lines.values()]
         write_text(output, dumps(facts, indent=2, allow_nan=False) + "\n")
     return show_table(lines, as_json=as_json)
 
 
-def _line(file: Path, *, options: Options, robot: str | None) -> Line:
+def _line(
+    file: Path, *, options: Options, robot: str | None, found: list[Analysis] | None = None
+) -> Line:
     from undulog.capture import Session
 
     from ..session.analyse import analyse_session
 
     with Session.open(file, robot=robot) as session:
-        return line_of(analyse_session(session, options))
+        analysis = analyse_session(session, options)
+    if found is not None:
+        found.append(analysis)
+    return line_of(analysis)
 
 
 def line_of(analysis: Analysis) -> Line:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from ..signals.stretch import Options
 
 
+_Format = Literal["svg", "png", "pdf"]
+
+
 def report(
     *files: Path,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
@@ -31,6 +35,8 @@ def report(
     command_topic: str = "/joint_commands",
     response_topic: str = "/joint_states",
     robot: str | None = None,
+    plots: Path | None = None,
+    format_: Annotated[_Format, Parameter(name="--format")] = "svg",
     force: bool = False,
     json: bool = False,
 ) -> int:
@@ -45,6 +51,8 @@ def report(
 
     A page a session: `undulog report runs/ -o pages/`
 
+    Its figures as files: `undulog report run.mcap -o run.html --plots figures --format pdf`
+
     Args:
         files: Sessions (MCAP), their URLs, folders of them or patterns such as 'runs/**/*.mcap';
             several are runs of one experiment.
@@ -57,7 +65,10 @@ def report(
         command_topic: JointState topic of the commands.
         response_topic: JointState topic of the responses.
         robot: Description of the robot of a log without one, a name or a TOML file.
-        force: Replace the page if it exists.
+        plots: Write each figure of the page to a file in this folder; of several pages, in a folder
+            of the page's name in it.
+        format_: Format of these files.
+        force: Replace the page, and figures, if they exist.
         json: Print one JSON object: the page, the answer, and the answer to each session; of a
             folder of pages a list of them.
     """
@@ -73,24 +84,60 @@ def report(
     if catalog is not None and options != chosen(None, None, "/joint_commands", "/joint_states"):
         raise UsageError("--catalog shows results as they are; leave out window and topics")
     paths = sessions_of(files)
+    figures = None if plots is None else _Figures(plots, format_, force=force)
     if len(paths) > 1 and (output.is_dir() or not output.suffix):
-        return _pages(paths, options, robot, output, force=force, as_json=json)
+        return _pages(paths, options, robot, output, figures, force=force, as_json=json)
     check_output(output, PAGES, "the report is an HTML page; end its name in .html", force=force)
-    if catalog is not None:
-        page, facts, warnings = _fleet(catalog, find, output)
-    elif len(paths) == 1:
-        page, facts, warnings = _one(paths[0], options, robot)
-    else:
-        page, facts, warnings = _several(paths, options, robot)
+    with _keeping(figures) as drawn:
+        if catalog is not None:
+            page, facts, warnings = _fleet(catalog, find, output)
+        elif len(paths) == 1:
+            page, facts, warnings = _one(paths[0], options, robot)
+        else:
+            page, facts, warnings = _several(paths, options, robot)
     write_text(output, page)
+    written = figures.save(page, drawn) if figures else []
     size = output.stat().st_size
     if json:
-        emit_json({"page": str(output), "bytes": size, **facts})
+        more = {"plots": [str(path) for path in written]} if figures else {}
+        emit_json({"page": str(output), "bytes": size, **facts, **more})
         return 0
     echo(facts["answer"])
     noted = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
     echo(f"{output}: {size / 1e3:.0f} kB{noted}")
+    if figures:
+        echo(f"{plots}: {', '.join(path.name for path in written) or 'no figure in the page'}")
     return 0
+
+
+def _keeping(figures: _Figures | None) -> AbstractContextManager[Mapping[str, Any]]:
+    """Keep the figures that are drawn, if they are wanted."""
+    if figures is None:
+        return nullcontext({})
+    from ..present.page.svg import kept_figures
+
+    return kept_figures()
+
+
+class _Figures:
+    """Where the figures of pages go, and as what."""
+
+    def __init__(self, folder: Path, kind: _Format, *, force: bool) -> None:
+        from ..present.notebook.plot_files import check_plots
+
+        check_plots(folder, kind, force=force)
+        self._folder, self._force = folder, force
+        self._kind: _Format = kind
+
+    def save(self, page: str, drawn: Mapping[str, Any], name: str | None = None) -> list[Path]:
+        """Write the figures of a page, into a folder of a name in the folder if there is one."""
+        from ..present.notebook.plot_files import save_plots
+
+        folder = self._folder
+        if name is not None:
+            folder.mkdir(exist_ok=True)
+            folder /= name
+        return save_plots(page, drawn, folder, self._kind, force=self._force)
 
 
 def _one(file: Path, options: Options, robot: str | None) -> tuple[str, dict[str, Any], int]:
@@ -122,6 +169,7 @@ def _pages(
     options: Options,
     robot: str | None,
     folder: Path,
+    figures: _Figures | None,
     *,
     force: bool,
     as_json: bool,
@@ -138,8 +186,11 @@ def _pages(
     def written(path: Path) -> Line:
         page = folder / pages[path]
         refuse_existing(page, force=force)
-        text, analysis = _page(path, options, robot)
+        with _keeping(figures) as drawn:
+            text, analysis = _page(path, options, robot)
         write_text(page, text)
+        if figures:
+            figures.save(text, drawn, page.stem)
         return replace(line_of(analysis), facts={"page": str(page), **_summary(analysis)})
 
     lines = each(paths, "report", written)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 import socket
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager, suppress
@@ -13,7 +14,15 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from .console import refuse_existing
-from .errors import Fault, FaultyFileError, InputFileError, LogWriteError, UndulogError, UsageError
+from .errors import (
+    Fault,
+    FaultyFileError,
+    InputFileError,
+    LogWriteError,
+    OutputExistsError,
+    UndulogError,
+    UsageError,
+)
 from .process import StopRequest
 from .strict_table import listed
 
@@ -136,6 +145,52 @@ def part_file(output: Path) -> Generator[Path]:
     finally:
         with suppress(OSError):  # what stopped the writing may stop this too
             part.unlink(missing_ok=True)
+
+
+@contextmanager
+def part_folder(output: Path, *, marker: Path, force: bool) -> Generator[Path]:
+    """Make ``OUTPUT.part``, and rename it on leaving without an exception.
+
+    Args:
+        output: The folder wanted.
+        marker: A file, relative to the folder, by which it is one of its kind: no other folder is
+            replaced.
+        force: Replace an existing one.
+
+    Raises:
+        OutputExistsError: If the output is there and ``force`` is not given.
+        UsageError: If it may not be replaced, its folder doesn't exist, or ``OUTPUT.part`` is
+            there.
+        LogWriteError: If it can't be written; nothing is left behind then.
+    """
+    if not output.name:
+        raise UsageError(f"{output}: name a folder to be made")
+    part = output.with_name(f"{output.name}.part")
+    if not output.is_dir():
+        if output.exists():
+            raise UsageError(f"{output} is a file; name a folder")
+        refuse_existing(output, force=force)
+    elif any(output.iterdir()):
+        if not (output / marker).is_file():
+            raise UsageError(
+                f"{output} has files but no {marker}: it is not replaced; name another"
+            )
+        if not force:
+            raise OutputExistsError(output)
+    if part.exists():
+        raise UsageError(f"{part} is left of an export that was ended; remove it first")
+    try:
+        part.mkdir()
+        yield part
+        if output.exists():
+            shutil.rmtree(output)
+        part.rename(output)
+    except OSError as error:
+        if isinstance(error, UndulogError):
+            raise
+        raise LogWriteError(output, f"can't be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def write_text(output: Path, text: str) -> None:

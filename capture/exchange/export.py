@@ -7,26 +7,23 @@ of its topic, and nothing in the columns of other topics. Nothing is resampled o
 that were sampled one after the other have rows at different times. Rows are sorted by time within a
 topic.
 
-A spreadsheet takes text in a CSV that begins with ``=``, ``+``, ``-`` or ``@`` for a formula. So
-a name of a topic, a joint or a column that begins with such a character, with a tab, a line end or
-an apostrophe has an apostrophe before it in CSV, and only there: take one leading apostrophe away
-to have the name. Numbers are never changed.
+Names in a CSV are escaped as :mod:`.capture.common.csv_text` says.
 """
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import FloatArray, IntArray
 from ..common.console import progress, refuse_existing
+from ..common.csv_text import as_text, csv_writer, number_cells
 from ..common.errors import MissingChannelError, MissingExtraError, UsageError
 from ..common.files import check_stop, part_file
 from ..common.process import StopRequest
@@ -83,7 +80,7 @@ def export_log(
         LogWriteError: If the output can't be written or the export was stopped; nothing is left
             behind then.
     """
-    chosen = _chosen(FRAME_FORMATS, "format", source, output, force=force)
+    chosen = chosen_format(FRAME_FORMATS, "format", source, output, force=force)
     tally = LossTally()
     with Session.open(source) as session:
         facts = frame_facts(session, chosen_buses(session, bus))
@@ -107,7 +104,7 @@ def export_log(
     return ExportReport(chosen.title, counts, warnings)
 
 
-def _chosen(
+def chosen_format(
     formats: Mapping[str, _Format], what: str, source: Path, output: Path, *, force: bool
 ) -> _Format:
     """Return the format by the suffix of the output, which must not be the session itself."""
@@ -122,8 +119,6 @@ def _chosen(
 
 _MOST_TOPICS = 500
 _ROWS_PER_BLOCK = 100_000
-_FORMULA = tuple("=+-@\t\r\n'＝＋－＠")
-"""How text begins that a spreadsheet may run, and the apostrophe that marks it as text."""
 
 
 @dataclass
@@ -187,15 +182,15 @@ def export_columns(
         LogWriteError: If the output can't be written or the export was stopped; nothing is left
             behind then.
     """
-    open_table = _chosen(TABLE_FORMATS, "table", source, output, force=force)
+    open_table = chosen_format(TABLE_FORMATS, "table", source, output, force=force)
     with Session.open(source) as session:
-        chosen = _topics(session, topics)
+        chosen = joint_topics(session, topics)
         if len(chosen) > _MOST_TOPICS:
             raise UsageError(
                 f"{source} has {len(chosen)} joint topics; a table takes at most {_MOST_TOPICS}: "
                 "name those that you want with --topics"
             )
-        wanted = {topic: _columns(session, topic) for topic in chosen}
+        wanted = {topic: joint_fields(session, topic) for topic in chosen}
         columns = [name for found in wanted.values() for name in found.values()]
         report = ColumnReport(["t_ns", "topic", "joint", *columns])
         with (
@@ -221,19 +216,20 @@ def export_columns(
 def _open_csv(path: Path, columns: Sequence[str]) -> Generator[WriteRows]:
     """Write CSV in UTF-8; floats with all digits that are needed, NaN as an empty cell."""
     with path.open("w", encoding="utf-8", newline="") as stream:
-        head = ["t_ns", "topic", "joint", *map(_as_text, columns)]
-        _writer(stream, head).writerow(head)
+        head = ["t_ns", "topic", "joint", *map(as_text, columns)]
+        csv_writer(stream, head).writerow(head)
 
         def write(block: RowBlock) -> None:
             empty = [""] * len(block.t_ns)
             cells = [
-                _cells(block.values[name]) if name in block.values else empty for name in columns
+                number_cells(block.values[name]) if name in block.values else empty
+                for name in columns
             ]
             row_joints: list[int] = block.joint.tolist()
-            names = [_as_text(name) for name in block.names]
+            names = [as_text(name) for name in block.names]
             joints = [names[j] for j in row_joints]
-            topics = [_as_text(block.topic)] * len(joints)
-            writer = _writer(stream, [*names, *topics[:1]])
+            topics = [as_text(block.topic)] * len(joints)
+            writer = csv_writer(stream, [*names, *topics[:1]])
             writer.writerows(zip(block.t_ns.tolist(), topics, joints, *cells, strict=True))
 
         yield write
@@ -277,26 +273,12 @@ TABLE_FORMATS = {".csv": _open_csv, ".parquet": _open_parquet}
 """Suffix to the function that creates a table with columns of some names."""
 
 
-def _writer(stream: TextIO, texts: Sequence[str]) -> Any:
-    """Return a writer of rows with some texts, quoted if one has a carriage return."""
-    odd = any("\r" in text for text in texts)  # the module doesn't quote for it
-    quoting = csv.QUOTE_NONNUMERIC if odd else csv.QUOTE_MINIMAL
-    return csv.writer(stream, lineterminator="\n", quoting=quoting)
+def joint_topics(session: Session, wanted: Sequence[str]) -> list[str]:
+    """Return the requested JointState topics; if none, commands and what the joints measure.
 
-
-def _as_text(name: str) -> str:
-    """Escape a name that a spreadsheet takes for a formula."""
-    return f"'{name}" if name.startswith(_FORMULA) else name
-
-
-def _cells(values: FloatArray) -> list[object]:
-    cells: list[object] = values.tolist()
-    for row in np.flatnonzero(np.isnan(values)).tolist():
-        cells[row] = ""
-    return cells
-
-
-def _topics(session: Session, wanted: Sequence[str]) -> list[str]:
+    Raises:
+        MissingChannelError: If none are requested and the session has none.
+    """
     if wanted:
         return list(dict.fromkeys(wanted))
     joint = [t for t, channel in session.channels.items() if channel.type_name == JOINT_STATE]
@@ -305,7 +287,7 @@ def _topics(session: Session, wanted: Sequence[str]) -> list[str]:
     return [topic for topic in JOINT_TOPIC.values() if topic in joint] or sorted(joint)
 
 
-def _columns(session: Session, topic: str) -> dict[str, str]:
+def joint_fields(session: Session, topic: str) -> dict[str, str]:
     """Return the fields that a topic carries, with the names of their columns."""
     found: dict[str, str] = {}
     for name in UNITS:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from ..bus.decoded_topics import JOINT_TOPIC
-from ..common.arrays import FloatArray, IntArray
+from ..common.arrays import BoolArray, FloatArray, IntArray
+from ..log.write.channels import JointStateChannel
 from ..log.write.writer import SessionWriter
 from ..robot.bus_map import SESSION_UNIT
 from ..robot.model import Quantity
 
 _WITH_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
 """What stands beside a position of the same row."""
+
+_MOST_PARTS = 128
+"""Sets of joints that have a value together; in further ones the others have NaN."""
 
 
 def topics_of(present: set[Quantity]) -> Iterator[tuple[Quantity, ...]]:
@@ -50,9 +55,10 @@ class JointTopic:
             self.name, self._joints, unit=SESSION_UNIT[quantities[0]],
             velocity=velocity, effort=effort,
         )  # fmt: skip
+        self._parts: dict[bytes, JointStateChannel] = {}
 
     def write(self, t_ns: IntArray, values: Mapping[tuple[str, Quantity], FloatArray]) -> int:
-        """Write the rows that have any value; a missing one is NaN.
+        """Write the rows that have any value; a joint without any value in a row has no sample.
 
         Args:
             t_ns: Times of the rows [Unix ns], shape (n,).
@@ -66,11 +72,29 @@ class JointTopic:
             for k, joint in enumerate(self._joints):
                 if (cells := values.get((joint, quantity))) is not None:
                     field[:, k] = cells
-        filled = ~np.isnan(fields).all(axis=(0, 2))
+        sampled: BoolArray = ~np.all(np.isnan(fields), axis=0)
+        filled = np.any(sampled, axis=1)
         if not filled.all():
-            t_ns, fields = t_ns[filled], fields[:, filled]
-        none = np.empty((len(t_ns), 0))
-        rest = iter(fields[1:])
-        velocity, effort = (next(rest) if present else none for present in self._rest)
-        self._channel.write_rows(t_ns, fields[0], velocity, effort)
+            t_ns, fields, sampled = t_ns[filled], fields[:, filled], sampled[filled]
+        if not len(t_ns):
+            return 0
+        changes = np.flatnonzero(np.any(sampled[1:] != sampled[:-1], axis=1)) + 1
+        edges = [0, *changes.tolist(), len(t_ns)]
+        for start, stop in pairwise(edges):
+            channel, which = self._part(sampled[start])
+            rows = iter(fields[:, start:stop, which])
+            none = np.empty((stop - start, 0))
+            position = next(rows)
+            velocity, effort = (next(rows) if present else none for present in self._rest)
+            channel.write_rows(t_ns[start:stop], position, velocity, effort)
         return len(t_ns)
+
+    def _part(self, sampled: BoolArray) -> tuple[JointStateChannel, BoolArray]:
+        """Return the channel of some joints, and which they are; all if there are too many sets."""
+        key = sampled.tobytes()
+        if key not in self._parts and not sampled.all() and len(self._parts) < _MOST_PARTS:
+            names = [name for name, is_in in zip(self._joints, sampled, strict=True) if is_in]
+            self._parts[key] = self._channel.part(names)
+        if key not in self._parts:
+            return self._channel, np.ones_like(sampled)
+        return self._parts[key], sampled

@@ -35,7 +35,8 @@ from .parquet_files import read_parquet, vectors_of
 from .table_import import TableSet, import_tables
 from .tables import TableFile
 
-_FEATURES = {"action": Quantity.COMMAND, "observation.state": Quantity.POSITION}
+FEATURES = {"action": Quantity.COMMAND, "observation.state": Quantity.POSITION}
+"""Feature to what it is of each joint."""
 _MOST_INFO = 1 << 24  # bytes
 _MOST_JOINTS = 1024
 _MOST_TASKS = 1 << 16
@@ -99,9 +100,9 @@ def open_lerobot(folder: Path) -> LeRobotDataset:
         info = json.loads(path.read_text(encoding="utf-8"))
         features = cast("dict[str, Any]", info["features"])
         fps = float(info["fps"])
-        names = {name: _element_names(features[name]) for name in _FEATURES if name in features}
+        names = {name: _element_names(features[name]) for name in FEATURES if name in features}
         version, kind = str(info.get("codebase_version", "")), str(info.get("robot_type") or "")
-        others = tuple(n for n in features if n not in _FEATURES and n not in _KNOWN)
+        others = tuple(n for n in features if n not in FEATURES and n not in _KNOWN)
     except LogError:
         raise
     except (
@@ -197,7 +198,7 @@ def _map(dataset: LeRobotDataset, units: Mapping[str, str]) -> tuple[ColumnMap, 
     notes = [f"times made from the frame number and fps = {dataset.fps:g}, as the dataset has them"]
     columns: list[Column] = []
     for feature, names in dataset.names.items():
-        quantity = _FEATURES[feature]
+        quantity = FEATURES[feature]
         unit = units.get(quantity, "")
         if not unit:
             unit = SESSION_UNIT[quantity]

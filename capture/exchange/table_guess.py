@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError, UsageError, some_names
+from ..common.strict_table import NAME_PATTERN
 from ..robot.bus_map import JOINT_QUANTITIES, SESSION_UNIT, TIME_UNITS, UNITS, valid_units
 from ..robot.description import numbered
 from ..robot.model import Quantity
@@ -49,6 +50,11 @@ _UNIT_WORDS = {
     "°": "deg", "sec": "s", "seconds": "s", "secs": "s",
 }  # fmt: skip
 _BY_LOWER = {name.lower(): name for name in UNITS} | _UNIT_WORDS
+_STATED = re.compile(
+    rf"(?P<joint>{NAME_PATTERN.pattern})\.(?P<quantity>{'|'.join(JOINT_QUANTITIES)}) "
+    rf"\[(?P<unit>{'|'.join(map(re.escape, UNITS))})\]"
+)
+"""A name as :mod:`.capture.exchange.wide_table` writes it, which leaves nothing to guess."""
 _WRAPS = (2 * math.pi, 4 * math.pi, 360.0, 720.0)
 _PLURAL = {Quantity.VELOCITY: "velocities"}
 _USUAL_HZ = 100.0
@@ -204,6 +210,8 @@ def _named_unit(name: str, valid: Sequence[str]) -> str:
 
 
 def _meaning(name: str, role: str, *, headerless: bool) -> _Name:
+    if stated := _STATED.fullmatch(name):
+        return _Name(Quantity(stated["quantity"]), stated["joint"], None, stated["unit"])
     if headerless:
         quantity = Quantity.COMMAND if role == COMMANDS else Quantity.POSITION
         return _Name(quantity, "", int(re.findall(r"\d+", name)[0]) - 2, "")
@@ -301,7 +309,8 @@ def _columns(  # noqa: PLR0917 - each is filled or read here
         unit = units.get(quantity) or (meaning.unit if _fits(meaning.unit, quantity) else "")
         if not unit:
             assumed[quantity] = unit = SESSION_UNIT[quantity]
-        wrap = _wrap(samples[role][name], quantity, unit)
+        stated = _STATED.fullmatch(name) is not None
+        wrap = 0.0 if stated else _wrap(samples[role][name], quantity, unit)
         if wrap:
             said.append(f"{name} jumps by {wrap:.6g} {unit}: taken as wrapping around, undone")
         columns.append(Column(name, joint, quantity, unit, wrap=wrap, table=role))

@@ -378,9 +378,9 @@ class _Source:
             turns = np.unwrap(np.concatenate([[before[0]], raw]), period=column.wrap)
             values[known] = turns[1:] + (before[1] - before[0])
             self._unwrapped[name] = (raw[-1], values[known][-1])
-        if (column.scale, column.offset) != (1.0, 0.0):
-            values = column.scale * values + column.offset
-        return unit_for(column.unit, column.quantity).convert(values)
+        scaled = values if column.scale == 1.0 else column.scale * values
+        unit = unit_for(column.unit, column.quantity)
+        return unit.convert(scaled + column.offset if column.offset else scaled)  # keeps -0.0
 
 
 def _exact_ns(text: str, unit_ns: int) -> int:

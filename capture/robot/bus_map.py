@@ -41,9 +41,8 @@ class Unit:
 
     def convert(self, values: FloatArray) -> FloatArray:
         """Return values in the session's unit, ``factor * values + offset``."""
-        if (self.factor, self.offset) == (1.0, 0.0):
-            return values
-        return values * self.factor + self.offset
+        scaled = values if self.factor == 1.0 else values * self.factor
+        return scaled + self.offset if self.offset else scaled  # keeps -0.0
 
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, 3rd CGPM 1901

@@ -16,6 +16,7 @@ import re
 import warnings
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 from xml.etree import ElementTree as ET
@@ -121,6 +122,20 @@ def drawing(height_in: float, width_in: float = WIDTH_IN) -> Generator[Figure]:
         yield _Figure(figsize=(width_in, height_in), layout="constrained")
 
 
+_kept: ContextVar[dict[str, Figure] | None] = ContextVar("figures", default=None)
+
+
+@contextmanager
+def kept_figures() -> Generator[dict[str, Figure]]:
+    """Keep the figures that :func:`inline_svg` writes meanwhile, by their prefix."""
+    found: dict[str, Figure] = {}
+    token = _kept.set(found)
+    try:
+        yield found
+    finally:
+        _kept.reset(token)
+
+
 def inline_svg(
     figure: Figure, prefix: str, title: str, description: str, tooltips: Mapping[str, str] = {}
 ) -> str:
@@ -137,6 +152,8 @@ def inline_svg(
         The element, without XML declaration, document type, metadata, date or outside reference.
     """
     root = _drawn(figure)
+    if (kept := _kept.get()) is not None:
+        kept[prefix] = figure
     for parent in list(root.iter()):
         for child in list(parent):
             if child.tag in (f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"):

@@ -17,7 +17,7 @@ from ...robot.model import Robot
 from ...robot.run import RUN_RECORD, Run, run_from_record, run_from_scenario
 from ..columns.blocks import Window
 from ..columns.columns import Messages
-from ..columns.layouts import Group
+from ..columns.layouts import Group, names_of
 from ..columns.topics import Topics
 from ..file.log_file import LogFile
 from ..messages.frames import FrameArray, join_batches
@@ -96,6 +96,12 @@ class OpenLog:
     ) -> dict[tuple[str, str], JointSignals]:
         """Read signals in one pass; see :meth:`.SessionView.joint_columns`."""
         return self._joints.read(wanted, window_ns, self._chain)
+
+    def joint_orders(self, topic: str, window_ns: Window) -> list[tuple[str, ...]]:
+        """See :meth:`.SessionView.joint_orders`."""
+        found = self.topics.read({topic: ()}, window_ns)[topic]
+        orders = dict.fromkeys(names_of(group.layout) for group in found.groups)
+        return [*orders, *([()] if found.unread else [])]
 
     def tables(
         self, wanted: Mapping[str, Sequence[str] | None], window_ns: Window

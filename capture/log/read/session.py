@@ -315,6 +315,23 @@ class SessionView:
             for field in fields
         }
 
+    def joint_orders(self, topic: str) -> list[tuple[str, ...]]:
+        """Return the lists of joints that messages of a JointState topic have, as they have them.
+
+        Args:
+            topic: E.g. ``/joint_states``.
+
+        Returns:
+            Each different list once, in order of first appearance; an empty one for messages that
+            can't be read.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If its type can't be read.
+        """
+        self._on_read()
+        return self._log.joint_orders(self._logged(topic), self._within(None, None))
+
     def table(
         self, topic: str, *, start_ns: int | None = None, stop_ns: int | None = None
     ) -> pd.DataFrame:

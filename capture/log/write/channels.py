@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...common.arrays import NS, FloatArray, IntArray
 from ...common.errors import DataError
-from ..messages.cdr import Leaf, encode
-from ..messages.definitions import DiagnosticStatus, message_type
+from ..messages.cdr import Leaf, encode, layout_of
+from ..messages.definitions import JOINT_STATE, DiagnosticStatus, message_type
 from ..messages.frames import (
     FD_FRAME_DTYPE,
     FD_FRAME_LAYOUT,
@@ -195,6 +195,17 @@ class JointStateChannel(_Stamped):
             if len(view):
                 values[path] = numbers
         self._template.emit_rows(t_ns, values)
+
+    def part(self, names: Sequence[str]) -> JointStateChannel:
+        """Return the channel for messages of some of the joints only, with the same fields."""
+        kind, zeros = message_type(JOINT_STATE), [0.0] * len(names)
+        fields = zip(self._fields, self._views, strict=True)
+        values = {field: zeros if len(view) else [] for field, view in fields}
+        example = encode(kind, {"name": list(names), **values})
+        leaves = layout_of(kind, example).leaves
+        whole = self._template
+        template = Template(bytearray(example), leaves, whole.send, whole.send_rows)
+        return JointStateChannel(template)
 
 
 class OdometryChannel(_Stamped):

@@ -279,7 +279,7 @@ def test_the_verb_lists_what_is_lost(session_of_every_kind, tmp_path, command):
     report = json.loads(command(*export, "--force", "--json").out)
     assert (report["warnings"], report["buses"]) == ([loss], {"can0": len(frames)})
     refused = command(*export, "--force", "--topics", "/x", code=2).err
-    assert "--topics is for tables; a .blf file has CAN frames" in refused
+    assert "--topics is for tables and layouts; a .blf file has CAN frames" in refused
 
 
 EXPORTS = [

@@ -1,4 +1,4 @@
-"""Commands ``import`` and ``log export``."""
+"""Command ``import``: a foreign log in, a session out."""
 
 from __future__ import annotations
 
@@ -117,70 +117,6 @@ def import_log(
     answer = facts[0] if len(facts) == 1 else {"sessions": facts}
     emit(answer, (line for report in reports for line in _import_lines(report)), as_json=json)
     return 0 if all(report.complete for report in reports) else 1
-
-
-def export_log(
-    session: Path,
-    /,
-    *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
-    bus: str | None = None,
-    topics: Annotated[tuple[str, ...], Parameter(consume_multiple=True, show_default=False)] = (),
-    force: bool = False,
-    json: bool = False,
-) -> None:
-    """Write a session for other tools: its raw CAN frames, or its joint columns as a table.
-
-    The suffix of the output selects the format. Frames: .log (candump), .blf and .asc (Vector),
-    .mcap (ROS 2, one can_msgs/msg/Frame a frame). Columns: .csv and .parquet, one row a sample of a
-    joint at its own time. What a format can't hold is counted in a warning.
-
-    Example: `undulog log export run.mcap -o trace.log`
-
-    For Vector's tools: `undulog log export run.mcap -o trace.blf`, or `-o trace.asc`
-
-    For ROS 2: `undulog log export run.mcap -o frames.mcap`
-
-    For pandas: `undulog log export run.mcap -o run.csv`, or `-o states.parquet --topics
-    /joint_states`
-
-    Args:
-        session: The session.
-        output: The file to write.
-        bus: The bus whose frames to write; all by default.
-        topics: The JointState topics whose columns to write; commands and whatever the joints
-            measure by default.
-        force: Replace an existing output.
-        json: Report as one JSON object.
-    """
-    from ..common.process import interruptible
-    from ..exchange.export import TABLE_FORMATS, export_columns
-    from ..exchange.export import export_log as export_frames
-    from ..exchange.frame_formats import FRAME_FORMATS
-
-    suffix = output.suffix.lower()
-    if suffix not in FRAME_FORMATS and suffix not in TABLE_FORMATS:
-        valid = ", ".join([*FRAME_FORMATS, *TABLE_FORMATS])
-        raise UsageError(f"{output}: no format has the suffix {suffix!r}; valid: {valid}")
-    with interruptible() as stop:
-        if suffix in TABLE_FORMATS:
-            if bus is not None:
-                raise UsageError(f"--bus is for CAN frames; a {suffix} file has joint columns")
-            table = export_columns(session, output, topics=topics, force=force, stop=stop)
-            counts = {"rows": sum(table.rows.values()), "topics": table.rows}
-            what = f"{counts['rows']} rows of {', '.join(table.rows)}"
-            warnings = table.warnings
-        else:
-            if topics:
-                raise UsageError(f"--topics is for tables; a {suffix} file has CAN frames")
-            trace = export_frames(session, output, bus=bus, force=force, stop=stop)
-            counts = {"frames": sum(trace.buses.values()), "buses": trace.buses}
-            what = f"{counts['frames']} frames of {', '.join(trace.buses)}, "
-            what += f"in the format of {trace.title}"
-            warnings = trace.warnings
-    facts = {"source": str(session), "output": str(output), **counts, "warnings": warnings}
-    lines = [f"{output}: {what}", *(f"  warning: {warning}" for warning in warnings)]
-    emit(facts, lines, as_json=json)
 
 
 def _is_table(log: Path) -> bool:

@@ -1,0 +1,315 @@
+"""Joint columns of a session as a wide table: a column for each joint and quantity.
+
+Columns: ``t_ns`` (Unix ns), ``time [s]`` (from the first row), then ``JOINT.QUANTITY [UNIT]``, as
+``joint01.command [rad]`` or ``joint01.velocity [rad/s]``; fields that are no quantity of the log
+contract are ``JOINT.TOPIC.FIELD [UNIT]``.
+
+Each joint has sampling times of its own. There is a row for every time at which some joint was
+sampled, and a row holds the samples of exactly that time: nothing is resampled or filled in. The
+other cells are empty in CSV and null in Parquet; ``nan`` is a sample without a number. Samples of
+one joint that repeat a time have as many rows of that time, in their order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..bus.decoded_topics import JOINT_TOPIC
+from ..common.arrays import NS, FloatArray, IntArray
+from ..common.console import progress
+from ..common.csv_text import as_text, csv_writer
+from ..common.errors import DataError, UsageError, some_names
+from ..common.files import check_stop, part_file
+from ..common.process import StopRequest
+from ..common.strict_table import NAME_PATTERN
+from ..log.read.session import Session
+from ..robot.bus_map import SESSION_UNIT
+from ..robot.model import Quantity
+from .export import chosen_format, joint_fields, joint_topics
+from .parquet_files import arrow
+
+_MOST_COLUMNS = 2000
+_MOST_CELLS = 2_000_000  # of a block
+_FORGET_EVERY = 32  # blocks
+
+_QUANTITIES = {(topic, "position"): quantity for quantity, topic in JOINT_TOPIC.items()} | {
+    (JOINT_TOPIC[Quantity.POSITION], "velocity"): Quantity.VELOCITY,
+    (JOINT_TOPIC[Quantity.POSITION], "effort"): Quantity.EFFORT,
+}
+"""Topic and field to the quantity that they hold."""
+
+
+@dataclass(frozen=True)
+class WideColumn:
+    """One quantity of one joint.
+
+    Attributes:
+        t_ns: Sampling times [Unix ns], not decreasing, shape (n,); columns that were sampled
+            together may share one array.
+        values: Shape (n,), NaN where a sample has no number.
+    """
+
+    name: str
+    t_ns: IntArray
+    values: FloatArray
+
+
+@dataclass(frozen=True)
+class WideBlock:
+    """Rows of a wide table.
+
+    Attributes:
+        t_ns: Times [Unix ns], not decreasing, shape (n,).
+        cells: Rows and values, shape (k,) each, of every column that has some.
+        done: Share of the samples that this block and those before it hold.
+    """
+
+    t_ns: IntArray
+    cells: dict[str, tuple[IntArray, FloatArray]]
+    done: float
+
+
+def wide_blocks(columns: Sequence[WideColumn], cells: int = _MOST_CELLS) -> Iterator[WideBlock]:
+    """Yield the rows of columns with sampling times of their own.
+
+    Args:
+        cells: Rows times columns of a block, at most; a block has at least one sample a column.
+    """
+    times: list[IntArray] = list({id(each.t_ns): each.t_ns for each in columns}.values())
+    step = max(1, cells // max(len(times) * len(columns), 1))
+    at = dict.fromkeys(map(id, times), 0)
+    total = sum(map(len, times))
+    while any(at[id(t)] < len(t) for t in times):
+        # The block ends where the first of the arrays has been read for one step. The n-th sample
+        # of a time belongs to the n-th row of that time.
+        ends = [(int(t[k]), k - int(t.searchsorted(int(t[k]))))
+                for t in times if (k := at[id(t)] + step) < len(t)]  # fmt: skip
+        stops = {id(t): _before(t, min(ends)) if ends else len(t) for t in times}
+        parts = {id(t): slice(at[id(t)], stops[id(t)]) for t in times}
+        t_ns, rows = _rows([(t, parts[id(t)]) for t in times])
+        row_of = dict(zip(map(id, times), rows, strict=True))
+        at = stops
+        yield WideBlock(
+            t_ns,
+            {
+                column.name: (row_of[id(column.t_ns)], column.values[parts[id(column.t_ns)]])
+                for column in columns
+                if len(row_of[id(column.t_ns)])
+            },
+            sum(at.values()) / total,
+        )
+
+
+def _before(t_ns: IntArray, end: tuple[int, int]) -> int:
+    """Return the number of samples before the n-th of a time."""
+    time, n = end
+    first, last = t_ns.searchsorted(time), t_ns.searchsorted(time, side="right")
+    return int(min(first + n, last))
+
+
+def _rows(parts: Sequence[tuple[IntArray, slice]]) -> tuple[IntArray, list[IntArray]]:
+    """Return the times of the rows of a block, and the rows of each part's samples."""
+    t_ns = np.concatenate([t[part] for t, part in parts])
+    each_nth: list[IntArray] = [
+        np.arange(part.start, part.stop) - t.searchsorted(t[part]) for t, part in parts
+    ]
+    nth = np.concatenate(each_nth)
+    order = np.lexsort((nth, t_ns))
+    is_new = np.ones(len(order), dtype=bool)
+    is_new[1:] = (np.diff(t_ns[order]) != 0) | (np.diff(nth[order]) != 0)
+    rows = np.empty(len(order), dtype=np.int64)
+    rows[order] = np.cumsum(is_new) - 1
+    cuts = np.cumsum([part.stop - part.start for _, part in parts])[:-1]
+    return t_ns[order][is_new], np.split(rows, cuts)
+
+
+@dataclass
+class WideReport:
+    """Result of an export of a wide table.
+
+    Attributes:
+        warnings: Missing or doubtful facts, one sentence each.
+    """
+
+    columns: list[str]
+    rows: int = 0
+    warnings: list[str] = field(default_factory=list[str])
+
+
+def export_wide(
+    source: Path,
+    output: Path,
+    *,
+    topics: Sequence[str] = (),
+    force: bool = False,
+    stop: StopRequest | None = None,
+) -> WideReport:
+    """Write joint columns of a session as a wide table.
+
+    The columns are held in files without names beside the output where they are large.
+
+    Args:
+        output: The table to write; its suffix is one of :data:`WIDE_FORMATS`.
+        topics: JointState topics; if none, commands and all quantities that the joints measure.
+        stop: Ends the export, with nothing left behind.
+
+    Raises:
+        UsageError: If the suffix is no format that can be written, the output is the session, or
+            the table would be too wide.
+        OutputExistsError: If the output is there and ``force`` is not given.
+        MissingChannelError: If the session has no such topic, or none of the default ones.
+        DataError: If a topic is not of JointStates, or two columns would have one name.
+        MissingExtraError: If a package for the format is not installed.
+        LogWriteError: If the output can't be written or the export was stopped; nothing is left
+            behind then.
+    """
+    open_table = chosen_format(WIDE_FORMATS, "wide table", source, output, force=force)
+    with Session.open(source, column_folder=output.parent) as session:
+        columns, warnings = wide_columns(session, topics)
+        names = [column.name for column in columns]
+        report = WideReport(["t_ns", "time [s]", *names], warnings=warnings)
+        start_ns = min(int(column.t_ns[0]) for column in columns)
+        with (
+            part_file(output) as part,
+            progress(f"export {output.name}", 1.0) as bar,
+            open_table(part, names, start_ns) as write,
+        ):
+            for number, block in enumerate(wide_blocks(columns)):
+                if number % _FORGET_EVERY == 0:
+                    session.forget()
+                write(block)
+                report.rows += len(block.t_ns)
+                bar.update(block.done)
+                check_stop(output, stop)
+        samples = sum(len(column.t_ns) for column in columns)
+        empty = 1.0 - samples / (report.rows * len(columns))
+        if empty > 0.5:
+            report.warnings.append(
+                f"{empty:.0%} of the cells are empty: joints were sampled at times of their own; "
+                "the long table (without --to wide) has no such cells"
+            )
+        report.warnings += session.warnings
+    return report
+
+
+def wide_columns(
+    session: Session, topics: Sequence[str] = ()
+) -> tuple[list[WideColumn], list[str]]:
+    """Return the columns of JointState topics that have samples, and what is to be noted.
+
+    Args:
+        topics: The topics; if none, commands and all quantities that the joints measure.
+
+    Raises:
+        UsageError: If there are too many.
+        MissingChannelError: If the session has no such topic, or none of the default ones.
+        DataError: If a topic is not of JointStates, has no samples, or two columns would have one
+            name.
+    """
+    wanted = {topic: list(joint_fields(session, topic)) for topic in joint_topics(session, topics)}
+    warnings = [f"{topic} carries no values" for topic, fields in wanted.items() if not fields]
+    read = session.joint_columns({topic: fields for topic, fields in wanted.items() if fields})
+    columns: dict[str, WideColumn] = {}
+    unknown: list[str] = []
+    for (topic, part), signals in read.items():
+        quantity = _QUANTITIES.get((topic, part))
+        plain = quantity is not None and signals.unit == SESSION_UNIT[quantity]
+        for joint, t_ns, values in zip(signals.names, signals.t_ns, signals.values, strict=True):
+            name = f"{joint}.{quantity} [{signals.unit}]"
+            if not plain or name in columns:
+                name = f"{joint}.{topic.removeprefix('/')}.{part} [{signals.unit}]"
+            if name in columns:
+                raise DataError(
+                    f"{session.path}: {topic} names {joint} twice, and a column can't; the long "
+                    "table (without --to wide) can"
+                )
+            if not plain or not NAME_PATTERN.fullmatch(joint):
+                unknown.append(name)
+            if len(t_ns):
+                columns[name] = WideColumn(name, t_ns, values)
+    if not columns:
+        raise DataError(f"{session.path}: {some_names(list(wanted), 10)} carry no values")
+    if len(columns) > _MOST_COLUMNS:
+        raise UsageError(
+            f"{session.path} has {len(columns)} joint columns; a wide table takes at most "
+            f"{_MOST_COLUMNS}: name those that you want with --topics"
+        )
+    if unknown:
+        warnings.append(
+            "undulog import doesn't know these columns by their names, give it a map (--columns): "
+            f"{some_names(unknown, 6)}"
+        )
+    return list(columns.values()), warnings
+
+
+WriteBlock = Callable[[WideBlock], None]
+
+
+@contextmanager
+def _open_csv(path: Path, names: Sequence[str], start_ns: int) -> Generator[WriteBlock]:
+    """Write CSV in UTF-8; floats with all digits that are needed."""
+    head = ["t_ns", "time [s]", *map(as_text, names)]
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv_writer(stream, head)
+        writer.writerow(head)
+        writer = csv_writer(stream, ())
+
+        def write(block: WideBlock) -> None:
+            empty = [""] * len(block.t_ns)
+            columns: list[Sequence[object]] = []
+            for name in names:
+                if name not in block.cells:
+                    columns.append(empty)
+                    continue
+                rows, values = block.cells[name]
+                cells: list[object] = list(empty)
+                for row, value in zip(rows.tolist(), values.tolist(), strict=True):
+                    cells[row] = value
+                columns.append(cells)
+            seconds = _seconds(block.t_ns, start_ns).tolist()
+            writer.writerows(zip(block.t_ns.tolist(), seconds, *columns, strict=True))
+
+        yield write
+
+
+@contextmanager
+def _open_parquet(path: Path, names: Sequence[str], start_ns: int) -> Generator[WriteBlock]:
+    """Parquet: t_ns int64, the rest float64, null where a column has no sample."""
+    parquet = arrow("a .parquet table")
+    import pyarrow as pa
+
+    module: Any = pa  # its types are incomplete
+    fields: list[Any] = [("t_ns", module.int64()), ("time [s]", module.float64())]
+    schema = module.schema([*fields, *((name, module.float64()) for name in names)])
+    with parquet.ParquetWriter(path, schema) as writer:
+
+        def write(block: WideBlock) -> None:
+            count = len(block.t_ns)
+            arrays: list[Any] = [module.array(block.t_ns)]
+            arrays.append(module.array(_seconds(block.t_ns, start_ns)))
+            for name in names:
+                if name not in block.cells:
+                    arrays.append(module.nulls(count, module.float64()))
+                    continue
+                rows, values = block.cells[name]
+                cells, missing = np.empty(count), np.ones(count, dtype=bool)
+                cells[rows], missing[rows] = values, False
+                cells[missing] = 0.0
+                arrays.append(module.array(cells, mask=missing, from_pandas=False))
+            writer.write_table(module.Table.from_arrays(arrays, schema=schema))
+
+        yield write
+
+
+def _seconds(t_ns: IntArray, start_ns: int) -> FloatArray:
+    return (t_ns - start_ns) / NS
+
+
+WIDE_FORMATS: Mapping[str, Callable[..., Any]] = {".csv": _open_csv, ".parquet": _open_parquet}
+"""Suffix to the function that creates a table with columns of some names."""

@@ -1,0 +1,129 @@
+"""rosbag2 folders: opened and decoded by rosbags, held against the session's own bytes."""
+
+import io
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from support.written_sessions import EPOCH_NS, NAMES, samples, write_session
+from undulog.capture import Session
+from undulog.capture.common.errors import DataError
+from undulog.capture.exchange.rosbag2_export import export_rosbag2
+
+
+def messages_of(path):
+    reader = make_reader(io.BytesIO(path.read_bytes()))
+    return [
+        (schema.name, channel.topic, message.log_time, message.publish_time, message.data)
+        for schema, channel, message in reader.iter_messages(log_time_order=False)
+    ]
+
+
+@pytest.fixture
+def bag(tmp_path):
+    write_session(tmp_path / "run.mcap")
+    report = export_rosbag2(tmp_path / "run.mcap", tmp_path / "bag")
+    return tmp_path / "bag", report
+
+
+def test_messages_are_those_of_the_session_byte_for_byte(bag, tmp_path):
+    folder, report = bag
+    assert {path.name for path in folder.iterdir()} == {"metadata.yaml", "bag_0.mcap"}
+    expected = messages_of(tmp_path / "run.mcap")
+    assert messages_of(folder / "bag_0.mcap") == expected
+    assert sum(report.messages.values()) == len(expected)
+    with Reader(folder) as reader:
+        by_rosbags = [(c.msgtype, c.topic, t, bytes(data)) for c, t, data in reader.messages()]
+        counts = {each.topic: each.msgcount for each in reader.connections}
+    assert sorted(by_rosbags) == sorted((n, t, log, data) for n, t, log, _, data in expected)
+    assert counts == report.messages
+
+
+def test_rosbags_decodes_every_type(bag):
+    folder, report = bag
+    store = get_typestore(Stores.EMPTY)
+    seen = dict.fromkeys(report.messages, 0)
+    positions = []
+    with Reader(folder) as reader:
+        assert (reader.start_time, reader.message_count) == (
+            EPOCH_NS,
+            sum(report.messages.values()),
+        )
+        assert reader.duration == 299 * 10_000_000 + 1
+        for connection in reader.connections:
+            store.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+        for connection, _, data in reader.messages():
+            message = store.deserialize_cdr(data, connection.msgtype)
+            seen[connection.topic] += 1
+            if connection.topic == "/joint_states":
+                assert tuple(message.name) == NAMES
+                positions.append(message.position)
+    assert seen == report.messages
+    np.testing.assert_array_equal(positions, samples()[:, 0])
+
+
+def test_a_topic_whose_last_message_stays_valid_is_offered_so(bag):
+    with Reader(bag[0]) as reader:
+        offered = {each.topic: each.ext.offered_qos_profiles for each in reader.connections}
+    assert [each.durability for each in offered["/gait/mode"]] == [QosDurability.TRANSIENT_LOCAL]
+    assert offered["/joint_states"] == []
+
+
+def test_the_bag_is_read_as_the_session(bag, tmp_path):
+    with Session.open(bag[0]) as back, Session.open(tmp_path / "run.mcap") as session:
+        assert back.session_id == session.session_id
+        assert back.verdict == session.verdict == "good"
+        expected, got = session.joints("/joint_states"), back.joints("/joint_states")
+        for name in NAMES:
+            np.testing.assert_array_equal(got.signal(name).values, expected.signal(name).values)
+
+
+def write_mcap(path, channels):
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, encoding, name, kind, text, data in channels:
+            schema = writer.register_schema(name, kind, text)
+            channel = writer.register_channel(topic, encoding, schema)
+            writer.add_message(channel, 5, data, 6)
+        writer.finish()
+    return path
+
+
+TEXT = ("cdr", "std_msgs/msg/String", "ros2msg", b"string data", b"\0\1\0\0\2\0\0\0a\0")
+
+
+def test_what_is_no_message_of_ros_is_left_out(tmp_path):
+    json_channel = ("/status", "json", "Status", "jsonschema", b"{}", b"{}")
+    path = write_mcap(tmp_path / "run.mcap", [("/a/01", *TEXT), json_channel])
+    report = export_rosbag2(path, tmp_path / "bag")
+    assert report.messages == {"/a/01": 1}
+    assert "not messages of ROS 2, left out: /status" in report.warnings
+    assert report.warnings[-1].endswith("of ros2 bag play: /a/01")
+    with Reader(tmp_path / "bag") as reader:
+        assert [(c.topic, t) for c, t, _ in reader.messages()] == [("/a/01", 5)]
+    path = write_mcap(tmp_path / "json.mcap", [json_channel])
+    with pytest.raises(DataError, match="has no messages of ROS 2"):
+        export_rosbag2(path, tmp_path / "none")
+    other = ("/a/01", "cdr", "std_msgs/msg/Bool", "ros2msg", b"bool data", b"\0\1\0\0\1")
+    path = write_mcap(tmp_path / "two.mcap", [("/a/01", *TEXT), other])
+    with pytest.raises(DataError, match="a topic of a bag has one type"):
+        export_rosbag2(path, tmp_path / "none")
+    assert not list(tmp_path.glob("none*"))
+
+
+def test_the_verb(tmp_path, command, report_of):
+    write_session(tmp_path / "run.mcap")
+    line = ("log", "export", tmp_path / "run.mcap", "--to", "rosbag2", "-o", tmp_path / "bag")
+    assert report_of(*line)["messages"]["/joint_states"] == 300
+    assert "exists already" in command(*line, code=2).err
+    command(*line, "--force")
+    refused = command(*line, tmp_path / "run.mcap", "--force", code=2).err
+    assert "--to rosbag2 takes one session, not 2" in refused
+    refused = command(*line, "--fps", 3, "--force", code=2).err
+    assert "--fps is for LeRobot; --to rosbag2 has all messages" in refused
