@@ -36,7 +36,7 @@ _COMMAND_FILES = {"control", "command", "commands", "cmd", "action", "actions", 
 _STATE_FILES = {"state", "states", "measured", "response", "feedback", "joint", "joints", "motor"}
 _EVENT_FILES = {"event", "events"}
 _MOST_NAMES = 1 << 16  # bytes of a list of joints
-_MOST_PARTS = 128  # sets of joints that have a value together; further ones get NaN for the others
+_MOST_PARTS = 100  # sets of joints that have a value together; further ones get NaN for the others
 
 Message: TypeAlias = tuple[int, int, Callable[[], None]]
 """Time [ns], order among those of one time, and what writes it."""

@@ -204,10 +204,13 @@ def test_what_is_no_wide_table_is_refused(tmp_path, command):
 
 
 def test_a_large_table_that_is_nearly_empty_is_refused(tmp_path, monkeypatch):
-    messages = [
-        ("/joint_states", T0 + k, joint_state(T0 + k, [f"j{k % 250}"], [0.1])) for k in range(1000)
-    ]
-    write_foreign(tmp_path / "run.mcap", messages)
+    names = [f"j{k}" for k in range(250)]
+    with SessionWriter(tmp_path / "run.mcap", session_id="s", epoch_ns=T0) as writer:
+        states = writer.joint_state("/joint_states", names, unit="rad")
+        offsets = writer.joint_state("/joint_sample_offset", names, unit="s")
+        offsets.write(T0, 1e-6 * np.arange(250))
+        for k in range(4):
+            states.write(T0 + k * 10_000_000, np.zeros(250))
     assert export_wide(tmp_path / "run.mcap", tmp_path / "x.csv").rows == 1000
     monkeypatch.setattr("undulog.capture.exchange.wide_table._MOST_SPARSE", 10_000)
     with pytest.raises(UsageError, match=r"empty but for 0\.4% of its cells; choose columns"):
