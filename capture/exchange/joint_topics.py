@@ -17,7 +17,7 @@ from ..robot.model import Quantity
 _WITH_POSITION = (Quantity.VELOCITY, Quantity.EFFORT)
 """What stands beside a position of the same row."""
 
-_MOST_PARTS = 128
+_MOST_PARTS = 100
 """Sets of joints that have a value together; in further ones the others have NaN."""
 
 

@@ -37,6 +37,8 @@ from .parquet_files import arrow
 _MOST_COLUMNS = 2000
 _MOST_CELLS = 2_000_000  # of a block
 _FORGET_EVERY = 32  # blocks
+_MOST_SPARSE = 200_000_000  # cells of a table that is nearly empty
+_LEAST_FILLED = 200  # cells for each sample
 
 _QUANTITIES = {(topic, "position"): quantity for quantity, topic in JOINT_TOPIC.items()} | {
     (JOINT_TOPIC[Quantity.POSITION], "velocity"): Quantity.VELOCITY,
@@ -79,31 +81,48 @@ def wide_blocks(columns: Sequence[WideColumn], cells: int = _MOST_CELLS) -> Iter
     """Yield the rows of columns with sampling times of their own.
 
     Args:
-        cells: Rows times columns of a block, at most; a block has at least one sample a column.
+        cells: Rows times columns of a block, at most about twice; it has a sample at least.
     """
-    times: list[IntArray] = list({id(each.t_ns): each.t_ns for each in columns}.values())
-    step = max(1, cells // max(len(times) * len(columns), 1))
-    at = dict.fromkeys(map(id, times), 0)
-    total = sum(map(len, times))
-    while any(at[id(t)] < len(t) for t in times):
-        # The block ends where the first of the arrays has been read for one step. The n-th sample
-        # of a time belongs to the n-th row of that time.
+    sampled: dict[int, list[WideColumn]] = {}
+    for column in columns:
+        sampled.setdefault(id(column.t_ns), []).append(column)
+    left: list[IntArray] = [own[0].t_ns for own in sampled.values()]
+    at = dict.fromkeys(sampled, 0)
+    total, done = sum(map(len, left)), 0
+    most = max(1, cells // max(len(columns), 1))
+    while left := [t for t in left if at[id(t)] < len(t)]:
+        parts = _parts(left, at, most)
+        t_ns, rows = _rows(list(zip(left, parts, strict=True)))
+        done += sum(part.stop - part.start for part in parts)
+        at |= {id(t): part.stop for t, part in zip(left, parts, strict=True)}
+        found = {
+            column.name: (row, column.values[part])
+            for t, part, row in zip(left, parts, rows, strict=True)
+            for column in (sampled[id(t)] if len(row) else ())
+        }
+        yield WideBlock(t_ns, found, done / total)
+
+
+def _parts(times: Sequence[IntArray], at: Mapping[int, int], most: int) -> list[slice]:
+    """Return the samples of a block, of each array of times those before one common end.
+
+    The end is where the first of the arrays has been read for one step; the n-th sample of a time
+    belongs to the n-th row of that time.
+
+    Args:
+        at: Where each array is read from, by its identity.
+        most: Samples of all arrays, at most about twice unless the step is one.
+    """
+    step = most
+    while True:
         ends = [(int(t[k]), k - int(t.searchsorted(int(t[k]))))
                 for t in times if (k := at[id(t)] + step) < len(t)]  # fmt: skip
-        stops = {id(t): _before(t, min(ends)) if ends else len(t) for t in times}
-        parts = {id(t): slice(at[id(t)], stops[id(t)]) for t in times}
-        t_ns, rows = _rows([(t, parts[id(t)]) for t in times])
-        row_of = dict(zip(map(id, times), rows, strict=True))
-        at = stops
-        yield WideBlock(
-            t_ns,
-            {
-                column.name: (row_of[id(column.t_ns)], column.values[parts[id(column.t_ns)]])
-                for column in columns
-                if len(row_of[id(column.t_ns)])
-            },
-            sum(at.values()) / total,
-        )
+        end = min(ends, default=None)
+        parts = [slice(at[id(t)], len(t) if end is None else _before(t, end)) for t in times]
+        count = sum(part.stop - part.start for part in parts)
+        if step == 1 or count <= 2 * most:
+            return parts
+        step = max(1, min(step // 2, step * most // count))
 
 
 def _before(t_ns: IntArray, end: tuple[int, int]) -> int:
@@ -161,7 +180,7 @@ def export_wide(
 
     Raises:
         UsageError: If the suffix is no format that can be written, the output is the session, or
-            the table would be too wide.
+            the table would be too wide, or large and nearly empty.
         OutputExistsError: If the output is there and ``force`` is not given.
         MissingChannelError: If the session has no such topic, or none of the default ones.
         DataError: If a topic is not of JointStates, or two columns would have one name.
@@ -174,7 +193,7 @@ def export_wide(
         columns, warnings = wide_columns(session, topics)
         names = [column.name for column in columns]
         report = WideReport(["t_ns", "time [s]", *names], warnings=warnings)
-        start_ns = min(int(column.t_ns[0]) for column in columns)
+        start_ns, samples = min(int(column.t_ns[0]) for column in columns), 0
         with (
             part_file(output) as part,
             progress(f"export {output.name}", 1.0) as bar,
@@ -185,9 +204,15 @@ def export_wide(
                     session.forget()
                 write(block)
                 report.rows += len(block.t_ns)
+                samples += sum(len(rows) for rows, _ in block.cells.values())
+                if report.rows * len(names) > max(_MOST_SPARSE, _LEAST_FILLED * samples):
+                    raise UsageError(
+                        f"{source}: a wide table of {len(names)} columns would be empty but for "
+                        f"{samples / (report.rows * len(names)):.1%} of its cells; choose columns "
+                        "with --topics, or the long table (without --to wide)"
+                    )
                 bar.update(block.done)
                 check_stop(output, stop)
-        samples = sum(len(column.t_ns) for column in columns)
         empty = 1.0 - samples / (report.rows * len(columns))
         if empty > 0.5:
             report.warnings.append(

@@ -203,6 +203,21 @@ def test_what_is_no_wide_table_is_refused(tmp_path, command):
     assert not list(tmp_path.glob("*.part"))
 
 
+def test_a_large_table_that_is_nearly_empty_is_refused(tmp_path, monkeypatch):
+    names = [f"j{k}" for k in range(250)]
+    with SessionWriter(tmp_path / "run.mcap", session_id="s", epoch_ns=T0) as writer:
+        states = writer.joint_state("/joint_states", names, unit="rad")
+        offsets = writer.joint_state("/joint_sample_offset", names, unit="s")
+        offsets.write(T0, 1e-6 * np.arange(250))
+        for k in range(4):
+            states.write(T0 + k * 10_000_000, np.zeros(250))
+    assert export_wide(tmp_path / "run.mcap", tmp_path / "x.csv").rows == 1000
+    monkeypatch.setattr("undulog.capture.exchange.wide_table._MOST_SPARSE", 10_000)
+    with pytest.raises(UsageError, match=r"empty but for 0\.4% of its cells; choose columns"):
+        export_wide(tmp_path / "run.mcap", tmp_path / "y.csv")
+    assert not list(tmp_path.glob("y.csv*"))
+
+
 def test_a_table_with_many_sets_of_joints_is_imported_whole(tmp_path):
     rng = np.random.default_rng(3)
     cells = rng.normal(size=(600, 12))
