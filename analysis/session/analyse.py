@@ -168,6 +168,11 @@ def measure_session(
     session = fetched_part(session, options, warn)
     topics = (options.command_topic, options.response_topic)
     columns = read_columns(session, *topics, warn, reference_topic=options.reference_topic)
+    options = dataclasses.replace(
+        options,
+        command_topic=columns.topics.get("command", options.command_topic),
+        response_topic=columns.topics.get("position", options.response_topic),
+    )
     for finding in judge_made_times(session.metadata.get("undulog", {})):
         warn(finding.sentence)
     columns, left_out = without_breaks(session, columns, options, warn)

@@ -176,6 +176,13 @@ class _Parser:
 
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
+CONTROLLER_STATE = "control_msgs/msg/JointTrajectoryControllerState"
+DYNAMIC_STATE = "control_msgs/msg/DynamicJointState"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+FLOAT_ARRAY = "std_msgs/msg/Float64MultiArray"
+
+JOINT_LISTS = (JOINT_STATE, CONTROLLER_STATE, DYNAMIC_STATE, FLOAT_ARRAY)
+"""Types whose messages each have one sample of some joints."""
 
 _BODIES: dict[str, str] = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",

@@ -18,11 +18,12 @@ from ...robot.run import RUN_RECORD, Run, run_from_record, run_from_scenario
 from ..columns.blocks import Window
 from ..columns.columns import Messages
 from ..columns.layouts import Group
-from ..columns.topics import Topics
+from ..columns.topics import Channel, Topics
 from ..file.log_file import LogFile
 from ..messages.frames import FrameArray, join_batches
 from .joint_names import check_joints
 from .joint_states import JointReader
+from .joint_topics import JointTopicFinder, JointTopics
 from .sample_times import JointSignals, StampClock
 
 if TYPE_CHECKING:
@@ -90,6 +91,14 @@ class OpenLog:
         scenario = self.file.attachments.get("scenario.toml")
         names = () if self.robot is None else self.robot.joint_names
         return None if scenario is None else run_from_scenario(scenario.data, names)
+
+    def joint_topics(self, command: str, response: str) -> JointTopics:
+        """Find commands and responses; see :meth:`.SessionView.joint_topics`."""
+        return JointTopicFinder(self.path, self.topics, self._chain).find(command, response)
+
+    def joint_channel(self, name: str) -> Channel | None:
+        """Return the JointStates that a name of joints is read as; None if there are none."""
+        return self._joints.channel(name)
 
     def joints(
         self, wanted: Mapping[str, Sequence[str]], window_ns: Window

@@ -25,6 +25,7 @@ from ...robot.run import Run
 from ..columns.blocks import Window
 from ..columns.topics import Channel
 from ..messages.frames import FD_FRAME_DTYPE, FD_FRAME_LAYOUT, FRAME_DTYPE, FRAME_LAYOUT, FrameArray
+from .joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC, JointTopics
 from .open_log import OpenLog
 from .sample_times import JointSignals
 
@@ -89,7 +90,7 @@ class SessionView:
             MissingChannelError: If a topic that is to be renamed isn't in the session.
         """
         for topic in rename.values():
-            if topic not in self.channels:
+            if self.joint_channel(topic) is None:
                 raise MissingChannelError(self.path, topic, sorted(self.channels))
         renamed = {name: self._logged(topic) for name, topic in rename.items()}
         return SessionView(
@@ -98,6 +99,59 @@ class SessionView:
             names={**self._names, **renamed},
             on_read=on_read or self._on_read,
         )
+
+    def joint_topics(
+        self, command: str = COMMAND_TOPIC, response: str = RESPONSE_TOPIC
+    ) -> JointTopics:
+        """Find the commands and the responses of a log of any make.
+
+        Args:
+            command: Topic of the commands; ``TOPIC.PART`` of a controller state, or
+                ``TOPIC:JOINT,JOINT`` of an array. If the log has no ``/joint_commands``, this
+                default stands for commands that are found by the types of messages.
+            response: Topic of the responses, likewise.
+
+        Returns:
+            Names as :meth:`joints` takes them.
+
+        Raises:
+            MissingChannelError: If a topic that was chosen is not there.
+            DataError: If an array was chosen whose joints are unknown.
+        """
+        if self._names.keys() & {COMMAND_TOPIC, RESPONSE_TOPIC}:
+            return JointTopics(command, response)
+        return self._log.joint_topics(command, response)
+
+    def joint_channel(self, name: str) -> Channel | None:
+        """Return the channel of JointStates that a name of joints is read as; None without one.
+
+        Raises:
+            DataError: If the topic has no joints.
+        """
+        return self.channels.get(name) or self._log.joint_channel(name)
+
+    def with_joints(
+        self, command: str = COMMAND_TOPIC, response: str = RESPONSE_TOPIC
+    ) -> SessionView:
+        """Return a view that has commands and responses on the topics of the log contract.
+
+        Args:
+            command: As for :meth:`joint_topics`.
+            response: As for :meth:`joint_topics`.
+
+        Returns:
+            The view; the session itself if they are there already.
+
+        Raises:
+            MissingChannelError: As :meth:`joint_topics`.
+            DataError: As :meth:`joint_topics`.
+        """
+        found = self.joint_topics(command, response)
+        known = {COMMAND_TOPIC: found.command, RESPONSE_TOPIC: found.response, **found.quantities}
+        names = {
+            topic: name for topic, name in known.items() if self.joint_channel(name) is not None
+        }
+        return self.view(rename=names) if found.renamed.keys() & names.keys() else self
 
     def part(self, start_ns: int | None, stop_ns: int | None) -> SessionView:
         """Return a view that reads a window [Unix ns]; its start and end stay those of this one."""
@@ -133,7 +187,11 @@ class SessionView:
         if not self._names:
             return logged
         away = {*self._names, *self._names.values()}
-        found = {name: replace(logged[topic], topic=name) for name, topic in self._names.items()}
+        found = {
+            name: replace(channel, topic=name)
+            for name, topic in self._names.items()
+            if (channel := logged.get(topic) or self._log.joint_channel(topic)) is not None
+        }
         found |= {topic: channel for topic, channel in logged.items() if topic not in away}
         return MappingProxyType(found)
 
