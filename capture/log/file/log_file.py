@@ -173,7 +173,7 @@ class LogFile:
 
         Args:
             path: Its file, any of its parts, or a folder that holds it and no other; a rosbag2
-                folder or a ``.db3`` file; or the URL of a file.
+                folder, a ``.db3`` file or a ``.bag`` of ROS 1; or the URL of a file.
             column_folder: Folder for large columns in files; None for memory.
 
         Raises:
@@ -197,6 +197,7 @@ class LogFile:
         self.scratch: list[mmap.mmap] = []  # used memory, which costs no page faults
         self.pages = None if column_folder is None else FilePages(column_folder)
         self._bag = BagCopy(path, column_folder) if is_bag(path) else None
+        self.warnings += [] if self._bag is None else self._bag.warnings
         first = first_part(path if self._bag is None else self._bag.path)
         wal = read_wal(first)  # before the files: segments released meanwhile are in the files
         self.parts: PartFiles = open_parts(first, bare=wal is not None)

@@ -243,6 +243,11 @@ _BODIES: dict[str, str] = {
 }
 
 
+def is_of_contract(kind: MessageType) -> bool:
+    """Whether a type is one of the log contract, with the same fields."""
+    return _short(kind.name) in _BODIES and message_type(kind.name) == kind
+
+
 @cache
 def schema_text(name: str) -> str:
     """Return the ``ros2msg`` schema of a message type, dependencies appended.

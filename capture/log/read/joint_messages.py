@@ -214,6 +214,29 @@ def interfaces(layout: Layout) -> dict[int, list[str]]:
     return found
 
 
+def carried(source: JointSource, type_name: str, layout: Layout) -> dict[str, tuple[str, ...]]:
+    """Return the fields that messages of one layout fill, each with the joints that have it."""
+    leaves = layout.leaves
+    if type_name == DYNAMIC_STATE:
+        listed = interfaces(layout)
+        every = enumerate(names_of(layout, _JOINTS))
+        own = [(name, listed.get(j, ())) for j, name in every]
+        wanted = {"position": source.part} if source.part else {field: field for field in UNITS}
+        found = {
+            field: tuple(name for name, there in own if interface in there)
+            for field, interface in wanted.items()
+        }
+    elif type_name == FLOAT_ARRAY:
+        found = {"position": source.joints if "data" in leaves else ()}
+    elif type_name == CONTROLLER_STATE:
+        names = names_of(layout, _JOINTS)
+        paths = {field: f"{source.part}.{_POINT_FIELDS[field]}" for field in UNITS}
+        found = {field: names for field, path in paths.items() if path in leaves}
+    else:
+        found = {field: names_of(layout) for field in UNITS if field in leaves}
+    return {field: names for field, names in found.items() if names}
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """The points of one message.

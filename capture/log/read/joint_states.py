@@ -23,6 +23,7 @@ from .joint_messages import (
     UNITS,
     JointSource,
     Trajectory,
+    carried,
     check_source,
     joint_source,
     leaf_paths,
@@ -149,6 +150,48 @@ class JointReader:
             paths[source.topic] = both
         return {topic: None if own is None else list(own) for topic, own in paths.items()}
 
+    def carried(self, name: str) -> dict[str, tuple[str, ...]]:
+        """Return the fields that a topic ever has, each with its joints in order of appearance.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If a topic has no joints.
+        """
+        self._check({name: ()})
+        source, kind = self._source(name)
+        found: dict[str, dict[str, None]] = {}
+        if kind == TRAJECTORY:
+            for one in self._read_trajectories(source.topic):
+                for field, values in one.values.items():
+                    if values.size:
+                        found.setdefault(field, {}).update(dict.fromkeys(one.names))
+        else:
+            for group in self._topics.read({source.topic: []}, (None, None))[source.topic].groups:
+                for field, names in carried(source, kind, group.layout).items():
+                    found.setdefault(field, {}).update(dict.fromkeys(names))
+        return {field: tuple(found[field]) for field in UNITS if field in found}
+
+    def logged(
+        self, wanted: Mapping[str, Sequence[str]], window_ns: Window
+    ) -> dict[tuple[str, str], list[JointRows]]:
+        """Return messages as they were logged, those of a window of log times.
+
+        Args:
+            wanted: Topic to fields.
+            window_ns: Half-open window of log times [Unix ns]; None for open ends. Trajectories are
+                returned whole, whatever the window.
+
+        Returns:
+            (topic, field) to rows; the rows of the fields of one topic belong together.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If a topic has no joints, or there is no such field.
+        """
+        found = self._topics.read(self.requests(wanted), window_ns)
+        keys = [(name, field) for name, fields in wanted.items() for field in fields]
+        return {key: self._rows(*key, found) for key in keys}
+
     def signals(
         self,
         wanted: Mapping[str, Sequence[str]],
@@ -257,33 +300,32 @@ class JointReader:
     ) -> Series:
         """Return one field of a topic at message stamps on the log's clock."""
         source, kind = self._source(name)
-        if kind == TRAJECTORY:
-            rows = self._points(source, field)
-        else:
-            messages = found[source.topic]
-            try:
-                rows = [rows_of(source, kind, group, field) for group in messages.groups]
-            except DataError as error:
-                raise DataError(f"{self._path}: {error}") from None
-            rows.extend(self._general_rows(source, kind, field, messages))
+        rows = self._rows(name, field, found)
         if (rows or kind == TRAJECTORY) and not any(row.values.size for row in rows):
             raise MissingChannelError(
                 self._path, f"{field} in {name}", self._filled(source, kind, window_ns)
             )
-        if kind not in (TRAJECTORY, FLOAT_ARRAY):  # whose times are the log's already
-            rows = [self._on_log_clock(row, source.topic) for row in rows]
         return Series(*merge_rows(rows, name, field, self._warn))
+
+    def _rows(self, name: str, field: str, found: Mapping[str, Messages]) -> list[JointRows]:
+        """Return one field of a topic, with stamps on the log's clock."""
+        source, kind = self._source(name)
+        if kind == TRAJECTORY:
+            return self._points(source, field)
+        messages = found[source.topic]
+        try:
+            rows = [rows_of(source, kind, group, field) for group in messages.groups]
+        except DataError as error:
+            raise DataError(f"{self._path}: {error}") from None
+        rows.extend(self._general_rows(source, kind, field, messages))
+        if kind == FLOAT_ARRAY:  # whose times are the log's already
+            return rows
+        return [self._on_log_clock(row, source.topic) for row in rows]
 
     def _points(self, source: JointSource, field: str) -> list[JointRows]:
         """Return the points of the trajectories of a topic, at their own times."""
         topic = source.topic
-        if topic not in self._trajectories:
-            warn = self._warn
-            messages = self._topics.raw(topic)
-            self._trajectories[topic] = [
-                *trajectories(messages, lambda sentence: warn(f"{topic}: {sentence}"))
-            ]
-        every = self._trajectories[topic]
+        every = self._read_trajectories(topic)
         stamped = any(one.stamp_ns for one in every)
         shift_ns = self._clock.shift_ns(topic) if stamped else 0
         found, replaced = points_in_force(every, field, shift_ns)
@@ -292,6 +334,15 @@ class JointReader:
                 f"{topic}: {replaced} points were replaced by a later trajectory before their time"
             )
         return [JointRows(names, t_ns, t_ns, values) for names, t_ns, values in found]
+
+    def _read_trajectories(self, topic: str) -> list[Trajectory]:
+        if topic not in self._trajectories:
+            warn = self._warn
+            messages = self._topics.raw(topic)
+            self._trajectories[topic] = [
+                *trajectories(messages, lambda sentence: warn(f"{topic}: {sentence}"))
+            ]
+        return self._trajectories[topic]
 
     def _signals(
         self,

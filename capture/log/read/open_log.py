@@ -22,6 +22,7 @@ from ..columns.topics import Channel, Topics
 from ..file.log_file import LogFile
 from ..messages.frames import FrameArray, join_batches
 from .joint_names import check_joints
+from .joint_rows import JointRows
 from .joint_states import JointReader
 from .joint_topics import JointTopicFinder, JointTopics
 from .sample_times import JointSignals, StampClock
@@ -99,6 +100,16 @@ class OpenLog:
     def joint_channel(self, name: str) -> Channel | None:
         """Return the JointStates that a name of joints is read as; None if there are none."""
         return self._joints.channel(name)
+
+    def joint_fields(self, name: str) -> dict[str, tuple[str, ...]]:
+        """Return the fields of a topic and their joints; see :meth:`.JointReader.carried`."""
+        return self._joints.carried(name)
+
+    def joint_messages(
+        self, wanted: Mapping[str, Sequence[str]], window_ns: Window
+    ) -> dict[tuple[str, str], list[JointRows]]:
+        """Return messages as they were logged; see :meth:`.JointReader.logged`."""
+        return self._joints.logged(wanted, window_ns)
 
     def joints(
         self, wanted: Mapping[str, Sequence[str]], window_ns: Window

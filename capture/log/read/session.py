@@ -24,7 +24,9 @@ from ...robot.model import Robot
 from ...robot.run import Run
 from ..columns.blocks import Window
 from ..columns.topics import Channel
+from ..messages.definitions import MessageType
 from ..messages.frames import FD_FRAME_DTYPE, FD_FRAME_LAYOUT, FRAME_DTYPE, FRAME_LAYOUT, FrameArray
+from .joint_rows import JointRows
 from .joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC, JointTopics
 from .open_log import OpenLog
 from .sample_times import JointSignals
@@ -129,6 +131,54 @@ class SessionView:
             DataError: If the topic has no joints.
         """
         return self.channels.get(name) or self._log.joint_channel(name)
+
+    def joint_fields(self, name: str) -> dict[str, tuple[str, ...]]:
+        """Return the fields that a topic ever has, each with its joints in order of appearance.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If it has no joints.
+        """
+        return self._log.joint_fields(self._logged(name))
+
+    def joint_messages(
+        self,
+        wanted: Mapping[str, Sequence[str]],
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> dict[tuple[str, str], list[JointRows]]:
+        """Return messages of joints as they were logged, in place of a series for each joint.
+
+        Args:
+            wanted: Topic to fields, as for :meth:`joint_columns`.
+            start_ns: First log time wanted [Unix ns]; None for the start.
+            stop_ns: One past the last log time wanted [Unix ns]; None for the end. Trajectories
+                are returned whole.
+
+        Returns:
+            (topic, field) to rows; those of the fields of one topic belong together.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If a topic has no joints or a field is none of the three.
+        """
+        self._on_read()
+        logged = {self._logged(topic): fields for topic, fields in wanted.items()}
+        found = self._log.joint_messages(logged, self._within(start_ns, stop_ns))
+        return {
+            (topic, field): found[self._logged(topic), field]
+            for topic, fields in wanted.items()
+            for field in fields
+        }
+
+    def message_type(self, topic: str) -> MessageType:
+        """Return the type of a topic's messages.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If its schema can't be read.
+        """
+        return self._log.topics.message_type(self._logged(topic))
 
     def with_joints(
         self, command: str = COMMAND_TOPIC, response: str = RESPONSE_TOPIC
@@ -522,7 +572,8 @@ class Session(SessionView):
 
         Args:
             path: The MCAP file, or its URL; of a split session any part, or the folder that holds
-                it; a rosbag2 folder of any storage or a ``.db3`` file (extra ``bags``).
+                it; a rosbag2 folder of any storage, a ``.db3`` file or a ``.bag`` of ROS 1 (extra
+                ``bags``).
             threads: Number of decompressing threads; None for one per core that this process may
                 use, at most four.
             column_folder: A folder on a disk for large columns, in files without names, so that
