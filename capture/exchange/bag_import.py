@@ -23,7 +23,7 @@ from ..common.files import check_stop
 from ..common.process import StopRequest
 from ..following.session import MOST_JOINTS
 from ..log.edit.raw_messages import RawLog
-from ..log.file.bag import BagCopy, check_room, is_bag
+from ..log.file.bag import check_room, is_bag
 from ..log.messages.definitions import TRAJECTORY, is_of_contract
 from ..log.read.joint_messages import INTERFACE_UNITS, UNITS, joint_source
 from ..log.read.joint_rows import JointRows
@@ -34,7 +34,7 @@ from ..log.write.writer import SessionWriter
 from .can_import import ImportReport, digest_of, imported_session
 
 _WINDOW_NS = 20 * NS
-_MOST_WINDOWS = 10_000
+_MOST_WINDOWS = 2000
 _MOST_NAMED = 20
 _COPYING = 0.4
 """Share of the progress that is the copy of a bag that isn't a plain MCAP file."""
@@ -75,17 +75,17 @@ def import_bag(
     check_room(source, output.absolute().parent)
     with ExitStack() as stack:
         bar = stack.enter_context(progress(f"import {source.name}", 1.0))
-        path, begun, damaged = source, 0.0, list[str]()
-        if is_bag(source):
+        begun = _COPYING if is_bag(source) else 0.0
 
-            def copied(share: float) -> None:
-                check_stop(output, stop)
-                bar.update(_COPYING * share, "reading")
+        def copied(share: float) -> None:
+            check_stop(output, stop)
+            bar.update(begun * share, "reading")
 
-            bag = BagCopy(source, output.absolute().parent, copied)
-            stack.callback(bag.close)
-            path, begun, damaged = bag.path, _COPYING, bag.warnings
-        session = stack.enter_context(Session.open(path, robot=robot))
+        session = stack.enter_context(
+            Session.open(
+                source, column_folder=output.absolute().parent, robot=robot, on_copied=copied
+            )
+        )
         if session.library.startswith("undulog/"):
             raise ImportFormatError(source, "is a session of undulog already")
         found = _found(source, session, topics)
@@ -93,7 +93,6 @@ def import_bag(
             source, output, session.robot.name if session.robot else "unknown robot"
         )
         report.start_ns, report.end_ns = session.start_ns, session.end_ns
-        report.problems += damaged
         report.notes += found.notes
         files = [source] if source.is_file() else sorted(p for p in source.iterdir() if p.is_file())
         facts = {
@@ -112,7 +111,7 @@ def import_bag(
         for share in joints.write(stop):
             bar.update(begun + (1 - begun) * share / 2, "joints")
         if report.complete:
-            others = _Others(path, session, writer, joints.taken, report)
+            others = _Others(session.files[0], session, writer, joints.taken, report)
             for share in others.write(stop):
                 bar.update(begun + (1 - begun) * (1 + share) / 2, "other topics")
         report.problems += [one for one in session.warnings if one not in report.problems]
@@ -121,14 +120,11 @@ def import_bag(
 
 
 def _found(source: Path, session: Session, topics: tuple[str, str]) -> JointTopics:
-    try:
-        found = session.joint_topics(*topics)
-        names = [found.command, found.response]
-        if not any(session.joint_channel(name) for name in names):
-            there = found.others or sorted(session.channels)
-            raise MissingChannelError(source, " or ".join(names), there, HOW_TO_CHOOSE)
-    except DataError as error:
-        raise ImportFormatError(source, str(error).removeprefix(f"{session.path}: ")) from error
+    found = session.joint_topics(*topics)
+    names = [found.command, found.response]
+    if not any(session.joint_channel(name) for name in names):
+        there = found.others or sorted(session.channels)
+        raise MissingChannelError(source, " or ".join(names), there, HOW_TO_CHOOSE)
     return found
 
 
@@ -228,7 +224,10 @@ class _Joints:
         windowed = [one for one in self._targets if not one.is_whole]
         self._write_window([one for one in self._targets if one.is_whole], None, None)
         step = max(_WINDOW_NS, (last - first) // _MOST_WINDOWS)
+        begins, ends = (each.astype(np.int64) for each in self._session.chunk_times_ns)
         for start in range(first, last, step):
+            if not ((begins < start + step) & (ends >= start)).any():
+                continue  # a gap
             if stop is not None and stop.requested:
                 self._report.complete, self._report.end_ns = False, start
                 return
@@ -277,7 +276,7 @@ class _Others:
         for topic, channel in session.channels.items():
             if topic in taken or not channel.count:
                 continue
-            if channel.is_ros2 and is_of_contract(session.message_type(topic)):
+            if channel.is_ros2 and _has_place(session, topic):
                 self._kept[topic] = channel.metadata
             else:
                 left.append(f"{topic} ({channel.type_name or 'no type'}, {channel.count})")
@@ -307,3 +306,11 @@ class _Others:
                 send(message.log_time_ns, message.publish_time_ns, message.data)
                 self._report.samples[topic] = self._report.samples.get(topic, 0) + 1
             self._report.problems += log.warnings
+
+
+def _has_place(session: Session, topic: str) -> bool:
+    """Whether the log contract has a topic's type, with the same fields."""
+    try:
+        return is_of_contract(session.message_type(topic))
+    except DataError:  # a damaged definition
+        return False

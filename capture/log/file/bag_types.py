@@ -100,10 +100,10 @@ class Ros1Types:
         """Take the definitions of a bag."""
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-        ros2 = get_typestore(Stores.LATEST).fielddefs
         self._store = get_typestore(Stores.EMPTY)
         # The conversion leaves out the sequence number of a header, so that its type has none.
-        self._store.register({_HEADER: ros2[_HEADER]})
+        header = "builtin_interfaces/Time stamp\nstring frame_id\n"
+        self._store.register(get_types_from_msg(header, _HEADER))
         known: dict[str, str] = {}
         for one in connections:
             known.setdefault(one.msgtype, one.msgdef.data)

@@ -267,7 +267,7 @@ class JointReader:
         source = joint_source(name, self._topics.channels)
         if source is None:
             return None
-        check_source(source, self._topics.message_type(source.topic))
+        self._check_source(source)
         logged = self._topics.channels[source.topic]
         return replace(logged, topic=name, type_name=JOINT_STATE)
 
@@ -279,14 +279,16 @@ class JointReader:
             raise MissingChannelError(self._path, name, sorted(channels))
         return source, channels[source.topic].type_name
 
+    def _check_source(self, source: JointSource) -> None:
+        try:
+            check_source(source, self._topics.message_type(source.topic))
+        except DataError as error:
+            named = "" if str(self._path) in str(error) else f"{self._path}: "
+            raise DataError(f"{named}{error}") from None
+
     def _check(self, wanted: Mapping[str, Sequence[str]]) -> None:
         for name, fields in wanted.items():
-            source, _ = self._source(name)
-            try:
-                check_source(source, self._topics.message_type(source.topic))
-            except DataError as error:
-                named = "" if str(self._path) in str(error) else f"{self._path}: "
-                raise DataError(f"{named}{error}") from None
+            self._check_source(self._source(name)[0])
             for field in fields:
                 if field not in UNITS:
                     raise DataError(f"a JointState has no {field!r}; it has {', '.join(UNITS)}")

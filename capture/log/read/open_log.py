@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,11 +45,12 @@ class OpenLog:
         column_folder: Path | None,
         threads: int,
         robot: str | Path | None = None,
+        on_copied: Callable[[float], None] = lambda _: None,
     ) -> None:
         """Open a log; see :meth:`.Session.open`."""
         self.path = path = as_path(path)
         described = None if robot is None else load_robot(robot)
-        self.file = LogFile(path, column_folder)
+        self.file = LogFile(path, column_folder, on_copied)
         self.warnings = list(self.file.warnings)
         self.topics = Topics(self.file, self._warn, threads=threads)
         self._clock = StampClock(self.topics, self._warn)

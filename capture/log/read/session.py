@@ -554,10 +554,11 @@ class Session(SessionView):
         threads: int | None = None,
         column_folder: Path | None = None,
         robot: str | Path | None = None,
+        on_copied: Callable[[float], None] = lambda _: None,
     ) -> None:
         """See :meth:`open`."""
         number = threads_or_default(threads)
-        super().__init__(OpenLog(as_path(path), column_folder, number, robot))
+        super().__init__(OpenLog(as_path(path), column_folder, number, robot, on_copied))
 
     @classmethod
     def open(
@@ -567,6 +568,7 @@ class Session(SessionView):
         threads: int | None = None,
         column_folder: Path | None = None,
         robot: str | Path | None = None,
+        on_copied: Callable[[float], None] = lambda _: None,
     ) -> Self:
         """Open a session; the same as calling the class.
 
@@ -580,6 +582,7 @@ class Session(SessionView):
                 :meth:`forget` can release their memory (Linux). None for memory.
             robot: Description of the robot of a log that has none, a name or a file; a log with
                 one keeps its own, with a warning.
+            on_copied: Called with the share of a bag that is copied, 0 to 1; may raise.
 
         Returns:
             The session, usable in a ``with`` block.
@@ -592,7 +595,9 @@ class Session(SessionView):
             RobotFileError: If the description has faults.
             JointSetError: If its joints aren't those of the log.
         """
-        return cls(path, threads=threads, column_folder=column_folder, robot=robot)
+        return cls(
+            path, threads=threads, column_folder=column_folder, robot=robot, on_copied=on_copied
+        )
 
     def close(self) -> None:
         """Release the file."""
