@@ -86,6 +86,7 @@ def _fits(store: Typestore, kind: str, example: bytes | None) -> bool:
     """Whether a message is decoded to its last byte."""
     if example is None:
         return True
+    store.max_sequence_length = max(1, len(example))
     try:
         store.deserialize_cdr(example, kind)
     except Exception:  # noqa: BLE001  its decoder has errors of many bases
@@ -117,6 +118,7 @@ class Ros1Types:
 
     def cdr(self, connection: Connection, message: bytes) -> bytes | None:
         """Return a message as CDR; None if it is damaged."""
+        self._store.max_sequence_length = max(1, len(message))  # no element is without a byte
         try:
             return bytes(self._store.ros1_to_cdr(message, connection.msgtype))
         except Exception:  # noqa: BLE001  its decoder has errors of many bases
