@@ -352,7 +352,7 @@ def points_in_force(
     parts: dict[tuple[str, ...], list[tuple[IntArray, FloatArray]]] = {}
     first: dict[tuple[str, ...], int] = {}
     replaced = 0
-    for one in sorted(every, key=lambda each: each.log_ns, reverse=True):
+    for one in reversed(sorted(every, key=lambda each: each.log_ns)):
         values = one.values[field]
         if not values.shape[1] or not len(values):
             continue
