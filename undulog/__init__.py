@@ -27,7 +27,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "record unit": ("capture record_control:unit", "Print a systemd unit for recordings."),
     "import": (
         "capture import_export:import_log",
-        "Bring in a foreign log: bags, CAN traces, tables.",
+        "Bring in bags, CAN traces, tables.",
     ),
     "log info": ("capture log_info:log_info", "Show what a log holds."),
     "log check": (

@@ -24,6 +24,7 @@ from ..common.process import StopRequest
 from ..following.session import MOST_JOINTS
 from ..log.edit.raw_messages import RawLog
 from ..log.file.bag import check_room, is_bag
+from ..log.mcap.chunk import LAST_NS
 from ..log.messages.definitions import TRAJECTORY, is_of_contract
 from ..log.read.joint_messages import INTERFACE_UNITS, UNITS, joint_source
 from ..log.read.joint_rows import JointRows
@@ -156,12 +157,13 @@ class _Target:
             lack are NaN.
         """
         log_ns, stamp_ns = rows[0].log_ns, rows[0].stamp_ns
+        at = {name: j for j, name in enumerate(self.joints)}
         matrices: list[NDArray[Any]] = []
         known = False
         for one in rows:
             matrix = np.full((len(log_ns), len(self.joints)), np.nan)
             if one.names and one.values.shape == (len(log_ns), len(one.names)):
-                matrix[:, [self.joints.index(name) for name in one.names]] = one.values
+                matrix[:, [at[name] for name in one.names]] = one.values
                 known = True
             matrices.append(matrix)
         return [log_ns, stamp_ns, *matrices] if known else None
@@ -224,7 +226,8 @@ class _Joints:
         windowed = [one for one in self._targets if not one.is_whole]
         self._write_window([one for one in self._targets if one.is_whole], None, None)
         step = max(_WINDOW_NS, (last - first) // _MOST_WINDOWS)
-        begins, ends = (each.astype(np.int64) for each in self._session.chunk_times_ns)
+        spans = self._session.chunk_times_ns
+        begins, ends = (np.minimum(each, LAST_NS).astype(np.int64) for each in spans)
         for start in range(first, last, step):
             if not ((begins < start + step) & (ends >= start)).any():
                 continue  # a gap

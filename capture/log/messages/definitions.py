@@ -181,8 +181,8 @@ DYNAMIC_STATE = "control_msgs/msg/DynamicJointState"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 FLOAT_ARRAY = "std_msgs/msg/Float64MultiArray"
 
-JOINT_LISTS = (JOINT_STATE, CONTROLLER_STATE, DYNAMIC_STATE, FLOAT_ARRAY)
-"""Types whose messages each have one sample of some joints."""
+JOINT_LISTS = (JOINT_STATE, CONTROLLER_STATE, DYNAMIC_STATE)
+"""Types whose messages each have one sample of some joints, and their names."""
 
 _BODIES: dict[str, str] = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",

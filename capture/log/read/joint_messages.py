@@ -31,7 +31,7 @@ from ..messages.definitions import (
     MessageType,
 )
 
-JOINT_TYPES = (*JOINT_LISTS, TRAJECTORY)
+JOINT_TYPES = (*JOINT_LISTS, FLOAT_ARRAY, TRAJECTORY)
 """Types that hold joints."""
 
 COMMAND_PARTS = ("reference", "desired", "output")
@@ -103,7 +103,7 @@ def check_source(source: JointSource, kind: MessageType) -> None:
     if kind.name not in JOINT_TYPES:
         readable = ", ".join(name.replace("/msg/", "/") for name in JOINT_TYPES)
         raise DataError(f"{topic} is {kind.name}, not of joints ({readable})")
-    if not _is_of_joints(kind):
+    if not is_of_joints(kind):
         raise DataError(f"{topic}: its schema is not that of {kind.name}")
     if kind.name == CONTROLLER_STATE:
         there = [part for part in (*COMMAND_PARTS, *STATE_PARTS, "error") if part in fields]
@@ -123,7 +123,7 @@ def check_source(source: JointSource, kind: MessageType) -> None:
         raise DataError(f"{topic} is {kind.name}, which names its joints itself")
 
 
-def _is_of_joints(kind: MessageType) -> bool:
+def is_of_joints(kind: MessageType) -> bool:
     """Whether a type has the fields of its name that are read."""
     fields = {field.name: field for field in kind.fields}
     if kind.name == FLOAT_ARRAY:
@@ -352,7 +352,8 @@ def points_in_force(
     parts: dict[tuple[str, ...], list[tuple[IntArray, FloatArray]]] = {}
     first: dict[tuple[str, ...], int] = {}
     replaced = 0
-    for one in reversed(sorted(every, key=lambda each: each.log_ns)):
+    in_order = sorted(every, key=lambda each: each.log_ns)
+    for one in reversed(in_order):
         values = one.values[field]
         if not values.shape[1] or not len(values):
             continue

@@ -30,6 +30,7 @@ from .joint_messages import (
     STATE_PARTS,
     UNITS,
     interfaces,
+    is_of_joints,
     joint_source,
 )
 from .joint_names import joint_names
@@ -225,8 +226,14 @@ class JointTopicFinder:
             (topic, channel.type_name, channel.count)
             for topic, channel in self._topics.channels.items()
             if channel.type_name in JOINT_TYPES and channel.is_ros2 and channel.count
-            if topic not in CONTRACT_TOPICS
+            if topic not in CONTRACT_TOPICS and self._is_readable(topic)
         ]
+
+    def _is_readable(self, topic: str) -> bool:
+        try:
+            return is_of_joints(self._topics.message_type(topic))
+        except DataError:  # a damaged schema: whoever reads the topic reports it
+            return False
 
     def _quantities(self) -> tuple[dict[str, str], tuple[str, ...]]:
         """Return the further quantities that DynamicJointStates have, and notes on the rest."""
