@@ -1,57 +1,118 @@
-"""Reading JointStates from a rosbag2 ``.db3``: a session's columns, against rosbags decoding them.
+"""Bags of sqlite3, by type: opened, and imported into a session, against rosbags decoding them.
 
-python bench/bag_import.py [BAG]   processor time of each [s] and the ratio, which is to be <= 1.3
+python bench/bag_import.py [BAG]   processor time [s] and ratio of each; the bar is 1.3
+
+Without a bag it writes two: JointStates of 12 joints, and what ros2_control logs of them (states
+and controller states), each 40,000 messages at 100 Hz.
 """
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from undulog.capture import Session
+from undulog.capture.exchange.bag_import import import_bag
 
-KIND = "sensor_msgs/msg/JointState"
+STATE = "sensor_msgs/msg/JointState"
+CONTROLLER = "control_msgs/msg/JointTrajectoryControllerState"
+POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
+PARTS = ("reference", "feedback", "error", "output")
 STORE = get_typestore(Stores.LATEST)
+STORE.register(
+    get_types_from_msg(
+        "std_msgs/Header header\nstring[] joint_names\n"
+        + "".join(f"{POINT} {part}\n" for part in PARTS),
+        CONTROLLER,
+    )
+)
 
 
-def written(folder: Path, messages: int = 40_000, joints: int = 12) -> Path:
-    """Write a bag of JointStates at 100 Hz."""
+def written(folder: Path, kinds: tuple[str, ...], messages: int = 40_000, joints: int = 12) -> Path:
+    """Write a bag at 100 Hz, the messages shared among the kinds."""
     types, none = STORE.types, np.zeros(0)
     names = [f"joint_{k}" for k in range(joints)]
+    zero = types["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
+
+    def point(values: np.ndarray) -> object:
+        return types[POINT](
+            positions=values, velocities=values, accelerations=none, effort=none,
+            time_from_start=zero,
+        )  # fmt: skip
+
     with Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        way = writer.add_connection("/joint_states", KIND, typestore=STORE)
+        topics = {STATE: "/joint_states", CONTROLLER: "/arm/controller_state"}
+        ways = {kind: writer.add_connection(topics[kind], kind, typestore=STORE) for kind in kinds}
         for k in range(messages):
-            stamp = types["builtin_interfaces/msg/Time"](sec=1 + k // 100, nanosec=k % 100 * 10**7)
-            header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
-            values = np.sin(0.05 * k - np.arange(joints))
-            message = types[KIND](
-                header=header, name=names, position=values, velocity=none, effort=none
+            kind, tick = kinds[k % len(kinds)], k // len(kinds)
+            stamp = types["builtin_interfaces/msg/Time"](
+                sec=1 + tick // 100, nanosec=tick % 100 * 10**7
             )
-            t_ns = 10**9 + k * 10**7
-            writer.write(way, t_ns, STORE.serialize_cdr(message, KIND))
+            header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
+            values = np.sin(0.05 * tick - np.arange(joints))
+            if kind == STATE:
+                message = types[STATE](
+                    header=header, name=names, position=values, velocity=values, effort=none
+                )
+            else:
+                parts = {part: point(values) for part in PARTS}
+                message = types[CONTROLLER](header=header, joint_names=names, **parts)
+            t_ns = 10**9 + tick * 10**7
+            writer.write(ways[kind], t_ns, STORE.serialize_cdr(message, kind))
     return folder
 
 
-def measure(bag: Path) -> None:
-    """Print both times, twice."""
+def decode(bag: Path) -> None:
+    """Decode all messages by rosbags."""
+    with Reader(bag) as reader:
+        for connection, _t_ns, data in reader.messages():
+            STORE.deserialize_cdr(data, connection.msgtype)
+
+
+def read(bag: Path) -> None:
+    """Read commands and responses, found by type."""
+    with Session.open(bag) as session:
+        found = session.joint_topics()
+        names = {found.command, found.response}
+        session.joint_columns({name: ["position"] for name in names if session.joint_channel(name)})
+
+
+def brought_in(bag: Path) -> None:
+    """Import a bag."""
+    with TemporaryDirectory() as scratch:
+        import_bag(bag, Path(scratch, "session.mcap"))
+
+
+def seconds(work: Callable[[Path], None], bag: Path) -> float:
+    """Return the processor time of some work, the least of two runs [s]."""
+    times: list[float] = []
     for _ in range(2):
         start = time.process_time()
-        with Reader(bag) as reader:
-            for connection, _t_ns, data in reader.messages():
-                STORE.deserialize_cdr(data, connection.msgtype)
-        middle = time.process_time()
-        with Session.open(bag) as session:
-            session.joints("/joint_states")
-        peer, own = middle - start, time.process_time() - middle
-        print(f"rosbags {peer:.3f} s, session {own:.3f} s, ratio {own / peer:.2f}")
+        work(bag)
+        times.append(time.process_time() - start)
+    return min(times)
+
+
+def measure(name: str, bag: Path) -> None:
+    """Print the times of one bag."""
+    peer = seconds(decode, bag)
+    own = {"opened and read": seconds(read, bag), "imported": seconds(brought_in, bag)}
+    listed = ", ".join(f"{what} {s:.2f} s (ratio {s / peer:.2f})" for what, s in own.items())
+    print(f"{name}: rosbags {peer:.2f} s, {listed}")
 
 
 if __name__ == "__main__":
     with TemporaryDirectory() as scratch:
-        measure(Path(sys.argv[1]) if len(sys.argv) > 1 else written(Path(scratch, "bag")))
+        if len(sys.argv) > 1:
+            measure(sys.argv[1], Path(sys.argv[1]))
+        else:
+            measure("JointStates", written(Path(scratch, "states"), (STATE,)))
+            both = written(Path(scratch, "control"), (STATE, CONTROLLER))
+            measure("ros2_control", both)

@@ -17,12 +17,12 @@ from typing import Any
 
 from undulog.analysis.compare.compare import compare_sessions
 from undulog.analysis.results.comparison import Comparison
-from undulog.analysis.signals.columns import RESPONSE_TOPIC
 from undulog.capture import Session, SessionView, load_robot
 from undulog.capture.common.console import echo, emit_json
 from undulog.capture.common.errors import DataError, MissingChannelError, UsageError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.edit.raw_messages import RawLog
+from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from undulog.sim.commands.drive import drive_armed, dry_run_on_bus, early_end
 from undulog.sim.drive.in_process import drive_twin
 from undulog.sim.drive.motion import MotionSource, find_motion
@@ -103,11 +103,13 @@ class Repetition:
     Attributes:
         original: The session that commands are taken from.
         scenario: The world that they are given in.
+        topics: Of the session's commands and responses.
     """
 
     original: Path
     driven: MotionSource
     scenario: Scenario
+    topics: tuple[str, str] = (COMMAND_TOPIC, RESPONSE_TOPIC)
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,7 @@ def find_repetition(
     world: str | None = None,
     changes: Mapping[str, Any] | None = None,
     duration_s: float | None = None,
+    topics: tuple[str, str] = (COMMAND_TOPIC, RESPONSE_TOPIC),
 ) -> Repetition:
     """Find a session's commands, and a world for them.
 
@@ -147,6 +150,7 @@ def find_repetition(
         world: A scenario's name or file; the world that the session was recorded in if None.
         changes: Keys of the world's scenario, with dots, to the values that they are to have.
         duration_s: How long [s]; as long as there are commands if None.
+        topics: Of commands and responses.
 
     Returns:
         What is to be run.
@@ -158,8 +162,8 @@ def find_repetition(
         LogError: If the session can't be read, or has no commands.
     """
     there = None if world is None else load_scenario(world, changes)
-    driven = find_motion(str(original), there, changes)
-    return Repetition(original, driven, driven.scenario(there, duration_s))
+    driven = find_motion(str(original), there, changes, command_topic=topics[0])
+    return Repetition(original, driven, driven.scenario(there, duration_s), topics)
 
 
 def replay_in_twin(
@@ -188,7 +192,7 @@ def replay_in_twin(
     )
     with Session.open(repetition.original) as first, Session.open(output) as second:
         of_twin = "physics_rate_hz" in first.metadata.get("undulog", {})
-        comparison, why = compared(first, second)
+        comparison, why = compared(first.with_joints(*repetition.topics), second)
     same = compare_logs(repetition.original, output) if of_twin else None
     return ReproducedRun(repetition.original, repetition.scenario, recording, same, comparison, why)
 
@@ -232,6 +236,7 @@ def replay_on_bus(
     duration_s: float | None = None,
     output: Path | None = None,
     recorder: Path | None = None,
+    topics: tuple[str, str] = (COMMAND_TOPIC, RESPONSE_TOPIC),
     force: bool = False,
     as_json: bool = False,
 ) -> int:
@@ -244,6 +249,7 @@ def replay_on_bus(
         output: The session to write; a dry run needs none.
         recorder: Control socket of a recorder that receives the gait; the only one that runs if
             None.
+        topics: Of commands and responses of the session.
         as_json: Report as one JSON object.
 
     Returns:
@@ -256,7 +262,7 @@ def replay_on_bus(
     """
     bus_address(on)
     described = load_robot(robot) if robot is not None else None
-    driven = find_motion(str(file), robot=described)
+    driven = find_motion(str(file), robot=described, command_topic=topics[0])
     if driven.kind != "commands":
         raise UsageError(f"{file} is no session; 'undulog drive {file} --on {on}' drives a gait")
     given: dict[str, Any] = {"robot": described, "duration_s": duration_s, "output": output}
@@ -267,7 +273,7 @@ def replay_on_bus(
     comparison, why = None, "it did not run to its end"
     if report.complete:
         with Session.open(file) as first, Session.open(report.plan.output) as second:
-            comparison, why = compared(first, second)
+            comparison, why = compared(first.with_joints(*topics), second)
     if as_json:
         facts = None if comparison is None else comparison.to_dict()
         emit_json(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
 from undulog.capture.commands.several import Line, sessions_of
 from undulog.capture.commands.several import each as each_session
 from undulog.capture.commands.several import show as show_table
@@ -35,8 +36,7 @@ def analyse(
     csv: Path | None = None,
     start: float | None = None,
     stop: float | None = None,
-    command_topic: str = "/joint_commands",
-    response_topic: str = "/joint_states",
+    topics: JointTopicOptions = CONTRACT,
     reference_topic: str | None = None,
     robot: str | None = None,
     null: Path | None = None,
@@ -45,10 +45,11 @@ def analyse(
 ) -> int:
     """Compute gain and lag, energy and spread over the segments, each with its interval.
 
-    Works on sessions of undulog and on any ROS 2 bag (MCAP) that has JointStates of commands and
-    of responses. The first line printed is the answer; the method comes last. Several sessions are
-    one experiment: runs of a gait and of its reverse separate boundary from module. A folder, a
-    pattern, or `--each` give a table instead, a line for each session; one that fails stops none.
+    Works on sessions of undulog and on any ROS bag that has joints, whose topics are found by type
+    where they have other names. The first line printed is the answer; the method comes last.
+    Several sessions are one experiment: runs of a gait and of its reverse separate boundary from
+    module. A folder, a pattern, or `--each` give a table instead, a line for each session; one that
+    fails stops none.
     The glossary of the manual, also at the end of each report, defines the words of results.
 
     Example: `undulog analyse run.mcap --json -o run.json`
@@ -64,8 +65,7 @@ def analyse(
             intervals; of one result a folder gets a file for each of its tables.
         start: Start of what is analysed, from the session's start [s]; chosen if not given.
         stop: Its end [s].
-        command_topic: JointState topic of the commands.
-        response_topic: JointState topic of the responses.
+        topics: Where commands and responses are.
         reference_topic: JointState topic of a second sensor of the same positions, to be compared.
         robot: Description of the robot of a log without one, a name or a TOML file.
         null: Model of identical modules (see `undulog sim null`) to hold the one session to.
@@ -74,7 +74,7 @@ def analyse(
     """
     if not files:
         raise UsageError("analyse needs at least one session, e.g. undulog analyse run.mcap")
-    options = chosen(start, stop, command_topic, response_topic, reference_topic)
+    options = chosen(start, stop, topics, reference_topic)
     paths = sessions_of(files)
     if null is not None and len(paths) > 1:
         raise UsageError("--null takes one session; with both directions recorded leave it out")
@@ -211,8 +211,7 @@ PAGES = (".html", ".htm")
 def chosen(
     start: float | None,
     stop: float | None,
-    command_topic: str,
-    response_topic: str,
+    topics: JointTopicOptions = CONTRACT,
     reference_topic: str | None = None,
 ) -> Options:
     """Check and collect the options of the analysis of each session.
@@ -231,7 +230,7 @@ def chosen(
         raise UsageError(f"--stop {stop:g} is not after --start {start or 0.0:g}")
     from ..signals.stretch import Options
 
-    return Options(start, stop, command_topic, response_topic, reference_topic)
+    return Options(start, stop, *topics.names, reference_topic)
 
 
 def opened(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import emit_json, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output, write_text
@@ -33,8 +34,7 @@ def compare(
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     start: float | None = None,
     stop: float | None = None,
-    command_topic: str = "/joint_commands",
-    response_topic: str = "/joint_states",
+    topics: JointTopicOptions = CONTRACT,
     robot: str | None = None,
     force: bool = False,
     json: bool = False,
@@ -58,14 +58,13 @@ def compare(
         output: Write the result to this file: a page if its name ends in .html, else .json.
         start: Start of what is analysed, from each session's start [s]; chosen if not given.
         stop: Its end [s].
-        command_topic: JointState topic of the commands.
-        response_topic: JointState topic of the responses.
+        topics: Where commands and responses are.
         robot: Description for logs without one, a name or a TOML file.
         force: Replace the output file if it exists.
         json: Print the result as one JSON object.
     """
     sides = _sides(files, a or [], b or [])
-    session = chosen(start, stop, command_topic, response_topic)
+    session = chosen(start, stop, topics)
     if not (0 < margin_gain < 1 and 0 < margin_lag_deg < 180):
         raise UsageError("--margin-gain lies between 0 and 1, --margin-lag-deg between 0 and 180")
     if output is not None:

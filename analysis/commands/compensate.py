@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
+
 from .plan import Planned, check_numbers, write_sessions
 from .predict import coupling_of_result
 
@@ -32,6 +34,7 @@ def compensate(
     runs: int = 1,
     settle: float = 10.0,
     measure: float = 10.0,
+    topics: JointTopicOptions = CONTRACT,
     json: bool = False,
 ) -> None:
     """Write commands that make all joints respond alike, from kicks around the gait.
@@ -55,11 +58,12 @@ def compensate(
         runs: How often the commands are run.
         settle: Time before what is measured [s].
         measure: Length of what is measured [s].
+        topics: Where commands and responses of the sessions are.
         json: Print one JSON object.
     """
     check_numbers(runs, settle, measure)
     coupling = coupling_of_result(kicks)
-    driven = _runs(after or (), start)
+    driven = _runs(after or (), start, topics)
 
     def design(base: BaseGait, session: SessionView) -> Planned:
         from dataclasses import asdict
@@ -74,10 +78,12 @@ def compensate(
         notes = _notes(found, coupling.base.frequency_hz if coupling.base else math.nan, base)
         return Planned((run,) * runs, settle, measure, notes=notes, result=asdict(found))
 
-    write_sessions("compensate", like, output, design, as_json=json)
+    write_sessions("compensate", like, output, design, topics, as_json=json)
 
 
-def _runs(files: Sequence[Path], start: float | None) -> tuple[GaitRun, ...]:
+def _runs(
+    files: Sequence[Path], start: float | None, topics: JointTopicOptions
+) -> tuple[GaitRun, ...]:
     """Fit the gaits of the sessions."""
     from undulog.capture import Session
 
@@ -85,7 +91,7 @@ def _runs(files: Sequence[Path], start: float | None) -> tuple[GaitRun, ...]:
     from ..session.runs import gait_run
     from .analyse import chosen
 
-    options = chosen(start, None, "/joint_commands", "/joint_states")
+    options = chosen(start, None, topics)
     found: list[GaitRun] = []
     for file in files:
         with Session.open(file) as session:

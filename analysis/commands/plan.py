@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
+from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json
 from undulog.capture.common.errors import UsageError
 
@@ -34,6 +35,7 @@ def phase_kicks(
     kick: float = 0.05,
     settle: float = 10.0,
     measure: float = 10.0,
+    topics: JointTopicOptions = CONTRACT,
     json: bool = False,
 ) -> None:
     """Write the commands of kicks around a recorded gait, which identify its coupling.
@@ -52,6 +54,7 @@ def phase_kicks(
         kick: Size of the kicks, of phase [rad] and of log amplitude.
         settle: Time before what is measured [s].
         measure: Length of what is measured [s].
+        topics: Where commands and responses of that session are.
         json: Print one JSON object.
     """
     if base_runs < 1 or not LEAST <= kick <= MOST:
@@ -66,7 +69,7 @@ def phase_kicks(
         planned = kicks(names, base.amplitude, runs, kick=kick, base_runs=base_runs)
         return Planned(planned, settle, measure)
 
-    write_sessions("phase-kicks", like, output, design, as_json=json)
+    write_sessions("phase-kicks", like, output, design, topics, as_json=json)
 
 
 def reversal(
@@ -76,6 +79,7 @@ def reversal(
     runs: int = 6,
     settle: float = 10.0,
     measure: float = 10.0,
+    topics: JointTopicOptions = CONTRACT,
     json: bool = False,
 ) -> None:
     """Write the commands of a recorded gait and of its reverse, to separate boundary from module.
@@ -92,6 +96,7 @@ def reversal(
         runs: Runs each way, an even number so that half of them are turned.
         settle: Time before what is measured [s].
         measure: Length of what is measured [s].
+        topics: Where commands and responses of that session are.
         json: Print one JSON object.
     """
     check_numbers(runs, settle, measure)
@@ -105,7 +110,7 @@ def reversal(
         )
         return Planned(both_ways(base.amplitude, runs), settle, measure, notes=(note,))
 
-    write_sessions("reversal", like, output, design, as_json=json)
+    write_sessions("reversal", like, output, design, topics, as_json=json)
 
 
 @dataclass(frozen=True)
@@ -136,6 +141,7 @@ def write_sessions(
     like: Path,
     folder: Path,
     design: Callable[[BaseGait, SessionView], Planned],
+    topics: JointTopicOptions,
     *,
     as_json: bool,
 ) -> None:
@@ -145,7 +151,8 @@ def write_sessions(
     from ..plan.designs import write_plan
     from ..plan.gait_base import base_gait
 
-    with Session.open(like) as session:
+    with Session.open(like) as opened:
+        session = topics.view(opened)
         base = base_gait(session)
         planned = design(base, session)
         settle_s, measure_s = planned.settle_s, planned.measure_s
@@ -179,6 +186,7 @@ def lag_sweep(
     runs: int = 1,
     settle: float | None = None,
     measure: float = 10.0,
+    topics: JointTopicOptions = CONTRACT,
     json: bool = False,
 ) -> None:
     """Write the commands of a lag sweep, which identifies the coupling of a chain without contact.
@@ -197,6 +205,7 @@ def lag_sweep(
         settle: Time before what is measured [s]; 5 time constants of the slowest body mode, at
             least 10 s, if not given.
         measure: Length of what is measured [s].
+        topics: Where commands and responses of that session are.
         json: Print one JSON object.
     """
     _check_tones(amplitude, runs)
@@ -207,7 +216,7 @@ def lag_sweep(
         planned = sweep(len(base.driven), amplitude, runs)
         return _without_contact(base, session, planned, (amplitude, settle, measure))
 
-    write_sessions("lag-sweep", like, output, design, as_json=json)
+    write_sessions("lag-sweep", like, output, design, topics, as_json=json)
 
 
 def multisine(
@@ -219,6 +228,7 @@ def multisine(
     runs: int = 1,
     settle: float | None = None,
     measure: float = 20.0,
+    topics: JointTopicOptions = CONTRACT,
     json: bool = False,
 ) -> None:
     """Write the commands of a multisine: coupling without contact at several frequencies at once.
@@ -239,6 +249,7 @@ def multisine(
         settle: Time before what is measured [s]; 5 time constants of the slowest body mode, at
             least 10 s, if not given.
         measure: Length of what is measured [s], rounded up to whole periods.
+        topics: Where commands and responses of that session are.
         json: Print one JSON object.
     """
     if tones < 2:
@@ -254,7 +265,7 @@ def multisine(
         whole_s = math.ceil(measure / period - 1e-6) * period
         return _without_contact(base, session, planned, (amplitude, settle, whole_s))
 
-    write_sessions("multisine", like, output, design, as_json=json)
+    write_sessions("multisine", like, output, design, topics, as_json=json)
 
 
 def _check_tones(amplitude: float, runs: int) -> None:

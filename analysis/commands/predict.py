@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import emit_json
 from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.common.files import check_output
@@ -26,6 +27,7 @@ def predict(
     until: float | None = None,
     start: float | None = None,
     stop: float | None = None,
+    topics: JointTopicOptions = CONTRACT,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     force: bool = False,
     json: bool = False,
@@ -47,6 +49,7 @@ def predict(
         until: How long to follow them [s].
         start: Start of what is analysed of each session, from its start [s]; chosen if not given.
         stop: Its end [s].
+        topics: Where commands and responses are.
         output: Write the JSON to this file too, a name that ends in .json.
         force: Replace the output file if it exists.
         json: Print the result as one JSON object.
@@ -54,7 +57,7 @@ def predict(
     if not files:
         raise UsageError("predict needs kicks, e.g. undulog predict kicks.json --eps 0.3")
     turned = _kicks(kick or ())
-    options = chosen(start, stop, "/joint_commands", "/joint_states")
+    options = chosen(start, stop, topics)
     if output is not None:
         why = "the prediction is JSON; end its name in .json"
         check_output(output, (".json",), why, force=force)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
 from undulog.capture.commands.several import FAILED, Line, each, sessions_of, show
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
@@ -32,8 +33,7 @@ def report(
     find: Annotated[str, Parameter(name="--where")] = "",
     start: float | None = None,
     stop: float | None = None,
-    command_topic: str = "/joint_commands",
-    response_topic: str = "/joint_states",
+    topics: JointTopicOptions = CONTRACT,
     robot: str | None = None,
     plots: Path | None = None,
     format_: Annotated[_Format, Parameter(name="--format")] = "svg",
@@ -62,8 +62,7 @@ def report(
         find: Condition on the sessions of the catalogue, as for `undulog catalog`.
         start: Start of what is analysed, from the session's start [s]; chosen if not given.
         stop: Its end [s].
-        command_topic: JointState topic of the commands.
-        response_topic: JointState topic of the responses.
+        topics: Where commands and responses are.
         robot: Description of the robot of a log without one, a name or a TOML file.
         plots: Write each figure of the page to a file in this folder; of several pages, in a folder
             of the page's name in it.
@@ -80,8 +79,8 @@ def report(
         raise UsageError("--catalog takes the place of files; name its sessions by --where")
     if find and catalog is None:
         raise UsageError("--where is a condition on the sessions of --catalog")
-    options = chosen(start, stop, command_topic, response_topic)
-    if catalog is not None and options != chosen(None, None, "/joint_commands", "/joint_states"):
+    options = chosen(start, stop, topics)
+    if catalog is not None and options != chosen(None, None):
         raise UsageError("--catalog shows results as they are; leave out window and topics")
     paths = sessions_of(files)
     figures = None if plots is None else _Figures(plots, format_, force=force)

@@ -31,9 +31,10 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.common.errors import MissingChannelError, UsageError
+from undulog.capture.log.read.joint_topics import RESPONSE_TOPIC
 from undulog.capture.log.read.sample_times import JointSignals, Signal
 
-from ..signals.columns import RESPONSE_TOPIC, planes_of
+from ..signals.columns import planes_of
 
 GAIT_TOPIC = "/gait"
 

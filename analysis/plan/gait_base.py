@@ -23,11 +23,12 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import UsageError
+from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from undulog.capture.robot.model import Joint, Plane, Robot
 
 from ..results.answer import Remarks, percent
 from ..session.analyse import measure_session
-from ..signals.columns import COMMAND_TOPIC, RESPONSE_TOPIC, read_columns
+from ..signals.columns import read_columns
 
 TIME_CONSTANTS = 5.0
 """So many of the slowest mode's time constants are waited for: 0.7 % of it is left."""

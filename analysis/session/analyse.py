@@ -175,6 +175,11 @@ def measure_session(
     session = fetched_part(session, options, warn)
     topics = (options.command_topic, options.response_topic)
     columns = read_columns(session, *topics, warn, reference_topic=options.reference_topic)
+    options = dataclasses.replace(
+        options,
+        command_topic=columns.topics.get("command", options.command_topic),
+        response_topic=columns.topics.get("position", options.response_topic),
+    )
     for finding in judge_made_times(session.metadata.get("undulog", {})):
         warn(finding.sentence)
     columns, left_out = without_breaks(session, columns, options, warn)
@@ -204,7 +209,6 @@ def measure_session(
     moving = {name: one for name, one in sound.items() if name not in broken}
     dead = dead_bands(columns, commands, moving, gait, origin_ns) if with_dead_bands else {}
     swept = frequency_responses(commands, sound, warn) if gait is None else ()
-    motion = None if columns.command else _free_motion(session.robot, responses, gait, warn)
     del commands
     session.forget()
     energies = joint_energies(session, columns, held, span, warn)
@@ -252,13 +256,13 @@ def measure_session(
         body=body,
         heterogeneity=heterogeneity,
         coupling=coupling_of_one_gait(0 if gait is None else len(gait.all_answered)),
+        free_motion=None if columns.command else _free_motion(session.robot, responses, gait, warn),
         warnings=warn.warnings(session.warnings),
         provenance=_provenance(session, options),
         artefacts=artefacts,
         over_time=over_time,
         energy=energy,
         frequency_response=swept,
-        free_motion=motion,
         oscillators=session_couplings(session, options.start_s, options.stop_s),
         notes=warn.notes,
     )
@@ -271,7 +275,7 @@ def measure_session(
         analysis.warnings,
         frequency_response=swept,
         left_out=left_out,
-        motion=motion,
+        motion=analysis.free_motion,
     )
     analysis = dataclasses.replace(analysis, answer=compose(facts))
     return SessionMeasurement(analysis, gait, sound, energies, span, follows.offsets)

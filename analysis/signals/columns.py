@@ -12,6 +12,7 @@ from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.following.session import MOST_JOINTS
 from undulog.capture.log.messages.definitions import PowerTopic
+from undulog.capture.log.read.joint_topics import HOW_TO_CHOOSE, RESPONSE_TOPIC
 from undulog.capture.log.read.sample_times import JointSignals, Signal
 from undulog.capture.robot.model import Robot
 
@@ -21,8 +22,6 @@ from ..results.answer import Lacking, Note
 DRAG_RATIO = 10.0
 """K = c_n / c_t where nothing says otherwise; 0.5 / 0.05 of the twin's ground."""
 
-COMMAND_TOPIC = "/joint_commands"
-RESPONSE_TOPIC = "/joint_states"
 CURRENT_TOPIC = "/joint_current"
 VOLTAGE_TOPIC = "/joint_voltage"
 
@@ -33,14 +32,6 @@ _OF_ITS_OWN = {
     "velocity": ("/joint_velocity", "position"),
     "effort": ("/joint_effort", "position"),
 }
-
-_CONTRACT = {"/joint_sample_offset", "/joint_command_offset", "/joint_temperature", "/gait"} | {
-    *("/energy_ledger", CURRENT_TOPIC, VOLTAGE_TOPIC, "/joint_velocity", "/joint_effort"),
-    *PowerTopic,
-}
-"""JointStates that are neither commands nor positions."""
-
-_JOINT_STATE = "sensor_msgs/msg/JointState"
 
 
 @dataclass(frozen=True)
@@ -98,39 +89,38 @@ def read_columns(
     """Read the joints' signals; warn of those that are missing.
 
     Args:
-        command_topic: JointState topic of the commands.
-        response_topic: JointState topic of the responses.
+        command_topic: Topic of the commands, as :meth:`.SessionView.joint_topics` takes it.
+        response_topic: Topic of the responses, likewise.
         warn: Takes one sentence for each thing missing.
         reference_topic: JointState topic of a second sensor of the positions, or None.
 
     Raises:
         MissingChannelError: If neither topic is there, or one that was chosen is not; the message
             lists those that are.
-        DataError: If a topic is not of JointStates, or there are too many joints.
+        DataError: If a topic has no joints, or there are too many joints.
     """
+    topics = session.joint_topics(command_topic, response_topic)
+    command_topic, response_topic = topics.command, topics.response
     wanted = {
         "command": (command_topic, "position"),
         "position": (response_topic, "position"),
         "velocity": (response_topic, "velocity"),
         "effort": (response_topic, "effort"),
-        "current": (CURRENT_TOPIC, "position"),
-        "voltage": (VOLTAGE_TOPIC, "position"),
+        "current": (topics.quantities.get(CURRENT_TOPIC, CURRENT_TOPIC), "position"),
+        "voltage": (topics.quantities.get(VOLTAGE_TOPIC, VOLTAGE_TOPIC), "position"),
         **{topic: (topic, "position") for topic in PowerTopic},
     }
     if reference_topic is not None:
         wanted["reference"] = (reference_topic, "position")
-    channels = session.channels.items()
-    joint_topics = sorted(topic for topic, one in channels if one.type_name == _JOINT_STATE)
     asked = [(command_topic, response_topic)]
     asked += [] if reference_topic is None else [(reference_topic,)]
-    named = [(command_topic, COMMAND_TOPIC), (response_topic, RESPONSE_TOPIC)]
-    asked += [(topic,) for topic, usual in named if topic != usual]  # chosen, so it must be there
-    for topics in asked:
-        if not set(topics) & set(session.channels):
-            there = joint_topics or sorted(session.channels)
+    for names in asked:
+        if not any(session.joint_channel(name) for name in names):
             damage = f" ({'; '.join(session.warnings)})" if session.warnings else ""
-            raise MissingChannelError(session.path, " or ".join(topics) + damage, there)
-    wanted = {key: one for key, one in wanted.items() if one[0] in session.channels}
+            there = topics.others or sorted(session.channels)
+            missing = " or ".join(names) + damage
+            raise MissingChannelError(session.path, missing, there, HOW_TO_CHOOSE)
+    wanted = {key: one for key, one in wanted.items() if session.joint_channel(one[0])}
     found = _read(session, wanted)
     if response_topic == RESPONSE_TOPIC:
         # A bus that gives them in frames of their own has them on topics of their own.
@@ -138,17 +128,17 @@ def read_columns(
         own = {key: one for key, one in own.items() if key not in found}
         found |= _read(session, own) if own else {}
         wanted |= own
-    others = [one for one in joint_topics if one not in _CONTRACT]
+    for note in topics.notes:
+        warn(Note(note))
     for key, kind, topic in (
         ("command", "commands", command_topic),
         ("position", "positions", response_topic),
     ):
         if key not in found:
             option = "--command-topic" if key == "command" else "--response-topic"
-            spare = [one for one in others if one not in (command_topic, response_topic)]
-            named = f" (other JointStates: {', '.join(spare)}; choose with {option})"
+            named = f" (other joints: {', '.join(topics.others)}; choose with {option})"
             logged = "no command logged: " if key == "command" else ""
-            nulls = f"gain and lag are null{named if spare else ''}"
+            nulls = f"gain and lag are null{named if topics.others else ''}"
             warn(Lacking(f"{logged}no {kind} on {topic}: {nulls}"))
     accumulated = PowerTopic.MECHANICAL in found and PowerTopic.MECHANICAL_PLUS in found
     if not accumulated and ("velocity" not in found or "effort" not in found):

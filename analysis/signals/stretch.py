@@ -12,12 +12,13 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError, UsageError
+from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from undulog.capture.log.read.sample_times import Signal, longest_unbroken
 
 from ..estimators.series import clean
 from ..response.rhythm import MIN_CYCLES
 from ..results.answer import Note
-from .columns import COMMAND_TOPIC, QUANTITIES, RESPONSE_TOPIC, Columns
+from .columns import QUANTITIES, Columns
 from .windows import Stretch, covered, long_enough, moving, settled, steady_part, steady_runs
 
 GAIT_TOPIC = "/gait"
@@ -35,8 +36,8 @@ class Options:
     Attributes:
         start_s: Start of what is analysed, from the session's start [s]; None: chosen.
         stop_s: Its end, not included [s]; None: chosen.
-        command_topic: JointState topic of the commands.
-        response_topic: JointState topic of the responses.
+        command_topic: Topic of the commands, as :meth:`.SessionView.joint_topics` takes it.
+        response_topic: Topic of the responses, likewise.
         reference_topic: JointState topic of a second sensor of the same positions, or None.
     """
 

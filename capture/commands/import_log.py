@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from ..common.console import emit
 from ..common.errors import ImportFormatError, UsageError
 from ..common.files import check_output, is_file
+from .joint_options import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:
     from ..exchange.can_import import ImportReport
@@ -31,6 +32,7 @@ def import_log(
     write_map: Path | None = None,
     episode: int | None = None,
     bus: str | None = None,
+    topics: JointTopicOptions = CONTRACT,
     force: bool = False,
     json: bool = False,
 ) -> int:
@@ -39,9 +41,13 @@ def import_log(
     CAN traces (candump .log, .asc, .blf, .trc, python-can .csv and .db, .mf4) keep every frame and
     its direction; the robot's bus map defines which of them are joint commands, states and sensor
     values. Tables (CSV, .npz, .mat, .parquet, .pt), folders of them and LeRobot datasets need no
-    robot: what their columns mean is guessed and shown, or given by --columns or --map.
+    robot: what their columns mean is guessed and shown, or given by --columns or --map. Bags of ROS
+    2 (MCAP, .db3, folders) and of ROS 1 (.bag) keep all joints, found by type, and every message
+    that a session has a place for.
 
     Example: `undulog import trace.log -o run.mcap --robot arcsnake-joint`
+
+    A bag of ROS: `undulog import BAG -o run.mcap`
 
     A table, with its commands in another: `undulog import states.csv --commands commands.csv
     -o run.mcap --write-map map.toml`, then, edited: `--columns map.toml`
@@ -52,7 +58,7 @@ def import_log(
     --map angle=joint01.position:deg,wrap=360`
 
     Args:
-        log: The foreign log: a file, a folder of tables, or a LeRobot dataset.
+        log: The foreign log: a file, a folder of tables or of a bag, or a LeRobot dataset.
         output: The session to write, `.mcap`; a folder for the episodes of a dataset.
         robot: A shipped robot (snake25, snake13, snake13-planar, snake12-sts3215, so101,
             arcsnake-joint) or a robot TOML; required for CAN traces.
@@ -64,12 +70,14 @@ def import_log(
         write_map: Write the guessed map here, to be edited.
         episode: The one episode of a LeRobot dataset to import.
         bus: The bus to decode, where the log has several; the first one by default.
+        topics: Where commands and responses of a bag are.
         force: Replace an existing output.
         json: Report as one JSON object.
     """
     if map_ and log.is_dir():
         raise UsageError(f"{log} is a folder; --map is for one table")
     from ..common.process import interruptible
+    from ..exchange.bag_import import is_recording
     from ..exchange.can_import import import_can
     from ..exchange.csv_import import import_csv
     from ..exchange.lerobot_import import import_lerobot, is_lerobot
@@ -83,20 +91,21 @@ def import_log(
     if not dataset or output.suffix:
         why = f"a session is an .mcap file, not {output.suffix or 'nameless'}"
         check_output(output, (".mcap",), why, force=force)
+    bag = not dataset and is_recording(log)
+    table = not bag and _is_table(log)
+    given = {"--commands": commands, "--columns": columns, "--map": map_, "--unit": unit}
+    given |= {"--write-map": write_map, "--episode": episode, "--bus": bus}
+    if topics != CONTRACT:
+        given |= {"--command-topic": topics.command_topic, "--response-topic": topics}
+    kind = _LEROBOT if dataset else _BAG if bag else _TABLE if table else _FRAMES
+    _check_options(log, kind, [name for name, value in given.items() if value not in (None, ())])
+    if bag:
+        return _import_bag(log, output, robot, topics, force=force, json=json)
     described = load_robot(robot) if robot is not None else None
-    table = _is_table(log)
-    if not table and (columns is not None or map_ or unit or write_map is not None):
-        raise UsageError(f"{log} holds CAN frames; --columns and --map are for other CSV logs")
-    if table and bus is not None:
-        raise UsageError(f"{log} holds no CAN frames; --bus is for those")
-    if episode is not None and not dataset:
-        raise UsageError(f"{log} is no LeRobot dataset; --episode is for those")
     units = parse_units(unit)
     column_map = _column_map(described, columns, map_)
     with interruptible() as stop:
         if dataset:
-            if column_map is not None or commands is not None or write_map is not None:
-                raise UsageError(f"{log} is a LeRobot dataset, which names its columns itself")
             reports = import_lerobot(
                 log, output, episode=episode, robot=described, units=units, force=force, stop=stop
             )
@@ -113,10 +122,47 @@ def import_log(
                 write_map=write_map, force=force, stop=stop,
             )  # fmt: skip
             reports = [report]
+    return _report_imports(reports, json=json)
+
+
+def _import_bag(
+    log: Path,
+    output: Path,
+    robot: str | None,
+    topics: JointTopicOptions,
+    *,
+    force: bool,
+    json: bool,
+) -> int:
+    from ..common.process import interruptible
+    from ..exchange.bag_import import import_bag
+
+    with interruptible() as stop:
+        report = import_bag(log, output, robot=robot, topics=topics.names, force=force, stop=stop)
+    return _report_imports([report], json=json)
+
+
+def _report_imports(reports: Sequence[ImportReport], *, json: bool) -> int:
     facts = [report.as_json() for report in reports]
     answer = facts[0] if len(facts) == 1 else {"sessions": facts}
     emit(answer, (line for report in reports for line in _import_lines(report)), as_json=json)
     return 0 if all(report.complete for report in reports) else 1
+
+
+_LEROBOT, _BAG = "is a LeRobot dataset, which names its columns itself", "is a bag of ROS"
+_TABLE, _FRAMES = "holds no CAN frames", "holds CAN frames"
+_OPTIONS = {
+    _LEROBOT: ("--unit", "--episode"),
+    _BAG: ("--command-topic", "--response-topic"),
+    _TABLE: ("--commands", "--columns", "--map", "--unit", "--write-map"),
+    _FRAMES: ("--bus",),
+}
+"""Kind of a log to the options that are for it alone."""
+
+
+def _check_options(log: Path, kind: str, given: Sequence[str]) -> None:
+    if wrong := [name for name in given if name not in _OPTIONS[kind]]:
+        raise UsageError(f"{log} {kind}; {', '.join(wrong)}: for logs of another kind")
 
 
 def _is_table(log: Path) -> bool:

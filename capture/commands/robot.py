@@ -13,6 +13,7 @@ from cyclopts import Parameter
 from ..common.console import UNLIMITED, Column, echo, emit, emit_json, table
 from ..common.errors import RobotFileError
 from ..common.files import check_output, write_text
+from .joint_options import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:
     from ..robot.model import Robot
@@ -97,8 +98,7 @@ def robot_new(
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     log: Annotated[Path | None, Parameter(name="--from")] = None,
     name: str | None = None,
-    command_topic: str = "/joint_commands",
-    response_topic: str = "/joint_states",
+    topics: JointTopicOptions = CONTRACT,
     force: bool = False,
     json: bool = False,
 ) -> None:
@@ -113,8 +113,7 @@ def robot_new(
         output: The description, a name that ends in .toml.
         log: A log of the robot.
         name: The robot's name; that of the file if not given.
-        command_topic: JointState topic of the commands, which count as angles too, if it is there.
-        response_topic: JointState topic of the measured angles.
+        topics: Where commands, which count as angles too, and measured angles are.
         force: Replace the file if it exists.
         json: Print one JSON object: the file and its joints.
     """
@@ -127,7 +126,7 @@ def robot_new(
         from ..log.read.session import Session
 
         with Session.open(log) as session:
-            joints = seen_joints(session, command_topic, response_topic)
+            joints = seen_joints(topics.view(session))
     robot = draft(name or output.stem, joints, "" if log is None else log.name)
     write_text(output, robot.toml)
     if json:

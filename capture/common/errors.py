@@ -191,12 +191,15 @@ def some_names(names: Sequence[str], most: int) -> str:
 class MissingChannelError(LogError, KeyError):
     """A topic, joint or field that the log does not have."""
 
-    def __init__(self, path: Path | str, wanted: str, available: Sequence[str]) -> None:
-        """Build the message."""
+    def __init__(
+        self, path: Path | str, wanted: str, available: Sequence[str], fix: str = ""
+    ) -> None:
+        """Build the message; ``fix`` is added to it."""
         self.wanted = wanted
         self.available = tuple(available)
         listed = some_names(available, _MOST_LISTED) or "nothing"
-        LogError.__init__(self, path, f"has no {wanted}; it has {listed}")
+        advice = f" ({fix})" if fix else ""
+        LogError.__init__(self, path, f"has no {wanted}; it has {listed}{advice}")
 
     def __str__(self) -> str:
         """Return the message without the quotes of ``KeyError``."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import chain
@@ -85,6 +85,14 @@ def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file's bytes, in hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def digest_of(files: Sequence[Path]) -> str:
+    """Return the SHA-256 of one file, or of the names and digests of several."""
+    if len(files) == 1:
+        return file_digest(files[0])
+    parts = "".join(f"{path.name} {file_digest(path)}\n" for path in files)
+    return hashlib.sha256(parts.encode()).hexdigest()
 
 
 @contextmanager

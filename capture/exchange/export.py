@@ -28,7 +28,7 @@ from ..common.errors import MissingChannelError, MissingExtraError, UsageError
 from ..common.files import check_stop, part_file
 from ..common.process import StopRequest
 from ..log.messages.definitions import JOINT_STATE
-from ..log.read.joint_states import UNITS
+from ..log.read.joint_messages import UNITS
 from ..log.read.sample_times import JointSignals
 from ..log.read.session import Session
 from .frame_blocks import LossTally, chosen_buses, frame_blocks, frame_facts

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,7 +23,7 @@ from ..common.process import StopRequest
 from ..log.write.writer import SessionWriter
 from ..robot.bus_map import TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
-from .can_import import ImportReport, file_digest, imported_session
+from .can_import import ImportReport, digest_of, imported_session
 from .column_map import COMMANDS, STATES, Column, ColumnMap
 from .csv_import import EARLIEST_NS
 from .frame_log import LATEST_NS, RELATIVE_EPOCH_NS
@@ -93,7 +92,7 @@ def open_tables(source: Path, commands: Path | None = None) -> TableSet:
     if commands is not None:
         tables[COMMANDS] = open_table(commands)
     files = [source, *([commands] if commands is not None else [])]
-    return TableSet(source, tables, digest=_digest(files))
+    return TableSet(source, tables, digest=digest_of(files))
 
 
 def _open_folder(folder: Path) -> TableSet:
@@ -129,7 +128,7 @@ def _open_folder(folder: Path) -> TableSet:
     events = found["events"][0] if found["events"] else None
     files = [path for paths in found.values() for path in paths]
     joints = _names(found["names"][0]) if found["names"] else ()
-    return TableSet(folder, tables, joints, events, _digest(files), tuple(others))
+    return TableSet(folder, tables, joints, events, digest_of(files), tuple(others))
 
 
 def _names(path: Path) -> tuple[str, ...]:
@@ -140,13 +139,6 @@ def _names(path: Path) -> tuple[str, ...]:
     except (OSError, UnicodeDecodeError) as error:
         raise ImportFormatError(path, f"can't be read: {error}") from error
     return tuple(word for word in text.replace(",", "\n").split() if word)
-
-
-def _digest(files: Sequence[Path]) -> str:
-    if len(files) == 1:
-        return file_digest(files[0])
-    parts = "".join(f"{path.name} {file_digest(path)}\n" for path in files)
-    return hashlib.sha256(parts.encode()).hexdigest()
 
 
 def import_tables(

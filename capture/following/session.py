@@ -33,6 +33,7 @@ def faults_in_session(session: SessionView) -> tuple[Fault, ...]:
     Raises:
         DataError: If a topic has more than :data:`MOST_JOINTS`.
     """
+    session = session.with_joints()
     quantities = {
         "command": (COMMANDS, "position"),
         "position": (STATES, "position"),

@@ -22,6 +22,7 @@ from undulog.analysis.session.analyse import measure_session
 from undulog.capture import Session, SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError, UndulogError
+from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from undulog.sim.scenario.scenario import Kernels, Scenario
 
 from ..reproduce import find_repetition
@@ -183,6 +184,7 @@ def calibrate(
     world: str | None = None,
     wanted: Wanted | None = None,
     *,
+    topics: tuple[str, str] = (COMMAND_TOPIC, RESPONSE_TOPIC),
     kernels: Kernels = Kernels.NUMPY,
     on_tick: Callable[[], None] = lambda: None,
     on_iteration: Callable[[int, float, float], None] = lambda _k, _rms, _speed: None,
@@ -193,6 +195,7 @@ def calibrate(
         path: The session: commands and joint states.
         world: Scenario to start from, by name or file; the one it was recorded in if None.
         wanted: What is to be fitted.
+        topics: Of commands and responses.
         kernels: What computes the force laws.
         on_tick: Called at every tick of every run; may raise to end the fit.
         on_iteration: Called with each iteration, the residuals' RMS [rad] and the real-time factor.
@@ -204,13 +207,14 @@ def calibrate(
         LogError: If the session can't be read.
     """
     wish = wanted or Wanted()
-    repetition = find_repetition(path, world)
+    repetition = find_repetition(path, world, topics=topics)
     driven, scenario = repetition.driven, repetition.scenario
     open_ones = unknowns(scenario, spread=wish.spread, only=wish.only, delay=wish.delay)
     if wish.module is not None:
         open_ones = (*open_ones, module_unknown(scenario, wish.module, wish.spread))
     settle_s = scenario.settle_s if wish.settle_s is None else wish.settle_s
-    with Session.open(path) as session:
+    with Session.open(path) as opened:
+        session = opened.with_joints(*topics)
         measured = read_measured(session, settle_s, scenario.duration_s)
         omega = _omega(session)
     if strange := [name for name in measured.joints if name not in scenario.robot.joint_names]:

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from undulog.analysis.signals.columns import RESPONSE_TOPIC
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError, UsageError
+from undulog.capture.log.read.joint_topics import RESPONSE_TOPIC
 from undulog.capture.robot.model import Servo
 from undulog.sim.drive.motion import COMMANDS
 from undulog.sim.gait.contract import Gait

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_stop
@@ -28,6 +29,7 @@ def fit(
     spread: float = 0.5,
     within: float = 0.05,
     settle: float | None = None,
+    topics: JointTopicOptions = CONTRACT,
     kernels: Literal["numpy", "numba", "auto"] = "auto",
     force: bool = False,
     json: bool = False,
@@ -55,6 +57,7 @@ def fit(
         spread: Relative standard deviation of the parameters, as known before the session.
         within: A parameter counts as determined if its interval is within this share of it.
         settle: The first seconds to leave out, instead of the session's own.
+        topics: Where commands and responses are; commands are never found by type.
         kernels: What computes the forces: `numba` is faster; `auto` takes it where it is installed.
         force: Replace the outputs if they are there.
         json: Print one JSON object instead of text.
@@ -78,6 +81,7 @@ def fit(
             file,
             world or None,
             wanted,
+            topics=topics.names,
             kernels=Kernels.NUMBA if compiled else Kernels.NUMPY,
             on_tick=lambda: check_stop(output, stop),
             on_iteration=lambda k, rms, speed: bar.update(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import interruptible
@@ -33,6 +34,7 @@ def replay(
     duration: float | None = None,
     arm: bool = False,
     robot: str | None = None,
+    topics: JointTopicOptions = CONTRACT,
     recorder: Path | None = None,
     force: bool = False,
     json: bool = False,
@@ -59,6 +61,7 @@ def replay(
         duration: How long in seconds, instead of as long as there are commands.
         arm: Send the commands.
         robot: The robot on the bus, a name or a TOML file; by default the session's own.
+        topics: Where commands and responses of the session are; commands are never found by type.
         recorder: Control socket of the recorder that receives the gait; by default the only one
             that runs.
         force: Replace the output if it is there.
@@ -82,6 +85,7 @@ def replay(
             _show,
             arm=arm,
             robot=robot,
+            topics=topics.names,
             duration_s=duration,
             output=output,
             recorder=recorder,
@@ -99,7 +103,7 @@ def replay(
     from ..reproduce import find_repetition, replay_in_twin, what_next
 
     changes = read_changes(change or [])
-    repetition = find_repetition(file, world or None, changes, duration)
+    repetition = find_repetition(file, world or None, changes, duration, topics.names)
     start = time.monotonic()
     with interruptible() as stop, progress(file.name, repetition.scenario.duration_s) as bar:
         again = replay_in_twin(

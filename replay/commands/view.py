@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from undulog.capture import Session
+from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import complain, echo, emit_json, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output
@@ -39,6 +40,7 @@ def view(
     clip: Path | None = None,
     shot: Annotated[ClipOptions | None, Parameter(name="*")] = None,
     beside: Annotated[OverlayOptions | None, Parameter(name="*")] = None,
+    topics: JointTopicOptions = CONTRACT,
     robot: str | None = None,
     force: bool = False,
     json: bool = False,
@@ -72,6 +74,7 @@ def view(
             the viewer; it is drawn off screen.
         shot: How the clip is filmed.
         beside: How several sessions are put side by side.
+        topics: Where commands and responses are.
         robot: Description of the robot of a log without one, a name or a TOML file.
         force: Replace the recording or the clip if it is there.
         json: Print one JSON object: what was written and what is missing. Needs `--save` or
@@ -87,18 +90,20 @@ def view(
     if live is not None and robot is not None:
         raise UsageError("--robot is for recorded logs; a recorder sends its robot's description")
     if clip is not None:
-        view_clip(files[0], clip, shot or ClipOptions(), robot=robot, force=force, json=json)
+        given = shot or ClipOptions()
+        view_clip(files[0], clip, given, topics=topics, robot=robot, force=force, json=json)
         return
     if save is not None:
         check_output(save, [".rrd"], "a Rerun recording; end its name in .rrd", force=force)
     if live is not None:
         _view_live(live, save=save, web=web, connect=connect, json=json)
     elif len(files) == 1 and save is not None:
-        _report(*_convert(files[0], save, single or SingleOptions(), robot), json=json)
+        _report(*_convert(files[0], save, single or SingleOptions(), topics, robot), json=json)
     elif len(files) == 1:
-        _view_session(files[0], single or SingleOptions(), robot, web=web)
+        _view_session(files[0], single or SingleOptions(), topics, robot, web=web)
     else:
-        view_overlay(files, beside or OverlayOptions(), robot=robot, save=save, web=web, json=json)
+        given = beside or OverlayOptions()
+        view_overlay(files, given, topics=topics, robot=robot, save=save, web=web, json=json)
 
 
 def _check_usage(
@@ -128,13 +133,17 @@ def _check_usage(
 
 
 def _convert(
-    file: Path, output: Path, single: SingleOptions, robot: str | None
+    file: Path,
+    output: Path,
+    single: SingleOptions,
+    topics: JointTopicOptions,
+    robot: str | None,
 ) -> tuple[Recording, float]:
     from undulog.analysis.signals.stretch import Options
 
     from ..feed.numbers import saved
 
-    command, response = single.topics
+    command, response = topics.names
     options = Options(command_topic=command, response_topic=response)
     folder = output.parent  # on a disk, so that an hour's columns need not be in memory
     with ExitStack() as stack:
@@ -149,7 +158,7 @@ def _convert(
         from ..layout import build_blueprint
 
         recording = write_recording(
-            single.view(session),
+            topics.view(session),
             output,
             analysis=layer.analysis,
             steady=layer.steady,
@@ -222,13 +231,15 @@ def _report_live(report: RelayReport, save: Path | None, *, json: bool) -> None:
         echo(f"note: {report.unread} messages could not be read")
 
 
-def _view_session(file: Path, single: SingleOptions, robot: str | None, *, web: bool) -> None:
+def _view_session(
+    file: Path, single: SingleOptions, topics: JointTopicOptions, robot: str | None, *, web: bool
+) -> None:
     """Show a session until the viewer is closed or a stop is requested."""
     if not web:
         viewer.require_display()
     with ExitStack() as stack:
         stop = stack.enter_context(interruptible())
-        session = single.view(stack.enter_context(Session.open(file, robot=robot)))
+        session = topics.view(stack.enter_context(Session.open(file, robot=robot)))
         known = Layer(None)
         if single.result:
             from ..feed.numbers import read_results
@@ -241,7 +252,7 @@ def _view_session(file: Path, single: SingleOptions, robot: str | None, *, web: 
         from ..feed.numbers import Analysing
         from ..feed.progressive import NoLongerWantedError, Task, show_session, steps
 
-        analysing = stack.enter_context(Analysing(file, single.topics, robot))
+        analysing = stack.enter_context(Analysing(file, topics.names, robot))
         try:
             with progress("view", total=steps(session)) as bar:
                 bar.update(0, note="the beginning")

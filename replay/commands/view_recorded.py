@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from undulog.capture import Session, SessionView
+from undulog.capture import Session
+from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import MissingExtraError, UsageError
 from undulog.capture.common.process import interruptible
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     from ..overlay.sessions import Align
     from ..overlay.write import Overlay, Place
 
-_COMMANDS = "/joint_commands"
-_STATES = "/joint_states"
 _TYPED = {"start": "from", "end": "to"}
 
 
@@ -53,37 +52,10 @@ class SingleOptions(_Options):
             modules they name. May be given several times.
         tab: With one session: the tab in front, `session` by default; the mean cycle's
             plays at once.
-        command_topic: With one session: JointState topic of the commands, in a bag of another make.
-        response_topic: With one session: JointState topic of the responses.
     """
 
     result: Annotated[list[Path] | None, Parameter(negative=())] = None
     tab: Tab | None = None
-    command_topic: str | None = None
-    response_topic: str | None = None
-
-    @property
-    def topics(self) -> tuple[str, str]:
-        """JointState topics of commands and responses."""
-        return self.command_topic or _COMMANDS, self.response_topic or _STATES
-
-    def view(self, session: SessionView) -> SessionView:
-        """View a session with commands and responses on the topics of the log contract.
-
-        Args:
-            session: The session.
-
-        Returns:
-            The view; the session itself where they are there already.
-
-        Raises:
-            MissingChannelError: If it has no topic of a name that was given.
-        """
-        names = dict(zip((_COMMANDS, _STATES), self.topics, strict=True))
-        if all(usual == topic for usual, topic in names.items()):
-            return session
-        known = session.channels
-        return session.view(rename={a: b for a, b in names.items() if a != b or b in known})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,6 +101,7 @@ def view_clip(
     clip: Path,
     options: ClipOptions,
     *,
+    topics: JointTopicOptions = CONTRACT,
     robot: str | None = None,
     force: bool,
     json: bool,
@@ -139,6 +112,7 @@ def view_clip(
         file: The session.
         clip: The clip, ``.gif`` or ``.mp4``.
         options: How it is filmed.
+        topics: Where commands and responses are.
         robot: Description for a log without one.
         force: Replace the clip if it is there.
         json: Print the report as one JSON object.
@@ -158,8 +132,9 @@ def view_clip(
     with (
         interruptible() as stop,
         tempfile.TemporaryDirectory(prefix="undulog-clip-") as folder,
-        Session.open(file, robot=robot) as session,
+        Session.open(file, robot=robot) as opened,
     ):
+        session = topics.view(opened)
         shot = _shot(options, session.duration_s, file)
         check_film(clip.suffix.lower(), shot.size, shot.fps)
         with progress(f"clip of {file.name}", total=len(shot.times_s)) as bar:
@@ -220,6 +195,7 @@ def view_overlay(
     files: Sequence[Path],
     options: OverlayOptions,
     *,
+    topics: JointTopicOptions = CONTRACT,
     robot: str | None = None,
     save: Path | None,
     web: bool,
@@ -230,6 +206,7 @@ def view_overlay(
     Args:
         files: Two or more sessions.
         options: How they are aligned, placed and called.
+        topics: Where commands and responses are.
         robot: Description for logs without one.
         save: Write the recording there instead of opening the viewer.
         web: Serve it to a browser on this machine.
@@ -254,6 +231,7 @@ def view_overlay(
             beside = combine_sessions(
                 files,
                 path,
+                topics=topics.names,
                 robot=robot,
                 names=names,
                 how=how,

@@ -29,7 +29,7 @@ from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.session.cycles import cycle_maps
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session, SessionView
-from undulog.capture.common.errors import DataError, MissingChannelError, UndulogError
+from undulog.capture.common.errors import DataError, UndulogError
 
 from ..samples.content import Layer, Named
 
@@ -115,10 +115,6 @@ def computed(session: SessionView, options: Options | None = None) -> Layer:
     """
     try:
         measured = measure_session(session, options)
-    except MissingChannelError as error:
-        # What is there is listed, and one of it may be what was looked for.
-        name = "name them with --command-topic and --response-topic"
-        return Layer(None, notes=(f"not analysed: {error}; {name}",))
     except UndulogError as error:
         return Layer(None, notes=(f"not analysed: {error}",))
     analysis = measured.analysis

@@ -29,6 +29,7 @@ from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.files import check_stop
 from undulog.capture.common.process import StopRequest
+from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 
 from ..draw.facts import log_facts
 from ..draw.plots.write import Plot
@@ -331,6 +332,7 @@ def combine_sessions(
     files: Sequence[Path],
     path: Path,
     *,
+    topics: tuple[str, str] = (COMMAND_TOPIC, RESPONSE_TOPIC),
     robot: str | None = None,
     names: Sequence[str] | None = None,
     how: Align = Align.TIME,
@@ -343,6 +345,7 @@ def combine_sessions(
     Args:
         files: Two or more sessions; differences are from the first.
         path: Where the .rrd file goes; an existing one is replaced when the new one is whole.
+        topics: Of commands and responses.
         robot: Description for logs without one.
         names: What they are called, or None for the files' names.
         place: Where the bodies are drawn.
@@ -367,6 +370,7 @@ def combine_sessions(
         for file, name in zip(files, called, strict=True):
             opened = Session.open(file, column_folder=folder, robot=robot)
             session = stack.enter_context(opened)
+            session = session.with_joints(*topics)
             pairs.append((session.view(on_read=partial(check_stop, path, stop)), name))
         step("angles")
         # Aligned before the long part, since that may refuse.

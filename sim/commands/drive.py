@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+from undulog.capture.commands.joint_options import CommandTopic
 from undulog.capture.commands.several import Line, each, sessions_of, show
 from undulog.capture.common.console import (
     UNLIMITED,
@@ -155,10 +156,11 @@ def _only_recorder() -> Path | None:
 
 
 _TWIN = "twin"
+_CONTRACT = CommandTopic()
 
 
 def _dry_runs(
-    whats: Sequence[str], on: str, robot: Robot | None, duration_s: float | None
+    whats: Sequence[str], on: str, robot: Robot | None, duration_s: float | None, topic: str
 ) -> dict[str, Line]:
     """Run motions in the twin, through the gate of a bus, one after the other."""
     from ..drive.dry_run import dry_run, reported, summary_lines
@@ -166,7 +168,7 @@ def _dry_runs(
     from ..drive.over_bus import check_drivable
 
     def line(what: str) -> Line:
-        driven = find_motion(what, robot=robot)
+        driven = find_motion(what, robot=robot, command_topic=topic)
         check_drivable(driven, robot or driven.robot)
         with interruptible() as stop:
             dry = dry_run(driven, robot=robot, duration_s=duration_s, stop=stop)
@@ -200,6 +202,7 @@ def drive(
     duration: float | None = None,
     arm: bool = False,
     robot: str | None = None,
+    commands: CommandTopic = _CONTRACT,
     recorder: Path | None = None,
     force: bool = False,
     json: bool = False,
@@ -224,6 +227,7 @@ def drive(
         duration: How long to drive in seconds, instead of the gait's or plan's duration.
         arm: Send the commands.
         robot: The robot on the bus, a name or a TOML file; by default the one that it was made for.
+        commands: Where the commands of a session are; they are never found by type.
         recorder: Control socket of the recorder that receives the gait; by default the only one
             that runs.
         force: Replace the output if it is there.
@@ -233,6 +237,7 @@ def drive(
     from ..drive.motion import find_motion
     from ..scenario.scenario_file import load_scenario
 
+    topic = commands.command_topic
     whats = _motions([what, *more])
     if len(whats) > 1 and (arm or output is not None or on.partition(":")[0] == _TWIN):
         raise UsageError(
@@ -254,8 +259,8 @@ def drive(
         bus_address(on)
         described = load_robot(robot) if robot is not None else None
         if len(whats) > 1:
-            return show(_dry_runs(whats, on, described, duration), as_json=json)
-        driven = find_motion(what, robot=described)
+            return show(_dry_runs(whats, on, described, duration, topic), as_json=json)
+        driven = find_motion(what, robot=described, command_topic=topic)
         given: dict[str, Any] = {
             "robot": described,
             "duration_s": duration,
@@ -273,7 +278,7 @@ def drive(
             "--arm, --recorder and --robot are for a bus; a run of the twin records itself"
         )
     world = load_scenario(rest) if rest else None
-    driven = find_motion(what, world)
+    driven = find_motion(what, world, command_topic=topic)
     scenario = driven.scenario(world, duration)
     if output is None:
         raise UsageError(

@@ -22,7 +22,13 @@ import numpy as np
 
 from undulog.capture import Session
 from undulog.capture.common.arrays import NS, FloatArray, IntArray
-from undulog.capture.common.errors import DataError, JointSetError, PlanError, UsageError
+from undulog.capture.common.errors import (
+    DataError,
+    JointSetError,
+    MissingChannelError,
+    PlanError,
+    UsageError,
+)
 from undulog.capture.common.files import Shelf
 from undulog.capture.log.read.sample_times import JointSignals
 from undulog.capture.robot.model import Plane, Robot
@@ -83,16 +89,20 @@ class RecordedCommands:
     modes: tuple[tuple[int, str], ...] = ()
 
     @classmethod
-    def read(cls, session: Session) -> Self:
+    def read(cls, session: Session, command_topic: str = COMMANDS) -> Self:
         """Read a session.
 
         Args:
             session: Open; it is not needed afterwards.
+            command_topic: Its commands. They may move a robot, so that they are never guessed.
 
         Raises:
             MissingChannelError: If it has none.
         """
-        commands = session.joints(COMMANDS)
+        if command_topic == COMMANDS not in session.channels:
+            listed = sorted(session.channels)
+            raise MissingChannelError(session.path, COMMANDS, listed, "choose with --command-topic")
+        commands = session.joints(session.joint_topics(command_topic).command)
         gait = session.joints("/gait") if "/gait" in session.channels else None
         modes = session.messages("/gait/mode") if "/gait/mode" in session.channels else ()
         return cls(commands, gait, tuple((t_ns, str(message.data)) for t_ns, message in modes))
@@ -268,6 +278,7 @@ def find_motion(
     world: Scenario | None = None,
     changes: Mapping[str, Any] | None = None,
     robot: Robot | None = None,
+    command_topic: str = COMMANDS,
 ) -> MotionSource:
     """Find a motion by name.
 
@@ -278,6 +289,7 @@ def find_motion(
         changes: Of recorded commands: what to change of the world that they were recorded in, see
             :func:`.sim.scenario.scenario_file.parse_scenario`.
         robot: The robot for recorded commands, in place of that of the session or world.
+        command_topic: Where the commands of a session are.
 
     Raises:
         UsageError: If there is no such thing.
@@ -289,7 +301,7 @@ def find_motion(
     path = Path(word)
     is_folder = path.is_dir() and word not in scenario_names()  # of the parts of a session
     if path.suffix == ".mcap" or is_folder:
-        return _commands(path, world, changes, robot)
+        return _commands(path, world, changes, robot, command_topic)
     found = Shelf("gait or plan", "undulog.sim", "scenarios", PlanError).read(word)
     if is_plan(found.text):
         return _plan(found.text, found.source)
@@ -331,11 +343,15 @@ def _plan(text: str, source: Path) -> MotionSource:
 
 
 def _commands(
-    path: Path, world: Scenario | None, changes: Mapping[str, Any] | None, robot: Robot | None
+    path: Path,
+    world: Scenario | None,
+    changes: Mapping[str, Any] | None,
+    robot: Robot | None,
+    command_topic: str,
 ) -> MotionSource:
     facts = {"driven": "commands", "driven.by": path.name}
     with Session.open(path) as session:
-        recorded = RecordedCommands.read(session)
+        recorded = RecordedCommands.read(session, command_topic)
         stored, meta = session.attachments, session.metadata
         settle_s, described = session.settle_s, session.robot
         if robot is None:

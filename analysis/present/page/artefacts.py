@@ -13,12 +13,12 @@ from undulog.capture.common.arrays import FloatArray, frozen
 from undulog.capture.common.console import plain
 from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.common.palette import joint_hex
+from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 
 from ...results import formats
 from ...results.analysis import Analysis, JointResult
 from ...results.artefact import KINDS, Artefact, Span
 from ...results.formats import degrees, estimate, short
-from ...signals.columns import COMMAND_TOPIC, RESPONSE_TOPIC
 from .svg import REFERENCE, Drawing, drawing, inline_svg, key, legend
 from .tables import element, is_driven
 

@@ -18,7 +18,7 @@ from ...common.errors import DataError
 from ..file.log_file import FilePages, LogFile
 from ..mcap.chunk import BODY_AT, FIXED_SIZE, MESSAGE, PREFIX_SIZE, Buffer, Places
 from ..messages.cdr import Layout, layout_of
-from ..messages.definitions import JOINT_STATE, MessageType
+from ..messages.definitions import JOINT_LISTS, MessageType
 from .blocks import Records, Window, blocks_in, record_batches
 from .buffers import TimeStore
 from .layouts import MOST_JOINT_LISTS, MOST_LAYOUTS, Group, LayoutSorter, Stamping
@@ -180,7 +180,7 @@ class _GroupReader:
         pages: FilePages | None,
     ) -> None:
         self._topic = request.topic
-        self._most = MOST_JOINT_LISTS if request.message_type.name == JOINT_STATE else None
+        self._most = MOST_JOINT_LISTS if request.message_type.name in JOINT_LISTS else None
         self._paths = None if request.paths is None else frozenset(request.paths)
         self._expected, self._reserve = expected, reserve
         self._shared, self._stamping, self._pages = shared, stamping, pages

@@ -129,9 +129,9 @@ def _fits(matrix: Matrix, layout: Layout) -> NDArray[np.bool_]:
     return fits
 
 
-def names_of(layout: Layout) -> tuple[str, ...]:
-    """Return the strings of the sequence ``name``: the joints of a JointState."""
-    return tuple(text for path, text in layout.strings.items() if path.startswith("name["))
+def names_of(layout: Layout, sequence: str = "name[") -> tuple[str, ...]:
+    """Return the strings of a sequence; by default ``name``, the joints of a JointState."""
+    return tuple(text for path, text in layout.strings.items() if path.startswith(sequence))
 
 
 def values_of(layout: Layout, path: str, matrix: Matrix) -> NDArray[Any]:

@@ -14,7 +14,7 @@ import sys
 import tempfile
 import weakref
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -168,13 +168,20 @@ class Recovered:
 class LogFile:
     """A session's blocks, channels, schemas, metadata and attachments, over all its files."""
 
-    def __init__(self, path: Path, column_folder: Path | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        column_folder: Path | None = None,
+        on_copied: Callable[[float], None] = lambda _: None,
+    ) -> None:
         """Open a session.
 
         Args:
             path: Its file, any of its parts, or a folder that holds it and no other; a rosbag2
-                folder or a ``.db3`` file; or the URL of a file.
-            column_folder: Folder for large columns in files; None for memory.
+                folder, a ``.db3`` file or a ``.bag`` of ROS 1; or the URL of a file.
+            column_folder: Folder for large columns in files, and for the copy of a bag; None for
+                memory, and the system's temporary folder.
+            on_copied: Called with the share of a bag that is copied, 0 to 1; may raise.
 
         Raises:
             NotALogError: If it is empty, not MCAP, or nothing in it can be read.
@@ -196,7 +203,8 @@ class LogFile:
         self._sources: list[McapFile | WalTail] = []
         self.scratch: list[mmap.mmap] = []  # used memory, which costs no page faults
         self.pages = None if column_folder is None else FilePages(column_folder)
-        self._bag = BagCopy(path, column_folder) if is_bag(path) else None
+        self._bag = BagCopy(path, column_folder, on_copied) if is_bag(path) else None
+        self.warnings += [] if self._bag is None else self._bag.warnings
         first = first_part(path if self._bag is None else self._bag.path)
         wal = read_wal(first)  # before the files: segments released meanwhile are in the files
         self.parts: PartFiles = open_parts(first, bare=wal is not None)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from ...following.fault import Fault as JointFault
 from ..messages.frames import FRAME_TOPIC_PREFIXES, bus_of
 from ..read.facts import TIMES_FROM_FPS
+from ..read.joint_messages import JOINT_TYPES
 from .freeze import FROZEN_SAMPLES
 from .tallies import (
     NS,
@@ -408,12 +409,12 @@ def judge_topics(
     """
     found = [] if undecoded is None else [Finding(1, undecoded)]
     framed = any(topic.startswith(FRAME_TOPIC_PREFIXES) for topic in types)
-    others = sorted(topic for topic, kind in types.items() if kind.endswith("/JointState"))
+    others = sorted(topic for topic, kind in types.items() if kind in JOINT_TYPES)
     for topic in ("/joint_states", "/joint_commands"):
         if topic in types:
             continue
         if others:
-            sentence = f"{topic} is missing; JointStates are on {', '.join(others)}"
+            sentence = f"{topic} is missing; joints are on {', '.join(others)}"
         elif undecoded is not None:
             continue
         elif framed:

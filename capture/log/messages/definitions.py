@@ -176,6 +176,13 @@ class _Parser:
 
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
+CONTROLLER_STATE = "control_msgs/msg/JointTrajectoryControllerState"
+DYNAMIC_STATE = "control_msgs/msg/DynamicJointState"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+FLOAT_ARRAY = "std_msgs/msg/Float64MultiArray"
+
+JOINT_LISTS = (JOINT_STATE, CONTROLLER_STATE, DYNAMIC_STATE)
+"""Types whose messages each have one sample of some joints, and their names."""
 
 _BODIES: dict[str, str] = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
@@ -234,6 +241,11 @@ _BODIES: dict[str, str] = {
         "string function\nuint32 line\n"
     ),
 }
+
+
+def is_of_contract(kind: MessageType) -> bool:
+    """Whether a type is one of the log contract, with the same fields."""
+    return _short(kind.name) in _BODIES and message_type(kind.name) == kind
 
 
 @cache

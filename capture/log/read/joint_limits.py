@@ -9,17 +9,17 @@ import numpy as np
 from ...common.arrays import NS, FloatArray, IntArray
 from ...common.errors import DataError, MissingChannelError
 from ...robot.draft import SeenJoint
+from .joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from .sample_times import JointSignals
 from .session import SessionView
 
 _SCALES = {"rad": 1.0, "deg": math.radians(1.0)}
 
 
-def seen_joints(session: SessionView, command_topic: str, response_topic: str) -> list[SeenJoint]:
+def seen_joints(session: SessionView) -> list[SeenJoint]:
     """Return the joints of a log with the ranges of their angles and their greatest rates.
 
-    Args:
-        command_topic: JointState topic whose angles count too, if the log has it.
+    Commands count too, if the log has some.
 
     Returns:
         In the order of the log. The rate is that of the measured velocities, or else between two
@@ -29,15 +29,15 @@ def seen_joints(session: SessionView, command_topic: str, response_topic: str) -
         MissingChannelError: If the log has no such responses.
         DataError: If their angles are neither in rad nor in deg.
     """
-    measured = session.joints(response_topic)
+    measured = session.joints(RESPONSE_TOPIC)
     scale = _scale(session, measured)
     try:
-        rates = session.joints(response_topic, "velocity")
+        rates = session.joints(RESPONSE_TOPIC, "velocity")
     except MissingChannelError:
         rates = None
     commands: JointSignals | None = None
-    if command_topic in session.channels:
-        commands = session.joints(command_topic)
+    if COMMAND_TOPIC in session.channels:
+        commands = session.joints(COMMAND_TOPIC)
     found: list[SeenJoint] = []
     for name in measured.names:
         angle = measured.signal(name)
@@ -54,7 +54,7 @@ def seen_joints(session: SessionView, command_topic: str, response_topic: str) -
             fastest = float(rate.max(initial=0.0))
             found.append(SeenJoint(name, float(known.min()), float(known.max()), fastest))
     if not found:
-        raise DataError(f"{session.path}: {response_topic} has no angle of any joint")
+        raise DataError(f"{session.path}: {measured.topic} has no angle of any joint")
     return found
 
 

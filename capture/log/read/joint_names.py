@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from ...common.errors import DataError, JointSetError, some_names
 from ..columns.topics import Topics
-from ..messages.definitions import JOINT_STATE
+from .joint_messages import JOINT_TYPES
 
 _LOOKED_AT = 2000
 """Messages of a topic; one with a message a joint names all its joints in them."""
@@ -17,14 +18,14 @@ _MOST_LISTED = 12
 
 
 def joint_names(topics: Topics, most: int = _LOOKED_AT) -> dict[str, tuple[str, ...]]:
-    """Return the joints of each JointState topic, in the order in which they appear.
+    """Return the joints of each topic that names some, in the order in which they appear.
 
     Args:
         most: Messages that are looked at of a topic whose messages name one joint each.
     """
     found: dict[str, tuple[str, ...]] = {}
     for topic, channel in topics.channels.items():
-        if channel.type_name != JOINT_STATE or not channel.is_ros2:
+        if channel.type_name not in JOINT_TYPES or not channel.is_ros2:
             continue
         try:
             names = _names(topics, topic, most)
@@ -39,11 +40,19 @@ def _names(topics: Topics, topic: str, most: int) -> tuple[str, ...]:
     decode = topics.decoder(topic)
     names: dict[str, None] = {}
     for _, message in islice(topics.raw(topic), most):
-        own = list(decode(message).name)
+        own = _joints(decode(message))
         names |= dict.fromkeys(own)
         if len(own) > 1:  # all joints in one message
             break
     return tuple(names)
+
+
+def _joints(message: Any) -> list[str]:
+    """Return the joints of a message; of a DynamicJointState those with a position."""
+    if hasattr(message, "interface_values"):
+        pairs = zip(message.joint_names, message.interface_values, strict=False)
+        return [name for name, one in pairs if "position" in one.interface_names]
+    return list(getattr(message, "joint_names", None) or getattr(message, "name", ()))
 
 
 def check_joints(path: Path, topics: Topics, joints: Sequence[str], robot: str) -> None:
@@ -61,7 +70,7 @@ def check_joints(path: Path, topics: Topics, joints: Sequence[str], robot: str) 
         )
         raise JointSetError(
             f"{path}: none of its joints is of {robot}, which has "
-            f"{some_names(joints, _MOST_LISTED)}; {has or 'it has no JointState topic'}"
+            f"{some_names(joints, _MOST_LISTED)}; {has or 'it has no topic of joints'}"
         )
     logged = dict.fromkeys(name for names in own.values() for name in names)
     strange = [name for name in logged if name not in known]

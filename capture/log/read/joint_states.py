@@ -1,4 +1,4 @@
-"""Reads JointState topics of any make as one series per joint.
+"""Reads topics of joints, JointStates and others, as one series per joint.
 
 Foreign logs have all joints in one message, or one joint per message, or a set that changes; each
 joint gets its own samples at its own sampling times.
@@ -7,134 +7,32 @@ joint gets its own samples at its own sampling times.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ...common.arrays import NS, FloatArray, IntArray
+from ...common.arrays import NS, IntArray
 from ...common.errors import DataError, MissingChannelError
 from ..columns.blocks import Window
 from ..columns.columns import Messages
-from ..columns.layouts import Group, names_of
-from ..columns.topics import Topics
-from ..messages.definitions import JOINT_STATE, MessageType
+from ..columns.topics import Channel, Topics
+from ..messages.definitions import FLOAT_ARRAY, JOINT_STATE, TRAJECTORY
+from .joint_messages import (
+    INTERFACE_UNITS,
+    UNITS,
+    JointSource,
+    Trajectory,
+    carried,
+    check_source,
+    joint_source,
+    leaf_paths,
+    points_in_force,
+    sampled,
+    trajectories,
+)
+from .joint_rows import JointRows, merge_rows, rows_of
 from .sample_times import JointSignals, Series, StampClock, cut, own_times
-
-_EARLY_OR_LATE = 0.1
-"""A joint that is missing for more than this part of the topic's span causes a warning."""
-
-
-@dataclass(frozen=True)
-class JointRows:
-    """Messages that carry the same joints.
-
-    Attributes:
-        names: The joints, k of them.
-        stamp_ns: header.stamp [ns], shape (n,).
-        log_ns: Log time [Unix ns], shape (n,).
-        values: Shape (n, k), or (n, 0) if these messages leave the field empty.
-    """
-
-    names: tuple[str, ...]
-    stamp_ns: IntArray
-    log_ns: IntArray
-    values: FloatArray
-
-
-def rows_of(group: Group, field: str) -> JointRows:
-    """Return the rows of JointState messages of one layout, in log order."""
-    log_ns = group.times()
-    stamp_ns = group.stamps() if group.is_stamped else np.zeros_like(log_ns)
-    values = group.values(field).astype(np.float64, copy=False)
-    if (np.diff(log_ns) < 0).any():  # a file need not be in log order, a reader must be
-        logged = np.argsort(log_ns, kind="stable")
-        stamp_ns, log_ns, values = stamp_ns[logged], log_ns[logged], values[logged]
-    return JointRows(names_of(group.layout), stamp_ns, log_ns, values)
-
-
-def merge_rows(
-    rows: Sequence[JointRows], topic: str, field: str, warn: Callable[[str], None]
-) -> tuple[tuple[str, ...], list[IntArray], list[FloatArray]]:
-    """Merge messages of all layouts to one series per joint.
-
-    Args:
-        rows: The messages, by layout.
-        warn: Called with one sentence for each irregularity.
-
-    Returns:
-        Joint names in order of first appearance, times [Unix ns] and values, one array per joint;
-        joints sampled together share one array of times.
-    """
-    filled = [row for row in rows if row.names and row.values.shape[1] == len(row.names)]
-    for row in rows:
-        if row.names and row.values.shape[1] not in {0, len(row.names)}:
-            warn(
-                f"{topic}: {len(row.stamp_ns)} messages have {len(row.names)} names but "
-                f"{row.values.shape[1]} values of {field}; they are left out"
-            )
-    if len(filled) == 1:
-        row = filled[0]
-        t_ns, order = _in_time(row.stamp_ns, f"{topic}", warn)
-        values = row.values if order is None else row.values[order]
-        if values.strides[0] != values.itemsize:  # a joint's samples side by side
-            values = np.asfortranarray(values)
-        return row.names, [t_ns] * len(row.names), [values[:, j] for j in range(len(row.names))]
-    parts: dict[str, list[tuple[JointRows, int]]] = {}
-    for row in filled:
-        for j, name in enumerate(row.names):
-            parts.setdefault(name, []).append((row, j))
-    times: list[IntArray] = []
-    columns: list[FloatArray] = []
-    for name, pieces in parts.items():
-        log_ns = np.concatenate([row.log_ns for row, _ in pieces])
-        logged = np.argsort(log_ns, kind="stable")
-        stamps = np.concatenate([row.stamp_ns for row, _ in pieces])[logged]
-        values = np.concatenate([row.values[:, j] for row, j in pieces])[logged]
-        t_ns, order = _in_time(stamps, f"{topic}, {name}", warn)
-        times.append(t_ns)
-        columns.append(values if order is None else values[order])
-    _warn_changed_set(tuple(parts), times, topic, warn)
-    return tuple(parts), times, columns
-
-
-def _in_time(
-    t_ns: IntArray, where: str, warn: Callable[[str], None]
-) -> tuple[IntArray, IntArray | None]:
-    """Sort times; return also the order if they were unsorted. Duplicates cause a warning."""
-    steps = np.diff(t_ns)
-    backward, repeated = int((steps < 0).sum()), int((steps == 0).sum())
-    order: IntArray | None = None
-    if backward:
-        warn(f"{where}: {backward} samples go back in time; sorted by their stamps")
-        order = np.argsort(t_ns, kind="stable")
-        t_ns = t_ns[order]
-        repeated = int((np.diff(t_ns) == 0).sum())
-    if repeated:
-        warn(f"{where}: {repeated} samples repeat the stamp before them; all are kept")
-    return t_ns, order
-
-
-def _warn_changed_set(
-    names: Sequence[str], times: Sequence[IntArray], topic: str, warn: Callable[[str], None]
-) -> None:
-    """Warn of joints that are missing at the start or end of the topic."""
-    filled = [t for t in times if len(t)]
-    if not filled:
-        return
-    start, stop = min(int(t[0]) for t in filled), max(int(t[-1]) for t in filled)
-    slack = _EARLY_OR_LATE * (stop - start)
-    partial = [
-        name
-        for name, t in zip(names, times, strict=True)
-        if not len(t) or t[0] - start > slack or stop - t[-1] > slack
-    ]
-    if partial:
-        warn(
-            f"{topic}: the set of joints changes during the session; only part of it has "
-            f"{', '.join(partial)}"
-        )
-
 
 SLACK_NS = 5 * NS
 """Largest difference between sampling time and log time for which a window is complete."""
@@ -172,8 +70,6 @@ def covers(found: Mapping[str, Messages], window_ns: Window) -> bool:
     return True
 
 
-UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
-"""Field of a JointState to its unit, if the channel states no other."""
 _MEASURED = (
     "/joint_states",
     "/joint_velocity",
@@ -197,6 +93,7 @@ class JointReader:
         """Set up a reader; ``warn`` is called with one sentence for each irregularity."""
         self._path, self._topics, self._clock, self._warn = path, topics, clock, warn
         self._offsets: dict[str, Series] = {}
+        self._trajectories: dict[str, list[Trajectory]] = {}
 
     def read(
         self, wanted: Mapping[str, Sequence[str]], window_ns: Window, chain: Sequence[str]
@@ -223,23 +120,77 @@ class JointReader:
             found = self._topics.read(requests, widened(window_ns, SLACK_NS))
         return self.signals(wanted, found, window_ns, chain)
 
-    def requests(self, wanted: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str]]:
+    def requests(self, wanted: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str] | None]:
         """Return the topics and leaf paths to read for some fields, with the offset topics.
 
+        Trajectories are not among them: the times of their points have no window of log times.
+
         Args:
-            wanted: Topic to fields: ``position``, ``velocity``, ``effort``.
+            wanted: Name of a topic, or of a part of one, to fields: ``position``, ``velocity``,
+                ``effort``.
+
+        Returns:
+            Topic of the log to leaf paths; None for all.
 
         Raises:
             MissingChannelError: If the session has no such topic.
-            DataError: If a topic is not of JointStates, or there is no such field.
+            DataError: If a topic has no joints, or there is no such field.
         """
         self._check(wanted)
         offsets = {topic for topic in map(self._offset_topic, wanted) if topic is not None}
         self._check(dict.fromkeys(offsets, ()))
-        return {
-            topic: [*wanted.get(topic, ()), *(["position"] if topic in offsets else [])]
-            for topic in dict.fromkeys([*wanted, *sorted(offsets)])
-        }
+        paths: dict[str, dict[str, None] | None] = {}
+        for name in [*wanted, *sorted(offsets)]:
+            source, kind = self._source(name)
+            if kind == TRAJECTORY:
+                continue
+            fields = [*wanted.get(name, ()), *(["position"] if name in offsets else [])]
+            own, known = leaf_paths(source, kind, fields), paths.get(source.topic, {})
+            both = None if own is None or known is None else known | dict.fromkeys(own)
+            paths[source.topic] = both
+        return {topic: None if own is None else list(own) for topic, own in paths.items()}
+
+    def carried(self, name: str) -> dict[str, tuple[str, ...]]:
+        """Return the fields that a topic ever has, each with its joints in order of appearance.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If a topic has no joints.
+        """
+        self._check({name: ()})
+        source, kind = self._source(name)
+        found: dict[str, dict[str, None]] = {}
+        if kind == TRAJECTORY:
+            for one in self._read_trajectories(source.topic):
+                for field, values in one.values.items():
+                    if values.size:
+                        found.setdefault(field, {}).update(dict.fromkeys(one.names))
+        else:
+            for group in self._topics.read({source.topic: []}, (None, None))[source.topic].groups:
+                for field, names in carried(source, kind, group.layout).items():
+                    found.setdefault(field, {}).update(dict.fromkeys(names))
+        return {field: tuple(found[field]) for field in UNITS if field in found}
+
+    def logged(
+        self, wanted: Mapping[str, Sequence[str]], window_ns: Window
+    ) -> dict[tuple[str, str], list[JointRows]]:
+        """Return messages as they were logged, those of a window of log times.
+
+        Args:
+            wanted: Topic to fields.
+            window_ns: Half-open window of log times [Unix ns]; None for open ends. Trajectories are
+                returned whole, whatever the window.
+
+        Returns:
+            (topic, field) to rows; the rows of the fields of one topic belong together.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If a topic has no joints, or there is no such field.
+        """
+        found = self._topics.read(self.requests(wanted), window_ns)
+        keys = [(name, field) for name, fields in wanted.items() for field in fields]
+        return {key: self._rows(*key, found) for key in keys}
 
     def signals(
         self,
@@ -262,7 +213,7 @@ class JointReader:
             MissingChannelError: If a topic never carries a field.
         """
         keys = [(topic, field) for topic, fields in wanted.items() for field in fields]
-        series = {key: self._series(*key, found[key[0]], window_ns) for key in keys}
+        series = {key: self._series(*key, found, window_ns) for key in keys}
         times = {key: list(each.t_ns) for key, each in series.items()}
         for offset_topic in sorted({name for t, _ in keys if (name := self._offset_topic(t))}):
             own = [key for key in keys if self._offset_topic(key[0]) == offset_topic]
@@ -296,41 +247,104 @@ class JointReader:
         """Return the offsets of a topic from before the first stamp on; may be overwritten."""
         if topic in self._offsets:
             return _copied(self._offsets[topic])
-        offsets = self._series(topic, "position", found[topic], window_ns)
+        offsets = self._series(topic, "position", found, window_ns)
         first = min((int(t[0]) for each in stamped for t in each.t_ns if len(t)), default=0)
         known = all(len(t) and int(t[0]) <= first for t in offsets.t_ns)
         if known or window_ns[0] is None:
             return offsets
-        whole = self._topics.read({topic: ["position"]}, (None, None))[topic]
+        whole = self._topics.read({topic: ["position"]}, (None, None))
         self._offsets[topic] = self._series(topic, "position", whole)  # such topics are small
         return _copied(self._offsets[topic])
 
-    def _check(self, wanted: Mapping[str, Sequence[str]]) -> None:
+    def channel(self, name: str) -> Channel | None:
+        """Return a topic, or a part of one, as the channel of JointStates that it is read as.
+
+        None if the log has no such topic.
+
+        Raises:
+            DataError: If it has no joints.
+        """
+        source = joint_source(name, self._topics.channels)
+        if source is None:
+            return None
+        self._check_source(source)
+        logged = self._topics.channels[source.topic]
+        return replace(logged, topic=name, type_name=JOINT_STATE)
+
+    def _source(self, name: str) -> tuple[JointSource, str]:
+        """Return what a name stands for, and the type of the messages."""
         channels = self._topics.channels
-        for topic, fields in wanted.items():
-            if topic not in channels:
-                raise MissingChannelError(self._path, topic, sorted(channels))
-            if channels[topic].type_name != JOINT_STATE:
-                kind = channels[topic].type_name
-                raise DataError(f"{self._path}: {topic} is {kind}, not {JOINT_STATE}")
-            if not _is_joint_state(self._topics.message_type(topic)):
-                raise DataError(f"{self._path}: {topic}: its schema is not that of {JOINT_STATE}")
+        source = joint_source(name, channels)
+        if source is None:
+            raise MissingChannelError(self._path, name, sorted(channels))
+        return source, channels[source.topic].type_name
+
+    def _check_source(self, source: JointSource) -> None:
+        try:
+            check_source(source, self._topics.message_type(source.topic))
+        except DataError as error:
+            named = "" if str(self._path) in str(error) else f"{self._path}: "
+            raise DataError(f"{named}{error}") from None
+
+    def _check(self, wanted: Mapping[str, Sequence[str]]) -> None:
+        for name, fields in wanted.items():
+            self._check_source(self._source(name)[0])
             for field in fields:
                 if field not in UNITS:
                     raise DataError(f"a JointState has no {field!r}; it has {', '.join(UNITS)}")
 
     def _series(
-        self, topic: str, field: str, found: Messages, window_ns: Window = (None, None)
+        self,
+        name: str,
+        field: str,
+        found: Mapping[str, Messages],
+        window_ns: Window = (None, None),
     ) -> Series:
         """Return one field of a topic at message stamps on the log's clock."""
-        rows = [rows_of(group, field) for group in found.groups]
-        rows.extend(self._general_rows(topic, field, found))
-        if rows and not any(row.values.size for row in rows):
+        source, kind = self._source(name)
+        rows = self._rows(name, field, found)
+        if (rows or kind == TRAJECTORY) and not any(row.values.size for row in rows):
             raise MissingChannelError(
-                self._path, f"{field} in {topic}", self._filled(topic, window_ns)
+                self._path, f"{field} in {name}", self._filled(source, kind, window_ns)
             )
-        rows = [self._on_log_clock(row, topic) for row in rows]
-        return Series(*merge_rows(rows, topic, field, self._warn))
+        return Series(*merge_rows(rows, name, field, self._warn))
+
+    def _rows(self, name: str, field: str, found: Mapping[str, Messages]) -> list[JointRows]:
+        """Return one field of a topic, with stamps on the log's clock."""
+        source, kind = self._source(name)
+        if kind == TRAJECTORY:
+            return self._points(source, field)
+        messages = found[source.topic]
+        try:
+            rows = [rows_of(source, kind, group, field) for group in messages.groups]
+        except DataError as error:
+            raise DataError(f"{self._path}: {error}") from None
+        rows.extend(self._general_rows(source, kind, field, messages))
+        if kind == FLOAT_ARRAY:  # whose times are the log's already
+            return rows
+        return [self._on_log_clock(row, source.topic) for row in rows]
+
+    def _points(self, source: JointSource, field: str) -> list[JointRows]:
+        """Return the points of the trajectories of a topic, at their own times."""
+        topic = source.topic
+        every = self._read_trajectories(topic)
+        stamped = any(one.stamp_ns for one in every)
+        shift_ns = self._clock.shift_ns(topic) if stamped else 0
+        found, replaced = points_in_force(every, field, shift_ns)
+        if replaced:
+            self._warn(
+                f"{topic}: {replaced} points were replaced by a later trajectory before their time"
+            )
+        return [JointRows(names, t_ns, t_ns, values) for names, t_ns, values in found]
+
+    def _read_trajectories(self, topic: str) -> list[Trajectory]:
+        if topic not in self._trajectories:
+            warn = self._warn
+            messages = self._topics.raw(topic)
+            self._trajectories[topic] = [
+                *trajectories(messages, lambda sentence: warn(f"{topic}: {sentence}"))
+            ]
+        return self._trajectories[topic]
 
     def _signals(
         self,
@@ -344,7 +358,9 @@ class JointReader:
         names = series.names
         unit = UNITS[field]
         if field == "position":
-            unit = self._topics.channels[topic].metadata.get("unit", unit)
+            source, _ = self._source(topic)
+            unit = INTERFACE_UNITS.get(source.part, unit)
+            unit = self._topics.channels[source.topic].metadata.get("unit", unit)
         signals = JointSignals(
             topic,
             field,
@@ -358,14 +374,19 @@ class JointReader:
         order = (*known, *(name for name in names if name not in of_chain))
         return signals if order == names else signals.select(order)
 
-    def _general_rows(self, topic: str, field: str, found: Messages) -> list[JointRows]:
-        """Read messages without a layout by the general decoder."""
+    def _general_rows(
+        self, source: JointSource, kind: str, field: str, found: Messages
+    ) -> list[JointRows]:
+        """Read JointStates without a layout by the general decoder."""
         if not found.unread:
             return []
-        decode = self._topics.decoder(topic)
         rows: list[JointRows] = []
         lost = 0
+        decode = self._topics.decoder(source.topic) if kind == JOINT_STATE else None
         for item in found.unread:
+            if decode is None:
+                lost += 1
+                continue
             try:
                 message = decode(item.data)
             except DataError:
@@ -377,14 +398,20 @@ class JointReader:
             times = np.array([stamp_ns]), np.array([item.log_ns])
             rows.append(JointRows(tuple(message.name), *times, values))
         if lost:
-            self._warn(f"{topic}: {lost} messages can't be read: {found.unread[0].why}")
+            self._warn(f"{source.topic}: {lost} messages can't be read: {found.unread[0].why}")
         return rows
 
-    def _filled(self, topic: str, window_ns: Window) -> list[str]:
-        """Return the fields that the topic has in a window of sampling times."""
+    def _filled(self, source: JointSource, kind: str, window_ns: Window) -> list[str]:
+        """Return the fields that a source has in a window of sampling times."""
+        if kind == TRAJECTORY:
+            every = self._trajectories[source.topic]
+            return [name for name in UNITS if any(one.values[name].size for one in every)]
         window_ns = widened(window_ns, SLACK_NS)
-        found = self._topics.read({topic: list(UNITS)}, window_ns)[topic]
-        return [name for name in UNITS if any(name in group.paths for group in found.groups)]
+        paths = leaf_paths(source, kind, UNITS)
+        groups = self._topics.read({source.topic: paths}, window_ns)[source.topic].groups
+        return [
+            name for name in UNITS if any(sampled(source, kind, g, name)[1].size for g in groups)
+        ]
 
     def _on_log_clock(self, row: JointRows, topic: str) -> JointRows:
         if len(row.stamp_ns) and not row.stamp_ns.any():
@@ -394,23 +421,6 @@ class JointReader:
         if not shift_ns:
             return row
         return JointRows(row.names, row.stamp_ns + shift_ns, row.log_ns, row.values)
-
-
-def _is_joint_state(found: MessageType) -> bool:
-    """Whether a type has all fields of a JointState."""
-    fields = {field.name: field for field in found.fields}
-    arrays = [fields.get(name) for name in UNITS]
-    header = fields["header"].nested if "header" in fields else None
-    stamp = [field.nested for field in header.fields if field.name == "stamp"] if header else []
-    time = stamp[0] if stamp else None
-    parts = [part.name for part in time.fields] if time is not None else []
-    return (
-        "sec" in parts
-        and "nanosec" in parts
-        and all(field is not None and field.is_array and field.base for field in arrays)
-        and "name" in fields
-        and fields["name"].base == "string"
-    )
 
 
 def _copied(series: Series) -> Series:

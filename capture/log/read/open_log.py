@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,11 +18,13 @@ from ...robot.run import RUN_RECORD, Run, run_from_record, run_from_scenario
 from ..columns.blocks import Window
 from ..columns.columns import Messages
 from ..columns.layouts import Group, names_of
-from ..columns.topics import Topics
+from ..columns.topics import Channel, Topics
 from ..file.log_file import LogFile
 from ..messages.frames import FrameArray, join_batches
 from .joint_names import check_joints
+from .joint_rows import JointRows
 from .joint_states import JointReader
+from .joint_topics import JointTopicFinder, JointTopics
 from .sample_times import JointSignals, StampClock
 
 if TYPE_CHECKING:
@@ -43,11 +45,12 @@ class OpenLog:
         column_folder: Path | None,
         threads: int,
         robot: str | Path | None = None,
+        on_copied: Callable[[float], None] = lambda _: None,
     ) -> None:
         """Open a log; see :meth:`.Session.open`."""
         self.path = path = as_path(path)
         described = None if robot is None else load_robot(robot)
-        self.file = LogFile(path, column_folder)
+        self.file = LogFile(path, column_folder, on_copied)
         self.warnings = list(self.file.warnings)
         self.topics = Topics(self.file, self._warn, threads=threads)
         self._clock = StampClock(self.topics, self._warn)
@@ -90,6 +93,24 @@ class OpenLog:
         scenario = self.file.attachments.get("scenario.toml")
         names = () if self.robot is None else self.robot.joint_names
         return None if scenario is None else run_from_scenario(scenario.data, names)
+
+    def joint_topics(self, command: str, response: str) -> JointTopics:
+        """Find commands and responses; see :meth:`.SessionView.joint_topics`."""
+        return JointTopicFinder(self.path, self.topics, self._chain).find(command, response)
+
+    def joint_channel(self, name: str) -> Channel | None:
+        """Return the JointStates that a name of joints is read as; None if there are none."""
+        return self._joints.channel(name)
+
+    def joint_fields(self, name: str) -> dict[str, tuple[str, ...]]:
+        """Return the fields of a topic and their joints; see :meth:`.JointReader.carried`."""
+        return self._joints.carried(name)
+
+    def joint_messages(
+        self, wanted: Mapping[str, Sequence[str]], window_ns: Window
+    ) -> dict[tuple[str, str], list[JointRows]]:
+        """Return messages as they were logged; see :meth:`.JointReader.logged`."""
+        return self._joints.logged(wanted, window_ns)
 
     def joints(
         self, wanted: Mapping[str, Sequence[str]], window_ns: Window

@@ -24,7 +24,10 @@ from ...robot.model import Robot
 from ...robot.run import Run
 from ..columns.blocks import Window
 from ..columns.topics import Channel
+from ..messages.definitions import MessageType
 from ..messages.frames import FD_FRAME_DTYPE, FD_FRAME_LAYOUT, FRAME_DTYPE, FRAME_LAYOUT, FrameArray
+from .joint_rows import JointRows
+from .joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC, JointTopics
 from .open_log import OpenLog
 from .sample_times import JointSignals
 
@@ -89,7 +92,7 @@ class SessionView:
             MissingChannelError: If a topic that is to be renamed isn't in the session.
         """
         for topic in rename.values():
-            if topic not in self.channels:
+            if self.joint_channel(topic) is None:
                 raise MissingChannelError(self.path, topic, sorted(self.channels))
         renamed = {name: self._logged(topic) for name, topic in rename.items()}
         return SessionView(
@@ -98,6 +101,107 @@ class SessionView:
             names={**self._names, **renamed},
             on_read=on_read or self._on_read,
         )
+
+    def joint_topics(
+        self, command: str = COMMAND_TOPIC, response: str = RESPONSE_TOPIC
+    ) -> JointTopics:
+        """Find the commands and the responses of a log of any make.
+
+        Args:
+            command: Topic of the commands; ``TOPIC.PART`` of a controller state, or
+                ``TOPIC:JOINT,JOINT`` of an array. If the log has no ``/joint_commands``, this
+                default stands for commands that are found by the types of messages.
+            response: Topic of the responses, likewise.
+
+        Returns:
+            Names as :meth:`joints` takes them.
+
+        Raises:
+            MissingChannelError: If a topic that was chosen is not there.
+            DataError: If an array was chosen whose joints are unknown.
+        """
+        if self._names.keys() & {COMMAND_TOPIC, RESPONSE_TOPIC}:
+            return JointTopics(command, response)
+        return self._log.joint_topics(command, response)
+
+    def joint_channel(self, name: str) -> Channel | None:
+        """Return the channel of JointStates that a name of joints is read as; None without one.
+
+        Raises:
+            DataError: If the topic has no joints.
+        """
+        return self.channels.get(name) or self._log.joint_channel(name)
+
+    def joint_fields(self, name: str) -> dict[str, tuple[str, ...]]:
+        """Return the fields that a topic ever has, each with its joints in order of appearance.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If it has no joints.
+        """
+        return self._log.joint_fields(self._logged(name))
+
+    def joint_messages(
+        self,
+        wanted: Mapping[str, Sequence[str]],
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> dict[tuple[str, str], list[JointRows]]:
+        """Return messages of joints as they were logged, in place of a series for each joint.
+
+        Args:
+            wanted: Topic to fields, as for :meth:`joint_columns`.
+            start_ns: First log time wanted [Unix ns]; None for the start.
+            stop_ns: One past the last log time wanted [Unix ns]; None for the end. Trajectories
+                are returned whole.
+
+        Returns:
+            (topic, field) to rows; those of the fields of one topic belong together.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If a topic has no joints or a field is none of the three.
+        """
+        self._on_read()
+        logged = {self._logged(topic): fields for topic, fields in wanted.items()}
+        found = self._log.joint_messages(logged, self._within(start_ns, stop_ns))
+        return {
+            (topic, field): found[self._logged(topic), field]
+            for topic, fields in wanted.items()
+            for field in fields
+        }
+
+    def message_type(self, topic: str) -> MessageType:
+        """Return the type of a topic's messages.
+
+        Raises:
+            MissingChannelError: If the session has no such topic.
+            DataError: If its schema can't be read.
+        """
+        return self._log.topics.message_type(self._logged(topic))
+
+    def with_joints(
+        self, command: str = COMMAND_TOPIC, response: str = RESPONSE_TOPIC
+    ) -> SessionView:
+        """Return a view that has commands and responses on the topics of the log contract.
+
+        Args:
+            command: As for :meth:`joint_topics`.
+            response: As for :meth:`joint_topics`.
+
+        Returns:
+            The view; the session itself if they are there already.
+
+        Raises:
+            MissingChannelError: As :meth:`joint_topics`.
+            DataError: As :meth:`joint_topics`.
+        """
+        found = self.joint_topics(command, response)
+        known = {COMMAND_TOPIC: found.command, RESPONSE_TOPIC: found.response, **found.quantities}
+        names = {
+            topic: name for topic, name in known.items() if self.joint_channel(name) is not None
+        }
+        return self.view(rename=names) if found.renamed.keys() & names.keys() else self
 
     def part(self, start_ns: int | None, stop_ns: int | None) -> SessionView:
         """Return a view that reads a window [Unix ns]; its start and end stay those of this one."""
@@ -133,7 +237,11 @@ class SessionView:
         if not self._names:
             return logged
         away = {*self._names, *self._names.values()}
-        found = {name: replace(logged[topic], topic=name) for name, topic in self._names.items()}
+        found = {
+            name: replace(channel, topic=name)
+            for name, topic in self._names.items()
+            if (channel := logged.get(topic) or self._log.joint_channel(topic)) is not None
+        }
         found |= {topic: channel for topic, channel in logged.items() if topic not in away}
         return MappingProxyType(found)
 
@@ -463,10 +571,11 @@ class Session(SessionView):
         threads: int | None = None,
         column_folder: Path | None = None,
         robot: str | Path | None = None,
+        on_copied: Callable[[float], None] = lambda _: None,
     ) -> None:
         """See :meth:`open`."""
         number = threads_or_default(threads)
-        super().__init__(OpenLog(as_path(path), column_folder, number, robot))
+        super().__init__(OpenLog(as_path(path), column_folder, number, robot, on_copied))
 
     @classmethod
     def open(
@@ -476,18 +585,21 @@ class Session(SessionView):
         threads: int | None = None,
         column_folder: Path | None = None,
         robot: str | Path | None = None,
+        on_copied: Callable[[float], None] = lambda _: None,
     ) -> Self:
         """Open a session; the same as calling the class.
 
         Args:
             path: The MCAP file, or its URL; of a split session any part, or the folder that holds
-                it; a rosbag2 folder of any storage or a ``.db3`` file (extra ``bags``).
+                it; a rosbag2 folder of any storage, a ``.db3`` file or a ``.bag`` of ROS 1 (extra
+                ``bags``).
             threads: Number of decompressing threads; None for one per core that this process may
                 use, at most four.
             column_folder: A folder on a disk for large columns, in files without names, so that
                 :meth:`forget` can release their memory (Linux). None for memory.
             robot: Description of the robot of a log that has none, a name or a file; a log with
                 one keeps its own, with a warning.
+            on_copied: Called with the share of a bag that is copied, 0 to 1; may raise.
 
         Returns:
             The session, usable in a ``with`` block.
@@ -500,7 +612,9 @@ class Session(SessionView):
             RobotFileError: If the description has faults.
             JointSetError: If its joints aren't those of the log.
         """
-        return cls(path, threads=threads, column_folder=column_folder, robot=robot)
+        return cls(
+            path, threads=threads, column_folder=column_folder, robot=robot, on_copied=on_copied
+        )
 
     def close(self) -> None:
         """Release the file."""

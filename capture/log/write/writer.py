@@ -255,6 +255,19 @@ class SessionWriter:
         """Open a DiagnosticArray channel for the states of the recorder's components."""
         return DiagnosticsChannel(self._sender(topic, "diagnostic_msgs/msg/DiagnosticArray"))
 
+    def messages(
+        self, topic: str, type_name: str, metadata: Mapping[str, str] | None = None
+    ) -> Send:
+        """Open a channel of messages that are encoded already.
+
+        Args:
+            type_name: One of the log contract's types.
+
+        Returns:
+            A function of log time [Unix ns], publish time [Unix ns] and the message.
+        """
+        return self._sender(topic, type_name, metadata)
+
     # -- whole session ---------------------------------------------------------------------
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:

@@ -67,7 +67,9 @@ def test_a_bad_file_is_named_and_leaves_nothing_behind(verb, good, tmp_path, com
 
 def test_a_topic_that_was_chosen_must_be_there(good, command):
     err = command("analyse", good, "--command-topic", "/foo", code=1).err
-    assert err == f"error: {good}: has no /foo; it has /joint_commands, /joint_states\n"
+    there = "it has /joint_commands, /joint_states"
+    how = "(choose with --command-topic and --response-topic)"
+    assert err == f"error: {good}: has no /foo; {there} {how}\n"
 
 
 @pytest.mark.parametrize(

@@ -66,9 +66,12 @@ def test_naming_the_topics_is_enough(bag, report_of):
     assert f"{topics[0]} {topics[1]}" in result["provenance"]["command"]
 
 
-def test_topics_that_are_not_named_are_listed(bag, command, report_of):
-    assert "it has /snake/encoders, /snake/targets" in command("analyse", bag, code=1).err
-    warnings = report_of("analyse", bag, "--response-topic", "/snake/encoders")["warnings"]
-    (found,) = [text for text in warnings if text.startswith("no command logged: no commands on")]
-    assert found.endswith("(other JointStates: /snake/targets; choose with --command-topic)")
-    command("analyse", bag, "--reference-topic", "/none", code=1)
+def test_topics_that_are_not_named_are_found_and_reported(bag, command, report_of):
+    result = report_of("analyse", bag)
+    assert [joint["gain"] for joint in result["joints"]] == pytest.approx(GAIN, abs=5e-4)
+    assert (
+        "commands on /snake/targets and positions on /snake/encoders, found by type (choose with "
+        "--command-topic and --response-topic)"
+    ) in result["notes"]
+    err = command("analyse", bag, "--reference-topic", "/none", code=1).err
+    assert "has no /none" in err

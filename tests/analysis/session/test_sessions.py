@@ -257,7 +257,8 @@ def test_missing_commands_and_missing_responses(bag, wave):
     for t_ns in truth.ticks_ns:
         no_commands.write("/joint_states", t_ns, truth.names, truth.response(t_ns))
         no_responses.write("/joint_commands", t_ns, truth.names, truth.command(t_ns))
-        neither.write("/arm/joint_states", t_ns, truth.names, truth.response(t_ns))
+        neither.write("/arm/left", t_ns, truth.names, truth.response(t_ns))
+        neither.write("/arm/right", t_ns, truth.names, truth.response(t_ns))
     result = no_commands.analysed()
     assert result.gait.frequency_hz.value == pytest.approx(0.97, abs=1e-7)
     assert result.joints[0].gain.value is None
@@ -267,9 +268,11 @@ def test_missing_commands_and_missing_responses(bag, wave):
     assert result.gait.frequency_hz.value == pytest.approx(0.97, abs=1e-7)
     assert result.joints[0].flags == ("not_recorded",)
     assert result.joints[0].command_amplitude_rad == pytest.approx(truth.amplitude[0], abs=1e-7)
-    with pytest.raises(MissingChannelError, match="it has /arm/joint_states"):
+    with pytest.raises(
+        MissingChannelError, match=r"it has /arm/left, /arm/right .choose with --command-topic"
+    ):
         neither.analysed()
-    named = Options(response_topic="/arm/joint_states")
+    named = Options(response_topic="/arm/left")
     assert analysed(neither.path, named).joints[0].samples > 600
 
 

@@ -256,7 +256,10 @@ def test_files_and_options_of_the_verb(twin, tmp_path, command):
     ):
         assert why in command("analyse", *wrong, code=2).err
     topics = ("--command-topic", "/a", "--response-topic", "/b")
-    assert "it has /gait, /joint_commands" in command("analyse", twin, *topics, code=1).err
+    assert (
+        "has no /a; it has /joint_commands, /joint_states (choose with --command-topic"
+        in command("analyse", twin, *topics, code=1).err
+    )
 
 
 def test_a_session_cut_before_it_settled_is_answered_with_a_warning(

@@ -61,7 +61,11 @@ WRONG = [
     (2, "{log} -o {log} -r snake25", "a session is an .mcap file, not .log"),
     (2, "{log} -o {dir}/no/x.mcap -r snake25", "no doesn't exist"),
     (1, "{dir}/a.csv -o {dir}/x.mcap -r snake25", "name them by --columns or --map"),
-    (2, "{log} -o {dir}/x.mcap -r snake25 --map t=time:s", "--map are for other CSV logs"),
+    (
+        2,
+        "{log} -o {dir}/x.mcap -r snake25 --map t=time:s",
+        "holds CAN frames; --map: for logs of another kind",
+    ),
     (1, "{dir}/bad.log -o {dir}/x.mcap -r snake25", "is not a candump log"),
     (1, "{log} -o {dir}/x.mcap -r snake25 --bus can7", "has no frames of bus can7; it has can0"),
 ]

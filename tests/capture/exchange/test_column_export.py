@@ -90,7 +90,7 @@ def test_topics_can_be_chosen(polled, tmp_path):
         export_columns(polled, tmp_path / "y.csv", topics=["/no"])
     with SessionWriter(tmp_path / "t.mcap", session_id="s", epoch_ns=T0) as writer:
         writer.string("/gait/mode").write(T0, "walk")
-    with pytest.raises(DataError, match="/gait/mode is std_msgs/msg/String, not"):
+    with pytest.raises(DataError, match="/gait/mode is std_msgs/msg/String, not of joints"):
         export_columns(tmp_path / "t.mcap", tmp_path / "y.csv", topics=["/gait/mode"])
     with pytest.raises(MissingChannelError, match="has no joint topics; it has /gait/mode"):
         export_columns(tmp_path / "t.mcap", tmp_path / "y.csv")

@@ -133,13 +133,13 @@ def test_a_foreign_bag_is_checked_joint_by_joint(tmp_path):
     gaps = {each.label: each.timing.gaps for each in health.series}
     assert gaps == {f"/joint_states ({name})": 0 for name in "abc"}
     assert [each.sequence.kind for each in health.channels] == ["none"]
-    assert health.reasons == ("/joint_commands is missing; JointStates are on /joint_states",)
+    assert health.reasons == ("/joint_commands is missing; joints are on /joint_states",)
 
 
 def test_missing_contract_topics_are_named(tmp_path):
     health = check_session(foreign(tmp_path / "s.mcap", "/arm/state", [["a", "b"]]))
     assert health.verdict == "degraded"
-    assert "/joint_states is missing; JointStates are on /arm/state" in health.reasons
+    assert "/joint_states is missing; joints are on /arm/state" in health.reasons
     with SessionWriter(tmp_path / "t.mcap", session_id="t", epoch_ns=EPOCH_NS) as writer:
         writer.string("/gait/mode").write(EPOCH_NS, "walk")
     assert check_session(tmp_path / "t.mcap").verdict == "bad"

@@ -116,18 +116,17 @@ def test_other_numbers_are_plotted_words_are_events_and_the_rest_is_named(shown)
     assert f"not shown: {left_out}" in written["warnings"]
 
 
-def test_without_names_the_joints_are_plotted_and_the_notes_say_what_to_do(
-    bag, tmp_path, report_of
-):
+def test_without_names_the_joints_are_found_by_type(bag, tmp_path, report_of):
     written = report_of("view", bag, "--save", tmp_path / "a.rrd")
-    assert written["joints"] == []
-    (why,) = [note for note in written["warnings"] if note.startswith("not analysed")]
-    assert "/snake/encoders, /snake/targets; name them with --command-topic" in why
+    assert len(written["joints"]) == 3
 
 
 def test_a_name_that_is_not_there_fails_and_lists_what_is(bag, tmp_path, command):
     words = ("view", bag, "--command-topic", "/none", "--save", tmp_path / "a.rrd")
-    assert "has no /none; it has /camera, /currents" in command(*words, code=1).err
+    assert (
+        "has no /none; it has /currents, /snake/encoders, /snake/targets (choose with"
+        in command(*words, code=1).err
+    )
     with Session.open(bag) as session, pytest.raises(MissingChannelError):
         session.view(rename={"/joint_commands": "/none"})
 

@@ -1,0 +1,375 @@
+"""Messages of other types than JointState as samples of joints.
+
+A message of ros2_control may hold commands and states: then each has a name of its own,
+``TOPIC.PART``, such as ``/arm/controller_state.reference``. A name may also list the joints of an
+array without names: ``TOPIC:JOINT,JOINT``. Neither character is valid in a topic's name.
+
+Definitions: https://github.com/ros-controls/control_msgs,
+https://github.com/ros2/common_interfaces.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...common.arrays import NS, FloatArray, IntArray
+from ...common.errors import DataError
+from ..columns.layouts import Group, names_of
+from ..messages.cdr import LITTLE_ENDIAN_HEADER, Layout
+from ..messages.definitions import (
+    CONTROLLER_STATE,
+    DYNAMIC_STATE,
+    FLOAT_ARRAY,
+    JOINT_LISTS,
+    JOINT_STATE,
+    TRAJECTORY,
+    MessageType,
+)
+
+JOINT_TYPES = (*JOINT_LISTS, FLOAT_ARRAY, TRAJECTORY)
+"""Types that hold joints."""
+
+COMMAND_PARTS = ("reference", "desired", "output")
+STATE_PARTS = ("feedback", "actual")
+"""Fields of a controller state, in order of preference; the second ones are of older versions."""
+
+UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
+"""Field of a JointState to its unit, if the channel states no other."""
+
+INTERFACE_UNITS = {"current": "A", "voltage": "V", "temperature": "degC"}
+"""Further interfaces of a DynamicJointState that the log contract has topics for."""
+
+_POINT_FIELDS = {"position": "positions", "velocity": "velocities", "effort": "effort"}
+_JOINTS = "joint_names["
+_MOST_POINTS = 100_000
+_LATEST_NS = 1 << 61  # a later start is damage, and the times of its points have no place
+
+
+@dataclass(frozen=True)
+class JointSource:
+    """A name under which joints are read.
+
+    Attributes:
+        topic: The topic in the log.
+        part: Field of a controller state, or interface of a DynamicJointState; may be empty.
+        joints: Names of the values of an array.
+    """
+
+    name: str
+    topic: str
+    part: str = ""
+    joints: tuple[str, ...] = ()
+
+
+def joint_source(name: str, topics: Mapping[str, Any]) -> JointSource | None:
+    """Return what a name stands for; None if its topic is not among those of a log."""
+    if name in topics:
+        return JointSource(name, name)
+    topic, colon, listed = name.partition(":")
+    if colon and topic in topics:
+        joints = tuple(part.strip() for part in listed.split(","))
+        if "" in joints or len(set(joints)) < len(joints):
+            raise DataError(f"{name}: after the colon each joint has one name, with commas between")
+        return JointSource(name, topic, joints=joints)
+    at = name.find(".")
+    while at >= 0:
+        if name[:at] in topics:
+            return JointSource(name, name[:at], name[at + 1 :])
+        at = name.find(".", at + 1)
+    return None
+
+
+def leaf_paths(source: JointSource, type_name: str, fields: Iterable[str]) -> list[str] | None:
+    """Return the leaf paths that hold some fields of joints; None for all paths."""
+    if type_name == CONTROLLER_STATE:
+        return [f"{source.part}.{_POINT_FIELDS[field]}" for field in fields]
+    if type_name == DYNAMIC_STATE:
+        return None
+    return ["data"] if type_name == FLOAT_ARRAY else list(fields)
+
+
+def check_source(source: JointSource, kind: MessageType) -> None:
+    """Check that a type has the fields that a source needs.
+
+    Raises:
+        DataError: If it has not; the message names those it has.
+    """
+    topic, fields = source.topic, {field.name: field for field in kind.fields}
+    if kind.name not in JOINT_TYPES:
+        readable = ", ".join(name.replace("/msg/", "/") for name in JOINT_TYPES)
+        raise DataError(f"{topic} is {kind.name}, not of joints ({readable})")
+    if not is_of_joints(kind):
+        raise DataError(f"{topic}: its schema is not that of {kind.name}")
+    if kind.name == CONTROLLER_STATE:
+        there = [part for part in (*COMMAND_PARTS, *STATE_PARTS, "error") if part in fields]
+        if source.part not in there:
+            raise DataError(
+                f"{topic} has several sets of joints: name one of "
+                f"{', '.join(f'{topic}.{part}' for part in there)}"
+            )
+    elif source.part and kind.name != DYNAMIC_STATE:
+        raise DataError(f"{topic} is {kind.name}, which has no part {source.part!r}")
+    if kind.name == FLOAT_ARRAY and not source.joints:
+        raise DataError(
+            f"{topic} is {kind.name}, whose values have no names: name its joints in their order, "
+            f"{topic}:JOINT,JOINT,..."
+        )
+    if kind.name != FLOAT_ARRAY and source.joints:
+        raise DataError(f"{topic} is {kind.name}, which names its joints itself")
+
+
+def is_of_joints(kind: MessageType) -> bool:
+    """Whether a type has the fields of its name that are read."""
+    fields = {field.name: field for field in kind.fields}
+    if kind.name == FLOAT_ARRAY:
+        return "data" in fields and fields["data"].base == "float64" and fields["data"].is_array
+    header = fields["header"].nested if "header" in fields else None
+    stamp = [field.nested for field in header.fields if field.name == "stamp"] if header else []
+    time = stamp[0] if stamp else None
+    if time is None or not {"sec", "nanosec"} <= {part.name for part in time.fields}:
+        return False
+    names = fields.get("name" if kind.name == JOINT_STATE else "joint_names")
+    if names is None or names.base != "string" or not names.is_array:
+        return False
+    if kind.name == JOINT_STATE:
+        arrays = [fields.get(name) for name in UNITS]
+        return all(one is not None and one.is_array and one.base for one in arrays)
+    if kind.name == DYNAMIC_STATE:
+        nested = fields["interface_values"].nested if "interface_values" in fields else None
+        parts = {part.name: part.base for part in nested.fields} if nested is not None else {}
+        return parts == {"interface_names": "string", "values": "float64"}
+    point = fields.get("points" if kind.name == TRAJECTORY else "error")
+    points = (
+        {part.name: part.base for part in point.nested.fields} if point and point.nested else {}
+    )
+    return all(points.get(name) == "float64" for name in _POINT_FIELDS.values()) and (
+        kind.name != TRAJECTORY or [field.name for field in kind.fields] == _TRAJECTORY_FIELDS
+    )
+
+
+_TRAJECTORY_FIELDS = ["header", "joint_names", "points"]
+
+
+def sampled(
+    source: JointSource, type_name: str, group: Group, field: str
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Return the joints of messages of one layout, and their values of a field.
+
+    Returns:
+        k names, and values of shape (n, k), or (n, 0) if these messages leave the field empty.
+
+    Raises:
+        DataError: If the values of an array are not as many as the joints that were named.
+    """
+    if type_name == CONTROLLER_STATE:
+        (path,) = leaf_paths(source, type_name, [field]) or [""]
+        names, values = names_of(group.layout, _JOINTS), group.values(path)
+    elif type_name == DYNAMIC_STATE:
+        names, values = _interface(group, source.part, field)
+    elif type_name == FLOAT_ARRAY:
+        names, values = source.joints, group.values("data")
+        if field != "position":
+            values = values[:, :0]
+        elif values.shape[1] not in {0, len(names)}:
+            raise DataError(
+                f"{source.topic} has {values.shape[1]} values in a message, but {len(names)} "
+                f"joints are named: {', '.join(names)}"
+            )
+    else:
+        names, values = names_of(group.layout), group.values(field)
+    return names, values.astype(np.float64, copy=False)
+
+
+def _interface(group: Group, part: str, field: str) -> tuple[tuple[str, ...], FloatArray]:
+    """Return the joints that have an interface, and its values."""
+    wanted = (part if field == "position" else None) if part else field
+    names: list[str] = []
+    columns: list[FloatArray] = []
+    listed = interfaces(group.layout)
+    for j, name in enumerate(names_of(group.layout, _JOINTS)):
+        own = listed.get(j, ())
+        if wanted is None or wanted not in own:
+            continue
+        values = group.values(f"interface_values[{j}].values")
+        if values.shape[1] == len(own):
+            names.append(name)
+            columns.append(values[:, own.index(wanted)])
+    if not columns:
+        return (), np.empty((len(group), 0))
+    return tuple(names), np.stack(columns, axis=1)
+
+
+def interfaces(layout: Layout) -> dict[int, list[str]]:
+    """Return the interfaces of a DynamicJointState by the place of their joint."""
+    found: dict[int, list[str]] = {}
+    for path, text in layout.strings.items():
+        if path.startswith("interface_values["):
+            place = path.removeprefix("interface_values[").partition("]")[0]
+            found.setdefault(int(place), []).append(text)
+    return found
+
+
+def carried(source: JointSource, type_name: str, layout: Layout) -> dict[str, tuple[str, ...]]:
+    """Return the fields that messages of one layout fill, each with the joints that have it."""
+    leaves = layout.leaves
+    if type_name == DYNAMIC_STATE:
+        listed = interfaces(layout)
+        every = enumerate(names_of(layout, _JOINTS))
+        own = [(name, listed.get(j, ())) for j, name in every]
+        wanted = {"position": source.part} if source.part else {field: field for field in UNITS}
+        found = {
+            field: tuple(name for name, there in own if interface in there)
+            for field, interface in wanted.items()
+        }
+    elif type_name == FLOAT_ARRAY:
+        found = {"position": source.joints if "data" in leaves else ()}
+    elif type_name == CONTROLLER_STATE:
+        names = names_of(layout, _JOINTS)
+        paths = {field: f"{source.part}.{_POINT_FIELDS[field]}" for field in UNITS}
+        found = {field: names for field, path in paths.items() if path in leaves}
+    else:
+        found = {field: names_of(layout) for field in UNITS if field in leaves}
+    return {field: names for field, names in found.items() if names}
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The points of one message.
+
+    Attributes:
+        log_ns: Its log time [Unix ns].
+        stamp_ns: Of its header [ns]; 0 for "from now on".
+        after_ns: Times of the points from its start [ns], shape (n,).
+        values: Field of a JointState to its values, shape (n, k), or (n, 0) if points lack it.
+    """
+
+    log_ns: int
+    stamp_ns: int
+    names: tuple[str, ...]
+    after_ns: IntArray
+    values: Mapping[str, FloatArray]
+
+
+_U32, _TIME = struct.Struct("<I"), struct.Struct("<iI")
+
+
+class _Cursor:
+    """Reads the parts of one CDR message in order."""
+
+    def __init__(self, message: bytes) -> None:
+        self._message, self._at = message, len(LITTLE_ENDIAN_HEADER)
+
+    def _take(self, size: int, align: int) -> int:
+        at = self._at + (4 - self._at) % align  # relative to the end of the header of 4 bytes
+        if at + size > len(self._message):
+            raise DataError(f"the message ends at byte {len(self._message)}, not {at + size}")
+        self._at = at + size
+        return at
+
+    def count(self) -> int:
+        return int(_U32.unpack_from(self._message, self._take(4, 4))[0])
+
+    def time_ns(self) -> int:
+        sec, nanosec = _TIME.unpack_from(self._message, self._take(8, 4))
+        return int(sec) * NS + int(nanosec)
+
+    def text(self) -> str:
+        size = self.count()
+        at = self._take(size, 1)
+        return self._message[at : at + max(size - 1, 0)].decode("utf-8", "replace")
+
+    def numbers(self) -> FloatArray:
+        count = self.count()
+        at = self._take(8 * count, 8) if count else 0
+        return np.frombuffer(self._message, np.float64, count, at)
+
+
+def read_trajectory(log_ns: int, message: bytes) -> Trajectory:
+    """Decode a ``trajectory_msgs/JointTrajectory``.
+
+    Raises:
+        DataError: If it is damaged, or no little-endian CDR.
+    """
+    if message[:2] != LITTLE_ENDIAN_HEADER[:2]:
+        raise DataError(f"encapsulation {message[:2].hex()} is not little-endian CDR")
+    cursor = _Cursor(message)
+    stamp_ns, _ = cursor.time_ns(), cursor.text()
+    names = tuple(cursor.text() for _ in range(cursor.count()))
+    count = cursor.count()
+    if count > _MOST_POINTS:
+        raise DataError(f"a trajectory of {count} points can't be right")
+    after_ns = np.zeros(count, np.int64)
+    rows: dict[str, list[FloatArray]] = {field: [] for field in UNITS}
+    for k in range(count):
+        position, velocity, _, effort = (cursor.numbers() for _ in range(4))
+        after_ns[k] = cursor.time_ns()
+        for field, values in zip(UNITS, (position, velocity, effort), strict=True):
+            rows[field].append(values)
+    values = {
+        field: np.array(row).reshape(count, len(names))
+        if all(len(one) == len(names) for one in row)
+        else np.empty((count, 0))
+        for field, row in rows.items()
+    }
+    return Trajectory(log_ns, stamp_ns, names, after_ns, values)
+
+
+def trajectories(
+    messages: Iterable[tuple[int, bytes]], warn: Callable[[str], None]
+) -> Iterator[Trajectory]:
+    """Decode trajectories; ``warn`` is called once if some are damaged."""
+    lost, why = 0, ""
+    for log_ns, message in messages:
+        try:
+            yield read_trajectory(log_ns, message)
+        except DataError as error:
+            lost, why = lost + 1, str(error)
+    if lost:
+        warn(f"{lost} messages can't be read: {why}")
+
+
+def points_in_force(
+    every: Sequence[Trajectory], field: str, shift_ns: int
+) -> tuple[list[tuple[tuple[str, ...], IntArray, FloatArray]], int]:
+    """Return the points of trajectories as commands.
+
+    A trajectory starts at its stamp, or when it was logged if the stamp is zero. From the time of
+    its first point on it replaces those before it.
+
+    Args:
+        every: The trajectories of a topic.
+        shift_ns: To add to stamps [ns].
+
+    Returns:
+        For each list of k joints its names, times [Unix ns], shape (n,), and values, shape (n, k);
+        and the number of points that were replaced.
+    """
+    parts: dict[tuple[str, ...], list[tuple[IntArray, FloatArray]]] = {}
+    first: dict[tuple[str, ...], int] = {}
+    replaced = 0
+    in_order = sorted(every, key=lambda each: each.log_ns)
+    for one in reversed(in_order):
+        values = one.values[field]
+        if not values.shape[1] or not len(values):
+            continue
+        start_ns = one.stamp_ns + shift_ns if one.stamp_ns else one.log_ns
+        t_ns = min(start_ns, _LATEST_NS) + one.after_ns
+        kept = t_ns < first.get(one.names, np.iinfo(np.int64).max)
+        replaced += int((~kept).sum())
+        if kept.any():
+            parts.setdefault(one.names, []).append((t_ns[kept], values[kept]))
+        first[one.names] = min(int(t_ns[0]), first.get(one.names, int(t_ns[0])))
+    found = [
+        (
+            names,
+            np.concatenate([t_ns for t_ns, _ in reversed(own)]),
+            np.concatenate([values for _, values in reversed(own)]),
+        )
+        for names, own in parts.items()
+    ]
+    return found, replaced

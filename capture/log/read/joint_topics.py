@@ -1,0 +1,290 @@
+"""Which topics of a log hold commands and responses: by name, else by the types of messages.
+
+The topics of the log contract come first. In a log without them the type decides, and where that
+leaves a choice the words of the topic's name; what was taken is reported.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+
+from ...common.errors import DataError, MissingChannelError, some_names
+from ..columns.topics import Topics
+from ..messages.cdr import Layout, layout_of
+from ..messages.definitions import (
+    CONTROLLER_STATE,
+    DYNAMIC_STATE,
+    FLOAT_ARRAY,
+    JOINT_STATE,
+    TRAJECTORY,
+    PowerTopic,
+)
+from .joint_messages import (
+    COMMAND_PARTS,
+    INTERFACE_UNITS,
+    JOINT_TYPES,
+    STATE_PARTS,
+    UNITS,
+    interfaces,
+    is_of_joints,
+    joint_source,
+)
+from .joint_names import joint_names
+
+COMMAND_TOPIC = "/joint_commands"
+RESPONSE_TOPIC = "/joint_states"
+
+CONTRACT_TOPICS = frozenset(
+    {
+        *("/joint_sample_offset", "/joint_command_offset", "/joint_velocity", "/joint_effort"),
+        *("/joint_current", "/joint_voltage", "/joint_temperature", "/gait", "/gate/wanted"),
+        *("/energy_ledger", *PowerTopic),
+    }
+)
+"""JointStates of the log contract that are neither commands nor positions."""
+
+_COMMAND_WORDS = {"command", "commands", "cmd", "cmds", "target", "targets", "desired", "goal"} | {
+    *("goals", "reference", "references", "setpoint", "setpoints", "action", "actions")
+}
+_NO_ANGLES = {"velocity", "velocities", "effort", "efforts", "torque", "torques", "current"}
+_MOST_LISTED = 8
+
+HOW_TO_CHOOSE = "choose with --command-topic and --response-topic"
+_NO_QUANTITIES: Mapping[str, str] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class JointTopics:
+    """Where the joints of a log are, as :meth:`.SessionView.joints` takes the names.
+
+    Attributes:
+        command: The commands; the name that was looked for if the log has none.
+        response: The responses, likewise.
+        quantities: Topic of the log contract that the log lacks, such as ``/joint_current``, to
+            where the values are.
+        others: Other names that could be commands or responses.
+        notes: What was found by its type, and interfaces that have no topic in the log contract.
+    """
+
+    command: str = COMMAND_TOPIC
+    response: str = RESPONSE_TOPIC
+    quantities: Mapping[str, str] = field(default_factory=lambda: _NO_QUANTITIES)
+    others: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def renamed(self) -> dict[str, str]:
+        """Topic of the log contract to the name in the log, where they differ."""
+        names = {COMMAND_TOPIC: self.command, RESPONSE_TOPIC: self.response, **self.quantities}
+        return {topic: name for topic, name in names.items() if topic != name}
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A name that could be commands or responses; a lower rank is better."""
+
+    name: str
+    topic: str
+    rank: int
+    count: int
+    joints: tuple[str, ...]
+
+
+class JointTopicFinder:
+    """Finds the commands and responses of one log."""
+
+    def __init__(self, path: Path, topics: Topics, joints: Sequence[str] = ()) -> None:
+        """Set up.
+
+        Args:
+            joints: Of the robot, in chain order; none if it is unknown.
+        """
+        self._path, self._topics, self._joints = path, topics, tuple(joints)
+
+    def find(self, command: str = COMMAND_TOPIC, response: str = RESPONSE_TOPIC) -> JointTopics:
+        """Find commands and responses.
+
+        Args:
+            command: Topic of the commands, ``TOPIC.PART`` or ``TOPIC:JOINT,JOINT``; that of the log
+                contract also stands for one that is found by its type.
+            response: That of the responses, likewise.
+
+        Raises:
+            MissingChannelError: If a topic that was chosen is not there.
+            DataError: If an array was chosen whose joints are unknown.
+        """
+        channels = self._topics.channels
+        named = {command: COMMAND_TOPIC, response: RESPONSE_TOPIC}
+        search = [usual for name, usual in named.items() if name == usual and name not in channels]
+        command = self._part(command, COMMAND_PARTS) if command != COMMAND_TOPIC else command
+        response = self._part(response, STATE_PARTS) if response != RESPONSE_TOPIC else response
+        quantities, notes = self._quantities()
+        if not search:
+            return JointTopics(command, response, quantities, notes=notes)
+        every = joint_names(self._topics)
+        commands = [one for one in self._commands(every) if one.name != response]
+        responses = [one for one in self._responses(every) if one.name != command]
+        taken: dict[str, str] = {}
+        known = every.get(response, ())
+        if COMMAND_TOPIC in search and commands:
+            # Of several controllers one that has joints of the responses.
+            best = min(commands, key=lambda one: (known and not {*one.joints} & {*known}, one.rank))
+            command = taken["commands"] = best.name
+        if RESPONSE_TOPIC in search and responses:
+            source = joint_source(command, channels)
+            own = "" if source is None else source.topic
+            best = min(responses, key=lambda one: (one.rank, one.topic != own))
+            if best.rank < _UNNAMED or sum(one.rank == _UNNAMED for one in responses) == 1:
+                response = taken["positions"] = best.name
+        if set(every.get(response, ())).isdisjoint(self._names_of(command, every)):
+            # Joints of another part of the robot: a controller has its own states beside them.
+            source = joint_source(command, channels)
+            own = [one for one in responses if source is not None and one.topic == source.topic]
+            if own and response == RESPONSE_TOPIC:
+                response = taken["positions"] = own[0].name
+        others = [one.name for one in (*commands, *responses)]
+        arrays = [topic for topic, kind, _ in self._joint_topics() if kind == FLOAT_ARRAY]
+        taken_topics = {one.topic for one in commands if one.name == command}
+        others += [f"{topic}:JOINT,..." for topic in arrays if topic not in taken_topics]
+        others = [name for name in dict.fromkeys(others) if name not in (command, response)]
+        notes = (*_notes(taken, others), *notes)
+        return JointTopics(command, response, quantities, tuple(others), notes)
+
+    def _names_of(self, name: str, every: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+        source = joint_source(name, self._topics.channels)
+        return () if source is None else source.joints or every.get(source.topic, ())
+
+    def _part(self, name: str, parts: Sequence[str]) -> str:
+        """Return a name that was chosen, with the part or the joints that it leaves open."""
+        channels = self._topics.channels
+        source = joint_source(name, channels)
+        if source is None:
+            there = [topic for topic, _, _ in self._joint_topics()] or channels
+            raise MissingChannelError(self._path, name, sorted(there), HOW_TO_CHOOSE)
+        kind = channels[source.topic].type_name
+        if kind == CONTROLLER_STATE and not source.part:
+            filled = self._filled(source.topic, parts)
+            return f"{name}.{filled[0]}" if filled else name
+        if kind == FLOAT_ARRAY and not source.joints:
+            return self._named_array(source.topic)
+        return name
+
+    def _named_array(self, topic: str) -> str:
+        """Return the name of an array's joints, those of the robot."""
+        width = self._width(topic)
+        if width and width == len(self._joints):
+            return f"{topic}:{','.join(self._joints)}"
+        if self._joints:
+            why = f"{width} values, the robot {len(self._joints)} joints"
+        else:
+            why = f"{width} values without names"
+        option = f"{topic}:JOINT,JOINT,..."
+        raise DataError(
+            f"{self._path}: {topic} ({FLOAT_ARRAY}) has {why}: name its joints in their order, "
+            f"--command-topic {option} (or --response-topic), or give a robot that has so many"
+        )
+
+    def _commands(self, every: Mapping[str, tuple[str, ...]]) -> list[_Candidate]:
+        found: list[_Candidate] = []
+        for topic, kind, count in self._joint_topics():
+            words, joints = _words(topic), every.get(topic, ())
+            if kind == CONTROLLER_STATE:
+                filled = self._filled(topic, COMMAND_PARTS)[:1]
+                found += [_Candidate(f"{topic}.{one}", topic, 0, count, joints) for one in filled]
+            elif kind == FLOAT_ARRAY:
+                of_angles = bool(words & _COMMAND_WORDS) and not words & _NO_ANGLES
+                if of_angles and self._joints and self._width(topic) == len(self._joints):
+                    name = self._named_array(topic)
+                    found.append(_Candidate(name, topic, 3, count, self._joints))
+            elif kind == TRAJECTORY:
+                found.append(_Candidate(topic, topic, 2, count, joints))
+            elif words & _COMMAND_WORDS:
+                found.append(_Candidate(topic, topic, 1, count, joints))
+        return sorted(found, key=lambda one: (one.rank, -one.count, one.name))
+
+    def _responses(self, every: Mapping[str, tuple[str, ...]]) -> list[_Candidate]:
+        found: list[_Candidate] = []
+        for topic, kind, count in self._joint_topics():
+            joints = every.get(topic, ())
+            if kind == CONTROLLER_STATE:
+                filled = self._filled(topic, STATE_PARTS)[:1]
+                found += [_Candidate(f"{topic}.{one}", topic, 1, count, joints) for one in filled]
+            elif kind == DYNAMIC_STATE:
+                found.append(_Candidate(topic, topic, 2, count, joints))
+            elif kind == JOINT_STATE and not _words(topic) & _COMMAND_WORDS:
+                usual = topic.rsplit("/", 1)[-1] == RESPONSE_TOPIC[1:]
+                found.append(_Candidate(topic, topic, 0 if usual else _UNNAMED, count, joints))
+        return sorted(found, key=lambda one: (one.rank, -one.count, one.name))
+
+    def _joint_topics(self) -> list[tuple[str, str, int]]:
+        """Return topic, type and number of messages of topics that could be either."""
+        return [
+            (topic, channel.type_name, channel.count)
+            for topic, channel in self._topics.channels.items()
+            if channel.type_name in JOINT_TYPES and channel.is_ros2 and channel.count
+            if topic not in CONTRACT_TOPICS and self._is_readable(topic)
+        ]
+
+    def _is_readable(self, topic: str) -> bool:
+        try:
+            return is_of_joints(self._topics.message_type(topic))
+        except DataError:  # a damaged schema: whoever reads the topic reports it
+            return False
+
+    def _quantities(self) -> tuple[dict[str, str], tuple[str, ...]]:
+        """Return the further quantities that DynamicJointStates have, and notes on the rest."""
+        found: dict[str, str] = {}
+        notes: list[str] = []
+        for topic, channel in self._topics.channels.items():
+            if channel.type_name != DYNAMIC_STATE or not channel.count:
+                continue
+            layout = self._first_layout(topic)
+            every = interfaces(layout).values() if layout else ()
+            own = dict.fromkeys(one for each in every for one in each)
+            for interface in INTERFACE_UNITS:
+                usual = f"/joint_{interface}"
+                if interface in own and usual not in self._topics.channels:
+                    found.setdefault(usual, f"{topic}.{interface}")
+            rest = [one for one in own if one not in UNITS and one not in INTERFACE_UNITS]
+            if rest:
+                listed = some_names(rest, _MOST_LISTED)
+                notes.append(f"{topic} has interfaces that aren't analysed: {listed}")
+        return found, tuple(notes)
+
+    def _filled(self, topic: str, parts: Sequence[str]) -> list[str]:
+        """Return the parts of a controller state that have positions in its first message."""
+        layout = self._first_layout(topic)
+        return [one for one in parts if layout and f"{one}.positions" in layout.leaves]
+
+    def _width(self, topic: str) -> int:
+        """Return the number of values in the first message of an array."""
+        layout = self._first_layout(topic)
+        leaf = layout.leaves.get("data") if layout else None
+        return leaf.count if leaf else 0
+
+    def _first_layout(self, topic: str) -> Layout | None:
+        try:
+            first = self._topics.first(topic)
+            return None if first is None else layout_of(first[2], first[1])
+        except DataError:  # whoever reads the topic reports it
+            return None
+
+
+_UNNAMED = 3
+"""Rank of a JointState whose name says nothing: taken if it is the only one."""
+
+
+def _words(topic: str) -> set[str]:
+    return {*re.split(r"[^a-z]+", topic.lower())}
+
+
+def _notes(taken: Mapping[str, str], others: Sequence[str]) -> tuple[str, ...]:
+    if not taken:
+        return ()
+    found = " and ".join(f"{kind} on {name}" for kind, name in taken.items())
+    rest = f"; other joints: {some_names(others, _MOST_LISTED)}" if others else ""
+    return (f"{found}, found by type{rest} ({HOW_TO_CHOOSE})",)

@@ -1,0 +1,175 @@
+"""Which topics of a log are taken, for each combination of names and types."""
+
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from support.ros_bags import EPOCH_NS, NAMES, STATE, Filler, header, message, ticks, write_bag
+from undulog.capture import Session
+from undulog.capture.common.errors import DataError, MissingChannelError
+from undulog.capture.log.read.joint_messages import Trajectory, joint_source, points_in_force
+
+
+def opened(tmp_path, fill):
+    def filled(bag):
+        own = Filler(bag)
+        for tick in ticks(0.2):
+            fill(own, tick)
+
+    return Session.open(write_bag(tmp_path / "bag", filled))
+
+
+def test_the_names_of_the_contract_come_first(tmp_path):
+    def fill(own, tick):
+        own.state(*tick)
+        own.state(*tick, "/joint_commands")
+        own.controller(*tick)
+
+    with opened(tmp_path, fill) as session:
+        found = session.joint_topics()
+        assert (found.command, found.response) == ("/joint_commands", "/joint_states")
+        assert found.notes == ()
+        assert session.with_joints() is session
+        # By the option, the controller; the responses stay.
+        found = session.joint_topics("/arm/controller_state")
+        assert found.command == "/arm/controller_state.reference"
+        assert found.response == "/joint_states"
+
+
+def test_commands_are_those_of_the_same_joints(tmp_path):
+    """A gripper's controller has more messages than that of the arm, and none of its joints."""
+
+    def fill(own, tick):
+        own.state(*tick)
+        own.controller(*tick, "/arm/controller_state")
+        for step in (0, 1):
+            store = own.bag.store
+            sample = message(
+                store,
+                STATE,
+                header=header(store, tick[0] + step),
+                name=["finger"],
+                position=np.zeros(1),
+            )
+            own.bag.write("/gripper/joint_commands", tick[0] + step, sample)
+
+    with opened(tmp_path, fill) as session:
+        found = session.joint_topics()
+        assert found.command == "/arm/controller_state.reference"
+        assert found.response == "/joint_states"
+
+
+def test_states_of_other_joints_give_way_to_those_of_the_controller(tmp_path):
+    def fill(own, tick):
+        own.controller(*tick)
+        store = own.bag.store
+        sample = message(
+            store, STATE, header=header(store, tick[0]), name=["finger"], position=np.zeros(1)
+        )
+        own.bag.write("/joint_states", tick[0], sample)
+
+    with opened(tmp_path, fill) as session:
+        assert session.joint_topics().response == "/arm/controller_state.feedback"
+        assert session.with_joints().joints("/joint_states").names == NAMES
+
+
+def test_states_that_could_be_either_are_not_taken(tmp_path):
+    def fill(own, tick):
+        own.state(*tick, "/left")
+        own.state(*tick, "/right")
+
+    with opened(tmp_path, fill) as session:
+        found = session.joint_topics()
+        assert (found.command, found.response) == ("/joint_commands", "/joint_states")
+        assert found.others == ("/left", "/right")
+        with pytest.raises(MissingChannelError, match="choose with --command-topic"):
+            session.joint_topics(response="/none")
+
+
+def test_the_array_of_a_robot_has_its_joints(tmp_path):
+    """Three values and a robot of 25 joints: refused; of the same number: taken, and reported."""
+
+    def fill(own, tick):
+        own.state(*tick)
+        own.array(*tick)
+
+    robot = tmp_path / "robot.toml"
+    with opened(tmp_path, fill) as session:
+        assert session.joint_topics().command == "/joint_commands"
+        path = session.path
+    from undulog import run
+
+    assert run(["robot", "new", "-o", str(robot), "--from", str(path)]) == 0
+    with Session.open(path, robot=robot) as session:
+        found = session.joint_topics()
+        assert found.command == f"/forward/commands:{','.join(NAMES)}"
+        assert (
+            "commands on /forward/commands:front_yaw,mid_yaw,rear_yaw, found by" in found.notes[0]
+        )
+        assert session.with_joints().joints("/joint_commands").names == NAMES
+
+
+def test_names_without_joints_are_refused(tmp_path):
+    def fill(own, tick):
+        own.state(*tick)
+        own.bag.write("/word", tick[0], message(own.bag.store, "std_msgs/msg/String", data="x"))
+
+    with opened(tmp_path, fill) as session:
+        with pytest.raises(DataError, match="/word is std_msgs/msg/String, not of joints"):
+            session.joints("/word")
+        with pytest.raises(DataError, match="names its joints itself"):
+            session.joints("/joint_states:a,b,c")
+        with pytest.raises(DataError, match="no part 'position'"):
+            session.joints("/joint_states.position")
+        assert session.joint_channel("/none.reference") is None
+
+
+@given(st.text(max_size=12), st.sampled_from(["", ".", ":", ".a:b", ":a,b", "..", "::"]))
+def test_any_name_is_read_or_refused(text, end):
+    known = {"/a": 0, "/a.b": 0, text: 0}
+    with suppress(DataError):  # names of joints that are empty, or twice there
+        found = joint_source("/a" + text + end, known)
+        assert found is None or found.topic in known
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 100), st.lists(st.integers(0, 30), min_size=1, max_size=5).map(sorted)
+        ),
+        min_size=1,
+        max_size=8,
+    )
+)
+def test_a_later_trajectory_replaces_what_is_not_yet_due(drawn):
+    every = [
+        Trajectory(t, 0, ("a",), np.array(after), {"position": np.full((len(after), 1), float(k))})
+        for k, (t, after) in enumerate(sorted(drawn, key=lambda one: one[0]))
+    ]
+    (found,), replaced = points_in_force(every, "position", 0)
+    _, t_ns, values = found
+    assert len(t_ns) + replaced == sum(len(one.after_ns) for one in every)
+    # Point by point: it is in force if every later trajectory begins after it.
+    expected = [
+        (one.log_ns + after, float(k))
+        for k, one in enumerate(every)
+        for after in one.after_ns.tolist()
+        if all(later.log_ns + later.after_ns[0] > one.log_ns + after for later in every[k + 1 :])
+    ]
+    assert sorted(zip(t_ns.tolist(), values[:, 0].tolist(), strict=True)) == sorted(expected)
+
+
+def test_stamps_of_trajectories_are_on_the_clock_of_the_log(tmp_path):
+    def fill(own, tick):
+        own.state(*tick)
+        own.trajectory(*tick, "/stamped")
+        own.trajectory(*tick, "/unstamped", stamped=False)
+
+    with opened(tmp_path, fill) as session:
+        for topic in ("/stamped", "/unstamped"):
+            assert session.joints(topic).t_ns[0][0] == EPOCH_NS + 10**8
+        window = session.joints("/stamped", start_ns=EPOCH_NS + 2 * 10**8)
+        assert len(window.t_ns[0]) == 10
