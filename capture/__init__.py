@@ -22,7 +22,8 @@ from .common.lazy import attach
 if TYPE_CHECKING:
     from .log.columns.topics import Channel
     from .log.read.sample_times import JointSignals, Signal
-    from .log.read.session import Session, SessionView
+    from .log.read.session import Session
+    from .log.read.session_view import SessionView
     from .log.write.writer import SessionWriter
     from .robot.description import load_robot, robot_names
     from .robot.model import Robot
@@ -34,7 +35,7 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "JointSignals": "log.read.sample_times",
         "Robot": "robot.model",
         "Session": "log.read.session",
-        "SessionView": "log.read.session",
+        "SessionView": "log.read.session_view",
         "SessionWriter": "log.write.writer",
         "Signal": "log.read.sample_times",
         "load_robot": "robot.description",

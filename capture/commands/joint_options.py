@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from cyclopts import Parameter
 
 from ..log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
-from ..log.read.session import SessionView
+from ..log.read.session_view import SessionView
 
 
 @Parameter(name="*")

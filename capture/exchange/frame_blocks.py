@@ -27,7 +27,7 @@ from ..log.messages.frames import (
     bus_of,
     empty_fd_frames,
 )
-from ..log.read.session import SessionView
+from ..log.read.session_view import SessionView
 from .can_import import DIRECTIONS_KEY
 from .frame_log import LogBlock, block_of, joined
 

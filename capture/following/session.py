@@ -10,7 +10,7 @@ from ..common.arrays import FloatArray, IntArray
 from ..common.errors import DataError, LogError, MissingChannelError
 from ..log.read.facts import TIMES_FROM_FPS
 from ..log.read.sample_times import LARGEST, Signal, longest_unbroken
-from ..log.read.session import SessionView
+from ..log.read.session_view import SessionView
 from .fault import Fault
 from .find import joints_not_following
 from .motion import JointMotion, Samples

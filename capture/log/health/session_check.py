@@ -29,7 +29,7 @@ from ..file.parts import check_chain
 from ..mcap.chunk import MAGIC, PREFIX_SIZE, Block, chunk_at, read_message_heads, walk_records
 from ..mcap.file import McapFile
 from ..read.open_log import OpenLog
-from ..read.session import SessionView
+from ..read.session_view import SessionView
 from .rules import Finding, judge_file, judge_following, judge_made_times, verdict_of
 from .session_scan import SessionMeasures, SessionScan
 from .tallies import FileHealth

@@ -11,7 +11,7 @@ from ...common.errors import DataError, MissingChannelError
 from ...robot.draft import SeenJoint
 from .joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from .sample_times import JointSignals
-from .session import SessionView
+from .session_view import SessionView
 
 _SCALES = {"rad": 1.0, "deg": math.radians(1.0)}
 
