@@ -14,6 +14,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -77,15 +78,27 @@ def _write(folder: Path) -> None:
     (folder / "wave.toml").write_text(scenario)
 
 
-def fleet(seed: int, wear: float) -> tuple[bool, str, bool]:
-    """Simulate one fleet with and without wear.
+@dataclass(frozen=True)
+class Fleet:
+    """Runs of one robot without and with wear.
+
+    Attributes:
+        days: When the runs were made, ascending.
+        at: Number of the first run with wear.
+    """
+
+    days: np.ndarray
+    at: int
+    worn: str
+    sound: list[Rows]
+    aged: list[Rows]
+
+
+def simulate(seed: int, wear: float) -> Fleet:
+    """Simulate one fleet without and with wear.
 
     Args:
         wear: Share of the stall torque that is lost.
-
-    Returns:
-        Whether the worn joint is named with its date; what was found; whether a joint is named
-        without wear.
     """
     rng = np.random.default_rng(seed)
     days = np.sort(rng.uniform(0, DAYS, SESSIONS))
@@ -105,20 +118,34 @@ def fleet(seed: int, wear: float) -> tuple[bool, str, bool]:
             sound.append(_run(folder, changes, seed * 1000 + k))
             weaker = changes | {key: own[key] * (1 - wear)}
             aged.append(sound[-1] if k < at else _run(folder, weaker, seed * 1000 + k))
-    begun = tuple(str(FIRST + pd.Timedelta(days=float(days[k])))[:19] for k in (at - 1, at))
-    changes_found = [
-        one for robot in analyse_fleet(*_tables(aged, days)).robots for one in robot.changes
-    ]
-    first = changes_found[0] if changes_found else None
+    return Fleet(days, at, worn, sound, aged)
+
+
+def judge(fleet: Fleet) -> tuple[bool, str, bool]:
+    """Hold the report of a fleet to the truth.
+
+    Returns:
+        Whether the worn joint is named with its date; what was found; whether a joint is named
+        without wear.
+    """
+    before, begun = (
+        FIRST + pd.Timedelta(days=float(fleet.days[k])) for k in (fleet.at - 1, fleet.at)
+    )
+    robots = analyse_fleet(*_tables(fleet.aged, fleet.days)).robots
+    first = next((one for robot in robots for one in robot.changes), None)
     within = (
         first is not None
-        and first.joint == worn
-        and first.earliest[:19] <= begun[1]
-        and first.latest[:19] >= begun[0]
+        and first.joint == fleet.worn
+        and pd.Timestamp(first.earliest) <= begun
+        and pd.Timestamp(first.latest) >= before
     )
     found = "nothing" if first is None else f"{first.joint} {first.quantity} since {first.date}"
-    false = any(robot.changes for robot in analyse_fleet(*_tables(sound, days)).robots)
-    return within, f"{worn} since {begun[1]}: {found}", false
+    robots = analyse_fleet(*_tables(fleet.sound, fleet.days)).robots
+    return within, f"{fleet.worn} since {begun:%F}: {found}", any(one.changes for one in robots)
+
+
+def _judged(seed: int, wear: float) -> tuple[bool, str, bool]:
+    return judge(simulate(seed, wear))
 
 
 def main() -> None:
@@ -131,7 +158,7 @@ def main() -> None:
     named = false = 0
     with ProcessPoolExecutor(given.workers, mp_context=get_context("spawn")) as pool:
         for seed, (within, text, mistaken) in enumerate(
-            pool.map(partial(fleet, wear=given.wear), range(given.seeds))
+            pool.map(partial(_judged, wear=given.wear), range(given.seeds))
         ):
             named, false = named + within, false + mistaken
             print(f"{seed:3d}  {'ok  ' if within else 'MISS'}  {text}", flush=True)
