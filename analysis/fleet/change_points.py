@@ -48,6 +48,7 @@ class ChangePoint:
         gradual: Whether the change takes time; else it is a step.
         before: Mean before the change, in the unit of the series.
         change: From before the change to its end.
+        t: Size over its standard error, of the shape and session that fit best.
         p: Family-wise p-value over all series that were given.
     """
 
@@ -58,6 +59,7 @@ class ChangePoint:
     gradual: bool
     before: float
     change: float
+    t: float
     p: float
 
 
@@ -107,8 +109,8 @@ def find_change_points(
         conditions: Number of each session's condition, shape (n_sessions,).
 
     Returns:
-        For each quantity the changes whose family-wise p-value is at most :data:`LEVEL`, the most
-        significant first; none from fewer than :data:`LEAST_SESSIONS` sessions.
+        For each quantity the changes whose family-wise p-value is at most :data:`LEVEL`, the
+        largest t first; none from fewer than :data:`LEAST_SESSIONS` sessions.
     """
     n = len(times_s)
     found: list[list[ChangePoint]] = [[] for _ in series]
@@ -136,9 +138,10 @@ def find_change_points(
         p = (1 + np.count_nonzero(null >= observed[column])) / (1 + len(null))
         if p <= LEVEL:
             fitted = _fit(residuals[:, column], raw[:, column], basis, shapes, rng)
-            found[quantity].append(replace(fitted, joint=joint, p=float(p)))
+            t = math.sqrt(observed[column])
+            found[quantity].append(replace(fitted, joint=joint, t=t, p=float(p)))
     for changes in found:
-        changes.sort(key=lambda change: (change.p, -abs(change.change)))
+        changes.sort(key=lambda change: -change.t)
     return found
 
 
@@ -187,7 +190,7 @@ def _fit(
     shapes: _Shapes,
     rng: np.random.Generator,
 ) -> ChangePoint:
-    """Fit a change; its joint and p-value are not known here."""
+    """Fit a change; its joint, t and p-value are not known here."""
     n = len(residual)
     left = _left(residual, shapes)
     best = int(left.argmin())
@@ -210,5 +213,6 @@ def _fit(
         gradual=bool(shapes.gradual[best]),
         before=float(np.mean(values[:start])),
         change=size,
+        t=math.nan,
         p=math.nan,
     )

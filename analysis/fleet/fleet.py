@@ -52,6 +52,7 @@ class JointChange:
         latest: Start of the last session in it.
         change: Ratio minus 1 for gain and energy; rad for lag.
         gradual: Whether the change takes time; else it is a step.
+        t: Size over its standard error. A joint that wears moves its neighbours, too, and less.
         p: Family-wise over all joints and quantities of the robot.
     """
 
@@ -63,6 +64,7 @@ class JointChange:
     latest: str
     change: float
     gradual: bool
+    t: float
     p: float
 
 
@@ -193,8 +195,7 @@ def _answer(histories: list[RobotHistory]) -> str:
     if not changes:
         n_sessions = sum(history.sessions for history in histories)
         return f"No joint changes over {n_sessions} sessions, at a family-wise level of 1 %."
-    rank = list(QUANTITIES).index
-    history, change = min(changes, key=lambda pair: (pair[1].p, rank(pair[1].quantity)))
+    history, change = max(changes, key=lambda pair: pair[1].t)
     more = len(changes) - 1
     others = f"; {more} more change{'s' if more > 1 else ''}" if more else ""
     return f"{history.robot}: {sentence(change)}{others}."
@@ -292,12 +293,13 @@ def _changes(
             latest=starts[point.last],
             change=_as_change(name, point.change),
             gradual=point.gradual,
+            t=point.t,
             p=point.p,
         )
         for name, points in zip(relative, found, strict=True)
         for point in points
     ]
-    return sorted(changes, key=lambda change: (change.p, change.date))
+    return sorted(changes, key=lambda change: -change.t)
 
 
 def _as_change(quantity: str, value: float) -> float:
