@@ -220,12 +220,13 @@ def table(
 
 
 def fit(text: str, width: int) -> str:
-    """Cut or pad a text to a width."""
-    return cut(text, width).ljust(width)
+    """Cut or pad a text to a width in cells of a terminal."""
+    short = cut(text, width)
+    return short + " " * (width - cell_len(short))
 
 
 def cut(text: str, width: int) -> str:
-    """Escape control characters and cut a text to a width."""
+    """Escape control characters and cut a text to a width in cells of a terminal."""
     clean = Text(_printable(text))
     clean.truncate(max(width, 1), overflow="ellipsis")
     return clean.plain

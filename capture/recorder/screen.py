@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from textwrap import wrap
 from typing import TextIO
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
@@ -185,7 +186,8 @@ def _verdict(snapshot: RecorderSnapshot, width: int) -> list[Text]:
     lines = [line]
     for reason in snapshot.reasons[:_REASONS]:
         folded = wrap(cut(reason, 4 * width), width - 4, max_lines=2, placeholder=" …")
-        lines += [Text(("    " if k else "  ") + part) for k, part in enumerate(folded)]
+        parts = (cut(part, width - 4) for part in folded)  # wrap counts characters
+        lines += [Text(("    " if k else "  ") + part) for k, part in enumerate(parts)]
     if count > _REASONS:
         lines.append(Text(f"  and {count - _REASONS} more", style=_MUTED))
     return lines
@@ -274,7 +276,11 @@ def _counted(count: int | None) -> tuple[str, str]:
 
 def _shorter(path: str, width: int) -> str:
     """Shorten a path to its end."""
-    return path if len(path) <= max(width, 8) else "…" + path[1 - max(width, 8) :]
+    width = max(width, 8)
+    if cell_len(path) <= width:
+        return path
+    ends = (path[k:] for k in range(max(1, len(path) - width), len(path) + 1))
+    return "…" + next(end for end in ends if cell_len(end) < width)
 
 
 LINE_EVERY_S = 10.0
