@@ -30,6 +30,7 @@ def import_log(
     map_: Annotated[tuple[str, ...], Parameter(name="--map", show_default=False)] = (),
     unit: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
     write_map: Path | None = None,
+    fps: float | None = None,
     episode: int | None = None,
     bus: str | None = None,
     topics: JointTopicOptions = CONTRACT,
@@ -41,7 +42,8 @@ def import_log(
     CAN traces (candump .log, .asc, .blf, .trc, python-can .csv and .db, .mf4) keep every frame and
     its direction; the robot's bus map defines which of them are joint commands, states and sensor
     values. Tables (CSV, .npz, .mat, .parquet, .pt), folders of them and LeRobot datasets need no
-    robot: what their columns mean is guessed and shown, or given by --columns or --map. Bags of ROS
+    robot: what their columns mean is guessed and shown, or given by --columns or --map. Tracks of
+    markers along a body (columns NAME_x and NAME_y, DeepLabCut) become joint angles. Bags of ROS
     2 (MCAP, .db3, folders) and of ROS 1 (.bag) keep all joints, found by type, and every message
     that a session has a place for.
 
@@ -51,6 +53,8 @@ def import_log(
 
     A table, with its commands in another: `undulog import states.csv --commands commands.csv
     -o run.mcap --write-map map.toml`, then, edited: `--columns map.toml`
+
+    Tracks of an animal in a video: `undulog import tracks.csv --fps 120 -o run.mcap`
 
     A LeRobot dataset, a session an episode: `undulog import DATASET -o sessions`
 
@@ -68,6 +72,7 @@ def import_log(
             `,wrap=PERIOD`, `,scale=FACTOR`, `,offset=VALUE` where needed. May be repeated.
         unit: Unit for the guess, `QUANTITY=UNIT`: `position=deg`, `time=ms`. May be repeated.
         write_map: Write the guessed map here, to be edited.
+        fps: Rows a second of a table without times.
         episode: The one episode of a LeRobot dataset to import.
         bus: The bus to decode, where the log has several; the first one by default.
         topics: Where commands and responses of a bag are.
@@ -94,7 +99,7 @@ def import_log(
     bag = not dataset and is_recording(log)
     table = not bag and _is_table(log)
     given = {"--commands": commands, "--columns": columns, "--map": map_, "--unit": unit}
-    given |= {"--write-map": write_map, "--episode": episode, "--bus": bus}
+    given |= {"--write-map": write_map, "--fps": fps, "--episode": episode, "--bus": bus}
     if topics != CONTRACT:
         given |= {"--command-topic": topics.command_topic, "--response-topic": topics}
     kind = _LEROBOT if dataset else _BAG if bag else _TABLE if table else _FRAMES
@@ -116,7 +121,7 @@ def import_log(
         elif described and column_map and log.suffix.lower() == ".csv" and commands is None:
             reports = [import_csv(log, output, described, column_map, force=force, stop=stop)]
         else:
-            found = open_tables(log, commands)
+            found = open_tables(log, commands, fps)
             report = import_tables(
                 found, output, robot=described, column_map=column_map, units=units,
                 write_map=write_map, force=force, stop=stop,
@@ -154,7 +159,7 @@ _TABLE, _FRAMES = "holds no CAN frames", "holds CAN frames"
 _OPTIONS = {
     _LEROBOT: ("--unit", "--episode"),
     _BAG: ("--command-topic", "--response-topic"),
-    _TABLE: ("--commands", "--columns", "--map", "--unit", "--write-map"),
+    _TABLE: ("--commands", "--columns", "--map", "--unit", "--write-map", "--fps"),
     _FRAMES: ("--bus",),
 }
 """Kind of a log to the options that are for it alone."""

@@ -24,6 +24,7 @@ from ..robot.description import numbered
 from ..robot.model import Quantity
 from .column_map import COMMANDS, STATES, Column, ColumnMap
 from .frame_log import LATEST_NS
+from .marker_tracks import is_frame_number
 from .packing import WIDEST, Block
 from .tables import TableFile, is_time, words
 
@@ -160,12 +161,13 @@ def _time_column(table: TableFile, sample: Block) -> str:
     rising = [n for n in table.columns if _numeric(sample[n]) and _rises(sample[n])]
     if chosen := [name for name in named if name in rising] or named[:1]:
         return chosen[0]
-    if rising and rising[0] == table.columns[0]:
+    if rising and rising[0] == table.columns[0] and not is_frame_number(rising[0]):
         return rising[0]
     raise ImportFormatError(
         table.path,
-        "no column is named as a time, nor does the first one rise; name it by --columns or --map. "
-        f"It has {some_names(table.columns, 20)}",
+        "no column is named as a time, nor does the first one rise; name it by --columns or --map, "
+        "or give the rate of its rows by --fps, if that is constant. It has "
+        f"{some_names(table.columns, 20)}",
     )
 
 

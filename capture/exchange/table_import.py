@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from functools import partial
 from itertools import chain
@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import FloatArray, IntArray
+from ..common.arrays import NS, FloatArray, IntArray
 from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError, UsageError, some_names
 from ..common.files import write_text
 from ..common.process import StopRequest
+from ..log.read.facts import TIMES_FROM_FPS
 from ..log.write.writer import SessionWriter
 from ..robot.bus_map import TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
@@ -28,6 +29,7 @@ from .column_map import COMMANDS, STATES, Column, ColumnMap
 from .csv_import import EARLIEST_NS
 from .frame_log import LATEST_NS, RELATIVE_EPOCH_NS
 from .joint_topics import JointTopic, topics_of
+from .marker_tracks import as_joints, with_fps
 from .table_guess import guess_map
 from .tables import TABLE_SUFFIXES, TableFile, is_time, open_table, words
 
@@ -73,26 +75,40 @@ class TableSet:
     facts: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
-def open_tables(source: Path, commands: Path | None = None) -> TableSet:
+def open_tables(source: Path, commands: Path | None = None, fps: float | None = None) -> TableSet:
     """Find the tables of a recording.
 
     Args:
         source: A table of states, or a folder with tables of states and commands, their names as
             ``control.csv`` and ``state_motor.csv``, with ``joint_list.txt`` and ``event.csv``.
         commands: A table of commands.
+        fps: Rows a second of tables without times.
 
     Raises:
+        UsageError: If ``fps`` is given for a table that has times.
         ImportFormatError: If a file is no table, or the folder has none, or too many.
     """
     if source.is_dir():
         if commands is not None:
             raise UsageError(f"{source} is a folder; --commands goes with a table of states")
-        return _open_folder(source)
-    tables = {STATES: open_table(source)}
-    if commands is not None:
-        tables[COMMANDS] = open_table(commands)
-    files = [source, *([commands] if commands is not None else [])]
-    return TableSet(source, tables, digest=digest_of(files))
+        found = _open_folder(source)
+    else:
+        tables = {STATES: open_table(source)}
+        if commands is not None:
+            tables[COMMANDS] = open_table(commands)
+        files = [source, *([commands] if commands is not None else [])]
+        found = TableSet(source, tables, digest=digest_of(files))
+    joints = {role: as_joints(table) or table for role, table in found.tables.items()}
+    if fps is None:
+        return replace(found, tables=joints)
+    if not 0 < fps < NS:
+        raise UsageError(f"--fps {fps:g}: more than 0 and less than 1e9 frames a second")
+    made = {
+        "import.time": f"made from the number of the frame and fps = {fps:g}",
+        TIMES_FROM_FPS: f"{fps:g}",
+    }
+    tables = {role: with_fps(table, fps) for role, table in joints.items()}
+    return replace(found, tables=tables, facts={**found.facts, **made})
 
 
 def _open_folder(folder: Path) -> TableSet:

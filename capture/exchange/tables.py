@@ -34,6 +34,8 @@ _NARROW = 64  # rows that show how wide a table is
 _SPARSE_CELLS, _SPARSEST = 1 << 24, 128
 _JOINT_COLUMNS = ("joint", "joint_name", "jointname", "motor", "servo", "name", "motor_id", "id")
 _SNIFFED = 1 << 16
+_TRACKS = "scorer"
+"""First cell of a file of DeepLabCut."""
 
 
 @dataclass(frozen=True)
@@ -144,6 +146,9 @@ def _open_text(path: Path) -> TableFile:
     skipped = next((i for i, line in enumerate(lines) if line.strip(" \t#%")), len(lines))
     delimiter, rows = _sniffed(path, [line for line in lines[skipped : skipped + 50] if line])
     first = [cell.strip(" #%\t") for cell in rows[0]]
+    if first[0].lower() == _TRACKS and len(rows) > 2:
+        first, lines_of_header = _track_names(rows), 3 + (rows[1][0].lower() == "individuals")
+        skipped, rows = skipped + lines_of_header - 1, rows[lines_of_header - 1 :]
     headerless = all(_is_number(cell) for cell in first if cell)
     raw = [f"column{i + 1}" for i in range(len(first))] if headerless else first
     repeated = [name for name in raw if raw.count(name) > 1]
@@ -167,6 +172,13 @@ def _open_text(path: Path) -> TableFile:
     read = partial(_read_text, path, raw, vectors, delimiter, decimal, skipped)
     table = TableFile(path, columns, read, delimiter, "headerless" if headerless else "wide")
     return _pivoted(table) or table
+
+
+def _track_names(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return names of columns from the header of DeepLabCut: scorer, (individuals,) body parts."""
+    parts = rows[1:4] if rows[1][0].lower() == "individuals" else rows[1:3]
+    names = ("_".join(part[k].strip() for part in parts) for k in range(1, len(rows[0])))
+    return ["frame", *names]
 
 
 def _width(path: Path, cell: str) -> int:

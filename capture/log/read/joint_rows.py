@@ -53,8 +53,8 @@ def merge_rows(
         warn: Called with one sentence for each irregularity.
 
     Returns:
-        Joint names in order of first appearance, times [Unix ns] and values, one array per joint;
-        joints sampled together share one array of times.
+        Joint names in the order of a list that has all, else of first appearance; times [Unix ns]
+        and values, one array per joint. Joints sampled together share one array of times.
     """
     filled = [row for row in rows if row.names and row.values.shape[1] == len(row.names)]
     for row in rows:
@@ -70,7 +70,11 @@ def merge_rows(
         if values.strides[0] != values.itemsize:  # a joint's samples side by side
             values = np.asfortranarray(values)
         return row.names, [t_ns] * len(row.names), [values[:, j] for j in range(len(row.names))]
+    # A list that has all joints gives their order; a shorter one may come first.
+    longest = max((row.names for row in filled), key=len, default=())
     parts: dict[str, list[tuple[JointRows, int]]] = {}
+    if len(longest) == len({name for row in filled for name in row.names}):
+        parts = {name: [] for name in longest}
     for row in filled:
         for j, name in enumerate(row.names):
             parts.setdefault(name, []).append((row, j))
