@@ -27,7 +27,8 @@ from ..segments.examine import OFFSET_RAD
 from ..session.runs import SAME_COMMAND, GaitRun, command_change, other_frequency
 from ..signals.stretch import Options
 from .decisions import Margins, answer_of, decide, differ, estimates_of, family
-from .side import ComparedSession, Quantities, changes, phases_rad, see, turned
+from .quantities import Quantities
+from .side import ComparedSession, changes, phases_rad, see, turned
 
 
 def broken_joints(

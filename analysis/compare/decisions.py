@@ -17,16 +17,8 @@ from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, around, 
 from ..results import formats
 from ..results.comparison import BODY, BrokenJoint, Difference, Equivalence, NamedJoint
 from ..results.estimate import Estimate, leaves_out_zero
-from .side import (
-    ComparedSession,
-    Differences,
-    Key,
-    Quantities,
-    from_runs,
-    holm,
-    independent,
-    paired,
-)
+from .quantities import Differences, Key, Quantities, from_runs, holm, independent, paired
+from .side import ComparedSession
 
 SIGNIFICANT_DIFFERENCE = 0.05
 """Family-wise level of the decisions, and level of each equivalence."""

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from undulog.analysis.compare.side import PHASES, cycles_by_phase, from_runs, phases_rad
+from undulog.analysis.compare.quantities import from_runs
+from undulog.analysis.compare.side import PHASES, cycles_by_phase, phases_rad
 from undulog.analysis.estimators.harmonic import fit_at
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series, clean

@@ -5,7 +5,13 @@ import pytest
 from scipy import stats
 
 from undulog.analysis.compare.decisions import Margins, decide
-from undulog.analysis.compare.side import Quantities, from_runs, holm, independent, paired
+from undulog.analysis.compare.quantities import (
+    Quantities,
+    from_runs,
+    holm,
+    independent,
+    paired,
+)
 from undulog.capture.common.errors import UsageError
 
 SEEDS = 600
