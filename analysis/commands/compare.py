@@ -42,7 +42,8 @@ def compare(
     """Report what differs between two sessions, or two groups of runs, and what is the same.
 
     Robot and twin, before and after a repair, two surfaces: gain, lag and energy of each joint,
-    speed and cost of transport, aligned by the gait's phase. The first line printed is the answer;
+    speed and cost of transport, aligned by the gait's phase; of sessions without commands amplitude
+    and phase lag of each joint, frequency and wave. The first line printed is the answer;
     decisions hold for all quantities together (Holm), and so do the intervals.
 
     Example: `undulog compare --a before1.mcap before2.mcap --b after1.mcap after2.mcap`
@@ -53,7 +54,7 @@ def compare(
         b: Runs of side B.
         paired: Run i of B belongs to run i of A.
         any_gait: Compare although the gaits differ; the result notes it.
-        margin_gain: Gains that differ by less count as the same, as a share.
+        margin_gain: Gains and amplitudes that differ by less count as the same, as a share.
         margin_lag_deg: Lags that differ by less count as the same [degrees].
         output: Write the result to this file: a page if its name ends in .html, else .json.
         start: Start of what is analysed, from each session's start [s]; chosen if not given.

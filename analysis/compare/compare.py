@@ -1,19 +1,21 @@
 """Compare two sessions, or two groups of them, joint by joint.
 
-They can be compared where the same commands drove the same joints.
+They can be compared where the same commands drove the same joints, and by their motion where no
+session has commands.
 """
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
 
 from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
+from undulog.capture.common.arrays import ComplexArray
 from undulog.capture.common.console import Warn, plain
 from undulog.capture.common.errors import DataError, UsageError
 
@@ -27,6 +29,7 @@ from ..segments.examine import OFFSET_RAD
 from ..session.runs import SAME_COMMAND, GaitRun, command_change, other_frequency
 from ..signals.stretch import Options
 from .decisions import Margins, answer_of, decide, differ, estimates_of, family
+from .motion import Motion, common_motion, motion_estimates
 from .quantities import Quantities
 from .side import ComparedSession, changes, phases_rad, see, turned
 
@@ -107,8 +110,8 @@ def align(a: Sequence[GaitRun], b: Sequence[GaitRun], *, any_gait: bool = False)
     for run in runs:
         if not run.names:
             raise DataError(f"{run.label} has no gait, so there is no gait phase to align it by")
-    _refuse_copies(a, "A")
-    _refuse_copies(b, "B")
+    for side, own in (("A", a), ("B", b)):
+        _refuse_copies([(run.label, run.ratio) for run in own], side)
     joints = list(dict.fromkeys(name for run in runs for name in run.names))
     answered = [
         {name for name, ratio in zip(run.names, run.ratio, strict=True) if np.isfinite(ratio)}
@@ -169,17 +172,21 @@ def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None
     )
 
 
-def _refuse_copies(runs: Sequence[GaitRun], side: str) -> None:
-    """Raise an error for copies: two copies of one run would show no scatter."""
+def _refuse_copies(runs: Sequence[tuple[str, ComplexArray]], side: str) -> None:
+    """Raise an error for copies: two copies of one run would show no scatter.
+
+    Args:
+        runs: Label and numbers of each.
+    """
     seen: dict[bytes, str] = {}
-    for run in runs:
-        numbers = run.ratio.tobytes()
+    for label, values in runs:
+        numbers = values.tobytes()
         if numbers in seen:
             raise DataError(
-                f"{run.label} is a copy of the numbers of {seen[numbers]} on side {side}: a copy "
+                f"{label} is a copy of the numbers of {seen[numbers]} on side {side}: a copy "
                 "is not a run of its own"
             )
-        seen[numbers] = run.label
+        seen[numbers] = label
 
 
 def _some(names: Sequence[str]) -> str:
@@ -215,7 +222,8 @@ def compare_sessions(
 
     Raises:
         MissingChannelError: If a session has neither commands nor responses.
-        DataError: If sessions have no gait, no joint in common or another gait.
+        DataError: If sessions have no gait or periodic motion, no joint in common or another gait,
+            or only some have commands.
         UsageError: If a side has no session, a group has one run, or runs don't pair up.
     """
     choices = choices or Choices()
@@ -249,21 +257,26 @@ def compare_fitted(
         warnings: Warnings of the sessions.
 
     Raises:
-        DataError: If sessions have no gait, no joint in common or another gait.
+        DataError: If sessions have no gait or periodic motion, no joint in common or another gait,
+            or only some have commands.
         UsageError: If a side has no session, a group has one run, or runs don't pair up.
     """
     if not a or not b:
         raise UsageError("a comparison needs at least one session a side")
     every_warning = list(warnings)
     design = "pairs" if choices.paired else "sessions" if len(a) == len(b) == 1 else "groups"
-    aligned = align([one.run for one in a], [one.run for one in b], any_gait=choices.any_gait)
+    if free := _without_commands(a, b):
+        a, b, aligned, before = _align_motions(a, b)
+    else:
+        before: Mapping[str, str] = {}
+        aligned = align([one.run for one in a], [one.run for one in b], any_gait=choices.any_gait)
     keys = family(a, b, aligned.names)
     # Lags near pi must not part company: all are taken within pi of the first session's.
     about = np.array([a[0].estimates[key][0] for key in keys])
     estimates = [estimates_of(side, keys, about) for side in (a, b)]
     first, second, found = differ(estimates[0], estimates[1], design)
-    decided = decide(keys, first, second, found, choices.margins)
-    partial = _partial(aligned)
+    decided = decide(keys, first, second, found, choices.margins, before=before)
+    partial = _partial(aligned, " by their phase" if free else "")
     _warn(a, b, design, every_warning.append)
     broken = broken_joints(a, b)
     verdict, sentence = answer_of(decided, partial is not None, broken)
@@ -286,11 +299,60 @@ def compare_fitted(
     )
 
 
-def _partial(aligned: Alignment) -> str | None:
+def _without_commands(a: Sequence[ComparedSession], b: Sequence[ComparedSession]) -> bool:
+    """Return whether no session has commands.
+
+    Raises:
+        DataError: If only some of them have.
+    """
+    commanded = [one for one in (*a, *b) if one.commanded]
+    free = [one for one in (*a, *b) if not one.commanded]
+    if commanded and free:
+        without, other = free[0].run.label, commanded[0].run.label
+        raise DataError(
+            f"{without} has no logged commands, {other} has: gain and lag need the commands of "
+            f"every session; log the commands of {without} too, name their topic "
+            "(--command-topic), or compare it with sessions without commands"
+        )
+    return bool(free)
+
+
+def _align_motions(
+    a: Sequence[ComparedSession], b: Sequence[ComparedSession]
+) -> tuple[list[ComparedSession], list[ComparedSession], Alignment, Mapping[str, str]]:
+    """Align sessions without commands.
+
+    Returns:
+        Both sides with the estimates of their motions, what they have in common, and the joint
+        that the phase lag of each is taken to.
+
+    Raises:
+        DataError: If a session has no periodic motion, or no joint moves in all of them.
+    """
+    motions: list[Motion] = []
+    for one in (*a, *b):
+        if one.motion is None:
+            raise DataError(
+                f"{one.run.label} has no logged commands and no periodic motion, so there is "
+                "nothing to compare; choose a part that is periodic (--start, --stop)"
+            )
+        motions.append(one.motion)
+    for side, own in (("A", motions[: len(a)]), ("B", motions[len(a) :])):
+        _refuse_copies([(one.label, one.oscillation.amplitudes) for one in own], side)
+    common = common_motion(motions)
+    sides = [
+        replace(one, estimates={**one.estimates, **motion_estimates(motion, common)})
+        for one, motion in zip((*a, *b), motions, strict=True)
+    ]
+    aligned = Alignment(common.names, dict(common.left_out), None)
+    return sides[: len(a)], sides[len(a) :], aligned, common.before
+
+
+def _partial(aligned: Alignment, how: str) -> str | None:
     parts: list[str] = []
     if aligned.left_out:
         left = "; ".join(f"{name}: {why}" for name, why in aligned.left_out.items())
-        parts.append(f"only {len(aligned.names)} joints can be compared ({left})")
+        parts.append(f"only {len(aligned.names)} joints can be compared{how} ({left})")
     if aligned.gaits_differ is not None:
         parts.append(f"the gaits differ: {aligned.gaits_differ}")
     return "; ".join(parts) or None
@@ -346,6 +408,10 @@ def _waveforms(
 
 def _by_first(one: ComparedSession, name: str, names: Sequence[str]) -> Quantities:
     """Turn a mean cycle to the phase of the first common joint of the same frequency."""
+    if (motion := one.motion) is not None:
+        return turned(
+            one.cycles[name], motion.phase_rad(motion.names[0]) - motion.phase_rad(names[0])
+        )
     run = one.run
     group = run.group[run.names.index(name)]
     members = [k for k, own in enumerate(run.group) if own == group]

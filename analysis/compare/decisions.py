@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,14 @@ from undulog.capture.common.console import plain
 
 from ..estimators.intervals import EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD, around, equivalence_p
 from ..results import formats
-from ..results.comparison import BODY, BrokenJoint, Difference, Equivalence, NamedJoint
+from ..results.comparison import (
+    BODY,
+    BrokenJoint,
+    Difference,
+    Equivalence,
+    NamedJoint,
+    of_body,
+)
 from ..results.estimate import Estimate, leaves_out_zero
 from .quantities import Differences, Key, Quantities, from_runs, holm, independent, paired
 from .side import ComparedSession
@@ -23,8 +30,24 @@ from .side import ComparedSession
 SIGNIFICANT_DIFFERENCE = 0.05
 """Family-wise level of the decisions, and level of each equivalence."""
 
-UNITS = {"gain": "1", "lag": "rad", "energy_abs": "J", "speed": "m/s", "cost_of_transport": "1"}
+UNITS = {
+    "gain": "1",
+    "lag": "rad",
+    "amplitude": "rad",
+    "phase_lag": "rad",
+    "rest_amplitude": "rad",
+    "energy_abs": "J",
+    "speed": "m/s",
+    "cost_of_transport": "1",
+    "frequency": "Hz",
+    "wave_number": "rad",
+    "travelling_index": "1",
+}
 """What is compared, in this order: of each joint, then of the body."""
+
+_BY_RATIO = ("gain", "amplitude", "frequency")
+_ANGLES = ("lag", "phase_lag", "rest_amplitude", "wave_number")
+_CYCLIC = ("lag", "phase_lag")
 
 
 @dataclass(frozen=True)
@@ -32,9 +55,10 @@ class Margins:
     """Differences below which two sides count as the same.
 
     Attributes:
-        lag_rad: [rad].
-        relative: Of energies (as a share of side A's mean over the joints), speed and cost of
-            transport.
+        gain: Of amplitudes, too.
+        lag_rad: Of phase lags and wave numbers (a joint), too [rad].
+        relative: Of energies (as a share of side A's mean over the joints), speed, cost of
+            transport and frequency; of the travelling index itself.
     """
 
     gain: float = EQUIVALENT_GAIN
@@ -65,10 +89,13 @@ def family(
         joints: Joints in common, head to tail.
 
     Returns:
-        Quantities and where, in the order of ``UNITS``.
+        Quantities and where, in the order of ``UNITS``; those of joints near rest, too.
     """
     every = [one.estimates for one in (*a, *b)]
-    keys = itertools.product(UNITS, (*joints, BODY))
+    others = [
+        place for quantity, place in every[0] if quantity == "rest_amplitude" or of_body(place)
+    ]
+    keys = itertools.product(UNITS, dict.fromkeys((*joints, *others)))
     return [key for key in keys if all(key in known for known in every)]
 
 
@@ -105,20 +132,27 @@ def estimates_of(
         lags_about: Lags are taken within pi of these, shape (k,).
     """
     stack = np.array([[one.estimates[key] for key in keys] for one in side]).transpose(2, 0, 1)
-    lag = np.array([quantity == "lag" for quantity, _ in keys])
+    lag = np.array([quantity in _CYCLIC for quantity, _ in keys])
     about = lags_about[lag]
     stack[0][:, lag] = about + np.angle(np.exp(1j * (stack[0][:, lag] - about)))
     return [Quantities(*stack[:, k]) for k in range(len(side))]
 
 
 def decide(
-    keys: Sequence[Key], a: Quantities, b: Quantities, found: Differences, margins: Margins
+    keys: Sequence[Key],
+    a: Quantities,
+    b: Quantities,
+    found: Differences,
+    margins: Margins,
+    *,
+    before: Mapping[str, str] | None = None,
 ) -> Decided:
     """Decide on a family of differences.
 
     Args:
         keys: What each is, k.
         margins: What counts as the same.
+        before: The joint that each joint's phase lag is taken to.
     """
     p, adjusted, half = found.p, holm(found.p), found.half
     kinds = np.array([quantity for quantity, _ in keys])
@@ -126,7 +160,7 @@ def decide(
     size = np.abs(found.value) / margin
     decisions: list[Difference] = []
     for k, (quantity, place) in enumerate(keys):
-        log = quantity == "gain"
+        log = quantity in _BY_RATIO
         ends = around(float(found.value[k]), float(half[k]))
         decisions.append(
             Difference(
@@ -145,7 +179,8 @@ def decide(
             )
         )
     decisions.sort(key=_rank)
-    return Decided(tuple(decisions), _named(decisions), _equivalence(kinds, found, margin))
+    named = _named(decisions, before or {})
+    return Decided(tuple(decisions), named, _equivalence(kinds, found, margin))
 
 
 def _rank(one: Difference) -> tuple[bool, float]:
@@ -158,7 +193,9 @@ def _plain(value: float, *, log: bool) -> float:
 
 
 def _margins(kinds: np.ndarray, a: FloatArray, margins: Margins) -> FloatArray:
-    fixed = {"gain": margins.gain, "lag": margins.lag_rad}
+    fixed = {"gain": margins.gain, "amplitude": margins.gain, "frequency": margins.relative}
+    fixed |= dict.fromkeys((*_CYCLIC, "wave_number"), margins.lag_rad)
+    fixed |= {"travelling_index": margins.relative, "rest_amplitude": margins.lag_rad}
     margin = np.empty(a.size)
     for kind in dict.fromkeys(kinds.tolist()):
         one = kinds == kind
@@ -167,11 +204,12 @@ def _margins(kinds: np.ndarray, a: FloatArray, margins: Margins) -> FloatArray:
     return margin
 
 
-def _named(decisions: Sequence[Difference]) -> tuple[NamedJoint, ...]:
+def _named(decisions: Sequence[Difference], before: Mapping[str, str]) -> tuple[NamedJoint, ...]:
     """List the joints that differ, the largest first: a weak module changes its neighbours less."""
     parts: dict[str, list[Difference]] = {}
+    follows = _follow(decisions, before)
     for one in decisions:
-        if one.quantity in ("gain", "lag"):
+        if one.quantity in RESPONSE and (one.quantity != "phase_lag" or one.place not in follows):
             parts.setdefault(one.place, []).append(one)
     named = [
         NamedJoint(name, float(np.hypot.reduce([one.size for one in both])), least)
@@ -179,6 +217,25 @@ def _named(decisions: Sequence[Difference]) -> tuple[NamedJoint, ...]:
         if (least := min(one.p_holm for one in both)) < SIGNIFICANT_DIFFERENCE
     ]
     return tuple(sorted(named, key=lambda one: -one.size))
+
+
+def _follow(decisions: Sequence[Difference], before: Mapping[str, str]) -> set[str]:
+    """Find the joints whose phase lag differs only because that of the joint before it does.
+
+    A joint that is late by itself adds to its own lag what it takes off that of the next one.
+    """
+    lags = {
+        one.place: one.difference.value or 0.0
+        for one in decisions
+        if one.quantity == "phase_lag" and one.p_holm < SIGNIFICANT_DIFFERENCE
+    }
+    found: set[str] = set()
+    for joint, last in before.items():  # in chain order
+        if joint in lags and last in lags and last not in found:
+            own, other = lags[joint], lags[last]
+            if own * other < 0 and abs(own + other) < min(abs(own), abs(other)) / 2:
+                found.add(joint)
+    return found
 
 
 def _equivalence(
@@ -189,7 +246,8 @@ def _equivalence(
         one = kinds == kind
         value, within = found.value[one], float(margin[one][0])
         p = equivalence_p(value, found.error[one], found.dof[one], within)
-        results.append(Equivalence(kind, within, UNITS[kind], float(np.abs(value).max()), p))
+        unit = "1" if kind in _BY_RATIO else UNITS[kind]
+        results.append(Equivalence(kind, within, unit, float(np.abs(value).max()), p))
     return tuple(results)
 
 
@@ -199,13 +257,23 @@ MOST = 4
 WORDS = {
     "gain": "gain",
     "lag": "lag",
+    "amplitude": "amplitude",
+    "phase_lag": "phase lag",
+    "rest_amplitude": "amplitude near rest",
     "energy_abs": "E_abs per cycle",
     "speed": "speed",
     "cost_of_transport": "cost of transport",
+    "frequency": "frequency",
+    "wave_number": "wave number",
+    "travelling_index": "travelling index",
 }
 """Names of the quantities in text."""
 
-_RESPONSE = ("gain", "lag")
+RESPONSE = ("gain", "lag", "amplitude", "phase_lag", "rest_amplitude")
+"""Quantities of a joint that make it a different one."""
+
+_SAME = ("gain", "lag", "amplitude", "phase_lag", "frequency")
+"""Quantities that two sides have in common if they are the same; other waves follow from them."""
 
 
 def answer_of(
@@ -228,17 +296,23 @@ def answer_of(
         return "different", f"{listed}; of the others: {rest}"
     beyond_doubt = _beyond_doubt(decided)
     tests = {one.quantity: one for one in decided.equivalence}
-    same = all(tests[quantity].p < SIGNIFICANT_DIFFERENCE for quantity in ("gain", "lag"))
-    gain, lag = tests["gain"].margin, math.degrees(tests["lag"].margin)
-    margins = f"{_short(100 * gain)} % and {_short(lag)}°"
+    main = [tests[quantity] for quantity in _SAME if quantity in tests]
+    at_rest = [one for one in beyond_doubt if one.quantity == "rest_amplitude"]
+    same = not at_rest and all(one.p < SIGNIFICANT_DIFFERENCE for one in main)
+    of_joints = [one for one in main if one.quantity in RESPONSE]
+    margins = " and ".join(margin_text(one) for one in of_joints)
     whole = " (partial comparison)" if partial else ""
-    joints = len({one.place for one in decided.differences if one.place != BODY})
+    joints = len({one.place for one in decided.differences if not of_body(one.place)})
     which = "the joint" if joints == 1 else f"all {joints} joints"
-    alike = f"gain and lag of {which} are equivalent within {margins}"
+    words = " and ".join(WORDS[one.quantity] for one in of_joints)
+    are = "are" if len(of_joints) > 1 else "is"
+    alike = f"{words} of {which} {are} equivalent within {margins}"
+    if "frequency" in tests:
+        alike += f", the frequency within {margin_text(tests['frequency'])}"
     if not beyond_doubt:
         if same:
             return "same", f"no difference found; {alike}{whole}"
-        return "open", f"no difference found, but {_not_shown(decided)}{whole}"
+        return "open", f"no difference found, but {_not_shown(decided, main)}{whole}"
     if same:
         return "small", f"{alike}; beyond doubt, if small: {_largest(decided)}{whole}"
     return "different", f"B differs from A: {_largest(decided)}{whole}"
@@ -276,12 +350,15 @@ def in_people_units(one: Difference) -> tuple[Estimate, str]:
     """Convert a difference to percent or degrees.
 
     Returns:
-        Percent for gains, degrees for lags, and for the others percent of side A.
+        Percent for gains, amplitudes and frequencies, degrees for lags (of wave numbers a joint),
+        the travelling index as it is, and for the others percent of side A.
     """
-    if one.quantity == "lag":
+    if one.quantity in _ANGLES:
         return formats.degrees(one.difference), "°"
-    if one.quantity == "gain":
+    if one.quantity in _BY_RATIO:
         return formats.scaled(one.difference, 100.0), " %"
+    if one.quantity == "travelling_index":
+        return one.difference, ""
     if one.a > 0:
         return formats.scaled(one.difference, 100.0 / one.a), " %"
     return one.difference, f" {one.unit}"
@@ -307,14 +384,14 @@ def _largest(decided: Decided) -> str:
     comparisons of a hundred that differ in nothing.
     """
     beyond_doubt = _beyond_doubt(decided)
-    large = {one.place for one in beyond_doubt if one.quantity in _RESPONSE and one.size >= 1}
+    large = {one.place for one in beyond_doubt if one.quantity in RESPONSE and one.size >= 1}
     named = [one.name for one in decided.named if one.name in large]
     if not named:
         first = beyond_doubt[0]
         others = len(beyond_doubt) - 1
         more = f"; and {others} more" if others else ""
         where = f"{plain(first.place)}:" if first.size >= 1 else "one joint's"
-        where = "the body's" if first.place == BODY else where
+        where = f"the body's{first.place[len(BODY) + 1 :]}" if of_body(first.place) else where
         return f"{where} {difference_text(first)} ({formats.p_value_text(first.p_holm)}){more}"
     own = [one for one in beyond_doubt if one.place == named[0] and one.quantity != "energy_abs"]
     parts = ", ".join(difference_text(one) for one in sorted(own, key=lambda one: one.quantity))
@@ -326,17 +403,36 @@ def _largest(decided: Decided) -> str:
     return f"{plain(named[0])} most, {parts} ({formats.p_value_text(smallest)}){more}"
 
 
-def _not_shown(decided: Decided) -> str:
-    """Describe how large a hidden difference might be, from the simultaneous intervals."""
-    worst: dict[str, float] = {"gain": 0.0, "lag": 0.0}
-    for one in decided.differences:
-        ends = one.difference.ci95
-        if one.quantity in worst and ends is not None:
-            worst[one.quantity] = max(worst[one.quantity], abs(ends[0]), abs(ends[1]))
-    return (
-        f"up to {_short(100 * worst['gain'])} % in gain and {_short(math.degrees(worst['lag']))}° "
-        "in lag could hide in the noise; record more"
-    )
+def _not_shown(decided: Decided, tests: Sequence[Equivalence]) -> str:
+    """Describe how large a hidden difference might be, from the simultaneous intervals.
+
+    Args:
+        tests: Those that are to be shown the same; of the body's only what is not is described.
+    """
+    shown: list[str] = []
+    for test in tests:
+        if test.quantity not in RESPONSE and test.p < SIGNIFICANT_DIFFERENCE:
+            continue
+        worst = 0.0
+        for one in decided.differences:
+            ends = one.difference.ci95
+            if one.quantity == test.quantity and ends is not None:
+                worst = max(worst, abs(ends[0]), abs(ends[1]))
+        shown.append(f"{margin_text(test, worst)} in {WORDS[test.quantity]}")
+    return f"up to {' and '.join(shown)} could hide in the noise; record more"
+
+
+def margin_text(one: Equivalence, value: float | None = None) -> str:
+    """Return a difference in readable units, e.g. ``2 %``, ``0.35°`` or ``0.01 J``.
+
+    Args:
+        value: In the test's unit; its margin if None.
+    """
+    units = {"rad": (math.degrees(1), "°"), "1": (1.0, "")}
+    factor, unit = units.get(one.unit, (1.0, f" {one.unit}"))
+    if one.quantity in _BY_RATIO:
+        factor, unit = 100.0, " %"
+    return f"{_short((one.margin if value is None else value) * factor)}{unit}"
 
 
 def _short(value: float) -> str:

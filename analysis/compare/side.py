@@ -2,7 +2,8 @@
 
 A mean cycle goes by gait phase, the phase that the commands define.
 Phase 0 is the crest of the fundamental of the first compared joint's command, in every session, so
-cycles are laid over each other by what the controller meant and not by the clock.
+cycles are laid over each other by what the controller meant and not by the clock. Without commands
+it is the crest of that joint's own motion.
 """
 
 from __future__ import annotations
@@ -23,11 +24,14 @@ from ..body.steps import body_steps, cost_of_transport, mean_of_cycles, speed
 from ..energy import in_all
 from ..estimators.harmonic import HarmonicFit
 from ..estimators.series import GAP_FACTOR, Series
+from ..free_motion.estimate import MotionFit
 from ..results.analysis import Analysis
 from ..results.comparison import BODY, Change
 from ..session.analyse import SessionMeasurement, measure_session
 from ..session.runs import GaitRun, gait_run
 from ..signals.stretch import Options
+from ..signals.windows import Span
+from .motion import Motion, motion_of
 from .quantities import Key, Known, Quantities, from_runs
 
 PHASES = 72
@@ -173,8 +177,10 @@ class ComparedSession:
         facts: Recorded facts, by their dotted names.
         estimates: ln gain [1] and lag [rad] of the joints, E_abs per cycle [J]; speed [m/s] and
             cost of transport of the body.
-        cycles: Mean cycle of each joint by the phase of the first command of its group [rad].
+        cycles: Mean cycle of each joint by the phase of the first command of its group, or of the
+            first joint's own motion where no commands were logged [rad].
         offsets: Mean of each joint's position less that of its command [rad].
+        motion: The periodic motion, where no commands were logged.
     """
 
     analysis: Analysis
@@ -183,6 +189,12 @@ class ComparedSession:
     estimates: Mapping[Key, Known]
     cycles: Mapping[str, Quantities]
     offsets: Mapping[str, float]
+    motion: Motion | None = None
+
+    @property
+    def commanded(self) -> bool:
+        """Whether commands were logged."""
+        return self.analysis.free_motion is None
 
 
 def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
@@ -215,9 +227,10 @@ def see(session: SessionView, options: Options, warn: Warn) -> ComparedSession:
             else:
                 estimates[quantity, BODY] = known
     offsets = {name: float(np.median(each)) for name, each in measured.offsets.items() if each.size}
-    return ComparedSession(
-        analysis, run, facts_of(session), estimates, _cycles(measured, run), offsets
-    )
+    moved = measured.motion
+    motion = None if moved is None else motion_of(run.label, session.robot, moved)
+    cycles = _cycles(measured, run) if moved is None else _cycles_of_motion(moved, measured.span)
+    return ComparedSession(analysis, run, facts_of(session), estimates, cycles, offsets, motion)
 
 
 def turned(cycle: Quantities, by_rad: float) -> Quantities:
@@ -281,4 +294,15 @@ def _cycles(measured: SessionMeasurement, run: GaitRun) -> dict[str, Quantities]
             cut = cycles_by_phase(measured.responses[name], group.fit, at, **window)
             if len(cut) > 1:
                 found[name] = from_runs(cut)
+    return found
+
+
+def _cycles_of_motion(moved: MotionFit, span: Span) -> dict[str, Quantities]:
+    zero_rad = float(np.angle(moved.fit.fundamental[0]))
+    window = {"zero_rad": zero_rad, "start_s": span.start_s, "stop_s": span.stop_s}
+    found: dict[str, Quantities] = {}
+    for row, one in enumerate(moved.series):
+        cut = cycles_by_phase(one, moved.fit, row, **window)
+        if len(cut) > 1:
+            found[one.name] = from_runs(cut)
     return found

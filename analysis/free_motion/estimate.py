@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,31 +19,69 @@ from ..response.fitting import GaitFit
 from ..results.estimate import Estimate, Interval
 from ..results.free_motion import BodyWave, FreeMotion, JointMotion
 from ..signals.columns import by_plane
-from .wave import Oscillation, phase_lag, phase_line, travelling_index
+from .wave import Oscillation, amplitude, phase_lag, phase_line, travelling_index
 
 
-def free_motion(
-    robot: Robot | None, angles: Mapping[str, Series], gait: GaitFit
-) -> tuple[FreeMotion, tuple[str, ...]]:
-    """Measure a periodic motion.
+@dataclass(frozen=True)
+class MotionFit:
+    """Joint angles fitted at the frequency that they share; heavy.
+
+    Attributes:
+        series: Angles of the m joints that are not constant, in chain order.
+        fit: Their harmonics, in this order.
+        oscillation: Their fundamentals, with errors.
+        still: Names of joints whose angles are constant.
+        omega_dof: Degrees of freedom of the variance of the frequency.
+    """
+
+    series: tuple[Series, ...]
+    fit: HarmonicFit
+    oscillation: Oscillation
+    still: tuple[str, ...]
+    omega_dof: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the joints that are not constant."""
+        return tuple(one.name for one in self.series)
+
+
+def fit_motion(angles: Mapping[str, Series], gait: GaitFit) -> MotionFit | None:
+    """Fit joint angles at their common frequency.
 
     Args:
-        robot: Gives planes and lengths.
         angles: Joint angles by name, in chain order.
         gait: Its frequency, found from the same angles.
 
     Returns:
-        The motion, and the names of moving joints whose phase noise leaves open.
+        The fit; None where no joint moves.
     """
-    series = [one for one in angles.values() if one.count > gait.fit.model.size + 1]
-    series = [one for one in series if np.ptp(one.values) > 0]
+    enough = [one for one in angles.values() if one.count > gait.fit.model.size + 1]
+    series = [one for one in enough if np.ptp(one.values) > 0]
     if not series:
-        return FreeMotion(), ()
+        return None
     fit = fit_at(series, gait.fit.omega, gait.fit.model)
     _, bins = residual_spectrum(series, fit)
-    motion = Oscillation(fit.fundamental, bins, fit.mean_time_s, gait.omega_error**2)
+    return MotionFit(
+        series=tuple(series),
+        fit=fit,
+        oscillation=Oscillation(fit.fundamental, bins, fit.mean_time_s, gait.omega_error**2),
+        still=tuple(one.name for one in enough if np.ptp(one.values) == 0),
+        omega_dof=gait.omega_dof,
+    )
+
+
+def free_motion(robot: Robot | None, moved: MotionFit) -> tuple[FreeMotion, tuple[str, ...]]:
+    """Measure a periodic motion.
+
+    Args:
+        robot: Gives planes and lengths.
+
+    Returns:
+        The motion, and the names of moving joints whose phase noise leaves open.
+    """
+    motion, names = moved.oscillation, moved.names
     known = motion.known_phases()
-    names = [one.name for one in series]
     lags = dict.fromkeys(names, Estimate())
     planes: dict[str, str] = {}
     waves: list[BodyWave] = []
@@ -51,21 +89,22 @@ def free_motion(
         planes |= dict.fromkeys(members, plane)
         rows = [names.index(name) for name in members if known[names.index(name)]]
         for before, joint in pairwise(rows):
-            lags[names[joint]] = phase_lag(motion, joint, before)
+            lags[names[joint]] = phase_lag(motion, joint, before)[0]
         if len(rows) > 1:
             index = np.array([members.index(names[row]) for row in rows], dtype=np.float64)
-            of_plane = motion.select(np.isin(np.arange(len(names)), rows))
-            wave = _body_wave(of_plane, index, [names[row] for row in rows], robot, fit.omega)
+            of_plane = motion.select(np.array(rows))
+            members_known = [names[row] for row in rows]
+            wave = _body_wave(of_plane, index, members_known, robot, moved.fit.omega)
             waves.append(replace(wave, plane=None if robot is None else plane))
     joints = tuple(
         JointMotion(
             name=one.name,
             plane=None if robot is None else planes[one.name],
             amplitude_rad=_amplitude(motion, row),
-            offset_rad=_offset(one, fit, row),
+            offset_rad=_offset(one, moved.fit, row),
             lag_rad=lags[one.name],
         )
-        for row, one in enumerate(series)
+        for row, one in enumerate(moved.series)
     )
     return FreeMotion(joints, tuple(waves)), tuple(
         name for name, one in zip(names, known, strict=True) if not one
@@ -73,10 +112,8 @@ def free_motion(
 
 
 def _amplitude(motion: Oscillation, row: int) -> Estimate:
-    size = float(np.abs(motion.amplitudes[row]))
-    factor = np.zeros(motion.amplitudes.size, dtype=np.complex128)
-    factor[row] = np.conj(motion.amplitudes[row]) / size if size > 0 else 1.0
-    half = t_factor(motion.dof) * motion.error(factor)
+    size, error = amplitude(motion, row)
+    half = t_factor(motion.dof) * error
     return Estimate(size, (max(0.0, size - half), size + half))
 
 
@@ -119,7 +156,7 @@ def _body_wave(
         waves=Estimate(abs(slope) * turns, (low * turns, high * turns)),
         speed=_speed(line.slope, omega),
         speed_m_s=metres,
-        travelling_index=travelling_index(motion),
+        travelling_index=travelling_index(motion)[0],
         deviation_rad=line.deviation_rad,
     )
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtri
 
-from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
+from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..estimators.spectrum import ResidualBins
@@ -46,9 +46,8 @@ class Oscillation:
         """Degrees of freedom of what the bins show."""
         return 2.0 * self.bins.values.shape[1]
 
-    def select(self, chosen: BoolArray) -> Oscillation:
-        """Return some of the joints."""
-        index = np.flatnonzero(chosen)
+    def select(self, index: IntArray) -> Oscillation:
+        """Return some of the joints, in the order of their indices."""
         return Oscillation(
             self.amplitudes[index],
             self.bins.select(index),
@@ -89,20 +88,34 @@ class Oscillation:
         return size > t_factor(self.dof) * errors
 
 
-def phase_lag(motion: Oscillation, joint: int, before: int) -> Estimate:
-    """Return the lag of a joint behind another [rad], in (-pi, pi].
+def amplitude(motion: Oscillation, row: int) -> tuple[float, float]:
+    """Return the amplitude of a joint and its standard error [rad]."""
+    size = float(np.abs(motion.amplitudes[row]))
+    factor = np.zeros(motion.amplitudes.size, dtype=np.complex128)
+    factor[row] = np.conj(motion.amplitudes[row]) / size if size > 0 else 1.0
+    return size, motion.error(factor)
+
+
+def phase_lag(motion: Oscillation, joint: int, before: int) -> tuple[Estimate, float]:
+    """Return the lag of a joint behind another, and its standard error [rad].
+
+    Args:
+        joint: A joint with a known phase; so is ``before``.
 
     Returns:
-        The estimate; empty where noise leaves it open.
+        The lag in (-pi, pi], empty where noise leaves it open.
     """
     lag = float(-np.angle(motion.amplitudes[joint] / motion.amplitudes[before]))
     weight = np.zeros(motion.amplitudes.size)
     weight[[joint, before]] = -1.0, 1.0
-    noise = motion.error(weight / (1j * motion.amplitudes))  # d arg a = Im(da / a)
-    sine = t_factor(motion.dof) * float(np.hypot(noise, motion.turn(weight)))
+    factor = np.zeros(motion.amplitudes.size, dtype=np.complex128)
+    np.divide(weight, 1j * motion.amplitudes, out=factor, where=weight != 0)
+    # d arg a = Im(da / a)
+    error = float(np.hypot(motion.error(factor), motion.turn(weight)))
+    sine = t_factor(motion.dof) * error
     if not sine < 1:
-        return Estimate()
-    return Estimate(lag, around(lag, float(np.arcsin(sine))))
+        return Estimate(), error
+    return Estimate(lag, around(lag, float(np.arcsin(sine)))), error
 
 
 @dataclass(frozen=True)
@@ -111,14 +124,23 @@ class PhaseLine:
 
     Attributes:
         slope: kappa [rad/unit of the places].
+        error: Its standard error.
         deviation_rad: Root mean square of the phases about it, weighted.
+        phases_rad: The phases, unwrapped along the chain, shape (m,).
     """
 
     slope: Estimate
+    error: float
     deviation_rad: float
+    phases_rad: FloatArray
 
 
-def phase_line(motion: Oscillation, index: FloatArray, place: FloatArray) -> PhaseLine:
+def phase_line(
+    motion: Oscillation,
+    index: FloatArray,
+    place: FloatArray,
+    near_rad: FloatArray | None = None,
+) -> PhaseLine:
     """Fit a line to the phases.
 
     Args:
@@ -126,33 +148,40 @@ def phase_line(motion: Oscillation, index: FloatArray, place: FloatArray) -> Pha
         index: Number of each in the chain, ascending; the phase between neighbours is known up to
             whole turns, and the fit takes the lag nearest to the mean one.
         place: Place of each along the chain, in any unit, shape (m,).
+        near_rad: Unwrapped phases, shape (m,); lags are taken nearest to theirs instead, so that
+            lines of several motions are of the same turns.
     """
     weight = np.abs(motion.amplitudes) ** 2
     weight = weight / weight.sum()
-    phase = _unwrapped(np.angle(motion.amplitudes), index, weight)
+    phase = np.angle(motion.amplitudes)
+    steps = _mean_steps(phase, index, weight) if near_rad is None else np.diff(near_rad)
+    phase = _unwrapped(phase, steps)
     centred = place - weight @ place
     contrast = -weight * centred / (weight @ centred**2)
     slope = float(contrast @ phase)
     left = phase - weight @ phase + slope * centred
     # d kappa = contrast (Im(da / a) + 2 left Re(da / a)): amplitudes are the weights.
     noise = motion.error(contrast * (2 * left - 1j) / motion.amplitudes)
-    half = t_factor(motion.dof) * float(np.hypot(noise, motion.turn(contrast)))
-    return PhaseLine(Estimate(slope, around(slope, half)), float(weight @ left**2) ** 0.5)
+    error = float(np.hypot(noise, motion.turn(contrast)))
+    interval = around(slope, t_factor(motion.dof) * error)
+    return PhaseLine(Estimate(slope, interval), error, float(weight @ left**2) ** 0.5, phase)
 
 
-def _unwrapped(phase: FloatArray, index: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the phases with each step as near to the mean step as whole turns allow."""
+def _mean_steps(phase: FloatArray, index: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the steps of phase along the wave that fits best, shape (m - 1,)."""
     count = _GRID * (int(index[-1] - index[0]) + 1)
     trial = np.linspace(-np.pi, np.pi, count, endpoint=False)
     sums = np.abs((weight * np.exp(1j * phase)) @ np.exp(1j * np.outer(index, trial)))
-    mean = trial[np.argmax(sums)] * np.diff(index)
-    steps = np.diff(phase) + mean
-    return phase[0] + np.concatenate(
-        ([0.0], np.cumsum(np.angle(np.exp(1j * steps)) - mean, dtype=np.float64))
-    )
+    return -trial[np.argmax(sums)] * np.diff(index)
 
 
-def travelling_index(motion: Oscillation) -> Estimate:
+def _unwrapped(phase: FloatArray, steps: FloatArray) -> FloatArray:
+    """Return the phases with each step as near to the given one as whole turns allow."""
+    off = np.angle(np.exp(1j * (np.diff(phase) - steps)))
+    return phase[0] + np.concatenate(([0.0], np.cumsum(off + steps, dtype=np.float64)))
+
+
+def travelling_index(motion: Oscillation) -> tuple[Estimate, float]:
     """Return how much of a wave travels: 1 of a travelling, 0 of a standing one.
 
     The complex amplitudes c + j d span a plane of shapes; with s1 >= s2 the singular values of the
@@ -165,21 +194,23 @@ def travelling_index(motion: Oscillation) -> Estimate:
         motion: At least two joints.
 
     Returns:
-        The index; its interval reaches to 0 where s2 can't be told from noise.
+        The index and its standard error; its interval reaches to 0 where s2 can't be told from
+        noise.
     """
     a = motion.amplitudes
     left, size, right = np.linalg.svd(np.stack([a.real, a.imag], axis=-1), full_matrices=False)
     if size[0] == 0:
-        return Estimate()
+        return Estimate(), 0.0
     # u^T E v = Re sum_k u_k conj(v) da_k, with v as a complex number.
     turned = right[:, 0] - 1j * right[:, 1]
     small, large = left[:, 1] * turned[1], left[:, 0] * turned[0]
     index = float(size[1] / size[0])
-    half = t_factor(motion.dof) * motion.error((small - index * large) / size[0])
+    error = motion.error((small - index * large) / size[0])
+    half = t_factor(motion.dof) * error
     across = np.eye(a.size) - np.outer(left[:, 0], left[:, 0])
     noise = motion.covariance(across * turned[1])
     power = float(np.trace(noise))
     freedom = power**2 / float(np.sum(noise**2)) if power > 0 else 1.0
     alone = size[1] ** 2 <= power * float(fdtri(freedom, motion.dof, CONFIDENCE))
     low = 0.0 if alone else max(0.0, index - half)
-    return Estimate(index, (low, min(1.0, index + half)))
+    return Estimate(index, (low, min(1.0, index + half))), error

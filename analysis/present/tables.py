@@ -16,7 +16,7 @@ from typing import Any, Generic, Literal, TypeVar
 from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, in_people_units, signed
 from ..results import formats
 from ..results.analysis import Analysis, BodyPoint, BodyResult, Index, JointResult
-from ..results.comparison import BODY, Comparison, Difference, NamedJoint, Waveform
+from ..results.comparison import Comparison, Difference, NamedJoint, Waveform, of_body
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, MirrorJoint, Reversal, Run
 from ..results.formats import degrees, scaled
@@ -422,9 +422,12 @@ def run_table(experiment: Experiment) -> Table[tuple[Run, Analysis]]:
 
 def difference_table(comparison: Comparison) -> Table[Difference]:
     """Every quantity of both sides."""
-    where = {BODY: "the body"}
+
+    def where(place: str) -> str:
+        return f"the {place}" if of_body(place) else place
+
     columns: list[Column[Difference]] = [
-        Column("joint", "where", lambda one: where.get(one.place, one.place), kind="word"),
+        Column("joint", "where", lambda one: where(one.place), kind="word"),
         Column("quantity", "quantity", lambda one: WORDS[one.quantity], kind="word"),
         Column("A", "A", lambda one: _side(one, one.a), spare=2),
         Column("B", "B", lambda one: _side(one, one.b), spare=2),
@@ -451,13 +454,21 @@ def _difference(one: Difference) -> Quantity:
     return Quantity(quantity, formats.decimals_for([quantity], most=2), unit)
 
 
+_NAMED = {
+    True: (("gain", "gain, B over A"), ("lag", "lag, B minus A")),
+    False: (("amplitude", "amplitude, B over A"), ("phase_lag", "phase lag, B minus A")),
+}
+
+
 def named_table(comparison: Comparison) -> Table[NamedJoint]:
     """Return the joints that differ, the largest difference first."""
     known = {(one.place, one.quantity): _difference(one) for one in comparison.differences}
     columns: list[Column[NamedJoint]] = [
         Column(None, "joint", lambda one: one.name, kind="word"),
-        Column(None, "gain, B over A", lambda one: known.get((one.name, "gain"))),
-        Column(None, "lag, B minus A", lambda one: known.get((one.name, "lag"))),
+        *(
+            Column(None, title, lambda one, key=quantity: known.get((one.name, key)))
+            for quantity, title in _NAMED[comparison.commanded]
+        ),
         Column(None, "size [margins]", lambda one: one.size, (0, 1)),
         Column(None, "p (Holm)", lambda one: _p(one.p_holm)),
     ]
@@ -466,6 +477,7 @@ def named_table(comparison: Comparison) -> Table[NamedJoint]:
 
 def waveform_table(comparison: Comparison) -> Table[Waveform]:
     """How far the mean cycles of each joint are apart."""
+    phase = "gait phase" if comparison.commanded else "phase"
     most, rms = "largest ° (95 %, by itself)", "RMS of B - A °"
     columns: list[Column[Waveform]] = [
         Column("mean cycle of", "joint", lambda one: one.name, kind="word"),
@@ -473,8 +485,8 @@ def waveform_table(comparison: Comparison) -> Table[Waveform]:
         Column(most, None, lambda one: signed(degrees(one.largest), "")),
         Column(None, "largest [°]", lambda one: degrees(one.largest), (2, 2)),
         Column(
-            "at gait phase °",
-            "at gait phase [°]",
+            f"at {phase} °",
+            f"at {phase} [°]",
             lambda one: math.degrees(one.largest_at_rad),
             spare=1,
         ),

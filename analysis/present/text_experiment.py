@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
 from undulog.capture.common.console import UNLIMITED, plain
 
-from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS
+from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, margin_text
 from ..experiment.answer import kick_detail, sweep_detail, sweep_method
 from ..experiment.reversal.modules import SIGNIFICANT
 from ..results import formats
-from ..results.comparison import Change, Comparison, Equivalence
+from ..results.comparison import Change, Comparison
 from ..results.coupling import LinearCoupling, LocalCoupling
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, FloorTilt, Headings, Reversal
@@ -66,19 +65,6 @@ def _changed(changed: tuple[Change, ...]) -> list[str]:
     return [*lines, f"  and {rest} more (--json)"] if rest > 0 else lines
 
 
-def margin_text(one: Equivalence, value: float | None = None) -> str:
-    """Return a difference in readable units, e.g. ``2 %``, ``0.35°`` or ``0.01 J``.
-
-    Args:
-        value: In the test's unit; its margin if None.
-    """
-    units = {"rad": (math.degrees(1), "°"), "1": (1.0, "")}
-    factor, unit = units.get(one.unit, (1.0, f" {one.unit}"))
-    if one.quantity == "gain":
-        factor, unit = 100.0, " %"
-    return f"{(one.margin if value is None else value) * factor:.2g}{unit}"
-
-
 def _equivalence(comparison: Comparison) -> str:
     parts: list[str] = []
     for one in comparison.equivalence:
@@ -91,8 +77,9 @@ def _equivalence(comparison: Comparison) -> str:
 
 def comparison_method(comparison: Comparison) -> str:
     """Return the method of a comparison as one sentence, beginning in lower case."""
+    phase = "gait phase" if comparison.commanded else "the phase of the first joint's own motion"
     return (
-        f"aligned by gait phase; {_DESIGNS[comparison.design]}; decisions over all "
+        f"aligned by {phase}; {_DESIGNS[comparison.design]}; decisions over all "
         f"{len(comparison.differences)} quantities after Holm at "
         f"{100 * SIGNIFICANT_DIFFERENCE:g} %, "
         "intervals hold together at 95 % after Bonferroni; the same within margins: two one-sided "

@@ -16,6 +16,11 @@ BODY = "body"
 """Where a difference is that belongs to no joint."""
 
 
+def of_body(place: str) -> bool:
+    """Return whether a place is the body, or one of its planes: ``body, yaw``."""
+    return place == BODY or place.startswith(f"{BODY}, ")
+
+
 @dataclass(frozen=True)
 class Change:
     """One thing that the sessions say of themselves, and say otherwise.
@@ -35,11 +40,15 @@ class Difference:
     """One quantity of one joint, or of the body, on both sides.
 
     Attributes:
-        quantity: ``gain``, ``lag``, ``energy_abs``, ``speed`` or ``cost_of_transport``.
-        place: Joint name, or ``body``.
-        unit: Of ``a``, ``b`` and ``difference``; gains differ by their ratio less one, in ``1``.
-        difference: B minus A (of gains B/A - 1), its interval holding together with all the
-            others of the comparison at 95 %.
+        quantity: ``gain``, ``lag``, ``energy_abs``, ``speed`` or ``cost_of_transport``; of sessions
+            without commands ``amplitude``, ``phase_lag`` (behind the joint before it in its plane),
+            ``rest_amplitude`` (of a joint that moves in some sessions only), ``frequency``,
+            ``wave_number`` (a joint) and ``travelling_index``.
+        place: Joint name, or ``body``; of waves in several planes ``body, PLANE``.
+        unit: Of ``a``, ``b`` and ``difference``; gains, amplitudes and frequencies differ by their
+            ratio less one, in ``1``.
+        difference: B minus A (of gains, amplitudes and frequencies B/A - 1), its interval holding
+            together with all the others of the comparison at 95 %.
         p: Of no difference, this one by itself.
         p_holm: The same for the whole family (Holm).
         size: abs(difference) in margins.
@@ -58,10 +67,11 @@ class Difference:
 
 @dataclass(frozen=True)
 class NamedJoint:
-    """A joint that answers its command differently on the two sides.
+    """A joint that answers its command, or moves, differently on the two sides.
 
     Attributes:
-        size: abs of the difference of ln(response/command), gain and lag in margins together.
+        size: abs of the difference of ln(response/command), gain and lag in margins together;
+            without commands amplitude and phase lag.
         p_holm: Of its clearer part, for the whole family.
     """
 
@@ -93,8 +103,9 @@ class Equivalence:
     Attributes:
         quantity: As in :class:`Difference`.
         margin: In ``unit``.
-        unit: ``1``, ``rad``, ``J`` or ``m/s``.
-        largest: The largest difference without its sign; of ln gain for gains.
+        unit: ``1``, ``rad``, ``J``, ``m/s`` or ``Hz``.
+        largest: The largest difference without its sign; of the logarithm for gains,
+            amplitudes and frequencies.
         p: Of 'some difference is as large as the margin'.
     """
 
@@ -107,7 +118,7 @@ class Equivalence:
 
 @dataclass(frozen=True)
 class Waveform:
-    """Mean cycle of a joint's response by gait phase.
+    """Mean cycle of a joint's response by gait phase, without commands by that of its first joint.
 
     Attributes:
         a_rad: On side A at each phase [rad].
@@ -165,3 +176,8 @@ class Comparison(PresentedResult):
     warnings: tuple[str, ...]
     provenance: Provenance
     broken: tuple[BrokenJoint, ...] = ()
+
+    @property
+    def commanded(self) -> bool:
+        """Whether the sessions have commands, and so gains and lags."""
+        return not any(one.quantity in ("amplitude", "frequency") for one in self.differences)

@@ -33,7 +33,7 @@ from ..energy import (
 from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..estimators.series import Series, clean_together, coverage
 from ..estimators.spectrum import BINS_PER_SIDE
-from ..free_motion.estimate import free_motion
+from ..free_motion.estimate import MotionFit, fit_motion, free_motion
 from ..frequency_response.estimate import frequency_responses
 from ..oscillators.chain import session_couplings
 from ..response.fitting import GaitFit, fit_gait
@@ -132,6 +132,7 @@ class SessionMeasurement:
         responses: Measured joint angles by name, on the analysed stretch.
         span: Whole cycles over which energies are taken.
         offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
+        motion: The periodic motion of a session without commands, or None.
     """
 
     analysis: Analysis
@@ -140,6 +141,7 @@ class SessionMeasurement:
     energies: Mapping[str, Energies]
     span: Span
     offsets: Mapping[str, FloatArray]
+    motion: MotionFit | None = None
 
 
 def analyse_session(session: SessionView, options: Options | None = None) -> Analysis:
@@ -205,8 +207,8 @@ def measure_session(
     faulty = (
         () if times_made(session) else not_following(follows, held, columns.names, whole.duration_s)
     )
-    broken = stopped(faulty)  # whose plateaus are no dead bands
-    moving = {name: one for name, one in sound.items() if name not in broken}
+    # Plateaus of stopped joints are no dead bands.
+    moving = {name: one for name, one in sound.items() if name not in stopped(faulty)}
     dead = dead_bands(columns, commands, moving, gait, origin_ns) if with_dead_bands else {}
     swept = frequency_responses(commands, sound, warn) if gait is None else ()
     del commands
@@ -242,6 +244,7 @@ def measure_session(
         commanded=commanded,
         offsets=follows.offsets,
     )
+    moved = None if columns.command or gait is None else fit_motion(responses, gait)
     analysis = Analysis(
         session=SessionFacts(
             id=session.session_id,
@@ -256,7 +259,7 @@ def measure_session(
         body=body,
         heterogeneity=heterogeneity,
         coupling=coupling_of_one_gait(0 if gait is None else len(gait.all_answered)),
-        free_motion=None if columns.command else _free_motion(session.robot, responses, gait, warn),
+        free_motion=None if columns.command else _free_motion(session.robot, moved, warn),
         warnings=warn.warnings(session.warnings),
         provenance=_provenance(session, options),
         artefacts=artefacts,
@@ -278,16 +281,14 @@ def measure_session(
         motion=analysis.free_motion,
     )
     analysis = dataclasses.replace(analysis, answer=compose(facts))
-    return SessionMeasurement(analysis, gait, sound, energies, span, follows.offsets)
+    return SessionMeasurement(analysis, gait, sound, energies, span, follows.offsets, moved)
 
 
-def _free_motion(
-    robot: Robot | None, angles: Mapping[str, Series], gait: GaitFit | None, warn: Warn
-) -> FreeMotion:
+def _free_motion(robot: Robot | None, moved: MotionFit | None, warn: Warn) -> FreeMotion:
     """Measure a motion without commands."""
-    if gait is None:
+    if moved is None:
         return FreeMotion()
-    motion, open_phases = free_motion(robot, angles, gait)
+    motion, open_phases = free_motion(robot, moved)
     if open_phases:
         warn(
             f"{', '.join(open_phases)}: no motion at the common frequency that differs from noise: "

@@ -10,11 +10,17 @@ import numpy as np
 
 from undulog.capture.common.palette import joint_hex
 
-from ...compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, in_people_units, signed
-from ...results.comparison import BODY, Comparison
+from ...compare.decisions import (
+    SIGNIFICANT_DIFFERENCE,
+    WORDS,
+    in_people_units,
+    margin_text,
+    signed,
+)
+from ...results.comparison import BODY, Comparison, of_body
 from ...results.estimate import Estimate
 from ...results.formats import scaled, short
-from ..text_experiment import comparison_method, margin_text
+from ..text_experiment import comparison_method
 from .svg import (
     DASHED,
     REFERENCE,
@@ -89,22 +95,23 @@ def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
     worst = sorted(comparison.waveforms, key=lambda one: -one.rms_rad)[:_MOST_WAVES]
     pairs = zip(comparison.waveforms, every, strict=True)
     shown = [(one, color) for one, color in pairs if one in worst]
-    phase = np.degrees(comparison.phase_rad)
+    phases = np.degrees(comparison.phase_rad)
+    phase = "gait phase" if comparison.commanded else "phase"
     with drawing(0.8 + 1.4 * len(shown)) as figure:
         grid = figure.subplots(len(shown), 2, sharex=True, squeeze=False)
         for (both, right), (one, color) in zip(grid, shown, strict=True):
-            both.plot(phase, np.degrees(one.a_rad), color=REFERENCE, linewidth=2.4)
-            both.plot(phase, np.degrees(one.b_rad), color=color)
+            both.plot(phases, np.degrees(one.a_rad), color=REFERENCE, linewidth=2.4)
+            both.plot(phases, np.degrees(one.b_rad), color=color)
             both.set_title(short(one.name))
             middle, half = np.degrees(one.difference_rad), np.degrees(one.half_rad)
             right.axhline(0.0, color=REFERENCE, linestyle=DASHED, linewidth=0.8)
             band = {"color": color, "alpha": 0.25, "linewidth": 0}
-            right.fill_between(phase, middle - half, middle + half, **band)
-            right.plot(phase, middle, color=color)
+            right.fill_between(phases, middle - half, middle + half, **band)
+            right.plot(phases, middle, color=color)
             right.set_title("B − A")
         grid[-1, 0].set_xticks(range(0, 361, 90))
         for axes in grid[-1]:
-            axes.set_xlabel("gait phase [°]")
+            axes.set_xlabel(f"{phase} [°]")
         figure.supylabel("joint angle [°]", fontsize=8.0)
         color = shown[0][1]
         legend(
@@ -114,10 +121,11 @@ def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
             key(color=color, linewidth=6, alpha=0.25, label="95 %, each phase"),
         )
         description = "Joints: " + ", ".join(short(one.name) for one, _ in shown) + "."
-        svg = inline_svg(figure, prefix, "Mean cycles by gait phase", description)
+        svg = inline_svg(figure, prefix, f"Mean cycles by {phase}", description)
+    by = "commands" if comparison.commanded else "first joint's own motion"
     return Drawing(
         svg,
-        "Mean cycle of the joints that differ most, by the phase of the commands: A in grey, B in "
+        f"Mean cycle of the joints that differ most, by the phase of the {by}: A in grey, B in "
         "the joint's colour, and their difference with its 95 % interval at each phase.",
     )
 
@@ -151,12 +159,14 @@ def comparison_view(comparison: Comparison) -> dict[str, Any]:
 def joints_of(comparison: Comparison) -> list[str]:
     """Return the names of the compared joints, head to tail if known from their mean cycles."""
     return [one.name for one in comparison.waveforms] or sorted(
-        {one.place for one in comparison.differences if one.quantity == "gain"}
+        {one.place for one in comparison.differences if one.quantity in ("gain", "amplitude")}
     )
 
 
 def differences_of(comparison: Comparison, prefix: str) -> Drawing:
     """Draw the differences of every joint in gain, lag and energy, one panel each.
+
+    Without commands, in amplitude and phase lag instead of gain and lag.
 
     Args:
         comparison: With at least one joint.
@@ -169,6 +179,8 @@ def differences_of(comparison: Comparison, prefix: str) -> Drawing:
     for quantity, label, factor in (
         ("gain", "gain [%]", 100.0),
         ("lag", "lag [°]", math.degrees(1)),
+        ("amplitude", "amplitude [%]", 100.0),
+        ("phase_lag", "phase lag [°]", math.degrees(1)),
         ("energy_abs", "E_abs [mJ a cycle]", 1000.0),
     ):
         if quantity in margins:
@@ -192,19 +204,26 @@ def _trials(comparison: Comparison) -> list[Trial]:
 def _facts(comparison: Comparison) -> list[Fact]:
     a, b = len(comparison.a), len(comparison.b)
     joints = len(joints_of(comparison))
+    quantities = ("gain", "lag") if comparison.commanded else ("amplitude", "phase_lag")
+    responses = [WORDS[quantity] for quantity in quantities]
     facts = [
         Fact("Verdict", _VERDICTS[comparison.verdict], "all quantities together, Holm at 5 %"),
         Fact("Sessions", f"{a} and {b}", "on side A and B"),
-        Fact("Joints that differ", f"{len(comparison.named)} of {joints}", "in gain or lag"),
+        Fact(
+            "Joints that differ",
+            f"{len(comparison.named)} of {joints}",
+            f"in {' or '.join(responses)}",
+        ),
     ]
-    for quantity in ("gain", "lag"):
+    for quantity in quantities:
         of = [one for one in comparison.differences if one.quantity == quantity]
         if of:
             worst = max(of, key=lambda one: one.size)
             text = signed(*in_people_units(worst))
-            facts.append(Fact(f"Largest in {quantity}", text, f"B minus A, {worst.place}"))
+            facts.append(Fact(f"Largest in {WORDS[quantity]}", text, f"B minus A, {worst.place}"))
     for one in comparison.differences:
-        if one.place == BODY:
+        if of_body(one.place):
             text = signed(*in_people_units(one))
-            facts.append(Fact(WORDS[one.quantity].capitalize(), text, "B minus A"))
+            title = f"{one.place[len(BODY) + 2 :]} {WORDS[one.quantity]}".strip().capitalize()
+            facts.append(Fact(title, text, "B minus A"))
     return facts

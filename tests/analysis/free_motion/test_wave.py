@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.free_motion.estimate import free_motion
+from undulog.analysis.free_motion.estimate import fit_motion, free_motion
 from undulog.analysis.response.fitting import fit_gait
 from undulog.capture.robot.description import load_robot
 
@@ -31,7 +31,7 @@ def chain(amplitudes, seconds=12.0, rate=50.0, noise=0.0, seed=0):
 def measured(series, robot=None):
     one = next(iter(series.values()))
     gait = fit_gait({}, series, float(np.ptp(one.t_s)), lambda _: None)
-    return gait, free_motion(robot, series, gait)[0]
+    return gait, free_motion(robot, fit_motion(series, gait))[0]
 
 
 def semi_axes_ratio(amplitudes):
@@ -107,7 +107,7 @@ def test_a_joint_at_rest_has_no_phase_and_the_wave_goes_on_behind_it():
     amplitudes[3] = 0.0
     series = chain(amplitudes, noise=NOISE)
     gait = fit_gait({}, series, 12.0, lambda _: None)
-    motion, lost = free_motion(None, series, gait)
+    motion, lost = free_motion(None, fit_motion(series, gait))
     assert lost == ("joint04",)
     assert "joint04" not in motion.waves[0].joints
     assert motion.waves[0].wave_number.value == pytest.approx(0.7, abs=0.01)
