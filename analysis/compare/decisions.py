@@ -40,13 +40,13 @@ UNITS = {
     "speed": "m/s",
     "cost_of_transport": "1",
     "frequency": "Hz",
-    "wave_number": "rad",
+    "wave_number": "rad/joint",
     "travelling_index": "1",
 }
 """What is compared, in this order: of each joint, then of the body."""
 
 _BY_RATIO = ("gain", "amplitude", "frequency")
-_ANGLES = ("lag", "phase_lag", "rest_amplitude", "wave_number")
+_ANGLES = ("lag", "phase_lag", "rest_amplitude")
 _CYCLIC = ("lag", "phase_lag")
 
 
@@ -343,7 +343,7 @@ def difference_text(one: Difference) -> str:
     Returns:
         For example ``gain −8.1 % [−8.6, −7.6]``.
     """
-    return f"{WORDS[one.quantity]} {signed(*in_people_units(one))}"
+    return f"{WORDS[one.quantity]} {signed_difference(one)}"
 
 
 def in_people_units(one: Difference) -> tuple[Estimate, str]:
@@ -355,6 +355,8 @@ def in_people_units(one: Difference) -> tuple[Estimate, str]:
     """
     if one.quantity in _ANGLES:
         return formats.degrees(one.difference), "°"
+    if one.quantity == "wave_number":
+        return formats.degrees(one.difference), "°/joint"
     if one.quantity in _BY_RATIO:
         return formats.scaled(one.difference, 100.0), " %"
     if one.quantity == "travelling_index":
@@ -364,7 +366,17 @@ def in_people_units(one: Difference) -> tuple[Estimate, str]:
     return one.difference, f" {one.unit}"
 
 
-def signed(quantity: Estimate, unit: str) -> str:
+def decimals_of(one: Difference) -> int:
+    """Return the most decimals that a difference is shown with."""
+    return 4 if one.quantity in ("frequency", "travelling_index") else 2
+
+
+def signed_difference(one: Difference) -> str:
+    """Format a difference in readable units with its sign."""
+    return signed(*in_people_units(one), most=decimals_of(one))
+
+
+def signed(quantity: Estimate, unit: str, most: int = 2) -> str:
     """Format a difference with its sign.
 
     Args:
@@ -373,7 +385,7 @@ def signed(quantity: Estimate, unit: str) -> str:
     Returns:
         For example ``+1.9° [1.7, 2.1]``.
     """
-    text = formats.estimate(quantity, unit, most=2)
+    text = formats.estimate(quantity, unit, most=most)
     return text if text.startswith(formats.MINUS) else f"+{text}"
 
 
@@ -428,7 +440,11 @@ def margin_text(one: Equivalence, value: float | None = None) -> str:
     Args:
         value: In the test's unit; its margin if None.
     """
-    units = {"rad": (math.degrees(1), "°"), "1": (1.0, "")}
+    units = {
+        "rad": (math.degrees(1), "°"),
+        "rad/joint": (math.degrees(1), "°/joint"),
+        "1": (1.0, ""),
+    }
     factor, unit = units.get(one.unit, (1.0, f" {one.unit}"))
     if one.quantity in _BY_RATIO:
         factor, unit = 100.0, " %"

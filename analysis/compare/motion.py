@@ -32,7 +32,7 @@ class Motion:
         robot: Its robot, or None.
         names: Joints that are not constant, in chain order.
         oscillation: Their fundamentals.
-        still: Joints that are constant.
+        chain: These joints and those that are constant, in chain order.
         log_frequency: ln of the frequency [Hz], its variance and degrees of freedom.
     """
 
@@ -40,7 +40,7 @@ class Motion:
     robot: Robot | None
     names: tuple[str, ...]
     oscillation: Oscillation
-    still: tuple[str, ...]
+    chain: tuple[str, ...]
     log_frequency: Known
 
     @property
@@ -62,7 +62,7 @@ def motion_of(label: str, robot: Robot | None, fitted: MotionFit) -> Motion:
     """
     relative = fitted.oscillation.omega_variance / fitted.fit.omega**2
     log_frequency = float(np.log(fitted.fit.frequency_hz)), relative, fitted.omega_dof
-    return Motion(label, robot, fitted.names, fitted.oscillation, fitted.still, log_frequency)
+    return Motion(label, robot, fitted.names, fitted.oscillation, fitted.chain, log_frequency)
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,9 @@ def common_motion(motions: Sequence[Motion]) -> CommonMotion:
         DataError: If no joint moves in all of them.
     """
     # Joints of the first session, then others, which no other session can shift.
-    recorded = [{*one.names, *one.still} for one in motions]
+    recorded = [frozenset(one.chain) for one in motions]
     phased = [one.phased for one in motions]
-    joints = list(dict.fromkeys(name for one in motions for name in one.names))
+    joints = list(dict.fromkeys(name for one in motions for name in one.chain))
     names = tuple(name for name in joints if all(name in known for known in phased))
     if not names:
         raise DataError(

@@ -30,14 +30,14 @@ class MotionFit:
         series: Angles of the m joints that are not constant, in chain order.
         fit: Their harmonics, in this order.
         oscillation: Their fundamentals, with errors.
-        still: Names of joints whose angles are constant.
+        chain: Names of these joints and of those whose angles are constant, in chain order.
         omega_dof: Degrees of freedom of the variance of the frequency.
     """
 
     series: tuple[Series, ...]
     fit: HarmonicFit
     oscillation: Oscillation
-    still: tuple[str, ...]
+    chain: tuple[str, ...]
     omega_dof: float
 
     @property
@@ -66,7 +66,7 @@ def fit_motion(angles: Mapping[str, Series], gait: GaitFit) -> MotionFit | None:
         series=tuple(series),
         fit=fit,
         oscillation=Oscillation(fit.fundamental, bins, fit.mean_time_s, gait.omega_error**2),
-        still=tuple(one.name for one in enough if np.ptp(one.values) == 0),
+        chain=tuple(one.name for one in enough),
         omega_dof=gait.omega_dof,
     )
 
@@ -85,9 +85,10 @@ def free_motion(robot: Robot | None, moved: MotionFit) -> tuple[FreeMotion, tupl
     lags = dict.fromkeys(names, Estimate())
     planes: dict[str, str] = {}
     waves: list[BodyWave] = []
-    for plane, members in by_plane(robot, names).items():
+    for plane, members in by_plane(robot, moved.chain).items():
         planes |= dict.fromkeys(members, plane)
-        rows = [names.index(name) for name in members if known[names.index(name)]]
+        rows = [names.index(name) for name in members if name in names]
+        rows = [row for row in rows if known[row]]
         for before, joint in pairwise(rows):
             lags[names[joint]] = phase_lag(motion, joint, before)[0]
         if len(rows) > 1:

@@ -13,7 +13,14 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, Literal, TypeVar
 
-from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, in_people_units, signed
+from ..compare.decisions import (
+    SIGNIFICANT_DIFFERENCE,
+    WORDS,
+    decimals_of,
+    in_people_units,
+    signed,
+    signed_difference,
+)
 from ..results import formats
 from ..results.analysis import Analysis, BodyPoint, BodyResult, Index, JointResult
 from ..results.comparison import Comparison, Difference, NamedJoint, Waveform, of_body
@@ -431,7 +438,7 @@ def difference_table(comparison: Comparison) -> Table[Difference]:
         Column("quantity", "quantity", lambda one: WORDS[one.quantity], kind="word"),
         Column("A", "A", lambda one: _side(one, one.a), spare=2),
         Column("B", "B", lambda one: _side(one, one.b), spare=2),
-        Column("B - A (95 %, all together)", None, lambda one: signed(*in_people_units(one))),
+        Column("B - A (95 %, all together)", None, signed_difference),
         Column(None, "B minus A", _difference),
         Column("p (Holm)", "p (Holm)", lambda one: _p(one.p_holm)),
         Column("in margins", None, lambda one: f"{one.size:.2g}", spare=1),
@@ -443,15 +450,15 @@ def difference_table(comparison: Comparison) -> Table[Difference]:
 
 def _side(one: Difference, value: float) -> str:
     """Return the value of a side, with the digits and the unit of both."""
-    factor = math.degrees(1) if one.unit == "rad" else 1.0
-    unit = {"rad": "°", "1": ""}.get(one.unit, f" {one.unit}")
+    factor = math.degrees(1) if one.unit in ("rad", "rad/joint") else 1.0
+    unit = {"rad": "°", "rad/joint": "°/joint", "1": ""}.get(one.unit, f" {one.unit}")
     digits = formats.decimals_for_values([one.a * factor, one.b * factor], 4)
     return formats.number(value * factor, digits) + unit
 
 
 def _difference(one: Difference) -> Quantity:
     quantity, unit = in_people_units(one)
-    return Quantity(quantity, formats.decimals_for([quantity], most=2), unit)
+    return Quantity(quantity, formats.decimals_for([quantity], most=decimals_of(one)), unit)
 
 
 _NAMED = {

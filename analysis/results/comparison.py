@@ -43,7 +43,7 @@ class Difference:
         quantity: ``gain``, ``lag``, ``energy_abs``, ``speed`` or ``cost_of_transport``; of sessions
             without commands ``amplitude``, ``phase_lag`` (behind the joint before it in its plane),
             ``rest_amplitude`` (of a joint that moves in some sessions only), ``frequency``,
-            ``wave_number`` (a joint) and ``travelling_index``.
+            ``wave_number`` and ``travelling_index``.
         place: Joint name, or ``body``; of waves in several planes ``body, PLANE``.
         unit: Of ``a``, ``b`` and ``difference``; gains, amplitudes and frequencies differ by their
             ratio less one, in ``1``.
@@ -103,7 +103,7 @@ class Equivalence:
     Attributes:
         quantity: As in :class:`Difference`.
         margin: In ``unit``.
-        unit: ``1``, ``rad``, ``J``, ``m/s`` or ``Hz``.
+        unit: ``1``, ``rad``, ``rad/joint``, ``J`` or ``m/s``.
         largest: The largest difference without its sign; of the logarithm for gains,
             amplitudes and frequencies.
         p: Of 'some difference is as large as the margin'.

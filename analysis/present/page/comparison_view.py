@@ -13,9 +13,8 @@ from undulog.capture.common.palette import joint_hex
 from ...compare.decisions import (
     SIGNIFICANT_DIFFERENCE,
     WORDS,
-    in_people_units,
     margin_text,
-    signed,
+    signed_difference,
 )
 from ...results.comparison import BODY, Comparison, of_body
 from ...results.estimate import Estimate
@@ -219,11 +218,11 @@ def _facts(comparison: Comparison) -> list[Fact]:
         of = [one for one in comparison.differences if one.quantity == quantity]
         if of:
             worst = max(of, key=lambda one: one.size)
-            text = signed(*in_people_units(worst))
+            text = signed_difference(worst)
             facts.append(Fact(f"Largest in {WORDS[quantity]}", text, f"B minus A, {worst.place}"))
     for one in comparison.differences:
         if of_body(one.place):
-            text = signed(*in_people_units(one))
+            text = signed_difference(one)
             title = f"{one.place[len(BODY) + 2 :]} {WORDS[one.quantity]}".strip().capitalize()
             facts.append(Fact(title, text, "B minus A"))
     return facts

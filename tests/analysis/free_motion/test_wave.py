@@ -114,6 +114,14 @@ def test_a_joint_at_rest_has_no_phase_and_the_wave_goes_on_behind_it():
     assert motion.joints[4].lag_rad.value == pytest.approx(1.4, abs=0.02)
 
 
+def test_a_constant_joint_keeps_its_place_in_the_chain():
+    series = chain(0.4 * np.exp(-0.7j * np.arange(8)), noise=NOISE)
+    dead = series["joint04"]
+    series["joint04"] = Series("joint04", dead.t_s, np.full_like(dead.values, 0.2))
+    _, motion = measured(series)
+    assert motion.waves[0].wave_number.value == pytest.approx(0.7, abs=0.01)
+
+
 @pytest.mark.parametrize(
     "seconds", [8.0, *(pytest.param(s, marks=pytest.mark.slow) for s in (20.0, 60.0))]
 )
