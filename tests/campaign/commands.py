@@ -51,6 +51,22 @@ COMMANDS = {
     "apart": [(1, "import {file} -o new.mcap --commands commands.csv")],
     "arrays": [(1, "import {file} -o new.mcap")],
     "dataset": [(2, "import {file} -o new"), (1, "import {file} -o new.mcap --episode 1")],
+    **{
+        kind: [
+            (4, "import {file} -o new.mcap"),
+            (1, "import {file} -o new.mcap --json"),
+            (1, "import {file} -o new.mcap --response-topic /dynamic_joint_states"),
+            (2, "log info {file}"),
+            (1, "log info {file} --json"),
+            (2, "log check {file}"),
+            (2, "analyse {file}"),
+            (1, "analyse {file} --json -o new.json"),
+            (1, "report {file} -o new.html"),
+            (1, "view {file} --save new.rrd"),
+            (1, "api"),
+        ]
+        for kind in ("bag", "bag file")
+    },
     "serial": [
         *EDITS,
         *READS,
@@ -92,6 +108,7 @@ WEIGHTS = {
     "tables": {"columns": 4, "apart": 1},
     "arrays": {"arrays": 1},
     "datasets": {"dataset": 1},
+    "bags": {"bag": 2, "bag file": 1},
     "serial": {"serial": 2, "feetech line": 1, "dynamixel2 line": 1},
 }  # fmt: skip
 """Part of the campaign to its kinds, and how often each of them comes."""
