@@ -177,7 +177,7 @@ def check_output(folder):
 
 
 def check_strays(case, folder):
-    """Return faults of a command that reads: inputs that it changed, files left or put elsewhere."""
+    """Return inputs that a command changed, and files that one that reads put elsewhere."""
     found = [name for name, data in case.files.items() if (folder / name).read_bytes() != data]
     found = [f"input: {name} was changed" for name in found]
     if case.words[0] not in READING:
