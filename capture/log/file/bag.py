@@ -181,7 +181,7 @@ class _Copy:
         for file in stated.files:
             with opened(file, stated.mode, scratch, allowance) as part:
                 self.add(part.connections, part.count, part.messages(), None)
-                self.warnings += part.warnings
+                self.warnings += [text.replace(str(scratch), str(file)) for text in part.warnings]
             self._begun += self._share
 
     def add(

@@ -1,4 +1,4 @@
-"""The files of a recording of ROS 2, as messages: MCAP and sqlite3, whole or compressed, split or not.
+"""The files of a recording of ROS 2 as messages: MCAP and sqlite3, whole or compressed.
 
 Every size in them is checked before it is used: a metadata.yaml is text alone, without merges and
 tags, a compressed file or message expands no further than an :class:`Allowance`.
@@ -107,15 +107,16 @@ def read_stated(folder: Path) -> Stated:
     text = metadata_text(path)
     try:
         # Kinds other than text would be computed: merges of merges expand without limit.
-        tree = cast("Any", YAML(typ="base", pure=True).load(text))
+        tree: Any = cast("Any", YAML(typ="base", pure=True)).load(text)
     except Exception as error:  # its parser has errors of many bases
         why = " ".join(str(error).split()) or type(error).__name__
         raise NotALogError(path, f"is no YAML: {why[:200]}; run 'ros2 bag reindex'") from error
-    facts = tree.get(_INFORMATION) if isinstance(tree, dict) else None
-    names = facts.get("relative_file_paths") if isinstance(facts, dict) else None
-    if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
+    facts = _field(tree, _INFORMATION)
+    names = _field(facts, "relative_file_paths")
+    listed = cast("list[Any]", names) if isinstance(names, list) else []
+    if not listed or not all(isinstance(name, str) for name in listed):
         raise NotALogError(path, "lists no files in relative_file_paths; run 'ros2 bag reindex'")
-    files = [folder / PurePath(name).name for name in cast("list[str]", names)]
+    files = [folder / PurePath(name).name for name in listed]
     if len(set(files)) < len(files):
         raise NotALogError(path, "names a file twice; run 'ros2 bag reindex'")
     for each in files:
@@ -142,8 +143,12 @@ def metadata_text(path: Path) -> str:
     return path.read_text("utf-8", errors="replace")
 
 
-def _text(facts: Any, name: str) -> str:
-    value = facts.get(name)
+def _field(tree: object, name: str) -> object:
+    return cast("dict[str, object]", tree).get(name) if isinstance(tree, dict) else None
+
+
+def _text(facts: object, name: str) -> str:
+    value = _field(facts, name)
     text = value.strip().lower() if isinstance(value, str) else ""
     return "" if text in _NONE else text
 
@@ -168,6 +173,10 @@ def opened(path: Path, mode: str, scratch: Path, allowance: Allowance) -> Genera
             _decompress(path, scratch, allowance)
         with reader(scratch if mode == "file" else path) as part:
             yield _of_messages(part, allowance) if mode == "message" else part
+    except LogError as error:
+        if error.path != scratch:
+            raise
+        raise NotALogError(path, str(error).removeprefix(f"{scratch}: ")) from error
     finally:
         scratch.unlink(missing_ok=True)
 
@@ -221,7 +230,7 @@ def _mcap(path: Path) -> Generator[Part]:
                 text = schema.data.decode("utf-8", "replace")
                 stated = schema.name, schema.encoding, text
             count = file.counts.get(key, 0)
-            ways[key] = _connection(key, channel.topic, *stated, channel.message_encoding, count)
+            ways[key] = _connection(key, channel.topic, stated, channel.message_encoding, count)
         warnings = list(file.warnings)
 
         def messages() -> Iterator[tuple[Connection, int, bytes | None]]:
@@ -264,11 +273,15 @@ def _sqlite(path: Path) -> Generator[Part]:
         raise NotALogError(path, f"is a damaged database: {why}; {_REINDEX}") from error
 
 
+def _readable(data: bytes) -> str:
+    return data.decode("utf-8", "replace")
+
+
 _REINDEX = "run 'ros2 bag reindex' on a copy of its folder"
 
 
 def _database(path: Path, base: sqlite3.Connection) -> Part:
-    base.text_factory = lambda data: data.decode("utf-8", "replace")
+    base.text_factory = _readable
     base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, 1 << 20))
     # A view or a table of a module is a program, which may never end.
     tables = base.execute(
@@ -290,8 +303,8 @@ def _database(path: Path, base: sqlite3.Connection) -> Part:
     ways: dict[int, Connection] = {}
     topics = base.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id")
     for key, topic, kind, encoding in topics:
-        stated = definitions.get(str(kind), ("", ""))
-        ways[key] = _connection(key, str(topic), str(kind), *stated, str(encoding), 0)
+        stated = str(kind), *definitions.get(str(kind), ("", ""))
+        ways[key] = _connection(key, str(topic), stated, str(encoding), 0)
     (count,) = base.execute("SELECT count(*) FROM messages").fetchone()
 
     def messages() -> Iterator[tuple[Connection, int, bytes | None]]:
@@ -309,8 +322,9 @@ _READERS = {".mcap": _mcap, ".db3": _sqlite}
 
 
 def _connection(
-    key: int, topic: str, kind: str, form: str, text: str, encoding: str, count: int
+    key: int, topic: str, described: tuple[str, str, str], encoding: str, count: int
 ) -> Connection:
+    """Return a topic; ``described`` is its type, and encoding and text of the definition."""
     from rosbags.interfaces import (
         Connection,
         ConnectionExtRosbag2,
@@ -318,6 +332,7 @@ def _connection(
         MessageDefinitionFormat,
     )
 
+    kind, form, text = described
     forms = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
     stated = MessageDefinition(forms.get(form, MessageDefinitionFormat.NONE), text)
     return Connection(key, topic, kind, stated, "", count, ConnectionExtRosbag2(encoding, []), None)

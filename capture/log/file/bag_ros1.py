@@ -9,6 +9,7 @@ import bz2
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import BinaryIO, cast
 
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Chunk, ChunkInfo, Header, IndexData, ReaderError, RecordType
@@ -37,19 +38,19 @@ class BoundedReader(Reader):
 
     def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
         """Read an index; raises ``ReaderError`` if all are longer than the file."""
-        assert self.bio
-        begun = self.bio.tell()
+        bio = cast("BinaryIO", self.bio)
+        begun = bio.tell()
         super().read_index_data(pos, indexes)
-        self._index_left -= self.bio.tell() - begun
+        self._index_left -= bio.tell() - begun
         if self._index_left < 0:
             raise ReaderError("The indexes of its chunks overlap.")
 
     def read_chunk(self) -> Chunk:
         """Read the head of a chunk."""
-        assert self.bio
-        begun = self.bio.tell()
-        header = Header.read(self.bio, RecordType.CHUNK)
-        self.bio.seek(begun)
+        bio = cast("BinaryIO", self.bio)
+        begun = bio.tell()
+        header = Header.read(bio, RecordType.CHUNK)
+        bio.seek(begun)
         kind, size = header.get_string("compression"), header.get_uint32("size")
         expand = partial(_EXPAND[kind], size) if kind in _EXPAND else bytes
         return super().read_chunk()._replace(decompressor=partial(self._taken, expand))
