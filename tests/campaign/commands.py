@@ -49,6 +49,12 @@ COMMANDS = {
         (1, "import {file} -o new.mcap --json --write-map new.toml --unit time=ms"),
     ],
     "apart": [(1, "import {file} -o new.mcap --commands commands.csv")],
+    "tracks": [
+        (4, "import {file} -o new.mcap --fps 120"),
+        (1, "import {file} -o new.mcap --fps 120 --json --write-map new.toml"),
+        (1, "import {file} -o new.mcap --fps 1e-300"),
+        (1, "import {file} -o new.mcap"),
+    ],
     "arrays": [(1, "import {file} -o new.mcap")],
     "dataset": [(2, "import {file} -o new"), (1, "import {file} -o new.mcap --episode 1")],
     **{
@@ -105,7 +111,7 @@ WEIGHTS = {
         "log": 10, "unfinished": 4, "split": 2, "trace": 6, "table": 2, "robot": 2, "scenario": 2,
         "plan": 1, "settings": 1, "result": 0.5,
     },
-    "tables": {"columns": 4, "apart": 1},
+    "tables": {"columns": 4, "apart": 1, "tracks": 2},
     "arrays": {"arrays": 1},
     "datasets": {"dataset": 1},
     "bags": {"bag": 2, "bag file": 1},
