@@ -213,9 +213,15 @@ class _Copy:
                 self._channel(connection, None, described)
 
     def finish(self) -> None:
-        """End the file."""
+        """End the file.
+
+        Raises:
+            NotALogError: If the recording has no topics.
+        """
         for connection in self._undescribed.values():
             self._channel(connection, None, None)
+        if not self._channels:
+            raise NotALogError(self._path, "holds no topics; record it again")
         self._writer.finish()
 
     def _channel(

@@ -6,10 +6,11 @@ Format: https://wiki.ros.org/Bags/Format/2.0.
 from __future__ import annotations
 
 import bz2
+import io
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO, cast
 
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Chunk, ChunkInfo, Header, IndexData, ReaderError, RecordType
@@ -18,12 +19,39 @@ from ..mcap.chunk import inflate, largest_chunk
 from .bag_parts import Allowance
 
 
+class _Stream(io.BufferedReader):
+    """A file of which no more than its size is requested, since as much would be allocated."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._size = path.stat().st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return super().read(size if size is None else min(size, self._size))
+
+
+class _Path:
+    """A path as ``rosbags`` takes it, which opens as such a file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def exists(self) -> bool:
+        return self._path.exists()
+
+    def open(self, _mode: str) -> BinaryIO:
+        return cast("BinaryIO", _Stream(self._path))
+
+    def __str__(self) -> str:
+        return str(self._path)
+
+
 class BoundedReader(Reader):
     """A reader that reads each chunk's index once, and expands no chunk beyond its stated size."""
 
     def __init__(self, path: Path, allowance: Allowance) -> None:
         """Set the file, and the bytes that its chunks may expand to."""
-        super().__init__(path)
+        super().__init__(cast("Any", _Path(path)))
         self._allowance = allowance
         self._places: set[int] = set()
         self._index_left = path.stat().st_size
