@@ -249,6 +249,10 @@ class _Joints:
             if not parts:
                 continue
             log_ns, stamp_ns, *values = (np.concatenate(each) for each in zip(*parts, strict=True))
+            if (early := stamp_ns < 0).any():
+                stamp_ns = np.where(early, log_ns, stamp_ns)
+                text = f"{target.topic}: stamps before 1970 are replaced by log times"
+                self._report.problems += [text] if text not in self._report.problems else []
             order = np.argsort(log_ns, kind="stable")
             by_field = dict(zip(target.fields, (one[order] for one in values), strict=True))
             none = [()] * len(order)

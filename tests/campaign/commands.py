@@ -49,8 +49,30 @@ COMMANDS = {
         (1, "import {file} -o new.mcap --json --write-map new.toml --unit time=ms"),
     ],
     "apart": [(1, "import {file} -o new.mcap --commands commands.csv")],
+    "tracks": [
+        (4, "import {file} -o new.mcap --fps 120"),
+        (1, "import {file} -o new.mcap --fps 120 --json --write-map new.toml"),
+        (1, "import {file} -o new.mcap --fps 1e-300"),
+        (1, "import {file} -o new.mcap"),
+    ],
     "arrays": [(1, "import {file} -o new.mcap")],
     "dataset": [(2, "import {file} -o new"), (1, "import {file} -o new.mcap --episode 1")],
+    **{
+        kind: [
+            (4, "import {file} -o new.mcap"),
+            (1, "import {file} -o new.mcap --json"),
+            (1, "import {file} -o new.mcap --response-topic /dynamic_joint_states"),
+            (2, "log info {file}"),
+            (1, "log info {file} --json"),
+            (2, "log check {file}"),
+            (2, "analyse {file}"),
+            (1, "analyse {file} --json -o new.json"),
+            (1, "report {file} -o new.html"),
+            (1, "view {file} --save new.rrd"),
+            (1, "api"),
+        ]
+        for kind in ("bag", "bag file")
+    },
     "serial": [
         *EDITS,
         *READS,
@@ -89,9 +111,10 @@ WEIGHTS = {
         "log": 10, "unfinished": 4, "split": 2, "trace": 6, "table": 2, "robot": 2, "scenario": 2,
         "plan": 1, "settings": 1, "result": 0.5,
     },
-    "tables": {"columns": 4, "apart": 1},
+    "tables": {"columns": 4, "apart": 1, "tracks": 2},
     "arrays": {"arrays": 1},
     "datasets": {"dataset": 1},
+    "bags": {"bag": 2, "bag file": 1},
     "serial": {"serial": 2, "feetech line": 1, "dynamixel2 line": 1},
 }  # fmt: skip
 """Part of the campaign to its kinds, and how often each of them comes."""

@@ -41,6 +41,24 @@ def foreign_bases(folder):
     return [*_tables(folder), *_serial(folder / "serial")]
 
 
+MARKERS = ("nose", "neck", "mid", "tail")
+
+
+def _tracks(folder):
+    """Write tracks of markers along a body that bends: plain columns, and DeepLabCut's."""
+    along = np.arange(len(MARKERS))
+    x, y = T[:, None] * 20 + 30 * along, 10 * np.sin(9 * T[:, None] - along)
+    plain = np.stack([x, y], axis=2).reshape(ROWS, -1)
+    head = ",".join(f"{name}_{axis}" for name in MARKERS for axis in "xy")
+    np.savetxt(folder / "tracks.csv", plain, "%.4f", ",", header=head, comments="")
+    names, axes = np.repeat(MARKERS, 3), ("x", "y", "likelihood") * len(MARKERS)
+    heads = [("scorer", ["DLC"] * len(names)), ("bodyparts", names), ("coords", axes)]
+    lines = "\n".join(",".join([first, *rest]) for first, rest in heads)
+    cells = np.stack([x, y, np.full_like(x, 0.9)], axis=2).reshape(ROWS, -1)
+    numbered = np.column_stack([np.arange(ROWS), cells])
+    np.savetxt(folder / "dlc.csv", numbered, "%.4f", ",", header=lines, comments="")
+
+
 def _tables(folder):
     states, sets = folder / "states", (folder / "dataset", folder / "dataset21")
     for path in (states, *(one / "meta" for one in sets)):
@@ -56,6 +74,7 @@ def _tables(folder):
         (folder / name).write_text(vectors)
     (states / "joint_list.txt").write_text("a\nb\nc\n")
     (states / "event.csv").write_text("timestamp,event\n0,START\n")
+    _tracks(folder)
     np.savez_compressed(folder / "run.npz", **ARRAYS)
     savemat(folder / "run.mat", ARRAYS, do_compression=True)
     savemat(folder / "plain.mat", ARRAYS)
@@ -71,6 +90,7 @@ def _tables(folder):
 
     names = ("wide.csv", "bare.txt", "long.csv", "vector.csv")
     bases = [Base("columns", name, files, (name,)) for name in names]
+    bases += [Base("tracks", name, files, (name,)) for name in ("tracks.csv", "dlc.csv")]
     bases.append(Base("columns", "states", files, below("states")))
     bases.append(Base("apart", "states/state.csv", files, ("commands.csv", "states/state.csv")))
     names = ("run.npz", "run.mat", "plain.mat", "run.parquet", "run.pt")

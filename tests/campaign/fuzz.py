@@ -9,6 +9,7 @@ import re
 import shlex
 import signal
 import sys
+import tempfile
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +18,8 @@ from pathlib import Path
 
 from support.read_back import messages_of
 
-from .base import EPOCH_NS, write_files
+from .bag_faults import BAGS, mutate_folder
+from .base import EPOCH_NS, files_below, write_files
 from .case import Result, front_door, judge, run_forked
 from .commands import COMMANDS, WEIGHTS
 from .line import fed
@@ -26,7 +28,11 @@ from .structure import STRUCTURE
 
 RECORDS_FOR_S = 12.0
 """A recorder with mutated settings may have been given an hour: it is ended then [s]."""
-TEXTS = {".toml", ".dbc", ".csv", ".txt", ".log", ".asc", ".trc", ".json", ".jsonl"}
+TEXTS = {".toml", ".yaml", ".dbc", ".csv", ".txt", ".log", ".asc", ".trc", ".json", ".jsonl"}
+TEMPORARY = "temporary"
+"""Folder of the temporary files of a case, beside its own."""
+READING = {"import", "analyse", "report", "view", "compare", "api"}
+OUTPUTS = ("new.", "new/", "new-")
 FIELDS = ("position", "velocity", "effort")
 
 
@@ -57,6 +63,8 @@ class Case:
         The names of the imported modules go to the file ``modules``.
         """
         write_files(folder, self.files)
+        temporary = folder.parent / TEMPORARY
+        temporary.mkdir(exist_ok=True)
         work = front_door(self.words)
         if self.words[0] == "api":
             work = partial(try_session, folder / self.words[1])
@@ -64,6 +72,7 @@ class Case:
             work = partial(fed, work, self.files["line.bin"])
 
         def listed():
+            tempfile.tempdir = str(temporary)
             try:
                 work()
             finally:
@@ -86,9 +95,11 @@ def make_case(seed, bases, scratch, part="mutated"):
         files["gait0.mcap"] = gait.files["gait.mcap"]
     names = [rng.choice(base.mutable) for _ in range(rng.choice([1, 1, 1, 2]))]
     for name in dict.fromkeys(names):  # in this order, whatever the hash seed of the process is
-        files[name] = _mutated(files[name], Path(name).suffix, rng, scratch)
+        files[name] = _mutated(files[name], Path(name).suffix, rng, scratch, part)
     if kind in {"unfinished", "split"} and rng.random() < 0.1:
         del files[rng.choice(base.mutable)]
+    if kind == "bag" and rng.random() < 0.1:
+        mutate_folder(files, rng)
     words = shlex.split(line.format(file=base.name))
     if words == ["api"]:
         words.append(base.name)
@@ -96,9 +107,10 @@ def make_case(seed, bases, scratch, part="mutated"):
     return Case(tuple(words), files, None if ends_itself else RECORDS_FOR_S)
 
 
-def _mutated(data, suffix, rng, scratch):
-    if suffix in STRUCTURE and rng.random() < 0.6:
-        return STRUCTURE[suffix](data, rng)
+def _mutated(data, suffix, rng, scratch, part):
+    structure = BAGS if part == "bags" else STRUCTURE
+    if suffix in structure and rng.random() < 0.6:
+        return structure[suffix](data, rng)
     if suffix in TEXTS:
         return mutate_text(data, rng)
     if suffix == ".db" and rng.random() < 0.7:
@@ -164,10 +176,26 @@ def check_output(folder):
     return found
 
 
+def check_strays(case, folder):
+    """Return inputs that a command changed, and files that one that reads put elsewhere."""
+    found = [name for name, data in case.files.items() if (folder / name).read_bytes() != data]
+    found = [f"input: {name} was changed" for name in found]
+    if case.words[0] not in READING:
+        return found
+    beside = {f"{folder.name}.out", f"{folder.name}.err", "modules"}
+    for name in files_below(folder.parent):
+        own = name.removeprefix(f"{folder.name}/")
+        expected = own in case.files or own.startswith(OUTPUTS) if own != name else name in beside
+        if not expected and not name.startswith("scratch"):
+            found.append(f"stray: {name} was left")
+    return found
+
+
 def run_case(case, folder, modules=None):
     """Run a case in an empty folder; return failures and outcome."""
     outcome = case.run(folder, modules)
-    return [*judge(outcome), *check_output(folder)], outcome
+    strays = [] if outcome.signal else check_strays(case, folder)
+    return [*judge(outcome), *check_output(folder), *strays], outcome
 
 
 def run_seed(seed, bases, folder, part):

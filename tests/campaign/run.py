@@ -71,6 +71,7 @@ PARTS = {
     "tables": Part(partial(mutated, part="tables"), 3_000, 60),
     "arrays": Part(partial(mutated, part="arrays"), 4_000, 60),
     "datasets": Part(partial(mutated, part="datasets"), 3_000, 60),
+    "bags": Part(partial(mutated, part="bags"), 3_000, 60),
     "serial": Part(partial(mutated, part="serial"), 2_000, 60),
     "mutated": Part(mutated, 35_214, 350),
 }

@@ -7,6 +7,7 @@ import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 
+from .bags import bag_bases
 from .base import make_bases
 from .case import run_command
 from .commands import COMMANDS
@@ -15,7 +16,7 @@ from .fuzz import Case, warm
 
 WHOLE = {
     "log", "trace", "scenario", "robot", "columns", "apart", "arrays", "dataset", "serial",
-    "feetech line", "dynamixel2 line",
+    "feetech line", "dynamixel2 line", "bag", "bag file",
 }  # fmt: skip
 """Kinds whose command lines end with exit code 0 on whole files."""
 
@@ -35,6 +36,7 @@ class Stage:
         (folder / "bases").mkdir()
         self.bases = make_bases(folder / "bases", self._result_of)
         self.bases += foreign_bases(folder / "bases" / "foreign")
+        self.bases += bag_bases(folder / "bases" / "bags")
         self.warm_failures = self._warm()
 
     def _result_of(self, gait):

@@ -115,11 +115,23 @@ class Bag:
         self.writer.write(self.ways[topic], t_ns, bytes(encode(sample, kind)))
 
 
-def write_bag(path, fill, *, storage=StoragePlugin.MCAP, store=None):
-    """Write a bag: a folder of ROS 2, or a file of ROS 1 if its name ends in .bag."""
+def write_bag(
+    path, fill, *, storage=StoragePlugin.MCAP, store=None, compression=(), chunk_size=1 << 20
+):
+    """Write a bag: a folder of ROS 2, or a file of ROS 1 if its name ends in .bag.
+
+    Args:
+        compression: Arguments of the writer's ``set_compression``.
+        chunk_size: Of a bag of ROS 1 [byte].
+    """
     ros1 = path.suffix == ".bag"
     store = store or typestore(base=Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-    with Writer1(path) if ros1 else Writer2(path, version=9, storage_plugin=storage) as writer:
+    writer = Writer1(path) if ros1 else Writer2(path, version=9, storage_plugin=storage)
+    if compression:
+        writer.set_compression(*compression)
+    if ros1:
+        writer.chunk_threshold = chunk_size
+    with writer:
         fill(Bag(store, writer, {}))
     return path
 

@@ -1,33 +1,37 @@
 """Recordings of ROS that are no single plain MCAP file: copied into a temporary one.
 
-Bags of sqlite3, compressed bags, split bags and bags of ROS 1 are read by ``rosbags``. Messages of
-ROS 2 and their definitions are copied as they are, those of ROS 1 converted, one message at a time,
-so that one reader serves all logs.
+Messages of ROS 2 and their definitions are copied as they are, those of ROS 1 converted by
+``rosbags``, one message at a time, so that one reader serves all logs.
 """
 
 from __future__ import annotations
 
+import errno
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
+
+from mcap.writer import Writer
 
 from ...common.errors import LogError, MissingExtraError, NotALogError, UndulogError
+from .bag_parts import METADATA, Allowance, Stated, metadata_text, opened, read_stated
 from .bag_types import Ros1Types, definition
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2 import Reader
 
 _PER_MESSAGE = re.compile(r"^\s*compression_mode:\s*['\"]?message\b", re.IGNORECASE | re.MULTILINE)
 _COPY = "session.mcap"
 _STEP = 4096
 _ROS1 = ".bag"
 _FILES = (".db3", _ROS1)
+_RECORD_SIZE = 31
+"""Of a message's record in an MCAP, without the message [byte]."""
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 _WHAT = (
     (
         "a rosbag2 recording",
@@ -41,12 +45,12 @@ def is_bag(path: Path) -> bool:
     """Whether a path is a recording of ROS that must be copied to be read."""
     if path.suffix in _FILES:
         return path.is_file()
-    stated = path / "metadata.yaml"
+    stated = path / METADATA
     if not stated.is_file():
         return False
     try:
         plain = len(list(path.glob("*.mcap"))) == 1
-        return not plain or bool(_PER_MESSAGE.search(stated.read_text(errors="replace")))
+        return not plain or bool(_PER_MESSAGE.search(metadata_text(stated)))
     except OSError as error:
         raise LogError(stated, f"can't be read: {error.strerror}") from error
 
@@ -73,35 +77,52 @@ class BagCopy:
 
         Raises:
             MissingExtraError: If ``rosbags`` is not installed.
-            NotALogError: If the bag is damaged or of an unknown kind.
+            NotALogError: If the bag is damaged, of an unknown kind, or expands too far.
             LogError: If the disk has no room for the copy.
         """
         try:
-            from rosbags.rosbag1 import Reader as Reader1
-            from rosbags.rosbag2 import Reader
+            from .bag_ros1 import BoundedReader
         except ImportError as error:
             raise MissingExtraError("reading a recording of ROS", "bags", "rosbags") from error
         ros1 = path.suffix == _ROS1
-        check_room(path, folder or Path(gettempdir()))
+        scratch = folder or Path(gettempdir())
+        size = check_room(path, scratch)
         self._folder = TemporaryDirectory(prefix="undulog-bag-", dir=folder)
         self.path = Path(self._folder.name, _COPY)
         try:
-            with Reader1(path) if ros1 else Reader(path) as bag:
-                damaged = _copy(bag, self.path, on_part)
+            with self.path.open("wb") as stream:
+                copy = _Copy(path, stream, Allowance(path, size), on_part)
+                if ros1:
+                    with BoundedReader(path, Allowance(path, size)) as bag:
+                        types = Ros1Types(bag.connections)
+                        read = (
+                            (way, t_ns, types.cdr(way, raw)) for way, t_ns, raw in bag.messages()
+                        )
+                        copy.add(bag.connections, bag.message_count, read, types.definition)
+                else:
+                    copy.rosbag2(Path(self._folder.name, "part"), Allowance(path, size))
+                copy.finish()
         except (MemoryError, UndulogError):
             self.close()
             raise
-        except Exception as error:  # rosbags lets sqlite's, zstd's and YAML's own errors through
+        except Exception as error:  # rosbags lets errors of struct, bz2 and dictionaries through
             self.close()
+            if isinstance(error, OSError) and error.errno in _FULL:
+                why = f"its copy fills {scratch}; choose a larger disk (TMPDIR)"
+                raise LogError(path, why) from error
             why = " ".join(str(error).split()) or type(error).__name__
             kind, fix = _WHAT[ros1]
             raise NotALogError(path, f"can't be read as {kind}: {why}; {fix}") from error
         except BaseException:
             self.close()
             raise
+        of = " of ROS 1" if ros1 else ""
         self.warnings = [
-            f"{topic}: {count} messages of ROS 1 are damaged and left out"
-            for topic, count in damaged.items()
+            *copy.warnings,
+            *(
+                f"{topic}: {count} messages{of} are damaged and left out"
+                for topic, count in copy.damaged.items()
+            ),
         ]
 
     def close(self) -> None:
@@ -109,8 +130,11 @@ class BagCopy:
         self._folder.cleanup()
 
 
-def check_room(path: Path, folder: Path) -> None:
+def check_room(path: Path, folder: Path) -> int:
     """Check that a folder's disk has room for as many bytes as a recording has.
+
+    Returns:
+        That number.
 
     Raises:
         LogError: If it has not.
@@ -121,38 +145,95 @@ def check_room(path: Path, folder: Path) -> None:
     if free < size:
         why = f"its copy needs {size} bytes, {folder} has {free}; choose a larger disk (TMPDIR)"
         raise LogError(path, why)
+    return size
 
 
-def _copy(bag: Reader | Reader1, target: Path, on_part: Callable[[float], None]) -> Counter[str]:
-    """Copy all messages; return the number of damaged ones by topic."""
-    from mcap.writer import Writer
-    from rosbags.rosbag1 import Reader as Reader1
+class _Copy:
+    """The messages of a recording on their way into an MCAP file.
 
-    damaged: Counter[str] = Counter()
-    ros1 = Ros1Types(bag.connections) if isinstance(bag, Reader1) else None
-    with target.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2", library="undulog")
-        channels: dict[tuple[str, str], int] = {}
+    Attributes:
+        damaged: Number of messages that can't be read, by topic.
+        warnings: Parts that can't be read.
+    """
 
-        def channel_of(connection: Connection, example: bytes | None) -> int:
-            key = connection.topic, connection.msgtype
-            if key not in channels:
-                found = ros1.definition(connection) if ros1 else definition(connection, example)
-                schema = writer.register_schema(connection.msgtype, found[0], found[1].encode())
-                channels[key] = writer.register_channel(connection.topic, "cdr", schema)
-            return channels[key]
+    def __init__(
+        self, path: Path, stream: BinaryIO, allowance: Allowance, on_part: Callable[[float], None]
+    ) -> None:
+        self._path, self._allowance, self._on_part = path, allowance, on_part
+        self._writer = Writer(stream)
+        self._writer.start(profile="ros2", library="undulog")
+        self._channels: dict[tuple[str, str], int] = {}
+        self._undescribed: dict[tuple[str, str], Connection] = {}
+        self._begun, self._share = 0.0, 1.0
+        self.damaged: Counter[str] = Counter()
+        self.warnings: list[str] = []
 
-        total = max(bag.message_count, 1)
-        for count, (connection, t_ns, raw) in enumerate(bag.messages()):
+    def rosbag2(self, scratch: Path, allowance: Allowance) -> None:
+        """Copy all files of a recording of ROS 2.
+
+        Args:
+            scratch: A name for a file decompressed.
+            allowance: For what is decompressed.
+        """
+        path = self._path
+        stated = read_stated(path) if path.is_dir() else Stated([path], "")
+        self._share = 1 / len(stated.files)
+        for file in stated.files:
+            with opened(file, stated.mode, scratch, allowance) as part:
+                self.add(part.connections, part.count, part.messages(), None)
+                self.warnings += [text.replace(str(scratch), str(file)) for text in part.warnings]
+            self._begun += self._share
+
+    def add(
+        self,
+        connections: Iterable[Connection],
+        total: int,
+        messages: Iterable[tuple[Connection, int, bytes | None]],
+        described: Callable[[Connection], tuple[str, str]] | None,
+    ) -> None:
+        """Add the messages of one file, and the topics without any.
+
+        Args:
+            total: Number of messages, for the progress.
+            described: Gives encoding and text of a definition; None for those of ROS 2.
+        """
+        for count, (connection, t_ns, data) in enumerate(messages):
             if count % _STEP == 0:
-                on_part(count / total)
-            data = ros1.cdr(connection, bytes(raw)) if ros1 else bytes(raw)
+                self._on_part(self._begun + self._share * min(1.0, count / max(total, 1)))
             if data is None:
-                damaged[connection.topic] += 1
+                self.damaged[connection.topic] += 1
                 continue
-            writer.add_message(channel_of(connection, data), t_ns, data, t_ns)
-        for connection in bag.connections:
-            channel_of(connection, None)
-        writer.finish()
-    return damaged
+            self._allowance.take(len(data) + _RECORD_SIZE)
+            channel = self._channel(connection, data, described)
+            self._writer.add_message(channel, t_ns, data, t_ns)
+        for connection in connections:
+            if described is None:  # a later file may have a message, which shows its definition
+                self._undescribed.setdefault((connection.topic, connection.msgtype), connection)
+            else:
+                self._channel(connection, None, described)
+
+    def finish(self) -> None:
+        """End the file.
+
+        Raises:
+            NotALogError: If the recording has no topics.
+        """
+        for connection in self._undescribed.values():
+            self._channel(connection, None, None)
+        if not self._channels:
+            raise NotALogError(self._path, "holds no topics; record it again")
+        self._writer.finish()
+
+    def _channel(
+        self,
+        connection: Connection,
+        example: bytes | None,
+        described: Callable[[Connection], tuple[str, str]] | None,
+    ) -> int:
+        key = connection.topic, connection.msgtype
+        if key not in self._channels:
+            found = described(connection) if described else definition(connection, example)
+            schema = self._writer.register_schema(connection.msgtype, found[0], found[1].encode())
+            encoding = getattr(connection.ext, "serialization_format", "cdr")
+            self._channels[key] = self._writer.register_channel(connection.topic, encoding, schema)
+        return self._channels[key]

@@ -1,0 +1,338 @@
+"""The files of a recording of ROS 2 as messages: MCAP and sqlite3, whole or compressed.
+
+Every size in them is checked before it is used: a metadata.yaml is text alone, without merges and
+tags, a compressed file or message expands no further than an :class:`Allowance`.
+
+Formats: https://github.com/ros2/rosbag2, https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import io
+import sqlite3
+import struct
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, cast
+
+import zstandard
+from mcap.opcode import Opcode
+
+from ...common.errors import LogError, NotALogError
+from ..mcap.chunk import BODY_AT, PREFIX_SIZE, walk_records
+from ..mcap.file import McapFile
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+
+METADATA = "metadata.yaml"
+LARGEST_METADATA = 1 << 20
+"""Of a metadata.yaml [byte]: hours in thousands of parts take less."""
+
+_RATIO, _LEAST = 100, 64 << 20
+_PIECE = 1 << 16
+_FIXED = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time
+_INFORMATION = "rosbag2_bagfile_information"
+_NONE = ("", "none", "null", "~")
+_SUFFIXES = (".mcap", ".db3")
+
+
+class Allowance:
+    """The bytes that a recording may expand to: so many times its own, or a least number."""
+
+    def __init__(self, path: Path, size: int) -> None:
+        """Begin with all of it.
+
+        Args:
+            size: Of the recording's files [byte].
+        """
+        self._path = path
+        self.size = self.left = max(_LEAST, _RATIO * size)
+
+    def take(self, count: int) -> None:
+        """Take some bytes.
+
+        Raises:
+            NotALogError: If they are more than what is left.
+        """
+        self.left -= count
+        if self.left < 0:
+            why = (
+                f"expands to more than {self.size >> 20} MiB, over {_RATIO} times its size; "
+                "if that is right, decompress it first ('ros2 bag convert', 'rosbag decompress')"
+            )
+            raise NotALogError(self._path, why)
+
+
+@dataclass(frozen=True)
+class Part:
+    """One file of a recording, open.
+
+    Attributes:
+        count: Number of messages that it states.
+        messages: Yields connection, log time [Unix ns] and message; None for a damaged one.
+        warnings: Parts that could not be read.
+    """
+
+    connections: list[Connection]
+    count: int
+    messages: Callable[[], Iterator[tuple[Connection, int, bytes | None]]]
+    warnings: list[str]
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What a metadata.yaml states of the files beside it.
+
+    Attributes:
+        files: In the order of time.
+        mode: ``file``, ``message`` or empty: what is compressed.
+    """
+
+    files: list[Path]
+    mode: str
+
+
+def read_stated(folder: Path) -> Stated:
+    """Read the metadata.yaml of a folder.
+
+    Raises:
+        NotALogError: If it is damaged, or names files that are not there.
+    """
+    from ruamel.yaml import YAML
+
+    path = folder / METADATA
+    text = metadata_text(path)
+    try:
+        # Kinds other than text would be computed: merges of merges expand without limit.
+        tree: Any = cast("Any", YAML(typ="base", pure=True)).load(text)
+    except Exception as error:  # its parser has errors of many bases
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise NotALogError(path, f"is no YAML: {why[:200]}; run 'ros2 bag reindex'") from error
+    facts = _field(tree, _INFORMATION)
+    names = _field(facts, "relative_file_paths")
+    listed = cast("list[Any]", names) if isinstance(names, list) else []
+    if not listed or not all(isinstance(name, str) for name in listed):
+        raise NotALogError(path, "lists no files in relative_file_paths; run 'ros2 bag reindex'")
+    files = [folder / PurePath(name).name for name in listed]
+    if len(set(files)) < len(files):
+        raise NotALogError(path, "names a file twice; run 'ros2 bag reindex'")
+    for each in files:
+        if "\0" in each.name or not each.is_file():
+            raise NotALogError(
+                path, f"names {each.name}, which is not there; run 'ros2 bag reindex'"
+            )
+    mode, form = (_text(facts, f"compression_{name}") for name in ("mode", "format"))
+    if mode not in ("", "file", "message", "storage") or (mode and form not in ("zstd", "")):
+        raise NotALogError(path, f"states the compression {mode[:40]} by {form[:40]}, not zstd")
+    return Stated(files, mode)
+
+
+def metadata_text(path: Path) -> str:
+    """Return the text of a metadata.yaml.
+
+    Raises:
+        NotALogError: If it is too large to be one.
+        OSError: If it can't be read.
+    """
+    if path.stat().st_size > LARGEST_METADATA:
+        why = f"has more than {LARGEST_METADATA >> 20} MiB; run 'ros2 bag reindex'"
+        raise NotALogError(path, why)
+    return path.read_text("utf-8", errors="replace")
+
+
+def _field(tree: object, name: str) -> object:
+    return cast("dict[str, object]", tree).get(name) if isinstance(tree, dict) else None
+
+
+def _text(facts: object, name: str) -> str:
+    value = _field(facts, name)
+    text = value.strip().lower() if isinstance(value, str) else ""
+    return "" if text in _NONE else text
+
+
+@contextmanager
+def opened(path: Path, mode: str, scratch: Path, allowance: Allowance) -> Generator[Part]:
+    """Open one file of a recording.
+
+    Args:
+        mode: What is compressed, as in :class:`Stated`.
+        scratch: A name for the file decompressed; removed afterwards.
+
+    Raises:
+        NotALogError: If it is damaged or expands too far.
+    """
+    kind = path.suffix if path.suffix in _SUFFIXES else Path(path.stem).suffix
+    reader = _READERS.get(kind)
+    if reader is None:
+        raise NotALogError(path, f"is no {' or '.join(_SUFFIXES)} file; run 'ros2 bag reindex'")
+    try:
+        if mode == "file":
+            _decompress(path, scratch, allowance)
+        with reader(scratch if mode == "file" else path) as part:
+            yield _of_messages(part, allowance) if mode == "message" else part
+    except LogError as error:
+        if error.path != scratch:
+            raise
+        raise NotALogError(path, str(error).removeprefix(f"{scratch}: ")) from error
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def _decompress(path: Path, target: Path, allowance: Allowance) -> None:
+    with path.open("rb") as stream, target.open("wb") as out:
+        source = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
+        with cast("io.RawIOBase", source) as reader:
+            while piece := reader.read(_PIECE * 16):
+                allowance.take(len(piece))
+                out.write(piece)
+
+
+def _of_messages(part: Part, allowance: Allowance) -> Part:
+    def messages() -> Iterator[tuple[Connection, int, bytes | None]]:
+        for connection, t_ns, data in part.messages():
+            yield connection, t_ns, None if data is None else _expanded(data, allowance)
+
+    return Part(part.connections, part.count, messages, part.warnings)
+
+
+def _expanded(data: bytes, allowance: Allowance) -> bytes | None:
+    """Return a message decompressed; None if it is damaged.
+
+    Raises:
+        NotALogError: If it expands too far.
+    """
+    pieces: list[bytes] = []
+    try:
+        stated = zstandard.get_frame_parameters(data).content_size
+        source = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True)
+        with cast("io.RawIOBase", source) as reader:
+            while piece := reader.read(_PIECE):
+                allowance.take(len(piece))
+                pieces.append(piece)
+    except zstandard.ZstdError:
+        return None
+    whole = b"".join(pieces)
+    unknown = stated == zstandard.CONTENTSIZE_UNKNOWN
+    return whole if unknown or len(whole) >= stated else None
+
+
+@contextmanager
+def _mcap(path: Path) -> Generator[Part]:
+    with closing(McapFile(path)) as file:
+        ways: dict[int, Connection] = {}
+        for key, channel in file.channels.items():
+            schema = file.schemas.get(channel.schema_id)
+            stated = ("", "", "")
+            if schema is not None:
+                text = schema.data.decode("utf-8", "replace")
+                stated = schema.name, schema.encoding, text
+            count = file.counts.get(key, 0)
+            ways[key] = _connection(key, channel.topic, stated, channel.message_encoding, count)
+        warnings = list(file.warnings)
+
+        def messages() -> Iterator[tuple[Connection, int, bytes | None]]:
+            for block in file.blocks:
+                try:
+                    data, start, stop = file.payload_once(block)
+                except LogError as error:
+                    warnings.append(f"{error}; its messages are missing")
+                    continue
+                if block.start:
+                    walked = walk_records(data, start, stop)
+                    places = ((a, b) for kind, a, b in walked if kind == Opcode.MESSAGE)
+                else:  # messages outside of chunks lie between other records
+                    found = (block.offsets or {}).values()
+                    offsets = sorted(start + at for each in found for at in each.tolist())
+                    places = ((at + PREFIX_SIZE, _end(data, at)) for at in offsets)
+                for body, end in places:
+                    if end - body >= _FIXED.size:
+                        key, _, log_ns, _ = _FIXED.unpack_from(data, body)
+                        if key in ways:
+                            at = body - PREFIX_SIZE + BODY_AT
+                            yield ways[key], log_ns, bytes(data[at:end])
+
+        yield Part(list(ways.values()), sum(file.counts.values()), messages, warnings)
+
+
+def _end(data: Any, at: int) -> int:
+    (length,) = struct.unpack_from("<Q", data, at + 1)
+    return at + PREFIX_SIZE + length
+
+
+@contextmanager
+def _sqlite(path: Path) -> Generator[Part]:
+    try:
+        name = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(name, uri=True)) as base:
+            yield _database(path, base)
+    except sqlite3.Error as error:
+        why = " ".join(str(error).split())
+        raise NotALogError(path, f"is a damaged database: {why}; {_REINDEX}") from error
+
+
+def _readable(data: bytes) -> str:
+    return data.decode("utf-8", "replace")
+
+
+_REINDEX = "run 'ros2 bag reindex' on a copy of its folder"
+
+
+def _database(path: Path, base: sqlite3.Connection) -> Part:
+    base.text_factory = _readable
+    base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, 1 << 20))
+    # A view or a table of a module is a program, which may never end.
+    tables = base.execute(
+        "SELECT name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'"
+    )
+    known = {str(name) for (name,) in tables}
+    if not {"topics", "messages"} <= known:
+        raise NotALogError(path, f"has no tables of topics and messages; {_REINDEX}")
+    # Pages that are part of two trees, or of themselves, would be read without end.
+    if (found := str(base.execute("PRAGMA quick_check(1)").fetchone()[0])) != "ok":
+        why = " ".join(found.split())[:200]
+        raise NotALogError(path, f"is a damaged database: {why}; {_REINDEX}")
+    definitions: dict[str, tuple[str, str]] = {}
+    if "message_definitions" in known:
+        rows = base.execute(
+            "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        )
+        definitions = {str(kind): (str(form), str(text)) for kind, form, text in rows}
+    ways: dict[int, Connection] = {}
+    topics = base.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id")
+    for key, topic, kind, encoding in topics:
+        stated = str(kind), *definitions.get(str(kind), ("", ""))
+        ways[key] = _connection(key, str(topic), stated, str(encoding), 0)
+    (count,) = base.execute("SELECT count(*) FROM messages").fetchone()
+
+    def messages() -> Iterator[tuple[Connection, int, bytes | None]]:
+        rows = base.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp")
+        for key, t_ns, data in rows:
+            if key not in ways:
+                continue
+            whole = isinstance(data, bytes) and isinstance(t_ns, int) and t_ns >= 0
+            yield ways[key], t_ns if whole else 0, data if whole else None
+
+    return Part(list(ways.values()), count, messages, [])
+
+
+_READERS = {".mcap": _mcap, ".db3": _sqlite}
+
+
+def _connection(
+    key: int, topic: str, described: tuple[str, str, str], encoding: str, count: int
+) -> Connection:
+    """Return a topic; ``described`` is its type, and encoding and text of the definition."""
+    from rosbags.interfaces import (
+        Connection,
+        ConnectionExtRosbag2,
+        MessageDefinition,
+        MessageDefinitionFormat,
+    )
+
+    kind, form, text = described
+    forms = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
+    stated = MessageDefinition(forms.get(form, MessageDefinitionFormat.NONE), text)
+    return Connection(key, topic, kind, stated, "", count, ConnectionExtRosbag2(encoding, []), None)
