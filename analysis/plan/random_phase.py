@@ -18,7 +18,6 @@ Dobrowiecki, Schoukens & Guillaume, IEEE Trans. Instrum. Meas. 55 (2006) 1774-17
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Robot
 
+from ..frequency_response.design import KIND, MOST_LINES, Inputs
 from .designs import RATE_HZ, PlannedRun, Tone, commands, dft
 from .gait_base import BaseGait
 
@@ -36,14 +36,8 @@ DRAWS = 64
 """Draws of the phases of which the one with the least peak is taken."""
 
 LEAST_LINES = 6
-MOST_LINES = 512
 HIGHEST_HZ = RATE_HZ / 8
 """Highest excited frequency [Hz]: above it the samples of the plan hardly follow a sine."""
-
-KIND = "odd-random-phase"
-"""Value of ``kind`` in the metadata of each run."""
-
-Inputs = Literal["same", "orthogonal"]
 
 
 @dataclass(frozen=True)
