@@ -125,23 +125,29 @@ def over_realisations(values: ComplexArray, noises: FloatArray) -> BestLinearApp
     # Each term has the expectation of the scatter, its deviations being from their own mean.
     squares = np.abs(values - value) ** 2 * realisations / (realisations - 1)
     excess = squares - noises
-    power = np.sum(np.abs(value) ** 2) - np.sum(squares.mean(axis=0)) / realisations
+    scatter = squares.mean(axis=0)
+    power = float(np.sum(np.abs(value) ** 2) - np.sum(scatter) / realisations)
+    # Of few realisations the squares depend on one another by their mean: circular normal errors
+    # have at least this variance.
+    variance = np.sum(scatter**2 + np.nan_to_num(noises.var(axis=0))) / realisations
     return BestLinearApproximation(
         value,
         noise,
-        squares.mean(axis=0) / realisations,
+        scatter / realisations,
         excess.mean(axis=0),
-        root_of_mean(excess.sum(axis=1) / power if power > 0 else np.full(realisations, np.nan)),
+        root_of_mean(excess.sum(axis=1) / power, float(variance) ** 0.5 / power)
+        if power > 0
+        else Estimate(),
         realisations,
     )
 
 
-def root_of_mean(squares: FloatArray) -> Estimate:
+def root_of_mean(squares: FloatArray, least_sd: float = 0.0) -> Estimate:
     """Return the root of a mean square with its interval, by Student's t.
 
     Args:
-        squares: Independent unbiased estimates of the square, some of which may be below zero,
-            shape (n,).
+        squares: Unbiased estimates of the square, some of which may be below zero, shape (n,).
+        least_sd: Least standard deviation of their mean.
 
     Returns:
         0 where the mean is below zero; empty where some square is NaN; without interval of one.
@@ -152,7 +158,7 @@ def root_of_mean(squares: FloatArray) -> Estimate:
     if squares.size < 2:
         return Estimate(max(mean, 0.0) ** 0.5)
     reach = float(stats.t.ppf(0.975, squares.size - 1) * np.std(squares, ddof=1))
-    reach /= squares.size**0.5
+    reach = max(reach / squares.size**0.5, 1.96 * least_sd)
     low, high = (max(end, 0.0) ** 0.5 for end in (mean - reach, mean + reach))
     return Estimate(max(mean, 0.0) ** 0.5, (low, high))
 
