@@ -159,12 +159,12 @@ def _spectra(
     every = [*commands.values(), *responses.values()]
     start_s, stop_s = max(one.t_s[0] for one in every), min(one.t_s[-1] for one in every)
     T = design.period_s
-    if stop_s - start_s < T:
+    step_s = max(one.period_s for one in every)
+    if stop_s - start_s + step_s < T:
         raise DataError(
             f"holds {max(stop_s - start_s, 0.0):.4g} s of steady commands and responses, less than "
             f"a period of {T:g} s"
         )
-    step_s = max(one.period_s for one in every)
     length = min(round(T / step_s), *(one.count for one in every))
     if design.lines[-1] > HIGHEST * length:
         raise DataError(
@@ -214,7 +214,8 @@ def _steady_periods(
         That time [s], and how many.
     """
     (start_s, stop_s), T = limits, design.period_s
-    t_s = stop_s - np.arange(int((stop_s - start_s) / T * length))[::-1] * T / length
+    count = int((stop_s - start_s) / T * length + 1e-6) + 1
+    t_s = stop_s - np.arange(count)[::-1] * T / length
     values = np.stack([resampled(one, t_s) for one in commands])
     power = float(np.sum(np.var(values, axis=1)))
     differ = np.sum((values[:, length:] - values[:, :-length]) ** 2, axis=0)
