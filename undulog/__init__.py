@@ -66,7 +66,10 @@ VERBS: dict[str, tuple[str, str]] = {
         "analysis plan:lag_sweep",
         "Commands that identify the coupling without contact.",
     ),
-    "plan multisine": ("analysis plan:multisine", "The same at several frequencies at once."),
+    "plan multisine": (
+        "analysis multisine:multisine",
+        "Commands at many frequencies at once: a band, or tones without contact.",
+    ),
     "plan phase-kicks": ("analysis plan:phase_kicks", "Commands that identify the coupling."),
     "plan reversal": ("analysis plan:reversal", "Commands that separate boundary from module."),
     "report": ("analysis report:report", "The offline report, one HTML page."),
@@ -79,7 +82,7 @@ VERBS: dict[str, tuple[str, str]] = {
 """Command to the function behind it, in its package's folder ``commands``, and its summary."""
 
 _GROUPS = {
-    "plan": "Write the commands of an experiment around a recorded gait.",
+    "plan": "Write the commands of an experiment around a recorded gait or pose.",
     "record": "Record a robot; look after a running recording.",
     "log": "Look after sessions.",
     "robot": "Robot descriptions: list, show, check, begin one.",

@@ -144,8 +144,13 @@ def write_sessions(
     topics: JointTopicOptions,
     *,
     as_json: bool,
+    base_of: Callable[[SessionView], BaseGait] | None = None,
 ) -> None:
-    """Write the sessions of a plan and print what to do with them."""
+    """Write the sessions of a plan and print what to do with them.
+
+    Args:
+        base_of: What the commands are around; the gait of ``like`` by default.
+    """
     from undulog.capture import Session
 
     from ..plan.designs import write_plan
@@ -153,7 +158,7 @@ def write_sessions(
 
     with Session.open(like) as opened:
         session = topics.view(opened)
-        base = base_gait(session)
+        base = (base_of or base_gait)(session)
         planned = design(base, session)
         settle_s, measure_s = planned.settle_s, planned.measure_s
         times = {"settle_s": settle_s, "measure_s": measure_s}
@@ -174,7 +179,7 @@ def write_sessions(
     echo(*planned.notes)
 
 
-_AMPLITUDE = 0.02
+AMPLITUDE = 0.02
 _LEAST_SETTLE_S = 10.0
 
 
@@ -182,7 +187,7 @@ def lag_sweep(
     *,
     like: Path,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
-    amplitude: float = _AMPLITUDE,
+    amplitude: float = AMPLITUDE,
     runs: int = 1,
     settle: float | None = None,
     measure: float = 10.0,
@@ -208,72 +213,24 @@ def lag_sweep(
         topics: Where commands and responses of that session are.
         json: Print one JSON object.
     """
-    _check_tones(amplitude, runs)
+    check_tones(amplitude, runs)
 
     def design(base: BaseGait, session: SessionView) -> Planned:
         from ..plan.designs import lag_sweep as sweep
 
         planned = sweep(len(base.driven), amplitude, runs)
-        return _without_contact(base, session, planned, (amplitude, settle, measure))
+        return without_contact(base, session, planned, (amplitude, settle, measure))
 
     write_sessions("lag-sweep", like, output, design, topics, as_json=json)
 
 
-def multisine(
-    *,
-    like: Path,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
-    amplitude: float = _AMPLITUDE,
-    tones: int = 3,
-    runs: int = 1,
-    settle: float | None = None,
-    measure: float = 20.0,
-    topics: JointTopicOptions = CONTRACT,
-    json: bool = False,
-) -> None:
-    """Write the commands of a multisine: coupling without contact at several frequencies at once.
-
-    As many runs as joints are driven; in each all joints move at all tones, with the phases of a
-    DFT over the runs. The first tone is the gait's frequency, and none is another plus a whole
-    number of the gait's, so that what a nonlinearity mixes shows beside the tones.
-
-    Example: `undulog plan multisine --like run.mcap -o tones`
-
-    Args:
-        like: A session of a gait: its joints, offsets and frequency.
-        output: Folder for the sessions.
-        amplitude: Of the first tone of every command [rad]; the others fall with the square of
-            the frequency, so that all of them need about the same torque.
-        tones: How many.
-        runs: How often each of them is run.
-        settle: Time before what is measured [s]; 5 time constants of the slowest body mode, at
-            least 10 s, if not given.
-        measure: Length of what is measured [s], rounded up to whole periods.
-        topics: Where commands and responses of that session are.
-        json: Print one JSON object.
-    """
-    if tones < 2:
-        raise UsageError("--tones is at least 2; for one frequency there is plan lag-sweep")
-    _check_tones(amplitude, runs)
-
-    def design(base: BaseGait, session: SessionView) -> Planned:
-        from ..plan import designs
-
-        omega = designs.tones(base.omega, tones)
-        planned = designs.multisine(len(base.driven), amplitude, omega, runs)
-        period = designs.period_s(base.omega, tones)
-        whole_s = math.ceil(measure / period - 1e-6) * period
-        return _without_contact(base, session, planned, (amplitude, settle, whole_s))
-
-    write_sessions("multisine", like, output, design, topics, as_json=json)
-
-
-def _check_tones(amplitude: float, runs: int) -> None:
+def check_tones(amplitude: float, runs: int) -> None:
+    """Refuse amplitudes and numbers of runs that no plan has."""
     if amplitude <= 0 or runs < 1:
         raise UsageError("--amplitude is more than 0, --runs at least 1")
 
 
-def _without_contact(
+def without_contact(
     base: BaseGait,
     session: SessionView,
     runs: tuple[PlannedRun, ...],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,9 @@ from .answer import broken_first, experiment_answer, kick_answer, sweep_answer
 from .kicks.coupling import kick_coupling
 from .kicks.local import ROW_TOLERANCE
 from .kicks.runs import MOST_KICK, MOST_PATTERN, SAME, find_kicks
+from .multisine.answer import multisine_answer
+from .multisine.estimate import best_linear_responses
+from .multisine.runs import MultisineRun, MultisineRuns, find_multisine, multisine_run
 from .pooling import PooledResponse, experiment_indices, pool_runs, pooled_answer
 from .reversal.mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
 from .reversal.modules import RESAMPLES, SAME_HEADING_RAD, SIGNIFICANT, floor_lean, reversal_of
@@ -70,28 +73,16 @@ def analyse_experiment(
         UsageError: If there is no session, or the options leave nothing of one.
     """
     options = options or Options()
-    analyses: list[Analysis] = []
-    gaits: list[GaitFit | None] = []
-    robots: list[Robot | None] = []
-    commanded: list[CommandTones | None] = []
-    runs: list[GaitRun] = []
-    for session in sessions:
-        measured = measure_session(session, options)
-        analysis, gait, robot = measured.analysis, measured.gait, session.robot
-        del measured  # heavy: no two at a time
-        label, lay = Path(analysis.session.path).name, posture(session, analysis.gait.windows)
-        runs.append(gait_run(label, robot, analysis, gait, lay))
-        analyses.append(analysis)
-        gaits.append(gait)
-        robots.append(robot)
-        commanded.append(command_tones(session, options, gait, analysis.session.robot))
-    if not runs:
-        raise UsageError("an experiment needs at least one session")
+    examined = _examine(sessions, options)
+    analyses, runs = examined.analyses, examined.runs
     warnings: list[str] = []
-    kicks = find_kicks(runs, gaits)
-    sweep = find_sweep(commanded) if kicks is None else None
+    multisine = find_multisine(examined.periodic)
+    if multisine is not None:
+        return _of_multisine(multisine, analyses, runs, options)
+    kicks = find_kicks(runs, examined.gaits)
+    sweep = find_sweep(examined.commanded) if kicks is None else None
     if sweep is not None:
-        return _of_sweep(sweep, commanded, analyses, runs, options)
+        return _of_sweep(sweep, examined.commanded, analyses, runs, options)
     parts = [None if kicks is None else kicks.role(k) for k in range(len(runs))]
     rest = [k for k, part in enumerate(parts) if part in (None, "base")]
     own_roles, own_why = sort_runs([runs[k] for k in rest])
@@ -115,7 +106,7 @@ def analyse_experiment(
         if len(set(ways)) == 1
         else None
     )
-    robot = robots[next(iter(roles))] if roles else None
+    robot = examined.robots[next(iter(roles))] if roles else None
     joints = None
     if pooled is not None:
         own = [analyses[k] for k in roles]
@@ -149,6 +140,44 @@ def analyse_experiment(
     )
 
 
+@dataclass(frozen=True)
+class _Examined:
+    """Sessions one by one, each list in their order."""
+
+    analyses: list[Analysis] = field(default_factory=list[Analysis])
+    runs: list[GaitRun] = field(default_factory=list[GaitRun])
+    gaits: list[GaitFit | None] = field(default_factory=list[GaitFit | None])
+    robots: list[Robot | None] = field(default_factory=list[Robot | None])
+    commanded: list[CommandTones | None] = field(default_factory=list[CommandTones | None])
+    periodic: list[MultisineRun | str | None] = field(
+        default_factory=list[MultisineRun | str | None]
+    )
+
+
+def _examine(sessions: Iterable[SessionView], options: Options) -> _Examined:
+    """Analyse each session.
+
+    Raises:
+        UsageError: If there is none.
+    """
+    found = _Examined()
+    for session in sessions:
+        measured = measure_session(session, options)
+        analysis, gait, robot = measured.analysis, measured.gait, session.robot
+        del measured  # heavy: no two at a time
+        label, lay = Path(analysis.session.path).name, posture(session, analysis.gait.windows)
+        name = analysis.session.robot
+        found.runs.append(gait_run(label, robot, analysis, gait, lay))
+        found.analyses.append(analysis)
+        found.gaits.append(gait)
+        found.robots.append(robot)
+        found.commanded.append(command_tones(session, options, gait, name))
+        found.periodic.append(multisine_run(session, options, name) if gait is None else None)
+    if not found.runs:
+        raise UsageError("an experiment needs at least one session")
+    return found
+
+
 def _of_sweep(
     sweep: Sweep,
     commanded: Sequence[CommandTones | None],
@@ -175,6 +204,32 @@ def _of_sweep(
         heterogeneity=experiment_indices(none, none, None),
         reversal=None,
         coupling=coupling,
+        warnings=tuple(warnings),
+        provenance=_provenance(analyses, options),
+    )
+
+
+def _of_multisine(
+    multisine: MultisineRuns,
+    analyses: Sequence[Analysis],
+    runs: Sequence[GaitRun],
+    options: Options,
+) -> Experiment:
+    """Return the experiment of random-phase multisines over a band."""
+    warnings = [f"{runs[k].label} {why}; it is left out" for k, why in multisine.why.items()]
+    found = best_linear_responses(multisine.runs, warnings.append)
+    none = np.zeros((0, 0), dtype=np.complex128)
+    return Experiment(
+        answer=broken_first(analyses, multisine_answer(found)),
+        sessions=tuple(analyses),
+        runs=tuple(
+            _run(one, run, "multisine" if k in multisine.index else None, multisine.why.get(k))
+            for k, (one, run) in enumerate(zip(analyses, runs, strict=True))
+        ),
+        heterogeneity=experiment_indices(none, none, None),
+        reversal=None,
+        coupling=coupling_of_one_gait(0),
+        best_linear=found,
         warnings=tuple(warnings),
         provenance=_provenance(analyses, options),
     )

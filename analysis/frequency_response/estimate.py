@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -79,7 +80,7 @@ def estimate(command: Series, response: Series, excitation: Excitation) -> LineR
     if response.count <= 2 * excitation.tones_hz.size + 16:
         return None
     if excitation.tones_hz.size:
-        return _sound(tone_response(command, response, excitation.tones_hz))
+        return sound_lines(tone_response(command, response, excitation.tones_hz))
     step = max(command.period_s, response.period_s)
     t_s = np.arange(command.t_s[0], command.t_s[-1], step)
     u, y = (_spectrum(resampled(one, t_s)) for one in (command, response))
@@ -93,10 +94,10 @@ def estimate(command: Series, response: Series, excitation: Excitation) -> LineR
     found = local_response(y, u[None], chosen, half)
     frequency = chosen / (t_s.size * step)
     freedom = np.full(chosen.size, float(found.freedom))
-    return _sound(LineResponse(frequency, found.value[:, 0], found.variance[:, 0], freedom))
+    return sound_lines(LineResponse(frequency, found.value[:, 0], found.variance[:, 0], freedom))
 
 
-def _sound(lines: LineResponse) -> LineResponse:
+def sound_lines(lines: LineResponse) -> LineResponse:
     """Leave out lines without a value, and give those without noise that of rounding."""
     gain = np.abs(lines.value)
     variance = np.maximum(lines.variance, (_ROUNDING * gain) ** 2)
@@ -158,6 +159,23 @@ def _result(
     command: Series,
     response: Series,
 ) -> JointFrequencyResponse:
+    return replace(
+        joint_response(response.name, str(excitation.kind), sharing, lines),
+        distortion=_distortion(command, response, excitation),
+        halves_agree=_halves(command, response, excitation),
+    )
+
+
+def joint_response(
+    joint: str, excitation: str, sharing: tuple[str, ...], lines: LineResponse
+) -> JointFrequencyResponse:
+    """Return the result of one joint, without distortion and comparison of halves.
+
+    Args:
+        excitation: Kind of its command.
+        sharing: Other joints with the same command.
+        lines: At least one, with variances above 0; see :func:`sound_lines`.
+    """
     gain = np.abs(lines.value)
     sd = np.sqrt(lines.variance / 2)
     reach = stats.t.ppf(0.975, 2 * lines.freedom) * sd
@@ -171,8 +189,8 @@ def _result(
         width = 1.96 * model.delay_sd_s
         delay = Estimate(model.delay_s, (model.delay_s - width, model.delay_s + width))
     return JointFrequencyResponse(
-        joint=response.name,
-        excitation=str(excitation.kind),
+        joint=joint,
+        excitation=excitation,
         shares_command=sharing,
         frequency_hz=tuple(lines.frequency_hz.tolist()),
         gain=tuple(gain.tolist()),
@@ -187,8 +205,6 @@ def _result(
         delay_model=model.orders,
         bandwidth_hz=_bandwidth(lines, gain, model),
         resonance_hz=_resonance(lines, gain, reach),
-        distortion=_distortion(command, response, excitation),
-        halves_agree=_halves(command, response, excitation),
     )
 
 
@@ -237,7 +253,7 @@ def _distortion(command: Series, response: Series, excitation: Excitation) -> fl
     shape = (periods, length)
     u, y = (np.fft.rfft(resampled(one, t_s).reshape(shape)) for one in (command, response))
     lines = excited_lines(u.mean(axis=0)[None])
-    power = line_power(y[None])
+    power = line_power(y)
     free = np.setdiff1d(np.arange(int(lines[0]), int(lines[-1])), lines, assume_unique=True)
     if not free.size:
         return None

@@ -154,7 +154,7 @@ def lag_sweep(m: int, amplitude: float, repeats: int) -> tuple[PlannedRun, ...]:
     return tuple(
         PlannedRun(
             f"lag{k:02d}",
-            amplitude * _dft(m)[k],
+            amplitude * dft(m)[k],
             {"kind": "lag", "lag_rad": f"{2 * np.pi * k / m:.6f}"},
         )
         for k in order
@@ -180,7 +180,7 @@ def multisine(m: int, amplitude: float, omega: FloatArray, repeats: int) -> tupl
     runs: list[PlannedRun] = []
     for _ in range(repeats):
         for k in random.permutation(m).tolist():
-            each = [(amplitude * one * _dft(m)[k]).astype(np.complex128) for one in strength]
+            each = [(amplitude * one * dft(m)[k]).astype(np.complex128) for one in strength]
             more = tuple(Tone(float(w), a) for w, a in zip(omega[1:], each[1:], strict=True))
             facts = {"kind": "multisine", "experiment": str(k)}
             runs.append(PlannedRun(f"experiment{k:02d}", each[0], facts, more))
@@ -218,7 +218,7 @@ def period_s(omega: float, count: int) -> float:
     return (2 * count - 1) * 2 * np.pi / omega
 
 
-def _dft(m: int) -> ComplexArray:
+def dft(m: int) -> ComplexArray:
     """Return exp(j 2 pi j k / m), row k = run, column j = joint; shape (m, m)."""
     place = np.arange(m)
     return np.exp(2j * np.pi / m * place[:, None] * place[None, :]).astype(np.complex128)
@@ -229,6 +229,7 @@ RAMP_S = 2.0
 """Time over which the amplitude grows from zero, if the settling leaves as much."""
 
 _LONGEST_STEM = 80
+_TONES_AT_ONCE = 16
 
 
 def write_plan(
@@ -256,7 +257,10 @@ def write_plan(
             nothing is written then.
         LogWriteError: If the folder or a file can't be written.
     """
-    _check_limits(base, runs, like)
+    length_ns = round((settle_s + measure_s) * 1e9)
+    t_ns = np.arange(0, length_ns + 1, 1_000_000_000 // RATE_HZ, dtype=np.int64)
+    t_s: FloatArray = t_ns.astype(np.float64) * 1e-9
+    _check_limits(base, runs, like, t_s)
     files = [folder / f"run{k:03d}-{_file_stem(run.label)}.mcap" for k, run in enumerate(runs)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -267,9 +271,6 @@ def write_plan(
     if there:
         raise UsageError(f"{there[0]} exists already; name another folder")
     plan_id, epoch_ns = uuid.uuid4().hex, time.time_ns()
-    length_ns = round((settle_s + measure_s) * 1e9)
-    t_ns = np.arange(0, length_ns + 1, 1_000_000_000 // RATE_HZ, dtype=np.int64)
-    t_s: FloatArray = t_ns.astype(np.float64) * 1e-9
     for k, (file, run) in enumerate(zip(files, runs, strict=True)):
         start_ns = epoch_ns + k * length_ns
         values = commands(base, run, t_s, min(RAMP_S, settle_s))
@@ -314,27 +315,34 @@ def commands(base: BaseGait, run: PlannedRun, t_s: FloatArray, ramp_s: float) ->
     """
     x = np.clip(t_s / ramp_s, 0.0, 1.0) if ramp_s > 0 else np.ones_like(t_s)
     grown = x * x * (3 - 2 * x)
+    tones = run.tones(base.omega)
+    wave = np.zeros((t_s.size, len(base.driven)))
+    for k in range(0, len(tones), _TONES_AT_ONCE):
+        some = tones[k : k + _TONES_AT_ONCE]
+        turns = np.exp(1j * np.outer(t_s, [tone.omega for tone in some]))
+        wave += np.real(turns @ np.stack([tone.amplitude for tone in some]))
     values = np.tile(base.offset, (t_s.size, 1))
-    for tone in run.tones(base.omega):
-        wave = np.real(np.exp(1j * tone.omega * t_s)[:, None] * tone.amplitude[None, :])
-        values[:, list(base.driven)] += grown[:, None] * wave
+    values[:, list(base.driven)] += grown[:, None] * wave
     return values
 
 
-def _check_limits(base: BaseGait, runs: Sequence[PlannedRun], like: SessionView) -> None:
+def _check_limits(
+    base: BaseGait, runs: Sequence[PlannedRun], like: SessionView, t_s: FloatArray
+) -> None:
     if like.robot is None:
         return
     joints = {joint.name: joint for joint in like.robot.joints}
     for run in runs:
-        largest = np.sum([np.abs(tone.amplitude) for tone in run.tones(base.omega)], axis=0)
-        for k, amplitude in zip(base.driven, largest, strict=True):
+        values = commands(base, run, t_s, 0.0)
+        for k in base.driven:
             joint = joints.get(base.names[k])
             if joint is None:
                 continue
-            low, high = base.offset[k] - amplitude, base.offset[k] + amplitude
+            low, high = float(values[:, k].min()), float(values[:, k].max())
             if low < joint.lower or high > joint.upper:
                 raise UsageError(
                     f"{like.path}: {run.label} would command {joint.name} from {low:.3f} to "
                     f"{high:.3f} rad, its limits are {joint.lower:.3f} and {joint.upper:.3f}; "
-                    "record a gait of less amplitude"
+                    "take a smaller amplitude, or record a session whose offsets are further "
+                    "from the limits"
                 )

@@ -177,3 +177,44 @@ def base_gait(session: SessionView) -> BaseGait:
     driven = tuple(names.index(name) for name in gait.driven)
     offset[list(driven)] = gait.fit.trend[:m, 0]
     return BaseGait(names, driven, gait.fit.fundamental[:m], offset, gait.fit.omega)
+
+
+def base_pose(session: SessionView, joints: Sequence[str] | None, omega: float) -> BaseGait:
+    """Return the pose around which a session's joints are commanded, with nothing moving.
+
+    Args:
+        session: An open session with commands of any kind.
+        joints: Those to be driven; those that the session drives if None.
+        omega: Angular frequency of what will be commanded [rad/s].
+
+    Returns:
+        The joints; each offset is half-way between the least and the largest command.
+
+    Raises:
+        UsageError: If it has no commands, drives no joint, or has no joint of a name.
+    """
+    columns = read_columns(session, COMMAND_TOPIC, RESPONSE_TOPIC, Remarks())
+    ends = {
+        name: (float(np.nanmin(one.values)), float(np.nanmax(one.values)))
+        for name, one in columns.command.items()
+        if np.isfinite(one.values).any()
+    }
+    names = tuple(name for name in columns.names if name in ends)
+    chosen = columns.commanded() if joints is None else tuple(dict.fromkeys(joints))
+    if not chosen:
+        raise UsageError(
+            f"{session.path}: it commands no motion; choose the joints to drive by --joints"
+            if names
+            else f"{session.path}: it has no commands; name a session that has"
+        )
+    if missing := [name for name in chosen if name not in names]:
+        raise UsageError(
+            f"{session.path}: no commands of {', '.join(missing)}; its joints are "
+            f"{', '.join(names[:_LISTED])}{' ...' if len(names) > _LISTED else ''}"
+        )
+    offset = np.array([sum(ends[name]) / 2 for name in names])
+    driven = tuple(k for k, name in enumerate(names) if name in chosen)
+    return BaseGait(names, driven, np.zeros(len(driven), dtype=np.complex128), offset, omega)
+
+
+_LISTED = 12

@@ -131,7 +131,7 @@ def _p(p: float | None) -> PValue | None:
     return None if p is None else PValue(p)
 
 
-def _typical(most: int) -> Callable[[Sequence[Estimate]], int]:
+def typical(most: int) -> Callable[[Sequence[Estimate]], int]:
     """Return the digits that the typical interval of the column deserves."""
     return partial(formats.decimals_for, most=most)
 
@@ -158,15 +158,13 @@ def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequ
         Column("command", "command", lambda one: one.excitation, kind="word", spare=2),
         Column("from Hz", "from [Hz]", lambda one: one.frequency_hz[0], (3, 4)),
         Column("to Hz", "to [Hz]", lambda one: one.frequency_hz[-1], (2, 3)),
-        Column(
-            "gain there (95 %)", "gain at the lowest [1]", at_lowest, (_typical(4), _typical(4))
-        ),
+        Column("gain there (95 %)", "gain at the lowest [1]", at_lowest, (typical(4), typical(4))),
         Column("-3 dB Hz", "-3 dB [Hz]", lambda one: Estimate(one.bandwidth_hz), (2, 3)),
         Column(
             "delay ms (95 %)",
             "delay [ms]",
             lambda one: scaled(one.delay_s, 1e3),
-            (_typical(2), _typical(3)),
+            (typical(2), typical(3)),
             note="with the offset of the clocks",
         ),
         Column("is", "delay is", model, kind="word", spare=4),
@@ -186,7 +184,7 @@ def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequ
 def motion_table(found: Sequence[JointMotion]) -> Table[JointMotion]:
     """Return amplitude, offset and lag of joints that move without commands."""
     with_planes = any(one.plane for one in found)
-    angle = (_typical(2), _typical(4))
+    angle = (typical(2), typical(4))
     columns: list[Column[JointMotion]] = [
         Column("joint", "joint", lambda one: one.name, kind="word"),
         *([Column("plane", "plane", lambda one: one.plane, kind="word")] if with_planes else []),
@@ -222,21 +220,19 @@ def wave_table(found: Sequence[BodyWave]) -> Table[BodyWave]:
             "°/joint (95 %)",
             "wave number [°/joint]",
             lambda one: degrees(one.wave_number),
-            (_typical(2), _typical(4)),
+            (typical(2), typical(4)),
             note="lag from joint to joint, of a line through the phases",
         ),
-        Column("waves (95 %)", "waves", lambda one: one.waves, (_typical(3), _typical(4))),
+        Column("waves (95 %)", "waves", lambda one: one.waves, (typical(3), typical(4))),
         Column(
-            "joints/s (95 %)", "speed [joints/s]", lambda one: one.speed, (_typical(2), _typical(3))
+            "joints/s (95 %)", "speed [joints/s]", lambda one: one.speed, (typical(2), typical(3))
         ),
-        Column(
-            "m/s", "speed [m/s]", lambda one: one.speed_m_s, (_typical(3), _typical(4)), spare=1
-        ),
+        Column("m/s", "speed [m/s]", lambda one: one.speed_m_s, (typical(3), typical(4)), spare=1),
         Column(
             "travelling (95 %)",
             "travelling index [1]",
             lambda one: one.travelling_index,
-            (_typical(3), _typical(4)),
+            (typical(3), typical(4)),
             note="1 of a travelling, 0 of a standing wave",
         ),
         Column(
@@ -290,14 +286,14 @@ def joint_table(analysis: Analysis, joints: Sequence[JointResult]) -> Table[Join
             "gain (95 %)",
             "gain [1]",
             lambda j: j.gain,
-            (_typical(4), _typical(4)),
+            (typical(4), typical(4)),
             note="amplitude of the response over that of the command",
         ),
         Column(
             "lag° (95 %)",
             "lag [°]",
             lambda j: degrees(j.lag_rad),
-            (_typical(2), _typical(3)),
+            (typical(2), typical(3)),
             note="response behind command, positive is late",
         ),
         *(
@@ -396,7 +392,7 @@ def index_table(indices: Mapping[str, Index]) -> Table[tuple[str, Index]]:
 
 def mirror_table(reversal: Reversal) -> Table[MirrorJoint]:
     """Each joint against its mirror joint."""
-    relative, most = formats.relative, (_typical(3), _typical(5))
+    relative, most = formats.relative, (typical(3), typical(5))
     columns: list[Column[MirrorJoint]] = [
         Column("joint", "joint", lambda one: one.name, kind="word"),
         Column("its mirror", "its mirror", lambda one: one.mirror, kind="word", spare=1),

@@ -10,12 +10,14 @@ from undulog.capture.common.console import UNLIMITED, plain
 
 from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, margin_text
 from ..experiment.answer import kick_detail, sweep_detail, sweep_method
+from ..experiment.multisine.answer import multisine_method
 from ..experiment.reversal.modules import SIGNIFICANT
 from ..results import formats
 from ..results.comparison import Change, Comparison
 from ..results.coupling import LinearCoupling, LocalCoupling
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, FloorTilt, Headings, Reversal
+from .best_linear import best_linear_table
 from .tables import difference_table, mirror_table, run_table, waveform_table
 from .text import Sheet, body_detail, unidentified
 
@@ -109,12 +111,15 @@ def render_experiment(
         sheet.lines(body_detail(experiment.oscillators))
     if isinstance(experiment.coupling, LinearCoupling):
         sheet.lines(sweep_detail(experiment.coupling))
+    if experiment.best_linear is not None:
+        sheet.print()
+        sheet.table(best_linear_table(experiment.best_linear.joints))
     sheet.print()
     sheet.table(run_table(experiment))
     sheet.print()
     own = [f"{warning} ({names})" for warning, names in by_sentence(experiment, "warnings")]
     sheet.lines(f"Warning: {warning}" for warning in (*experiment.warnings, *own))
-    if not experiment.coupling.identifiable:
+    if not experiment.coupling.identifiable and experiment.best_linear is None:
         sheet.print(unidentified(experiment.coupling))
     sheet.print(f"Method: {method(experiment)}", "dim")
     notes = by_sentence(experiment, "notes")
@@ -184,7 +189,9 @@ def by_sentence(
         Sentence, and the names of its files, or ``all sessions``.
     """
     expected = ["boundary or module:"]
-    if isinstance(experiment.coupling, LinearCoupling) and experiment.coupling.plan == "multisine":
+    coupling = experiment.coupling
+    several_tones = isinstance(coupling, LinearCoupling) and coupling.plan == "multisine"
+    if several_tones or experiment.best_linear is not None:
         expected += _MANY_TONES
     files: dict[str, list[str]] = {}
     for session in experiment.sessions:
@@ -201,6 +208,8 @@ def by_sentence(
 def method(experiment: Experiment) -> str:
     """Return the method of an experiment as one sentence, beginning in lower case."""
     coupling = experiment.coupling
+    if experiment.best_linear is not None:
+        return multisine_method(experiment.best_linear)
     if isinstance(coupling, LocalCoupling):
         return _kick_method(coupling)
     if isinstance(coupling, LinearCoupling):

@@ -15,6 +15,7 @@ from typing import Any
 from .analysis import Analysis, Index
 from .coupling import Coupling
 from .estimate import Estimate, Provenance
+from .frequency_response import BestLinearResponses
 from .oscillators import BodyOscillators
 from .shown import PresentedResult
 
@@ -31,7 +32,7 @@ class Run:
     Attributes:
         wave: ``head-to-tail``, ``tail-to-head``, ``standing`` or None.
         role: ``forward`` (wave from head to tail), ``reverse``; among kicks ``base``, ``kick`` or
-            ``held-out``; or None where it has none.
+            ``held-out``; ``sweep``; ``multisine``; or None where it has none.
     """
 
     id: str
@@ -214,6 +215,8 @@ class Experiment(PresentedResult):
         oscillators: From kicks around one gait: how oscillators that feel their servos would
             synchronise through the body; None without such kicks.
         pooled: The response over the runs, where all of them are of one direction.
+        best_linear: Frequency responses with their nonlinear distortion, where the sessions are
+            runs of one multisine experiment over a band.
     """
 
     answer: str
@@ -224,6 +227,7 @@ class Experiment(PresentedResult):
     pooled: PooledRuns | None = None
     coupling: Coupling
     oscillators: BodyOscillators | None = None
+    best_linear: BestLinearResponses | None = None
     warnings: tuple[str, ...]
     provenance: Provenance
 

@@ -13,7 +13,7 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_hex
 
 from ...results.formats import short
-from ...results.frequency_response import JointFrequencyResponse
+from ...results.frequency_response import BestLinearJoint, JointFrequencyResponse
 from .svg import Drawing, drawing, inline_svg, key, legend
 
 JOINTS = 6
@@ -34,7 +34,18 @@ def bode(found: Sequence[JointFrequencyResponse], prefix: str) -> list[Drawing]:
     return [_figure(group, f"{prefix}-{k}") for k, group in enumerate(groups)]
 
 
-def _figure(group: Sequence[JointFrequencyResponse], prefix: str) -> Drawing:
+def best_linear_bode(found: Sequence[BestLinearJoint], prefix: str) -> list[Drawing]:
+    """Draw best linear approximations likewise, with the noise and the distortion of each gain."""
+    groups = [found[k : k + JOINTS] for k in range(0, len(found), JOINTS)]
+    return [
+        _figure([one.response for one in group], f"{prefix}-{k}", group)
+        for k, group in enumerate(groups)
+    ]
+
+
+def _figure(
+    group: Sequence[JointFrequencyResponse], prefix: str, best: Sequence[BestLinearJoint] = ()
+) -> Drawing:
     colors = joint_hex(len(group))
     with drawing(4.6) as figure:
         gain_axes, lag_axes = figure.subplots(2, 1, sharex=True)
@@ -52,6 +63,13 @@ def _figure(group: Sequence[JointFrequencyResponse], prefix: str) -> Drawing:
                 lag_axes.plot(frequency[sure], np.degrees(lag), **style)
                 band = np.degrees(lag - reach), np.degrees(lag + reach)
                 lag_axes.fill_between(frequency[sure], *band, color=color, alpha=0.18, linewidth=0)
+        for one, color in zip(best, colors, strict=False):
+            frequency = np.array(one.response.frequency_hz)
+            for values, line in ((one.distortion_sd, "--"), (one.noise_sd, ":")):
+                shown = np.array(values or ()) > 0  # a logarithm has no zero
+                if shown.any():
+                    sd = np.array(values)[shown]
+                    gain_axes.plot(frequency[shown], sd, line, color=color, linewidth=1.0)
         gain_axes.set_xscale("log")
         gain_axes.set_yscale("log")
         for axis in (gain_axes.yaxis, lag_axes.xaxis):
@@ -72,8 +90,14 @@ def _figure(group: Sequence[JointFrequencyResponse], prefix: str) -> Drawing:
     return Drawing(
         svg,
         "Gain and lag of each joint's response to its command; bands hold the 95 % interval. Lag "
-        "is drawn where the gain is distinct from zero.",
+        "is drawn where the gain is distinct from zero." + (_BEST if best else ""),
     )
+
+
+_BEST = (
+    " Dashed: standard deviation that nonlinear distortion gives to the gain of one realisation, "
+    "where there is any; dotted: standard deviation by noise of the mean of all realisations."
+)
 
 
 def _reach(one: JointFrequencyResponse, k: int) -> float:

@@ -21,7 +21,9 @@ from ...results.estimate import Estimate, leaves_out_zero
 from ...results.experiment import Experiment, Reversal
 from ...results.formats import degrees, estimate, relative, short
 from ...results.oscillators import BodyOscillators
+from ..best_linear import best_linear_table
 from ..text_experiment import by_sentence, method, reversal_detail
+from .bode import best_linear_bode
 from .matrix import Entries, entries_of, matrix_picture
 from .svg import (
     DASHED,
@@ -105,6 +107,7 @@ _BOUND = "no joint differs more from its mirror, 95 %"
 def experiment_view(experiment: Experiment) -> dict[str, Any]:
     """Return what the template shows of an experiment, by name."""
     reversal, coupling, body = experiment.reversal, experiment.coupling, experiment.oscillators
+    best = experiment.best_linear
     joints = [joint for one in experiment.sessions for joint in one.joints]
     known = {joint.name for joint in joints if joint.gain.value is not None}
     names = tuple(name for name in dict.fromkeys(j.name for j in joints) if name in known)
@@ -123,6 +126,8 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
         "mirror": None
         if reversal is None
         else mirror_profile(profiles(experiment, reversal), reversal, "mirror-figure"),
+        "bode": [] if best is None else best_linear_bode(best.joints, "bode-figure"),
+        "responses": None if best is None else best_linear_table(best.joints),
         "entries": entries,
         "matrices": [
             matrix_picture(one, f"matrix-{k + 1}", small=k > 0) for k, one in enumerate(entries)

@@ -1,0 +1,1 @@
+"""Best linear approximations from several sessions of one multisine experiment."""
