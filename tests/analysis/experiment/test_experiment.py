@@ -201,8 +201,8 @@ def test_the_json_object(weak, tmp_path, report_of):
     words = ["analyse", *map(str, weak), "--start", "0.02"]
     printed = report_of(*words, "-o", out)
     assert json.loads(out.read_text()) == printed
-    keys = "answer sessions runs heterogeneity reversal pooled coupling oscillators warnings"
-    assert list(printed) == [*keys.split(), "provenance"]
+    keys = "answer sessions runs heterogeneity reversal pooled coupling oscillators best_linear"
+    assert list(printed) == [*keys.split(), "warnings", "provenance"]
     assert [one["session"]["path"] for one in printed["sessions"]] == [str(path) for path in weak]
     reversal = printed["reversal"]
     assert reversal["p"] == pytest.approx(2 / 924)
