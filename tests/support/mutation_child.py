@@ -21,7 +21,8 @@ from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.wal.reader import recover
 from undulog.capture.robot.description import parse_robot
 
-sys.path[:0] = map(str, (Path(__file__).parents[1], Path(__file__).parents[2] / "bench"))
+sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))
 from campaign.base import of_recorder, write_files, write_logs, write_texts
 from campaign.fuzz import read_session
 from campaign.mutate import mutate_bytes, mutate_text
