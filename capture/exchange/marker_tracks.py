@@ -61,7 +61,12 @@ def as_joints(table: TableFile) -> TableFile | None:
     def read(names: Sequence[str], time: str) -> Iterator[Block]:
         wanted = [name for name in names if name in kept]
         for block in table.read([*wanted, *(name for name in used if name)], time):
-            points = [_points(block, one) for one in markers.values()]
+            try:
+                points = [_points(block, one) for one in markers.values()]
+            except (ValueError, TypeError) as error:
+                raise ImportFormatError(
+                    table.path, f"has a point without numbers: {error}"
+                ) from error
             found = dict(zip(angles, _turns(np.stack(points)), strict=True))
             yield {name: found[name] if name in found else block[name] for name in names}
 
