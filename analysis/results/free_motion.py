@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from .estimate import Estimate
 
@@ -71,4 +71,4 @@ class FreeMotion:
     """
 
     joints: tuple[JointMotion, ...] = ()
-    waves: tuple[BodyWave, ...] = field(default=())
+    waves: tuple[BodyWave, ...] = ()

@@ -99,3 +99,18 @@ def test_arrays_without_times_take_a_rate(tmp_path, command):
     _, t_ns, values, _ = joints_of(tmp_path / "a.mcap")
     assert np.unique(np.diff(t_ns[0])).tolist() == [20_000_000]
     np.testing.assert_array_equal(values[1], np.arange(1.0, 40.0, 2.0))
+
+
+@pytest.mark.parametrize("column", ["mid1_x", "mid1_likelihood"])
+def test_a_point_without_numbers_is_named(tmp_path, command, column):
+    _, points = swimmer(1.0)
+    table = {"time [s]": np.arange(points.shape[2]) / FPS}
+    for name, (x, y) in zip(MARKERS, points, strict=True):
+        table |= {f"{name}_x": x, f"{name}_y": y, f"{name}_likelihood": np.ones_like(x)}
+    frame = pd.DataFrame(table).astype({column: object})
+    frame.loc[7, column] = "44.0@0-000"
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    error = command("import", tmp_path / "t.csv", "-o", tmp_path / "t.mcap", code=1).err
+    assert "t.csv" in error
+    assert "44.0@0-000" in error
+    assert not (tmp_path / "t.mcap").exists()
