@@ -26,9 +26,9 @@ from functools import partial
 
 import mujoco
 import numpy as np
-from measuring import arguments, verdict
+from measuring import arguments, chain, verdict
 from mujoco import rollout
-from twin_step import chain, least, step_builtin, step_twin
+from twin_step import least, step_builtin, step_twin
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Plane

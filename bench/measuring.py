@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 import subprocess
 import sys
@@ -10,6 +11,8 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+
+from undulog.capture.robot.model import Robot
 
 HERE = Path(__file__).parent
 HOUR_S = 3600
@@ -76,3 +79,19 @@ def add_place(parser: argparse.ArgumentParser, room: str) -> None:
     place = parser.add_mutually_exclusive_group()
     place.add_argument("--folder", type=Path, help=f"a folder with {room} to spare")
     place.add_argument("--keep", type=Path, help="the session, written if it is not there")
+
+
+def chain(robot: Robot, joints: int) -> Robot:
+    """Return a robot of another length, of the same modules, without sensors."""
+    last, (one, other) = robot.links[-1], robot.joints[:2]
+    return dataclasses.replace(
+        robot,
+        name=f"chain{joints}",
+        links=tuple(dataclasses.replace(last, name=f"link{k}") for k in range(joints + 1)),
+        joints=tuple(
+            dataclasses.replace(other if k % 2 else one, name=f"joint{k}") for k in range(joints)
+        ),
+        sensors=(),
+        bus=None,
+        databases=(),
+    )

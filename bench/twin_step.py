@@ -22,7 +22,7 @@ from functools import partial
 from typing import TypeVar
 
 import pybullet
-from measuring import arguments
+from measuring import arguments, chain
 
 from undulog.capture.robot.model import Plane, Robot
 from undulog.sim.gait.contract import CONTROL_RATE_HZ, Readings
@@ -119,22 +119,6 @@ def built_in_body(robot: Robot, client: int) -> int:
             body, k, anisotropicFriction=[0.1, 1, 1], lateralFriction=0.5, physicsClientId=client
         )
     return body
-
-
-def chain(robot: Robot, joints: int) -> Robot:
-    """Return a robot of another length, of the same modules, without sensors."""
-    last, (one, other) = robot.links[-1], robot.joints[:2]
-    return dataclasses.replace(
-        robot,
-        name=f"chain{joints}",
-        links=tuple(dataclasses.replace(last, name=f"link{k}") for k in range(joints + 1)),
-        joints=tuple(
-            dataclasses.replace(other if k % 2 else one, name=f"joint{k}") for k in range(joints)
-        ),
-        sensors=(),
-        bus=None,
-        databases=(),
-    )
 
 
 def least(ways: dict[_Way, Callable[[], float]], runs: int) -> dict[_Way, float]:

@@ -1,4 +1,4 @@
-"""Many runs of the twin at once, on one core.
+"""Many runs of the twin at once, on one core or a GPU.
 
 For sweeps: open-loop gaits on open ground, or without contact. Laws, integrator, start and checks
 are those of :class:`.sim.twin.twin.Twin`, and results agree with its runs on MuJoCo within
@@ -7,17 +7,18 @@ rounding. A run's results don't depend on the runs beside it, bit for bit.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import DTypeLike
+from numpy.typing import ArrayLike, DTypeLike
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SimulationError, UsageError
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
-from undulog.capture.robot.model import Plane
+from undulog.capture.robot.model import Plane, Robot
 
 from ..gait.contract import CONTROL_RATE_HZ, Readings
 from ..gait.oscillators import OscillatorChains
@@ -48,9 +49,11 @@ from .body import (
 from .kernels import GROUND_ROWS, SAMPLE_ROWS, run_block
 
 _TICKS_A_CALL = CONTROL_RATE_HZ  # Ctrl-C waits for a call
+_BLOCK_BYTES = 4 << 30
+"""Of the samples of a block on a GPU, which are in memory at once."""
 
 _Shape: TypeAlias = tuple[object, ...]
-_Commands: TypeAlias = dict[str, FloatArray]
+_Commands: TypeAlias = dict[tuple[object, ...], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -104,8 +107,18 @@ class BatchRun:
         return np.einsum("i,kij->kj", mass / mass.sum(), centres)
 
 
+class Device(StrEnum):
+    """What steps a batch."""
+
+    CPU = "cpu"
+    CUDA = "cuda"
+
+
 def run_batch(
-    scenarios: Sequence[Scenario], *, dtype: DTypeLike = np.float64
+    scenarios: Sequence[Scenario],
+    *,
+    dtype: DTypeLike = np.float64,
+    device: str = Device.CPU,
 ) -> tuple[BatchRun, ...]:
     """Run scenarios, many at a time, each from its start to its end.
 
@@ -115,17 +128,20 @@ def run_batch(
     Args:
         scenarios: The runs; what they give stays in memory, 80 bytes a joint and tick.
         dtype: ``float64``, or ``float32`` for gains and lags within 1e-3 at a higher speed.
+        device: ``cpu``: one core; ``cuda``: an NVIDIA GPU (package numba-cuda), for
+            thousands of runs: results agree with the CPU's within rounding, not bit for bit.
 
     Returns:
         Results in the order of the scenarios.
 
     Raises:
         UsageError: If a scenario needs what a batch hasn't: obstacles, pushes, a controller or
-            oscillators with feedback; lists all such fields.
+            oscillators with feedback; lists all such fields. If there is no such device.
     """
     precision = np.dtype(dtype)
     if precision.name not in ("float64", "float32"):
         raise UsageError(f"dtype {precision}: use float64 or float32")
+    width, advance = _stepper(device)
     for scenario in scenarios:
         _refuse(scenario)
     groups: dict[_Shape, list[int]] = {}
@@ -134,12 +150,30 @@ def run_batch(
     runs: dict[int, BatchRun] = {}
     commands: _Commands = {}
     for group in groups.values():
-        for first in range(0, len(group), LANES):
-            members = group[first : first + LANES]
-            block = _Block([scenarios[i] for i in members], precision, commands)
-            block.run()
+        one = scenarios[group[0]]
+        bytes_a_run = one.tick_count * len(one.robot.joints) * SAMPLE_ROWS * precision.itemsize
+        lanes = width or max(1, min(len(group), _BLOCK_BYTES // bytes_a_run))
+        for first in range(0, len(group), lanes):
+            members = group[first : first + lanes]
+            block = _Block([scenarios[i] for i in members], precision, commands, lanes)
+            block.run(advance)
             runs |= zip(members, block.results(), strict=True)
     return tuple(runs[i] for i in range(len(scenarios)))
+
+
+def _stepper(device: str) -> tuple[int | None, Callable[..., None]]:
+    """How many runs a block of a device has (None: any number), and what steps them.
+
+    Raises:
+        UsageError: If no device has that name.
+    """
+    if device not in list(Device):
+        raise UsageError(f"device {device}: use {' or '.join(Device)}")
+    if device == Device.CPU:
+        return LANES, run_block
+    from .cuda import run_block_on_gpu
+
+    return None, run_block_on_gpu
 
 
 def _refuse(scenario: Scenario) -> None:
@@ -170,8 +204,8 @@ def _shape(scenario: Scenario) -> _Shape:
 def _commands(scenario: Scenario, known: _Commands) -> FloatArray:
     """Commands of all ticks, shape (k, m), computed once for runs that share them."""
     resolution = scenario.sensing.servo.command_resolution
-    limits = [(joint.plane, joint.lower, joint.upper) for joint in scenario.robot.joints]
-    key = repr((scenario.gait, limits, scenario.tick_count, resolution))
+    limits = tuple((joint.plane, joint.lower, joint.upper) for joint in scenario.robot.joints)
+    key = (id(scenario.gait), limits, scenario.tick_count, resolution)
     if key not in known:
         times_s = np.arange(scenario.tick_count) / CONTROL_RATE_HZ
         gait = generator(scenario.gait, scenario.robot)
@@ -184,51 +218,61 @@ def _commands(scenario: Scenario, known: _Commands) -> FloatArray:
     return known[key]
 
 
+def _chain(robot: Robot) -> FloatArray:
+    """Parameters of the links, shape (n, SERVO)."""
+    half = np.array([link.length / 2 for link in robot.links])
+    table = np.zeros((len(half), SERVO))
+    table[:, ARM], table[1:, CENTRE] = -2.0 * half, -half[1:]
+    table[0, ARM] = -half[0]
+    table[:, RADIUS] = [link.radius for link in robot.links]
+    table[:, MASS] = [link.mass for link in robot.links]
+    table[:, INERTIA : INERTIA + 3] = [link.inertia for link in robot.links]
+    return table
+
+
+def _last(of_runs: Sequence[ArrayLike]) -> FloatArray:
+    """Arrays of runs as one whose last axis is the run."""
+    return np.moveaxis(np.asarray(of_runs, dtype=np.float64), 0, -1)
+
+
 class _Block:
     """Runs that share their steps; lanes that are left over repeat the last of them."""
 
-    def __init__(self, scenarios: Sequence[Scenario], dtype: np.dtype, known: _Commands) -> None:
+    def __init__(
+        self, scenarios: Sequence[Scenario], dtype: np.dtype, known: _Commands, width: int
+    ) -> None:
         """Set the robots on the ground, straight, their servos at rest."""
         self._scenarios = scenarios
-        lanes = [scenarios[min(r, len(scenarios) - 1)] for r in range(LANES)]
+        lanes = [scenarios[min(r, len(scenarios) - 1)] for r in range(width)]
         one = scenarios[0]
         n, m, ticks = len(one.robot.links), len(one.robot.joints), one.tick_count
         self._vertical = np.array([joint.plane is Plane.VERTICAL for joint in one.robot.joints])
         self._law = 0 if one.world.ground is None else LAWS.index(one.world.ground.law)
         self._steps = one.physics_rate_hz // CONTROL_RATE_HZ
-        self._links = np.zeros((n, LINK_ROWS, LANES), dtype)
-        self._head = np.zeros((HEAD_ROWS, LANES), dtype)
-        self._carried = np.zeros((CARRIED_ROWS, LANES), dtype)
-        self._ground = np.zeros((GROUND_ROWS, LANES), dtype)
-        self._gravity = np.zeros((3, LANES), dtype)
-        self._commands = np.zeros((ticks, m, LANES), dtype)
-        self._samples = np.zeros((ticks, SAMPLE_ROWS, m, LANES), dtype)
-        self._poses = np.zeros((ticks, HEAD_ROWS, LANES), dtype)
-        self._failure = np.full((4, LANES), -1.0)
-        for r, scenario in enumerate(lanes):
-            self._put(r, scenario)
-            self._commands[:, :, r] = _commands(scenario, known)
+        self._links = np.zeros((n, LINK_ROWS, width), dtype)
+        self._head = np.zeros((HEAD_ROWS, width), dtype)
+        self._carried = np.zeros((CARRIED_ROWS, width), dtype)
+        self._ground = np.zeros((GROUND_ROWS, width), dtype)
+        self._gravity = np.zeros((3, width), dtype)
+        self._commands = np.zeros((ticks, m, width), dtype)
+        self._samples = np.zeros((ticks, SAMPLE_ROWS, m, width), dtype)
+        self._poses = np.zeros((ticks, HEAD_ROWS, width), dtype)
+        self._failure = np.full((4, width), -1.0)
+        chains = {id(each.robot.links): _chain(each.robot) for each in lanes}
+        self._links[:, :SERVO] = _last([chains[id(each.robot.links)] for each in lanes])
+        servos = Servos([joint.servo for each in lanes for joint in each.robot.joints]).table
+        parameters = servos.reshape(len(servos), width, m).transpose(2, 0, 1)
+        self._links[1:, SERVO : SERVO + len(servos)] = parameters
+        heading = np.array([each.world.heading for each in lanes]) / 2
+        self._head[PLACE + 2] = [resting_height(each) for each in lanes]
+        self._head[TURN + 2], self._head[TURN + 3] = np.sin(heading), np.cos(heading)
+        self._head[VELOCITY : VELOCITY + 3] = _last([each.world.velocity for each in lanes])
+        self._ground[:] = _last([ground_table(each.world.ground) for each in lanes])
+        self._gravity[:] = _last([each.world.gravity for each in lanes])
+        self._commands[:] = _last([_commands(each, known) for each in lanes])
         self._poses[0] = self._head
 
-    def _put(self, r: int, scenario: Scenario) -> None:
-        """Put a run into a lane."""
-        robot, world = scenario.robot, scenario.world
-        half = np.array([link.length / 2 for link in robot.links])
-        links, head = self._links[:, :, r], self._head[:, r]
-        links[:, ARM], links[1:, CENTRE] = -2.0 * half, -half[1:]
-        links[0, ARM] = -half[0]
-        links[:, RADIUS] = [link.radius for link in robot.links]
-        links[:, MASS] = [link.mass for link in robot.links]
-        links[:, INERTIA : INERTIA + 3] = [link.inertia for link in robot.links]
-        servos = Servos([joint.servo for joint in robot.joints]).table
-        links[1:, SERVO : SERVO + len(servos)] = servos.T
-        head[PLACE + 2] = resting_height(scenario)
-        head[TURN + 2], head[TURN + 3] = np.sin(world.heading / 2), np.cos(world.heading / 2)
-        head[VELOCITY : VELOCITY + 3] = world.velocity
-        self._ground[:, r] = ground_table(world.ground)
-        self._gravity[:, r] = world.gravity
-
-    def run(self) -> None:
+    def run(self, advance: Callable[..., None]) -> None:
         """Run to the end, or until all have failed."""
         ticks, n = len(self._commands), len(self._scenarios)
         limits = np.array([MAX_ROTOR_SPEED, MAX_SPEED**2])
@@ -236,32 +280,36 @@ class _Block:
         for first in range(0, ticks - 1, _TICKS_A_CALL):
             if (self._failure[0, :n] >= 0).all():
                 return
-            run_block(
+            last = min(first + _TICKS_A_CALL, ticks - 1)
+            part = slice(first, last + 1)
+            advance(
                 *(self._links, self._head, self._carried, self._ground, self._gravity),
-                *(self._vertical, self._law, self._commands, self._samples, self._poses),
-                *(self._failure, limits, step_s, self._steps),
-                *(first, min(first + _TICKS_A_CALL, ticks - 1), LANES),
+                *(self._vertical, self._law, self._commands[part], self._samples[part]),
+                *(self._poses[part], self._failure, limits, step_s, self._steps, first, last),
+                self._head.shape[1],
             )
 
     def results(self) -> Iterator[BatchRun]:
         """Take the runs apart."""
-        ticks = len(self._commands)
-        counts = np.full((ticks, 1), float(self._steps))
-        counts[[0, -1]] /= 2
+        steps = self._steps
+        # All runs at once: a run's numbers are far apart in a block.
+        samples = np.ascontiguousarray(self._samples.transpose(3, 1, 0, 2), np.float64)
+        poses = np.ascontiguousarray(self._poses.transpose(2, 0, 1), np.float64)
+        commands = np.ascontiguousarray(self._commands.transpose(2, 0, 1), np.float64)
+        samples[:, 2:5, 1:-1] /= steps
+        samples[:, 2:5, [0, -1]] /= steps / 2
         for r, scenario in enumerate(self._scenarios):
             error, end = self._failed(r)
-            samples = self._samples[:end, :, :, r].swapaxes(0, 1).astype(np.float64)
-            samples[2:5] /= counts[:end]
-            poses = self._poses[:end, :, r].astype(np.float64)
+            sample, pose = samples[r, :, :end], poses[r, :end]
             yield BatchRun(
                 scenario,
                 error,
-                *(samples[0], samples[1], self._commands[:end, :, r].astype(np.float64)),
-                *(samples[2], samples[3], samples[4], samples[5:]),
-                head=poses[:, PLACE : PLACE + 3],
-                head_quaternion=poses[:, TURN : TURN + 4],
-                head_velocity=poses[:, VELOCITY : VELOCITY + 3],
-                head_spin=poses[:, SPIN : SPIN + 3],
+                *(sample[0], sample[1], commands[r, :end], sample[2], sample[3], sample[4]),
+                sample[5:],
+                head=pose[:, PLACE : PLACE + 3],
+                head_quaternion=pose[:, TURN : TURN + 4],
+                head_velocity=pose[:, VELOCITY : VELOCITY + 3],
+                head_spin=pose[:, SPIN : SPIN + 3],
             )
 
     def _failed(self, r: int) -> tuple[SimulationError | None, int]:

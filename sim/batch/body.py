@@ -1,7 +1,8 @@
 """The articulated body of many runs at once: Featherstone's articulated-body algorithm, compiled.
 
 A block holds :data:`LANES` runs. Its arrays have the run as the last axis, so that the innermost
-loops go over runs and a compiler turns them into instructions on several runs at a time. A run's
+loops go over runs and a compiler turns them into instructions on several runs at a time; on a GPU
+each thread has a run, and the loops have one turn. A run's
 numbers never meet those of another run.
 
 The algorithm (Featherstone, Rigid Body Dynamics Algorithms, 2008, Chapter 7) goes through the
@@ -24,6 +25,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 from numba import njit
+from numba.extending import overload
 
 from undulog.capture.common.arrays import FloatArray
 
@@ -64,22 +66,41 @@ _QUARTER_1, _QUARTER_2 = 1.5707963267341256, 6.077100506506192e-11  # pi/2 in tw
 _SYMMETRIC = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 
 
-@inlined
 def of_lanes(rows: FloatArray) -> None:
-    """Refuse rows of another width.
+    """Refuse rows of another width than a block's; on a GPU nothing: a thread has one lane.
 
     With it the compiler knows how far apart rows are, hence that they don't overlap. The number of
     lanes is an argument all the same: a loop of known length is unrolled before it is vectorised.
     """
-    if rows.shape[1] != LANES:
-        raise ValueError
+
+
+@overload(of_lanes)
+def _of_lanes(rows: FloatArray) -> Callable[[FloatArray], None]:  # noqa: ARG001 - its type
+    def check(rows: FloatArray) -> None:
+        if rows.shape[1] != LANES:
+            raise ValueError
+
+    return check
+
+
+def floor(x: float) -> float:
+    """The largest whole number that isn't above x, in its precision: np.floor, not on a GPU."""
+    return np.floor(x)
+
+
+@overload(floor)
+def _floor(x: float) -> Callable[[float], float]:  # noqa: ARG001 - its type
+    def of_numpy(x: float) -> float:
+        return np.floor(x)
+
+    return of_numpy
 
 
 @inlined
 def _sine_cosine(x: float) -> tuple[float, float]:
     """Sine and cosine, for angles up to some thousand turns [rad]."""
     real = type(x)
-    quarters = np.floor(x * real(2 / math.pi) + _HALF)
+    quarters = floor(x * real(2 / math.pi) + _HALF)
     r = x - quarters * real(_QUARTER_1) - quarters * real(_QUARTER_2)
     z = r * r
     s = real(1 / 6227020800) * z - real(1 / 39916800)
@@ -90,8 +111,8 @@ def _sine_cosine(x: float) -> tuple[float, float]:
     c = (c * z - real(1 / 3628800)) * z + real(1 / 40320)
     c = (c * z - real(1 / 720)) * z + real(1 / 24)
     c = _ONE - _HALF * z + z * z * c
-    halves = np.floor(quarters * _HALF)
-    sign = _ONE - _TWO * (halves - _TWO * np.floor(halves * _HALF))
+    halves = floor(quarters * _HALF)
+    sign = _ONE - _TWO * (halves - _TWO * floor(halves * _HALF))
     odd = quarters != _TWO * halves
     return sign * (c if odd else s), sign * (-s if odd else c)
 

@@ -10,7 +10,7 @@ import hashlib
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numba import njit
@@ -30,6 +30,7 @@ from .body import (
     DEPTH,
     FASTEST,
     FLAT,
+    HEAD_ROWS,
     HEIGHT,
     INERTIA,
     LOAD,
@@ -277,73 +278,81 @@ def _take_sums(links: FloatArray, sample: FloatArray, lanes: int) -> None:
                 links[i, SUMS + row, r] = _ZERO
 
 
+@njit(error_model="numpy")
+def run_lanes(
+    links: FloatArray,
+    head: FloatArray,
+    carried: FloatArray,
+    ground: FloatArray,
+    gravity: FloatArray,
+    vertical: BoolArray,
+    law: int,
+    commands: FloatArray,
+    samples: FloatArray,
+    poses: FloatArray,
+    failure: FloatArray,
+    limits: FloatArray,
+    step_s: float,
+    steps: int,
+    first: int,
+    last: int,
+    lanes: int,
+) -> None:
+    """Run all runs of a block through some control periods.
+
+    Args:
+        links: Parameters, state and work space, shape (n, :data:`LINK_ROWS`, lanes).
+        head: State, shape (:data:`HEAD_ROWS`, lanes).
+        carried: Work space, shape (:data:`CARRIED_ROWS`, lanes).
+        ground: Parameters, shape (:data:`GROUND_ROWS`, lanes).
+        gravity: [m/s^2], shape (3, lanes).
+        vertical: Whether a joint turns about y rather than z, shape (m,).
+        law: Number of the friction law.
+        commands: q_ref from each tick on [rad], shape (ticks, m, lanes); ticks first to last.
+        samples: Filled in but for the first tick, which is completed, shape
+            (ticks, :data:`SAMPLE_ROWS`, m, lanes); effort, current and voltage are sums.
+        poses: Filled in, but for the first: the head, shape (ticks, :data:`HEAD_ROWS`, lanes).
+        failure: Step, kind, place and value of the first impossible state of a run; the step is
+            negative as long as there is none. Shape (4, lanes).
+        limits: Of a rotor's speed, and of the square of a link's.
+        step_s: Physics step [s].
+        steps: Of a control period, an even number.
+        first: The first period.
+        last: The period after the last one; its tick is filled in.
+    """
+    dt = links.dtype.type(step_s)
+    for tick in range(last - first):
+        samples[tick + 1, 2:5] = _ZERO
+        for part in range(2):
+            for k in range(steps // 2):
+                step = (first + tick) * steps + part * (steps // 2) + k
+                for i in range(1, len(links)):
+                    _servo(links[i], commands[tick, i - 1], carried, i - 1, dt, lanes)
+                _note(carried, failure, step, limits[0], 0, lanes)
+                _forward(links, head, carried, ground, vertical, law, lanes)
+                _note(carried, failure, step, limits[1], 1, lanes)
+                _move(links, head, carried, gravity, vertical, dt, lanes)
+            _take_sums(links, samples[tick + part], lanes)
+        for i in range(1, len(links)):
+            for r in range(lanes):
+                samples[tick + 1, 0, i - 1, r] = links[i, ANGLE, r]
+                samples[tick + 1, 1, i - 1, r] = links[i, RATE, r]
+                for row in range(4):
+                    samples[tick + 1, 5 + row, i - 1, r] = links[i, WORK + row, r]
+        for row in range(HEAD_ROWS):
+            for r in range(lanes):
+                poses[tick + 1, row, r] = head[row, r]
+    _forward(links, head, carried, ground, vertical, law, lanes)
+    _note(carried, failure, last * steps, limits[1], 1, lanes)
+
+
 def _entry(sources: str) -> Callable[..., None]:
     """Compile the entry, or load what was compiled from these sources: numba checks one file."""
 
     @njit(cache=True, error_model="numpy")
-    def run_block(
-        links: FloatArray,
-        head: FloatArray,
-        carried: FloatArray,
-        ground: FloatArray,
-        gravity: FloatArray,
-        vertical: BoolArray,
-        law: int,
-        commands: FloatArray,
-        samples: FloatArray,
-        poses: FloatArray,
-        failure: FloatArray,
-        limits: FloatArray,
-        step_s: float,
-        steps: int,
-        first: int,
-        last: int,
-        lanes: int,
-    ) -> None:
-        """Run all runs of a block through some control periods.
-
-        Args:
-            links: Parameters, state and work space, shape (n, :data:`LINK_ROWS`, lanes).
-            head: State, shape (:data:`HEAD_ROWS`, lanes).
-            carried: Work space, shape (:data:`CARRIED_ROWS`, lanes).
-            ground: Parameters, shape (:data:`GROUND_ROWS`, lanes).
-            gravity: [m/s^2], shape (3, lanes).
-            vertical: Whether a joint turns about y rather than z, shape (m,).
-            law: Number of the friction law.
-            commands: q_ref from each tick on [rad], shape (ticks, m, lanes).
-            samples: Filled in at each tick, shape (ticks, :data:`SAMPLE_ROWS`, m, lanes); effort,
-                current and voltage are sums.
-            poses: Filled in: the head at each tick, shape (ticks, :data:`HEAD_ROWS`, lanes).
-            failure: Step, kind, place and value of the first impossible state of a run; the step is
-                negative as long as there is none. Shape (4, lanes).
-            limits: Of a rotor's speed, and of the square of a link's.
-            step_s: Physics step [s].
-            steps: Of a control period, an even number.
-            first: The first period.
-            last: The period after the last one; its tick is filled in.
-        """
+    def run_block(*arguments: Any) -> None:
         assert sources  # noqa: S101 - part of what is compiled
-        dt = links.dtype.type(step_s)
-        for tick in range(first, last):
-            for part in range(2):
-                for k in range(steps // 2):
-                    step = tick * steps + part * (steps // 2) + k
-                    for i in range(1, len(links)):
-                        _servo(links[i], commands[tick, i - 1], carried, i - 1, dt, lanes)
-                    _note(carried, failure, step, limits[0], 0, lanes)
-                    _forward(links, head, carried, ground, vertical, law, lanes)
-                    _note(carried, failure, step, limits[1], 1, lanes)
-                    _move(links, head, carried, gravity, vertical, dt, lanes)
-                _take_sums(links, samples[tick + part], lanes)
-            for i in range(1, len(links)):
-                for r in range(lanes):
-                    samples[tick + 1, 0, i - 1, r] = links[i, ANGLE, r]
-                    samples[tick + 1, 1, i - 1, r] = links[i, RATE, r]
-                    for row in range(4):
-                        samples[tick + 1, 5 + row, i - 1, r] = links[i, WORK + row, r]
-            poses[tick + 1] = head
-        _forward(links, head, carried, ground, vertical, law, lanes)
-        _note(carried, failure, last * steps, limits[1], 1, lanes)
+        run_lanes(*arguments)
 
     return run_block
 
@@ -352,4 +361,4 @@ _digest = hashlib.sha256()
 for _module in (body, compiled_kernels):
     _digest.update(Path(str(_module.__file__)).read_bytes())
 run_block = _entry(_digest.hexdigest())
-"""Run all runs of a block through some control periods."""
+"""Run all runs of a block through some control periods: :func:`run_lanes`, on a CPU."""

@@ -2,7 +2,11 @@
 
 import dataclasses
 import math
+import os
+import pickle
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -284,3 +288,42 @@ def test_commands_of_many_ticks_are_those_of_one_after_the_other(uneven):
     unknown = Readings.nothing(uneven.robot)
     expected = [gait.step(time_s, unknown).command for time_s in times_s.tolist()]
     np.testing.assert_allclose(gait.commands(times_s), expected, rtol=0, atol=1e-15)
+
+
+GPU = """
+import pickle, sys
+import numpy as np
+from undulog.sim import run_batch
+
+runs = pickle.load(open(sys.argv[1], "rb"))
+done = run_batch(runs, device="cuda", dtype=sys.argv[3])
+np.savez(sys.argv[2], *[part for one in done for part in (one.angle, one.work, one.head)])
+"""
+
+
+@pytest.mark.parametrize("law", [FrictionLaw.ELLIPSE, None])
+def test_threads_of_a_gpu_step_as_a_core_does(uneven, law, tmp_path):
+    """By numba's simulator of a GPU, which runs the kernel and its copies thread by thread.
+
+    Contact begins and ends within a step, and magnifies rounding.
+    """
+    one = with_law(uneven, law).changed(duration_s=0.12)
+    runs = [one, dataclasses.replace(one, world=dataclasses.replace(one.world, heading=1.2))]
+    (tmp_path / "runs").write_bytes(pickle.dumps(runs))
+    environment = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "NUMBA_DISABLE_JIT": "1"}
+    command = [sys.executable, "-c", GPU, tmp_path / "runs", tmp_path / "done.npz", "float64"]
+    subprocess.run(command, check=True, env=environment, timeout=300)
+    expected = [part for one in run_batch(runs) for part in (one.angle, one.work, one.head)]
+    assert abs(expected[0][-1]).max() > 1e-3
+    with np.load(tmp_path / "done.npz") as found:
+        for name, part in zip(found.files, expected, strict=True):
+            np.testing.assert_allclose(
+                found[name], part, rtol=0, atol=1e-13 if law is None else 1e-7
+            )
+
+
+def test_a_machine_without_gpu_says_so(weak):
+    with pytest.raises(ValueError, match="device cuda: no NVIDIA GPU"):
+        run_batch([weak], device="cuda")
+    with pytest.raises(ValueError, match="device tpu: use cpu or cuda"):
+        run_batch([weak], device="tpu")

@@ -1,0 +1,104 @@
+"""Runs of the twin on a GPU: a batch of thousands, against the batch on one core.
+
+Chains of 5, 25 and 50 joints under the gait of the scenario weak-servo-pi3, 1 kHz, servos that
+differ from run to run. Wall time of run_batch as a whole: set-up, copies and results
+included. Outputs are compared with the CPU's: joint angles over 1 s within 1e-6 of the amplitude
+(float32: 1e-3), amplitudes over the last cycle within 1e-5 (float32: 1e-3).
+
+Needs an NVIDIA GPU and numba-cuda. Run: python bench/batch_gpu.py [--seconds 2]
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+
+import numpy as np
+from measuring import arguments, chain, verdict
+from numba import cuda
+
+from undulog.capture.common.arrays import FloatArray
+from undulog.sim import BatchRun, Scenario, load_scenario, run_batch
+from undulog.sim.batch.cuda import require_gpu
+
+JOINTS, WORLDS = (5, 25, 50), (1024, 4096, 16384)
+
+
+def servos_of(scenario: Scenario, worlds: int) -> list[Scenario]:
+    """Return the scenario with supplies from 5 V to 6 V."""
+    runs = list[Scenario]()
+    for k in range(worlds):
+        joints = tuple(
+            dataclasses.replace(one, servo=dataclasses.replace(one.servo, supply_v=5 + k / worlds))
+            for one in scenario.robot.joints
+        )
+        robot = dataclasses.replace(scenario.robot, joints=joints)
+        runs.append(dataclasses.replace(scenario, robot=robot))
+    return runs
+
+
+def run_s(scenario: Scenario, dtype: type[np.floating], device: str, worlds: int) -> float:
+    """Return wall time of a batch [s]."""
+    runs = servos_of(scenario, worlds)
+    start = time.monotonic()
+    done = run_batch(runs, dtype=dtype, device=device)
+    used = time.monotonic() - start
+    assert all(one.error is None for one in done), [str(one.error) for one in done]
+    return used
+
+
+def apart(scenario: Scenario) -> bool:
+    """Print how far the GPU's outputs are from the CPU's; return whether too far."""
+    runs = servos_of(scenario.changed(duration_s=5.0), 16)
+    expected = run_batch(runs)
+    good = True
+    for dtype, angles, gains in ((np.float64, 1e-6, 1e-5), (np.float32, 1e-3, 1e-3)):
+        found = run_batch(runs, dtype=dtype, device="cuda")
+        far = max(
+            np.abs(a.angle - b.angle)[:101].max() for a, b in zip(found, expected, strict=True)
+        )
+        gain = max(
+            np.abs(swing(a) / swing(b) - 1).max() for a, b in zip(found, expected, strict=True)
+        )
+        name = dtype.__name__
+        good &= verdict(f"joint angles over 1 s, {name}", 1e12 * far / 0.4, 1e12 * angles, "1e-12")
+        good &= verdict(f"gain over the last cycle, {name}", 1e12 * gain, 1e12 * gains, "1e-12")
+    return not good
+
+
+def swing(run: BatchRun) -> FloatArray:
+    """Return the amplitudes of the joints that move, over the last 2 s, a cycle [rad]."""
+    part = run.angle[-200:]
+    wave = np.exp(-2j * np.pi * np.arange(200) / 200)
+    moving = np.ptp(run.command, axis=0) > 0
+    return np.abs(wave @ part[:, moving]) / 100
+
+
+def main() -> None:
+    """Print the table."""
+    parser = arguments(__doc__)
+    parser.add_argument("--seconds", type=float, default=2.0)
+    parser.add_argument("--worlds", type=int, nargs="+", default=WORLDS)
+    options = parser.parse_args()
+    require_gpu()
+    weak = load_scenario("weak-servo-pi3").changed(duration_s=options.seconds)
+    weak = dataclasses.replace(weak, sensing=dataclasses.replace(weak.sensing, enabled=False))
+    failed = apart(weak)
+    print(f"\n{cuda.get_current_device().name}, 1 kHz, {options.seconds:g} s")
+    print(f"{'':<14}{'worlds':>7}{'joints':>7}{'wall s':>8}{'steps/s':>13}{'of a core':>11}")
+    for joints in JOINTS:
+        scenario = dataclasses.replace(weak, robot=chain(weak.robot, joints))
+        for dtype in (np.float64, np.float32):
+            core = 0.0
+            for device, worlds in (("cpu", 64), *(("cuda", one) for one in options.worlds)):
+                used = run_s(scenario, dtype, device, worlds)
+                rate = worlds * scenario.duration_s * scenario.physics_rate_hz / used
+                core = core or rate
+                row = f"{device}, {dtype.__name__:<8}{worlds:>8}{joints:>7}{used:>8.2f}"
+                print(f"{row}{rate:>13,.0f}{rate / core:>11.1f}", flush=True)
+    sys.exit(failed)
+
+
+if __name__ == "__main__":
+    main()
