@@ -403,11 +403,13 @@ def _of_scale(
             scale = float(np.nanmedian(by_second.ratio))
             yield "position", flag, spans, f"{scale:.3g} of the second sensor's"
     if way is not None:
-        by_rate = against_witness(compare(position, way, edges, noisy=True), SAME_RATE)
+        by_rate = compare(position, way, edges, noisy=True)
         # What the position is blamed for already is no fault of the velocity.
-        for flag, spans in by_rate.items():
+        for flag, spans in against_witness(by_rate, SAME_RATE).items():
             if flag not in found:
-                yield "velocity", flag, spans, ""
+                scale = 1 / float(np.nanmedian(by_rate.ratio))
+                note = f"{scale:.3g} times the derivative of the position"
+                yield "velocity", flag, spans, note if flag == "scale_mismatch" else ""
 
 
 def _stalled(joint: _Joint) -> tuple[Span, ...]:

@@ -142,7 +142,8 @@ def column_map_from_options(options: Sequence[str], robot: Robot | None) -> Colu
         target, colon, unit = head.partition(":")
         joint, dot, quantity = target.partition(".")
         if not (equals and colon and column) or (target != "time" and not dot):
-            raise UsageError(f"--map {option!r} is not of the form {_OPTION_FORM}")
+            file = "; a map in a file: --columns" if option.endswith(".toml") else ""
+            raise UsageError(f"--map {option!r} is not of the form {_OPTION_FORM}{file}")
         if target == "time":
             values["time"] = {"column": column, "unit": unit}
             continue

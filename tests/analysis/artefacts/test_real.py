@@ -102,6 +102,8 @@ def test_all_joints_of_an_arm_with_stick_and_play_are_compared(arm):
     assert all(joint.gain.value is not None for joint in arm.joints)
     wrong = {(one.joint, one.quantity, one.flag) for one in arm.artefacts if one.about == "sensor"}
     assert wrong == {("Jaw", "velocity", "scale_mismatch")}  # by 2.343: of the data set itself
+    (jaw,) = (one for one in arm.artefacts if one.about == "sensor")
+    assert float(jaw.note.split()[0]) == pytest.approx(2.343, rel=0.01)
 
 
 def test_their_dead_bands_explain_their_gains(arm):
