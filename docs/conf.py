@@ -67,7 +67,7 @@ def _notebook_page() -> str:
     return executed_page()
 
 
-(Path(__file__).parent / "command-line.md").write_text(_command_line_page())
+(Path(__file__).parent / "reference/command-line.md").write_text(_command_line_page())
 (Path(__file__).parent / "notebook.md").write_text(_notebook_page())
 
 

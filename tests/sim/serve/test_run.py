@@ -268,7 +268,7 @@ def test_it_ends_in_good_order(number, tmp_path):
 
 @pytest.mark.slow
 def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
-    page = (ROOT / "docs" / "virtual-robot.md").read_text()
+    page = (ROOT / "docs" / "how-to/virtual-robot.md").read_text()
     section = page[page.index("## Three terminals") : page.index("## The bus")]
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -305,7 +305,7 @@ def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
 
 @pytest.mark.slow
 def test_the_manuals_own_controller_moves_the_robot():
-    page = (ROOT / "docs" / "virtual-robot.md").read_text()
+    page = (ROOT / "docs" / "how-to/virtual-robot.md").read_text()
     (snippet,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     with serving("flat", "--wait") as (robot, ready):
         snippet = snippet.replace("29536", str(ready["port"])).replace("range(1000)", "range(50)")
