@@ -18,7 +18,7 @@ release = version = package_version("undulog")
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "**/_*.md"]
 html_theme = "furo"
 html_math_renderer = "mathml"
 html_title = f"undulog {version}"
