@@ -70,11 +70,12 @@ campaign: $(READY)  ## 50,000 attacks with new seeds, resumable (SEED=1 CASES=20
 study: $(READY)  ## what body couplings do to synchrony, short form (LONG=1 for all of it, hours, resumable)
 	$(BIN)/python docs/study/study.py $(if $(LONG),,--quick)
 
-check: $(READY)  ## lint, format, types, layers
+check: $(READY)  ## lint, format, types, layers, how README and tutorials read
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/pyright
+	$(BIN)/python tests/house/reading_ease.py
 
 format: $(READY)  ## fix what lint and format can fix
 	$(BIN)/ruff check --fix .

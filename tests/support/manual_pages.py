@@ -40,6 +40,11 @@ class Command:
     shown: str
 
     @property
+    def codes(self) -> set[int]:
+        """The exit codes that it may have: a verdict depends on what else the computer does."""
+        return {0, 1} if self.line.startswith("undulog log check ") else {0}
+
+    @property
     def serves(self) -> bool:
         return self.line.startswith("undulog sim serve ")
 
@@ -112,7 +117,10 @@ def walk(page: str, folder: Path) -> None:
             elif step.serves:
                 robots.append(robot := opened(step))
                 printed = robot.stdout.readline()
-                assert shows(step.shown, printed), (step.line, printed, robot.stderr)
+                told = (
+                    step.shown if "--wait" in step.line else f"{step.shown.partition(' it ')[0]}..."
+                )
+                assert shows(told, printed), (step.line, printed)
             elif step.records:
                 recorder = opened(step)
                 wait_for(lambda: _connected(options), "the recorder", alive=(recorder,))
@@ -125,7 +133,7 @@ def walk(page: str, folder: Path) -> None:
                     timeout=PATIENCE_S,
                     **options,
                 )
-                assert done.returncode == 0, (step.line, done.stderr)
+                assert done.returncode in step.codes, (step.line, done.stderr)
                 if step.shown:
                     assert shows(step.shown, done.stdout), f"{step.line}\n{done.stdout}"
         for robot in robots:
