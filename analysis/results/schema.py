@@ -57,7 +57,7 @@ _INTERVAL = {
     "minItems": 2,
     "maxItems": 2,
 }
-_PLAIN = {float: "number", int: "integer", str: "string", bool: "boolean"}
+_PLAIN: dict[Any, str] = {float: "number", int: "integer", str: "string", bool: "boolean"}
 _ATTRIBUTES = re.compile(r"^Attributes:\n(.*?)(?=^\S|\Z)", re.MULTILINE | re.DOTALL)
 _ENTRY = re.compile(r"^    (\w+): (.*?)(?=^    \w+: |\Z)", re.MULTILINE | re.DOTALL)
 _ROLE = re.compile(r":\w+:`~?\.?([^`]*)`|``([^`]*)``")
@@ -120,13 +120,13 @@ class _Writer:
             return self._array(arguments)
         if origin is dict:
             return {"type": "object", "additionalProperties": self._type(arguments[1])}
+        if not (is_dataclass(hint) or issubclass(hint, Enum)):
+            raise TypeError(f"a result has a field of {hint}, which has no JSON Schema here")
         return self._class(cast("type", hint))
 
     def _class(self, hint: type) -> dict[str, Any]:
         if issubclass(hint, Enum):
             return {"enum": [one.value for one in hint]}
-        if not is_dataclass(hint):
-            raise TypeError(f"a result has a field of {hint}, which has no JSON Schema here")
         kinds = [self._reference(one) for one in _kinds(hint)]
         return kinds[0] if len(kinds) == 1 else {"anyOf": kinds}
 
