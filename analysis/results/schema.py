@@ -122,9 +122,9 @@ class _Writer:
             return {"type": "object", "additionalProperties": self._type(arguments[1])}
         if not (is_dataclass(hint) or issubclass(hint, Enum)):
             raise TypeError(f"a result has a field of {hint}, which has no JSON Schema here")
-        return self._class(cast("type", hint))
+        return self._class(cast("type[Any]", hint))
 
-    def _class(self, hint: type) -> dict[str, Any]:
+    def _class(self, hint: type[Any]) -> dict[str, Any]:
         if issubclass(hint, Enum):
             return {"enum": [one.value for one in hint]}
         kinds = [self._reference(one) for one in _kinds(hint)]
@@ -168,7 +168,7 @@ class _Writer:
         return cls.__module__.rpartition(".")[2].title().replace("_", "") + name
 
 
-def _kinds(cls: type) -> list[type]:
+def _kinds(cls: type[Any]) -> list[type[Any]]:
     """Return the record and those that refine it, the most special first."""
     found = [kind for one in cls.__subclasses__() for kind in _kinds(one)]
     return [*found, cls]
