@@ -18,7 +18,7 @@ _INCLUDE = re.compile(r"^```\{include\} (\S+)\n```$", re.MULTILINE)
 _BLOCK = re.compile(r"^```(console|\{code-block\} \w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _CAPTION = re.compile(r":caption: (\S+?)(, at its end)?\n\n?")
 _FENCED = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
-PATIENCE_S = 600
+PATIENCE_S = 1000
 WORDS_A_MINUTE = 200
 TYPED_A_MINUTE = 150
 
