@@ -11,7 +11,7 @@ DEMO   := out/demo
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow zoo campaign study check format bench docs pictures golden lock clean
+.PHONY: help demo test slow zoo campaign study check format bench docs schemas pictures golden lock clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -70,11 +70,12 @@ campaign: $(READY)  ## 50,000 attacks with new seeds, resumable (SEED=1 CASES=20
 study: $(READY)  ## what body couplings do to synchrony, short form (LONG=1 for all of it, hours, resumable)
 	$(BIN)/python docs/study/study.py $(if $(LONG),,--quick)
 
-check: $(READY)  ## lint, format, types, layers
+check: $(READY)  ## lint, format, types, layers, how README and tutorials read
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/pyright
+	$(BIN)/python tests/house/reading_ease.py
 
 format: $(READY)  ## fix what lint and format can fix
 	$(BIN)/ruff check --fix .
@@ -101,6 +102,9 @@ bench: $(READY)  ## speed, as ratios against named peers
 
 docs: $(READY)  ## the manual, as HTML under docs/_build/html
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build/html
+
+schemas: $(READY)  ## the JSON Schemas of the results, which ship with the package
+	$(BIN)/python docs/reference_pages.py
 
 pictures: demo  ## the pictures of README and manual, from recorded sessions
 	$(BIN)/python docs/pictures.py $(DEMO) docs/images

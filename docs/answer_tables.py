@@ -1,4 +1,4 @@
-"""The tables of docs/faults.md on errors: how often an answer names what is not there.
+"""The tables of docs/explanation/faults.md on errors: how often an answer names what is not there.
 
 ``.venv/bin/python docs/answer_tables.py [SESSIONS]`` prints them as Markdown; with 2,000 sessions
 a cell it takes about twenty minutes on two cores. Nothing is written to files: commands and

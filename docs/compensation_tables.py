@@ -1,4 +1,4 @@
-"""The figures of docs/compensation.md: spread, speed and cost before and after compensation.
+"""The figures of docs/how-to/compensation.md: spread, speed and cost before and after compensation.
 
 ``nice .venv/bin/python docs/compensation_tables.py 5 13`` prints those of chains with so many yaw
 joints, ``13:1.5`` those with servos of 1.5 N m instead of 0.25 N m. Each takes 4 m + 9 runs for the

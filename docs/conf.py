@@ -10,6 +10,9 @@ from latex2mathml.converter import convert as latex_to_mathml
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
 
+sys.path.insert(0, str(Path(__file__).parent))
+from reference_pages import write_pages
+
 project = "undulog"
 author = "the undulog developers"
 copyright = "the undulog developers, Apache-2.0"  # noqa: A001 - the name that Sphinx reads
@@ -18,7 +21,7 @@ release = version = package_version("undulog")
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "**/_*.md"]
 html_theme = "furo"
 html_math_renderer = "mathml"
 html_title = f"undulog {version}"
@@ -31,43 +34,14 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 
 
-def _command_line_page() -> str:
-    """Return the help of every command, as the terminal shows it."""
-    import os
-    from contextlib import redirect_stdout
-    from io import StringIO
-
-    import undulog
-
-    os.environ["COLUMNS"] = "84"
-    parts = [
-        "# Command line",
-        "",
-        (
-            "One command, `undulog`. Exit codes: 0 done, 1 the work failed (also: a file that "
-            "isn't there), 2 wrong usage (also: a name that nothing has). Nothing is overwritten "
-            "without `--force`; Ctrl-C and SIGTERM leave a readable file. Bars of progress go to "
-            "stderr, and only on a terminal."
-        ),
-        "",
-    ]
-    for verb in undulog.VERBS:
-        shown = StringIO()
-        with redirect_stdout(shown):
-            undulog.run([*verb.split(), "--help"])
-        parts += [f"## {verb}", "", "```text", shown.getvalue().rstrip(), "```", ""]
-    return "\n".join(parts)
-
-
 def _notebook_page() -> str:
     """Return the example notebook, run anew."""
-    sys.path.insert(0, str(Path(__file__).parent))
     from notebook_page import executed_page
 
     return executed_page()
 
 
-(Path(__file__).parent / "command-line.md").write_text(_command_line_page())
+write_pages()
 (Path(__file__).parent / "notebook.md").write_text(_notebook_page())
 
 

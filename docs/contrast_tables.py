@@ -1,4 +1,4 @@
-"""The table of contrasts in docs/estimators.md: joints that share noise, and their intervals.
+"""The table of docs/explanation/estimators.md on contrasts between joints that share noise.
 
 ``.venv/bin/python docs/contrast_tables.py`` prints it as Markdown; it takes about half a minute.
 """

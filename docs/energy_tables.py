@@ -1,4 +1,4 @@
-"""The table of docs/energy.md: energies by the log against the twin's ledger, every scenario.
+"""The table of docs/explanation/energy.md: energies by the log against the twin's ledger.
 
 ``.venv/bin/python docs/energy_tables.py`` runs all shipped scenarios, which takes some minutes, and
 prints the table as Markdown; ``--write`` puts it into the page. With names, those only.
@@ -25,7 +25,7 @@ BAR = 0.005
 NET_FLOOR = 0.05
 """E_net may vanish: its error is held against at least this part of E_abs."""
 
-PAGE = Path(__file__).with_name("energy.md")
+PAGE = Path(__file__).parent / "explanation/energy.md"
 BEGIN, END = "<!-- table by energy_tables.py -->", "<!-- end of the table -->"
 TITLES = {"net": "E_net", "plus": "E_plus", "abs": "E_abs", "el": "E_el", "el_clipped": "E_el+"}
 
@@ -104,7 +104,7 @@ def main():
     """Print the table, or write it into the page."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("names", nargs="*", help="scenarios; all that are shipped by default")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/energy.md")
+    parser.add_argument("--write", action="store_true", help="put the table into the page")
     parser.add_argument("--quick", action="store_true", help="one short scenario")
     options = parser.parse_args()
     if options.quick:

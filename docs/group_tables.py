@@ -1,4 +1,4 @@
-"""The table of docs/estimators.md on joints at two frequencies.
+"""The table of docs/explanation/estimators.md on joints at two frequencies.
 
 ``.venv/bin/python docs/group_tables.py [DRAWS]`` prints it; 500 draws take some minutes.
 """

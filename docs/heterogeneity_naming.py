@@ -1,4 +1,4 @@
-"""The second power table of docs/heterogeneity.md: is the right module named, whichever it is?
+"""The second power table of docs/explanation/heterogeneity.md: is the right module named?
 
 Every module but the middle one in turn, its servo weakened: by 20, 10 or 5 % in the 25-joint twin
 (``weak-servo-pi3`` and its reverse), by 20 % in chains of 13 joints (7 yaw) with gaits, servos and

@@ -1,4 +1,4 @@
-"""Level and power of the reversal test on a tilted floor, for docs/heterogeneity.md.
+"""Level and power of the reversal test on a tilted floor, for docs/explanation/heterogeneity.md.
 
 Profiles without noise come from the 25-joint twin (``weak-servo-pi3``): identical modules on a
 floor tilted by 0, 0.3, 1 and 2 degrees along the body and across it, and each yaw module in turn

@@ -1,4 +1,4 @@
-"""The tables of docs/method.md on kicks: what holds when runs differ by more than their own noise.
+"""The tables of docs/explanation/method.md on kicks, whose runs differ beyond their own noise.
 
 ``nice .venv/bin/python docs/kick_tables.py`` prints them as Markdown; it takes about a minute and a
 half. ``docs/kick_tables.py 2000`` makes so many experiments a row.

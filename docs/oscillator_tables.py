@@ -1,4 +1,4 @@
-"""The figures of docs/oscillators.md: P in contact, its modes, and what they predict.
+"""The figures of docs/explanation/oscillators.md: P in contact, its modes, and what they predict.
 
 ``nice .venv/bin/python docs/oscillator_tables.py 5 9 13`` prints those of chains with so many yaw
 joints (every other joint is a yaw joint, as in snake25), ``13:1.5`` those with servos of 1.5 N m

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -16,10 +16,12 @@ from ..common.errors import DataError
 from ..log.columns.topics import Channel
 from ..log.messages.frames import FD_TOPIC_PREFIX
 from ..log.read.session import Session
+from ..log.write.writer import CONTRACT_VERSION
 from .several import Line, each, sessions_of, show, stated_gait
 
 if TYPE_CHECKING:
     from ..log.health.bus_tally import SourceHealth
+    from ..log.health.contract import Violation
     from ..log.health.session_check import SessionHealth
     from ..log.health.tallies import BusHealth, SeriesHealth
 
@@ -170,24 +172,29 @@ def _utc(t_ns: int) -> str:
     return datetime.fromtimestamp(t_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-def log_check(file: Path, /, *more: Path, json: bool = False) -> int:
+def log_check(file: Path, /, *more: Path, contract: bool = False, json: bool = False) -> int:
     """Judge whether a recorded session is good, degraded or bad, and why.
 
     Everything is computed from the data: rhythm, gaps, jitter and dropped messages of every
     channel, values that are not a number, frozen joints and joints at their limits, the CRC of
     every chunk, error frames and load of the bus. Exit code 1 for a bad session.
     Several logs, folders of them or patterns give a table, a line each.
+    With `--contract` the question is another: does a log, of any make, follow the log contract,
+    and what has its writer to do where it doesn't?
 
     Example: `undulog log check run.mcap`
 
     Args:
         file: An MCAP file, of any make, or its URL, which is fetched whole.
         more: More of them; a folder has all logs in it, a pattern such as 'runs/**/*.mcap' too.
+        contract: Check against the log contract; exit code 1 for a log that breaks it.
         json: Print one JSON object, or for several logs a list of them.
     """
     from ..log.health.session_check import check_session
 
     paths = sessions_of([file, *more])
+    if contract:
+        return _check_contracts(paths, as_json=json)
     if len(paths) > 1:
         return show(each(paths, "log check", _check_line), as_json=json)
     (file,) = paths
@@ -195,6 +202,46 @@ def log_check(file: Path, /, *more: Path, json: bool = False) -> int:
         health = check_session(file, bar.update)
     emit(as_json(health), _check_lines(health), as_json=json)
     return int(health.verdict == "bad")
+
+
+def _check_contracts(paths: Sequence[Path], *, as_json: bool) -> int:
+    from ..log.health.contract import RULES, check_contract
+
+    if len(paths) > 1:
+        return show(each(paths, "log check", _contract_line), as_json=as_json)
+    (path,) = paths
+    found = check_contract(path)
+    facts = _contract_facts(path, found)
+    verdict = f"{_count(found)} of" if found else f"follows all {len(RULES)} rules of"
+    head = f"{path.name}: {verdict} the log contract, version {facts['contract']}"
+    emit(facts, [head, *(f"  {one}" for one in found)], as_json=as_json)
+    return int(bool(found))
+
+
+def _contract_line(path: Path) -> Line:
+    from ..log.health.contract import check_contract
+
+    found = check_contract(path)
+    with Session.open(path) as session:
+        robot = session.robot.name if session.robot is not None else ""
+        gait = stated_gait(session.metadata)
+    first = str(found[0]) if found else "follows the log contract"
+    verdict = _count(found) if found else "follows"
+    return Line(robot, gait, verdict, first, _contract_facts(path, found), not found)
+
+
+def _count(found: Sequence[Violation]) -> str:
+    return f"{len(found)} violation{'s' if len(found) != 1 else ''}"
+
+
+def _contract_facts(path: Path, found: Sequence[Violation]) -> dict[str, Any]:
+    violations = [asdict(one) for one in found]
+    return {
+        "path": str(path),
+        "contract": CONTRACT_VERSION,
+        "follows": not found,
+        "violations": violations,
+    }
 
 
 def _check_line(path: Path) -> Line:

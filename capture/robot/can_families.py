@@ -1,7 +1,7 @@
 """Motor families on CAN, as DBC databases and map entries made from the motors' numbers.
 
 Layouts follow the manufacturers' manuals and libraries, named at each function. What they were
-checked against, and which ranges are in doubt, is in ``docs/motor-families.md``.
+checked against, and which ranges are in doubt, is in ``docs/reference/motor-families.md``.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 ::
 
     [bus]
-    family = "feetech"            # see `docs/motor-families.md`
+    family = "feetech"            # see `docs/reference/motor-families.md`
     model = "sts3215"
     ids = [1, 2, 3]               # of the joints, head to tail
 

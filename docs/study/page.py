@@ -254,7 +254,7 @@ def _prediction() -> list[str]:
     """Return the tables of ``prediction.py``, from ``rows/prediction`` where it was computed."""
     folder = HERE / "rows" / "prediction"
     if not folder.is_dir():
-        known = "[Oscillators](oscillators.md#measured-in-the-twin)"
+        known = "[Oscillators](explanation/oscillators.md#measured-in-the-twin)"
         return [f"{known} has what has been predicted so far: 5 to 13 yaw joints."]
     from .prediction import PATTERNS, STANDARD, rows, summary
 

@@ -28,8 +28,9 @@ STATEMENTS = (
         "Segments move unequally: amplitude and phase of head, middle and tail differ.",
         "refined",
         "It holds for the joints' response to their commands, as the last figure of "
-        "[the paper, figure by figure](paper.md) has it beside its null. Link positions, which the "
-        "paper shows, differ by kinematics alone with every joint exactly on its command.",
+        "[the paper, figure by figure](explanation/paper.md) has it beside its null. Link "
+        "positions, which the paper shows, differ by kinematics alone with every joint exactly on "
+        "its command.",
         ("weak-servos", "boundary"),
     ),
     Statement(
@@ -73,23 +74,26 @@ STATEMENTS = (
         "The last figure compares lags of π/2 and π/3.",
         "refined",
         "Joints respond the more alike the larger the lag. Part of what link positions show is "
-        "kinematics: [the null](paper.md#head-middle-and-tail-of-13-links) beside that figure.",
+        "kinematics: [the null](explanation/paper.md#head-middle-and-tail-of-13-links) beside that "
+        "figure.",
         ("short-waves",),
     ),
     Statement(
         "Contact is a spring and damper, F_n = -k p_z - d v_z for p_z < 0 (Eq. 7).",
         "refined",
-        "Clamped at 0: ground doesn't pull ([physics](physics.md)).",
+        "Clamped at 0: ground doesn't pull ([physics](explanation/physics.md)).",
     ),
     Statement(
         "A chain of delay blocks makes the serpentine wave of Eq. 2.",
         "refined",
-        "Equal at constant frequency and amplitude alone ([delay blocks](paper.md#delay-blocks)).",
+        "Equal at constant frequency and amplitude alone "
+        "([delay blocks](explanation/paper.md#delay-blocks)).",
     ),
     Statement(
         "A~(d) = exp(k d) - A_max shrinks the amplitude near a wall.",
         "refined",
-        "Ill-formed as printed; [adaptive control](control.md) has the bounded law that does.",
+        "Ill-formed as printed; [adaptive control](explanation/control.md) has the bounded law "
+        "that does.",
     ),
 )
 

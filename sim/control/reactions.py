@@ -6,7 +6,7 @@ as a point on the ground, while the robot moves on.
 
 The reactions are the adaptive control laws of Meister, Stepanenko & Kernbach 2011: distance in,
 gait out. Each takes the distance d >= 0 to an obstacle [m]; +inf, nothing in range, changes
-nothing. ``docs/control.md`` says where they depart from the printed form, and why.
+nothing. ``docs/explanation/control.md`` says where they depart from the printed form, and why.
 """
 
 from __future__ import annotations

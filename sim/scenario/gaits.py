@@ -1,4 +1,4 @@
-"""The ``[gait]`` table of a scenario, read and written; ``docs/gaits.md`` lists its keys."""
+"""The ``[gait]`` table of a scenario, read and written; its keys: ``docs/reference/gaits.md``."""
 
 from __future__ import annotations
 

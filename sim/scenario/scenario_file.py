@@ -12,7 +12,7 @@ A scenario::
     engine = "bullet"               # or "mujoco": who solves the body's dynamics
 
     [gait]
-    kind = "serpentine"             # or "delay-blocks", "oscillators": see docs/gaits.md
+    kind = "serpentine"             # or "delay-blocks", "oscillators": see docs/reference/gaits.md
     ramp_s = 2.0                    # amplitude and offset grow from nothing over this time
 
     [gait.horizontal]               # and [gait.vertical]; rad throughout
@@ -41,7 +41,7 @@ A scenario::
     drag_tangential = 1.0           # N s/m, of a link, viscous law
     drag_normal = 10.0
 
-    [[world.obstacles]]             # see docs/twin-world.md for all that can stand in the way,
+    [[world.obstacles]]             # docs/reference/twin-world.md: all that can stand in the way,
     shape = "cylinder"              # for [world.field], [world.obstacle_contact] and the sensors
     position = [1.5, 0.2]           # m
     radius = 0.1                    # m

@@ -9,7 +9,7 @@ import pytest
 from support.paths import DOCS, SHARED
 from support.processes import run
 
-PAGE = (DOCS / "other-robots.md").read_text()
+PAGE = (DOCS / "how-to/other-robots.md").read_text()
 BLOCKS = re.findall(r"```console\n(.*?)```", PAGE, re.DOTALL)
 
 

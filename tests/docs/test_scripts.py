@@ -9,8 +9,8 @@ from support.paths import ROOT
 from support.processes import run
 
 DOCS = ROOT / "docs"
-RUN_ELSEWHERE = {"conf.py", "notebook_page.py"}
-"""Run by Sphinx (``make docs``), the second by test_notebook.py, too."""
+RUN_ELSEWHERE = {"conf.py", "notebook_page.py", "reference_pages.py"}
+"""Run by Sphinx (``make docs``), the others by tests of their own, too."""
 
 PICTURES = {"pictures.py", "side_by_side.py"}
 """Need the viewer's driver."""

@@ -43,7 +43,7 @@ def test_the_rows_in_the_tree_give_the_page_and_all_conclusions():
     [(5, 0.25, -0.034, -0.022, 0.28), (9, 0.25, -0.017, -0.031, 0.68)],
 )
 def test_kicks_as_rows_give_the_matrix_of_a_kick_experiment(n, stall, gap, homogeneous, explicit):
-    """docs/oscillators.md has these, from sessions by ``analyse_experiment``."""
+    """docs/explanation/oscillators.md has these, from sessions by ``analyse_experiment``."""
     rows = read_rows(LONG)
     rows = rows[rows["plan"] == f"kicks-{n}-{stall}"]
     one = coupling.measures(coupling.kicked(rows)).iloc[0]

@@ -1,4 +1,4 @@
-"""The table of faults in docs/faults.md: ``PYTHONPATH=tests python -m zoo.page`` prints it."""
+"""The table of docs/explanation/faults.md: ``PYTHONPATH=tests python -m zoo.page`` prints it."""
 
 from .faults import FAULTS, plant
 from .robot import Channels, draw

@@ -71,7 +71,7 @@ def test_a_healthy_robot_answers_as_drawn():
 
 
 def test_the_manual_lists_the_kinds_of_every_fault():
-    page = (DOCS / "faults.md").read_text()
+    page = (DOCS / "explanation/faults.md").read_text()
     assert "\n".join(lines()) in page, "renew it: python -m zoo.page"
 
 

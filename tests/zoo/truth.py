@@ -1,7 +1,7 @@
 """Right statements about a planted fault: the joints, since when, and which kinds.
 
 The kinds follow from physics and from what is logged, never from what the code under test does.
-``docs/faults.md`` gives the same table with the reasons.
+``docs/explanation/faults.md`` gives the same table with the reasons.
 """
 
 from dataclasses import dataclass

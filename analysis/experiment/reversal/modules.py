@@ -27,8 +27,8 @@ It differs from one bad module in three ways:
   make some hundredths. That it doesn't lean excludes nothing: an offset may hide it.
 
 The first two are statements about the size of effects, not theorems: measured on the twin in
-docs/heterogeneity.md. Runs with the robot turned by half a turn (:mod:`.reversal.mirror`)
-need none of them.
+docs/explanation/heterogeneity.md. Runs with the robot turned by half a turn
+(:mod:`.reversal.mirror`) need none of them.
 """
 
 from __future__ import annotations

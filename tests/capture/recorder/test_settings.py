@@ -24,7 +24,7 @@ from undulog.capture.common.amounts import (
 from undulog.capture.common.errors import DataError, InputFileError, SettingsError
 from undulog.capture.recorder.settings import DEFAULT_FLOOR, ENVIRONMENT_PREFIX, PARSERS, resolve
 
-MANUAL = DOCS / "recording.md"
+MANUAL = DOCS / "how-to/recording.md"
 NEEDED = {"sources": ("can:virtual:a",), "output": "run.mcap"}
 
 

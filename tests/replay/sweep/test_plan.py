@@ -84,7 +84,7 @@ def test_what_can_not_be_meant_is_refused_with_the_key(text, message, tmp_path):
 
 
 def test_the_plan_of_the_manual_is_one(tmp_path):
-    page = (Path(__file__).parents[3] / "docs" / "sweeps.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "how-to/sweeps.md").read_text()
     path = tmp_path / "strength.toml"
     path.write_text(page.split("```toml\n")[1].split("```")[0])
     sweep = prepare(read_plan(path), tmp_path, str(tmp_path / "strength"))

@@ -207,7 +207,7 @@ def test_a_lag_may_turn_round_through_zero(make_plan, make_robot):
 
 
 def test_the_manuals_plan_is_one():
-    text = (DOCS / "driving.md").read_text().split("```toml\n")[1].split("```")[0]
+    text = (DOCS / "how-to/driving.md").read_text().split("```toml\n")[1].split("```")[0]
     assert is_plan(text)
     plan = parse_plan(text, Path("turn.toml"))
     assert plan.duration_s == 26.0

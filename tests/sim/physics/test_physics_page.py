@@ -8,7 +8,7 @@ import pytest
 from support.paths import DOCS
 
 SIM = Path(__file__).parents[1]
-PAGE = (DOCS / "physics.md").read_text(encoding="utf-8")
+PAGE = (DOCS / "explanation/physics.md").read_text(encoding="utf-8")
 NAMED = sorted(set(re.findall(r"`(test_\w+(?:\.py)?)`", PAGE)))
 
 

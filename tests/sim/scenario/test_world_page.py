@@ -8,7 +8,7 @@ import pytest
 from support.paths import DOCS
 from undulog import sim
 
-PAGE = (DOCS / "twin-world.md").read_text()
+PAGE = (DOCS / "reference/twin-world.md").read_text()
 
 
 def test_the_examples_make_a_scenario():

@@ -2,9 +2,7 @@
 
 import json
 import math
-import os
 import re
-import shlex
 import signal
 import socket
 import subprocess
@@ -267,45 +265,8 @@ def test_it_ends_in_good_order(number, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_manuals_three_terminals_do_what_they_say(tmp_path):
-    page = (ROOT / "docs" / "virtual-robot.md").read_text()
-    section = page[page.index("## Three terminals") : page.index("## The bus")]
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    section = section.replace("29536", str(port)).replace("--duration 20", "--duration 2")
-    commands = [line[2:] for line in section.splitlines() if line.startswith("$ ")]
-    serve, record, drive, stop = (shlex.split(command)[1:] for command in commands)
-    options = {"env": os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}, "cwd": tmp_path}
-    with process(*UNDULOG, *serve, **options) as robot:
-        line = robot.stdout.readline().rstrip()
-        assert line == f"snake25 is on can0 at 127.0.0.1:{port}; it waits for commands"
-        assert line in section
-        with process(*UNDULOG, *record, **options) as recording:
-
-            def connected():
-                status = undulog("record", "status", "--json", **options)
-                found = json.loads(status.stdout or "{}").get("recordings", [])
-                return found and found[0]["sources"][0]["connected"]
-
-            wait_for(connected, "the recorder")
-            for words in (drive, stop):
-                subprocess.run([*UNDULOG, *words], check=True, timeout=PATIENCE_S, **options)
-            assert recording.wait(60) == 0
-        robot.send_signal(signal.SIGINT)
-        shown, _ = robot.communicate(timeout=60)
-        assert robot.returncode == 0
-        assert re.match(r"snake25 ran for [\d.]+ s of flat ", shown)
-    with Session.open(tmp_path / "run.mcap") as session:
-        commanded, measured = (session.joints(f"/joint_{w}") for w in ("commands", "states"))
-        assert commanded.names == measured.names == session.robot.joint_names
-        # How many there are depends on what else the computer has to do.
-        assert min(len(series.values[0]) for series in (commanded, measured)) > 20
-        assert session.channels["/gait"].count > 20
-
-
-@pytest.mark.slow
 def test_the_manuals_own_controller_moves_the_robot():
-    page = (ROOT / "docs" / "virtual-robot.md").read_text()
+    page = (ROOT / "docs" / "how-to/virtual-robot.md").read_text()
     (snippet,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     with serving("flat", "--wait") as (robot, ready):
         snippet = snippet.replace("29536", str(ready["port"])).replace("range(1000)", "range(50)")

@@ -1,0 +1,188 @@
+"""JSON Schemas of the results, made from their dataclasses and the docstrings of these.
+
+The schemas ship as files in ``analysis/results/schemas``; ``make schemas`` writes them. A test
+holds them to the dataclasses, and real results to them. A key that is new leaves the version as it
+is; a key that is removed, renamed or of another type raises it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from types import NoneType, UnionType
+from typing import Any, Union, cast, get_args, get_origin, get_type_hints
+
+from . import analysis, artefact, oscillators
+from .analysis import Analysis, interval_key
+from .comparison import Comparison
+from .estimate import Estimate
+from .experiment import Experiment
+from .free_motion import BodyWave, JointMotion
+from .frequency_response import JointFrequencyResponse
+
+VERSION = 1
+
+RESULTS: dict[str, tuple[type, str]] = {
+    "analysis": (Analysis, "undulog analyse FILE --json"),
+    "experiment": (Experiment, "undulog analyse FILE FILE ... --json"),
+    "comparison": (Comparison, "undulog compare A B --json"),
+    "prediction": (oscillators.ClosedLoop, "undulog predict FILE --eps EPS --json"),
+}
+"""Name of each result to its dataclass and the command that prints it."""
+
+_FLAT = frozenset(
+    {
+        analysis.BodyPoint,
+        analysis.GaitFacts,
+        analysis.GroupFacts,
+        analysis.JointResult,
+        analysis.Transport,
+        BodyWave,
+        JointFrequencyResponse,
+        JointMotion,
+    }
+)
+"""Records of a session whose estimates are two keys each, as :meth:`.Analysis.to_dict` has them."""
+
+_DERIVED: dict[type, dict[str, Any]] = {
+    artefact.Artefact: {"about": {"type": "string"}},
+    BodyWave: {"direction": {"enum": ["first-to-last", "last-to-first", "undecided"]}},
+}
+_INTERVAL = {
+    "description": "Low and high end of the 95 % interval.",
+    "type": ["array", "null"],
+    "items": {"type": "number"},
+    "minItems": 2,
+    "maxItems": 2,
+}
+_PLAIN: dict[Any, str] = {float: "number", int: "integer", str: "string", bool: "boolean"}
+_ATTRIBUTES = re.compile(r"^Attributes:\n(.*?)(?=^\S|\Z)", re.MULTILINE | re.DOTALL)
+_ENTRY = re.compile(r"^    (\w+): (.*?)(?=^    \w+: |\Z)", re.MULTILINE | re.DOTALL)
+_ROLE = re.compile(r":\w+:`~?\.?([^`]*)`|``([^`]*)``")
+
+
+def result_schema(name: str) -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of a result.
+
+    Args:
+        name: One of :data:`RESULTS`.
+    """
+    cls, command = RESULTS[name]
+    writer = _Writer(flat=cls is Analysis)
+    root = writer.record(cls)
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": f"urn:undulog:{name}:{VERSION}",
+        "title": f"What {command} prints, version {VERSION}",
+        **root,
+        "$defs": dict(sorted(writer.definitions.items())),
+    }
+
+
+class _Writer:
+    """Writes records; an estimate is two keys in those of a session, an object elsewhere."""
+
+    def __init__(self, *, flat: bool) -> None:
+        self.definitions: dict[str, Any] = {}
+        self._names: dict[tuple[type, bool], str] = {}
+        self._flat = flat
+
+    def record(self, cls: type) -> dict[str, Any]:
+        hints = get_type_hints(cls, localns=vars(oscillators))
+        described = _descriptions(cls)
+        properties: dict[str, Any] = {}
+        for one in fields(cls):
+            about = {"description": described[one.name]} if one.name in described else {}
+            if self._flat and cls in _FLAT and hints[one.name] is Estimate:
+                properties[one.name] = about | {"type": ["number", "null"]}
+                properties[interval_key(one.name)] = _INTERVAL
+            else:
+                properties[one.name] = about | self._type(hints[one.name])
+        if self._flat:
+            properties |= _DERIVED.get(cls, {})
+        return {
+            "description": _text(inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0]),
+            "type": "object",
+            "properties": properties,
+            "required": sorted(properties),
+        }
+
+    def _type(self, hint: Any) -> dict[str, Any]:
+        if hint is Any or hint in _PLAIN:
+            return {} if hint is Any else {"type": _PLAIN[hint]}
+        arguments = get_args(hint)
+        origin = get_origin(hint)
+        if origin in (Union, UnionType):
+            return self._one_of(arguments)
+        if origin is tuple:
+            return self._array(arguments)
+        if origin is dict:
+            return {"type": "object", "additionalProperties": self._type(arguments[1])}
+        if not (is_dataclass(hint) or issubclass(hint, Enum)):
+            raise TypeError(f"a result has a field of {hint}, which has no JSON Schema here")
+        return self._class(cast("type[Any]", hint))
+
+    def _class(self, hint: type[Any]) -> dict[str, Any]:
+        if issubclass(hint, Enum):
+            return {"enum": [one.value for one in hint]}
+        kinds = [self._reference(one) for one in _kinds(hint)]
+        return kinds[0] if len(kinds) == 1 else {"anyOf": kinds}
+
+    def _one_of(self, arguments: tuple[Any, ...]) -> dict[str, Any]:
+        kinds = [self._type(one) for one in arguments if one is not NoneType]
+        if NoneType not in arguments:
+            return {"anyOf": kinds}
+        if len(kinds) == 1 and isinstance(kinds[0].get("type"), str):
+            return kinds[0] | {"type": [kinds[0]["type"], "null"]}
+        return {"anyOf": [*kinds, {"type": "null"}]}
+
+    def _array(self, arguments: tuple[Any, ...]) -> dict[str, Any]:
+        if len(arguments) == 2 and arguments[1] is Ellipsis:
+            return {"type": "array", "items": self._type(arguments[0])}
+        return {
+            "type": "array",
+            "prefixItems": [self._type(one) for one in arguments],
+            "minItems": len(arguments),
+            "maxItems": len(arguments),
+        }
+
+    def _reference(self, cls: type) -> dict[str, Any]:
+        outside, self._flat = self._flat, self._flat or cls is Analysis
+        key = (cls, self._flat and cls in _FLAT)
+        if key not in self._names:
+            self._names[key] = name = self._free_name(cls)
+            self.definitions[name] = {}
+            self.definitions[name] = self.record(cls)
+        self._flat = outside
+        return {"$ref": f"#/$defs/{self._names[key]}"}
+
+    def _free_name(self, cls: type) -> str:
+        """Return the name of a record, with that of its module where another record has it."""
+        name = cls.__name__
+        if name not in self.definitions:
+            return name
+        if any(one is cls for one, _ in self._names):
+            return f"{name}Nested"
+        return cls.__module__.rpartition(".")[2].title().replace("_", "") + name
+
+
+def _kinds(cls: type[Any]) -> list[type[Any]]:
+    """Return the record and those that refine it, the most special first."""
+    found = [kind for one in cls.__subclasses__() for kind in _kinds(one)]
+    return [*found, cls]
+
+
+def _descriptions(cls: type) -> dict[str, str]:
+    """Return what the docstrings of a record and its bases tell of each field."""
+    found: dict[str, str] = {}
+    for one in reversed(cls.__mro__):
+        if section := _ATTRIBUTES.search(inspect.cleandoc(one.__doc__ or "")):
+            found |= {name: _text(text) for name, text in _ENTRY.findall(section[1])}
+    return found
+
+
+def _text(text: str) -> str:
+    plain = _ROLE.sub(lambda m: m[1] or m[2], " ".join(text.split()))
+    return re.sub(r"\bNone\b", "null", plain)
