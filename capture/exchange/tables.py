@@ -22,10 +22,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError
-from .array_files import read_mat, read_npz
+from .array_files import read_mat, read_npz, read_tensors
 from .packing import WIDEST, Block, check_rows, refuse, rows_of_block, spread
 from .parquet_files import block_of, read_parquet
-from .torch_zip import read_tensors
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".mat", ".parquet", ".pt", ".pth")
 ARRAY_SUFFIXES = TABLE_SUFFIXES[3:]
