@@ -125,7 +125,7 @@ def view_clip(
         from ..feed.film import check_film, film, scene_only
     except ModuleNotFoundError as error:
         raise MissingExtraError("'undulog view --clip'", "replay", error.name or "av") from error
-    from ..draw.scene.body import body_title
+    from ..draw.body import body_title
     from ..feed.recording import write_recording
 
     refuse_existing(clip, force=force)

@@ -25,8 +25,8 @@ from undulog.capture.recorder.live_wire import LiveMessage
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Robot
 
-from ..draw.plots.lines import MODE
-from ..draw.scene.motion import POSE, HeadPath, tracked_head
+from ..draw.lines import MODE
+from ..draw.motion import POSE, HeadPath, tracked_head
 from ..samples.tracks import JOINT_STATE, OFFSETS, Columns, Track, ordered, without_filler
 
 PATIENCE_NS = 250_000_000

@@ -13,8 +13,8 @@ from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.capture.robot.model import Robot
 
-from ...samples.quantities import mechanical_power
-from ...samples.tracks import (
+from ..samples.quantities import mechanical_power
+from ..samples.tracks import (
     Columns,
     Track,
     decimate,

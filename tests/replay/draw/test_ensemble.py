@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from undulog.capture.robot.kinematics import link_poses
-from undulog.replay.draw.cycles.ensemble import DEGREES, body_frame, mean_cycles, pace_of
+from undulog.replay.draw.ensemble import DEGREES, body_frame, mean_cycles, pace_of
 from undulog.replay.samples.content import Places
 from undulog.replay.samples.timeline import Rhythm
 from undulog.replay.samples.tracks import Track

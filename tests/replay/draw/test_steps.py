@@ -17,9 +17,9 @@ from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.session.cycles import CycleMaps
 from undulog.capture import Session
 from undulog.capture.common.palette import joint_colors
-from undulog.replay.draw.cycles.heat_maps import cell_colors, heat_maps
-from undulog.replay.draw.cycles.steps import charts, cycle_tables, together
-from undulog.replay.draw.scene.body import power_colors
+from undulog.replay.draw.body import power_colors
+from undulog.replay.draw.heat_maps import cell_colors, heat_maps
+from undulog.replay.draw.steps import charts, cycle_tables, together
 from undulog.replay.feed.recording import write_recording
 from undulog.replay.samples.content import ENERGY, GAIN, LAG, CycleTable
 

@@ -18,8 +18,8 @@ from undulog.capture.robot.model import Robot, Sensor, SensorKind
 from undulog.sim.scenario.obstacles import Box, Cylinder, Obstacle, Target, Wall
 from undulog.sim.scenario.world import World, read_world
 
-from ...samples.timeline import Clock, Span, Stretch
-from ...samples.tracks import decimate, gaps, hold, ordered
+from ..samples.timeline import Clock, Span, Stretch
+from ..samples.tracks import decimate, gaps, hold, ordered
 from . import body
 from .body import ROUNDING, Look, rounded_to
 from .motion import HeadPath, Motion, assemble, frames_of

@@ -22,9 +22,9 @@ from undulog.capture.common.errors import DataError
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Plane, Robot
 
-from ...samples.content import GREY, SCALARS, TOTAL, Color, Places, line_title
-from ...samples.timeline import Clock, Rhythm
-from ...samples.tracks import Track, rounded
+from ..samples.content import GREY, SCALARS, TOTAL, Color, Places, line_title
+from ..samples.timeline import Clock, Rhythm
+from ..samples.tracks import Track, rounded
 
 PLACES = "/joints/places"
 DEGREES = "Angle:degrees"

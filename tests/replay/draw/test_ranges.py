@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from undulog.capture.robot.kinematics import link_poses
 from undulog.capture.robot.model import Sensor, SensorKind
-from undulog.replay.draw.scene.stage import rays
+from undulog.replay.draw.stage import rays
 
 
 def ir(name="ir01", link="link01", position=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0), limit=1.5):

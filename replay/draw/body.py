@@ -27,9 +27,9 @@ from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.kinematics import mesh_type, quaternion_from_rotation
 from undulog.capture.robot.model import Robot
 
-from ...samples.content import GREY, NAMED, Color, Content, Places
-from ...samples.quantities import power_limit, segment_power
-from ...samples.timeline import Clock
+from ..samples.content import GREY, NAMED, Color, Content, Places
+from ..samples.quantities import power_limit, segment_power
+from ..samples.timeline import Clock
 from .motion import Motion
 
 MESHES = "/world/snake/meshes"

@@ -31,7 +31,7 @@ from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.session.cycles import LEAST_COVERED, CycleMaps
 from undulog.capture.common.arrays import FloatArray, IntArray
 
-from ...samples.content import (
+from ..samples.content import (
     ENERGY,
     GAIN,
     GREY,
@@ -44,10 +44,10 @@ from ...samples.content import (
     Quantity,
     Series,
 )
-from ...samples.timeline import Clock
-from ...samples.tracks import Track
-from ...samples.tracks import tables as tables_of
-from ..plots.lines import log_look, log_rows, part_entities
+from ..samples.timeline import Clock
+from ..samples.tracks import Track
+from ..samples.tracks import tables as tables_of
+from .lines import log_look, log_rows, part_entities
 
 CYCLES = "/cycles"
 

@@ -24,9 +24,9 @@ from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 from undulog.capture.robot.kinematics import link_poses
 from undulog.capture.robot.model import Robot
 
-from ...samples.content import Places
-from ...samples.timeline import Rhythm
-from ...samples.tracks import Track, interpolate
+from ..samples.content import Places
+from ..samples.timeline import Rhythm
+from ..samples.tracks import Track, interpolate
 
 DEGREES = np.rint(np.degrees(np.append(phases_rad(), 2 * np.pi))).astype(np.int64)
 """Phases of a mean cycle, the end again like the beginning [degrees], shape (p,)."""

@@ -20,13 +20,13 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Robot
 
-from ...samples.content import GREY, Color, MeanCycle, Series, line_title
-from ...samples.quantities import mechanical_power, segment_power
-from ...samples.timeline import ENSEMBLE_CYCLE, Clock
-from ...samples.tracks import Columns, read_columns
-from ..plots.lines import log_look
-from ..scene.body import Look, capsule_columns, capsule_poses, power_colors
+from ..samples.content import GREY, Color, MeanCycle, Series, line_title
+from ..samples.quantities import mechanical_power, segment_power
+from ..samples.timeline import ENSEMBLE_CYCLE, Clock
+from ..samples.tracks import Columns, read_columns
+from .body import Look, capsule_columns, capsule_poses, power_colors
 from .ensemble import DEGREES, MeanCycles, Pace, body_frame, falsified, mean_cycles, pace_of
+from .lines import log_look
 
 ENSEMBLE = "/ensemble"
 BODY = f"{ENSEMBLE}/body"

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from undulog.capture.robot.kinematics import link_poses
-from undulog.replay.draw.scene import body
-from undulog.replay.draw.scene.motion import HeadPath, assemble, frames_of
+from undulog.replay.draw import body
+from undulog.replay.draw.motion import HeadPath, assemble, frames_of
 from undulog.replay.samples.quantities import power_limit, segment_power
 from undulog.replay.samples.tracks import Track
 

@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 import undulog
 from undulog.capture import Session
 from undulog.capture.common.errors import MissingChannelError
-from undulog.replay.draw.plots.write import is_foreign, log_others
+from undulog.replay.draw.plots import is_foreign, log_others
 
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = ["front_yaw", "mid_yaw", "rear_yaw"]

@@ -21,9 +21,9 @@ from undulog.analysis.results.formats import number
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_colors
 
-from ...samples.content import ENERGY, GAIN, LAG, NAMED, Color, CycleTable, HeatMap, Quantity
-from ...samples.timeline import Clock
-from ..scene.body import power_colors
+from ..samples.content import ENERGY, GAIN, LAG, NAMED, Color, CycleTable, HeatMap, Quantity
+from ..samples.timeline import Clock
+from .body import power_colors
 from .steps import cycle_edges_ns, together
 
 POWER = Quantity("power_milliwatt", "Power", "mW")

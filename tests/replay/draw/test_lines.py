@@ -4,8 +4,8 @@ import numpy as np
 
 from undulog.capture.common.palette import joint_colors
 from undulog.capture.robot.model import Plane
-from undulog.replay.draw.plots.lines import changes, head_middle_tail, joint_palette, rhythm_of
-from undulog.replay.draw.scene.stage import trail_segments
+from undulog.replay.draw.lines import changes, head_middle_tail, joint_palette, rhythm_of
+from undulog.replay.draw.stage import trail_segments
 from undulog.replay.samples import quantities
 from undulog.replay.samples.tracks import Track
 

@@ -22,7 +22,7 @@ from undulog.capture.common.errors import DataError
 from undulog.capture.log.columns.topics import Channel
 from undulog.capture.robot.model import Robot
 
-from ...samples.content import (
+from ..samples.content import (
     COMMANDED,
     ERROR,
     MEASURED,
@@ -36,9 +36,9 @@ from ...samples.content import (
     Signal,
     signal_title,
 )
-from ...samples.quantities import SIGNALS, topic_entity
-from ...samples.timeline import Clock, stretch_length_ns
-from ...samples.tracks import JOINT_STATE, Track, join_tracks, mark_gaps, ordered, plot_step
+from ..samples.quantities import SIGNALS, topic_entity
+from ..samples.timeline import Clock, stretch_length_ns
+from ..samples.tracks import JOINT_STATE, Track, join_tracks, mark_gaps, ordered, plot_step
 from .lines import (
     DEGREES,
     EVENTS,
@@ -224,7 +224,7 @@ class Plot:
     def style(
         self, rec: rr.RecordingStream, palette: Mapping[str, Color] | None, **look: Any
     ) -> None:
-        """Write the style of its lines, as :func:`~.replay.draw.plots.lines.log_look` takes it."""
+        """Write the style of its lines, as :func:`~.replay.draw.lines.log_look` takes it."""
         for one in self.series:
             log_look(rec, one.entity, one.names, palette, **look)
 
