@@ -10,8 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
-from undulog.capture.commands.several import FAILED, Line, each, sessions_of, show
+from undulog.capture.commands.sessions import (
+    CONTRACT,
+    FAILED,
+    JointTopicOptions,
+    Line,
+    each,
+    sessions_of,
+    show,
+)
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output, write_text

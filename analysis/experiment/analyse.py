@@ -42,8 +42,7 @@ from .answer import broken_first, experiment_answer, kick_answer, sweep_answer
 from .kicks.coupling import kick_coupling
 from .kicks.local import ROW_TOLERANCE
 from .kicks.runs import MOST_KICK, MOST_PATTERN, SAME, find_kicks
-from .multisine.answer import multisine_answer
-from .multisine.estimate import best_linear_responses
+from .multisine.estimate import best_linear_responses, multisine_answer
 from .multisine.runs import MultisineRun, MultisineRuns, find_multisine, multisine_run
 from .pooling import PooledResponse, experiment_indices, pool_runs, pooled_answer
 from .reversal.mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS

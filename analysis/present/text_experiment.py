@@ -10,7 +10,7 @@ from undulog.capture.common.console import UNLIMITED, plain
 
 from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, margin_text
 from ..experiment.answer import kick_detail, sweep_detail, sweep_method
-from ..experiment.multisine.answer import multisine_method
+from ..experiment.multisine.estimate import multisine_method
 from ..experiment.reversal.modules import SIGNIFICANT
 from ..results import formats
 from ..results.comparison import Change, Comparison

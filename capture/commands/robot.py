@@ -22,7 +22,7 @@ from ..log.read.sample_times import JointSignals
 from ..log.read.session_view import SessionView
 from ..robot.description import numbered, parse_robot
 from ..robot.model import Robot
-from .joint_options import CONTRACT, JointTopicOptions
+from .sessions import CONTRACT, JointTopicOptions
 
 _SCALES = {"rad": 1.0, "deg": math.radians(1.0)}
 

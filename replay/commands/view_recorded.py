@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from undulog.capture import Session
-from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
+from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import MissingExtraError, UsageError
 from undulog.capture.common.process import interruptible
 
+from .. import viewer
 from ..samples.content import Tab
-from ..viewer import viewer
 
 if TYPE_CHECKING:
     from ..feed.film import Shot

@@ -50,7 +50,7 @@ from ..samples.content import (
 from ..samples.survey import GAIT, Survey, comes, survey
 from ..samples.timeline import STRETCH_NS, Rhythm, Span, Stretch, stretches
 from ..samples.tracks import wanted_fields
-from ..viewer.viewer import Viewer
+from ..viewer import Viewer
 from .numbers import Analysing
 from .recording import open_recording, recording_id, send_properties
 

@@ -23,7 +23,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from undulog.capture import SessionView
-from undulog.capture.commands.several import Line, first_sentence
+from undulog.capture.commands.sessions import Line, first_sentence
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import plain
 from undulog.capture.common.errors import UsageError

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.free_motion.estimate import fit_motion, free_motion
+from undulog.analysis.free_motion import fit_motion, free_motion
 from undulog.analysis.response.fitting import fit_gait
 from undulog.capture.robot.description import load_robot
 

@@ -14,7 +14,7 @@ from rerun.experimental import View, ViewerClient
 
 from undulog.capture.common.errors import UndulogError
 
-from ..samples.timeline import ENSEMBLE_CYCLE, SESSION_TIME
+from .samples.timeline import ENSEMBLE_CYCLE, SESSION_TIME
 from .viewer import Viewer
 
 _START_S = 60.0
