@@ -4,7 +4,6 @@ import bz2
 import re
 import sqlite3
 import struct
-import tempfile
 
 import lz4.frame
 import pytest
@@ -27,16 +26,6 @@ def fill(bag):
     own = Filler(bag)
     for tick in ticks(0.3):
         own.state(*tick)
-
-
-@pytest.fixture(autouse=True)
-def scratch(tmp_path, monkeypatch):
-    """A folder of temporary files, which must be empty after each test."""
-    folder = tmp_path / "scratch"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    yield
-    assert not any(folder.iterdir())
 
 
 def refused(path, match):
