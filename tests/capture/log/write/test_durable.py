@@ -19,7 +19,7 @@ from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import DataError, LogWriteError, OutputExistsError
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.definitions import ERROR, OK, DiagnosticStatus, schema_text
-from undulog.capture.log.sinks.durable_sink import DurableSink
+from undulog.capture.log.write.durable_sink import DurableSink
 from undulog.capture.recorder.recording import TappedSink
 
 EPOCH_NS = recorder.EPOCH_NS

@@ -19,8 +19,8 @@ from support.processes import python, wait_for
 from support.read_back import messages_of, metadata_of
 from undulog.capture import Session
 from undulog.capture.common.errors import LogWriteError
-from undulog.capture.log.sinks.mcap_sink import McapSink
-from undulog.capture.log.sinks.ring_sink import (
+from undulog.capture.log.write.mcap_sink import McapSink
+from undulog.capture.log.write.ring_sink import (
     MARK_RECORD,
     MAX_WAITING,
     MESSAGE_OVERHEAD,
@@ -300,7 +300,7 @@ def test_a_process_that_ends_without_a_close_still_writes_its_mark(tmp_path):
     code = (
         "from pathlib import Path\n"
         "from mcap.records import Channel\n"
-        "from undulog.capture.log.sinks.ring_sink import RingSink\n"
+        "from undulog.capture.log.write.ring_sink import RingSink\n"
         f"ring = RingSink(Path({str(tmp_path)!r}) / 'run.mcap', 10**9)\n"
         "ring.define(Channel(1, '/a', 'cdr', {}, 0))\n"
         "for k in range(50_000):\n"
