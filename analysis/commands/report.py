@@ -228,7 +228,7 @@ def _page_names(paths: Sequence[Path]) -> dict[Path, str]:
 def _fleet(where: str, find: str, output: Path) -> tuple[str, dict[str, Any], int]:
     """Return the page on the sessions of a catalogue, its result, and the number of warnings."""
     from ..catalog.catalog import Catalog
-    from ..fleet.fleet import analyse_fleet
+    from ..catalog.fleet import analyse_fleet
     from ..present.page.page import render_fleet
 
     found = Catalog(where)

@@ -29,8 +29,8 @@ from undulog.capture.common.console import plain
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.palette import joint_hex
 
-from ...fleet.fleet import QUANTITIES, Fleet, JointChange, RobotHistory
-from ...fleet.fleet import sentence as change_sentence
+from ...catalog.fleet import QUANTITIES, Fleet, JointChange, RobotHistory
+from ...catalog.fleet import sentence as change_sentence
 from ...results import formats
 from ...results.analysis import Analysis
 from ...results.answer import beyond

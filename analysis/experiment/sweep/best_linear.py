@@ -24,8 +24,8 @@ from ...frequency_response.tones import LineResponse
 from ...results import formats
 from ...results.estimate import Estimate
 from ...results.frequency_response import BestLinearJoint, BestLinearResponses, CrossResponse
-from ..sweep.runs import MOST_CONDITION
-from .runs import MultisineRun
+from .multisine_runs import MultisineRun
+from .runs import MOST_CONDITION
 
 IMPURE = 0.01
 """Share of the commands at lines that the plan leaves out from which a warning is given."""

@@ -25,7 +25,7 @@ from ...frequency_response.periodic import excited_lines
 from ...frequency_response.tones import resampled
 from ...response.rhythm import DRIVEN_SHARE
 from ...signals.stretch import Options
-from ..sweep.runs import read_signals
+from .runs import read_signals
 
 HIGHEST = 0.25
 """Share of the sampling rate up to which lines are estimated: beyond it splines are not exact."""

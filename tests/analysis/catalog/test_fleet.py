@@ -9,8 +9,8 @@ import pytest
 
 from support.linear_chain import CHAIN, WAVE, M, write_run
 from support.processes import undulog
-from undulog.analysis.fleet.change_points import find_change_points, relative_to_others
-from undulog.analysis.fleet.fleet import Components, analyse_fleet
+from undulog.analysis.catalog.change_points import find_change_points, relative_to_others
+from undulog.analysis.catalog.fleet import Components, analyse_fleet
 
 DAY_NS = 86_400_000_000_000
 FIRST = pd.Timestamp("2026-09-01")
@@ -172,7 +172,7 @@ def test_one_joint_does_not_move_the_others():
 def without_models(monkeypatch):
     """Leave out the mixed-effects models, which take most of the time."""
     monkeypatch.setattr(
-        "undulog.analysis.fleet.fleet._components", lambda name, *_: Components(name)
+        "undulog.analysis.catalog.fleet._components", lambda name, *_: Components(name)
     )
 
 
