@@ -96,7 +96,7 @@ def open_csv(path: Path, time: str, columns: Sequence[str], delimiter: str) -> T
         ImportFormatError: If it can't be read, or a column is not there once.
     """
     with _rows(path, delimiter) as rows:
-        header = [name.strip() for name in next(rows, [])]
+        header = [name.strip() for name in next(rows, list[str]())]
     for name in (time, *columns):
         if header.count(name) != 1:
             found = f"{header.count(name)} columns" if name in header else "no column"
