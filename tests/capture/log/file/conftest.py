@@ -5,7 +5,7 @@ import tempfile
 import pytest
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def scratch(tmp_path, monkeypatch):
     """A folder of temporary files, which must be empty after each test."""
     folder = tmp_path / "scratch"

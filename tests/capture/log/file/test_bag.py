@@ -11,6 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from undulog.capture import Session
 from undulog.capture.common.errors import NotALogError, UndulogError
 
+pytestmark = pytest.mark.usefixtures("scratch")
 EPOCH_NS = 1_700_000_000_000_000_000
 KIND = "sensor_msgs/msg/JointState"
 STORE = get_typestore(Stores.ROS2_HUMBLE)

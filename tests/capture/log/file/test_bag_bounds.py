@@ -15,6 +15,7 @@ from support.ros_bags import Filler, ticks, write_bag
 from undulog.capture import Session
 from undulog.capture.common.errors import NotALogError
 
+pytestmark = pytest.mark.usefixtures("scratch")
 MIB = 1 << 20
 BY_FILE, BY_MESSAGE = (
     (mode, CompressionFormat.ZSTD) for mode in (CompressionMode.FILE, CompressionMode.MESSAGE)
