@@ -24,10 +24,10 @@ from .results.shown import present_with
 
 if TYPE_CHECKING:
     from .catalog.catalog import Catalog
+    from .catalog.fleet import Fleet, analyse_fleet
     from .compare.compare import Choices, compare_sessions
     from .compare.decisions import Margins
     from .experiment.analyse import analyse_experiment
-    from .fleet.fleet import Fleet, analyse_fleet
     from .present.notebook.files import load
     from .present.notebook.pictures import Picture
     from .present.text import render
@@ -57,7 +57,7 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "Comparison": "results.comparison",
         "Estimate": "results.estimate",
         "Experiment": "results.experiment",
-        "Fleet": "fleet.fleet",
+        "Fleet": "catalog.fleet",
         "Index": "results.analysis",
         "JointResult": "results.analysis",
         "LinearCoupling": "results.coupling",
@@ -67,7 +67,7 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "Picture": "present.notebook.pictures",
         "Reversal": "results.experiment",
         "analyse_experiment": "experiment.analyse",
-        "analyse_fleet": "fleet.fleet",
+        "analyse_fleet": "catalog.fleet",
         "analyse_session": "session.analyse",
         "compare_sessions": "compare.compare",
         "load": "present.notebook.files",

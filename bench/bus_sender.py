@@ -179,6 +179,7 @@ def main() -> None:
     parser.add_argument("--fifo", action="store_true", help="real-time priority")
     parser.add_argument("--sent", type=Path, help="npz of when each frame was taken")
     parser.add_argument("--log", type=Path, help="append each accepted batch: time, frames so far")
+    parser.add_argument("--cycle", type=Path, help="npy of a polling cycle, known beforehand")
     args = parser.parse_args()
     if args.fifo:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
@@ -188,7 +189,7 @@ def main() -> None:
         peer = UnixPeer(args.where, per_packet=args.per_packet, buffer=args.buffer)
     else:
         peer = SocketcandPeer(int(args.where))
-    cycle = cycle_frames()
+    cycle = np.load(args.cycle) if args.cycle else cycle_frames()
     log = args.log.open("wb", buffering=0) if args.log else None
     begin = time.monotonic_ns() + 50_000_000
     wall = time.time_ns() + 50_000_000

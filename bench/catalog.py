@@ -22,7 +22,7 @@ import pandas as pd
 from undulog.analysis.catalog.catalog import FOLDER, Catalog
 from undulog.analysis.catalog.rows import table_of
 from undulog.capture import Session, SessionWriter
-from undulog.capture.common.object_store import ObjectStore
+from undulog.capture.common.remote import ObjectStore
 
 EPOCH_NS = 1_735_689_600_000_000_000
 NAMES = tuple(f"joint{k:02d}" for k in range(1, 6))

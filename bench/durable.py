@@ -24,10 +24,10 @@ from mcap.records import Channel
 from mcap.writer import Writer
 from measuring import arguments
 
-from undulog.capture.log.sinks import durable_sink
-from undulog.capture.log.sinks.durable_sink import DurableSink
-from undulog.capture.log.sinks.mcap_sink import McapSink
 from undulog.capture.log.wal.writer import WriteAheadLog
+from undulog.capture.log.write import durable_sink
+from undulog.capture.log.write.durable_sink import DurableSink
+from undulog.capture.log.write.mcap_sink import McapSink
 
 EPOCH_NS = 1_700_000_000_000_000_000
 SIZES = (100, 1000)

@@ -25,8 +25,8 @@ import pandas as pd
 from measuring import arguments, verdict
 
 from undulog.analysis import analyse_session
+from undulog.analysis.catalog.fleet import analyse_fleet
 from undulog.analysis.catalog.rows import Row, result_rows
-from undulog.analysis.fleet.fleet import analyse_fleet
 from undulog.capture import Session
 from undulog.sim import record
 from undulog.sim.scenario.scenario import Kernels

@@ -30,10 +30,10 @@ from mcap.reader import make_reader
 from measuring import arguments
 from rerun.experimental import ViewerClient
 
-from undulog.capture.log.sinks.mcap_sink import Description
+from undulog.capture.log.write.mcap_sink import Description
 from undulog.capture.recorder.live_feed import LiveFeed
+from undulog.replay.headless import client_of
 from undulog.replay.samples.timeline import SESSION_TIME
-from undulog.replay.viewer.headless import client_of
 
 LAG_MS = 150.0
 """The bar."""

@@ -29,7 +29,7 @@ from undulog.capture import load_robot
 from undulog.capture.log.messages.cdr import encode, layout_of
 from undulog.capture.log.messages.definitions import message_type, schema_text
 from undulog.capture.recorder.live_feed import LiveFeed
-from undulog.replay.viewer.viewer import LOOPBACK, free_ports, viewer_binary
+from undulog.replay.viewer import LOOPBACK, free_ports, viewer_binary
 
 TICK_S = 0.005
 RATE_HZ = 100

@@ -32,8 +32,8 @@ from analyse_hour import cost
 from measuring import HOUR_S, add_place, arguments, verdict, write_hour
 
 from undulog.capture import Session
-from undulog.replay.draw.scene.body import capsule_poses, capsule_shape
-from undulog.replay.draw.scene.motion import assemble, frames_of, read_head
+from undulog.replay.draw.body import capsule_poses, capsule_shape
+from undulog.replay.draw.motion import assemble, frames_of, read_head
 from undulog.replay.samples.quantities import quantities
 from undulog.replay.samples.tracks import read_columns, wanted_fields
 

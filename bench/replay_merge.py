@@ -29,7 +29,7 @@ from rerun.chunk import Chunk, LazyChunkStream
 from undulog.capture import Session
 from undulog.replay.overlay.sessions import Align, align, convert, read_side
 from undulog.replay.overlay.write import Converted, chunks_of, send, write_overlay
-from undulog.replay.viewer.viewer import viewer_binary
+from undulog.replay.viewer import viewer_binary
 
 BAR_S = 3.0
 """For the merge of the two recordings; what is written beside it is told."""

@@ -21,14 +21,11 @@ from rerun.encodings import EntityPathLike
 
 from undulog.capture.robot.model import Plane, Robot
 
-from .draw import facts
-from .draw.cycles import mean_cycle
-from .draw.cycles.heat_maps import VISIBLE
-from .draw.cycles.steps import SEGMENTS
-from .draw.plots import lines
-from .draw.scene import body
-from .draw.scene import stage as trail
-from .draw.scene.body import body_title
+from .draw import body, facts, lines, mean_cycle
+from .draw import stage as trail
+from .draw.body import body_title
+from .draw.heat_maps import VISIBLE
+from .draw.steps import SEGMENTS
 from .samples import content as entities
 from .samples.content import Content, Series, Start, Tab
 from .samples.timeline import ENSEMBLE_CYCLE, GAIT_CYCLE, SESSION_TIME

@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 VERBS: dict[str, tuple[str, str]] = {
     "record": ("capture record:record", "Record a robot, or its twin, into a session."),
-    "record status": ("capture record_control:status", "Show the state of the running recordings."),
-    "record mark": ("capture record_control:mark", "Mark this moment of the running recording."),
-    "record note": ("capture record_control:note", "Write a remark into the running recording."),
-    "record split": ("capture record_control:split", "Begin a new part of the recording."),
-    "record stop": ("capture record_control:stop", "End the running recording in good order."),
-    "record unit": ("capture record_control:unit", "Print a systemd unit for recordings."),
+    "record status": ("capture record:status", "Show the state of the running recordings."),
+    "record mark": ("capture record:mark", "Mark this moment of the running recording."),
+    "record note": ("capture record:note", "Write a remark into the running recording."),
+    "record split": ("capture record:split", "Begin a new part of the recording."),
+    "record stop": ("capture record:stop", "End the running recording in good order."),
+    "record unit": ("capture record:unit", "Print a systemd unit for recordings."),
     "import": ("capture import_log:import_log", "Bring in bags, CAN traces, tables."),
     "log info": ("capture log_info:log_info", "Show what a log holds."),
     "log check": (
@@ -46,7 +46,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "Write a description to start from, from a log if given.",
     ),
     "sim list": ("sim run:list_scenarios", "List the shipped scenarios."),
-    "sim show": ("sim show:show", "Show a scenario: every value with its unit."),
+    "sim show": ("sim run:show", "Show a scenario: every value with its unit."),
     "sim run": ("sim run:run", "Simulate a scenario and record it."),
     "sim fit": ("replay fit:fit", "Fit the twin's servo and friction to a session."),
     "sim null": ("sim run:null", "Model identical modules, for analyse --null."),

@@ -19,8 +19,7 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.process import in_threads
-from undulog.capture.following.linear_model import linearised
-from undulog.capture.following.motion import JointMotion, Samples
+from undulog.capture.following.motion import JointMotion, Samples, linearised
 from undulog.capture.log.read.sample_times import LARGEST, Signal
 from undulog.capture.robot.model import Joint
 

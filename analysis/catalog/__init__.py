@@ -1,1 +1,1 @@
-"""Find sessions by robot, gait, date, verdict and results."""
+"""Many sessions: found by robot, gait, date, verdict and results, and compared over weeks."""

@@ -31,13 +31,22 @@ from undulog.capture.common.errors import (
     UndulogError,
     UsageError,
 )
-from undulog.capture.common.object_store import ObjectStore, StoredFile
 from undulog.capture.common.process import StopRequest
+from undulog.capture.common.remote import ObjectStore, StoredFile
 from undulog.capture.log.file.parts import split_part_path
 from undulog.capture.log.read.facts import LogFacts, read_facts
 
-from .query import connect, put_together
-from .rows import SCHEMAS, Row, is_result, result_rows, session_row, sweep_rows, table_of
+from .rows import (
+    SCHEMAS,
+    Row,
+    connect,
+    is_result,
+    put_together,
+    result_rows,
+    session_row,
+    sweep_rows,
+    table_of,
+)
 
 _ARROW: Any = pa  # comes without types
 _PARQUET: Any = pq

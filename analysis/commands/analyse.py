@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
-from undulog.capture.commands.several import Line, sessions_of
-from undulog.capture.commands.several import each as each_session
-from undulog.capture.commands.several import show as show_table
+from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions, Line, sessions_of
+from undulog.capture.commands.sessions import each as each_session
+from undulog.capture.commands.sessions import show as show_table
 from undulog.capture.common.console import UNLIMITED, Progress, echo, emit_json, progress
 from undulog.capture.common.errors import UndulogError, UsageError
 from undulog.capture.common.files import check_output, write_text
@@ -83,7 +82,7 @@ def analyse(
         check_output(output, (".json",), why, force=force)
     one_by_one = len(paths) > 1 and (each or paths != [*map(as_path, files)])
     if csv is not None:
-        from ..present.notebook.csv_tables import check_csv
+        from ..present.notebook.frames import check_csv
 
         check_csv(csv, force=force, several=one_by_one)
     if one_by_one:
@@ -95,7 +94,7 @@ def analyse(
     if output is not None:
         result.save(output, force=True)  # refused before the work began, if it was there
     if csv is not None:
-        from ..present.notebook.csv_tables import write_csv
+        from ..present.notebook.frames import write_csv
 
         write_csv([result], csv, force=force)
     if json:
@@ -157,7 +156,7 @@ def _table(
     work = partial(_line, options=options, robot=robot, found=None if csv is None else found)
     lines = each_session(paths, "analyse", work)
     if csv is not None:
-        from ..present.notebook.csv_tables import write_csv
+        from ..present.notebook.frames import write_csv
 
         write_csv(found, csv, force=True)  # refused before the work began, if it was there
     if output is not None:

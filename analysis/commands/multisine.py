@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
+from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
 from undulog.capture.common.errors import UsageError
 
 from .plan import AMPLITUDE, Planned, check_tones, settling, without_contact, write_sessions

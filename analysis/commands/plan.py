@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
-from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
+from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json
 from undulog.capture.common.errors import UsageError
 

@@ -10,8 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
-from undulog.capture.commands.several import FAILED, Line, each, sessions_of, show
+from undulog.capture.commands.sessions import (
+    CONTRACT,
+    FAILED,
+    JointTopicOptions,
+    Line,
+    each,
+    sessions_of,
+    show,
+)
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output, write_text
@@ -221,7 +228,7 @@ def _page_names(paths: Sequence[Path]) -> dict[Path, str]:
 def _fleet(where: str, find: str, output: Path) -> tuple[str, dict[str, Any], int]:
     """Return the page on the sessions of a catalogue, its result, and the number of warnings."""
     from ..catalog.catalog import Catalog
-    from ..fleet.fleet import analyse_fleet
+    from ..catalog.fleet import analyse_fleet
     from ..present.page.page import render_fleet
 
     found = Catalog(where)

@@ -16,8 +16,14 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError
 from undulog.capture.robot.model import Robot
 
-from ..free_motion.estimate import MotionFit
-from ..free_motion.wave import Oscillation, amplitude, phase_lag, phase_line, travelling_index
+from ..free_motion import (
+    MotionFit,
+    Oscillation,
+    amplitude,
+    phase_lag,
+    phase_line,
+    travelling_index,
+)
 from ..results.comparison import BODY
 from ..signals.columns import by_plane
 from .quantities import Key, Known

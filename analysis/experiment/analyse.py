@@ -42,13 +42,12 @@ from .answer import broken_first, experiment_answer, kick_answer, sweep_answer
 from .kicks.coupling import kick_coupling
 from .kicks.local import ROW_TOLERANCE
 from .kicks.runs import MOST_KICK, MOST_PATTERN, SAME, find_kicks
-from .multisine.answer import multisine_answer
-from .multisine.estimate import best_linear_responses
-from .multisine.runs import MultisineRun, MultisineRuns, find_multisine, multisine_run
 from .pooling import PooledResponse, experiment_indices, pool_runs, pooled_answer
 from .reversal.mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
 from .reversal.modules import RESAMPLES, SAME_HEADING_RAD, SIGNIFICANT, floor_lean, reversal_of
+from .sweep.best_linear import best_linear_responses, multisine_answer
 from .sweep.coupling import NONLINEAR, sweep_coupling
+from .sweep.multisine_runs import MultisineRun, MultisineRuns, find_multisine, multisine_run
 from .sweep.runs import MOST_CONDITION, CommandTones, Sweep, command_tones, find_sweep
 
 _LOW_FLOOR = 0.01

@@ -10,8 +10,8 @@ from undulog.capture.common.console import UNLIMITED, plain
 
 from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, margin_text
 from ..experiment.answer import kick_detail, sweep_detail, sweep_method
-from ..experiment.multisine.answer import multisine_method
 from ..experiment.reversal.modules import SIGNIFICANT
+from ..experiment.sweep.best_linear import multisine_method
 from ..results import formats
 from ..results.comparison import Change, Comparison
 from ..results.coupling import LinearCoupling, LocalCoupling

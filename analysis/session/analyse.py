@@ -33,7 +33,7 @@ from ..energy import (
 from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..estimators.series import Series, clean_together, coverage
 from ..estimators.spectrum import BINS_PER_SIDE
-from ..free_motion.estimate import MotionFit, fit_motion, free_motion
+from ..free_motion import MotionFit, fit_motion, free_motion
 from ..frequency_response.estimate import frequency_responses
 from ..oscillators.chain import session_couplings
 from ..response.fitting import GaitFit, fit_gait

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from ..common.console import emit
 from ..common.errors import ImportFormatError, UsageError
 from ..common.files import check_output, is_file
-from .joint_options import CONTRACT, JointTopicOptions
+from .sessions import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:
     from ..exchange.can_import import ImportReport
@@ -84,10 +84,9 @@ def import_log(
     from ..common.process import interruptible
     from ..exchange.bag_import import is_recording
     from ..exchange.can_import import import_can
-    from ..exchange.csv_import import import_csv
     from ..exchange.lerobot_import import import_lerobot, is_lerobot
     from ..exchange.table_guess import parse_units
-    from ..exchange.table_import import import_tables, open_tables
+    from ..exchange.table_import import import_tables, open_mapped, open_tables
     from ..robot.description import load_robot
 
     if not log.is_dir() and not is_file(log):
@@ -118,10 +117,12 @@ def import_log(
             if described is None:
                 raise UsageError(f"{log} holds CAN frames: --robot says what they mean")
             reports = [import_can(log, output, described, bus=bus, force=force, stop=stop)]
-        elif described and column_map and log.suffix.lower() == ".csv" and commands is None:
-            reports = [import_csv(log, output, described, column_map, force=force, stop=stop)]
         else:
-            found = open_tables(log, commands, fps)
+            by_map = described and column_map if commands is fps is None else None
+            if by_map and log.suffix.lower() == ".csv":
+                found = open_mapped(log, by_map)
+            else:
+                found = open_tables(log, commands, fps)
             report = import_tables(
                 found, output, robot=described, column_map=column_map, units=units,
                 write_map=write_map, force=force, stop=stop,
@@ -172,7 +173,7 @@ def _check_options(log: Path, kind: str, given: Sequence[str]) -> None:
 
 def _is_table(log: Path) -> bool:
     """Return whether a log is a table, or a folder of tables, and no log of CAN frames."""
-    from ..exchange.csv_import import is_frame_csv
+    from ..exchange.can_logs import is_frame_csv
     from ..exchange.tables import TABLE_SUFFIXES
 
     return log.is_dir() or (log.suffix.lower() in TABLE_SUFFIXES and not is_frame_csv(log))

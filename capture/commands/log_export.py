@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from ..common.console import emit
 from ..common.errors import UsageError
-from .several import sessions_of
+from .sessions import sessions_of
 
 if TYPE_CHECKING:
     from ..common.process import StopRequest

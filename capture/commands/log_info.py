@@ -17,7 +17,7 @@ from ..log.columns.topics import Channel
 from ..log.messages.frames import FD_TOPIC_PREFIX
 from ..log.read.session import Session
 from ..log.write.writer import CONTRACT_VERSION
-from .several import Line, each, sessions_of, show, stated_gait
+from .sessions import Line, each, sessions_of, show, stated_gait
 
 if TYPE_CHECKING:
     from ..log.health.bus_tally import SourceHealth

@@ -132,7 +132,7 @@ def _expanded(container: bytes, at: int) -> bytes:
 SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db", ".mf4")
 """Suffixes of the logs that can be read, each also with ``.gz`` behind it where it is text."""
 
-CSV_HEADER = "timestamp,arbitration_id,"
+_CSV_HEADER = "timestamp,arbitration_id,"
 """How a CSV file begins that python-can wrote; any other needs a column map."""
 
 _MOST_TEXTS = 20  # different warnings of a library that are reported
@@ -188,6 +188,15 @@ def open_frame_log(path: Path) -> Generator[FrameLog]:
         yield _datable(_python_can_log(path, reader, suffix, problems))
     finally:
         reader.stop()
+
+
+def is_frame_csv(path: Path) -> bool:
+    """Return whether a file is a CSV of CAN frames by python-can; False if it is unreadable."""
+    try:
+        with path.open(encoding="utf-8-sig", errors="replace") as stream:
+            return stream.readline().startswith(_CSV_HEADER)
+    except OSError:
+        return False
 
 
 def _datable(log: FrameLog) -> FrameLog:

@@ -26,12 +26,11 @@ from ..robot.bus_map import TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
 from .can_import import ImportReport, digest_of, imported_session
 from .column_map import COMMANDS, STATES, Column, ColumnMap
-from .csv_import import EARLIEST_NS
-from .frame_log import LATEST_NS, RELATIVE_EPOCH_NS
+from .frame_log import EARLIEST_NS, LATEST_NS, RELATIVE_EPOCH_NS
 from .joint_topics import JointTopic, topics_of
 from .marker_tracks import as_joints, with_fps
 from .table_guess import guess_map
-from .tables import TABLE_SUFFIXES, TableFile, is_time, open_table, words
+from .tables import TABLE_SUFFIXES, TableFile, is_time, open_csv, open_table, words
 
 _COMMAND_FILES = {"control", "command", "commands", "cmd", "action", "actions", "target", "targets"}
 _STATE_FILES = {"state", "states", "measured", "response", "feedback", "joint", "joints", "motor"}
@@ -109,6 +108,17 @@ def open_tables(source: Path, commands: Path | None = None, fps: float | None = 
     }
     tables = {role: with_fps(table, fps) for role, table in joints.items()}
     return replace(found, tables=tables, facts={**found.facts, **made})
+
+
+def open_mapped(source: Path, column_map: ColumnMap) -> TableSet:
+    """Take a CSV file with a header by its column map: a fault names row and column.
+
+    Raises:
+        ImportFormatError: If it can't be read, or a column is not there once.
+    """
+    columns = [column.column for column in column_map.columns]
+    table = open_csv(source, column_map.time_column, columns, column_map.delimiter)
+    return TableSet(source, {STATES: table}, digest=digest_of([source]))
 
 
 def _open_folder(folder: Path) -> TableSet:

@@ -11,8 +11,10 @@ import csv
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -22,10 +24,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError
-from .array_files import read_mat, read_npz
+from ..common.strict_table import listed
+from .array_files import read_mat, read_npz, read_tensors
 from .packing import WIDEST, Block, check_rows, refuse, rows_of_block, spread
 from .parquet_files import block_of, read_parquet
-from .torch_zip import read_tensors
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".mat", ".parquet", ".pt", ".pth")
 ARRAY_SUFFIXES = TABLE_SUFFIXES[3:]
@@ -81,6 +83,97 @@ def open_table(path: Path) -> TableFile:
     readers = {".npz": read_npz, ".mat": read_mat}
     arrays = readers.get(suffix, read_tensors)(path)
     return _of_arrays(path, arrays, suffix.removeprefix("."))
+
+
+def open_csv(path: Path, time: str, columns: Sequence[str], delimiter: str) -> TableFile:
+    """Open a CSV file with a header whose columns are known; a fault names row and column.
+
+    Args:
+        time: Column of the times, which stay exact and don't go back.
+        columns: The columns of numbers; an empty cell has none.
+
+    Raises:
+        ImportFormatError: If it can't be read, or a column is not there once.
+    """
+    with _rows(path, delimiter) as rows:
+        header = [name.strip() for name in next(rows, list[str]())]
+    for name in (time, *columns):
+        if header.count(name) != 1:
+            found = f"{header.count(name)} columns" if name in header else "no column"
+            raise ImportFormatError(path, f"has {found} {name!r}; it has {listed(header, name)}")
+    return TableFile(path, (time, *columns), partial(_read_csv, path, header, delimiter), delimiter)
+
+
+@contextmanager
+def _rows(path: Path, delimiter: str) -> Generator[Iterator[list[str]]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            yield csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ImportFormatError(path, f"can't be read: {error}") from error
+
+
+def _read_csv(
+    path: Path, header: Sequence[str], delimiter: str, names: Sequence[str], time: str
+) -> Iterator[Block]:
+    before: Decimal | None = None
+    places = [header.index(name) for name in names]
+    step = rows_of_block(len(names))
+    cells: dict[str, list[Any]] = {name: [] for name in names}
+    with _rows(path, delimiter) as rows:
+        for line, row in enumerate(rows, 1):
+            if line == 1 or not row:
+                continue
+            if len(row) != len(header):
+                refuse(path, f"row {line} has {len(row)} cells, the header {len(header)}")
+            for name, place in zip(names, places, strict=True):
+                try:
+                    number = _exact(row[place], before) if name == time else _number(row[place])
+                except ValueError as error:
+                    raise ImportFormatError(
+                        path, f"row {line}, column {name!r}: {error}"
+                    ) from error
+                cells[name].append(number)
+            before = cells[time][-1]
+            if len(cells[time]) == step:
+                yield _block(cells, time)
+                cells = {name: [] for name in names}
+    if before is None:
+        refuse(path, "has no rows below its header")
+    if cells[time]:
+        yield _block(cells, time)
+
+
+def _block(cells: Mapping[str, list[Any]], time: str) -> Block:
+    return {
+        name: np.array(column, dtype=object if name == time else float)
+        for name, column in cells.items()
+    }
+
+
+def _exact(cell: str, before: Decimal | None) -> Decimal:
+    """Parse a time: a double can't hold Unix times to the ns."""
+    try:
+        found = Decimal(cell.strip())
+    except InvalidOperation:
+        found = Decimal("nan")
+    if not found.is_finite():
+        raise ValueError(f"{cell!r} is not a time")
+    if before is not None and found < before:
+        raise ValueError(f"time goes back, from {before:g}")
+    return found
+
+
+def _number(cell: str) -> float:
+    if not cell or cell.isspace():
+        return math.nan
+    try:
+        number = float(cell)
+    except ValueError as error:
+        raise ValueError(f"{cell!r} is not a number") from error
+    if math.isinf(number):
+        raise ValueError(f"{cell!r} is not a finite number")
+    return number
 
 
 def _of_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], form: str) -> TableFile:

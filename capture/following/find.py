@@ -19,7 +19,6 @@ from ..common.process import in_threads
 from .excursions import Excursions, departures, find_excursions, find_holds
 from .fault import Fault, Span, Symptom
 from .kinds import fault_of, powerless, usual_effort
-from .linear_model import linearised
 from .motion import (
     DEGREE,
     FEW_SAMPLES,
@@ -31,6 +30,7 @@ from .motion import (
     common_response,
     complex_median,
     judge,
+    linearised,
     marked_spans,
     median_of,
     neighbours,

@@ -23,7 +23,7 @@ from ..log.health.tallies import BusHealth, JointHealth
 from ..log.mcap.chunk import BODY_AT, FIXED_SIZE, HEAD
 from ..log.messages.definitions import parse_message_type
 from ..log.messages.frames import FRAME_TOPIC_PREFIX, FRAME_TOPIC_PREFIXES, SERIAL_TOPIC_PREFIX
-from ..log.sinks.mcap_sink import Description
+from ..log.write.mcap_sink import Description
 from ..robot.model import Robot
 from ..sources.contract import Source
 from .source_clock import SourceClock

@@ -26,7 +26,7 @@ from typing import NamedTuple
 from mcap.records import Channel
 
 from ..common.errors import MissingExtraError, UndulogError
-from ..log.sinks.mcap_sink import Description
+from ..log.write.mcap_sink import Description
 from .live_wire import (
     HEAD_SIZE,
     MAX_DATAGRAM,

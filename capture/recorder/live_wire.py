@@ -29,8 +29,8 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 
 from ..common.errors import DataError
 from ..log.messages.frames import FRAME_TOPIC_PREFIXES
-from ..log.sinks.mcap_sink import Description
 from ..log.wal.format import Definition, pack_definition, unpack_definition
+from ..log.write.mcap_sink import Description
 
 MAX_DATAGRAM = 64 << 10
 """No datagram is longer [byte]."""

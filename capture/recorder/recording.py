@@ -19,9 +19,9 @@ from mcap.records import Metadata
 from ..common.arrays import NS
 from ..common.errors import LogWriteError, SocketInUseError, SourceError, UsageError
 from ..common.process import StopRequest
-from ..log.sinks.durable_sink import DurableSink
-from ..log.sinks.mcap_sink import Description, MessageFields, MessageSink
-from ..log.sinks.ring_sink import RingStorage
+from ..log.write.durable_sink import DurableSink
+from ..log.write.mcap_sink import Description, MessageFields, MessageSink
+from ..log.write.ring_sink import RingStorage
 from ..log.write.writer import SessionWriter
 from ..sources.contract import SourceContext, open_sources
 from .bus_recorder import decoded_source, robot_of

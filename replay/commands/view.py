@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from undulog.capture import Session
-from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
+from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import complain, echo, emit_json, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output
 from undulog.capture.common.process import interruptible
 
+from .. import viewer
 from ..samples.content import Layer
-from ..viewer import viewer
 from .view_recorded import ClipOptions, OverlayOptions, SingleOptions, view_clip, view_overlay
 
 if TYPE_CHECKING:

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from undulog.capture import Session
-from undulog.capture.commands.joint_options import CONTRACT, JointTopicOptions
+from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import MissingExtraError, UsageError
 from undulog.capture.common.process import interruptible
 
+from .. import viewer
 from ..samples.content import Tab
-from ..viewer import viewer
 
 if TYPE_CHECKING:
     from ..feed.film import Shot
@@ -125,7 +125,7 @@ def view_clip(
         from ..feed.film import check_film, film, scene_only
     except ModuleNotFoundError as error:
         raise MissingExtraError("'undulog view --clip'", "replay", error.name or "av") from error
-    from ..draw.scene.body import body_title
+    from ..draw.body import body_title
     from ..feed.recording import write_recording
 
     refuse_existing(clip, force=force)

@@ -1,1 +1,1 @@
-"""Samples as Rerun entities."""
+"""Samples as Rerun entities: the scene, plots, cycles of a gait."""

@@ -23,15 +23,14 @@ from ..samples.quantities import quantities
 from ..samples.survey import GAIT, Survey, survey
 from ..samples.timeline import Clock, Span, Stretch
 from ..samples.tracks import Track, drawn_topics, read_columns
-from . import facts
-from .cycles.heat_maps import heat_maps, log_maps
-from .cycles.mean_cycle import log_mean_cycle, read_averaged
-from .cycles.steps import charts, cycle_tables, log_charts, log_current, log_cycles
-from .plots import lines
-from .plots.write import Plots, log_others, log_words
-from .scene.body import Look, body_title
-from .scene.motion import BODY_RATE_HZ, HeadPath, read_head
-from .scene.stage import Scene
+from . import facts, lines
+from .body import Look, body_title
+from .heat_maps import heat_maps, log_maps
+from .mean_cycle import log_mean_cycle, read_averaged
+from .motion import BODY_RATE_HZ, HeadPath, read_head
+from .plots import Plots, log_others, log_words
+from .stage import Scene
+from .steps import charts, cycle_tables, log_charts, log_current, log_cycles
 
 _WHOLE = Span()
 

@@ -27,12 +27,12 @@ from undulog.capture.common.console import Progress
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.process import StopRequest
 
-from ..draw.cycles import mean_cycle
-from ..draw.cycles.heat_maps import POWER
-from ..draw.cycles.steps import CYCLES
+from ..draw import mean_cycle
 from ..draw.drawing import Drawing, Sources, clock_of
-from ..draw.plots.lines import MODE
-from ..draw.scene.motion import BODY_RATE_HZ
+from ..draw.heat_maps import POWER
+from ..draw.lines import MODE
+from ..draw.motion import BODY_RATE_HZ
+from ..draw.steps import CYCLES
 from ..layout import build_blueprint, build_views
 from ..samples.content import (
     ENERGY,
@@ -50,7 +50,7 @@ from ..samples.content import (
 from ..samples.survey import GAIT, Survey, comes, survey
 from ..samples.timeline import STRETCH_NS, Rhythm, Span, Stretch, stretches
 from ..samples.tracks import wanted_fields
-from ..viewer.viewer import Viewer
+from ..viewer import Viewer
 from .numbers import Analysing
 from .recording import open_recording, recording_id, send_properties
 

@@ -23,9 +23,9 @@ from undulog.analysis.signals.columns import planes_of
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.robot.model import Robot
 
-from ..draw.cycles.heat_maps import POWER
-from ..draw.cycles.steps import CYCLES, SEGMENTS
-from ..draw.plots.write import Plot
+from ..draw.heat_maps import POWER
+from ..draw.plots import Plot
+from ..draw.steps import CYCLES, SEGMENTS
 from ..samples.content import GAIN, LAG, Chart, Color, Quantity
 from ..samples.content import Series as Lines
 from ..samples.quantities import products

@@ -20,13 +20,13 @@ from undulog.capture.log.messages.definitions import MessageType, parse_message_
 from undulog.capture.log.read.joint_rows import JointRows, merge_rows
 from undulog.capture.log.read.joint_states import OFFSET_TOPICS
 from undulog.capture.log.read.sample_times import clock_shift_ns, moved
-from undulog.capture.log.sinks.mcap_sink import Description
+from undulog.capture.log.write.mcap_sink import Description
 from undulog.capture.recorder.live_wire import LiveMessage
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Robot
 
-from ..draw.plots.lines import MODE
-from ..draw.scene.motion import POSE, HeadPath, tracked_head
+from ..draw.lines import MODE
+from ..draw.motion import POSE, HeadPath, tracked_head
 from ..samples.tracks import JOINT_STATE, OFFSETS, Columns, Track, ordered, without_filler
 
 PATIENCE_NS = 250_000_000

@@ -18,13 +18,12 @@ import rerun as rr
 
 from undulog.capture.common.arrays import FloatArray, IntArray
 
+from ..draw import lines, stage
+from ..draw.body import Look, body_title
 from ..draw.drawing import palette_of, start_of
 from ..draw.facts import code, document, listed, log_facts
-from ..draw.plots import lines
-from ..draw.plots.write import Plots
-from ..draw.scene import stage
-from ..draw.scene.body import Look, body_title
-from ..draw.scene.motion import HeadPath, assemble, frames_of, still_head
+from ..draw.motion import HeadPath, assemble, frames_of, still_head
+from ..draw.plots import Plots
 from ..layout import build_blueprint
 from ..samples import content as entities
 from ..samples.content import Content, Start

@@ -33,12 +33,12 @@ from undulog.analysis.results.estimate import Estimate
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.robot.model import Robot
 
-from ..draw.cycles.steps import bar_of, log_bar
-from ..draw.plots.lines import DEGREES, log_look, log_rows
-from ..draw.plots.write import Plot
-from ..draw.scene.body import MEASURED, MESHES, meshed
-from ..draw.scene.motion import HeadPath
-from ..draw.scene.stage import TRAIL
+from ..draw.body import MEASURED, MESHES, meshed
+from ..draw.lines import DEGREES, log_look, log_rows
+from ..draw.motion import HeadPath
+from ..draw.plots import Plot
+from ..draw.stage import TRAIL
+from ..draw.steps import bar_of, log_bar
 from ..samples.content import GREY, TOTAL, Bar, Color, Places, Series, line_title
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
 from ..samples.tracks import (

@@ -12,12 +12,12 @@ from rerun.encodings import EntityPathLike
 from undulog.analysis.results.comparison import Change, Comparison
 from undulog.analysis.results.formats import short, utc
 
+from ..draw import lines
+from ..draw import stage as ranges
+from ..draw.body import COMMANDED, LABELS, MARKERS, MEASURED
 from ..draw.facts import FACTS as SESSION
 from ..draw.facts import code, document, escaped, listed
-from ..draw.plots import lines
-from ..draw.scene import stage as ranges
-from ..draw.scene.body import COMMANDED, LABELS, MARKERS, MEASURED
-from ..draw.scene.stage import TRAIL
+from ..draw.stage import TRAIL
 from ..layout import bar_chart, blueprint, build_views, plot, tabs, trail_window
 from ..samples.content import Content, Series
 from .draw import BARS, DIFFERENCES, LINES, POWER, Quantity

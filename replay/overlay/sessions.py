@@ -32,8 +32,8 @@ from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternio
 from undulog.capture.robot.model import Robot
 
 from ..draw.drawing import palette_of
-from ..draw.plots.lines import rhythm_of
-from ..draw.scene.motion import HeadPath, read_head
+from ..draw.lines import rhythm_of
+from ..draw.motion import HeadPath, read_head
 from ..feed.recording import Recording, write_recording
 from ..samples.content import Color
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME, Clock, Rhythm

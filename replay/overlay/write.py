@@ -31,9 +31,9 @@ from undulog.capture.common.files import check_stop
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 
+from ..draw.body import body_title
 from ..draw.facts import log_facts
-from ..draw.plots.write import Plot
-from ..draw.scene.body import body_title
+from ..draw.plots import Plot
 from ..feed.recording import Recording, recording_file, recording_id
 from ..samples.content import Color
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME

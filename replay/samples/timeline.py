@@ -3,7 +3,7 @@
 ``session_time`` counts from the first sample. ``gait_cycle`` is the gait's cumulative phase over
 2 pi, so that two runs at different frequencies can be scrubbed in step; Rerun has no timeline
 of real numbers, so one cycle is drawn as one second: ``+3.25s`` there reads 3.25 cycles.
-``ensemble_cycle`` counts the degrees of a mean cycle (:mod:`.replay.draw.cycles.mean_cycle`), which
+``ensemble_cycle`` counts the degrees of a mean cycle (:mod:`.replay.draw.mean_cycle`), which
 is computed; samples are never folded into one cycle.
 """
 

@@ -27,7 +27,7 @@ import pyarrow as pa
 import pyarrow.fs as pafs
 
 from undulog.capture.common.errors import InputFileError, LogWriteError, UsageError
-from undulog.capture.common.object_store import ObjectStore
+from undulog.capture.common.remote import ObjectStore
 
 _ARROW: Any = pa  # comes without types
 _FS: Any = pafs

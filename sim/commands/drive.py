@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.joint_options import CommandTopic
-from undulog.capture.commands.several import Line, each, sessions_of, show
+from undulog.capture.commands.sessions import CommandTopic, Line, each, sessions_of, show
 from undulog.capture.common.console import (
     UNLIMITED,
     complain,

@@ -1,21 +1,25 @@
-"""Commands ``sim list`` and ``sim run``."""
+"""Commands ``sim list``, ``sim run`` and ``sim show``."""
 
 from __future__ import annotations
 
+import re
 import sys
 import time
-from collections.abc import Callable, Sequence
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from fnmatch import fnmatchcase
 from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
+from json import dumps
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import wrap
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import UNLIMITED, emit, progress, refuse_existing
+from undulog.capture.common.console import UNLIMITED, Column, emit, progress, refuse_existing, table
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import interruptible
 
@@ -285,3 +289,114 @@ def _touched(contact_s: dict[str, float]) -> str:
     return (
         f"{len(contact_s)} {links} touched obstacles, {longest} longest: {contact_s[longest]:.3g} s"
     )
+
+
+_COLUMNS = (Column("key", left=True), Column("value", left=True), Column("unit", left=True))
+_HEAD = ("name", "description", "robot")
+
+
+def show(scenario: str, /, *, json: bool = False) -> None:
+    """Show a scenario: robot, gait, world and sensors, every value with its unit, defaults too.
+
+    The keys are those of the scenario file, and of `undulog sim run --set KEY=VALUE`.
+
+    Example: `undulog sim show weak-servo-pi3`
+
+    Args:
+        scenario: Name of a shipped scenario (see `undulog sim list`), or a TOML file.
+        json: Print one JSON object: each key with value and unit.
+    """
+    from ..scenario.scenario_file import load_scenario
+
+    found = load_scenario(scenario)
+    every = dict(leaves(tomllib.loads(found.toml())))
+    values = {
+        key: {"value": value, "unit": unit_of(key) if _is_number(value) else ""}
+        for key, value in every.items()
+        if key not in _HEAD
+    }
+    robot = found.robot
+    facts = {
+        "name": found.name,
+        "description": found.description,
+        "robot": {"name": robot.name, "joints": len(robot.joints), "mass_kg": robot.total_mass},
+        "values": values,
+    }
+    rows = [
+        [(text, "") for text in (key, dumps(one["value"]), one["unit"] or "")]
+        for key, one in values.items()
+    ]
+    texts, _ = table(_COLUMNS, rows, UNLIMITED)
+    lines = [
+        f"{found.name}: {found.description}",
+        f"robot {robot.name}: {len(robot.joints)} joints, {robot.total_mass:.3g} kg",
+        "",
+        *(text.plain.rstrip() for text in texts),
+    ]
+    emit(facts, lines, as_json=json)
+
+
+def _is_number(value: Any) -> bool:
+    every = cast("list[object]", value) if isinstance(value, list) else [value]
+    return all(isinstance(one, int | float) and not isinstance(one, bool) for one in every)
+
+
+_UNITS = (
+    ("s", "*_s"),
+    ("Hz", "*_hz"),
+    ("V", "*_v"),
+    ("rad", "gait.*amplitude gait.*lag gait.*offset gait.*phase gait.*kick_size noise.position"),
+    ("rad", "*.heading *.slope *.slope_heading *.inclination *.north sensing.servo.* *.backlash"),
+    ("rad", "controller.*.f0 controller.*.largest"),
+    ("rad/s", "gait.*.detuning noise.velocity *.stribeck_speed"),
+    ("1/s", "gait.*.forward gait.*.backward gait.*.approach_rate gait.*.attraction"),
+    ("1/s", "gait.*.feedback"),
+    ("1/m", "controller.*.k"),
+    ("1/rad", "*.proportional_gain"),
+    ("N", "disturbances.force"),
+    ("N m", "noise.effort *.stall_torque *.coulomb_friction *.static_friction"),
+    ("N m/A", "*.torque_constant"),
+    ("N m/rad", "*.gear_stiffness"),
+    ("N m s/rad", "*.viscous_friction *.gear_damping"),
+    ("kg m^2", "*.rotor_inertia"),
+    ("N/m", "world.*.stiffness"),
+    ("N s/m", "world.*.damping world.*.drag_tangential world.*.drag_normal"),
+    ("m/s", "world.velocity world.*.slip_speed"),
+    ("m/s^2", "world.gravity sensing.accelerometer.noise sensing.accelerometer.resolution"),
+    ("T", "sensing.compass.noise sensing.compass.resolution sensing.compass.horizontal_field"),
+    ("m", "sensing.sonar.noise sensing.sonar.resolution sensing.ir.peak *_m"),
+    ("m", "*.position *.radius *.height *.size *.from *.to *.thickness *.centre *.clear *.gap"),
+)
+_NUMBERS = (  # without a unit
+    "*seed *.count *.rays *_bits *.mu *.mu_tangential *.mu_normal *.gain *_gain *.slip_ratio "
+    "*.smallest *.mass_factor *.feedback_bias faults.value"
+)
+
+
+def unit_of(key: str) -> str | None:
+    """Return the unit of a number of a scenario.
+
+    Args:
+        key: With dots, and an index in brackets in a list: ``world.obstacles[2].radius``.
+
+    Returns:
+        The unit, in SI; empty for a number without one; None if the key is unknown.
+    """
+    plain = re.sub(r"\[\d+\]", "", key)
+    for unit, patterns in (*_UNITS, ("", _NUMBERS)):
+        if any(fnmatchcase(plain, pattern) for pattern in patterns.split()):
+            return unit
+    return None
+
+
+def leaves(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield each value of a scenario's tables with its key, in order."""
+    for name, value in values.items():
+        key = f"{before}{name}"
+        if isinstance(value, dict):
+            yield from leaves(cast("dict[str, Any]", value), f"{key}.")
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            for k, item in enumerate(cast("list[dict[str, Any]]", value)):
+                yield from leaves(item, f"{key}[{k}].")
+        else:
+            yield key, value

@@ -19,9 +19,9 @@ import numpy as np
 
 from undulog.capture.common.errors import ControlError
 from undulog.capture.log.messages.frames import FrameArray
-from undulog.capture.log.sinks.durable_sink import DurableSink
 from undulog.capture.log.wal.segment import require_space
 from undulog.capture.log.write.channels import StringChannel
+from undulog.capture.log.write.durable_sink import DurableSink
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.recorder.bus_recorder import BusRecorder
 from undulog.capture.recorder.control_client import ControlClient

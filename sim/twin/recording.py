@@ -14,7 +14,7 @@ from types import TracebackType
 from undulog.capture.common.console import refuse_existing
 from undulog.capture.common.errors import LogWriteError, SimulationError
 from undulog.capture.common.process import StopRequest
-from undulog.capture.log.sinks.mcap_sink import write_error
+from undulog.capture.log.write.mcap_sink import write_error
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.model import ClockDomain
 

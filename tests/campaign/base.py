@@ -18,7 +18,7 @@ from support.written_sessions import joint_state
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.log.messages.definitions import schema_text
 from undulog.capture.log.messages.frames import empty_frames
-from undulog.capture.log.sinks.durable_sink import DurableSink
+from undulog.capture.log.write.durable_sink import DurableSink
 
 EPOCH_NS = 1_700_000_000_000_000_000
 JOINTS = ("joint01", "joint02", "joint03", "joint04")

@@ -11,7 +11,7 @@ from .case import Result
 from .recording import check_kept, end, recorder, senders, start
 
 RATE = 9000
-SECONDS = 20.0
+SECONDS = 10.0
 BUSY = "while True: pass"
 
 

@@ -245,7 +245,7 @@ def recording(session_file, analysis, tmp_path_factory):
 @pytest.fixture(scope="session")
 def rerun_command():
     """Runs Rerun's own command line; returns its standard output."""
-    from undulog.replay.viewer.viewer import viewer_binary
+    from undulog.replay.viewer import viewer_binary
 
     def run(*arguments):
         done = processes.run(viewer_binary(), *arguments, timeout=120)
@@ -258,7 +258,7 @@ def rerun_command():
 @pytest.fixture(scope="module")
 def show(vulkan):
     """Opens a recording at a time in a headless viewer of its own: a viewer keeps its layout."""
-    from undulog.replay.viewer.headless import HeadlessViewer
+    from undulog.replay.headless import HeadlessViewer
 
     with ExitStack() as stack:
 

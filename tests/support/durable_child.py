@@ -14,7 +14,7 @@ import time
 from mcap.records import Channel, Metadata, Schema
 
 from undulog.capture.log.messages.definitions import schema_text
-from undulog.capture.log.sinks.durable_sink import DurableSink
+from undulog.capture.log.write.durable_sink import DurableSink
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STRING = "std_msgs/msg/String"

@@ -1,1 +1,1 @@
-"""Linear coupling of a chain without contact, from lag sweeps and multisines."""
+"""Sweeps and multisines: linear coupling of a chain, and best linear approximations of joints."""

@@ -23,14 +23,14 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from undulog.capture import SessionView
-from undulog.capture.commands.several import Line, first_sentence
+from undulog.capture.commands.sessions import Line, first_sentence
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import plain
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.palette import joint_hex
 
-from ...fleet.fleet import QUANTITIES, Fleet, JointChange, RobotHistory
-from ...fleet.fleet import sentence as change_sentence
+from ...catalog.fleet import QUANTITIES, Fleet, JointChange, RobotHistory
+from ...catalog.fleet import sentence as change_sentence
 from ...results import formats
 from ...results.analysis import Analysis
 from ...results.answer import beyond

@@ -20,7 +20,7 @@ from ...common.console import progress, refuse_existing
 from ...common.errors import DataError, UndulogError, UsageError
 from ...common.files import part_file
 from ...common.process import StopRequest
-from ..sinks.mcap_sink import library_name
+from ..write.mcap_sink import library_name
 from .raw_messages import RawLog, RawMessage
 
 EDIT_RECORD = "undulog.edit"

@@ -34,8 +34,7 @@ from mcap.records import (
 from ...common.arrays import IntArray, frozen
 from ...common.errors import LogError, NotALogError
 from .chunk import MAGIC, PREFIX_SIZE, Block, Buffer, chunk_at, next_chunk, walk_records
-from .fetched import FetchedFile
-from .payloads import McapPayloads
+from .payloads import FetchedFile, McapPayloads
 
 _Record = TypeVar("_Record")
 

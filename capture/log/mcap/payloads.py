@@ -2,21 +2,238 @@
 
 from __future__ import annotations
 
+import itertools
 import mmap
 import os
+import tempfile
+import threading
 import weakref
 import zlib
-from collections.abc import Generator
+from collections import OrderedDict, deque
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import zstandard
 
 from ...common.errors import InputFileError, LogError, NotALogError
-from ...common.remote import RemotePath
-from .cache import cache
-from .chunk import Block, Buffer, checks_itself, inflate, inflate_zstd_into, read_at
-from .fetched import FetchedFile
+from ...common.remote import HEAD_SIZE, RemoteFile, RemotePath
+from .chunk import (
+    PREFIX_SIZE,
+    Block,
+    Buffer,
+    checks_itself,
+    chunk_at,
+    inflate,
+    inflate_zstd_into,
+    read_at,
+)
+
+_CACHE_SIZE = 64 << 20
+
+
+class Cache:
+    """Pieces that were read last, of all open files together, up to 64 MiB.
+
+    Attributes:
+        owners: Numbers for files, each given once.
+        abandoned: Files that nothing refers to. The garbage collector adds to it at any moment,
+            also while the lock is held, so it must not take the lock.
+    """
+
+    def __init__(self) -> None:
+        """Begin empty."""
+        self._held: OrderedDict[tuple[int, int], bytes] = OrderedDict()
+        self._size = 0
+        self._lock = threading.Lock()
+        self.owners = itertools.count()
+        self.abandoned: deque[int] = deque()
+
+    def get(self, key: tuple[int, int]) -> bytes | None:
+        """Return a piece, by its file's number and its place; None if it isn't kept."""
+        with self._lock:
+            data = self._held.get(key)
+            if data is not None:
+                self._held.move_to_end(key)
+            return data
+
+    def put(self, key: tuple[int, int], data: bytes) -> None:
+        """Keep a piece, unless it is larger than the cache."""
+        with suppress(IndexError):  # empty, perhaps since another thread was faster
+            while True:
+                self.drop(self.abandoned.popleft())
+        if len(data) > _CACHE_SIZE:
+            return
+        with self._lock:
+            self._size += len(data) - len(self._held.pop(key, b""))
+            self._held[key] = data
+            while self._size > _CACHE_SIZE:
+                _, dropped = self._held.popitem(last=False)
+                self._size -= len(dropped)
+
+    def drop(self, owner: int) -> None:
+        """Drop all pieces of one file."""
+        with self._lock:
+            for key in [key for key in self._held if key[0] == owner]:
+                self._size -= len(self._held.pop(key))
+
+
+cache = Cache()
+"""The one of this process."""
+
+
+_PAGE = HEAD_SIZE // 2
+_BATCH = 8 << 20
+"""Bytes of blocks that are fetched at a time, if they are expected."""
+
+_GAP = 64 << 10
+"""A smaller gap between two ranges is fetched with them: a request costs as much."""
+
+
+class FetchedFile:
+    """Parts of a file on a server."""
+
+    def __init__(self, path: RemotePath, owner: int) -> None:
+        """Connect and fetch the first bytes.
+
+        Args:
+            owner: Number of the file in the cache.
+
+        Raises:
+            NotALogError: If it is empty.
+            InputFileError: If it can't be read, or not in ranges of bytes.
+        """
+        self._file, self._owner = RemoteFile(path), owner
+        self._lock = threading.RLock()
+        self._pages: set[int] = set()
+        self._ends: dict[int, int] = {}  # chunk record to the end of its message indexes
+        self._expected: Sequence[Block] = ()
+        self._place: dict[int, int] = {}
+        self._whole = False
+        if not self._file.size:
+            raise NotALogError(path, "the file is empty (0 bytes)")
+        with tempfile.TemporaryFile(prefix="undulog-") as sparse:
+            sparse.truncate(self._file.size)
+            self._descriptor = os.dup(sparse.fileno())
+        self.close = weakref.finalize(self, os.close, self._descriptor)
+        self._buffer = mmap.mmap(self._descriptor, 0, access=mmap.ACCESS_READ)
+        self._write(0, self._file.head)
+
+    @property
+    def tag(self) -> str:
+        """ETag of the object, or else the time of its last change."""
+        return self._file.tag
+
+    def mapped(self) -> tuple[mmap.mmap, int]:
+        """Return the mapped sparse file and a descriptor of it."""
+        return self._buffer, os.dup(self._descriptor)
+
+    def need(self, start: int, stop: int) -> None:
+        """Fetch the bytes [start, stop) into the mapped file.
+
+        Raises:
+            InputFileError: If they can't be fetched.
+        """
+        stop = min(stop, self._file.size)
+        with self._lock:
+            pages = range(start // _PAGE, -(-stop // _PAGE))
+            missing = [page * _PAGE for page in pages if page not in self._pages]
+            ranges = _merged((at, min(at + _PAGE, self._file.size)) for at in missing)
+            for (at, _), data in zip(ranges, self._file.read_many(ranges), strict=True):
+                self._write(at, data)
+            self._whole = self._whole or (start == 0 and stop == self._file.size)
+
+    def add(self, block: Block, end: int) -> None:
+        """Add a block that only its index describes; its message indexes end at ``end``."""
+        self._ends[block.record_at] = end
+
+    def expect(self, blocks: Sequence[Block]) -> None:
+        """Announce blocks that will be read next, in this order, to be fetched many at a time."""
+        with self._lock:
+            self._expected = blocks
+            self._place = {block.record_at: k for k, block in enumerate(blocks)}
+
+    def around(self, block: Block) -> tuple[Buffer, int]:
+        """Return a buffer with a block and its message indexes, and its first byte's offset.
+
+        Raises:
+            InputFileError: If it can't be fetched.
+            LogError: If the chunk isn't what its index says.
+        """
+        if block.record_at not in self._ends:  # found by reading the whole file
+            return self._buffer, 0
+        if self._whole:
+            return self._buffer, self._check_head(block, self._buffer, 0)
+        key = self._owner, block.record_at
+        data = cache.get(key)
+        if data is None:
+            with self._lock:  # another thread may be fetching it, among others
+                data = cache.get(key) or self._fetch(block)
+        return data, self._check_head(block, data, block.record_at)
+
+    def _fetch(self, block: Block) -> bytes:
+        """Fetch a block and those that are expected behind it; return the block's piece."""
+        place, found = self._place.get(block.record_at), b""
+        batch, size = [block], self._size(block)
+        for other in () if place is None else self._expected[place + 1 :]:
+            size += self._size(other)
+            if size > _BATCH:
+                break
+            batch.append(other)
+        wanted = [
+            (one.record_at, self._ends[one.record_at])
+            for one in batch
+            if one is block or cache.get((self._owner, one.record_at)) is None
+        ]
+        ranges = _merged(sorted(wanted), _GAP)
+        for (base, stop), data in zip(ranges, self._file.read_many(ranges), strict=True):
+            for start, end in wanted:
+                if base <= start < stop:
+                    piece = data[start - base : end - base]
+                    cache.put((self._owner, start), piece)
+                    found = piece if start == block.record_at else found
+        return found
+
+    def _size(self, block: Block) -> int:
+        return self._ends[block.record_at] - block.record_at
+
+    def _check_head(self, block: Block, data: Buffer, base: int) -> int:
+        """Hold a chunk to its index and take its CRC, which no index has; return the offset."""
+        at = block.record_at - base + PREFIX_SIZE
+        head = chunk_at(data, at, block.stop - base)
+        same = (
+            head is not None
+            and head.complete
+            and (
+                (head.start + base, head.stop + base, head.size, head.compression)
+                == (block.start, block.stop, block.size, block.compression)
+            )
+        )
+        if head is None or not same:
+            where = f"the chunk at byte {block.start}"
+            raise LogError(self._file.path, f"{where} is not what its index says")
+        block.crc = head.crc
+        return base
+
+    def _write(self, at: int, data: bytes) -> None:
+        """Write into the sparse file: on a full disk the mapping would end the process."""
+        pages = range(at // _PAGE, -(-(at + len(data)) // _PAGE))
+        while data:
+            written = os.pwrite(self._descriptor, data, at)
+            at, data = at + written, data[written:]
+        self._pages.update(pages)
+
+
+def _merged(ranges: Iterable[tuple[int, int]], gap: int = 0) -> list[tuple[int, int]]:
+    """Join ranges, in order, that are no further apart than a gap."""
+    found: list[tuple[int, int]] = []
+    for start, stop in ranges:
+        if found and start <= found[-1][1] + gap:
+            found[-1] = found[-1][0], max(found[-1][1], stop)
+        else:
+            found.append((start, stop))
+    return found
+
 
 _CORRUPT = "is corrupt (its CRC doesn't fit)"
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
-from ...common.errors import DataError, MissingChannelError, some_names
+from ...common.errors import DataError, JointSetError, MissingChannelError, some_names
 from ..columns.topics import Topics
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import (
@@ -33,7 +35,82 @@ from .joint_messages import (
     is_of_joints,
     joint_source,
 )
-from .joint_names import joint_names
+
+_LOOKED_AT = 2000
+"""Messages of a topic; one with a message a joint names all its joints in them."""
+
+_MOST_LISTED = 12
+
+
+def joint_names(topics: Topics, most: int = _LOOKED_AT) -> dict[str, tuple[str, ...]]:
+    """Return the joints of each topic that names some, in the order in which they appear.
+
+    Args:
+        most: Messages that are looked at of a topic whose messages name one joint each.
+    """
+    found: dict[str, tuple[str, ...]] = {}
+    for topic, channel in topics.channels.items():
+        if channel.type_name not in JOINT_TYPES or not channel.is_ros2:
+            continue
+        try:
+            names = _names(topics, topic, most)
+        except DataError:  # a damaged schema or message: whoever reads the topic says so
+            continue
+        if names:
+            found[topic] = names
+    return found
+
+
+def _names(topics: Topics, topic: str, most: int) -> tuple[str, ...]:
+    decode = topics.decoder(topic)
+    names: dict[str, None] = {}
+    for _, message in islice(topics.raw(topic), most):
+        own = _joints(decode(message))
+        names |= dict.fromkeys(own)
+        if len(own) > 1:  # all joints in one message
+            break
+    return tuple(names)
+
+
+def _joints(message: Any) -> list[str]:
+    """Return the joints of a message; of a DynamicJointState those with a position."""
+    if hasattr(message, "interface_values"):
+        pairs = zip(message.joint_names, message.interface_values, strict=False)
+        return [name for name, one in pairs if "position" in one.interface_names]
+    return list(getattr(message, "joint_names", None) or getattr(message, "name", ()))
+
+
+def check_joints(path: Path, topics: Topics, joints: Sequence[str], robot: str) -> None:
+    """Hold the joints of a log to those of a robot that is to describe it.
+
+    Raises:
+        JointSetError: If they are not the same; names those that only one of them has.
+    """
+    every: Mapping[str, tuple[str, ...]] = joint_names(topics)
+    known = set(joints)
+    own = {topic: names for topic, names in every.items() if not known.isdisjoint(names)}
+    if not own:
+        has = "; ".join(
+            f"{topic} has {some_names(names, _MOST_LISTED)}" for topic, names in every.items()
+        )
+        raise JointSetError(
+            f"{path}: none of its joints is of {robot}, which has "
+            f"{some_names(joints, _MOST_LISTED)}; {has or 'it has no topic of joints'}"
+        )
+    logged = dict.fromkeys(name for names in own.values() for name in names)
+    strange = [name for name in logged if name not in known]
+    missing = [name for name in joints if name not in logged]
+    if strange or missing:
+        faults = [
+            f"{what} {some_names(names, _MOST_LISTED)}"
+            for what, names in (("lacks", strange), ("has, but not the log,", missing))
+            if names
+        ]
+        raise JointSetError(
+            f"{path}: its joints are not those of {robot}: the description {', and '.join(faults)}"
+            " (undulog robot new --from writes one for a log)"
+        )
+
 
 COMMAND_TOPIC = "/joint_commands"
 RESPONSE_TOPIC = "/joint_states"
@@ -51,7 +128,7 @@ _COMMAND_WORDS = {"command", "commands", "cmd", "cmds", "target", "targets", "de
     *("goals", "reference", "references", "setpoint", "setpoints", "action", "actions")
 }
 _NO_ANGLES = {"velocity", "velocities", "effort", "efforts", "torque", "torques", "current"}
-_MOST_LISTED = 8
+_FEW_LISTED = 8
 
 HOW_TO_CHOOSE = "choose with --command-topic and --response-topic"
 _NO_QUANTITIES: Mapping[str, str] = MappingProxyType({})
@@ -251,7 +328,7 @@ class JointTopicFinder:
                     found.setdefault(usual, f"{topic}.{interface}")
             rest = [one for one in own if one not in UNITS and one not in INTERFACE_UNITS]
             if rest:
-                listed = some_names(rest, _MOST_LISTED)
+                listed = some_names(rest, _FEW_LISTED)
                 notes.append(f"{topic} has interfaces that aren't analysed: {listed}")
         return found, tuple(notes)
 
@@ -286,5 +363,5 @@ def _notes(taken: Mapping[str, str], others: Sequence[str]) -> tuple[str, ...]:
     if not taken:
         return ()
     found = " and ".join(f"{kind} on {name}" for kind, name in taken.items())
-    rest = f"; other joints: {some_names(others, _MOST_LISTED)}" if others else ""
+    rest = f"; other joints: {some_names(others, _FEW_LISTED)}" if others else ""
     return (f"{found}, found by type{rest} ({HOW_TO_CHOOSE})",)

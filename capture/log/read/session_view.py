@@ -17,9 +17,8 @@ from ..messages.definitions import MessageType
 from ..messages.frames import FD_FRAME_DTYPE, FD_FRAME_LAYOUT, FRAME_DTYPE, FRAME_LAYOUT, FrameArray
 from .joint_rows import JointRows
 from .joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC, JointTopics
-from .open_log import OpenLog
+from .open_log import OpenLog, SessionFacts
 from .sample_times import JointSignals
-from .session_facts import SessionFacts
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,1 +1,1 @@
-"""The session writer and its channels."""
+"""The session writer, its channels, and where messages go: a file, a log before it, a ring."""

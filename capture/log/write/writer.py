@@ -22,7 +22,6 @@ from ...robot.kinematics import mesh_type
 from ...robot.model import Robot, Sensor, SensorKind
 from ..messages.cdr import encode, layout_of
 from ..messages.definitions import message_type, schema_text
-from ..sinks.mcap_sink import McapSink, MessageSink
 from .channels import (
     DiagnosticsChannel,
     FrameChannel,
@@ -39,6 +38,7 @@ from .channels import (
     TimeReferenceChannel,
     TransformChannel,
 )
+from .mcap_sink import McapSink, MessageSink
 
 CONTRACT_VERSION = "1"
 """Version of the log contract that this writer follows."""

@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 from support.paths import ROOT
-from undulog.capture.commands.several import first_sentence, sessions_of
+from undulog.capture.commands.sessions import first_sentence, sessions_of
 
 GOLDEN = ROOT / "tests/replay/golden/session.mcap"
 

@@ -13,8 +13,8 @@ from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError, MissingChannelError, MissingExtraError
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.column_map import column_map_from_options
-from undulog.capture.exchange.csv_import import import_csv
 from undulog.capture.exchange.export import TABLE_FORMATS, export_columns
+from undulog.capture.exchange.table_import import import_tables, open_mapped
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -144,7 +144,8 @@ def test_a_csv_of_one_joint_can_be_imported_again(tmp_path):
     export_columns(tmp_path / "run.mcap", tmp_path / "x.csv", topics=["/joint_states"])
     options = ["t_ns=time:ns", "joint_states.position [rad]=joint01.position:rad"]
     columns = column_map_from_options(options, robot)
-    import_csv(tmp_path / "x.csv", tmp_path / "back.mcap", robot, columns)
+    found = open_mapped(tmp_path / "x.csv", columns)
+    import_tables(found, tmp_path / "back.mcap", robot=robot, column_map=columns)
     with Session.open(tmp_path / "back.mcap") as session:
         back = session.joints("/joint_states").signal("joint01")
     np.testing.assert_array_equal(back.t_ns, states.t_ns)

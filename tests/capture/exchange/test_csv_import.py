@@ -11,8 +11,9 @@ from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import FaultyFileError, ImportFormatError, UsageError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.exchange import column_map
-from undulog.capture.exchange import csv_import as csv
+from undulog.capture.exchange.can_logs import is_frame_csv
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
+from undulog.capture.exchange.table_import import import_tables, open_mapped
 
 GEAR = 22
 JOINT7 = f"""
@@ -40,7 +41,8 @@ def load(source, tmp_path):
     (tmp_path / "map.toml").write_text(JOINT7)
     robot = load_robot("arcsnake-joint")
     columns = column_map.read_column_map(tmp_path / "map.toml", robot)
-    return csv.import_csv(source, tmp_path / "run.mcap", robot, columns)
+    found = open_mapped(source, columns)
+    return import_tables(found, tmp_path / "run.mcap", robot=robot, column_map=columns)
 
 
 @pytest.mark.skipif(not ARCSNAKE.exists(), reason=f"the ArcSnake data are not at {ARCSNAKE}")
@@ -85,7 +87,8 @@ def csv_file(tmp_path, text):
 def run(tmp_path, text, *options, time="s", **more):
     robot = load_robot("snake13")
     columns = column_map.column_map_from_options((f"t=time:{time}", *options), robot)
-    return csv.import_csv(csv_file(tmp_path, text), tmp_path / "run.mcap", robot, columns, **more)
+    found = open_mapped(csv_file(tmp_path, text), columns)
+    return import_tables(found, tmp_path / "run.mcap", robot=robot, column_map=columns, **more)
 
 
 def test_columns_of_several_joints_and_quantities(tmp_path):
@@ -218,8 +221,8 @@ def test_options_and_file_say_the_same(tmp_path):
 
 def test_a_csv_of_can_frames_is_reported_from_others(tmp_path):
     header = "timestamp,arbitration_id,extended,remote,error,dlc,data\n"
-    assert csv.is_frame_csv(csv_file(tmp_path, header))
-    assert not csv.is_frame_csv(csv_file(tmp_path, "time,a\n"))
+    assert is_frame_csv(csv_file(tmp_path, header))
+    assert not is_frame_csv(csv_file(tmp_path, "time,a\n"))
 
 
 def test_a_stopped_import_leaves_a_whole_file(tmp_path):

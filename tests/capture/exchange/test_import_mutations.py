@@ -11,7 +11,7 @@ from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.exchange.can_import import import_can
 from undulog.capture.exchange.column_map import column_map_from_options
-from undulog.capture.exchange.csv_import import import_csv
+from undulog.capture.exchange.table_import import import_tables, open_mapped
 
 SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".db")
 LARGE = ("1e308", "-1e308", "1e19", "1e999999999", "9" * 400)
@@ -133,6 +133,10 @@ def test_odd_numbers_in_a_csv_of_columns(number, robot, tmp_path):
         path = tmp_path / "a.csv"
         path.write_bytes(f"t,a\n0.0,0.5\n{row}\n0.03,0.25\n".encode())
         columns = column_map_from_options(["t=time:s", f"a={name}.position:rad"], robot)
-        given = (path, tmp_path / "a.mcap", robot, columns)
-        why = refusal(lambda given=given: import_csv(*given, force=True))
+        given = {"robot": robot, "column_map": columns, "force": True}
+        why = refusal(
+            lambda source=(path, columns), given=given: import_tables(
+                open_mapped(*source), tmp_path / "a.mcap", **given
+            )
+        )
         assert why is None or str(path) in why

@@ -15,9 +15,9 @@ from scipy.io import savemat
 from support.paths import ARCSNAKE, SHARED
 from undulog.capture import Session
 from undulog.capture.common.errors import ImportFormatError
+from undulog.capture.exchange.array_files import read_tensors
 from undulog.capture.exchange.frame_log import RELATIVE_EPOCH_NS
 from undulog.capture.exchange.table_import import import_tables, open_tables
-from undulog.capture.exchange.torch_zip import read_tensors
 
 T = np.arange(300) * 0.01
 Q = np.stack([np.sin(3 * T + k) for k in range(3)], axis=1)

@@ -18,7 +18,7 @@ from undulog.capture.log.health.freeze import FreezeTally, RangeTally
 from undulog.capture.log.health.session_check import check_session
 from undulog.capture.log.messages.definitions import OK, DiagnosticStatus
 from undulog.capture.log.messages.frames import ERROR_FLAG, empty_frames
-from undulog.capture.log.sinks.mcap_sink import McapSink
+from undulog.capture.log.write.mcap_sink import McapSink
 from undulog.capture.recorder import health as live_health
 from undulog.capture.recorder.health import LiveHealth
 from undulog.capture.recorder.recording import TappedSink

@@ -8,7 +8,7 @@ from support.written_topics import write_topics
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError, LogWriteError
 from undulog.capture.common.palette import joint_colors
-from undulog.replay.draw.scene.body import ROUNDING
+from undulog.replay.draw.body import ROUNDING
 from undulog.replay.feed.recording import recording_id, write_recording
 
 

@@ -17,7 +17,7 @@ from undulog.replay.feed import progressive
 from undulog.replay.feed.numbers import Analysing, computed
 from undulog.replay.feed.recording import recording_id, write_recording
 from undulog.replay.samples.content import Layer
-from undulog.replay.viewer.viewer import Viewer
+from undulog.replay.viewer import Viewer
 
 TOPICS = ("/joint_commands", "/joint_states")
 NS = 1_000_000_000

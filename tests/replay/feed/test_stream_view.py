@@ -12,8 +12,8 @@ import pytest
 
 from support import golden_pictures, processes
 from support.processes import freeze
-from undulog.replay.viewer.headless import client_of
-from undulog.replay.viewer.viewer import Viewer
+from undulog.replay.headless import client_of
+from undulog.replay.viewer import Viewer
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.recorder import live_feed
 from undulog.capture.recorder.live_feed import spawn_relay
 from undulog.capture.recorder.live_wire import DatagramHead, Kind, pack_datagram
-from undulog.replay.live.inbox import Inbox
+from undulog.replay.live.relay import Inbox
 
 
 def test_relay_that_comes_late_understands_what_is_left(stage, truth, read_back):

@@ -10,7 +10,7 @@ import pytest
 
 from support.live_stage import WAIT_S
 from support.processes import freeze, listening
-from undulog.replay.viewer.viewer import free_ports, viewer_binary
+from undulog.replay.viewer import free_ports, viewer_binary
 
 
 @pytest.fixture

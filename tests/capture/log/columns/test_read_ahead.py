@@ -15,7 +15,7 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.log.columns import blocks as arenas
 from undulog.capture.log.columns.blocks import Piece, ahead, helpers
 from undulog.capture.log.file.log_file import LogFile
-from undulog.capture.log.sinks.durable_sink import DurableSink
+from undulog.capture.log.write.durable_sink import DurableSink
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

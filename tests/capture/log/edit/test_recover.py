@@ -156,22 +156,26 @@ def test_a_recording_that_runs_can_be_read(tmp_path, path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap"]
 
 
-@pytest.mark.parametrize("looks", [5, pytest.param(40, marks=pytest.mark.slow)])
-def test_a_recording_can_be_read_at_any_moment(path, looks):
+@pytest.mark.parametrize("recordings", [1, pytest.param(8, marks=pytest.mark.slow)])
+def test_a_recording_can_be_read_at_any_moment(tmp_path, recordings):
     """A reader that comes while the recorder writes and splits in another process."""
-    with start(path, split_size=1 << 17) as child:
-        try:
-            os.read(child.stdout.fileno(), 8)
-            counts = []
-            for _ in range(looks):
-                found, _ = read(path)
-                assert found == recorder.truth(len(found))
-                counts.append(len(found))
-                os.read(child.stdout.fileno(), 1 << 16)  # let it go on
-        finally:
-            child.kill()
-            child.stdout.read()
-    assert counts == sorted(counts)
+    truth = recorder.truth(50_000)
+    for number in range(recordings):
+        path = tmp_path / str(number) / "run.mcap"
+        path.parent.mkdir()
+        with start(path, split_size=1 << 17) as child:
+            try:
+                os.read(child.stdout.fileno(), 8)
+                counts = []
+                for _ in range(5):
+                    found, _ = read(path)
+                    assert found == truth[: len(found)]
+                    counts.append(len(found))
+                    os.read(child.stdout.fileno(), 1 << 16)  # let it go on
+            finally:
+                child.kill()
+                child.stdout.read()
+        assert counts == sorted(counts)
 
 
 def test_what_the_log_let_go_of_while_it_was_read_is_no_reason_to_read_twice(tmp_path):
@@ -454,8 +458,9 @@ def damage(rng, folder):
 def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_reported(tmp_path, runs):
     source = tmp_path / "source"
     source.mkdir()
-    unfinished(source / "run.mcap", 2400, splits=[900, 1800])
-    truth = set(recorder.truth(2400))
+    total = 900
+    unfinished(source / "run.mcap", total, splits=[300, 600], segment_size=1 << 15)
+    truth = set(recorder.truth(total))
     place = tmp_path / "damaged"
     outcomes = Counter()
     rng = random.Random(runs)
@@ -474,8 +479,8 @@ def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_reported
         assert len(set(found)) == len(found), run
         assert sum(report.messages.values()) == len(found), run
         # What the damaged log itself can't tell any more is not counted.
-        assert report.missing is None or report.missing <= 2400 - len(found), run
-        assert len(found) == 2400 or warnings, run
-        outcomes["all" if len(found) == 2400 else "some"] += 1
+        assert report.missing is None or report.missing <= total - len(found), run
+        assert len(found) == total or warnings, run
+        outcomes["all" if len(found) == total else "some"] += 1
     assert outcomes["none"] <= runs // 20
     assert outcomes.keys() >= {"all", "some"}

@@ -2,7 +2,6 @@
 
 import shutil
 import sqlite3
-import tempfile
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from undulog.capture import Session
 from undulog.capture.common.errors import NotALogError, UndulogError
 
+pytestmark = pytest.mark.usefixtures("scratch")
 EPOCH_NS = 1_700_000_000_000_000_000
 KIND = "sensor_msgs/msg/JointState"
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -44,16 +44,6 @@ def check(path):
         assert session.path == path
         np.testing.assert_array_equal(found.t_ns, np.stack([TIMES_NS, TIMES_NS]))
         np.testing.assert_array_equal(found.values, TRUTH.T)
-
-
-@pytest.fixture(autouse=True)
-def scratch(tmp_path, monkeypatch):
-    """A folder of temporary files, which must be empty after each test."""
-    folder = tmp_path / "scratch"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    yield
-    assert not any(folder.iterdir())
 
 
 @pytest.mark.parametrize("mode", MODES)

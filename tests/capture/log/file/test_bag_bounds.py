@@ -4,7 +4,6 @@ import bz2
 import re
 import sqlite3
 import struct
-import tempfile
 
 import lz4.frame
 import pytest
@@ -16,6 +15,7 @@ from support.ros_bags import Filler, ticks, write_bag
 from undulog.capture import Session
 from undulog.capture.common.errors import NotALogError
 
+pytestmark = pytest.mark.usefixtures("scratch")
 MIB = 1 << 20
 BY_FILE, BY_MESSAGE = (
     (mode, CompressionFormat.ZSTD) for mode in (CompressionMode.FILE, CompressionMode.MESSAGE)
@@ -27,16 +27,6 @@ def fill(bag):
     own = Filler(bag)
     for tick in ticks(0.3):
         own.state(*tick)
-
-
-@pytest.fixture(autouse=True)
-def scratch(tmp_path, monkeypatch):
-    """A folder of temporary files, which must be empty after each test."""
-    folder = tmp_path / "scratch"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    yield
-    assert not any(folder.iterdir())
 
 
 def refused(path, match):

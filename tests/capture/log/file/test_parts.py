@@ -16,7 +16,7 @@ from undulog.capture.log.edit.cut import cut_log
 from undulog.capture.log.edit.merge import merge_logs
 from undulog.capture.log.file.parts import later_parts, part_path, split_part_path
 from undulog.capture.log.health.session_check import check_session
-from undulog.capture.log.sinks.durable_sink import DurableSink
+from undulog.capture.log.write.durable_sink import DurableSink
 
 EPOCH_NS = recorder.EPOCH_NS
 

@@ -18,7 +18,7 @@ from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import InputFileError, LogError, UndulogError
 from undulog.capture.common.remote import RemoteFile, RemotePath, as_path
 from undulog.capture.log.health.session_check import check_session
-from undulog.capture.log.sinks.durable_sink import DurableSink
+from undulog.capture.log.write.durable_sink import DurableSink
 
 T0 = 1_735_689_600_000_000_000
 JOINTS = tuple(f"joint{k:02d}" for k in range(1, 6))

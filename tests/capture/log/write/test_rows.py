@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as arrays
 from support.read_back import decoded_of, messages_of
 from undulog.capture import SessionWriter
 from undulog.capture.common.errors import DataError
-from undulog.capture.log.sinks.durable_sink import DurableSink
+from undulog.capture.log.write.durable_sink import DurableSink
 
 EPOCH_NS = 1_700_000_000_000_000_000
 FACTS = {"session_id": "s", "epoch_ns": EPOCH_NS}

@@ -1,1 +1,0 @@
-"""Best linear approximations from several sessions of one multisine experiment."""

@@ -1,1 +1,0 @@
-"""Many sessions of a robot over weeks: change points, variance components, outliers."""

@@ -1,1 +1,0 @@
-"""Motion without commands: of animals, of robots whose commands were not logged."""

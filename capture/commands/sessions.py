@@ -1,0 +1,194 @@
+"""Sessions of a command: paths, folders and patterns in, a table out; topics of their joints."""
+
+from __future__ import annotations
+
+import glob
+import re
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from cyclopts import Parameter
+
+from ..common.console import UNLIMITED, Column, emit_json, progress, table
+from ..common.errors import UndulogError
+from ..common.remote import RemotePath, as_path
+from ..log.file.parts import first_part
+from ..log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
+from ..log.read.session_view import SessionView
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class CommandTopic:
+    """Where the commands are.
+
+    Attributes:
+        command_topic: Topic of the commands: of JointStates or JointTrajectories,
+            `TOPIC.reference` of a controller state, or `TOPIC:JOINT,JOINT,...` of a
+            Float64MultiArray.
+    """
+
+    command_topic: str = COMMAND_TOPIC
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class JointTopicOptions(CommandTopic):
+    """Where commands and responses are; by default found by type if those topics are missing.
+
+    Attributes:
+        response_topic: Topic of the responses: of JointStates or DynamicJointStates, or
+            `TOPIC.feedback` of a controller state.
+    """
+
+    response_topic: str = RESPONSE_TOPIC
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Topics of commands and responses."""
+        return self.command_topic, self.response_topic
+
+    def view(self, session: SessionView) -> SessionView:
+        """View a session with its joints on the topics of the log contract."""
+        return session.with_joints(*self.names)
+
+
+CONTRACT = JointTopicOptions()
+
+
+_COLUMNS = (
+    Column("session", left=True),
+    Column("robot", left=True, spare=2),
+    Column("gait", left=True, spare=1),
+    Column("verdict", left=True),
+    Column("first sentence", left=True),
+)
+
+FAILED = "failed"
+"""Verdict of a session that couldn't be worked on; its sentence is why."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A session in the table.
+
+    Attributes:
+        robot: Its name; empty without a description.
+        gait: Frequency or name of its gait; empty if unknown.
+        facts: What the command prints of this session alone with ``--json``.
+        good: False if the command would end with exit code 1 for it.
+    """
+
+    robot: str = ""
+    gait: str = ""
+    verdict: str = ""
+    sentence: str = ""
+    facts: Any = field(default_factory=dict[str, Any])
+    good: bool = True
+
+
+def sessions_of(given: Iterable[Path]) -> list[Path]:
+    """Return the sessions that paths, URLs, folders and patterns name, in that order.
+
+    Args:
+        given: Of a folder, all sessions in it and in the folders in it, in order of name; a
+            rosbag2 folder and the parts of a split session are one. A pattern (``*``, ``?``,
+            ``[...]``, ``**``) is a path that isn't there. What names no session stays, for the
+            command to refuse.
+    """
+    found: list[Path] = []
+    for path in map(as_path, given):
+        own = _named(path)
+        found += [one for one in own if one == path or one not in found]
+    return found
+
+
+def _named(path: Path) -> list[Path]:
+    if isinstance(path, RemotePath):
+        return [path]
+    if path.is_dir():
+        found = _in_folder(path)
+        alone = len(found) == 1 and found[0].parent == path
+        return [path] if alone or not found else found
+    if glob.has_magic(str(path)) and not path.exists():
+        matches = sorted(map(Path, glob.glob(str(path), recursive=True)))  # noqa: PTH207 - absolute too
+        whole = [each if each.is_dir() else first_part(each) for each in matches]
+        return [one for each in dict.fromkeys(whole) for one in _named(each)] or [path]
+    return [path]
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    """Return the sessions in a folder and, behind them, in its folders."""
+    if (folder / "metadata.yaml").is_file():  # as rosbag2 writes it
+        return [folder]
+    found: dict[Path, None] = {}
+    entries = sorted(folder.iterdir())
+    for entry in entries:
+        if entry.suffix == ".mcap" and entry.is_file():
+            found[first_part(entry)] = None
+        elif entry.name.endswith(".mcap.wal") and entry.is_dir():
+            found[entry.with_name(entry.name.removesuffix(".wal"))] = None
+    for entry in entries:
+        if entry.is_dir() and not entry.name.startswith(".") and entry.suffix != ".wal":
+            found |= dict.fromkeys(_in_folder(entry))
+    return list(found)
+
+
+def each(what: Sequence[Any], verb: str, work: Callable[[Any], Line]) -> dict[str, Line]:
+    """Do the work on each session, with progress on a terminal; one that fails has a line of why.
+
+    Args:
+        what: Paths, or names.
+        verb: For the progress.
+
+    Returns:
+        Each one's name in the table to its line: its path only where names repeat.
+    """
+    what = list(dict.fromkeys(what))
+    short = [one.name if isinstance(one, Path) else str(one) for one in what]
+    names = [n if short.count(n) == 1 else str(one) for n, one in zip(short, what, strict=True)]
+    lines: dict[str, Line] = {}
+    with progress(verb, total=len(names)) as bar:
+        for k, (name, one) in enumerate(zip(names, what, strict=True)):
+            bar.update(k, note=name)
+            try:
+                lines[name] = work(one)
+            except (UndulogError, OSError, MemoryError) as error:
+                why = str(error).removeprefix(f"{one}: ") or "there is not enough memory"
+                facts = {"path": str(one), "error": why}
+                lines[name] = Line(verdict=FAILED, sentence=why, facts=facts, good=False)
+    return lines
+
+
+def show(lines: Mapping[str, Line], *, as_json: bool) -> int:
+    """Print the table, or a list of JSON objects; return 1 if any line is not good, else 0."""
+    if as_json:
+        emit_json([line.facts for line in lines.values()])
+    else:
+        terminal = sys.stdout.isatty()
+        width = shutil.get_terminal_size().columns if terminal else UNLIMITED
+        rows = [
+            [(text or "-", "") for text in (name, *_cells(line))] for name, line in lines.items()
+        ]
+        texts, _ = table(_COLUMNS, rows, width, cropped=terminal)
+        sys.stdout.write("".join(f"{text.plain.rstrip()}\n" for text in texts))
+    return int(not all(line.good for line in lines.values()))
+
+
+def _cells(line: Line) -> tuple[str, str, str, str]:
+    return line.robot, line.gait, line.verdict, first_sentence(line.sentence)
+
+
+def first_sentence(text: str) -> str:
+    """Return the first sentence of a text, in one line."""
+    return re.split(r"(?<=[.!?])\s+(?=[A-Z])|\n", text, maxsplit=1)[0]
+
+
+def stated_gait(metadata: Mapping[str, Mapping[str, str]]) -> str:
+    """Return what drove a session, as its metadata states it; empty if they don't."""
+    own = metadata.get("undulog", {})
+    return own.get("driven.by") or own.get("scenario") or ""

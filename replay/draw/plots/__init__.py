@@ -1,1 +1,0 @@
-"""Plots: angles, power, the gait, and topics of foreign logs."""

@@ -1,1 +1,0 @@
-"""The scene: body, sensors, surroundings."""

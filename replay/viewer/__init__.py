@@ -1,1 +1,0 @@
-"""The viewer process, with and without a window."""

@@ -1,0 +1,224 @@
+"""Fleets whose truth is known: a joint that wears from a day on, or none."""
+
+import json
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from support.linear_chain import CHAIN, WAVE, M, write_run
+from support.processes import undulog
+from undulog.analysis.catalog.change_points import find_change_points, relative_to_others
+from undulog.analysis.catalog.fleet import Components, analyse_fleet
+
+DAY_NS = 86_400_000_000_000
+FIRST = pd.Timestamp("2026-09-01")
+
+
+def wear(kind, age_days):
+    """Share of the full change, by the time since it began."""
+    after = np.maximum(age_days, 0.0)
+    return {
+        "none": 0.0 * after,
+        "step": (age_days > 0).astype(float),
+        "ramp": after / 30,
+        "saturating": 1 - np.exp(-after / 7),
+    }[kind]
+
+
+def frames(seed, kind="none", *, size=0.05, n=60, joints=13, gaits=1):
+    """Sessions and joints as the catalogue has them; who wears, and since when."""
+    rng = np.random.default_rng(seed)
+    days = np.sort(rng.uniform(0, 60, n))
+    paths = [f"run{k:03d}.mcap" for k in range(n)]
+    names = [f"joint{k:02d}" for k in range(1, joints + 1)]
+    at, worn = int(rng.integers(10, n - 10)), int(rng.integers(joints))
+    begun = (days[at - 1] + days[at]) / 2
+
+    def values(mean, own, shared, noise):
+        of_joints = mean + own * rng.normal(size=joints)
+        of_sessions = shared * rng.normal(size=n)[:, None]
+        return of_joints + of_sessions + noise * rng.normal(size=(n, joints))
+
+    gait = rng.integers(0, gaits, n)
+    gain = values(0.9, 0.05, 0.03, 0.01) + 0.03 * gait[:, None] * rng.normal(size=joints)
+    lag, power = values(0.1, 0.02, 0.02, 0.01), np.exp(values(0, 0.2, 0.1, 0.03))
+    gain[:, worn] -= size * wear(kind, days - begun)
+    sessions = pd.DataFrame(
+        {
+            "path": paths,
+            "status": "analysed",
+            "robot": "snake13",
+            "start": FIRST + pd.to_timedelta(days * DAY_NS, unit="ns"),
+            "duration_s": 16.0,
+            "lag_sd": lag.std(axis=1),
+            "gain_cv": gain.std(axis=1),
+            "energy_cv": power.std(axis=1),
+            "cost_of_transport": np.nan,
+            "distance_m": np.nan,
+            "frequency_hz": 0.5,
+            "changes": None,
+        }
+    )
+    rows = pd.DataFrame(
+        {
+            "path": np.repeat(paths, joints),
+            "joint": np.tile(names, n),
+            "position": np.tile(np.arange(joints), n),
+            "gain": gain.ravel(),
+            "lag_rad": lag.ravel(),
+            "energy_abs_j": 8 * power.ravel(),
+            "start_s": 8.0,
+            "stop_s": 16.0,
+            "command_amplitude_rad": np.repeat(0.3 + 0.1 * gait, joints),
+            "frequency_hz": 0.5,
+        }
+    )
+    return sessions, rows, names[worn], FIRST + pd.Timedelta(days=begun)
+
+
+def test_a_worn_joint_is_named_with_its_date():
+    sessions, rows, name, begun = frames(3, "step")
+    fleet = analyse_fleet(sessions, rows)
+    (change,) = fleet.robots[0].changes
+    assert (change.joint, change.quantity, change.gradual) == (name, "gain", False)
+    assert change.earliest <= begun.isoformat() <= change.latest
+    assert change.change == pytest.approx(-0.055, abs=0.01)
+    assert f"the gain of {name} falls by" in fleet.answer
+    assert begun.date().isoformat() in fleet.answer
+
+
+def test_variance_components_and_trends_are_those_planted():
+    sessions, rows, _, _ = frames(8)
+    (robot,) = analyse_fleet(sessions, rows).robots
+    by_name = {one.quantity: one for one in robot.components}
+    assert by_name["lag"].residual == pytest.approx(0.01, rel=0.1)
+    assert by_name["lag"].session == pytest.approx(0.02, rel=0.3)
+    assert by_name["energy"].joint == pytest.approx(0.2, rel=0.6)
+    assert robot.changes == ()
+    days = (sessions.start - FIRST) / pd.Timedelta(days=1)
+    drifting = sessions.assign(lag_sd=0.01 + 0.001 * days)
+    trends = {one.quantity: one for one in analyse_fleet(drifting, rows).robots[0].trends}
+    assert trends["lag_sd"].tau == 1.0
+    assert trends["lag_sd"].p < 1e-6
+    low, high = trends["lag_sd"].slope_ci95
+    assert trends["lag_sd"].slope == pytest.approx(0.001)
+    assert low - 1e-9 <= 0.001 <= high + 1e-9
+
+
+def test_results_of_a_sweep_are_held_against_its_parameters():
+    sessions, rows, _, _ = frames(3)
+    torque = np.random.default_rng(0).permutation(np.geomspace(0.2, 1.0, len(sessions)))
+    swept = sessions.assign(
+        lag_sd=0.02 / torque,
+        changes=[json.dumps({"servo.stall_torque": t, "robot": "snake13"}) for t in torque],
+    )
+    trends = {(t.quantity, t.against): t for t in analyse_fleet(swept, rows).robots[0].trends}
+    trend = trends["lag_sd", "servo.stall_torque"]
+    assert (trend.tau, trend.sessions) == (-1.0, len(sessions))
+    assert trend.p < 1e-6
+    pairs = [
+        (y - x) / (b - a)
+        for (a, x), (b, y) in combinations(zip(torque, 0.02 / torque, strict=True), 2)
+    ]
+    assert trend.slope == pytest.approx(np.median(pairs))
+    assert trends["lag_sd", "date"].p > 0.05
+
+
+def test_an_odd_session_is_an_outlier_and_no_change():
+    sessions, rows, _, _ = frames(5)
+    at = (rows.path == "run030.mcap") & (rows.joint == "joint04")
+    rows.loc[at, "lag_rad"] += 0.2
+    (robot,) = analyse_fleet(sessions, rows).robots
+    assert robot.changes == ()
+    first = robot.outliers[0]
+    assert (first.path, first.joint, first.quantity) == ("run030.mcap", "joint04", "lag")
+    assert first.deviation == pytest.approx(0.2, abs=0.04)
+
+
+def test_few_or_incomplete_sessions_are_reported():
+    sessions, rows, _, _ = frames(1, n=40)
+    few = analyse_fleet(sessions.head(5), rows)
+    assert few.robots == ()
+    assert "No robot has enough" in few.answer
+    partly = sessions.assign(status=np.where(np.arange(40) < 4, "not analysed", "analysed"))
+    result = analyse_fleet(partly, rows[rows.path != "run020.mcap"])
+    assert result.robots[0].sessions == 35
+    assert result.robots[0].warnings == ("1 sessions lack the response of a joint",)
+    assert "4 sessions are not analysed" in result.warnings[0]
+
+
+def test_constant_and_missing_series_have_no_change():
+    times = np.arange(20.0)
+    nothing = np.zeros(20, dtype=np.int64)
+    constant = np.ones((20, 5))
+    holes = np.random.default_rng(1).normal(size=(20, 5))
+    holes[3] = np.nan
+    assert find_change_points([constant, holes], times, nothing) == [[], []]
+    assert find_change_points([holes[:5]], times[:5], nothing[:5]) == [[]]
+
+
+def test_one_joint_does_not_move_the_others():
+    values = np.random.default_rng(2).normal(size=(40, 5)) * 0.01 + np.arange(5)
+    moved = values.copy()
+    moved[20:, 2] -= 3.0
+    nothing = np.zeros(40, dtype=np.int64)
+    before, after = (relative_to_others(one, nothing) for one in (values, moved))
+    assert np.abs(after - before)[:, [0, 1, 3, 4]].max() < 0.03
+
+
+@pytest.fixture
+def without_models(monkeypatch):
+    """Leave out the mixed-effects models, which take most of the time."""
+    monkeypatch.setattr(
+        "undulog.analysis.catalog.fleet._components", lambda name, *_: Components(name)
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gaits", [1, 3])
+def test_without_wear_hardly_a_joint_is_named(without_models, gaits):
+    named = 0
+    for seed in range(50):
+        sessions, rows, _, _ = frames(seed, gaits=gaits)
+        named += bool(analyse_fleet(sessions, rows).robots[0].changes)
+    assert named <= 2  # binomial, 1 %: 2 or fewer in 99 %
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["step", "ramp", "saturating"])
+def test_wear_is_named_with_a_date_whose_interval_holds(without_models, kind):
+    good = 0
+    for seed in range(50):
+        sessions, rows, name, begun = frames(seed, kind, size=0.06)
+        changes = analyse_fleet(sessions, rows).robots[0].changes
+        mine = [change for change in changes if (change.joint, change.quantity) == (name, "gain")]
+        good += any(one.earliest <= begun.isoformat() <= one.latest for one in mine)
+    assert good >= {"step": 45, "ramp": 36, "saturating": 42}[kind]
+
+
+def test_the_page_of_a_folder_names_the_joint_and_links_outliers(tmp_path):
+    for number in range(12):
+        weak = np.diag(np.where(np.arange(M) == 2, 0.8 if number >= 6 else 1.0, 1.0))
+        answer = weak @ CHAIN @ WAVE
+        if number == 3:
+            answer[1] *= np.exp(-0.3j)
+        write_run(tmp_path / f"run{number:02d}.mcap", WAVE, answer, number, 0.003)
+    (tmp_path / "run03.html").write_text("its page")
+    page = tmp_path / "fleet.html"
+    done = undulog("report", "--catalog", tmp_path, "-o", page, "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert "the gain of j3 falls by" in result["answer"]
+    text = page.read_text()
+    for part in (
+        result["answer"].split(":")[1].strip()[:20],
+        '<a href="run03.mcap">',
+        '<a href="run03.html">page</a>',
+        "<svg",
+    ):
+        assert part in text
+    assert "://" not in text.replace("http://www.w3.org", "")
+    words = ("--catalog", tmp_path, "-o", page, "--force")
+    assert undulog("report", tmp_path / "run00.mcap", *words).returncode == 2
