@@ -19,7 +19,7 @@ from ...results import formats
 from ...results.analysis import Analysis, JointResult
 from ...results.artefact import KINDS, Artefact, Span
 from ...results.formats import degrees, estimate, short
-from .svg import REFERENCE, Drawing, drawing, inline_svg, key, legend
+from .svg import COMMAND, Drawing, drawing, inline_svg, key, legend
 from .tables import element, is_driven
 
 CYCLES = 2.5
@@ -133,8 +133,7 @@ def command_response(traces: Sequence[Trace], joint_count: int, prefix: str) -> 
         for (axes,), trace in zip(grid, traces, strict=True):
             command, response = np.degrees(trace.command_rad), np.degrees(trace.response_rad)
             at, color = trace.place, colors[trace.place]
-            gray = {"color": REFERENCE, "linewidth": 2.4}
-            axes.plot(trace.command_t_s, command, gid=f"command-{at}", **gray)
+            axes.plot(trace.command_t_s, command, gid=f"command-{at}", **COMMAND)
             axes.plot(
                 trace.response_t_s, response, gid=f"response-{at}", color=color, linewidth=1.6
             )
@@ -144,16 +143,14 @@ def command_response(traces: Sequence[Trace], joint_count: int, prefix: str) -> 
             axes.margins(x=0.01)
         figure.supylabel("joint angle [°]", fontsize=8.0)
         grid[-1, 0].set_xlabel("time from the session's start [s]")
-        command_key = key(color=REFERENCE, linewidth=2.4, label="command")
+        command_key = key(label="command", **COMMAND)
         middle = colors[traces[len(traces) // 2].place]
         legend(figure, command_key, key(color=middle, label="response"))
         title = "Command and response of " + ", ".join(t.joint.name for t in traces)
-        about = "Joint angle over time, command in grey, response in the joint's colour. "
+        about = "Joint angle over time, command dashed, response in the joint's colour. "
         about += "; ".join(_panel_title(t.joint) for t in traces) + "."
         svg = inline_svg(figure, prefix, title, about, tooltips)
-    return Drawing(
-        svg, "The last analysed cycles: command in grey, response in the joint's colour."
-    )
+    return Drawing(svg, "The last analysed cycles: command dashed, response in the joint's colour.")
 
 
 def _panel_title(joint: JointResult) -> str:

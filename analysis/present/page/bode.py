@@ -17,7 +17,10 @@ from ...results.formats import degrees, estimate, short
 from ...results.frequency_response import BestLinearJoint, JointFrequencyResponse
 from .svg import Drawing, band, drawing, inline_svg, key, legend
 
-JOINTS = 6
+MARKERS = ("o", "s", "^", "D", "v", "P")
+"""Of the joints in one figure, since colours alone don't distinguish them for all readers."""
+
+JOINTS = len(MARKERS)
 """Joints in one figure."""
 
 _TICKS = (1.0, 2.0, 5.0)
@@ -54,7 +57,7 @@ def _figure(
         for number, (one, color) in enumerate(zip(group, colors, strict=True)):
             frequency = np.array(one.frequency_hz)
             gain, ends = np.array(one.gain), np.array(one.gain_ci95)
-            style = {"color": color, "linewidth": 1.4, "marker": "o", "markersize": 2.6}
+            style = {"color": color, "linewidth": 1.4, "marker": MARKERS[number], "markersize": 3.6}
             gain_axes.plot(frequency, gain, gid=f"gain-{number}", **style)
             tooltips[f"gain-{number}"] = _tips(one, range(gain.size), lag=False)
             low = np.maximum(ends[:, 0], gain.min() / 10)  # a logarithm has no zero
@@ -84,8 +87,8 @@ def _figure(
         lag_axes.set_ylabel("lag [°]")
         lag_axes.set_xlabel("frequency [Hz]")
         handles = [
-            key(color=color, linewidth=1.4, label=short(one.joint, 14))
-            for one, color in zip(group, colors, strict=True)
+            key(color=color, linewidth=1.4, marker=each, label=short(one.joint, 14))
+            for one, color, each in zip(group, colors, MARKERS, strict=False)
         ]
         legend(figure, *handles)
         figure.align_ylabels()

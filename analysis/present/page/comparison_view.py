@@ -21,6 +21,7 @@ from ...results.estimate import Estimate
 from ...results.formats import estimate, scaled, short
 from ..text_experiment import comparison_method
 from .svg import (
+    COMMAND,
     DASHED,
     REFERENCE,
     Axes,
@@ -111,8 +112,7 @@ def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
     with drawing(0.8 + 1.4 * len(shown)) as figure:
         grid = figure.subplots(len(shown), 2, sharex=True, squeeze=False)
         for k, ((both, right), (one, color)) in enumerate(zip(grid, shown, strict=True)):
-            gray = {"color": REFERENCE, "linewidth": 2.4}
-            both.plot(phases, np.degrees(one.a_rad), gid=f"a-{k}", **gray)
+            both.plot(phases, np.degrees(one.a_rad), gid=f"a-{k}", **COMMAND)
             both.plot(phases, np.degrees(one.b_rad), color=color, gid=f"b-{k}")
             both.set_title(short(one.name))
             middle, half = np.degrees(one.difference_rad), np.degrees(one.half_rad)
@@ -129,7 +129,7 @@ def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
         color = shown[0][1]
         legend(
             figure,
-            key(color=REFERENCE, linewidth=2.4, label="A"),
+            key(label="A", **COMMAND),
             key(color=color, label="B"),
             key(color=color, linewidth=6, alpha=0.25, label="95 %, each phase"),
         )
@@ -138,7 +138,7 @@ def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
     by = "commands" if comparison.commanded else "first joint's own motion"
     return Drawing(
         svg,
-        f"Mean cycle of the joints that differ most, by the phase of the {by}: A in grey, B in "
+        f"Mean cycle of the joints that differ most, by the phase of the {by}: A dashed, B in "
         "the joint's colour, and their difference with its 95 % interval at each phase.",
     )
 

@@ -303,6 +303,9 @@ def _plain_text_style(text: ET.Element) -> None:
 DASHED = (0, (5, 3))
 """Line style of margins, means and nulls."""
 
+COMMAND: dict[str, Any] = {"color": REFERENCE, "linewidth": 2.4, "linestyle": (0, (2.2, 0.9))}
+"""Line behind that of a joint, whose colour some readers can't tell from grey."""
+
 
 @dataclass(frozen=True)
 class Drawing:

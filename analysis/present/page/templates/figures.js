@@ -257,7 +257,7 @@ class Figure {
       ['+', 'Zoom in', () => this.zoom(1.6)],
       ['\u2212', 'Zoom out', () => this.zoom(1 / 1.6)],
       ['Reset', 'Reset the zoom', () => this.reset()],
-    ]) make('button', {type: 'button', 'aria-label': name, title: name}, bar, text).addEventListener('click', action);
+    ]) make('button', {type: 'button', 'aria-label': `${name}, ${label}`, title: name}, bar, text).addEventListener('click', action);
     const drag = this.panels.length ? 'drag: zoom; double click: reset; ' : '';
     bar.title = `point: value; ${drag}keys: arrows, +, \u2212, 0`;
     if (!document.querySelector('.tools span')) make('span', {}, bar, bar.title);
