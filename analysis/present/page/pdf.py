@@ -31,7 +31,8 @@ _FLAGS = (
     *("--no-default-browser-check", "--disable-extensions", "--disable-default-apps"),
     # No network: neither by the page, whose policy forbids it, nor by the browser itself.
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    "--host-resolver-rules=MAP * ~NOTFOUND",
+    *("--disable-domain-reliability", "--disable-features=NetworkTimeServiceQuerying,MediaRouter"),
+    *("--host-resolver-rules=MAP * ~NOTFOUND", "--proxy-server=127.0.0.1:9"),  # port 9: discard
     *("--no-pdf-header-footer", "--generate-pdf-document-outline"),
 )
 
