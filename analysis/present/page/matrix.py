@@ -348,5 +348,5 @@ def _caption(entries: Entries) -> str:
     )
     if entries.half is not None:
         text += " Numbers in italics do not differ significantly from 0 (95 %, one by one)."
-    hint = "its intervals" if len(entries.rows) <= MOST_IN_CELLS else "its numbers"
-    return f"{text} Point at a row, or reach it with the tab key, for {hint}."
+    what = "the numbers" if entries.half is None else "the intervals"
+    return f"{text} The table below has {what}."
