@@ -36,7 +36,10 @@ def fleet_view(fleet: Fleet, joints: pd.DataFrame, where: str, page: Path) -> di
         "fleet": fleet,
         "where": where,
         "warnings": [*fleet.warnings, *(w for h in fleet.robots for w in h.warnings)],
-        "contents": [(f"robot{k}", h.robot) for k, h in enumerate(fleet.robots, start=1)],
+        "contents": [
+            (f"robot{k}", h.robot or "Robot without a name")
+            for k, h in enumerate(fleet.robots, start=1)
+        ],
         "command": f"undulog report --catalog {shlex.quote(where)} -o {shlex.quote(page.name)}",
         "robots": [
             {

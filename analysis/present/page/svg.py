@@ -221,8 +221,9 @@ def _scale(figure: Figure, axes: Axes, name: str) -> list[object]:
     together = [
         k for k, each in enumerate(figure.axes) if each is axes or shared.joined(axes, each)
     ]
-    labels = (getattr(figure.axes[k], f"get_{name}label")() for k in together)
-    label = next(filter(None, labels), getattr(figure, f"get_sup{name}label")())
+    labels: list[str] = [getattr(figure.axes[k], f"get_{name}label")() for k in together]
+    labels.append(getattr(figure, f"get_sup{name}label")())
+    label = next((each for each in labels if each), "")
     fixed = isinstance(axis.get_major_locator(), _FIXED)
     kind = "fixed" if fixed else axis.get_scale()
     return [*map(float, getattr(axes, f"get_{name}lim")()), kind, together[0], label]

@@ -281,7 +281,6 @@ class Figure {
       this.show();
       svg.setPointerCapture(event.pointerId);
       event.preventDefault();
-      frame.focus({preventScroll: true});
     });
     svg.addEventListener('pointerup', event => {
       if (!from) return;
