@@ -1,9 +1,8 @@
 // Values under the pointer or by arrow keys, and zoom. The page is complete without it.
 (() => {
 'use strict';
-const NS = 'http://www.w3.org/2000/svg';
 const make = (name, attributes, parent, text) => {
-  const one = name === 'rect' ? document.createElementNS(NS, name) : document.createElement(name);
+  const one = document.createElementNS((parent || document.body).namespaceURI, name);
   for (const key in attributes) one.setAttribute(key, attributes[key]);
   if (text) one.textContent = text;
   if (parent) parent.append(one);
@@ -123,7 +122,7 @@ class Figure {
       return [parent, text];
     }));
     const title = this.svg.querySelector(':scope > title');
-    const defs = this.svg.insertBefore(document.createElementNS(NS, 'defs'), title);
+    const defs = this.svg.insertBefore(document.createElementNS(this.svg.namespaceURI, 'defs'), title);
     defs.append(title);
     this.scale = 1;
     this.ring = make('rect', {class: 'ring', visibility: 'hidden'}, this.svg);

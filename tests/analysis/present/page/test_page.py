@@ -97,8 +97,7 @@ def test_nothing_is_fetched_from_outside(page):
         assert re.findall(r"@import|url\(|http", style.text()) == []
     (script,) = root.all("script")
     assert script.attributes == {}
-    addresses = set(re.findall(r"\w+://[^'\"]*", script.text()))
-    assert addresses == {"http://www.w3.org/2000/svg"}, "the name of SVG, which is not fetched"
+    assert "://" not in script.text()
 
 
 def test_the_policy_allows_the_one_script_and_nothing_else(page):
