@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from cyclopts import Parameter
 
@@ -15,13 +15,14 @@ from undulog.capture.commands.sessions import (
     FAILED,
     JointTopicOptions,
     Line,
-    each,
     sessions_of,
     show,
 )
+from undulog.capture.commands.sessions import each as each_session
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output, write_text
+from undulog.capture.common.remote import as_path
 
 from .analyse import PAGES, chosen, experiment_of, line_of
 
@@ -35,7 +36,10 @@ _Format = Literal["svg", "png", "pdf"]
 
 def report(
     *files: Path,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    pdf: Path | None = None,
+    browser: str | None = None,
+    each: bool = False,
     catalog: str | None = None,
     find: Annotated[str, Parameter(name="--where")] = "",
     start: float | None = None,
@@ -47,14 +51,23 @@ def report(
     force: bool = False,
     json: bool = False,
 ) -> int:
-    """Write the offline report: one HTML page that needs no network and no script.
+    """Write the offline report: one HTML page that needs no network, or the same on paper as PDF.
 
-    Several sessions are one experiment, as for `undulog analyse`: runs of a gait and of its reverse
-    separate boundary from module, kicks of single joints identify the coupling. If `-o` names a
-    folder, each session gets a page of its own in it, and index.html lists them. With `--catalog`
-    the page is on all sessions of a folder over time: joints that change, trends, outliers.
+    The page states question, answer, evidence, limits and method. Pointing at a value of a figure
+    shows it with its interval, and figures zoom; without scripts the page is complete all the same.
+
+    Named sessions are one experiment, as for `undulog analyse`: runs of a gait and of its reverse
+    separate boundary from module, kicks of single joints identify the coupling. A folder, a
+    pattern, or `--each` give one page with an index, and below it the report on each session by
+    itself. If `-o` names a folder, each session gets a page of its own in it, and index.html lists
+    them. With `--catalog` the page is on all sessions of a folder over time: joints that change,
+    trends, outliers.
 
     Example: `undulog report run.mcap -o run.html`
+
+    On paper: `undulog report run.mcap --pdf run.pdf`
+
+    One page with an index: `undulog report runs/ -o runs.html`
 
     A page a session: `undulog report runs/ -o pages/`
 
@@ -62,8 +75,14 @@ def report(
 
     Args:
         files: Sessions (MCAP), their URLs, folders of them or patterns such as 'runs/**/*.mcap';
-            several are runs of one experiment.
-        output: The page, a name that ends in .html; for several sessions also a folder.
+            several named ones are runs of one experiment.
+        output: The page, a name that ends in .html, or in .pdf for paper; for several sessions also
+            a folder.
+        pdf: Print the page to this PDF file, besides or instead of `-o`; takes an installed
+            Chromium, Chrome or Edge, which runs without network.
+        browser: Name or path of the browser that prints; else that of UNDULOG_BROWSER, or the first
+            on the path.
+        each: Report on several sessions one by one on one page instead of as one experiment.
         catalog: Folder or URL of sessions to compare over time, instead of files; those without
             results are analysed first.
         find: Condition on the sessions of the catalogue, as for `undulog catalog`.
@@ -78,6 +97,60 @@ def report(
         json: Print one JSON object: the page, the answer, and the answer to each session; of a
             folder of pages a list of them.
     """
+    options = chosen(start, stop, topics)
+    _check_sources(files, catalog, find, options)
+    paths = sessions_of(files)
+    several = len(paths) > 1
+    if several and output is not None and (output.is_dir() or not output.suffix):
+        if pdf is not None:
+            raise UsageError("--pdf prints one page; with it name a page, -o PAGE.html, no folder")
+        figures = None if plots is None else _Figures(plots, format_, force=force)
+        return _pages(paths, options, robot, output, figures, force=force, as_json=json)
+    outputs = _Outputs(output, pdf, browser, force=force)
+    figures = None if plots is None else _Figures(plots, format_, force=force)
+    with _keeping(figures) as drawn:
+        if catalog is not None:
+            made = _fleet(catalog, find, outputs.first)
+        elif not several:
+            made = _one(paths[0], options, robot)
+        elif each or paths != [*map(as_path, files)]:
+            made = _one_by_one(paths, options, robot)
+        else:
+            made = _several(paths, options, robot)
+    outputs.write(made.html)
+    written = figures.save(made.html, drawn) if figures else []
+    if json:
+        more = {"plots": [str(path) for path in written]} if figures else {}
+        emit_json({**outputs.facts(), **made.facts, **more})
+        return made.code
+    if made.lines:
+        show(made.lines, as_json=False)
+    else:
+        echo(made.facts["answer"])
+    count = made.warnings
+    noted = f", {count} warning{'s' if count > 1 else ''} in it" if count else ""
+    echo(*(f"{path}: {path.stat().st_size / 1e3:.0f} kB{noted}" for path in outputs.paths))
+    if figures:
+        echo(f"{plots}: {', '.join(path.name for path in written) or 'no figure in the page'}")
+    return made.code
+
+
+class _Page(NamedTuple):
+    """A page, its answers, its number of warnings, and a line for each session by itself."""
+
+    html: str
+    facts: dict[str, Any]
+    warnings: int = 0
+    lines: Mapping[str, Line] = {}
+
+    @property
+    def code(self) -> int:
+        """The exit code."""
+        return int(not all(line.good for line in self.lines.values()))
+
+
+def _check_sources(files: Sequence[Path], catalog: str | None, find: str, options: Options) -> None:
+    """Check that there are sessions, or a catalogue with what goes with one."""
     if not files and catalog is None:
         raise UsageError(
             "report needs at least one session, e.g. undulog report run.mcap -o x.html"
@@ -86,34 +159,52 @@ def report(
         raise UsageError("--catalog takes the place of files; name its sessions by --where")
     if find and catalog is None:
         raise UsageError("--where is a condition on the sessions of --catalog")
-    options = chosen(start, stop, topics)
     if catalog is not None and options != chosen(None, None):
         raise UsageError("--catalog shows results as they are; leave out window and topics")
-    paths = sessions_of(files)
-    figures = None if plots is None else _Figures(plots, format_, force=force)
-    if len(paths) > 1 and (output.is_dir() or not output.suffix):
-        return _pages(paths, options, robot, output, figures, force=force, as_json=json)
-    check_output(output, PAGES, "the report is an HTML page; end its name in .html", force=force)
-    with _keeping(figures) as drawn:
-        if catalog is not None:
-            page, facts, warnings = _fleet(catalog, find, output)
-        elif len(paths) == 1:
-            page, facts, warnings = _one(paths[0], options, robot)
-        else:
-            page, facts, warnings = _several(paths, options, robot)
-    write_text(output, page)
-    written = figures.save(page, drawn) if figures else []
-    size = output.stat().st_size
-    if json:
-        more = {"plots": [str(path) for path in written]} if figures else {}
-        emit_json({"page": str(output), "bytes": size, **facts, **more})
-        return 0
-    echo(facts["answer"])
-    noted = f", {warnings} warning{'s' if warnings > 1 else ''} in it" if warnings else ""
-    echo(f"{output}: {size / 1e3:.0f} kB{noted}")
-    if figures:
-        echo(f"{plots}: {', '.join(path.name for path in written) or 'no figure in the page'}")
-    return 0
+
+
+class _Outputs:
+    """The page, the PDF file, or both; checked before any work is done."""
+
+    def __init__(
+        self, page: Path | None, pdf: Path | None, browser: str | None, *, force: bool
+    ) -> None:
+        if page is not None and page.suffix.lower() == ".pdf":
+            if pdf is not None:
+                raise UsageError(f"{page}: with --pdf the page's own name (-o) ends in .html")
+            page, pdf = None, page
+        if page is None and pdf is None:
+            raise UsageError("report needs --output (-o) PAGE.html, or --pdf PAGE.pdf, or both")
+        if page is not None:
+            why = "the report is a page; end its name in .html, or in .pdf for paper"
+            check_output(page, PAGES, why, force=force)
+        if pdf is not None:
+            check_output(pdf, (".pdf",), "end the name of the PDF file in .pdf", force=force)
+        elif browser is not None:
+            raise UsageError("--browser is the browser that prints; add --pdf PAGE.pdf")
+        self._page, self._pdf = page, pdf
+        self.paths = [path for path in (page, pdf) if path is not None]
+        self.first = self.paths[0]
+        self._browser = ""
+        if pdf is not None:
+            from ..present.page.pdf import find_browser
+
+            self._browser = find_browser(browser)
+
+    def write(self, page: str) -> None:
+        if self._page is not None:
+            write_text(self._page, page)
+        if self._pdf is not None:
+            from ..present.page.pdf import write_pdf
+
+            with progress("print", total=1) as bar:
+                bar.update(0, note=self._pdf.name)
+                write_pdf(page, self._pdf, self._browser)
+
+    def facts(self) -> dict[str, Any]:
+        page = {} if self._page is None else {"page": str(self._page)}
+        pdf = {} if self._pdf is None else {"pdf": str(self._pdf)}
+        return page | pdf | {"bytes": self.first.stat().st_size}
 
 
 def _keeping(figures: _Figures | None) -> AbstractContextManager[Mapping[str, Any]]:
@@ -146,13 +237,14 @@ class _Figures:
         return save_plots(page, drawn, folder, self._kind, force=self._force)
 
 
-def _one(file: Path, options: Options, robot: str | None) -> tuple[str, dict[str, Any], int]:
-    """Return the page on one session, its answer, and the number of warnings."""
+def _one(file: Path, options: Options, robot: str | None) -> _Page:
+    """Return the page on one session."""
     with progress("report", total=2) as bar:
         bar.update(0, note=file.name)
         page, analysis = _page(file, options, robot, lambda: bar.update(1, note="page"))
     summary = _summary(analysis)
-    return page, {"answer": summary["sentence"], "answers": [summary]}, len(analysis.warnings)
+    facts = {"answer": summary["sentence"], "answers": [summary]}
+    return _Page(page, facts, len(analysis.warnings))
 
 
 def _page(
@@ -199,7 +291,7 @@ def _pages(
             figures.save(text, drawn, page.stem)
         return replace(line_of(analysis), facts={"page": str(page), **_summary(analysis)})
 
-    lines = each(paths, "report", written)
+    lines = each_session(paths, "report", written)
     rows = [
         (name, line, pages[path] if line.verdict != FAILED else None)
         for path, (name, line) in zip(paths, lines.items(), strict=True)
@@ -225,8 +317,8 @@ def _page_names(paths: Sequence[Path]) -> dict[Path, str]:
     return names
 
 
-def _fleet(where: str, find: str, output: Path) -> tuple[str, dict[str, Any], int]:
-    """Return the page on the sessions of a catalogue, its result, and the number of warnings."""
+def _fleet(where: str, find: str, output: Path) -> _Page:
+    """Return the page on the sessions of a catalogue."""
     from ..catalog.catalog import Catalog
     from ..catalog.fleet import analyse_fleet
     from ..present.page.page import render_fleet
@@ -244,13 +336,39 @@ def _fleet(where: str, find: str, output: Path) -> tuple[str, dict[str, Any], in
         warnings = [*fleet.warnings, *(f"{name}: {why}" for name, why in faults.items())]
         fleet = replace(fleet, warnings=tuple(warnings))
         page = render_fleet(fleet, joints, where, output)
-    return page, fleet.to_dict(), len(warnings)
+    return _Page(page, fleet.to_dict(), len(warnings))
 
 
-def _several(
-    files: Sequence[Path], options: Options, robot: str | None
-) -> tuple[str, dict[str, Any], int]:
-    """Return the page on an experiment, all answers, and the number of warnings."""
+def _one_by_one(files: Sequence[Path], options: Options, robot: str | None) -> _Page:
+    """Return one page on sessions by themselves."""
+    from undulog.capture import Session
+
+    from ..present.page.sessions_page import SessionsPage
+    from ..session.analyse import measure_session
+    from ..session.cycles import cycle_maps
+
+    page = SessionsPage()
+
+    def added(path: Path) -> Line:
+        page.check_size()
+        with Session.open(path, robot=robot) as session:
+            measured = measure_session(session, options)
+            analysis = measured.analysis
+            page.add(path, analysis, session, cycle_maps(measured))
+        return replace(line_of(analysis), facts=_summary(analysis))
+
+    lines = each_session(files, "report", added)
+    paths = dict.fromkeys(files)
+    text = page.render(list(zip(paths, lines.items(), strict=True)))
+    facts = {
+        "answer": f"{len(lines)} sessions, each by itself",
+        "answers": [line.facts for line in lines.values()],
+    }
+    return _Page(text, facts, lines=lines)
+
+
+def _several(files: Sequence[Path], options: Options, robot: str | None) -> _Page:
+    """Return the page on an experiment."""
     from ..present.page.page import render
 
     experiment = experiment_of(files, options, "report", robot=robot)
@@ -259,7 +377,7 @@ def _several(
         "answer": f"{len(files)} sessions: {experiment.answer}.",
         "answers": [_summary(one) for one in experiment.sessions],
     }
-    return page, facts, len(experiment.warnings)
+    return _Page(page, facts, len(experiment.warnings))
 
 
 def _summary(analysis: Analysis) -> dict[str, Any]:

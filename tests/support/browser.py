@@ -65,8 +65,9 @@ class Browser:
         while not any(e.get("method") == event for e in self.events):
             self.events.append(self._receive(deadline))
 
-    def open(self, url, *, width=1280, height=900, dark=False, media=""):
+    def open(self, url, *, width=1280, height=900, dark=False, media="", scripts=True):
         """Load a page and wait until it is drawn; forgets earlier events."""
+        self.call("Emulation.setScriptExecutionDisabled", value=not scripts)
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
         self.call("Emulation.setDeviceMetricsOverride", **size)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
@@ -74,6 +75,8 @@ class Browser:
         self.events = []
         self.call("Page.navigate", url=url)
         self.wait_for("Page.loadEventFired")
+        if not scripts:
+            return
         # Two frames later everything that loading caused has been reported.
         self.evaluate("new Promise(r => requestAnimationFrame(() => requestAnimationFrame(r)))")
 
@@ -83,6 +86,18 @@ class Browser:
         result = self.call("Runtime.evaluate", expression=script, **options)
         assert "exceptionDetails" not in result, result["exceptionDetails"]
         return result["result"].get("value")
+
+    def press(self, key, *, shift=False):
+        """Press and release a key, e.g. ``Tab``, ``ArrowRight`` or ``+``."""
+        event = {"key": key, "code": key, "modifiers": 8 if shift else 0}
+        event |= {"windowsVirtualKeyCode": 9} if key == "Tab" else {}
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, **event)
+
+    def mouse(self, kind, x, y, clicks=0):
+        """Send one mouse event, e.g. ``mouseMoved``; with clicks it is of the left button."""
+        button = {"button": "left", "clickCount": clicks} if clicks else {}
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **button)
 
     def requests(self):
         """Return the addresses requested since ``open``."""

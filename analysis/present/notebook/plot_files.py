@@ -175,6 +175,8 @@ def _draw(axes: Axes, element: ET.Element, classes: list[str], kind: frozenset[s
             fontstyle="italic" if "unsure" in classes else "normal",
             ha={"middle": "center", "end": "right"}.get(element.get("text-anchor", ""), "left"),
             va="center_baseline",
+            rotation=90 if "rotate" in element.get("transform", "") else 0,
+            rotation_mode="anchor",
             color=ink,
         )
     elif element.tag == "line":

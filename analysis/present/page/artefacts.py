@@ -19,7 +19,7 @@ from ...results import formats
 from ...results.analysis import Analysis, JointResult
 from ...results.artefact import KINDS, Artefact, Span
 from ...results.formats import degrees, estimate, short
-from .svg import REFERENCE, Drawing, drawing, inline_svg, key, legend
+from .svg import COMMAND, Drawing, drawing, inline_svg, key, legend
 from .tables import element, is_driven
 
 CYCLES = 2.5
@@ -119,33 +119,38 @@ def _thinned(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArra
     return frozen(t_s[::step]), frozen(values[::step])
 
 
-def command_response(traces: Sequence[Trace], joint_count: int) -> Drawing:
+def command_response(traces: Sequence[Trace], joint_count: int, prefix: str) -> Drawing:
     """Draw command (grey) and response (coloured) of a few joints, one panel each.
 
     Args:
         joint_count: Joints in the chain, for their colours.
+        prefix: For identifiers, unique in the page.
     """
     colors = joint_hex(joint_count)
+    tooltips: dict[str, str] = {}
     with drawing(0.7 + 1.35 * len(traces)) as figure:
         grid = figure.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)
         for (axes,), trace in zip(grid, traces, strict=True):
             command, response = np.degrees(trace.command_rad), np.degrees(trace.response_rad)
-            axes.plot(trace.command_t_s, command, color=REFERENCE, linewidth=2.4)
-            axes.plot(trace.response_t_s, response, color=colors[trace.place], linewidth=1.6)
+            at, color = trace.place, colors[trace.place]
+            axes.plot(trace.command_t_s, command, gid=f"command-{at}", **COMMAND)
+            axes.plot(
+                trace.response_t_s, response, gid=f"response-{at}", color=color, linewidth=1.6
+            )
+            for what in ("command", "response"):
+                tooltips[f"{what}-{at}"] = f"{trace.joint.name} {what}"
             axes.set_title(_panel_title(trace.joint))
             axes.margins(x=0.01)
         figure.supylabel("joint angle [°]", fontsize=8.0)
         grid[-1, 0].set_xlabel("time from the session's start [s]")
-        command_key = key(color=REFERENCE, linewidth=2.4, label="command")
+        command_key = key(label="command", **COMMAND)
         middle = colors[traces[len(traces) // 2].place]
         legend(figure, command_key, key(color=middle, label="response"))
         title = "Command and response of " + ", ".join(t.joint.name for t in traces)
-        about = "Joint angle over time, command in grey, response in the joint's colour. "
+        about = "Joint angle over time, command dashed, response in the joint's colour. "
         about += "; ".join(_panel_title(t.joint) for t in traces) + "."
-        svg = inline_svg(figure, "signals-figure", title, about)
-    return Drawing(
-        svg, "The last analysed cycles: command in grey, response in the joint's colour."
-    )
+        svg = inline_svg(figure, prefix, title, about, tooltips)
+    return Drawing(svg, "The last analysed cycles: command dashed, response in the joint's colour.")
 
 
 def _panel_title(joint: JointResult) -> str:

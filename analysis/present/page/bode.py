@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import matplotlib.ticker
@@ -12,11 +12,15 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_hex
 
-from ...results.formats import short
+from ...results.estimate import Estimate
+from ...results.formats import degrees, estimate, short
 from ...results.frequency_response import BestLinearJoint, JointFrequencyResponse
-from .svg import Drawing, drawing, inline_svg, key, legend
+from .svg import Drawing, band, drawing, inline_svg, key, legend
 
-JOINTS = 6
+MARKERS = ("o", "s", "^", "D", "v", "P")
+"""Of the joints in one figure, since colours alone don't distinguish them for all readers."""
+
+JOINTS = len(MARKERS)
 """Joints in one figure."""
 
 _TICKS = (1.0, 2.0, 5.0)
@@ -47,22 +51,25 @@ def _figure(
     group: Sequence[JointFrequencyResponse], prefix: str, best: Sequence[BestLinearJoint] = ()
 ) -> Drawing:
     colors = joint_hex(len(group))
+    tooltips: dict[str, str | Sequence[str]] = {}
     with drawing(4.6) as figure:
         gain_axes, lag_axes = figure.subplots(2, 1, sharex=True)
-        for one, color in zip(group, colors, strict=True):
+        for number, (one, color) in enumerate(zip(group, colors, strict=True)):
             frequency = np.array(one.frequency_hz)
             gain, ends = np.array(one.gain), np.array(one.gain_ci95)
-            style = {"color": color, "linewidth": 1.4, "marker": "o", "markersize": 2.6}
-            gain_axes.plot(frequency, gain, **style)
+            style = {"color": color, "linewidth": 1.4, "marker": MARKERS[number], "markersize": 3.6}
+            gain_axes.plot(frequency, gain, gid=f"gain-{number}", **style)
+            tooltips[f"gain-{number}"] = _tips(one, range(gain.size), lag=False)
             low = np.maximum(ends[:, 0], gain.min() / 10)  # a logarithm has no zero
-            gain_axes.fill_between(frequency, low, ends[:, 1], color=color, alpha=0.18, linewidth=0)
+            band(gain_axes, frequency, low, ends[:, 1], color=color, alpha=0.18)
             sure = np.array([interval is not None for interval in one.lag_ci95])
             if sure.any():
                 lag = _unwrapped(np.array(one.lag_rad)[sure])
                 reach = np.array([_reach(one, k) for k in np.flatnonzero(sure).tolist()])
-                lag_axes.plot(frequency[sure], np.degrees(lag), **style)
-                band = np.degrees(lag - reach), np.degrees(lag + reach)
-                lag_axes.fill_between(frequency[sure], *band, color=color, alpha=0.18, linewidth=0)
+                lag_axes.plot(frequency[sure], np.degrees(lag), gid=f"lag-{number}", **style)
+                tooltips[f"lag-{number}"] = _tips(one, np.flatnonzero(sure).tolist(), lag=True)
+                edges = np.degrees(lag - reach), np.degrees(lag + reach)
+                band(lag_axes, frequency[sure], *edges, color=color, alpha=0.18)
         for one, color in zip(best, colors, strict=False):
             frequency = np.array(one.response.frequency_hz)
             for values, line in ((one.distortion_sd, "--"), (one.noise_sd, ":")):
@@ -80,13 +87,15 @@ def _figure(
         lag_axes.set_ylabel("lag [°]")
         lag_axes.set_xlabel("frequency [Hz]")
         handles = [
-            key(color=color, linewidth=1.4, label=short(one.joint, 14))
-            for one, color in zip(group, colors, strict=True)
+            key(color=color, linewidth=1.4, marker=each, label=short(one.joint, 14))
+            for one, color, each in zip(group, colors, MARKERS, strict=False)
         ]
         legend(figure, *handles)
         figure.align_ylabels()
         names = ", ".join(one.joint for one in group)
-        svg = inline_svg(figure, prefix, f"Frequency response of {names}", _in_words(group))
+        svg = inline_svg(
+            figure, prefix, f"Frequency response of {names}", _in_words(group), tooltips
+        )
     return Drawing(
         svg,
         "Gain and lag of each joint's response to its command; bands hold the 95 % interval. Lag "
@@ -98,6 +107,18 @@ _BEST = (
     " Dashed: standard deviation that nonlinear distortion gives to the gain of one realisation, "
     "where there is any; dotted: standard deviation by noise of the mean of all realisations."
 )
+
+
+def _tips(one: JointFrequencyResponse, lines: Iterable[int], *, lag: bool) -> list[str]:
+    """Return the text of each line of a response, with its interval."""
+    texts: list[str] = []
+    for k in lines:
+        value = Estimate(one.gain[k], one.gain_ci95[k])
+        if lag:
+            value = degrees(Estimate(one.lag_rad[k], one.lag_ci95[k]))
+        shown = f"lag {estimate(value, '°')}" if lag else f"gain {estimate(value)}"
+        texts.append(f"{one.joint}: {shown} at {one.frequency_hz[k]:.4g} Hz")
+    return texts
 
 
 def _reach(one: JointFrequencyResponse, k: int) -> float:

@@ -18,13 +18,15 @@ from ...compare.decisions import (
 )
 from ...results.comparison import BODY, Comparison, of_body
 from ...results.estimate import Estimate
-from ...results.formats import scaled, short
+from ...results.formats import estimate, scaled, short
 from ..text_experiment import comparison_method
 from .svg import (
+    COMMAND,
     DASHED,
     REFERENCE,
     Axes,
     Drawing,
+    band,
     drawing,
     inline_svg,
     joint_ticks,
@@ -53,10 +55,11 @@ def differences_drawing(
         prefix: For identifiers, unique in the page.
     """
     colors = joint_hex(len(names))
+    tooltips: dict[str, str] = {}
     with drawing(0.8 + 1.6 * len(panels)) as figure:
         grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False)
         for row, panel in enumerate(panels):
-            _panel(grid[row, 0], panel, colors)
+            tooltips |= _panel(grid[row, 0], panel, names, colors)
         last: Axes = grid[-1, 0]
         joint_ticks(last, names)
         last.set_xlabel("joint, head on the left")
@@ -64,19 +67,28 @@ def differences_drawing(
         difference = key(color=colors[len(colors) // 2], marker="o", label="difference, 95 %")
         legend(figure, difference, key(color=REFERENCE, linestyle=DASHED, label="margins"))
         labels = ", ".join(panel.label for panel in panels)
-        svg = inline_svg(figure, prefix, title, f"{len(names)} joints; panels: {labels}.")
+        svg = inline_svg(figure, prefix, title, f"{len(names)} joints; panels: {labels}.", tooltips)
     return Drawing(svg, f"{title}. The intervals hold together at 95 %; dashed: the margins.")
 
 
-def _panel(axes: Axes, panel: Panel, colors: Sequence[str]) -> None:
+def _panel(axes: Axes, panel: Panel, names: Sequence[str], colors: Sequence[str]) -> dict[str, str]:
+    """Draw a quantity; returns the texts of its values by the identifiers of their groups."""
+    tooltips: dict[str, str] = {}
+    quantity, _, unit = panel.label.rstrip("]").partition(" [")
+    unit = unit if unit.startswith("°") else f" {unit}"
     axes.axhline(0.0, color=REFERENCE, linewidth=0.8, zorder=1)
     for margin in (-panel.margin, panel.margin):
         axes.axhline(margin, color=REFERENCE, linestyle=DASHED, linewidth=0.8, zorder=1)
-    for place, (value, color) in enumerate(zip(panel.values, colors, strict=True), start=1):
+    for place, (value, name, color) in enumerate(
+        zip(panel.values, names, colors, strict=True), start=1
+    ):
         if value.value is not None:
-            plot_estimate(axes, place, value, color)
+            gid = f"{quantity}-{place}"
+            plot_estimate(axes, place, value, color, gid=gid)
+            tooltips[gid] = f"{name}: difference of {quantity} {estimate(value, unit)}"
     axes.set_ylabel(panel.label)
     axes.margins(y=0.15)
+    return tooltips
 
 
 _MOST_WAVES = 4
@@ -96,17 +108,19 @@ def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
     shown = [(one, color) for one, color in pairs if one in worst]
     phases = np.degrees(comparison.phase_rad)
     phase = "gait phase" if comparison.commanded else "phase"
+    tooltips: dict[str, str] = {}
     with drawing(0.8 + 1.4 * len(shown)) as figure:
         grid = figure.subplots(len(shown), 2, sharex=True, squeeze=False)
-        for (both, right), (one, color) in zip(grid, shown, strict=True):
-            both.plot(phases, np.degrees(one.a_rad), color=REFERENCE, linewidth=2.4)
-            both.plot(phases, np.degrees(one.b_rad), color=color)
+        for k, ((both, right), (one, color)) in enumerate(zip(grid, shown, strict=True)):
+            both.plot(phases, np.degrees(one.a_rad), gid=f"a-{k}", **COMMAND)
+            both.plot(phases, np.degrees(one.b_rad), color=color, gid=f"b-{k}")
             both.set_title(short(one.name))
             middle, half = np.degrees(one.difference_rad), np.degrees(one.half_rad)
             right.axhline(0.0, color=REFERENCE, linestyle=DASHED, linewidth=0.8)
-            band = {"color": color, "alpha": 0.25, "linewidth": 0}
-            right.fill_between(phases, middle - half, middle + half, **band)
-            right.plot(phases, middle, color=color)
+            band(right, phases, middle - half, middle + half, color=color, alpha=0.25)
+            right.plot(phases, middle, color=color, gid=f"difference-{k}")
+            names = {"a": "A", "b": "B", "difference": "B − A"}
+            tooltips |= {f"{which}-{k}": f"{one.name} {name}" for which, name in names.items()}
             right.set_title("B − A")
         grid[-1, 0].set_xticks(range(0, 361, 90))
         for axes in grid[-1]:
@@ -115,16 +129,16 @@ def waveforms_drawing(comparison: Comparison, prefix: str) -> Drawing:
         color = shown[0][1]
         legend(
             figure,
-            key(color=REFERENCE, linewidth=2.4, label="A"),
+            key(label="A", **COMMAND),
             key(color=color, label="B"),
             key(color=color, linewidth=6, alpha=0.25, label="95 %, each phase"),
         )
         description = "Joints: " + ", ".join(short(one.name) for one, _ in shown) + "."
-        svg = inline_svg(figure, prefix, f"Mean cycles by {phase}", description)
+        svg = inline_svg(figure, prefix, f"Mean cycles by {phase}", description, tooltips)
     by = "commands" if comparison.commanded else "first joint's own motion"
     return Drawing(
         svg,
-        f"Mean cycle of the joints that differ most, by the phase of the {by}: A in grey, B in "
+        f"Mean cycle of the joints that differ most, by the phase of the {by}: A dashed, B in "
         "the joint's colour, and their difference with its 95 % interval at each phase.",
     )
 

@@ -119,6 +119,7 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
         "experiment": experiment,
         "runs": list(zip(experiment.runs, experiment.sessions, strict=True)),
         "left_out": [run for run in experiment.runs if run.role is None],
+        "question": _question(experiment),
         "sentence": formats.sentence(experiment.answer),
         "detail": [] if reversal is None else list(reversal_detail(reversal)),
         "facts": _facts(experiment),
@@ -145,6 +146,17 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
         "tables": _tables(experiment, names),
         "method": formats.sentence(method(experiment)),
     }
+
+
+def _question(experiment: Experiment) -> str:
+    """Return the question that the answer of an experiment answers."""
+    if experiment.best_linear is not None:
+        return "How does each joint respond to its command, from frequency to frequency?"
+    if experiment.reversal is not None:
+        return "Does the spread over the joints come from the modules or from the boundary?"
+    if experiment.coupling.identifiable:
+        return "How does the motion of one joint act on the others?"
+    return "What can these sessions separate: modules, boundary, coupling between joints?"
 
 
 def _checks(coupling: Coupling) -> list[str]:

@@ -6,6 +6,7 @@ and from one hue over the ground to another where the sign matters.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -61,8 +62,12 @@ class Map:
         return low - short_by, high + short_by
 
 
-def cycle_drawings(cycles: CycleMaps) -> tuple[Drawing, ...]:
-    """Draw gain, lag and power, as far as any cycle has them."""
+def cycle_drawings(cycles: CycleMaps, prefix: str) -> tuple[Drawing, ...]:
+    """Draw gain, lag and power, as far as any cycle has them.
+
+    Args:
+        prefix: For identifiers, unique in the page.
+    """
     shown = (
         ("Gain", cycles.driven, cycles.gain, False, 0.02),
         ("Lag [°]", cycles.driven, np.degrees(cycles.lag_rad), False, 1.0),
@@ -72,7 +77,7 @@ def cycle_drawings(cycles: CycleMaps) -> tuple[Drawing, ...]:
     for title, names, value, signed, least in shown:
         if np.isfinite(value).any():
             one = Map(title, names, *_thinned(cycles, value), signed, least)
-            drawings.append(_draw(one, f"map-{len(drawings)}", _caption(cycles, one)))
+            drawings.append(_draw(one, f"{prefix}-{len(drawings)}", _caption(cycles, one)))
     return tuple(drawings)
 
 
@@ -130,8 +135,29 @@ def _draw(shown: Map, prefix: str, caption: str) -> Drawing:
         viewBox=f"0 0 {WIDTH:.0f} {foot + 74:.0f}",
         role="img",
         class_="map",
+        data_map=_cell_values(shown, edges, top, side),
     )
     return Drawing(str(svg), caption)
+
+
+def _cell_values(shown: Map, edges: FloatArray, top: float, side: float) -> str:
+    """Return places and values of all cells for the page's script, with three digits."""
+    low, high = shown.limits
+    decimals = decimals_for_values([low, high], 3)
+    values = [
+        [round(value, decimals) if math.isfinite(value) else None for value in row]
+        for row in shown.value.tolist()
+    ]
+    facts = {
+        "top": top,
+        "side": side,
+        "edges": edges.round(1).tolist(),
+        "times": shown.edges_s.round(2).tolist(),
+        "names": shown.names,
+        "values": values,
+        "label": shown.title[0].lower() + shown.title[1:],
+    }
+    return json.dumps(facts, ensure_ascii=False, separators=(",", ":"))
 
 
 def _cells(chosen: BoolArray, edges: FloatArray, top: float, side: float) -> str:

@@ -193,9 +193,9 @@ def matrix_picture(entries: Entries, prefix: str, *, small: bool = False) -> Dra
     """
     m, k = entries.value.shape
     names = [short(name, 12) for name in entries.rows]
-    left = 14.0 + 7.0 * max(map(len, names)) if not small else 26.0
+    left = 32.0 + 7.0 * max(map(len, names)) if not small else 54.0
     cell = (PICTURE - left) / max(m, k)
-    top = 38.0 if small else 30.0
+    top = 64.0 if small else 48.0
     numbers = not small and m <= MOST_IN_CELLS
     rows = [_row(entries, i, _Box(left, top + i * cell, cell), small=small) for i in range(m)]
     unit = 2.2 if small else 1.0
@@ -206,6 +206,7 @@ def matrix_picture(entries: Entries, prefix: str, *, small: bool = False) -> Dra
         prefix,
         title,
         entries.in_words(),
+        *_axis_titles(entries, _Box(left, top, cell)),
         _column_names(entries, left, top, cell, small=small),
         element("g", *rows, class_=f"cells{' numbers' if numbers else ''}"),
         _color_bar(entries.limit, bar, unit),
@@ -304,6 +305,22 @@ def _column_names(entries: Entries, left: float, top: float, cell: float, *, sma
     return element("g", *texts)
 
 
+def _axis_titles(entries: Entries, first: _Box) -> list[Markup]:
+    """Return the titles of columns and rows, centred over them and beside them.
+
+    Args:
+        first: The cell at the top left.
+    """
+    m, k = entries.value.shape
+    middle_x, middle_y = first.x + k * first.side / 2, first.y + m * first.side / 2
+    style = {"text_anchor": "middle", "class_": "name"}
+    turned = f"rotate(-90 12 {middle_y:.2f})"
+    return [
+        element("text", f"column: {entries.column}", x=middle_x, y=12, **style),
+        element("text", f"row: {entries.row}", x=12, y=middle_y, transform=turned, **style),
+    ]
+
+
 def _tail(name: str) -> str:
     """Return the number at a name's end, or else a short form of the name."""
     return name[len(name.rstrip("0123456789")) :] or short(name, 5)
@@ -325,11 +342,11 @@ def _color_bar(limit: float, box: _Box, unit: float) -> Markup:
 
 def _caption(entries: Entries) -> str:
     text = (
-        f"{entries.symbol}: {entries.meaning}. Row: {entries.row}; column: {entries.column}. "
+        f"{entries.symbol}: {entries.meaning}. "
         "Colours end at the largest entry beside the diagonal, which is framed and may go beyond. "
         "A stroke stands in negative cells."
     )
     if entries.half is not None:
         text += " Numbers in italics do not differ significantly from 0 (95 %, one by one)."
-    hint = "its intervals" if len(entries.rows) <= MOST_IN_CELLS else "its numbers"
-    return f"{text} Point at a row, or reach it with the tab key, for {hint}."
+    what = "the numbers" if entries.half is None else "the intervals"
+    return f"{text} The table below has {what}."

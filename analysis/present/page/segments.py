@@ -15,6 +15,7 @@ from ...results.analysis import BodyPoint, BodyResult, JointResult
 from ...results.estimate import Estimate
 from ...results.formats import degrees, estimate, number, scaled, short
 from .svg import (
+    ABOVE,
     DASHED,
     INK,
     MUTED,
@@ -24,6 +25,7 @@ from .svg import (
     Drawing,
     Figure,
     Handle,
+    band,
     drawing,
     inline_svg,
     key,
@@ -156,7 +158,8 @@ def _flag_marks(axes: Axes, joints: Sequence[JointResult]) -> None:
     style = {"ha": "center", "va": "bottom", "fontweight": "bold"}
     for i, joint in enumerate(joints):
         if joint.flags:
-            axes.text(i + 1, 1.0, "!", transform=axes.get_xaxis_transform(), **style)
+            place: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "gid": f"{ABOVE}{i}"}
+            axes.text(i + 1, 1.0, "!", **place, **style)
 
 
 def _segment_axis(axes: Axes, count: int) -> None:
@@ -233,6 +236,7 @@ def body_motion(body: BodyResult, prefix: str) -> Drawing:
     points = body.observed
     colors = joint_hex(len(points))
     cycle = np.linspace(0.0, 2.0 * np.pi, 121)
+    tooltips: dict[str, str] = {}
     with drawing(2.7) as figure:
         grid = figure.subplots(1, len(points), sharex=True, sharey=True, squeeze=False)
         for axes, point, color in zip(grid[0], points, colors, strict=True):
@@ -240,7 +244,9 @@ def body_motion(body: BodyResult, prefix: str) -> Drawing:
                 for null in points_of_null:
                     if null.place == point.place:
                         _harmonic(axes, null, cycle, REFERENCE, style)
-            _harmonic(axes, point, cycle, color, "-")
+            gid = f"place-{len(tooltips)}"
+            _harmonic(axes, point, cycle, color, "-", gid=gid)
+            tooltips[gid] = point.place
             axes.set_title(short(f"{point.place} ({point.link})", 28))
             axes.set_xticks([0.0, 90.0, 180.0, 270.0, 360.0])
         grid[0, 0].set_ylabel("left of the heading [mm]" if body.plane != "vertical" else "up [mm]")
@@ -252,7 +258,8 @@ def body_motion(body: BodyResult, prefix: str) -> Drawing:
         legend(figure, key(color=colors[len(colors) // 2], label="measured, 95 %"), *nulls)
         title = f"Motion of {', '.join(p.place for p in points)} over one gait cycle"
         dashed = ". Dashed grey: the same body with every joint exactly on its command."
-        svg = inline_svg(figure, prefix, title, "; ".join(map(_point_in_words, points)) + dashed)
+        words = "; ".join(map(_point_in_words, points)) + dashed
+        svg = inline_svg(figure, prefix, title, words, tooltips)
     return Drawing(
         svg,
         "Motion of the links at the gait frequency, across the mean heading. Dashed grey is a "
@@ -262,7 +269,15 @@ def body_motion(body: BodyResult, prefix: str) -> Drawing:
     )
 
 
-def _harmonic(axes: Axes, point: BodyPoint, cycle: FloatArray, color: str, style: object) -> None:
+def _harmonic(
+    axes: Axes,
+    point: BodyPoint,
+    cycle: FloatArray,
+    color: str,
+    style: object,
+    *,
+    gid: str | None = None,
+) -> None:
     amplitude, phase = scaled(point.amplitude_m, 1000.0), point.phase_rad
     if amplitude.value is None or phase.value is None:
         return
@@ -273,9 +288,9 @@ def _harmonic(axes: Axes, point: BodyPoint, cycle: FloatArray, color: str, style
         low, high = phase.ci95 or (phase.value, phase.value)
         sizes = amplitude.ci95 or (amplitude.value, amplitude.value)
         family = np.stack([a * np.cos(cycle + p) for a in sizes for p in np.linspace(low, high, 9)])
-        axes.fill_between(x, family.min(0), family.max(0), color=color, alpha=0.3, linewidth=0)
+        band(axes, x, family.min(0), family.max(0), color=color, alpha=0.3)
     y = amplitude.value * np.cos(cycle + phase.value)
-    axes.plot(x, y, color=color, linestyle=style, linewidth=width, zorder=zorder)
+    axes.plot(x, y, color=color, linestyle=style, linewidth=width, zorder=zorder, gid=gid)
 
 
 def _point_in_words(point: BodyPoint) -> str:

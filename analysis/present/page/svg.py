@@ -12,6 +12,7 @@ circles and vertical ones squares, references and nulls are dashed grey, estimat
 from __future__ import annotations
 
 import io
+import json
 import re
 import warnings
 from collections.abc import Generator, Mapping, Sequence
@@ -22,10 +23,12 @@ from typing import Any, TypeAlias
 from xml.etree import ElementTree as ET
 
 import matplotlib as mpl
-from matplotlib import lines
+import numpy as np
+from matplotlib import dates, lines, ticker
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as _Figure
 
+from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import plain
 
 from ...results.estimate import Estimate
@@ -37,6 +40,7 @@ Handle: TypeAlias = Any
 """Matplotlib's own annotations leave keyword arguments unknown, so its objects are untyped."""
 
 _mpl: Any = mpl
+_FIXED: Any = (ticker.FixedLocator, dates.DateLocator)
 
 INK = "#010101"
 """Sentinel: text and outlines."""
@@ -97,6 +101,9 @@ STYLE: dict[str, Any] = {
 }
 """What a figure is drawn with; see :func:`drawing`."""
 
+ABOVE = "above-"
+"""Begin of the ``gid`` of a text above a panel that belongs to a value in it."""
+
 WIDTH_IN = 8.0
 """Width of every figure [inch]; the page scales it."""
 
@@ -107,6 +114,7 @@ _URL = re.compile(r"url\(#([^)]+)\)")
 _FONT_SIZE = re.compile(r"font-size: ([\d.]+)px")
 _FONT_WEIGHT = re.compile(r"font(?:-weight)?: (bold|[6-9]00)\b")
 _ANCHOR = re.compile(r"text-anchor: (\w+)")
+_TICK = re.compile(r"([xy])tick_")
 _FILL = re.compile(r"(?:^|; ?)fill: ([^;]+)")
 
 
@@ -137,7 +145,11 @@ def kept_figures() -> Generator[dict[str, Figure]]:
 
 
 def inline_svg(
-    figure: Figure, prefix: str, title: str, description: str, tooltips: Mapping[str, str] = {}
+    figure: Figure,
+    prefix: str,
+    title: str,
+    description: str,
+    tooltips: Mapping[str, str | Sequence[str]] = {},
 ) -> str:
     """Write a figure as an ``<svg>`` element for any HTML page.
 
@@ -146,11 +158,14 @@ def inline_svg(
         prefix: Unique in the page; every identifier begins with it.
         title: Its accessible name (WAI-ARIA ``img``; W3C SVG Accessibility API Mappings).
         description: Text for readers who cannot see the figure.
-        tooltips: Group identifier (``gid`` of an artist) to the text shown when hovered.
+        tooltips: Group identifier (``gid`` of an artist) to the text shown when it is pointed at;
+            of a line its name, or a text for each of its points.
 
     Returns:
         The element, without XML declaration, document type, metadata, date or outside reference.
     """
+    for k, axes in enumerate(figure.axes):
+        axes.set_gid(f"panel-{k}")
     root = _drawn(figure)
     if (kept := _kept.get()) is not None:
         kept[prefix] = figure
@@ -159,8 +174,12 @@ def inline_svg(
             if child.tag in (f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"):
                 parent.remove(child)
     for group in root.iter(f"{{{_SVG}}}g"):
-        if group.get("id", "") in tooltips:
-            group.insert(0, _text_element("title", tooltips[group.get("id", "")]))
+        text = tooltips.get(group.get("id", ""))
+        if isinstance(text, str):
+            group.insert(0, _text_element("title", text))
+        elif text is not None:
+            group.set("data-tips", "\n".join(map(plain, text)))
+    _describe_panels(root, figure)
     _rename_identifiers(root, prefix)
     for element in root.iter():
         _tidy(element)
@@ -172,6 +191,42 @@ def inline_svg(
     for element in root.iter():
         element.tag = element.tag.removeprefix(f"{{{_SVG}}}")
     return ET.tostring(root, encoding="unicode")
+
+
+def _describe_panels(root: ET.Element, figure: Figure) -> None:
+    """Give each panel its box, scales and labels, and mark its ticks, for the page's script."""
+    size = 72 * figure.get_size_inches()
+    for k, axes in enumerate(figure.axes):
+        group = next(each for each in root.iter() if each.get("id") == f"panel-{k}")
+        low, high = axes.get_position().get_points() * size
+        box = [low[0], size[1] - high[1], high[0] - low[0], high[1] - low[1]]
+        facts = {
+            "box": [round(float(value), 2) for value in box],
+            "x": _scale(figure, axes, "x"),
+            "y": _scale(figure, axes, "y"),
+        }
+        group.set("data-panel", plain(json.dumps(facts, ensure_ascii=False)))
+        for each in group.iter(f"{{{_SVG}}}g"):
+            name = each.get("id", "")
+            if found := _TICK.match(name):
+                each.set("class", f"tick {found[1]}")
+            elif name.startswith(ABOVE):
+                each.set("class", "above")
+
+
+def _scale(figure: Figure, axes: Axes, name: str) -> list[object]:
+    """Return ends, kind, group of panels that share it, and label of an axis."""
+    axis = getattr(axes, f"{name}axis")
+    shared = getattr(axes, f"get_shared_{name}_axes")()
+    together = [
+        k for k, each in enumerate(figure.axes) if each is axes or shared.joined(axes, each)
+    ]
+    labels: list[str] = [getattr(figure.axes[k], f"get_{name}label")() for k in together]
+    labels.append(getattr(figure, f"get_sup{name}label")())
+    label = next((each for each in labels if each), "")
+    fixed = isinstance(axis.get_major_locator(), _FIXED)
+    kind = "fixed" if fixed else axis.get_scale()
+    return [*map(float, getattr(axes, f"get_{name}lim")()), kind, together[0], label]
 
 
 def _drawn(figure: Figure) -> ET.Element:
@@ -249,6 +304,9 @@ def _plain_text_style(text: ET.Element) -> None:
 DASHED = (0, (5, 3))
 """Line style of margins, means and nulls."""
 
+COMMAND: dict[str, Any] = {"color": REFERENCE, "linewidth": 2.4, "linestyle": (0, (2.2, 0.9))}
+"""Line behind that of a joint, whose colour some readers can't tell from grey."""
+
 
 @dataclass(frozen=True)
 class Drawing:
@@ -295,6 +353,11 @@ def plot_estimate(
     solid = {"marker": "o", "markersize": 5.2, "markerfacecolor": color, "markeredgecolor": INK}
     style = solid | {"markeredgewidth": 0.5} | style
     axes.plot([place], [quantity.value], linestyle="none", zorder=zorder + 1, **style)
+
+
+def band(axes: Axes, x: FloatArray, low: FloatArray, high: FloatArray, **style: Any) -> None:
+    """Fill the area between two curves, each of shape (n,), as one path that zooms like a line."""
+    axes.fill(np.append(x, x[::-1]), np.append(low, high[::-1]), linewidth=0, **style)
 
 
 def legend(figure: Figure, *handles: Handle) -> None:

@@ -128,13 +128,6 @@ def softer(text: str) -> Markup:
     return Markup(marked)  # noqa: S704  escaped above
 
 
-def cut(text: str, most: int = 130) -> str:
-    """Return the beginning of a long sentence, up to a whole word, with an ellipsis."""
-    if len(text) <= most:
-        return text
-    return text[:most].rpartition(" ")[0] + " \N{HORIZONTAL ELLIPSIS}"
-
-
 def digits(value: float) -> str:
     """Return a number of any size with two digits, e.g. ``0.026`` or ``3.4e−9``."""
     return f"{value:.2g}".replace("-", formats.MINUS)
@@ -229,7 +222,7 @@ def p_value(p: float | None) -> Markup:
     """Return a p-value that keeps its full precision in the page, or a dash."""
     if p is None:
         return _NOT_COMPUTED
-    return Markup('<data value="{}">{}</data>').format(p, formats.p_value(p))
+    return Markup('<data value="{}">{}</data>').format(p, formats.p_value(p).replace(" ", NO_BREAK))
 
 
 def known(value: object) -> Markup:

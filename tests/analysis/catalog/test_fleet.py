@@ -214,7 +214,7 @@ def test_the_page_of_a_folder_names_the_joint_and_links_outliers(tmp_path):
     text = page.read_text()
     for part in (
         result["answer"].split(":")[1].strip()[:20],
-        '<a href="run03.mcap">',
+        '<a class="same" href="run03.mcap">',
         '<a href="run03.html">page</a>',
         "<svg",
     ):

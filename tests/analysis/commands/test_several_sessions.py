@@ -1,8 +1,10 @@
 """``analyse``, ``report`` and dry runs of several sessions: a line and a page for each."""
 
 import json
+import re
 import shutil
 from html.parser import HTMLParser
+from itertools import pairwise
 
 import pytest
 
@@ -71,6 +73,55 @@ def test_report_into_a_folder_writes_a_page_each_and_an_index(folder, tmp_path, 
     alone = tmp_path / "alone.html"
     command("report", folder / "a.mcap", "-o", alone)
     assert (pages / "a.html").read_text() == alone.read_text()
+
+
+def test_a_folder_makes_one_page_with_an_index(folder, tmp_path, command):
+    page = tmp_path / "all.html"
+    printed = command("report", folder, "-o", page, code=1).out.splitlines()
+    assert [line.split()[0].rpartition("/")[2] for line in printed[1:4]] == [
+        *("a.mcap", "bad.mcap", "a.mcap")
+    ]
+    assert printed[4].startswith(f"{page}: ")
+    text = page.read_text()
+    ids = re.findall(r' id="([^"]+)"', text)
+    assert len(ids) == len(set(ids))
+    index = re.search(r'<table class="index">.*?</table>', text, re.DOTALL)[0]
+    assert re.findall(r'href="#([^"]+)"', index) == ["s1-answer", "s2-answer"]
+    assert set(re.findall(r'href="#([^"]+)"', text)) <= {*ids}
+    assert "not an MCAP file" in index
+    assert text.index('class="index"') < text.index('id="s1-answer"') < text.index('id="s2-answer"')
+    found = json.loads(command("analyse", folder / "a.mcap", "--json").out)
+    first = found["answer"]["sentence"].partition(". ")[0].partition(" [")[0]
+    assert first in index.replace("\N{NO-BREAK SPACE}", " ")
+    levels = [int(level) for level in re.findall(r"<h([1-6])", text)]
+    assert levels[0] == levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in pairwise(levels))
+
+
+def test_named_files_are_one_page_by_themselves_only_if_asked(folder, tmp_path, command):
+    files = folder / "a.mcap", folder / "sub/a.mcap"
+    one, each = tmp_path / "one.html", tmp_path / "each.html"
+    assert command("report", *files, "-o", one).out.startswith("2 sessions: ")
+    command("report", *files, "--each", "-o", each)
+    assert "of one experiment" in one.read_text()
+    assert 'id="s2-answer"' in each.read_text()
+
+
+def test_a_page_of_many_sessions_leaves_out_samples_then_refuses(
+    folder, tmp_path, command, monkeypatch
+):
+    page, limit = tmp_path / "all.html", "undulog.analysis.present.page.sessions_page.LARGEST_BYTES"
+    command("report", folder, "-o", page, code=1)
+    full = page.read_text()
+    monkeypatch.setattr(limit, len(full.encode()) * 0.7)
+    command("report", folder, "-o", page, "--force", code=1)
+    small = page.read_text()
+    assert full.count("last analysed cycles") == 2
+    assert (small.count("last analysed cycles"), small.count("are not drawn")) == (0, 2)
+    monkeypatch.setattr(limit, 1000)
+    refused = command("report", folder, "-o", tmp_path / "none.html", code=2)
+    assert "-o FOLDER" in refused.err
+    assert not (tmp_path / "none.html").exists()
 
 
 def test_one_session_needs_a_page_not_a_folder(folder, tmp_path, command):

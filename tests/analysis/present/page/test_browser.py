@@ -57,7 +57,6 @@ def test_it_opens_without_a_word_and_asks_for_nothing(browser, address, name):
     url = address(name)
     browser.open(url)
     assert (browser.requests(), browser.complaints()) == ([url], [])
-    assert browser.evaluate("document.scripts.length") == 0
 
 
 @pytest.mark.parametrize("dark", SCHEMES)
@@ -70,7 +69,7 @@ def test_all_text_stands_out_from_its_ground(browser, address, name, dark):
     assert browser.evaluate(CONTRAST) == []
 
 
-@pytest.mark.parametrize("width", [360, 820, 1280])
+@pytest.mark.parametrize("width", [360, 400, 820, 1280])
 @pytest.mark.parametrize("name", ["snake", "both_ways", "kicked"])
 def test_the_page_itself_never_scrolls_sideways(browser, address, name, width):
     browser.open(address(name), width=width)

@@ -58,7 +58,11 @@ def test_an_existing_page_stays_without_force(recorded, tmp_path, command):
     ("arguments", "complaint"),
     [
         (["-o", "x.html"], "at least one session"),
-        (["run.mcap", "-o", "x.pdf"], "end its name in .html"),
+        (["run.mcap", "-o", "x.txt"], "end its name in .html"),
+        (["run.mcap", "-o", "x.html", "--pdf", "x.ps"], "in .pdf"),
+        (["run.mcap", "-o", "x.pdf", "--pdf", "y.pdf"], "ends in .html"),
+        (["run.mcap", "-o", "x.html", "--browser", "chromium"], "add --pdf"),
+        (["run.mcap", "--pdf", "x.pdf", "--browser", "/no/browser"], "no program /no/browser"),
         (["run.mcap"], "--output"),
     ],
 )
@@ -95,7 +99,7 @@ def test_the_paper_s_claim_from_the_twin_to_the_browser(browser, tmp_path, comma
     browser.open(page.as_uri())
     assert (browser.requests(), browser.complaints()) == ([page.as_uri()], [])
     titles = browser.evaluate(
-        "[...document.querySelectorAll('svg > title')].map(t => t.textContent)"
+        "[...document.querySelectorAll('svg > defs > title')].map(t => t.textContent)"
     )
     assert titles == [
         "Gain, lag and energy of every joint, head to tail",

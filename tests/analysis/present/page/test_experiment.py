@@ -120,9 +120,9 @@ def test_tests_answer_in_words(both_ways, kicked, snake):
 
 def test_what_was_not_recorded_is_named(both_ways):
     page = render(dataclasses.replace(both_ways, reversal=None, warnings=("record the reverse",)))
-    assert "Not tested; the" in page
+    assert "Boundary or module: not tested." in page
     assert "Record the reverse." in page
-    assert "Not identifiable from these sessions" in page
+    assert "Coupling: not identifiable from these sessions." in page
 
 
 def test_a_page_that_grows_too_large_goes_without_every_run(both_ways, pages, monkeypatch):

@@ -9,7 +9,8 @@ import pytest
 
 from undulog.analysis import Estimate
 from undulog.analysis.present.page.experiment_view import entrainment_entries
-from undulog.analysis.present.page.page import chain_view, render
+from undulog.analysis.present.page.page import render
+from undulog.analysis.present.page.session_view import chain_view
 from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 
 LINKS = (
