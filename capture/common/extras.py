@@ -1,0 +1,45 @@
+"""Extras: the optional packages of undulog, and the command that installs them."""
+
+from __future__ import annotations
+
+import shlex
+from importlib.metadata import PackageNotFoundError, requires
+
+from packaging.requirements import Requirement
+
+EXTRAS = (
+    *("sim", "mujoco", "numba", "replay", "report", "parquet", "mf4", "bags", "serial"),
+    *("remote", "cluster", "catalog"),
+)
+"""Every extra of ``pyproject.toml`` but ``all``, which is all of them."""
+
+
+def extra_packages(extra: str) -> dict[str, str]:
+    """Return the packages of an extra that this Python and machine need.
+
+    Returns:
+        Name to requirement (``rerun-sdk`` to ``rerun-sdk<0.42,>=0.41``); empty if undulog is not
+        installed as a package.
+    """
+    try:
+        lines = requires("undulog") or []
+    except PackageNotFoundError:
+        return {}
+    found: dict[str, str] = {}
+    for wanted in map(Requirement, lines):
+        marker, wanted.marker = wanted.marker, None
+        if marker is not None and marker.evaluate({"extra": extra}):
+            found[wanted.name] = str(wanted)
+    return found
+
+
+def install_command(extra: str, missing: str = "") -> str:
+    """Return the command that installs an extra into the environment that runs.
+
+    It names the packages, not undulog, so it is the same wherever undulog came from.
+
+    Args:
+        missing: Package to be installed where the extra's own packages are unknown.
+    """
+    packages = extra_packages(extra).values() or [missing]
+    return shlex.join(["pip", "install", *packages])
