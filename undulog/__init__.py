@@ -89,6 +89,8 @@ _GROUPS = {
     "sim": "The twin: simulate and record.",
 }
 
+_COMPLETION = "--install-completion"
+
 _EXTRAS = {
     "pybullet": "sim",
     "tomlkit": "sim",
@@ -137,6 +139,9 @@ def build(arguments: Sequence[str] = ()) -> App:
         result_action="return_value",
         suppress_keyboard_interrupt=False,  # run() says so, and ends with 1
     )
+    app.register_install_completion_command(
+        _COMPLETION, help="Install completion of commands and options for bash, zsh or fish."
+    )
     groups = {name: _group(name, arguments) for name in _GROUPS}
     for group in groups.values():
         app.command(group)
@@ -166,7 +171,7 @@ def _group(name: str, arguments: Sequence[str]) -> App:
     """
     from cyclopts import App
 
-    if name not in VERBS or list(arguments[:1]) != [name]:
+    if name not in VERBS or list(arguments[:1]) not in ([name], [_COMPLETION]):
         summary = VERBS[name][1] if name in VERBS else _GROUPS[name]
         return App(name=name, help=summary, help_epilogue="")
     module, function = _in_commands(VERBS[name][0]).split(":")
