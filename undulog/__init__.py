@@ -24,7 +24,10 @@ VERBS: dict[str, tuple[str, str]] = {
     "record note": ("capture record_control:note", "Write a remark into the running recording."),
     "record split": ("capture record_control:split", "Begin a new part of the recording."),
     "record stop": ("capture record_control:stop", "End the running recording in good order."),
-    "record unit": ("capture record_control:unit", "Print a systemd unit for recordings."),
+    "record unit": (
+        "capture record_control:unit",
+        "Print or install a systemd unit.",
+    ),
     "import": ("capture import_log:import_log", "Bring in bags, CAN traces, tables."),
     "log info": ("capture log_info:log_info", "Show what a log holds."),
     "log check": (

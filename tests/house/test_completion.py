@@ -46,7 +46,7 @@ def test_bash_completes_commands_options_and_choices(home, words, expected):
 
 
 def test_the_scripts_of_other_shells_parse(home):
-    for shell, pattern in (("zsh", ".zsh/completions/*undulog"), ("fish", ".config/fish/**/*.fish")):
+    for shell, pattern in (("zsh", ".zsh/**/*undulog"), ("fish", ".config/fish/**/*.fish")):
         (script,) = home.glob(pattern)
         assert "analyse" in script.read_text()
         if shutil.which(shell):
