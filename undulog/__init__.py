@@ -94,24 +94,6 @@ _GROUPS = {
 
 _COMPLETION = "--install-completion"
 
-_EXTRAS = {
-    "pybullet": "sim",
-    "tomlkit": "sim",
-    "mujoco": "mujoco",
-    "numba": "numba",
-    "rerun": "replay",
-    "jinja2": "report",
-    "markupsafe": "report",
-    "matplotlib": "report",
-    "asammdf": "mf4",
-    "distributed": "cluster",
-    "pyarrow": "parquet",
-    "duckdb": "catalog",
-    "obstore": "remote",
-    "statsmodels": "catalog",
-}
-"""Optional package to the extra that installs it."""
-
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 """What writing to a full or failing disk raises."""
 
@@ -299,15 +281,12 @@ def _unknown(arguments: Sequence[str]) -> str:
 def _missing_extra(error: ImportError, arguments: Sequence[str]) -> MissingExtraError | None:
     """The extra that would mend the import, if one would."""
     from undulog.capture.common.errors import MissingExtraError
+    from undulog.capture.common.extras import extra_of, missing_package
 
-    cause: BaseException | None = error
-    while cause is not None:
-        package = (getattr(cause, "name", None) or "").partition(".")[0]
-        if package in _EXTRAS:
-            verb = max((v for v in VERBS if " ".join(arguments).startswith(v)), key=len)
-            return MissingExtraError(f"'undulog {verb}'", _EXTRAS[package], package)
-        cause = cause.__cause__
-    return None
+    if (package := missing_package(error)) is None:
+        return None
+    verb = max((v for v in VERBS if " ".join(arguments).startswith(v)), key=len)
+    return MissingExtraError(f"'undulog {verb}'", extra_of(package, verb), package)
 
 
 def _complain(message: str, code: int) -> int:

@@ -13,6 +13,45 @@ EXTRAS = (
 )
 """Every extra of ``pyproject.toml`` but ``all``, which is all of them."""
 
+_OF_MODULE = {
+    "pybullet": "sim",
+    "tomlkit": "sim",
+    "mujoco": "mujoco",
+    "numba": "numba",
+    "rerun": "replay",
+    "jinja2": "report",
+    "markupsafe": "report",
+    "matplotlib": "report",
+    "asammdf": "mf4",
+    "distributed": "cluster",
+    "pyarrow": "parquet",
+    "duckdb": "catalog",
+    "obstore": "remote",
+    "statsmodels": "catalog",
+}
+"""Optional module to the extra that installs it."""
+
+
+def missing_package(error: BaseException) -> str | None:
+    """Return the optional module whose import failed, or None if it was another one."""
+    cause: BaseException | None = error
+    while cause is not None:
+        name = (getattr(cause, "name", None) or "").partition(".")[0]
+        if isinstance(cause, ImportError) and name in _OF_MODULE:
+            return name
+        cause = cause.__cause__
+    return None
+
+
+def extra_of(package: str, command: str = "") -> str:
+    """Return the extra that installs a module.
+
+    Args:
+        package: One that :func:`missing_package` returns.
+        command: The command that needs it; an extra of its name comes first.
+    """
+    return command if package in extra_packages(command) else _OF_MODULE[package]
+
 
 def extra_packages(extra: str) -> dict[str, str]:
     """Return the packages of an extra that this Python and machine need.
