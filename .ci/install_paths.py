@@ -191,7 +191,7 @@ class Paths:
         folder.mkdir()
         ticks = range(1200)
         rows = (f"{0.01 * k:.2f},{0.3 * ((k % 100) / 50 - 1):.4f}\n" for k in ticks)
-        (folder / "a.csv").write_text("time,joint01\n" + "".join(rows))
+        (folder / "a.csv").write_text("time,joint01_position\n" + "".join(rows))
         run(undulog, "import", "a.csv", "-o", "a.mcap", cwd=folder)
         (folder / "a.mf4").write_bytes(b"MDF     4.10    ".ljust(64, b"\0"))
         (folder / "a.parquet").write_bytes(b"PAR1")
