@@ -59,7 +59,6 @@ NEEDS_NONE = (
     "log export a.mcap -o a-out.csv",
     "log export a.mcap --to rosbag2 -o rosbag2",
     "robot show snake25",
-    "plan reversal --like a.mcap -o plan",
     "info",
 )
 
