@@ -7,8 +7,8 @@ from collections.abc import Mapping
 CONTRACT_VERSION = 1
 """Version that sessions are written by.
 
-It goes up when a reader of the version before would take a new file for something else. A new topic,
-record or entry doesn't change it: earlier readers leave it out. Every earlier version is read.
+It goes up when a reader of the version before would take a new file for something else. A new
+topic, record or entry leaves it: earlier readers ignore it. Every earlier version is read.
 """
 
 

@@ -70,7 +70,7 @@ def test_the_twins_of_all_versions_have_the_same_response_and_servos(path, comma
     )
     with Session.open(path) as session:
         assert session.run.physics_rate_hz == 2000
-        assert {servo["stall_torque"] for servo in session.run.servo_of.values()} == {0.25}
+        assert {joint.servo.stall_torque for joint in session.robot_as_run.joints} == {0.25}
         assert session.settle_s == 0.2
 
 
