@@ -1,6 +1,7 @@
-"""The command line ``undulog``: each command is imported when it is used.
+"""The command line ``undulog``, and the objects of a notebook.
 
-Exit codes: 0 done, 1 the work failed, 2 wrong usage.
+Each command is imported when it is used, and so is each name of ``__all__``. Exit codes: 0 done, 1
+the work failed, 2 wrong usage.
 """
 
 from __future__ import annotations
@@ -10,12 +11,70 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cyclopts import App
 
+    from undulog.analysis import Analysis as Analysis
+    from undulog.analysis import Catalog as Catalog
+    from undulog.analysis import Choices as Choices
+    from undulog.analysis import Comparison as Comparison
+    from undulog.analysis import Experiment as Experiment
+    from undulog.analysis import Options as Options
+    from undulog.analysis import load as load
+    from undulog.capture import Robot as Robot
+    from undulog.capture import Session as Session
+    from undulog.capture import SessionWriter as SessionWriter
+    from undulog.capture import load_robot as load_robot
     from undulog.capture.common.errors import MissingExtraError
+    from undulog.notebook import analyse as analyse
+    from undulog.notebook import compare as compare
+    from undulog.notebook import record as record
+    from undulog.replay import write_recording as write_recording
+    from undulog.sim import Scenario as Scenario
+    from undulog.sim import Twin as Twin
+    from undulog.sim import load_scenario as load_scenario
+
+__all__ = [
+    "Analysis",
+    "Catalog",
+    "Choices",
+    "Comparison",
+    "Experiment",
+    "Options",
+    "Robot",
+    "Scenario",
+    "Session",
+    "SessionWriter",
+    "Twin",
+    "analyse",
+    "compare",
+    "load",
+    "load_robot",
+    "load_scenario",
+    "record",
+    "run",
+    "write_recording",
+]
+
+_HOMES = {
+    "analysis": "Analysis Catalog Choices Comparison Experiment Options load",
+    "capture": "Robot Session SessionWriter load_robot",
+    "notebook": "analyse compare record",
+    "replay": "write_recording",
+    "sim": "Scenario Twin load_scenario",
+}
+"""Module of this package to the names of ``__all__`` that are imported from it."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name of ``__all__`` when it is first used."""
+    for module, names in _HOMES.items():
+        if name in names.split():
+            return getattr(import_module(f".{module}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
 
 VERBS: dict[str, tuple[str, str]] = {
     "record": ("capture record:record", "Record a robot, or its twin, into a session."),
