@@ -63,6 +63,9 @@ NEEDS_NONE = (
 )
 
 
+KEPT_IN_CHROOT = ("PIP_CERT", "PIP_INDEX_URL", "http_proxy", "https_proxy")
+"""Variables of the network, which a container build is given too."""
+
 SIMULATE = "sim run flat --duration 10 --json -o a.mcap"
 
 
@@ -288,6 +291,9 @@ class Paths:
                 (root / place[1:]).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(place, root / place[1:])
         (entry,) = (json.loads(value) for word, value in steps if word == "ENTRYPOINT")
+        kept = {k: v for k, v in os.environ.items() if k in KEPT_IN_CHROOT}
+        variables = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root"} | kept
+        inside = ("chroot", root, "env", "-i", *(f"{k}={v}" for k, v in variables.items()))
         for word, value in steps:
             if word == "COPY":
                 source, target = value.split()
@@ -295,8 +301,8 @@ class Paths:
                 for path in dist.parent.glob(source):
                     shutil.copy(path, root / target[1:])
             elif word == "RUN":
-                run("chroot", root, "/bin/sh", "-c", value)
-        run("chroot", root, *entry, "--help")
+                run(*inside, "/bin/sh", "-c", value)
+        run(*inside, *entry, "--help")
         return "its steps in a Debian chroot; not tried as an image (no podman or docker)"
 
 

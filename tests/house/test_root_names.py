@@ -93,8 +93,8 @@ def test_a_strangers_program_is_typed_by_the_installed_wheel(tmp_path):
     check = (sys.executable, "-m", "pyright", "--pythonpath", tmp_path / "venv/bin/python")
     found = processes.run(*check, "stranger.py", cwd=tmp_path).stdout
     types = {line.rpartition(" is ")[2] for line in found.splitlines() if "information:" in line}
-    assert {'"Analysis"', '"Experiment"', '"Comparison"', '"float | None"'} <= types, found
+    assert {'"Analysis"', '"Experiment"', '"Comparison"', '"Estimate"'} <= types, found
     assert not [one for one in types if "Unknown" in one], found
     errors = [line for line in found.splitlines() if " error: " in line]
     assert len(errors) == 1, found
-    assert "stranger.py:21:" in errors[0]
+    assert "stranger.py:20:" in errors[0]
