@@ -59,16 +59,17 @@ def _command_line_page() -> str:
     return "\n".join(parts)
 
 
-def _notebook_page() -> str:
-    """Return the example notebook, run anew."""
+def _write_notebook_pages() -> None:
+    """Write the page of each notebook beside it, run anew."""
     sys.path.insert(0, str(Path(__file__).parent))
-    from notebook_page import executed_page
+    from notebook_page import GALLERY, NOTEBOOK, executed_page
 
-    return executed_page()
+    for notebook in (NOTEBOOK, *GALLERY):
+        notebook.with_suffix(".md").write_text(executed_page(notebook))
 
 
 (Path(__file__).parent / "command-line.md").write_text(_command_line_page())
-(Path(__file__).parent / "notebook.md").write_text(_notebook_page())
+_write_notebook_pages()
 
 
 def setup(app: Sphinx) -> None:
