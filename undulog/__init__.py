@@ -183,7 +183,7 @@ def build(arguments: Sequence[str] = ()) -> App:
         result_action="return_value",
         suppress_keyboard_interrupt=False,  # run() says so, and ends with 1
     )
-    app.register_install_completion_command(
+    app.register_install_completion_command(  # pyright: ignore[reportUnknownMemberType] untyped **
         _COMPLETION, help="Install completion of commands and options for bash, zsh or fish."
     )
     groups = {name: _group(name, arguments) for name in _GROUPS}
