@@ -11,10 +11,11 @@ DEMO   := out/demo
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow zoo campaign study check format bench docs schemas pictures golden lock clean
+.PHONY: help demo test slow zoo campaign study check format bench docs schemas pictures golden lock \
+  release install-paths clean
 
 help:  ## this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 $(READY): requirements.lock pyproject.toml
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11) and "undulog is set up on Python 3.11 (pybullet has wheels for it); found %d.%d. Use: make PYTHON=python3.11" % sys.version_info[:2])'
@@ -113,6 +114,12 @@ pictures: demo  ## the pictures of README and manual, from recorded sessions
 
 golden: $(READY)  ## the golden pictures that every view is held to, anew; look at each
 	$(BIN)/python tests/support/golden_pictures.py
+
+release: $(READY)  ## wheel, source archive, notes, bill of materials of the last commit, under dist/
+	$(BIN)/python .ci/release.py dist
+
+install-paths: $(READY)  ## every way to install, one line each (minutes, gigabytes)
+	$(BIN)/python .ci/install_paths.py
 
 lock: $(READY)  ## renew requirements.lock (needs uv on the path)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header \

@@ -23,21 +23,27 @@ from undulog.capture.common.lazy import attach
 from .results.shown import present_with
 
 if TYPE_CHECKING:
-    from .catalog.catalog import Catalog
-    from .catalog.fleet import Fleet, analyse_fleet
-    from .compare.compare import Choices, compare_sessions
-    from .compare.decisions import Margins
-    from .experiment.analyse import analyse_experiment
-    from .present.notebook.files import load
-    from .present.notebook.pictures import Picture
-    from .present.text import render
-    from .results.analysis import Analysis, Index, JointResult
-    from .results.comparison import Comparison
-    from .results.coupling import LinearCoupling, LocalCoupling
-    from .results.estimate import Estimate
-    from .results.experiment import Experiment, Reversal
-    from .session.analyse import analyse_session
-    from .signals.stretch import Options
+    from .catalog.catalog import Catalog as Catalog
+    from .catalog.fleet import Fleet as Fleet
+    from .catalog.fleet import analyse_fleet as analyse_fleet
+    from .compare.compare import Choices as Choices
+    from .compare.compare import compare_sessions as compare_sessions
+    from .compare.decisions import Margins as Margins
+    from .experiment.analyse import analyse_experiment as analyse_experiment
+    from .present.notebook.files import load as load
+    from .present.notebook.pictures import Picture as Picture
+    from .present.text import render as render
+    from .results.analysis import Analysis as Analysis
+    from .results.analysis import Index as Index
+    from .results.analysis import JointResult as JointResult
+    from .results.comparison import Comparison as Comparison
+    from .results.coupling import LinearCoupling as LinearCoupling
+    from .results.coupling import LocalCoupling as LocalCoupling
+    from .results.estimate import Estimate as Estimate
+    from .results.experiment import Experiment as Experiment
+    from .results.experiment import Reversal as Reversal
+    from .session.analyse import analyse_session as analyse_session
+    from .signals.stretch import Options as Options
 
 
 def _presentation() -> Any:

@@ -20,13 +20,15 @@ from typing import TYPE_CHECKING
 from .common.lazy import attach
 
 if TYPE_CHECKING:
-    from .log.columns.topics import Channel
-    from .log.read.sample_times import JointSignals, Signal
-    from .log.read.session import Session
-    from .log.read.session_view import SessionView
-    from .log.write.writer import SessionWriter
-    from .robot.description import load_robot, robot_names
-    from .robot.model import Robot
+    from .log.columns.topics import Channel as Channel
+    from .log.read.sample_times import JointSignals as JointSignals
+    from .log.read.sample_times import Signal as Signal
+    from .log.read.session import Session as Session
+    from .log.read.session_view import SessionView as SessionView
+    from .log.write.writer import SessionWriter as SessionWriter
+    from .robot.description import load_robot as load_robot
+    from .robot.description import robot_names as robot_names
+    from .robot.model import Robot as Robot
 
 __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
     __name__,

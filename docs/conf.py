@@ -34,15 +34,17 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 
 
-def _notebook_page() -> str:
-    """Return the example notebook, run anew."""
-    from notebook_page import executed_page
+def _write_notebook_pages() -> None:
+    """Write the page of each notebook beside it, run anew."""
+    sys.path.insert(0, str(Path(__file__).parent))
+    from notebook_page import GALLERY, NOTEBOOK, executed_page
 
-    return executed_page()
+    for notebook in (NOTEBOOK, *GALLERY):
+        notebook.with_suffix(".md").write_text(executed_page(notebook))
 
 
 write_pages()
-(Path(__file__).parent / "notebook.md").write_text(_notebook_page())
+_write_notebook_pages()
 
 
 def setup(app: Sphinx) -> None:

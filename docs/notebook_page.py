@@ -1,4 +1,4 @@
-"""The example notebook, run anew, as a page of the manual: `python docs/notebook_page.py`.
+"""Notebooks of the manual, run anew, as its pages: `python docs/notebook_page.py [NOTEBOOK]`.
 
 Cells are run here as a notebook runs them, in one namespace and with the value of a last expression
 shown, so the manual needs no kernel and no packages besides those of the project.
@@ -6,12 +6,15 @@ shown, so the manual needs no kernel and no packages besides those of the projec
 
 import ast
 import json
+import sys
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 NOTEBOOK = Path(__file__).parent / "notebook.ipynb"
+GALLERY = sorted((Path(__file__).parent / "gallery").glob("*.ipynb"))
+"""Worked examples, which make their own data."""
 
 
 def executed_page(notebook: Path = NOTEBOOK) -> str:
@@ -73,4 +76,4 @@ def _shown(value: Any) -> str:
 
 
 if __name__ == "__main__":
-    print(executed_page())
+    print(executed_page(*map(Path, sys.argv[1:2])))

@@ -22,8 +22,9 @@ from typing import TYPE_CHECKING
 from undulog.capture.common.lazy import attach
 
 if TYPE_CHECKING:
-    from .feed.recording import Recording, write_recording
-    from .samples.content import Content
+    from .feed.recording import Recording as Recording
+    from .feed.recording import write_recording as write_recording
+    from .samples.content import Content as Content
 
 __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
     __name__,

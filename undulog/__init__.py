@@ -1,6 +1,7 @@
-"""The command line ``undulog``: each command is imported when it is used.
+"""The command line ``undulog``, and the objects of a notebook.
 
-Exit codes: 0 done, 1 the work failed, 2 wrong usage.
+Each command is imported when it is used, and so is each name of ``__all__``. Exit codes: 0 done, 1
+the work failed, 2 wrong usage.
 """
 
 from __future__ import annotations
@@ -10,12 +11,70 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cyclopts import App
 
+    from undulog.analysis import Analysis as Analysis
+    from undulog.analysis import Catalog as Catalog
+    from undulog.analysis import Choices as Choices
+    from undulog.analysis import Comparison as Comparison
+    from undulog.analysis import Experiment as Experiment
+    from undulog.analysis import Options as Options
+    from undulog.analysis import load as load
+    from undulog.capture import Robot as Robot
+    from undulog.capture import Session as Session
+    from undulog.capture import SessionWriter as SessionWriter
+    from undulog.capture import load_robot as load_robot
     from undulog.capture.common.errors import MissingExtraError
+    from undulog.notebook import analyse as analyse
+    from undulog.notebook import compare as compare
+    from undulog.notebook import record as record
+    from undulog.replay import write_recording as write_recording
+    from undulog.sim import Scenario as Scenario
+    from undulog.sim import Twin as Twin
+    from undulog.sim import load_scenario as load_scenario
+
+__all__ = [
+    "Analysis",
+    "Catalog",
+    "Choices",
+    "Comparison",
+    "Experiment",
+    "Options",
+    "Robot",
+    "Scenario",
+    "Session",
+    "SessionWriter",
+    "Twin",
+    "analyse",
+    "compare",
+    "load",
+    "load_robot",
+    "load_scenario",
+    "record",
+    "run",
+    "write_recording",
+]
+
+_HOMES = {
+    "analysis": "Analysis Catalog Choices Comparison Experiment Options load",
+    "capture": "Robot Session SessionWriter load_robot",
+    "notebook": "analyse compare record",
+    "replay": "write_recording",
+    "sim": "Scenario Twin load_scenario",
+}
+"""Module of this package to the names of ``__all__`` that are imported from it."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name of ``__all__`` when it is first used."""
+    for module, names in _HOMES.items():
+        if name in names.split():
+            return getattr(import_module(f".{module}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
 
 VERBS: dict[str, tuple[str, str]] = {
     "record": ("capture record:record", "Record a robot, or its twin, into a session."),
@@ -24,7 +83,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "record note": ("capture record:note", "Write a remark into the running recording."),
     "record split": ("capture record:split", "Begin a new part of the recording."),
     "record stop": ("capture record:stop", "End the running recording in good order."),
-    "record unit": ("capture record:unit", "Print a systemd unit for recordings."),
+    "record unit": ("capture record:unit", "Print or install a systemd unit."),
     "import": ("capture import_log:import_log", "Bring in bags, CAN traces, tables."),
     "log info": ("capture log_info:log_info", "Show what a log holds."),
     "log check": (
@@ -89,23 +148,7 @@ _GROUPS = {
     "sim": "The twin: simulate and record.",
 }
 
-_EXTRAS = {
-    "pybullet": "sim",
-    "tomlkit": "sim",
-    "mujoco": "mujoco",
-    "numba": "numba",
-    "rerun": "replay",
-    "jinja2": "report",
-    "markupsafe": "report",
-    "matplotlib": "report",
-    "asammdf": "mf4",
-    "distributed": "cluster",
-    "pyarrow": "parquet",
-    "duckdb": "catalog",
-    "obstore": "remote",
-    "statsmodels": "catalog",
-}
-"""Optional package to the extra that installs it."""
+_COMPLETION = "--install-completion"
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 """What writing to a full or failing disk raises."""
@@ -137,6 +180,9 @@ def build(arguments: Sequence[str] = ()) -> App:
         result_action="return_value",
         suppress_keyboard_interrupt=False,  # run() says so, and ends with 1
     )
+    app.register_install_completion_command(  # pyright: ignore[reportUnknownMemberType] untyped **
+        _COMPLETION, help="Install completion of commands and options for bash, zsh or fish."
+    )
     groups = {name: _group(name, arguments) for name in _GROUPS}
     for group in groups.values():
         app.command(group)
@@ -166,7 +212,7 @@ def _group(name: str, arguments: Sequence[str]) -> App:
     """
     from cyclopts import App
 
-    if name not in VERBS or list(arguments[:1]) != [name]:
+    if name not in VERBS or list(arguments[:1]) not in ([name], [_COMPLETION]):
         summary = VERBS[name][1] if name in VERBS else _GROUPS[name]
         return App(name=name, help=summary, help_epilogue="")
     module, function = _in_commands(VERBS[name][0]).split(":")
@@ -291,15 +337,12 @@ def _unknown(arguments: Sequence[str]) -> str:
 def _missing_extra(error: ImportError, arguments: Sequence[str]) -> MissingExtraError | None:
     """The extra that would mend the import, if one would."""
     from undulog.capture.common.errors import MissingExtraError
+    from undulog.capture.common.extras import extra_of, missing_package
 
-    cause: BaseException | None = error
-    while cause is not None:
-        package = (getattr(cause, "name", None) or "").partition(".")[0]
-        if package in _EXTRAS:
-            verb = max((v for v in VERBS if " ".join(arguments).startswith(v)), key=len)
-            return MissingExtraError(f"'undulog {verb}'", _EXTRAS[package], package)
-        cause = cause.__cause__
-    return None
+    if (package := missing_package(error)) is None:
+        return None
+    verb = max((v for v in VERBS if " ".join(arguments).startswith(v)), key=len)
+    return MissingExtraError(f"'undulog {verb}'", extra_of(package, verb), package)
 
 
 def _complain(message: str, code: int) -> int:

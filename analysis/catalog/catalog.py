@@ -91,7 +91,7 @@ class ScanReport:
 class Catalog:
     """The catalogue of a folder or URL."""
 
-    def __init__(self, where: str) -> None:
+    def __init__(self, where: Path | str) -> None:
         """Connect; nothing is read.
 
         Args:
@@ -101,8 +101,8 @@ class Catalog:
             InputFileError: If there is no such folder, or the store can't be reached.
             MissingExtraError: If pyarrow is not installed.
         """
-        self.where = where
-        self._store = ObjectStore(where)
+        self.where = str(where)
+        self._store = ObjectStore(self.where)
         if self._store.is_local and not Path(self._store.base).is_dir():
             raise InputFileError(where, "there is no such folder")
 

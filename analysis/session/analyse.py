@@ -460,13 +460,19 @@ def _estimates(gait: GaitFit | None, name: str) -> tuple[Estimate, Estimate]:
     return (gain_estimate(gait.response, place) if lag.value is not None else Estimate()), lag
 
 
+def _engine(session: SessionView) -> dict[str, str]:
+    """Return the physics engine that a session of the twin was simulated with."""
+    engine = session.metadata.get("undulog", {}).get("engine")
+    return {} if engine is None else {"engine of the session": engine}
+
+
 def _provenance(session: SessionView, options: Options) -> Provenance:
     """What makes the same numbers again."""
     given = [] if session.robot_given is None else ["--robot", session.robot_given]
     words = ["undulog", "analyse", str(session.path), *options.arguments(), *given]
     return Provenance(
         command=shlex.join(words),
-        versions=base_versions(),
+        versions=base_versions() | _engine(session),
         inputs={str(session.path): session.fingerprint()},
         options={
             **asdict(options),

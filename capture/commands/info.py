@@ -6,19 +6,9 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 
 from ..common.console import emit
+from ..common.extras import EXTRAS, extra_packages, install_command
 
 _BASE = ("undulog", "numpy", "scipy", "pandas", "mcap", "python-can", "cantools")
-_EXTRAS: dict[str, tuple[str, ...]] = {
-    "sim": ("pybullet",),
-    "mujoco": ("mujoco",),
-    "numba": ("numba",),
-    "replay": ("rerun-sdk", "av"),
-    "report": ("jinja2", "matplotlib"),
-    "parquet": ("pyarrow",),
-    "mf4": ("asammdf",),
-    "remote": ("obstore",),
-    "cluster": ("dask", "distributed"),
-}
 
 
 def package_version(name: str) -> str | None:
@@ -44,8 +34,7 @@ def info(*, json: bool = False) -> None:
         json: Print one JSON object.
     """
     extras = {
-        extra: {name: package_version(name) for name in packages}
-        for extra, packages in _EXTRAS.items()
+        extra: {name: package_version(name) for name in extra_packages(extra)} for extra in EXTRAS
     }
     packages, system = base_versions(), platform.platform()
     lines = [
@@ -54,6 +43,6 @@ def info(*, json: bool = False) -> None:
     ]
     for extra, found in extras.items():
         listed = ", ".join(f"{name} {number}" for name, number in found.items())
-        missing = f"not installed: pip install 'undulog[{extra}]'"
+        missing = f"not installed: {install_command(extra)}"
         lines.append(f"{extra:<9} {missing if None in found.values() else listed}")
     emit({"platform": system, "packages": packages, "extras": extras}, lines, as_json=json)

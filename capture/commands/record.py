@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from ..common.console import complain, echo, emit, emit_json
-from ..common.errors import ControlError, UndulogError, UsageError, some_names
+from ..common.console import complain, echo, emit, emit_json, refuse_existing
+from ..common.errors import ControlError, LogWriteError, UndulogError, UsageError, some_names
+from ..common.files import write_text
 
 if TYPE_CHECKING:
     from ..common.process import StopRequest
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from ..recorder.status import RecorderSnapshot
 
 
+_UNITS = Path("/etc/systemd/system")
 _Words = Annotated[tuple[str, ...], Parameter(show_default=False)]
 
 
@@ -266,17 +268,36 @@ def stop(*, wait: bool = False, socket: Path | None = None, json: bool = False) 
     return int(bool(reply.get("failed", False)))
 
 
-def unit() -> None:
-    """Print a systemd unit for recordings that start with the computer.
+def unit(*, install: bool = False, folder: Path = _UNITS, force: bool = False) -> None:
+    """Print or install a systemd unit for recordings that start with the computer.
 
     It is hardened, runs as a user of its own and reads its settings from `/etc/undulog/NAME.toml`.
 
-    Example: `undulog record unit | sudo tee /etc/systemd/system/undulog-record@.service`
+    Example: `undulog record unit --install`
+
+    Args:
+        install: Write the unit to the folder instead of printing it; needs the rights to do so.
+        folder: Folder of units, for `--install`.
+        force: Replace the unit if it is there.
     """
-    from ..recorder.systemd import hidden_folder, installed_program, unit_text
+    from ..recorder.systemd import UNIT_NAME, hidden_folder, installed_program, unit_text
 
     program = installed_program()
-    echo(*unit_text(program).splitlines())
+    text = unit_text(program)
+    if install:
+        path = folder / UNIT_NAME
+        refuse_existing(path, force=force)
+        if not os.access(folder, os.W_OK):
+            raise LogWriteError(path, f"no right to write; sudo {program} record unit --install")
+        write_text(path, text)
+        path.chmod(0o644)
+        echo(
+            f"{path}: runs {program}",
+            "next, for the settings /etc/undulog/NAME.toml:",
+            "  systemctl daemon-reload && systemctl enable --now undulog-record@NAME",
+        )
+    else:
+        echo(*text.splitlines())
     if (folder := hidden_folder(program)) is not None:
         complain(
             f"warning: {program} lies below {folder}, which this unit hides from the service; "

@@ -52,19 +52,24 @@ class UsageError(UndulogError, ValueError):
 class MissingExtraError(UsageError, ImportError):
     """A command needs an optional part that is not installed."""
 
-    def __init__(self, verb: str, extra: str, missing: str) -> None:
+    def __init__(self, verb: str, extra: str, missing: str, instead: str = "") -> None:
         """Build the message.
 
         Args:
             verb: The command, e.g. ``sim run``.
             extra: The extra that installs the package, e.g. ``sim``.
             missing: The package that could not be imported.
+            instead: What works without it.
         """
+        from .extras import install_command  # reads the metadata of packages
+
         self.extra = extra
-        super().__init__(
-            f"{verb} needs the package {missing}, which is not installed: "
-            f"pip install 'undulog[{extra}]'"
-        )
+        parts = [
+            f"{verb} needs the package {missing}, which is not installed",
+            f"the extra '{extra}' brings it: {install_command(extra, missing)}",
+            instead,
+        ]
+        super().__init__("; ".join(part for part in parts if part))
 
 
 class OutputExistsError(UsageError, FileExistsError):

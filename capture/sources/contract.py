@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Protocol, cast, runtime_checkable
 import numpy as np
 
 from ..common.errors import MissingExtraError, SourceError, UndulogError, UsageError
+from ..common.extras import extra_of, missing_package
 from ..common.strict_table import listed
 from ..log.messages.frames import FD_FRAME_DTYPE, FRAME_DTYPE, FrameArray, frames_from_bytes
 from ..robot.model import ClockDomain, Robot
@@ -334,10 +335,6 @@ def _options(text: str, query: str) -> dict[str, str]:
     return options
 
 
-_EXTRAS = {"pybullet": "sim", "mujoco": "mujoco"}
-"""Optional package of a source to the extra that installs it."""
-
-
 def schemes() -> tuple[str, ...]:
     """Return the installed schemes, sorted."""
     return tuple(sorted(entry_points(group=ENTRY_POINTS).names))
@@ -386,8 +383,7 @@ def _open(entry: EntryPoint, address: SourceAddress) -> Source:
     except UndulogError:
         raise
     except Exception as error:
-        missing = (getattr(error, "name", None) or "").split(".")[0]
-        if isinstance(error, ModuleNotFoundError) and missing in _EXTRAS:
-            raise MissingExtraError(address.text, _EXTRAS[missing], missing) from error
+        if (missing := missing_package(error)) is not None:
+            raise MissingExtraError(address.text, extra_of(missing), missing) from error
         fault = f"{entry.value} can't be opened: {error!r}"  # a plug-in, or the installation
         raise SourceError(address.text, fault) from error

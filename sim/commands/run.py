@@ -246,6 +246,7 @@ def _reported(scenario: Scenario, recording: Recording, factor: float) -> dict[s
         "scenario": scenario.name,
         "robot": scenario.robot.name,
         "seed": scenario.seed,
+        "engine": scenario.engine,
         "duration_s": recording.duration_s,
         "planned_duration_s": scenario.duration_s,
         "settle_s": scenario.settle_s,
@@ -276,7 +277,7 @@ def _summary(scenario: Scenario, recording: Recording, factor: float) -> list[st
         lines.append(f"energy ledger closes within {100 * closure:.2g} % of the absolute work")
     if scenario.world.obstacles:
         lines.append(_touched(recording.contact_s))
-    lines.append(f"simulated at {factor:.1f} x real time")
+    lines.append(f"simulated with {scenario.engine} at {factor:.1f} x real time")
     return lines
 
 

@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol, TypeAlias, cast
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import MissingExtraError
 from undulog.capture.robot.model import Robot
 
 from ..scenario.scenario import EngineKind, Kernels
@@ -117,8 +118,14 @@ def engine_type(kind: EngineKind, kernels: Kernels = Kernels.NUMPY) -> EngineTyp
         kernels: What computes the body's kinematics where the engine leaves it to us.
 
     Raises:
-        ImportError: If its package is not installed; the front door says which extra brings it.
+        MissingExtraError: If its package is not installed.
+        ImportError: If Numba is needed and not installed.
     """
+    if not kind.installed:
+        other = next((other for other in EngineKind if other.installed), None)
+        instead = "" if other is None else f'engine = "{other}" in the scenario runs without it'
+        extra = "sim" if kind is EngineKind.BULLET else "mujoco"
+        raise MissingExtraError(f"the engine '{kind}'", extra, kind.package, instead)
     module, name = _TYPES[kind]
     if kind is EngineKind.BULLET and kernels is Kernels.NUMBA:
         module, name = "undulog.sim.physics.compiled_bullet", "CompiledBulletEngine"

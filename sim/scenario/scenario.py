@@ -16,6 +16,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from importlib.util import find_spec
 from typing import Annotated, Any, TypeAlias
 
 import tomlkit
@@ -42,15 +43,32 @@ class EngineKind(StrEnum):
 
     @property
     def package(self) -> str:
-        """Name of its package in the package index."""
+        """Name of its package in the package index, and of the module it installs."""
         return {EngineKind.BULLET: "pybullet", EngineKind.MUJOCO: "mujoco"}[self]
+
+    @property
+    def installed(self) -> bool:
+        """Whether its package can be imported."""
+        return find_spec(self.package) is not None
+
+
+DEFAULT_ENGINE = (
+    EngineKind.MUJOCO
+    if EngineKind.MUJOCO.installed and not EngineKind.BULLET.installed
+    else EngineKind.BULLET
+)
+"""Engine of a scenario that names none: Bullet, or MuJoCo where PyBullet is not installed.
+
+The engines agree within rounding, not bit by bit. A scenario that is written out and a session name
+the engine that ran, and the session id depends on it.
+"""
 
 
 class Kernels(StrEnum):
     """What computes the force laws, and the body's kinematics where that pays.
 
-    Results of the two agree within rounding, not bit by bit, so the default does not depend on what
-    is installed.
+    Results of the two agree within rounding, not bit by bit, so the default does not depend on
+    whether Numba is installed.
     """
 
     NUMPY = "numpy"
@@ -200,7 +218,7 @@ class Scenario:
     seed: Seed = 1
     epoch_s: Epoch = 1_735_689_600  # 2025-01-01T00:00:00Z
     physics_rate_hz: PhysicsRate = 1000
-    engine: EngineKind = EngineKind.BULLET
+    engine: EngineKind = DEFAULT_ENGINE
     faults: tuple[BusFault, ...] = ()
     controller: Controller | None = None
 

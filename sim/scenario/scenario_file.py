@@ -9,7 +9,8 @@ A scenario::
     seed = 1                        # of the noise
     epoch_s = 1735689600            # Unix time at which the session starts
     physics_rate_hz = 1000
-    engine = "bullet"               # or "mujoco": who solves the body's dynamics
+    engine = "bullet"               # or "mujoco": what solves the body's dynamics; the default is
+                                    # "mujoco" where PyBullet is not installed
 
     [gait]
     kind = "serpentine"             # or "delay-blocks", "oscillators": see docs/reference/gaits.md

@@ -23,6 +23,7 @@ from ..columns.columns import Messages
 from ..columns.layouts import Group, names_of
 from ..columns.topics import Channel, Topics
 from ..file.log_file import LogFile
+from ..messages.contract import newer_contract
 from ..messages.frames import FrameArray, join_batches
 from .joint_rows import JointRows
 from .joint_states import JointReader
@@ -54,6 +55,8 @@ class OpenLog:
         described = None if robot is None else load_robot(robot)
         self.file = LogFile(path, column_folder, on_copied)
         self.warnings = list(self.file.warnings)
+        if (newer := newer_contract(self.file.metadata.get("undulog", {}))) is not None:
+            self.warnings.append(newer)
         self.topics = Topics(self.file, self._warn, threads=threads)
         self._clock = StampClock(self.topics, self._warn)
         self._joints = JointReader(path, self.topics, self._clock, self._warn)

@@ -71,6 +71,12 @@ class Session(SessionView):
             path, threads=threads, column_folder=column_folder, robot=robot, on_copied=on_copied
         )
 
+    def _repr_html_(self) -> str:
+        """Return what it is, its topics and warnings, for a notebook."""
+        from .session_html import session_html
+
+        return session_html(self)
+
     def close(self) -> None:
         """Release the file."""
         self._log.file.close()

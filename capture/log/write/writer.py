@@ -21,6 +21,7 @@ from ...common.errors import DataError, LogWriteError
 from ...robot.kinematics import mesh_type
 from ...robot.model import Robot, Sensor, SensorKind
 from ..messages.cdr import encode, layout_of
+from ..messages.contract import CONTRACT_VERSION
 from ..messages.definitions import message_type, schema_text
 from .channels import (
     DiagnosticsChannel,
@@ -39,9 +40,6 @@ from .channels import (
     TransformChannel,
 )
 from .mcap_sink import McapSink, MessageSink
-
-CONTRACT_VERSION = "1"
-"""Version of the log contract that this writer follows."""
 
 
 class SessionWriter:
@@ -88,7 +86,7 @@ class SessionWriter:
         self._logs: dict[str, LogChannel] = {}
         facts = {
             "session_id": session_id,
-            "contract": CONTRACT_VERSION,
+            "contract": str(CONTRACT_VERSION),
             "epoch_ns": str(epoch_ns),
             "robot": robot.name if robot is not None else "",
             "undulog": version("undulog"),

@@ -232,7 +232,8 @@ def test_without_asammdf_the_command_names_the_extra(tmp_path, command, monkeypa
     source, output = tmp_path / "x.mf4", tmp_path / "run.mcap"
     refused = command("import", source, "-o", output, "--robot", "snake25", code=2).err
     missing = "importing x.mf4 needs the package asammdf, which is not installed"
-    assert refused == f"error: {missing}: pip install 'undulog[mf4]'\n"
+    fix = "the extra 'mf4' brings it: pip install 'asammdf>=8.8'"
+    assert refused == f"error: {missing}; {fix}\n"
     assert not (tmp_path / "run.mcap").exists()
 
 

@@ -181,6 +181,26 @@ def test_the_unit_is_printed_with_this_installation_s_command(ask):
     assert start in ask("unit").out
 
 
+def test_the_unit_is_installed_once(tmp_path, ask):
+    printed = ask("unit").out
+    install = ("unit", "--install", "--folder", tmp_path)
+    path = tmp_path / "undulog-record@.service"
+    assert "systemctl enable --now undulog-record@NAME" in ask(*install).out
+    assert path.read_text() == printed
+    assert path.stat().st_mode & 0o777 == 0o644
+    path.write_text("changed here")
+    assert str(path) in ask(*install, code=2).err
+    assert path.read_text() == "changed here"
+    ask(*install, "--force")
+    assert path.read_text() == printed
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_unit_that_cant_be_written_is_an_error(tmp_path, ask):
+    nowhere = tmp_path / "nowhere"
+    assert str(nowhere) in ask("unit", "--install", "--folder", nowhere, code=2).err
+
+
 def test_two_outputs_of_one_name_in_two_folders(recorder, place, ask):
     started = []
     for folder in ("a", "b"):

@@ -70,9 +70,10 @@ def test_two_sources_need_two_names(tmp_path):
         open_sources([])
 
 
-def test_a_source_without_its_extra_names_it():
+@pytest.mark.parametrize("hidden", [("pybullet", "mujoco"), ("tomlkit",)])
+def test_a_source_without_its_extra_names_it(hidden):
     code = (
-        "import sys; sys.modules['pybullet'] = None\n"
+        f"import sys; sys.modules |= dict.fromkeys({hidden!r})\n"
         "from undulog.capture.common.errors import MissingExtraError\n"
         "from undulog.capture.sources.contract import open_sources\n"
         "try:\n"
@@ -81,4 +82,4 @@ def test_a_source_without_its_extra_names_it():
         "    print(error)\n"
     )
     done = python(code)
-    assert "pip install 'undulog[sim]'" in done.stdout, done.stderr
+    assert "the extra 'sim' brings it: pip install" in done.stdout, done.stderr

@@ -1,0 +1,112 @@
+"""Sessions that earlier versions wrote are read as before: opened, checked, analysed, exported."""
+
+import json
+import shutil
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from undulog.capture import Session, SessionWriter
+from undulog.capture.log.messages.contract import CONTRACT_VERSION
+
+EARLIER = Path(__file__).parent / "earlier"
+FILES = sorted(EARLIER.glob("*.mcap"))
+TWINS = [path for path in FILES if path.stem.endswith("twin")]
+
+
+@pytest.fixture(params=FILES, ids=lambda path: path.stem)
+def session_file(request, tmp_path):
+    """A copy of a session of an earlier version."""
+    return Path(shutil.copy(request.param, tmp_path / "run.mcap"))
+
+
+def positions(path):
+    """Joints and positions [rad], shape (n, m), by the format's own reader."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        messages = [m for *_, m in reader.iter_decoded_messages("/joint_states")]
+    return list(messages[0].name), np.array([message.position for message in messages])
+
+
+def test_each_is_listed_in_the_readme():
+    text = (EARLIER / "README.md").read_text()
+    assert len(FILES) == 6
+    assert [p.name for p in EARLIER.iterdir() if p.stem != "README" and p.name not in text] == []
+
+
+def test_each_opens_with_every_message_and_no_warning(session_file):
+    names, wanted = positions(session_file)
+    with Session.open(session_file) as session:
+        signals = session.joints("/joint_states", "position")
+        assert list(signals.names) == names
+        for column, values in zip(wanted.T, signals.values, strict=True):
+            np.testing.assert_array_equal(values, column)
+        assert session.metadata["undulog"]["contract"] == "1"
+        assert session.robot is not None
+        assert session.verdict in ("good", "degraded")
+        assert session.warnings == []
+
+
+def test_each_is_checked_analysed_and_exported(session_file, command):
+    shown = json.loads(command("log", "check", session_file, "--json").out)
+    assert shown["verdict"] == "good"
+    found = json.loads(command("analyse", session_file, "--json").out)
+    assert [joint["name"] for joint in found["joints"]] == positions(session_file)[0]
+    table = session_file.with_suffix(".csv")
+    command("log", "export", session_file, "-o", table)
+    assert table.stat().st_size > 1000
+
+
+@pytest.mark.parametrize("path", TWINS, ids=lambda path: path.stem)
+def test_the_twins_of_all_versions_have_the_same_response_and_servos(path, command):
+    found = json.loads(command("analyse", path, "--json").out)
+    lags = {j["name"]: j["lag_rad"] for j in found["joints"] if j["plane"] == "horizontal"}
+    assert lags == pytest.approx(
+        {"joint01": np.radians(85.6), "joint03": np.radians(88.4)}, abs=np.radians(0.2)
+    )
+    with Session.open(path) as session:
+        assert session.run.physics_rate_hz == 2000
+        assert {joint.servo.stall_torque for joint in session.robot_as_run.joints} == {0.25}
+        assert session.settle_s == 0.2
+
+
+def test_can_frames_of_both_kinds_are_kept():
+    with Session.open(EARLIER / "2026-11-21-can-fd.mcap") as session:
+        frames = session.fd_frames("/can_fd/can0")
+        assert [bytes(row["data"][: row["len"]]).hex() for row in frames] == [
+            "aabbccddeeff0011"
+        ] * 3
+        assert len(session.frames("/can/can0")) == 100
+
+
+def test_a_killed_recording_is_put_together_and_recovered(tmp_path, command):
+    with tarfile.open(EARLIER / "2026-11-25-killed.tar.xz") as archive:
+        archive.extractall(tmp_path, filter="data")
+    (path,) = tmp_path.glob("*.mcap")
+    whole = tmp_path / "whole.mcap"
+    assert "none is missing" in command("log", "recover", path, "-o", whole).out
+    names, wanted = positions(whole)
+    assert names == ["joint01", "joint02", "joint03"]
+    with Session.open(path) as session:
+        signals = session.joints("/joint_states", "position")
+        for column, values in zip(wanted.T, signals.values, strict=True):
+            np.testing.assert_array_equal(values, column)
+    assert len(wanted) == 95
+
+
+@pytest.mark.parametrize(
+    ("version", "warns"), [("1", False), ("2", True), ("9" * 40, True), ("", False), ("x", False)]
+)
+def test_a_session_of_a_later_contract_is_read_with_a_warning(tmp_path, version, warns):
+    path = tmp_path / "later.mcap"
+    facts = {"contract": version}
+    with SessionWriter(path, session_id="a", epoch_ns=0, metadata=facts) as writer:
+        writer.joint_state("/joint_states", ["a"], unit="rad")
+    with Session.open(path) as session:
+        found = [text for text in session.warnings if "of the log contract" in text]
+    assert bool(found) == warns
+    assert all(f"reads up to {CONTRACT_VERSION}:" in text for text in found)

@@ -1,0 +1,100 @@
+"""The names of ``import undulog``: imported when used, typed, and paths in, results out."""
+
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import undulog
+from support import processes
+from support.paths import ROOT
+from support.processes import python
+from undulog.capture.common.errors import UsageError
+
+STRANGER = """
+import undulog
+from undulog.capture import SessionWriter
+
+scenario = undulog.load_scenario("flat").changed(duration_s=2.0)
+recording = undulog.record(scenario, "run.mcap", force=True)
+result = undulog.analyse("run.mcap")
+several = undulog.analyse("run.mcap", "run.mcap")
+reveal_type(result)
+reveal_type(several)
+reveal_type(undulog.compare("a.mcap", ["b.mcap", "c.mcap"]))
+with undulog.Session.open("run.mcap") as session:
+    reveal_type(session.joints("/joint_states", "position").values)
+    reveal_type(undulog.analyse(session).joints[0].gain)
+with undulog.Twin(scenario) as twin:
+    for sample in twin.samples():
+        reveal_type(sample.time_s)
+        break
+print(recording.path, result.frames()["joints"], SessionWriter)
+undulog.analyse(3)
+"""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    for name, changes in (("a", {}), ("b", {"servo.stall_torque": 0.3})):
+        undulog.record("flat", folder / f"{name}.mcap", changes=changes, duration_s=12.0)
+    return folder
+
+
+def test_importing_undulog_imports_none_of_its_packages():
+    code = (
+        "import sys; before = set(sys.modules); import undulog;"
+        "print(*sorted(n for n in set(sys.modules) - before if 'undulog' in n or 'numpy' in n))"
+    )
+    assert python(code).stdout.split() == ["undulog"]
+
+
+def test_every_name_can_be_imported_and_no_other():
+    assert all(getattr(undulog, name) is not None for name in undulog.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        undulog.nothing  # noqa: B018
+    homes = [name for names in undulog._HOMES.values() for name in names.split()]
+    assert sorted([*homes, "run"]) == undulog.__all__
+
+
+def test_paths_and_open_sessions_give_the_same(runs):
+    one = undulog.analyse(runs / "a.mcap")
+    with undulog.Session.open(runs / "a.mcap") as session:
+        again = undulog.analyse(session)
+        assert session.duration_s == pytest.approx(12.0, abs=0.1)
+    assert one.joints == again.joints
+    several = undulog.analyse(runs / "a.mcap", str(runs / "b.mcap"))
+    assert isinstance(several, undulog.Experiment)
+    found = undulog.compare(runs / "a.mcap", [runs / "b.mcap"])
+    assert "servo.stall_torque" in str(found)
+    for result in (one, several, found):
+        assert "<table" in result._repr_html_()
+
+
+def test_changes_are_for_a_scenario_that_is_named(tmp_path):
+    with pytest.raises(UsageError, match="changes are for"):
+        undulog.record(undulog.load_scenario("flat"), tmp_path / "x.mcap", changes={"seed": 2})
+
+
+@pytest.mark.slow
+def test_a_strangers_program_is_typed_by_the_installed_wheel(tmp_path):
+    build = (sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path)
+    assert processes.run(*build, cwd=ROOT).returncode == 0
+    venv.create(tmp_path / "venv", with_pip=False)
+    (site,) = (tmp_path / "venv/lib").glob("python*/site-packages")
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
+        wheel.extractall(site)
+    (ours,) = {Path(p) for p in sys.path if p.endswith("site-packages")}
+    (site / "dependencies.pth").write_text(f"{ours}\n")
+    (tmp_path / "stranger.py").write_text(STRANGER)
+    check = (sys.executable, "-m", "pyright", "--pythonpath", tmp_path / "venv/bin/python")
+    found = processes.run(*check, "stranger.py", cwd=tmp_path).stdout
+    types = {line.rpartition(" is ")[2] for line in found.splitlines() if "information:" in line}
+    assert {'"Analysis"', '"Experiment"', '"Comparison"', '"Estimate"'} <= types, found
+    assert not [one for one in types if "Unknown" in one], found
+    errors = [line for line in found.splitlines() if " error: " in line]
+    assert len(errors) == 1, found
+    assert "stranger.py:20:" in errors[0]
