@@ -36,7 +36,7 @@ from enum import StrEnum
 from itertools import product
 
 import numpy as np
-from scipy.special import fdtrc, gammaincc, polygamma, psi, stdtr
+from scipy.special import gammaincc, ndtr, polygamma, psi, stdtr
 
 from undulog.capture.common.arrays import BoolArray, FloatArray
 
@@ -48,7 +48,7 @@ MIN_CYCLES = 5
 MOST_CYCLES = 160
 """More are averaged in blocks of several."""
 
-SIGNIFICANT = 0.01
+SIGNIFICANT = 3e-3
 """Chance of a trend in steady responses, over all joints and trends."""
 
 EXCESS = 0.05
@@ -100,6 +100,9 @@ class SlowChanges:
         turn: Rotation of a transient per cycle [rad]; 0 where it does not oscillate.
         correlation: Of u from cycle to cycle, of gains and of lags; 0 where their scatter is white.
         correlated: Posterior probability that it is not white, of gains and of lags.
+        alike: Whether gains and lags scatter alike.
+        dof: Degrees of freedom of the scatter of each series.
+        excess: Chance that noise within the cycles makes the scatter between them.
         residuals: Independent errors of equal variance, of which ``level`` would have that times
             ``share``, shape (k, c - p).
         share: See ``residuals``; of gains and of lags.
@@ -114,6 +117,9 @@ class SlowChanges:
     turn: float
     correlation: tuple[float, float]
     correlated: tuple[float, float]
+    alike: bool
+    dof: int
+    excess: float
     residuals: FloatArray
     share: tuple[float, float]
     explained: FloatArray
@@ -125,11 +131,11 @@ class CycleNoise:
 
     Attributes:
         variance: Of the value in one cycle, 0 where it is unknown, shape (k,).
-        dof: Degrees of freedom of each.
+        log_variance: Variance of the logarithm of each.
     """
 
     variance: FloatArray
-    dof: float
+    log_variance: float
 
 
 @dataclass(frozen=True)
@@ -186,7 +192,7 @@ def slow_changes(series: FloatArray, cycle: FloatArray, noise: CycleNoise) -> Sl
     if excess < EXCESS:
         grid = [white, *correlated]
         p, shapes = _clearest(series, place, steady, grid)
-    return _inferred(series, place, shapes, grid, p)
+    return _inferred(series, place, shapes, grid, p=p, excess=excess)
 
 
 def _excess(fits: _Fits, shapes: _Shapes, noise: CycleNoise) -> float:
@@ -198,9 +204,13 @@ def _excess(fits: _Fits, shapes: _Shapes, noise: CycleNoise) -> float:
     n, p = shapes.designs.shape[1:]
     if n <= p:
         return 1.0
-    parts = _independent(fits.rest[s])
-    ratio = float(np.mean(fits.rss[s][known] / noise.variance[known])) / (n - p)
-    return float(fdtrc(parts * (n - p), parts * noise.dof, ratio))
+    half = (n - p) / 2
+    ratio = np.log(fits.rss[s][known] / (n - p) / noise.variance[known])
+    expected = float(psi(half) - np.log(half))
+    # Gains and lags have one estimate of the noise.
+    error = float(polygamma(1, half)) + 2 * noise.log_variance
+    error = (error / max(_independent(fits.rest[s]), 1.0)) ** 0.5
+    return float(ndtr(-(float(np.mean(ratio)) - expected) / error))
 
 
 def _independent(series: FloatArray) -> float:
@@ -422,7 +432,9 @@ def _inferred(
     place: FloatArray,
     shapes: _Shapes,
     noises: Sequence[_Noise],
+    *,
     p: float,
+    excess: float,
 ) -> SlowChanges:
     """Weigh the grid and give the coefficients."""
     fits = [_fit(shapes, noise, series) for noise in noises]
@@ -456,6 +468,9 @@ def _inferred(
         turn=float(shapes.turn[found.best[0][1]]),
         correlation=(noises[found.best[0][0]].correlation, noises[found.best[1][0]].correlation),
         correlated=(float(correlated[0]), float(correlated[1])),
+        alike=alike,
+        dof=dof,
+        excess=excess,
         residuals=np.concatenate(residuals),
         share=(shares[0], shares[1]),
         explained=np.concatenate(explained),

@@ -6,6 +6,7 @@ import dataclasses
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from ..energy import (
 )
 from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..estimators.series import Series, clean_together, coverage
+from ..estimators.slow_changes import Trend
 from ..estimators.spectrum import BINS_PER_SIDE
 from ..free_motion.estimate import MotionFit, fit_motion, free_motion
 from ..frequency_response.estimate import frequency_responses
@@ -381,8 +383,27 @@ def _group_facts(
             window = Window(first_s, last_s, float(cycles))
         wave, steps = _wave(robot, group)
         estimate = Estimate(frequency, around(frequency, half))
-        result.append(GroupFacts(estimate, group.driven, (window,), wave, steps))
+        facts = GroupFacts(estimate, group.driven, (window,), wave, steps)
+        result.append(_with_changes(facts, group))
     return tuple(result)
+
+
+def _with_changes(facts: GroupFacts, gait: GaitFit) -> GroupFacts:
+    """Add how the gait of a group and its responses change."""
+    if gait.pace is not None:
+        facts = dataclasses.replace(facts, frequency_drift_hz_per_s=gait.pace.hz_per_s)
+    changes = gait.changes
+    if changes is None:
+        return facts
+    turn = changes.found.turn if changes.trend is Trend.SETTLING else 0.0
+    return dataclasses.replace(
+        facts,
+        trend=str(changes.trend),
+        time_constant_s=changes.time_constant_s,
+        oscillation_hz=turn / (2 * np.pi * changes.period_s) or None,
+        cycle_correlation=max(changes.found.correlation) if changes.varies else None,
+        amplitude_drift_per_cycle=changes.amplitude_drift or Estimate(),
+    )
 
 
 def _wave(robot: Robot | None, gait: GaitFit) -> tuple[str | None, dict[str, float]]:
@@ -446,6 +467,7 @@ def _joint_results(
                 group=index,
                 frequency_hz=None if group is None else group.fit.frequency_hz,
                 dead_band=dead.get(name),
+                **_changes(group, name),
             )
         )
     return tuple(results)
@@ -458,6 +480,25 @@ def _estimates(gait: GaitFit | None, name: str) -> tuple[Estimate, Estimate]:
     lag = lag_estimate(gait.response, place)
     # A phase that noise leaves open means an amplitude that isn't there.
     return (gain_estimate(gait.response, place) if lag.value is not None else Estimate()), lag
+
+
+def _changes(gait: GaitFit | None, name: str) -> dict[str, Any]:
+    """Return the fields of a joint's changes from cycle to cycle."""
+    if gait is None or gait.changes is None or name not in gait.answered:
+        return {}
+    changes, place = gait.changes, gait.answered.index(name)
+    found: dict[str, Any] = {}
+    if changes.trend is not Trend.STEADY:
+        drifts = changes.trend is Trend.DRIFTING
+        keys = (
+            ("gain_drift_per_cycle", "lag_drift_rad_per_cycle")
+            if drifts
+            else ("gain_transient", "lag_transient_rad")
+        )
+        found |= zip(keys, changes.of_joint(place), strict=True)
+    if changes.varies:
+        found["gain_cycle_sd"], found["lag_cycle_sd_rad"] = changes.scatter[:, place].tolist()
+    return found
 
 
 def _provenance(session: SessionView, options: Options) -> Provenance:
