@@ -32,18 +32,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from itertools import product
 
 import numpy as np
 from scipy.special import gammaincc, ndtr, polygamma, psi, stdtr
 
-from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import FloatArray
 
 from .intervals import CONFIDENCE
-
-MIN_CYCLES = 5
-"""Fewer cycles show no trend beside their scatter."""
+from .trends import MIN_CYCLES, Shapes, Trend, families, finer, steady, transients
 
 MOST_CYCLES = 160
 """More are averaged in blocks of several."""
@@ -58,8 +55,6 @@ EXCESS = 0.05
 _CORRELATIONS = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
 _CELLS = (0.34, 0.19, 0.15, 0.11, 0.1, 0.06, 0.05)  # a prior between flat and reference
 _WHITE = (0.0, 0.1, 0.25, 0.5, 0.75)  # share of the variance
-_SHORTEST = 0.4  # time constant in cycles
-_LONGEST = 0.5  # share of the window
 _TRIALS = {"drifting": 1.0, "settling": 4.0, "ringing": 20.0}
 _LIKELY = 0.05
 _UNLIKE = 2.0  # standard errors of the logarithm of a ratio of variances
@@ -68,15 +63,8 @@ _HALVINGS = 40
 _ZOOMS = 8
 _ENOUGH = 8  # points that a fine grid spreads over
 _LEAST_WEIGHT = 1e-3
+_OUT_OF_REACH = 1e9  # a transient as long as the window has no known end
 _TINY = 1e-300
-
-
-class Trend(StrEnum):
-    """How the responses change over the window."""
-
-    STEADY = "steady"
-    DRIFTING = "drifting"
-    SETTLING = "settling"
 
 
 @dataclass(frozen=True)
@@ -149,24 +137,12 @@ class _Noise:
 
 
 @dataclass(frozen=True)
-class _Shapes:
-    """Trends of one kind: s designs of p columns."""
-
-    kind: str
-    designs: FloatArray  # (s, c, p)
-    tau: FloatArray  # (s,)
-    turn: FloatArray  # (s,)
-    hyper: int
-
-
-@dataclass(frozen=True)
 class _Fits:
     """All trends of one kind with one noise, k series."""
 
     beta: FloatArray  # (s, p, k)
     cov: FloatArray  # (s, p, p)
     rss: FloatArray  # (s, k)
-    rest: FloatArray  # whitened residuals (s, k, c)
     restricted: FloatArray  # of gains and of lags (s, 2)
     full: FloatArray  # (s,)
 
@@ -183,20 +159,20 @@ def slow_changes(series: FloatArray, cycle: FloatArray, noise: CycleNoise) -> Sl
         The fit; steady where there are fewer than ``MIN_CYCLES`` cycles.
     """
     place = cycle - cycle[0]
-    steady = _Shapes("steady", np.ones((1, place.size, 1)), np.full(1, np.nan), np.zeros(1), 0)
     white, *correlated = _noises(place)
     # Scatter that noise within the cycles explains has no correlation from cycle to cycle.
     grid = [white]
-    p, shapes = _clearest(series, place, steady, grid)
-    excess = _excess(_fit(shapes, white, series), shapes, noise)
+    p, shapes = _clearest(series, place, grid)
+    excess = _excess(shapes, white, series, noise)
     if excess < EXCESS:
         grid = [white, *correlated]
-        p, shapes = _clearest(series, place, steady, grid)
+        p, shapes = _clearest(series, place, grid)
     return _inferred(series, place, shapes, grid, p=p, excess=excess)
 
 
-def _excess(fits: _Fits, shapes: _Shapes, noise: CycleNoise) -> float:
+def _excess(shapes: Shapes, white: _Noise, series: FloatArray, noise: CycleNoise) -> float:
     """Return the chance that noise within cycles makes the scatter between them."""
+    fits = _fit(shapes, white, series)
     s = int(np.argmax(fits.full))
     known = noise.variance > 0
     if not np.any(known):
@@ -209,7 +185,7 @@ def _excess(fits: _Fits, shapes: _Shapes, noise: CycleNoise) -> float:
     expected = float(psi(half) - np.log(half))
     # Gains and lags have one estimate of the noise.
     error = float(polygamma(1, half)) + 2 * noise.log_variance
-    error = (error / max(_independent(fits.rest[s]), 1.0)) ** 0.5
+    error = (error / max(_independent(_rest(shapes, s, white, series)), 1.0)) ** 0.5
     return float(ndtr(-(float(np.mean(ratio)) - expected) / error))
 
 
@@ -241,40 +217,18 @@ def _noises(place: FloatArray) -> Iterator[_Noise]:
         root = np.linalg.cholesky(matrix)
         log_det = 2 * float(np.sum(np.log(np.diag(root))))
         prior = 0.5 * cell / len(_WHITE)
-        yield _Noise(correlation, prior, np.linalg.inv(root), log_det)
+        yield _Noise(correlation, prior, np.asarray(np.linalg.inv(root), np.float64), log_det)
 
 
-def _families(place: FloatArray) -> Iterator[_Shapes]:
-    """Yield the trends by kind."""
-    one, length = np.ones(place.size), float(place[-1] + 1)
-    columns = [one]
-    for degree in (1, 2):
-        power = place**degree
-        basis, _ = np.linalg.qr(np.stack(columns, axis=1))
-        columns = [*columns, power - basis @ (basis.T @ power)]
-        if place.size - degree >= MIN_CYCLES - 1:
-            yield _Shapes("drifting", np.stack(columns, axis=1)[None], _NONE, np.zeros(1), 0)
-    longest = _LONGEST * length
-    if longest <= _SHORTEST or place.size < MIN_CYCLES:
-        return
-    yield _transients(place, np.geomspace(_SHORTEST, longest, 24), np.zeros(1))
-    if place.size > MIN_CYCLES and longest > 1:
-        turn = np.pi * np.arange(1, 16) / 16
-        yield _transients(place, np.geomspace(1.0, longest, 10), turn)
-
-
-_NONE = np.full(1, np.nan)
-
-
-def _fit(shapes: _Shapes, noise: _Noise, series: FloatArray) -> _Fits:
+def _fit(shapes: Shapes, noise: _Noise, series: FloatArray) -> _Fits:
     n, p = shapes.designs.shape[1:]
     k = series.shape[0]
     right = noise.whiten @ series.T
     q, r = np.linalg.qr(noise.whiten @ shapes.designs)
     inverse = np.linalg.inv(r)
     turned = np.swapaxes(q, 1, 2) @ right
-    rest = np.swapaxes(right - q @ turned, 1, 2)
-    rss = np.maximum(np.sum(rest**2, axis=2), _TINY)
+    squares = [np.sum((right - a @ b) ** 2, axis=0) for a, b in zip(q, turned, strict=True)]
+    rss = np.maximum(np.stack(squares), _TINY)
     logs = np.log(rss).reshape(-1, 2, k // 2).sum(axis=2)
     information = 2 * np.log(np.abs(np.diagonal(r, axis1=1, axis2=2))).sum(axis=1)
     # Over |X' X|, or it would depend on the scale of the columns.
@@ -284,7 +238,6 @@ def _fit(shapes: _Shapes, noise: _Noise, series: FloatArray) -> _Fits:
         beta=inverse @ turned,
         cov=inverse @ np.swapaxes(inverse, 1, 2),
         rss=rss,
-        rest=rest,
         restricted=-0.5 * (k / 2 * information + (n - p) * logs),
         full=-0.5 * (k * noise.log_det + n * logs.sum(axis=1)),
     )
@@ -305,40 +258,54 @@ class _Posterior:
     temper: float
 
 
-def _posterior(fits: Sequence[_Fits], noises: Sequence[_Noise]) -> _Posterior:
+def _posterior(
+    shapes: Shapes, fits: Sequence[_Fits], noises: Sequence[_Noise], series: FloatArray
+) -> _Posterior:
     """Weigh the grid; gains and lags share the trend, but have each their correlation."""
     prior = np.log([one.prior for one in noises])[None, :, None]
     log = np.stack([one.restricted.T for one in fits], axis=1)  # (2, noises, s)
-    temper = 1.0
-    for _ in range(2):  # what joints share shows once their scatter is white
-        tempered = temper * log + prior
-        each = np.exp(tempered - tempered.max())
-        each = np.maximum(each, _TINY)
-        marginal = each.sum(axis=1, keepdims=True)
-        weights = each * marginal[::-1]
-        weights /= weights.sum(axis=(1, 2), keepdims=True)
-        best = [_best(one) for one in weights]
-        half = fits[0].rss.shape[1] // 2
-        rest = [fits[i].rest[s].reshape(2, half, -1)[part] for part, (i, s) in enumerate(best)]
-        temper = _independent(np.concatenate(rest)) / (2 * half)
+    weights, best = _weighed(log + prior)
+    half = series.shape[0] // 2
+    # What joints share shows once their scatter is white.
+    white = [
+        _rest(shapes, s, noises[i], series[part * half : (part + 1) * half])
+        for part, (i, s) in enumerate(best)
+    ]
+    temper = _independent(np.concatenate(white)) / (2 * half)
+    weights, best = _weighed(temper * log + prior)
     return _Posterior(weights, best, temper)
 
 
+def _weighed(log: FloatArray) -> tuple[FloatArray, list[tuple[int, int]]]:
+    each = np.maximum(np.exp(log - log.max(axis=(1, 2), keepdims=True)), _TINY)
+    weights = each * each.sum(axis=1, keepdims=True)[::-1]
+    weights /= weights.sum(axis=(1, 2), keepdims=True)
+    return weights, [_best(one) for one in weights]
+
+
+def _rest(shapes: Shapes, s: int, noise: _Noise, series: FloatArray) -> FloatArray:
+    """Return what one trend leaves of the series, made white, shape (k, c)."""
+    right = noise.whiten @ series.T
+    basis = np.linalg.qr(noise.whiten @ shapes.designs[s])[0]
+    return np.asarray((right - basis @ (basis.T @ right)).T, dtype=np.float64)
+
+
 def _clearest(
-    series: FloatArray, place: FloatArray, steady: _Shapes, noises: Sequence[_Noise]
-) -> tuple[float, _Shapes]:
+    series: FloatArray, place: FloatArray, noises: Sequence[_Noise]
+) -> tuple[float, Shapes]:
     """Return the chance of the clearest trend, and the trends of the likeliest kind."""
+    none = steady(place.size)
     if place.size < MIN_CYCLES:
-        return 1.0, steady
-    null = [_fit(steady, noise, series) for noise in noises]
-    weights = _posterior(null, noises).weights[:, :, 0]
+        return 1.0, none
+    null = [_fit(none, noise, series) for noise in noises]
+    weights = _posterior(none, null, noises, series).weights[:, :, 0]
     likely = [np.flatnonzero(each >= _LIKELY).tolist() for each in weights]
     spread = range(1, len(noises), 5)
     tried = sorted({0, *likely[0], *likely[1], *spread})
-    p, best, chosen = 1.0, np.inf, steady
-    for family in _families(place):
+    p, best, chosen = 1.0, np.inf, none
+    for family in families(place):
         fits = {k: _fit(family, noises[k], series) for k in tried}
-        found = _posterior([fits[k] for k in tried], [noises[k] for k in tried])
+        found = _posterior(family, [fits[k] for k in tried], [noises[k] for k in tried], series)
         chance, total = np.zeros(family.tau.size), 0.0
         for i, j in product(*likely):
             share = float(weights[0, i] * weights[1, j])
@@ -350,10 +317,13 @@ def _clearest(
         p = min(p, own)
         if own > SIGNIFICANT:
             continue
-        value = _criterion(family, max(float(one.full.max()) for one in fits.values()), series)
+        full = np.max([one.full for one in fits.values()], axis=0)
+        value = _criterion(family, float(full.max()), series)
+        if family.free and family.tau[int(np.argmax(full))] >= family.longest:
+            value += _OUT_OF_REACH
         if value < best:
             best, chosen = value, family
-    if chosen.hyper:
+    if chosen.free:
         chosen = _zoomed(chosen, series, place, [noises[k] for k in tried])
     return p, chosen
 
@@ -365,58 +335,37 @@ def _halves(gains: _Fits, lags: _Fits) -> tuple[_Fits, _Fits]:
 
 
 def _zoomed(
-    shapes: _Shapes,
+    shapes: Shapes,
     series: FloatArray,
     place: FloatArray,
     noises: Sequence[_Noise],
-) -> _Shapes:
+) -> Shapes:
     """Return transients on a grid as fine as the likelihood is narrow."""
-    lowest, highest = float(shapes.tau.min()), float(shapes.tau.max())
+    lowest, highest = float(shapes.tau.min()), shapes.longest
     for _ in range(_ZOOMS):
         fits = [_fit(shapes, one, series) for one in noises]
-        weights = _posterior(fits, noises).weights[0].sum(axis=0)
+        weights = _posterior(shapes, fits, noises, series).weights[0].sum(axis=0)
         weights /= weights.max()
         spread = float(weights.sum() ** 2 / np.sum(weights**2))
-        if spread >= _ENOUGH**shapes.hyper:
+        if spread >= _ENOUGH**shapes.free:
             break
         kept = weights >= _LEAST_WEIGHT
-        tau = _finer(shapes.tau, kept, 24 // shapes.hyper, lowest, highest)
-        if shapes.hyper == 1:
-            shapes = _transients(place, tau, np.zeros(1))
+        tau = finer(shapes.tau, kept, 24 // shapes.free, lowest, highest)
+        if shapes.free == 1:
+            shapes = transients(place, tau, np.zeros(1))
         else:
-            turn = _finer(shapes.turn, kept, 16, 1e-3, np.pi - 1e-3)
-            shapes = _transients(place, tau, turn)
+            turn = finer(shapes.turn, kept, 16, 1e-3, np.pi - 1e-3)
+            shapes = transients(place, tau, turn)
     return shapes
 
 
-def _finer(
-    values: FloatArray, kept: BoolArray, count: int, lowest: float, highest: float
-) -> FloatArray:
-    """Return a grid that reaches one step beyond the values that are kept."""
-    known = np.unique(values)
-    chosen = np.flatnonzero(np.isin(known, values[kept]))
-    low = known[max(chosen[0] - 1, 0)] if chosen[0] else lowest
-    high = known[chosen[-1] + 1] if chosen[-1] + 1 < known.size else highest
-    return np.geomspace(low, high, count)
-
-
-def _transients(place: FloatArray, tau: FloatArray, turn: FloatArray) -> _Shapes:
-    """Return every time constant with every rotation; without rotation where that is 0."""
-    taus, turns = (each.ravel() for each in np.meshgrid(tau, turn, indexing="ij"))
-    wave = np.exp((-1 / taus + 1j * turns)[:, None] * place)
-    parts = [np.ones(wave.shape), wave.real, wave.imag]
-    if not turn.any():
-        return _Shapes("settling", np.stack(parts[:2], axis=-1), taus, turns, 1)
-    return _Shapes("ringing", np.stack(parts, axis=-1), taus, turns, 2)
-
-
-def _criterion(family: _Shapes, log_likelihood: float, series: FloatArray) -> float:
+def _criterion(family: Shapes, log_likelihood: float, series: FloatArray) -> float:
     k, n = series.shape
-    free = k * (family.designs.shape[2] + 1) + family.hyper + 1
+    free = k * (family.designs.shape[2] + 1) + family.free + 1
     return -2 * log_likelihood + 2 * free * k * n / max(k * n - free - 1, 1)
 
 
-def _chance(before: FloatArray, after: FloatArray, family: _Shapes, temper: float) -> FloatArray:
+def _chance(before: FloatArray, after: FloatArray, family: Shapes, temper: float) -> FloatArray:
     """Return the chance that steady series are explained so well by some more columns, (s,)."""
     n, p = family.designs.shape[1:]
     a, b = (n - p) / 2, (p - 1) / 2
@@ -430,7 +379,7 @@ def _chance(before: FloatArray, after: FloatArray, family: _Shapes, temper: floa
 def _inferred(
     series: FloatArray,
     place: FloatArray,
-    shapes: _Shapes,
+    shapes: Shapes,
     noises: Sequence[_Noise],
     *,
     p: float,
@@ -438,7 +387,7 @@ def _inferred(
 ) -> SlowChanges:
     """Weigh the grid and give the coefficients."""
     fits = [_fit(shapes, noise, series) for noise in noises]
-    found = _posterior(fits, noises)
+    found = _posterior(shapes, fits, noises, series)
     columns = shapes.designs.shape[2]
     half = series.shape[0] // 2
     dof = series.shape[1] - columns
@@ -451,16 +400,18 @@ def _inferred(
     level, turned = (
         _mixture(fits, found.weights, each, dof, alike=alike) for each in (firsts, change)
     )
-    residuals, shares, explained = [], [], []
+    residuals: list[FloatArray] = []
+    shares: list[float] = []
+    explained: list[FloatArray] = []
     for part, (i, s) in enumerate(found.best):
         own = slice(part * half, (part + 1) * half)
         noise, fit = noises[i], fits[i]
-        whole, _ = np.linalg.qr(noise.whiten @ shapes.designs[s], mode="complete")
+        whole = np.linalg.qr(noise.whiten @ shapes.designs[s], mode="complete")[0]
         residuals.append(series[own] @ noise.whiten.T @ whole[:, columns:])
         shares.append(float(fit.cov[s, 0, 0]))
         explained.append((shapes.designs[s] @ fit.beta[s][:, own]).T)
     return SlowChanges(
-        trend=Trend.SETTLING if shapes.hyper else Trend(shapes.kind),
+        trend=Trend.SETTLING if shapes.free else Trend(shapes.kind),
         p=p,
         level=level,
         change=turned,
@@ -489,10 +440,10 @@ def _alike(gains: FloatArray, lags: FloatArray, dof: int, temper: float) -> bool
     return abs(ratio) <= _UNLIKE * error
 
 
-def _changes(shapes: _Shapes, place: FloatArray) -> FloatArray:
+def _changes(shapes: Shapes, place: FloatArray) -> FloatArray:
     """Return the weights of the columns in :attr:`SlowChanges.change`, shape (s, p)."""
     start = shapes.designs[:, 0].copy()
-    if not shapes.hyper:
+    if not shapes.free:
         start = (shapes.designs[:, -1] - start) / max(float(place[-1]), 1.0)
     start[:, 0] = 0.0
     return start
@@ -515,7 +466,9 @@ def _mixture(
             scale = (scale + np.stack([fits[i].rss[s][other] for i, s in index]) / dof) / 2
         scale *= np.array([rows[s] @ fits[i].cov[s] @ rows[s] for i, s in index])[:, None]
         parts.append(_central(share, mean, np.sqrt(np.maximum(scale, _TINY)), dof * (1 + alike)))
-    return Coefficients(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    return Coefficients(
+        np.concatenate([one[0] for one in parts]), np.concatenate([one[1] for one in parts])
+    )
 
 
 def _central(

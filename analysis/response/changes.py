@@ -27,14 +27,13 @@ from ..estimators.intervals import ResponseErrors, around, t_factor
 from ..estimators.series import Series
 from ..estimators.slow_changes import (
     EXCESS,
-    MIN_CYCLES,
     MOST_CYCLES,
     Coefficients,
     CycleNoise,
     SlowChanges,
-    Trend,
     slow_changes,
 )
+from ..estimators.trends import MIN_CYCLES, Trend
 from ..results.estimate import Estimate
 from .response import Response
 from .rhythm import NYQUIST_SHARE
@@ -180,7 +179,7 @@ def with_changes(response: Response, changes: ResponseChanges) -> Response:
     are raised where cycles vary by more than the noise beside the gait frequency shows.
     """
     found = changes.found
-    moving = changes.trend is not Trend.STEADY or changes.amplitude_drift is not None
+    moving = found.trend is not Trend.STEADY or changes.amplitude_drift is not None
     if not moving and changes.excess > _CLEAR_EXCESS:
         return response
     level = found.level.value.reshape(2, -1)

@@ -11,8 +11,8 @@ from undulog.capture.common.console import Warn
 
 from ..estimators.harmonic import LINEAR, HarmonicFit, fit_at, fit_shared
 from ..estimators.series import Series
-from ..estimators.slow_changes import Trend
 from ..estimators.spectrum import Noise, omega_variance, residual_noise, residual_spectrum
+from ..estimators.trends import Trend
 from ..results.answer import Lacking, Note, distinct, percent
 from ..results.estimate import Estimate
 from .changes import Pace, ResponseChanges, moving_pace, response_changes, with_changes

@@ -33,8 +33,8 @@ from ..energy import (
 )
 from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..estimators.series import Series, clean_together, coverage
-from ..estimators.slow_changes import Trend
 from ..estimators.spectrum import BINS_PER_SIDE
+from ..estimators.trends import Trend
 from ..free_motion.estimate import MotionFit, fit_motion, free_motion
 from ..frequency_response.estimate import frequency_responses
 from ..oscillators.chain import session_couplings
