@@ -37,7 +37,7 @@ from itertools import product
 import numpy as np
 from scipy.special import gammaincc, ndtr, polygamma, psi, stdtr
 
-from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.arrays import BoolArray, FloatArray
 
 from .intervals import CONFIDENCE
 from .trends import MIN_CYCLES, Shapes, Trend, families, finer, steady, transients
@@ -199,8 +199,8 @@ def _independent(series: FloatArray) -> float:
         k^2 over the sum of squared correlations, less what independent series have by chance, 1 to
         k.
     """
-    size = np.sqrt(np.sum(series**2, axis=1))
-    used = series[size > 0] / size[size > 0, None]
+    size: FloatArray = np.sqrt(np.sum(series**2, axis=1))
+    used: FloatArray = series[size > 0] / size[size > 0, None]
     k = used.shape[0]
     if k < 2:
         return 1.0
@@ -406,7 +406,7 @@ def _inferred(
     for part, (i, s) in enumerate(found.best):
         own = slice(part * half, (part + 1) * half)
         noise, fit = noises[i], fits[i]
-        whole = np.linalg.qr(noise.whiten @ shapes.designs[s], mode="complete")[0]
+        whole: FloatArray = np.linalg.qr(noise.whiten @ shapes.designs[s], mode="complete")[0]
         residuals.append(series[own] @ noise.whiten.T @ whole[:, columns:])
         shares.append(float(fit.cov[s, 0, 0]))
         explained.append((shapes.designs[s] @ fit.beta[s][:, own]).T)
@@ -457,11 +457,11 @@ def _mixture(
     parts: list[tuple[FloatArray, FloatArray]] = []
     for part, own in enumerate(weights):
         mine, other = (slice(k * half, (k + 1) * half) for k in (part, 1 - part))
-        index = np.argwhere(own >= _LEAST_WEIGHT * own.max())
-        share = own[tuple(index.T)]
+        index: list[list[int]] = np.argwhere(own >= _LEAST_WEIGHT * own.max()).tolist()
+        share: FloatArray = np.array([own[i, s] for i, s in index])
         share = (share / share.sum())[:, None]
-        mean = np.stack([rows[s] @ fits[i].beta[s][:, mine] for i, s in index])
-        scale = np.stack([fits[i].rss[s][mine] for i, s in index]) / dof
+        mean: FloatArray = np.stack([rows[s] @ fits[i].beta[s][:, mine] for i, s in index])
+        scale: FloatArray = np.stack([fits[i].rss[s][mine] for i, s in index]) / dof
         if alike:
             scale = (scale + np.stack([fits[i].rss[s][other] for i, s in index]) / dof) / 2
         scale *= np.array([rows[s] @ fits[i].cov[s] @ rows[s] for i, s in index])[:, None]
@@ -479,10 +479,11 @@ def _central(
     reach = 12.0 * (scale.max(axis=0) + np.ptp(mean, axis=0))
     ends: list[FloatArray] = []
     for quantile in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2):
-        low, high = centre - reach, centre + reach
+        low: FloatArray = centre - reach
+        high: FloatArray = centre + reach
         for _ in range(_HALVINGS):
-            middle = (low + high) / 2
-            below = (share * stdtr(dof, (middle - mean) / scale)).sum(axis=0) < quantile
+            middle: FloatArray = (low + high) / 2
+            below: BoolArray = (share * stdtr(dof, (middle - mean) / scale)).sum(axis=0) < quantile
             low, high = np.where(below, middle, low), np.where(below, high, middle)
         ends.append((low + high) / 2)
     return centre, np.maximum(ends[1] - centre, centre - ends[0])

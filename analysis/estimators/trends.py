@@ -96,7 +96,8 @@ def finer(
 
 def transients(place: FloatArray, tau: FloatArray, turn: FloatArray) -> Shapes:
     """Return every time constant with every rotation; without rotation where that is 0."""
-    taus, turns = (np.ravel(each) for each in np.meshgrid(tau, turn, indexing="ij"))
+    taus: FloatArray = np.repeat(tau, turn.size)
+    turns: FloatArray = np.tile(turn, tau.size)
     decay = np.exp(-place / taus[:, None])
     angle = turns[:, None] * place
     parts = [np.ones(decay.shape), decay * np.cos(angle), decay * np.sin(angle)]

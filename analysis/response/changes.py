@@ -28,7 +28,6 @@ from ..estimators.series import Series
 from ..estimators.slow_changes import (
     EXCESS,
     MOST_CYCLES,
-    Coefficients,
     CycleNoise,
     SlowChanges,
     slow_changes,
@@ -104,11 +103,18 @@ class ResponseChanges:
 
     def of_joint(self, joint: int) -> tuple[Estimate, Estimate]:
         """Return :attr:`.SlowChanges.change` of log gain and of lag [rad] of one joint."""
-        value, half = (one.reshape(2, -1)[:, joint] for one in _both(self.found.change))
-        gain, phase = value.tolist()
-        return Estimate(gain, around(gain, float(half[0]))), Estimate(
-            -phase, around(-phase, float(half[1]))
+        size = float(np.abs(self._level[joint]))
+        gain_half, lag_half = (self.found.change.half.reshape(2, -1)[:, joint] / size).tolist()
+        change = complex(self.per_joint[joint])
+        return (
+            Estimate(change.real, around(change.real, gain_half)),
+            Estimate(-change.imag, around(-change.imag, lag_half)),
         )
+
+    @property
+    def _level(self) -> ComplexArray:
+        gain, phase = self.found.level.value.reshape(2, -1)
+        return gain + 1j * phase
 
     @property
     def time_constant_s(self) -> Estimate:
@@ -121,8 +127,8 @@ class ResponseChanges:
     @property
     def per_joint(self) -> ComplexArray:
         """:attr:`.SlowChanges.change` of ln H, shape (m,)."""
-        gain, lag = self.found.change.value.reshape(2, -1)
-        return gain + 1j * lag
+        gain, phase = self.found.change.value.reshape(2, -1)
+        return np.asarray((gain + 1j * phase) / self._level)
 
     @property
     def largest(self) -> float:
@@ -130,10 +136,6 @@ class ResponseChanges:
         size = float(np.max(np.abs(self.per_joint), initial=0.0))
         settling = self.found.trend is Trend.SETTLING
         return size * min(self.found.tau[0] / self.cycles, 1.0) if settling else size
-
-
-def _both(one: Coefficients) -> tuple[FloatArray, FloatArray]:
-    return one.value, one.half
 
 
 def response_changes(
@@ -230,8 +232,8 @@ def _cycles(
         found.append(_without_image(1 + own / amplitude, amplitude, edges, fit.omega))
         noise.append(_noise_within(rest, starts, fit.omega, own) / abs(amplitude) ** 2)
     whole = np.array(found).reshape(2, len(commands), count)
-    usable: BoolArray = np.isfinite(whole).all(axis=(0, 1))
-    usable &= (np.abs(whole[0]) > _ROUNDING).all(axis=0)
+    usable: BoolArray = np.all(np.isfinite(whole), axis=(0, 1)).reshape(count)
+    usable &= np.all(np.abs(whole[0]) > _ROUNDING, axis=0)
     if np.count_nonzero(usable) < MIN_CYCLES:
         return None
     whole = whole[:, :, usable]
@@ -265,9 +267,12 @@ def _noise_within(one: Series, starts: IntArray, omega: float, amplitude: Comple
     """
     cosine, sine = cos_sin(omega * one.t_s)
     filled = np.diff(starts)
-    known = np.repeat(np.where(np.isfinite(amplitude), amplitude, 0.0), filled)
+    known: ComplexArray = np.where(np.isfinite(amplitude), amplitude, 0.0).astype(np.complex128)
+    known = np.repeat(known, filled)
     inside = slice(int(starts[0]), int(starts[-1]))
-    rest = one.values[inside] - (known.real * cosine[inside] - known.imag * sine[inside])
+    rest: FloatArray = one.values[inside] - (
+        known.real * cosine[inside] - known.imag * sine[inside]
+    )
     starts = starts - starts[0]
     rest = rest - np.repeat(cycle_sums(rest, starts) / np.maximum(filled, 1), filled)
     usable = filled > 0
@@ -304,7 +309,7 @@ def _amplitude_drift(cycles: Cycles) -> Estimate | None:
     place = cycles.number - cycles.number.mean()
     power = float(place @ place)
     slope = size @ place / power
-    rest = size - size.mean(axis=1, keepdims=True) - slope[:, None] * place
+    rest: FloatArray = size - size.mean(axis=1, keepdims=True) - slope[:, None] * place
     moved = float(np.max(np.abs(slope))) * float(np.ptp(place))
     clear = _stands_out(float(np.sum(slope**2)) * power, slope.size, rest, 2)
     if moved < MOVING or not clear:
@@ -345,13 +350,16 @@ class Pace:
         return Estimate(drift, around(drift, self.half / (2 * np.pi)))
 
 
-def moving_pace(series: Sequence[Series], commands: int, fit: HarmonicFit) -> Pace | None:
+def moving_pace(
+    series: Sequence[Series], commands: int, fit: HarmonicFit, least: float = MOVING
+) -> Pace | None:
     """Take channels over the phase of their commands.
 
     Args:
         series: The first ones of them are commands.
         commands: How many.
         fit: Of all, with one frequency.
+        least: Phase by which one frequency must miss the commands [rad].
 
     Returns:
         None where the frequency stays.
@@ -363,7 +371,9 @@ def moving_pace(series: Sequence[Series], commands: int, fit: HarmonicFit) -> Pa
     if count < MIN_CYCLES:
         return None
     count = min(count, MOST_CYCLES)
-    edges = np.linspace(start, start + turn_s * int((stop - start) / turn_s + 0.01), count + 1)
+    edges: FloatArray = np.linspace(
+        start, start + turn_s * int((stop - start) / turn_s + 0.01), count + 1
+    )
     phases: list[FloatArray] = []
     weights: list[float] = []
     for k, one in enumerate(own):
@@ -376,11 +386,11 @@ def moving_pace(series: Sequence[Series], commands: int, fit: HarmonicFit) -> Pa
             weights.append(float(fit.weight[k]) * abs(amplitude) ** 2)
     if not phases:
         return None
-    middle = (edges[:-1] + edges[1:]) / 2
+    middle: FloatArray = (edges[:-1] + edges[1:]) / 2
     centre, scale = float(middle.mean()), float(np.ptp(middle)) / 2
-    place = (middle - centre) / scale
-    phase = np.average(phases, axis=0, weights=weights)
-    coefficients = _polynomial(place, phase)
+    place: FloatArray = (middle - centre) / scale
+    phase: FloatArray = np.average(phases, axis=0, weights=weights)
+    coefficients = _polynomial(place, phase, least)
     if coefficients is None:
         return None
     curve = np.polynomial.Polynomial(coefficients)
@@ -406,7 +416,7 @@ def moving_pace(series: Sequence[Series], commands: int, fit: HarmonicFit) -> Pa
     return Pace(result, drift, t_factor(dof) * spread**0.5 / (2 * scale**2))
 
 
-def _polynomial(place: FloatArray, phase: FloatArray) -> FloatArray | None:
+def _polynomial(place: FloatArray, phase: FloatArray, least: float) -> FloatArray | None:
     """Return the coefficients of the phase where it bends; None where it doesn't."""
     chosen: FloatArray | None = None
     before = phase - np.polynomial.polynomial.polyval(
@@ -419,6 +429,6 @@ def _polynomial(place: FloatArray, phase: FloatArray) -> FloatArray | None:
         rest = phase - np.polynomial.polynomial.polyval(place, found)
         gained = float(before @ before - rest @ rest)
         clear = _stands_out(gained, 1, rest[None], degree + 1)
-        if gained / place.size > (MOVING / 4) ** 2 and clear:
+        if gained / place.size > (least / 4) ** 2 and clear:
             chosen, before = np.asarray(found), rest
     return chosen

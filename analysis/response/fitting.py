@@ -15,7 +15,7 @@ from ..estimators.spectrum import Noise, omega_variance, residual_noise, residua
 from ..estimators.trends import Trend
 from ..results.answer import Lacking, Note, distinct, percent
 from ..results.estimate import Estimate
-from .changes import Pace, ResponseChanges, moving_pace, response_changes, with_changes
+from .changes import MOVING, Pace, ResponseChanges, moving_pace, response_changes, with_changes
 from .groups import (
     RESOLUTION,
     Groups,
@@ -43,6 +43,8 @@ _CLEAR = 0.95
 
 _PACE_ROUNDS = 3
 """Of following a frequency that moves; the second is a correction."""
+
+_CORRECTED = 1e-2
 
 _ROUNDS = 10
 """Of fitting several groups in turn; exact commands need one, noisy ones two or three."""
@@ -278,13 +280,16 @@ def _paced(
     if fit.model.lines:
         return found, channels, fit  # a group whose frequency moves has no constant lines
     for _ in range(_PACE_ROUNDS):
-        pace = moving_pace(channels, commands, fit)
+        least = MOVING if found is None else _CORRECTED * MOVING
+        pace = moving_pace(channels, commands, fit, least)
         if pace is None:
             break
+        before = 0.0 if found is None else found.drift
         channels = pace.series
-        fit = fit_shared(channels, fit.omega, fit.model)
-        drift = pace.drift + (0.0 if found is None else found.drift)
-        found = replace(pace, drift=drift)
+        turned = fit_shared(channels, fit.omega, fit.model)
+        # The bent time stays as it is, whatever frequency is then found over it.
+        found = replace(pace, drift=(before + pace.drift) * turned.omega / fit.omega)
+        fit = turned
     return found, channels, fit
 
 
