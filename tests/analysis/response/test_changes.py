@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.estimators.slow_changes import CycleNoise, slow_changes
 from undulog.analysis.estimators.trends import Trend
@@ -75,12 +76,13 @@ def planted_session(rng, planted, cycles, joints=JOINTS):
 
 
 def oracle(planted, cycles, columns):
-    """Half width of the interval of least squares that know the model and all variances."""
+    """Half width of least squares that know the trend and the correlation, but not the scale."""
     place = np.arange(cycles)
     own = 2 * (NOISE_RAD / AMPLITUDE_RAD / 0.95) ** 2 / (RATE_HZ / GAIT_HZ) * np.eye(cycles)
     covariance = own + planted.sd**2 * planted.correlation ** np.abs(place[:, None] - place)
     design = columns(place.astype(float))
-    return 1.96 * np.linalg.inv(design.T @ np.linalg.solve(covariance, design))[0, 0] ** 0.5
+    factor = t_factor(2 * (cycles - design.shape[1]))
+    return factor * np.linalg.inv(design.T @ np.linalg.solve(covariance, design))[0, 0] ** 0.5
 
 
 def mean(place):
@@ -153,7 +155,9 @@ def test_intervals_hold_in_19_of_20_repetitions(case, cycles):
     found = outcome(planted, cycles, 200, seed=7)
     assert 0.91 <= found.gain <= 0.98, found
     assert 0.91 <= found.lag <= 0.98, found
-    assert found.width <= 1.2 * oracle(planted, cycles, columns), found
+    # An unknown correlation costs more than an unknown trend.
+    most = 1.3 if case == "variation" else 1.2
+    assert found.width <= most * oracle(planted, cycles, columns), found
     if case == "none":
         assert found.trends[Trend.STEADY] >= 190, found
 
