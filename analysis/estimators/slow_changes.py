@@ -30,12 +30,13 @@ Tiao, Bayesian Inference in Statistical Analysis, 1973, section 8).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.special import gammaincc, ndtr, polygamma, psi, stdtr
+from scipy.special import gammaincc, ndtr, psi, stdtr, zeta
 
 from undulog.capture.common.arrays import BoolArray, FloatArray
 
@@ -120,10 +121,12 @@ class CycleNoise:
     Attributes:
         variance: Of the value in one cycle, 0 where it is unknown, shape (k,).
         log_variance: Variance of the logarithm of each.
+        relative: Standard deviation in each cycle over the mean one, shape (c,).
     """
 
     variance: FloatArray
     log_variance: float
+    relative: FloatArray
 
 
 @dataclass(frozen=True)
@@ -159,7 +162,7 @@ def slow_changes(series: FloatArray, cycle: FloatArray, noise: CycleNoise) -> Sl
         The fit; steady where there are fewer than ``MIN_CYCLES`` cycles.
     """
     place = cycle - cycle[0]
-    white, *correlated = _noises(place)
+    white, *correlated = _noises(place, noise.relative)
     # Scatter that noise within the cycles explains has no correlation from cycle to cycle.
     grid = [white]
     p, shapes = _clearest(series, place, grid)
@@ -181,12 +184,23 @@ def _excess(shapes: Shapes, white: _Noise, series: FloatArray, noise: CycleNoise
     if n <= p:
         return 1.0
     half = (n - p) / 2
-    ratio = np.log(fits.rss[s][known] / (n - p) / noise.variance[known])
-    expected = float(psi(half) - np.log(half))
+    ratio: FloatArray = np.log(fits.rss[s][known] / (n - p) / noise.variance[known])
+    expected = _digamma(half) - math.log(half)
     # Gains and lags have one estimate of the noise.
-    error = float(polygamma(1, half)) + 2 * noise.log_variance
+    error = _trigamma(half) + 2 * noise.log_variance
     error = (error / max(_independent(_rest(shapes, s, white, series)), 1.0)) ** 0.5
-    return float(ndtr(-(float(np.mean(ratio)) - expected) / error))
+    chance: float = ndtr((expected - float(np.mean(ratio))) / error)
+    return chance
+
+
+def _digamma(value: float) -> float:
+    found: float = psi(value)
+    return found
+
+
+def _trigamma(value: float) -> float:
+    found: float = zeta(2.0, value)
+    return found
 
 
 def _independent(series: FloatArray) -> float:
@@ -208,12 +222,13 @@ def _independent(series: FloatArray) -> float:
     return k * k / (k + max(excess, 0.0))
 
 
-def _noises(place: FloatArray) -> Iterator[_Noise]:
+def _noises(place: FloatArray, relative: FloatArray) -> Iterator[_Noise]:
     """Yield white scatter, then every correlation with every white share."""
     apart = np.abs(place[:, None] - place)
-    yield _Noise(0.0, 0.5, np.eye(place.size), 0.0)
+    log_det = 2 * float(np.sum(np.log(relative)))
+    yield _Noise(0.0, 0.5, np.diag(1 / relative), log_det)
     for (correlation, cell), white in product(zip(_CORRELATIONS, _CELLS, strict=True), _WHITE):
-        matrix = (1 - white) * correlation**apart + white * np.eye(place.size)
+        matrix = (1 - white) * correlation**apart + white * np.diag(relative**2)
         root = np.linalg.cholesky(matrix)
         log_det = 2 * float(np.sum(np.log(np.diag(root))))
         prior = 0.5 * cell / len(_WHITE)
@@ -370,10 +385,12 @@ def _chance(before: FloatArray, after: FloatArray, family: Shapes, temper: float
     n, p = family.designs.shape[1:]
     a, b = (n - p) / 2, (p - 1) / 2
     k = before.size
-    statistic = np.sum(np.log(before / after), axis=1)
-    mean = k * float(psi(a + b) - psi(a))
-    variance = k * float(polygamma(1, a) - polygamma(1, a + b)) / temper
-    return np.asarray(gammaincc(mean**2 / variance, statistic * mean / variance))
+    logs: FloatArray = np.log(before / after)
+    statistic: FloatArray = np.sum(logs, axis=1)
+    mean = k * (_digamma(a + b) - _digamma(a))
+    variance = k * (_trigamma(a) - _trigamma(a + b)) / temper
+    chance: FloatArray = gammaincc(mean**2 / variance, statistic * mean / variance)
+    return chance
 
 
 def _inferred(
@@ -436,7 +453,7 @@ def _best(values: FloatArray) -> tuple[int, int]:
 def _alike(gains: FloatArray, lags: FloatArray, dof: int, temper: float) -> bool:
     """Return whether gains and lags scatter alike, so that both say how much."""
     ratio = float(np.mean(np.log(gains / lags)))
-    error = (2 * float(polygamma(1, dof / 2)) / max(temper * gains.size, 1.0)) ** 0.5
+    error = (2 * _trigamma(dof / 2) / max(temper * gains.size, 1.0)) ** 0.5
     return abs(ratio) <= _UNLIKE * error
 
 
@@ -483,7 +500,8 @@ def _central(
         high: FloatArray = centre + reach
         for _ in range(_HALVINGS):
             middle: FloatArray = (low + high) / 2
-            below: BoolArray = (share * stdtr(dof, (middle - mean) / scale)).sum(axis=0) < quantile
+            chance: FloatArray = stdtr(dof, (middle - mean) / scale)
+            below: BoolArray = np.sum(share * chance, axis=0) < quantile
             low, high = np.where(below, middle, low), np.where(below, high, middle)
         ends.append((low + high) / 2)
     return centre, np.maximum(ends[1] - centre, centre - ends[0])

@@ -87,11 +87,9 @@ def finer(
     values: FloatArray, kept: BoolArray, count: int, lowest: float, highest: float
 ) -> FloatArray:
     """Return a grid that reaches one step beyond the values that are kept."""
-    known = np.unique(values)
-    chosen = np.flatnonzero(np.isin(known, values[kept]))
-    low = known[max(chosen[0] - 1, 0)] if chosen[0] else lowest
-    high = known[chosen[-1] + 1] if chosen[-1] + 1 < known.size else highest
-    return log_spaced(float(low), float(high), count)
+    below, above = values[values < values[kept].min()], values[values > values[kept].max()]
+    low, high = float(np.max(below, initial=lowest)), float(np.min(above, initial=highest))
+    return log_spaced(low, high, count)
 
 
 def transients(place: FloatArray, tau: FloatArray, turn: FloatArray) -> Shapes:

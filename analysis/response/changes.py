@@ -160,7 +160,8 @@ def response_changes(
     series = np.concatenate([relative.real, relative.imag])
     if float(np.ptp(series, axis=1).max()) < _ROUNDING:
         return None
-    noise = CycleNoise(np.tile(cycles.noise, 2), _SPREAD / cycles.number.size)
+    size = np.mean(np.abs(cycles.command), axis=0)
+    noise = CycleNoise(np.tile(cycles.noise, 2), _SPREAD / cycles.number.size, size.mean() / size)
     found = slow_changes(series, cycles.number, noise)
     scatter = np.mean(found.residuals**2, axis=1) - noise.variance
     return ResponseChanges(
@@ -281,8 +282,9 @@ def _noise_within(one: Series, starts: IntArray, omega: float, amplitude: Comple
         if beside * omega * one.period_s > 2 * np.pi * NYQUIST_SHARE:
             break
         waves = np.stack(cos_sin(beside * omega * one.t_s[inside]))
-        power = np.sum(cycle_sums(waves * rest, starts) ** 2, axis=0)
-        levels.append(float(np.mean(power[usable] / filled[usable])) / kept)
+        power: FloatArray = np.sum(cycle_sums(waves * rest, starts) ** 2, axis=0)
+        level: FloatArray = power[usable] / filled[usable]
+        levels.append(float(np.mean(level)) / kept)
     if not levels or min(levels) <= 0:
         return 0.0
     rise = max(levels[0] / levels[-1], 1.0) ** _POWER
@@ -314,9 +316,9 @@ def _amplitude_drift(cycles: Cycles) -> Estimate | None:
     clear = _stands_out(float(np.sum(slope**2)) * power, slope.size, rest, 2)
     if moved < MOVING or not clear:
         return None
-    common = rest.mean(axis=0)
+    common: FloatArray = np.mean(rest, axis=0)
     dof = place.size - 2
-    error = (float(common @ common) / dof / power) ** 0.5
+    error = (float(np.sum(common**2)) / dof / power) ** 0.5
     mean = float(np.mean(slope))
     return Estimate(mean, around(mean, t_factor(dof) * error))
 
@@ -366,14 +368,13 @@ def moving_pace(
     """
     own = series[:commands]
     turn_s = 2 * np.pi / fit.omega
-    start, stop = max(one.t_s[0] for one in own), min(one.t_s[-1] for one in own)
-    count = int((stop - start) / turn_s + 0.01)
-    if count < MIN_CYCLES:
+    start = max(float(one.t_s[0]) for one in own)
+    stop = min(float(one.t_s[-1]) for one in own)
+    whole = int((stop - start) / turn_s + 0.01)
+    if whole < MIN_CYCLES:
         return None
-    count = min(count, MOST_CYCLES)
-    edges: FloatArray = np.linspace(
-        start, start + turn_s * int((stop - start) / turn_s + 0.01), count + 1
-    )
+    several = -(-whole // MOST_CYCLES)  # cycles together
+    edges = start + turn_s * several * np.arange(whole // several + 1.0)
     phases: list[FloatArray] = []
     weights: list[float] = []
     for k, one in enumerate(own):
@@ -406,29 +407,34 @@ def moving_pace(
                 return None
             moved[id(one.t_s)] = t_s
         result.append(Series(one.name, moved[id(one.t_s)], one.values))
-    rest = phase - curve(place)
-    slope = curve.deriv()
-    drift = float(slope(1.0) - slope(-1.0)) / (2 * scale**2)
+    design = place[:, None] ** np.arange(float(coefficients.size))
+    rest = phase - design @ coefficients
+    # Of the slope at the end less that at the start, over 2 scale^2.
+    row = np.array([n * (1 - (-1.0) ** (n - 1)) for n in range(coefficients.size)])
+    row /= 2 * scale**2
     dof = place.size - coefficients.size
-    design = np.polynomial.polynomial.polyvander(place, coefficients.size - 1)
-    row = np.array([0.0, *(n * (1 - (-1.0) ** (n - 1)) for n in range(1, coefficients.size))])
     spread = float(row @ np.linalg.inv(design.T @ design) @ row) * float(rest @ rest) / dof
-    return Pace(result, drift, t_factor(dof) * spread**0.5 / (2 * scale**2))
+    return Pace(result, float(row @ coefficients), t_factor(dof) * spread**0.5)
 
 
 def _polynomial(place: FloatArray, phase: FloatArray, least: float) -> FloatArray | None:
     """Return the coefficients of the phase where it bends; None where it doesn't."""
     chosen: FloatArray | None = None
-    before = phase - np.polynomial.polynomial.polyval(
-        place, np.polynomial.polynomial.polyfit(place, phase, 1)
-    )
+    before = phase - _fitted(place, phase, 1)[1]
     for degree in _DEGREES:
         if place.size <= degree + 2:
             break
-        found = np.polynomial.polynomial.polyfit(place, phase, degree)
-        rest = phase - np.polynomial.polynomial.polyval(place, found)
+        found, value = _fitted(place, phase, degree)
+        rest: FloatArray = phase - value
         gained = float(before @ before - rest @ rest)
         clear = _stands_out(gained, 1, rest[None], degree + 1)
         if gained / place.size > (least / 4) ** 2 and clear:
-            chosen, before = np.asarray(found), rest
+            chosen, before = found, rest
     return chosen
+
+
+def _fitted(place: FloatArray, values: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Return the coefficients of a polynomial, ascending, and its values."""
+    design = place[:, None] ** np.arange(degree + 1.0)
+    found = np.linalg.lstsq(design, values, rcond=None)[0].astype(np.float64)
+    return found, np.asarray(design @ found, dtype=np.float64)

@@ -261,8 +261,8 @@ def _group_fit(
         bins=(bins.select(commanded), bins.select(responded)),
     )
     changes = response_changes(
-        [paced[k] for k in commanded.tolist()],
-        [paced[k] for k in responded.tolist()],
+        [paced[moved.index(name)] for name in answered],
+        paced[len(moved) :],
         paced_fit,
         np.stack([commanded, responded]),
     )

@@ -241,7 +241,7 @@ def test_variation_that_joints_share_counts_once():
         common = autoregression(rng, 0.7, (2, 1, 24))
         scatter = 0.01 * np.broadcast_to(common, (2, 8, 24)).reshape(16, 24)
         series = 1 + scatter + rng.normal(0, 0.002, (16, 24))
-        noise = CycleNoise(np.full(16, 0.002**2), 0.02)
+        noise = CycleNoise(np.full(16, 0.002**2), 0.02, np.ones(24))
         found = slow_changes(series, np.arange(24.0), noise)
         inside.append(np.abs(found.level.value - 1) <= found.level.half)
     assert np.mean(inside) >= 0.88
