@@ -390,6 +390,8 @@ class Analysis(PresentedResult):
             oscillator's phase was logged.
         frequency_response: Of joints whose commands are no gait but excite a band or several
             frequencies.
+        closed_loop: What makes the commands of a frequency response depend on measured motion, as
+            far as the log shows it, or None.
         free_motion: Where no commands were logged: amplitudes, lags and waves of the motion.
         answer: Which joints do not follow or stand out, and the shape of the rest, in words.
         notes: One sentence each: what was not recorded, does not apply or was assumed.
@@ -406,6 +408,7 @@ class Analysis(PresentedResult):
     energy: EnergyResult | None = None
     oscillators: tuple[ChainCoupling, ...] = ()
     frequency_response: tuple[JointFrequencyResponse, ...] = ()
+    closed_loop: str | None = None
     free_motion: FreeMotion | None = None
     artefacts: tuple[Artefact, ...] = ()
     warnings: tuple[str, ...]

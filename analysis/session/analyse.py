@@ -72,6 +72,7 @@ from ..signals.stretch import (
     without_breaks,
 )
 from ..signals.windows import Span, Stretch, whole_cycles
+from .closed_loop import closed_loop
 from .heterogeneity import heterogeneity_indices
 from .over_time import response_over_time
 from .runs import coupling_of_one_gait
@@ -262,6 +263,7 @@ def measure_session(
         heterogeneity=heterogeneity,
         coupling=coupling_of_one_gait(0 if gait is None else len(gait.all_answered)),
         free_motion=None if columns.command else _free_motion(session.robot, moved, warn),
+        closed_loop=closed_loop(session, options, warn) if swept else None,
         warnings=warn.warnings(session.warnings),
         provenance=_provenance(session, options),
         artefacts=artefacts,
