@@ -36,7 +36,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.special import gammaincc, ndtr, psi, stdtr, zeta
+from scipy.special import gammaincc, psi, stdtr, zeta
 
 from undulog.capture.common.arrays import BoolArray, FloatArray
 
@@ -189,18 +189,15 @@ def _excess(shapes: Shapes, white: _Noise, series: FloatArray, noise: CycleNoise
     # Gains and lags have one estimate of the noise.
     error = _trigamma(half) + 2 * noise.log_variance
     error = (error / max(_independent(_rest(shapes, s, white, series)), 1.0)) ** 0.5
-    chance: float = ndtr((expected - float(np.mean(ratio))) / error)
-    return chance
+    return 0.5 * math.erfc((float(np.mean(ratio)) - expected) / (error * math.sqrt(2.0)))
 
 
 def _digamma(value: float) -> float:
-    found: float = psi(value)
-    return found
+    return float(psi(value))
 
 
 def _trigamma(value: float) -> float:
-    found: float = zeta(2.0, value)
-    return found
+    return float(zeta(2.0, value))
 
 
 def _independent(series: FloatArray) -> float:
@@ -389,8 +386,7 @@ def _chance(before: FloatArray, after: FloatArray, family: Shapes, temper: float
     statistic: FloatArray = np.sum(logs, axis=1)
     mean = k * (_digamma(a + b) - _digamma(a))
     variance = k * (_trigamma(a) - _trigamma(a + b)) / temper
-    chance: FloatArray = gammaincc(mean**2 / variance, statistic * mean / variance)
-    return chance
+    return gammaincc(mean**2 / variance, statistic * mean / variance).astype(np.float64)
 
 
 def _inferred(

@@ -80,7 +80,7 @@ def families(place: FloatArray) -> Iterator[Shapes]:
 
 def log_spaced(low: float, high: float, count: int) -> FloatArray:
     """Return numbers of one ratio."""
-    return np.exp(np.linspace(np.log(low), np.log(high), count))
+    return low * (high / low) ** (np.arange(float(count)) / (count - 1))
 
 
 def finer(

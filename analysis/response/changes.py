@@ -307,10 +307,10 @@ _SPREAD = (1 + _POWER) ** 2 + _POWER**2  # of the logarithm, times the number of
 
 def _amplitude_drift(cycles: Cycles) -> Estimate | None:
     """Return the relative change of the commands' amplitudes per cycle, None where they stay."""
-    size = np.log(np.abs(cycles.command))
+    size: FloatArray = np.log(np.abs(cycles.command))
     place = cycles.number - cycles.number.mean()
     power = float(place @ place)
-    slope = size @ place / power
+    slope: FloatArray = np.asarray(size @ place / power, dtype=np.float64)
     rest: FloatArray = size - size.mean(axis=1, keepdims=True) - slope[:, None] * place
     moved = float(np.max(np.abs(slope))) * float(np.ptp(place))
     clear = _stands_out(float(np.sum(slope**2)) * power, slope.size, rest, 2)
@@ -328,7 +328,8 @@ def _stands_out(explained: float, columns: int, rest: FloatArray, fitted: int) -
     dof = rest.size - fitted * rest.shape[0]
     if scatter <= 0 or dof <= 0:
         return dof > 0
-    return float(fdtrc(columns, dof, explained / columns / (scatter / dof))) < _SIGNIFICANT
+    ratio = explained / columns / (scatter / dof)
+    return bool(fdtrc(columns, dof, ratio) < _SIGNIFICANT)
 
 
 @dataclass(frozen=True)
