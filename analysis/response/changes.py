@@ -329,7 +329,7 @@ def _stands_out(explained: float, columns: int, rest: FloatArray, fitted: int) -
     if scatter <= 0 or dof <= 0:
         return dof > 0
     ratio = explained / columns / (scatter / dof)
-    return bool(fdtrc(columns, dof, ratio) < _SIGNIFICANT)
+    return not fdtrc(columns, dof, ratio) >= _SIGNIFICANT
 
 
 @dataclass(frozen=True)
