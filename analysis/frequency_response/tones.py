@@ -6,8 +6,9 @@ exact by Gauss-Newton steps of
     u(t) = sum_k Re(A_k exp(j w_k t)) + drift(t),                                        (1)
 
 with a quadratic drift. The response is fitted with the same frequencies, and its noise at each of
-them is the power of the residual in the nearest bins that no tone is in. Distortion is in the
-residual, too, as far as the tones' combinations don't fall on tones.
+them is the power of the residual in the nearest bins that no tone is in. Tones of other joints and
+distortion are lines in some of these bins, the same in every period: they are no noise, so the
+power is that of the median bin.
 """
 
 from __future__ import annotations
@@ -114,9 +115,20 @@ def tone_response(command: Series, response: Series, tones_hz: FloatArray) -> Li
     for k, tone in enumerate(tones_hz):
         bins = _bins_beside(tone, tones_hz, length_s, 0.5 / response.period_s)
         turns = np.exp(-2j * np.pi * np.outer(bins, response.t_s))
-        noise[k] = np.mean(np.abs(2.0 / response.count * (turns @ residual)) ** 2)
-        freedom[k] = bins.size
+        noise[k] = _level(np.abs(2.0 / response.count * (turns @ residual)) ** 2)
+        freedom[k] = bins.size * np.log(2) ** 2
     return LineResponse(tones_hz, outputs / inputs, noise / np.abs(inputs) ** 2, freedom)
+
+
+def _level(power: FloatArray) -> float:
+    """Return the noise level of bins by their median, which lines in less than half of them leave.
+
+    Powers of n bins of noise are exponential variables; the k-th smallest has the mean
+    1/n + ... + 1/(n - k + 1). The median has log(2)^2 of the mean's degrees of freedom.
+    """
+    n = power.size
+    means = np.cumsum(1.0 / np.arange(n, 0, -1.0))
+    return float(np.median(power) / np.median(means))
 
 
 def _bins_beside(tone: float, tones_hz: FloatArray, length_s: float, highest: float) -> FloatArray:

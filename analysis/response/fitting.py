@@ -9,11 +9,13 @@ import numpy as np
 
 from undulog.capture.common.console import Warn
 
-from ..estimators.cycle_sums import worst_drift
 from ..estimators.harmonic import LINEAR, HarmonicFit, fit_at, fit_shared
 from ..estimators.series import Series
 from ..estimators.spectrum import Noise, omega_variance, residual_noise, residual_spectrum
+from ..estimators.trends import Trend
 from ..results.answer import Lacking, Note, distinct, percent
+from ..results.estimate import Estimate
+from .changes import MOVING, Pace, ResponseChanges, moving_pace, response_changes, with_changes
 from .groups import (
     RESOLUTION,
     Groups,
@@ -39,6 +41,11 @@ from .rhythm import (
 _CLEAR = 0.95
 """Commands explained to less than this are not one steady rhythm, if still a gait."""
 
+_PACE_ROUNDS = 3
+"""Of following a frequency that moves; the second is a correction."""
+
+_CORRECTED = 1e-2
+
 _ROUNDS = 10
 """Of fitting several groups in turn; exact commands need one, noisy ones two or three."""
 
@@ -57,6 +64,8 @@ class GaitFit:
         response: Of the ``answered`` joints.
         command_amplitudes: By joint name, also of joints that are not driven and of the other
             groups [rad].
+        changes: How the responses change from cycle to cycle; None where that is unknown.
+        pace: How the frequency moves; None where it stays.
         others: Fits of the other groups, the larger first; they hold none themselves.
     """
 
@@ -67,6 +76,8 @@ class GaitFit:
     answered: tuple[str, ...]
     response: Response | None
     command_amplitudes: Mapping[str, float]
+    changes: ResponseChanges | None = None
+    pace: Pace | None = None
     others: tuple[GaitFit, ...] = ()
 
     @property
@@ -228,33 +239,117 @@ def _group_fit(
     variance, dof = omega_variance(fit, noise)
     commanded = np.array([moved.index(name) for name in answered], dtype=np.int64)
     responded = np.arange(len(moved), len(channels))
-    explained = 1 - float(fit.rss[: len(moved)].sum() / fit.total[: len(moved)].sum())
+    pace, paced, paced_fit = _paced(channels, len(moved), fit)
+    explained = 1 - float(paced_fit.rss[: len(moved)].sum() / paced_fit.total[: len(moved)].sum())
     if explained < _CLEAR:
         share = percent(explained, _CLEAR)
         warn(
             f"one steady rhythm explains {share} of the commands' variance: gain "
             "and lag are averages over what changes"
         )
-    response = None
-    if answered:
-        response = respond(
-            fit.fundamental[commanded],
-            _pick(noise, commanded),
-            fit.fundamental[responded],
-            _pick(noise, responded),
-            omega_variance=variance,
-            delay_between_s=fit.mean_time_s[responded] - fit.mean_time_s[commanded],
-            bins=(bins.select(commanded), bins.select(responded)),
-        )
-        drift = worst_drift(channels[len(moved) :], fit, responded.tolist())
-        if drift is not None:
-            warn(
-                f"not settled: the response of {drift.name} drifts by "
-                f"{100 * drift.log_gain:+.2g} % in gain and "
-                f"{np.degrees(-drift.phase_rad):+.2g} degrees of lag per cycle, more than any "
-                "other; start later (--start)"
+    if not answered:
+        return GaitFit(fit, variance**0.5, dof, moved, answered, None, amplitudes, None, pace)
+    if pace is not None:
+        noise, bins = residual_spectrum(paced, paced_fit)
+    response = respond(
+        paced_fit.fundamental[commanded],
+        _pick(noise, commanded),
+        paced_fit.fundamental[responded],
+        _pick(noise, responded),
+        omega_variance=variance if pace is None else omega_variance(paced_fit, noise)[0],
+        delay_between_s=paced_fit.mean_time_s[responded] - paced_fit.mean_time_s[commanded],
+        bins=(bins.select(commanded), bins.select(responded)),
+    )
+    changes = response_changes(
+        [paced[moved.index(name)] for name in answered],
+        paced[len(moved) :],
+        paced_fit,
+        np.stack([commanded, responded]),
+    )
+    if changes is not None:
+        response = with_changes(response, changes)
+    _warn_changes(changes, pace, answered, warn)
+    return GaitFit(fit, variance**0.5, dof, moved, answered, response, amplitudes, changes, pace)
+
+
+def _paced(
+    channels: list[Series], commands: int, fit: HarmonicFit
+) -> tuple[Pace | None, list[Series], HarmonicFit]:
+    """Take the channels over the phase of the commands, where their frequency moves."""
+    found: Pace | None = None
+    if fit.model.lines:
+        return found, channels, fit  # a group whose frequency moves has no constant lines
+    for _ in range(_PACE_ROUNDS):
+        least = MOVING if found is None else _CORRECTED * MOVING
+        pace = moving_pace(channels, commands, fit, least)
+        if pace is None:
+            break
+        before = 0.0 if found is None else found.drift
+        channels = pace.series
+        turned = fit_shared(channels, fit.omega, fit.model)
+        # The bent time stays as it is, whatever frequency is then found over it.
+        found = replace(pace, drift=(before + pace.drift) * turned.omega / fit.omega)
+        fit = turned
+    return found, channels, fit
+
+
+def _warn_changes(
+    changes: ResponseChanges | None, pace: Pace | None, names: Sequence[str], warn: Warn
+) -> None:
+    """Report how the gait and the responses change, a sentence for each."""
+    if pace is not None:
+        warn(
+            Note(
+                f"the gait's frequency changes by {_within(pace.hz_per_s, ' Hz/s')}: gain and lag "
+                "are taken over the phase of the commands"
             )
-    return GaitFit(fit, variance**0.5, dof, moved, answered, response, amplitudes)
+        )
+    if changes is None:
+        return
+    if changes.amplitude_drift is not None:
+        share = _within(changes.amplitude_drift, " %", 100.0)
+        warn(
+            Note(
+                f"the gait's amplitude changes by {share} per cycle: gain and lag are means of the "
+                "cycles' own"
+            )
+        )
+    worst = int(np.argmax(np.abs(changes.per_joint)))
+    gain, lag = changes.of_joint(worst)
+    size = (
+        f"{names[worst]} {{}} {_within(gain, ' %', 100.0)} in gain and "
+        f"{_within(lag, ' degrees', 180 / np.pi)} of lag"
+    )
+    if changes.trend is Trend.DRIFTING:
+        warn(
+            f"not settled: the response of {size.format('drifts by')} per cycle, more than any "
+            "other; gain and lag are means over the window"
+        )
+    elif changes.trend is Trend.SETTLING:
+        warn(
+            "not settled: the responses approach steady values with a time constant of "
+            f"{_within(changes.time_constant_s, ' s')}, at the start "
+            f"{size.format('is off by')}, more than any other; gain and lag are the steady values"
+        )
+    if changes.varies:
+        most = int(np.argmax(np.hypot(*changes.scatter)))
+        gain_sd, lag_sd = changes.scatter[:, most].tolist()
+        warn(
+            Note(
+                f"gain and lag vary from cycle to cycle by more than noise, most at {names[most]} "
+                f"(standard deviations {100 * gain_sd:.2g} % and {np.degrees(lag_sd):.2g} "
+                "degrees): their intervals contain this"
+            )
+        )
+
+
+def _within(value: Estimate, unit: str, scale: float = 1.0) -> str:
+    """Return a value with its interval in words."""
+    text = f"{scale * (value.value or 0.0):+.3g}"
+    if value.ci95 is None:
+        return f"{text}{unit}"
+    low, high = (f"{scale * end:+.3g}" for end in value.ci95)
+    return f"{text}{unit} ({low} to {high})"
 
 
 def _responses_only(responses: Mapping[str, Series], rhythm: Rhythm) -> GaitFit:

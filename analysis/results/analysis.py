@@ -225,6 +225,14 @@ class GroupFacts:
         windows: Whole cycles of it at the end of the fitted stretch.
         wave: As in :class:`GaitFacts`.
         lag_per_joint_rad: As in :class:`GaitFacts`.
+        trend: How the responses change over the fitted window: ``steady``, ``drifting`` or
+            ``settling``; None where it is unknown.
+        time_constant_s: Of the approach to steady values, where the responses settle.
+        oscillation_hz: Frequency by which a transient that rings is off the gait's; None of others.
+        cycle_correlation: Of gain or lag from one cycle to the next, the larger; None where cycles
+            do not vary by more than noise.
+        frequency_drift_hz_per_s: Of the commands; empty where their frequency stays.
+        amplitude_drift_per_cycle: Of the commands, relative; empty where it stays.
     """
 
     frequency_hz: Estimate
@@ -232,6 +240,12 @@ class GroupFacts:
     windows: tuple[Window, ...] = ()
     wave: str | None = None
     lag_per_joint_rad: dict[str, float] = field(default_factory=dict[str, float])
+    trend: str | None = None
+    time_constant_s: Estimate = field(default_factory=Estimate)
+    oscillation_hz: float | None = None
+    cycle_correlation: float | None = None
+    frequency_drift_hz_per_s: Estimate = field(default_factory=Estimate)
+    amplitude_drift_per_cycle: Estimate = field(default_factory=Estimate)
 
 
 @dataclass(frozen=True)
@@ -278,6 +292,15 @@ class JointResult:
             where the gait does not drive it.
         frequency_hz: Frequency of that group, at which gain and lag are given; or None.
         dead_band: Stick or play at the reversals, or None where none can be measured.
+        gain_drift_per_cycle: Relative change of the gain, mean over the window, where it drifts;
+            gain and lag are then means over the window.
+        lag_drift_rad_per_cycle: The same of the lag.
+        gain_transient: Relative deviation of the gain from its steady value at the start of the
+            window, where the response settles; gain and lag are then the steady values.
+        lag_transient_rad: The same of the lag.
+        gain_cycle_sd: Standard deviation of the relative gain from cycle to cycle beyond noise;
+            None where there is none.
+        lag_cycle_sd_rad: The same of the lag.
     """
 
     name: str
@@ -296,6 +319,12 @@ class JointResult:
     group: int | None = None
     frequency_hz: float | None = None
     dead_band: DeadBand | None = None
+    gain_drift_per_cycle: Estimate = field(default_factory=Estimate)
+    lag_drift_rad_per_cycle: Estimate = field(default_factory=Estimate)
+    gain_transient: Estimate = field(default_factory=Estimate)
+    lag_transient_rad: Estimate = field(default_factory=Estimate)
+    gain_cycle_sd: float | None = None
+    lag_cycle_sd_rad: float | None = None
 
 
 @dataclass(frozen=True)
@@ -361,6 +390,8 @@ class Analysis(PresentedResult):
             oscillator's phase was logged.
         frequency_response: Of joints whose commands are no gait but excite a band or several
             frequencies.
+        closed_loop: What makes the commands of a frequency response depend on measured motion, as
+            far as the log shows it, or None.
         free_motion: Where no commands were logged: amplitudes, lags and waves of the motion.
         answer: Which joints do not follow or stand out, and the shape of the rest, in words.
         notes: One sentence each: what was not recorded, does not apply or was assumed.
@@ -377,6 +408,7 @@ class Analysis(PresentedResult):
     energy: EnergyResult | None = None
     oscillators: tuple[ChainCoupling, ...] = ()
     frequency_response: tuple[JointFrequencyResponse, ...] = ()
+    closed_loop: str | None = None
     free_motion: FreeMotion | None = None
     artefacts: tuple[Artefact, ...] = ()
     warnings: tuple[str, ...]

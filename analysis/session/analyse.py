@@ -6,6 +6,7 @@ import dataclasses
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from ..energy import (
 from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..estimators.series import Series, clean_together, coverage
 from ..estimators.spectrum import BINS_PER_SIDE
+from ..estimators.trends import Trend
 from ..free_motion import MotionFit, fit_motion, free_motion
 from ..frequency_response.estimate import frequency_responses
 from ..oscillators.chain import session_couplings
@@ -70,6 +72,7 @@ from ..signals.stretch import (
     without_breaks,
 )
 from ..signals.windows import Span, Stretch, whole_cycles
+from .closed_loop import closed_loop
 from .heterogeneity import heterogeneity_indices
 from .over_time import response_over_time
 from .runs import coupling_of_one_gait
@@ -260,6 +263,7 @@ def measure_session(
         heterogeneity=heterogeneity,
         coupling=coupling_of_one_gait(0 if gait is None else len(gait.all_answered)),
         free_motion=None if columns.command else _free_motion(session.robot, moved, warn),
+        closed_loop=closed_loop(session, options, warn) if swept else None,
         warnings=warn.warnings(session.warnings),
         provenance=_provenance(session, options),
         artefacts=artefacts,
@@ -381,8 +385,27 @@ def _group_facts(
             window = Window(first_s, last_s, float(cycles))
         wave, steps = _wave(robot, group)
         estimate = Estimate(frequency, around(frequency, half))
-        result.append(GroupFacts(estimate, group.driven, (window,), wave, steps))
+        facts = GroupFacts(estimate, group.driven, (window,), wave, steps)
+        result.append(_with_changes(facts, group))
     return tuple(result)
+
+
+def _with_changes(facts: GroupFacts, gait: GaitFit) -> GroupFacts:
+    """Add how the gait of a group and its responses change."""
+    if gait.pace is not None:
+        facts = dataclasses.replace(facts, frequency_drift_hz_per_s=gait.pace.hz_per_s)
+    changes = gait.changes
+    if changes is None:
+        return facts
+    turn = changes.found.turn if changes.trend is Trend.SETTLING else 0.0
+    return dataclasses.replace(
+        facts,
+        trend=str(changes.trend),
+        time_constant_s=changes.time_constant_s,
+        oscillation_hz=turn / (2 * np.pi * changes.period_s) or None,
+        cycle_correlation=max(changes.found.correlation) if changes.varies else None,
+        amplitude_drift_per_cycle=changes.amplitude_drift or Estimate(),
+    )
 
 
 def _wave(robot: Robot | None, gait: GaitFit) -> tuple[str | None, dict[str, float]]:
@@ -446,6 +469,7 @@ def _joint_results(
                 group=index,
                 frequency_hz=None if group is None else group.fit.frequency_hz,
                 dead_band=dead.get(name),
+                **_changes(group, name),
             )
         )
     return tuple(results)
@@ -464,6 +488,25 @@ def _engine(session: SessionView) -> dict[str, str]:
     """Return the physics engine that a session of the twin was simulated with."""
     engine = session.metadata.get("undulog", {}).get("engine")
     return {} if engine is None else {"engine of the session": engine}
+
+
+def _changes(gait: GaitFit | None, name: str) -> dict[str, Any]:
+    """Return the fields of a joint's changes from cycle to cycle."""
+    if gait is None or gait.changes is None or name not in gait.answered:
+        return {}
+    changes, place = gait.changes, gait.answered.index(name)
+    found: dict[str, Any] = {}
+    if changes.trend is not Trend.STEADY:
+        drifts = changes.trend is Trend.DRIFTING
+        keys = (
+            ("gain_drift_per_cycle", "lag_drift_rad_per_cycle")
+            if drifts
+            else ("gain_transient", "lag_transient_rad")
+        )
+        found |= zip(keys, changes.of_joint(place), strict=True)
+    if changes.varies:
+        found["gain_cycle_sd"], found["lag_cycle_sd_rad"] = changes.scatter[:, place].tolist()
+    return found
 
 
 def _provenance(session: SessionView, options: Options) -> Provenance:

@@ -16,15 +16,11 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray, frozen
 
-from ..estimators.cycle_sums import cycle_sums, weigh
-from ..estimators.harmonic import cos_sin
-from ..estimators.series import Series
+from ..estimators.cycle_sums import amplitudes, weigh
 from .analyse import SessionMeasurement
 
 LEAST_COVERED = 0.9
 """A cycle with samples over less of its length is missing."""
-
-_LEAST_SAMPLES = 6
 
 
 @dataclass(frozen=True)
@@ -99,27 +95,6 @@ def cycle_maps(measured: SessionMeasurement) -> CycleMaps | None:
         powered=tuple(power),
         power_w=frozen(np.array(list(power.values())).reshape(-1, span.cycles) / period),
     )
-
-
-def amplitudes(series: Series, starts: IntArray, omega: float) -> ComplexArray:
-    """Complex amplitude of each cycle, from its samples alone.
-
-    Args:
-        starts: Where c cycles begin among them and the last one ends, shape (c + 1,).
-        omega: Angular frequency [rad/s].
-
-    Returns:
-        Amplitudes at t = 0, shape (c,); NaN where a cycle has too few samples.
-    """
-    cosine, sine = cos_sin(omega * series.t_s)
-    basis = np.stack([np.ones(series.count), cosine, -sine])
-    gram = np.stack([cycle_sums(basis * row, starts) for row in basis])
-    right = cycle_sums(basis * series.values, starts)
-    known: BoolArray = np.diff(starts) >= _LEAST_SAMPLES
-    result = np.full(known.size, np.nan, dtype=np.complex128)
-    solved = np.linalg.solve(gram.T[known], right.T[known, :, None])[..., 0]
-    result[known] = solved[:, 1] + 1j * solved[:, 2]
-    return result
 
 
 def _lag(response: ComplexArray) -> FloatArray:

@@ -21,8 +21,8 @@ from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 from undulog.capture.robot.run import Run
 
-from ...estimators.cycle_sums import DRIFT_PER_CYCLE, SIGNIFICANT
 from ...estimators.series import Series, clean
+from ...response.changes import DRIFT_PER_CYCLE
 from ...response.fitting import GaitFit
 from ...response.rhythm import DRIVEN_SHARE, NYQUIST_SHARE
 from ...results.answer import Remarks
@@ -303,6 +303,10 @@ def _phasors(fits: Sequence[ToneFit], lines: Sequence[int]) -> tuple[Phasors, ..
     )
 
 
+_CHANCE_OF_DRIFT = 5e-3
+"""Chance of a warning about a settled run."""
+
+
 def _drift(series: Sequence[Series], omega: FloatArray, fit: ToneFit, runs: int) -> float:
     """Return the largest change of a tone's responses between the halves of a run, per cycle.
 
@@ -325,6 +329,6 @@ def _drift(series: Sequence[Series], omega: FloatArray, fit: ToneFit, runs: int)
     for tone, per_cycle in enumerate((size / cycles).tolist()):
         dof = float(fit.dof[:, tone].sum())
         chance = float(fdtrc(2 * len(series), dof, float(ratio[tone]))) * omega.size * runs
-        if per_cycle > DRIFT_PER_CYCLE and chance < SIGNIFICANT:
+        if per_cycle > DRIFT_PER_CYCLE and chance < _CHANCE_OF_DRIFT:
             worst = max(worst, per_cycle)
     return worst

@@ -5,7 +5,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from undulog.analysis.estimators.cycle_sums import worst_drift
 from undulog.analysis.estimators.harmonic import fit_at, fit_shared
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.response.fitting import fit_gait
@@ -127,28 +126,3 @@ def test_whole_cycles_are_those_at_the_end():
     assert whole_cycles(0.0, 7.99999, 0.5) == (0.0, 7.99999, 4)
     assert whole_cycles(8.0, 20.01, 0.5) == (8.0, 20.0, 6)  # a sample more than whole cycles
     assert whole_cycles(0.0, 1.0, 0.5)[2] == 0
-
-
-def test_a_decaying_mode_is_reported_as_drift():
-    """A bending mode at 0.551 Hz with tau = 7.5 s, from the start of a gait of 0.5 Hz."""
-    rng = np.random.default_rng(3)
-    omega = np.pi
-
-    def drifts(mode, duration=12.0):
-        def angle(t, i):
-            bending = mode * np.exp(-t / 7.5) * np.sin(3.46 * t - 0.4 * i)
-            return 0.4 * np.sin(omega * t - i) + bending + rng.normal(0, 1e-3, t.size)
-
-        series = channels(angle, 8, duration)
-        return worst_drift(series, fit_shared(series, omega), list(range(8))) is not None
-
-    assert all(drifts(mode, duration) for duration in (8.0, 12.0, 20.0) for mode in (0.02, 0.002))
-    assert sum(drifts(0.0) for _ in range(200)) <= 5
-
-
-def test_the_size_of_a_drift():
-    t = np.arange(1200) / 100
-    growing = [Series("q", t, (0.4 + 0.002 * t) * np.sin(np.pi * t - 1))]
-    drift = worst_drift(growing, fit_shared(growing, np.pi), [0])
-    assert drift.log_gain == pytest.approx(0.004 / 0.412, rel=0.02)
-    assert abs(drift.phase_rad) < 1e-3

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from undulog.analysis.estimators.cycle_sums import starts_of
+from undulog.analysis.estimators.cycle_sums import amplitudes, starts_of
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.session.analyse import measure_session
-from undulog.analysis.session.cycles import amplitudes, cycle_maps
+from undulog.analysis.session.cycles import cycle_maps
 from undulog.capture import Session, SessionWriter
 
 EPOCH_NS = 1_735_689_600_000_000_000
