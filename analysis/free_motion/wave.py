@@ -154,7 +154,9 @@ def phase_line(
     weight = np.abs(motion.amplitudes) ** 2
     weight = weight / weight.sum()
     phase = np.angle(motion.amplitudes)
-    steps = _mean_steps(phase, index, weight) if near_rad is None else np.diff(near_rad)
+    steps = (
+        -best_lag(phase, index, weight) * np.diff(index) if near_rad is None else np.diff(near_rad)
+    )
     phase = _unwrapped(phase, steps)
     centred = place - weight @ place
     contrast = -weight * centred / (weight @ centred**2)
@@ -167,12 +169,18 @@ def phase_line(
     return PhaseLine(Estimate(slope, interval), error, float(weight @ left**2) ** 0.5, phase)
 
 
-def _mean_steps(phase: FloatArray, index: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the steps of phase along the wave that fits best, shape (m - 1,)."""
+def best_lag(phase: FloatArray, index: FloatArray, weight: FloatArray) -> float:
+    """Return the lag from joint to joint of the wave that fits best, on a grid [rad].
+
+    Args:
+        phase: Of the joints [rad], shape (m,).
+        index: Number of each in the chain, shape (m,).
+        weight: Shape (m,).
+    """
     count = _GRID * (int(index[-1] - index[0]) + 1)
     trial = np.linspace(-np.pi, np.pi, count, endpoint=False)
     sums = np.abs((weight * np.exp(1j * phase)) @ np.exp(1j * np.outer(index, trial)))
-    return -trial[np.argmax(sums)] * np.diff(index)
+    return float(trial[np.argmax(sums)])
 
 
 def _unwrapped(phase: FloatArray, steps: FloatArray) -> FloatArray:

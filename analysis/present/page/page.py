@@ -40,6 +40,7 @@ from ...results.experiment import Experiment
 from ...results.oscillators import ChainCoupling
 from ...session.cycles import CycleMaps
 from .. import tables
+from ..body_shape import shape_lines
 from ..text import chain_detail
 from .artefacts import artefact_rows, command_response, flagged_joints, read_traces
 from .bode import bode
@@ -399,6 +400,7 @@ def _environment() -> Environment:
         body_gradient=", ".join(joint_hex(9)),
         MISSING=formats.MISSING,
         LEVEL_NOTE=LEVEL_NOTE,
+        shape_lines=shape_lines,
     )
     return environment
 
