@@ -215,14 +215,11 @@ def shape_base(shapes: ComplexArray, most_modes: int = MOST_MODES) -> ShapeBase:
 def aligned_shapes(shapes: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """Return gaits with their phases as alike as can be, and the mean fundamental of the joints.
 
-    The first gait is the one most like the others.
-
     Args:
         shapes: Shape (g, m, h + 1).
     """
     first = shapes[:, :, 1]
-    alike = np.abs(first.conj() @ first.T) - 0.5 * np.sum(np.abs(first) ** 2, axis=1)
-    mean = first[int(np.argmax(np.median(alike, axis=1)))]
+    mean = _central(first)
     for _ in range(2):
         phase = np.angle(first @ mean.conj())
         mean = np.mean(first * np.exp(-1j * phase)[:, None], axis=0)
@@ -230,18 +227,26 @@ def aligned_shapes(shapes: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     return np.stack([turned(*one) for one in zip(shapes, phase, strict=True)]), mean
 
 
+def _central(first: ComplexArray) -> ComplexArray:
+    """Return the fundamental that differs least from the others, in the median; (g, m) to (m,)."""
+    power = np.sum(np.abs(first) ** 2, axis=1)
+    # |a - b exp(j phase)|^2 at the best phase
+    off = power[:, None] + power - 2 * np.abs(first.conj() @ first.T)
+    return first[int(np.argmin(np.median(off, axis=1)))]
+
+
 def fit_connection(cycles: Sequence[GaitCycle], most_modes: int = MOST_MODES) -> Connection:
     """Fit the model to gaits around one gait.
 
     Args:
-        cycles: Of the same joints.
+        cycles: Of the same joints, one or more.
 
     Raises:
         DataError: If they are too few or too much alike; it names the condition number.
     """
     base = shape_base(np.stack([one.shape for one in cycles]), most_modes)
     perturbations = [base.perturbation(one.shape)[0] for one in cycles]
-    condition = _condition(base, perturbations)
+    condition = condition_of(cycles, most_modes)
     count, needed = len(cycles), f"at least {MIN_GAITS} gaits around one gait are needed"
     number = f"the condition number is {condition:.3g}, at most {MOST_CONDITION:g} is of use"
     if count < MIN_GAITS:
@@ -249,6 +254,28 @@ def fit_connection(cycles: Sequence[GaitCycle], most_modes: int = MOST_MODES) ->
     if float(np.linalg.norm(base.largest)) < base.least:
         raise DataError(f"the {count} gaits are too much alike: {number}")
     return _fitted(base, condition, perturbations, cycles)
+
+
+def condition_of(cycles: Sequence[GaitCycle], most_modes: int = MOST_MODES) -> float:
+    """Return the condition number of the shapes and rates of shape that gaits show."""
+    base = shape_base(np.stack([one.shape for one in cycles]), most_modes)
+    return _condition(base, [base.perturbation(one.shape)[0] for one in cycles])
+
+
+def distances(cycles: Sequence[GaitCycle]) -> FloatArray:
+    """Return by which share each gait's joints differ from the gait most like the others.
+
+    Args:
+        cycles: g gaits of the same joints.
+
+    Returns:
+        Shape (g,), 0 for the central gait itself; a shift in phase is no difference.
+    """
+    first = np.stack([one.shape[:, 1] for one in cycles])
+    central = _central(first)
+    phase = np.angle(first @ central.conj())
+    off = first * np.exp(-1j * phase)[:, None] - central
+    return np.linalg.norm(off, axis=1) / max(float(np.linalg.norm(central)), 1e-12)
 
 
 def _fitted(

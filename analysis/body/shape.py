@@ -17,7 +17,7 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
-from undulog.capture.robot.model import Robot
+from undulog.capture.robot.model import Plane, Robot
 
 from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series
@@ -99,6 +99,7 @@ def body_shape(
             omega = moved.fit.omega
             cycle = gait_cycle(robot, path, sound, omega, span.start_s)
             travel = _travel(path, cycle)
+            cycle = cycle if _planar(robot, moved) else None
     except (DataError, LogError) as error:
         warn(Note(f"no travel of the body: {error}"))
     shape = BodyShape(planes, travel) if planes or travel is not None else None
@@ -115,6 +116,15 @@ def _path(
     if any(name not in angles or angles[name].count < 2 for name in robot.joint_names):
         return None
     return robot, chassis_path(robot, head_poses(session, robot.links[0].name, span), angles)
+
+
+def _planar(robot: Robot, moved: MotionFit) -> bool:
+    """Return whether only horizontal joints move."""
+    plane_of = {joint.name: joint.plane for joint in robot.joints}
+    power = dict.fromkeys(Plane, 0.0)
+    for name, size in zip(moved.names, np.abs(moved.fit.fundamental).tolist(), strict=True):
+        power[plane_of[name]] += size**2
+    return power[Plane.VERTICAL] <= _STILL**2 * power[Plane.HORIZONTAL]
 
 
 def _travel(path: ChassisPath, cycle: GaitCycle) -> BodyTravel:
@@ -298,7 +308,7 @@ def _nearest(
         if not bend < 0:
             break
         kappa -= (total.conjugate() * 1j * first).real / bend
-    mean = complex(np.mean(amplitudes * np.exp(1j * kappa * x)))
+    mean = complex(amplitudes @ np.exp(1j * kappa * x)) / place.size
     power = 0.5 * float(np.sum(np.abs(amplitudes) ** 2))
     left = max(power - 0.5 * place.size * abs(mean) ** 2, 0.0) + beside
     whole = power + beside

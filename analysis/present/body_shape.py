@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from ..results import formats
+from ..results.body_connection import BodyConnection, PredictedTravel
 from ..results.body_shape import BodyShape, PlaneShape
 from ..results.estimate import Estimate
+from .tables import Column, Table, typical
 
 
 def shape_lines(shape: BodyShape | None) -> Iterator[str]:
@@ -50,3 +52,36 @@ def _degrees(angle: Estimate) -> str:
 
 def _percent(share: Estimate) -> str:
     return formats.estimate(formats.scaled(share, 100.0), " %", most=2)
+
+
+def travel_table(found: BodyConnection) -> Table[PredictedTravel]:
+    """Return the travel of each session, predicted from the others and measured."""
+
+    def column(
+        name: str, unit: str, of: Callable[[PredictedTravel], Estimate], spare: int = 0
+    ) -> Column[PredictedTravel]:
+        digits = (typical(2), typical(3))
+        return Column(f"{name} {unit} (95 %)", f"{name} [{unit}]", of, digits, spare=spare)
+
+    def mm(of: Callable[[PredictedTravel], Estimate]) -> Callable[[PredictedTravel], Estimate]:
+        return lambda one: formats.scaled(of(one), 1000.0)
+
+    columns: list[Column[PredictedTravel]] = [
+        Column("session", "session", lambda one: formats.filename(one.path), kind="word"),
+        Column("Hz", "frequency [Hz]", lambda one: one.frequency_hz, (3, 4), spare=3),
+        column("forward", "mm", mm(lambda one: one.forward_m)),
+        column("measured", "mm", mm(lambda one: one.measured_forward_m)),
+        column("left", "mm", mm(lambda one: one.left_m), 2),
+        column("measured left", "mm", mm(lambda one: one.measured_left_m), 2),
+        column("turn", "°", lambda one: formats.degrees(one.turn_rad)),
+        column("measured turn", "°", lambda one: formats.degrees(one.measured_turn_rad)),
+        Column(None, "not predicted because", lambda one: one.why or "", kind="sentence"),
+    ]
+    return Table(columns, found.predicted)
+
+
+def refusals(found: BodyConnection) -> Iterator[str]:
+    """Yield a sentence on each session that is not predicted."""
+    for one in found.predicted:
+        if one.why is not None:
+            yield f"{formats.filename(one.path)} is not predicted: {one.why}."
