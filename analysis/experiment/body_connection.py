@@ -19,7 +19,7 @@ from ..results.body_connection import BodyConnection, ConnectionEntry, Predicted
 from ..results.body_shape import ShapeMode
 from ..results.estimate import Estimate
 
-MOST_DISTANCE = 0.5
+MOST_DISTANCE = 0.3
 """A gait whose joints differ from the central one by more than this share is another gait."""
 
 _VELOCITIES = ("forward", "left", "turn")
