@@ -34,7 +34,7 @@ MOST_MODES = 3
 MOST_CONDITION = 100.0
 """The weakest perturbation of a shape mode is at least about this share of the gait itself."""
 
-ORDER = 4
+ORDER = 6
 """Of A and B as Fourier series in the phase."""
 
 _ALONE = 1 - 1e-6
