@@ -27,7 +27,7 @@ from .null import SAMPLES, travel
 ROUND = 0.7
 """Beyond this ratio of the short to the long semi-axis the axes are not those of a long body."""
 
-HARMONICS = 8
+HARMONICS = 6
 """Of shape and velocity within a cycle."""
 
 

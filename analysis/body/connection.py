@@ -27,15 +27,15 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray, frozen
 from undulog.capture.common.errors import DataError
 
 from ..estimators.intervals import t_factor
-from .chassis import PHASES, GaitCycle, step_of_cycle, wave_at
+from .chassis import HARMONICS, PHASES, GaitCycle, step_of_cycle, wave_at
 
 MIN_GAITS = 8
 MOST_MODES = 3
 MOST_CONDITION = 100.0
 """The weakest perturbation of a shape mode is at least about this share of the gait itself."""
 
-ORDER = 6
-"""Of A and B as Fourier series in the phase."""
+ORDER = HARMONICS
+"""Of A and B as Fourier series in the phase; with fewer terms than the cycles have, A is biased."""
 
 _ALONE = 1 - 1e-6
 """Largest share of its own prediction that a gait may have."""

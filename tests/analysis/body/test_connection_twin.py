@@ -22,8 +22,8 @@ SETTLE, MEASURED = 6, 6
 """Cycles."""
 
 
-SLOW = 0.1
-"""Gait frequency at which inertia is small beside drag [Hz]: omega m / c_t = 0.004."""
+SLOW = 0.05
+"""Gait frequency at which inertia is small beside drag [Hz]: omega m / c_t = 0.005."""
 
 
 def scenario(base, gait, ground=None, cycles=SETTLE + MEASURED):
@@ -107,7 +107,6 @@ def test_held_out_gaits_under_coulomb_friction_at_two_speeds():
     model = fit_connection(known)
     for cycle in beyond:
         assert model.outside(cycle.shape) is not None
-    print()
     for frequency in (0.5, 1.0):
         errors, covered = [], []
         for gait, cycle in zip(held, rest, strict=True):
@@ -124,8 +123,8 @@ def test_held_out_gaits_under_coulomb_friction_at_two_speeds():
             gone = np.hypot(*step[:2])
             errors.append([(abs(d - gone), abs(turn - step[2])) for d, turn in guesses])
         medians = np.median(errors, axis=0)
-        print(f"{frequency} Hz, {len(errors)} gaits, rows model, K 10, K 1e4, nearest:")
-        print(medians, "covered", np.mean(covered, axis=0))
+        shown = np.round(1000 * medians, 2).tolist()
+        print(f"{frequency} Hz, {len(errors)} gaits, model, K 10, K 1e4, nearest: {shown}")
         assert len(errors) >= 6
         assert np.all(medians[0] <= 0.5 * medians[1:].min(axis=0))
         assert np.mean(covered, axis=0)[[0, 2]].min() > 0.85
@@ -136,11 +135,10 @@ def test_the_connection_of_a_viscous_chain_is_that_of_force_and_moment_balance(t
     (tmp_path / "chain.toml").write_text(twin_chains.chain(5, stall_torque=6.0))
     (tmp_path / "wave.toml").write_text(twin_chains.wave(duration_s=8.0, settle_s=4.0))
     base = load_scenario(tmp_path / "wave.toml")
-    base = dataclasses.replace(base, physics_rate_hz=2000)
     random = np.random.default_rng(0)
-    ground = Ground(law=FrictionLaw.VISCOUS, drag_tangential=15.0, drag_normal=150.0)
+    ground = Ground(law=FrictionLaw.VISCOUS, drag_tangential=6.0, drag_normal=60.0)
     runs = []
-    for _ in range(24):
+    for _ in range(16):
         off = random.uniform(-1, 1, 7)
         chain = OscillatorChain(
             amplitude=1.0,
@@ -151,11 +149,11 @@ def test_the_connection_of_a_viscous_chain_is_that_of_force_and_moment_balance(t
             backward=0.0,
             start_phase=tuple((0.06 * off[3:6]).tolist()),
         )
-        one = scenario(base, (1.0, SLOW, 1.0, 0.03 * off[6]), ground, cycles=5)
+        one = scenario(base, (1.0, SLOW, 1.0, 0.03 * off[6]), ground, cycles=3)
         # A command of 1 rad is cut to what each joint's limits leave: amplitudes of their own.
         one = limited(one, 0.35 * (1 + 0.06 * off[:3]))
         runs.append(dataclasses.replace(one, gait=OscillatorChains({Plane.HORIZONTAL: chain})))
-    cycles = [cycle_of(run, SLOW, cycles=3) for run in run_batch(runs)]
+    cycles = [cycle_of(run, SLOW, cycles=2) for run in run_batch(runs)]
     model = fit_connection(cycles)
     swimmer = Swimmer(0.06, 1.0, 10.0, turning=0.0)
     phases = 2 * np.pi * np.arange(24) / 24
@@ -167,11 +165,12 @@ def test_the_connection_of_a_viscous_chain_is_that_of_force_and_moment_balance(t
             for yaw in angles.T
         ]
     )
-    print("cond", model.condition, np.mean(np.abs(value - expected) <= half))
-    for one in (value - expected, expected, half):
-        print(np.sqrt(np.mean(one**2, axis=0)))
     for cycle in cycles[:6]:
         step = swimmer.cycle(np.insert(cycle.shape, [1, 2], 0.0, axis=0)).steps[0]
         np.testing.assert_allclose(cycle.steps.mean(axis=0), step, rtol=2e-3, atol=3e-5)
     assert model.identified
-    assert np.mean(np.abs(value - expected) <= half) > 0.9
+    # Inertia, and links that pitch under their drag, are not in the closed form.
+    assert np.mean(np.abs(value - expected) <= half) > 0.85
+    error, size = (np.sqrt(np.mean(one**2, axis=0)) for one in (value - expected, expected))
+    assert error[0, 0] < 0.02 * size[0, 0]
+    assert error[2, 0] < 0.1 * size[2, 0]
