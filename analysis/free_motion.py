@@ -162,7 +162,9 @@ def phase_line(
     weight = np.abs(motion.amplitudes) ** 2
     weight = weight / weight.sum()
     phase = np.angle(motion.amplitudes)
-    steps = _mean_steps(phase, index, weight) if near_rad is None else np.diff(near_rad)
+    steps = (
+        -best_lag(phase, index, weight) * np.diff(index) if near_rad is None else np.diff(near_rad)
+    )
     phase = _unwrapped(phase, steps)
     centred = place - weight @ place
     contrast = -weight * centred / (weight @ centred**2)
@@ -175,12 +177,18 @@ def phase_line(
     return PhaseLine(Estimate(slope, interval), error, float(weight @ left**2) ** 0.5, phase)
 
 
-def _mean_steps(phase: FloatArray, index: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the steps of phase along the wave that fits best, shape (m - 1,)."""
+def best_lag(phase: FloatArray, index: FloatArray, weight: FloatArray) -> float:
+    """Return the lag from joint to joint of the wave that fits best, on a grid [rad].
+
+    Args:
+        phase: Of the joints [rad], shape (m,).
+        index: Number of each in the chain, shape (m,).
+        weight: Shape (m,).
+    """
     count = _GRID * (int(index[-1] - index[0]) + 1)
     trial = np.linspace(-np.pi, np.pi, count, endpoint=False)
     sums = np.abs((weight * np.exp(1j * phase)) @ np.exp(1j * np.outer(index, trial)))
-    return -trial[np.argmax(sums)] * np.diff(index)
+    return float(trial[np.argmax(sums)])
 
 
 def _unwrapped(phase: FloatArray, steps: FloatArray) -> FloatArray:
@@ -349,33 +357,33 @@ def _body_wave(
         # Joint k is between links k and k + 1.
         along = np.cumsum([link.length for link in robot.links])
         places = along[[robot.joint_names.index(name) for name in names]]
-        metres = _speed(phase_line(motion, index, places).slope, omega)
-    slope, (low, high) = line.slope.value or 0.0, _sizes(line.slope.ci95 or (0.0, 0.0))
+        metres = wave_speed(phase_line(motion, index, places).slope, omega)
+    slope, (low, high) = line.slope.value or 0.0, absolute(line.slope.ci95 or (0.0, 0.0))
     turns = float(index[-1] - index[0]) / (2 * np.pi)
     return BodyWave(
         plane=None,
         joints=tuple(names),
         wave_number=line.slope,
         waves=Estimate(abs(slope) * turns, (low * turns, high * turns)),
-        speed=_speed(line.slope, omega),
+        speed=wave_speed(line.slope, omega),
         speed_m_s=metres,
         travelling_index=travelling_index(motion)[0],
         deviation_rad=line.deviation_rad,
     )
 
 
-def _sizes(ends: Interval) -> Interval:
+def absolute(ends: Interval) -> Interval:
     """Return the interval of the absolute value."""
     low, high = sorted(map(abs, ends))
     return (0.0 if ends[0] <= 0 <= ends[1] else low), high
 
 
-def _speed(slope: Estimate, omega: float) -> Estimate:
+def wave_speed(slope: Estimate, omega: float) -> Estimate:
     """Return omega / |kappa|; empty where kappa may be zero.
 
     The error of the frequency is left out: it is smaller by the number of cycles.
     """
-    low, high = _sizes(slope.ci95 or (0.0, 0.0))
+    low, high = absolute(slope.ci95 or (0.0, 0.0))
     if slope.value is None or low == 0:
         return Estimate()
     return Estimate(omega / abs(slope.value), (omega / high, omega / low))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,24 +78,49 @@ def track(
     Returns:
         The track at the times that all joints cover.
     """
-    start = max([float(t_s[0]), *(float(one.t_s[0]) for one in angles)])
-    stop = min([float(t_s[-1]), *(float(one.t_s[-1]) for one in angles)])
-    inside = np.flatnonzero((t_s >= start) & (t_s <= stop))
     chosen = list(place_links(len(robot.links)))
-    position = np.empty((inside.size, 3, 3))
+    times: list[FloatArray] = []
+    places: list[FloatArray] = []
     chord = np.zeros(3)
-    for first in range(0, inside.size, _CHUNK):
-        part = slice(first, first + _CHUNK)
-        rows = inside[part]
-        shape = np.stack([one.at(t_s[rows]) for one in angles], axis=-1)
-        rotation = rotation_from_quaternion(head_quaternion[rows])
-        centres, _ = link_poses(robot, head_position[rows], rotation, shape)
-        position[part] = centres[:, chosen]
+    for at_s, centres in link_centres(robot, t_s, head_position, head_quaternion, angles):
+        times.append(at_s)
+        places.append(centres[:, chosen])
         chord += np.sum(centres[:, 0] - centres[:, -1], axis=0)
     chord[2] = 0.0
     size = float(np.linalg.norm(chord))
     heading = chord / size if size > 0 else np.array([1.0, 0.0, 0.0])
-    return Track(t_s[inside], position, heading)
+    if not times:
+        return Track(np.zeros(0), np.zeros((0, 3, 3)), heading)
+    return Track(np.concatenate(times), np.concatenate(places), heading)
+
+
+def link_centres(
+    robot: Robot,
+    t_s: FloatArray,
+    head_position: FloatArray,
+    head_quaternion: FloatArray,
+    angles: Sequence[Series],
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield times and link centres, chunk by chunk.
+
+    Args:
+        t_s: Times of the head's poses [s], shape (n,).
+        head_position: [m], shape (n, 3).
+        head_quaternion: x, y, z, w, shape (n, 4).
+        angles: Measured angle of every joint, in chain order; interpolated linearly.
+
+    Yields:
+        Times that all joints cover [s], shape (k,), and centres [m], shape (k, links, 3).
+    """
+    start = max([float(t_s[0]), *(float(one.t_s[0]) for one in angles)])
+    stop = min([float(t_s[-1]), *(float(one.t_s[-1]) for one in angles)])
+    inside = np.flatnonzero((t_s >= start) & (t_s <= stop))
+    for first in range(0, inside.size, _CHUNK):
+        rows = inside[first : first + _CHUNK]
+        shape = np.stack([one.at(t_s[rows]) for one in angles], axis=-1)
+        rotation = rotation_from_quaternion(head_quaternion[rows])
+        centres, _ = link_poses(robot, head_position[rows], rotation, shape)
+        yield t_s[rows], centres
 
 
 def observed(robot: Robot, plane: Plane, seen: Track, omega: float) -> tuple[BodyPoint, ...]:

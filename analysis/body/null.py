@@ -87,9 +87,6 @@ def free_chain(robot: Robot, plane: Plane) -> Chain:
 def one_cycle(chain: Chain, amplitudes: ComplexArray, offsets: FloatArray, omega: float) -> Motion:
     """Move a chain through one cycle of its gait.
 
-    The head's velocity is periodic in its own frame; its turning and its path are integrated in
-    Fourier series, exactly up to the resolution of the cycle.
-
     Args:
         chain: n links.
         amplitudes: Complex amplitudes of the joint angles, theta_i = offset_i +
@@ -105,19 +102,38 @@ def one_cycle(chain: Chain, amplitudes: ComplexArray, offsets: FloatArray, omega
     wave = np.exp(1j * np.outer(phase, order))
     angles = offsets + np.real(wave @ amplitudes.T)
     velocity = _head_velocity(chain, angles, np.real((1j * order * omega * wave) @ amplitudes.T))
-    omegas: FloatArray = omega * np.fft.fftfreq(SAMPLES, 1 / SAMPLES).astype(np.float64)
-    spinning = np.fft.fft(velocity[:, 2]) / SAMPLES
+    head, heading, displacement, turn = travel(velocity, omega)
+    return Motion(head, heading, angles, displacement, turn)
+
+
+def travel(velocity: FloatArray, omega: float) -> tuple[ComplexArray, FloatArray, complex, float]:
+    """Integrate a velocity that is periodic in the body's own frame.
+
+    Turning and path are integrated in Fourier series, exactly up to the resolution of the cycle.
+
+    Args:
+        velocity: Forward, left and turning at even times of one cycle, shape (samples, 3).
+        omega: Angular frequency of the cycle [rad/s].
+
+    Returns:
+        Positions x + j y, from 0, and headings [rad], from 0, each of shape (samples,); their
+        change over the cycle.
+    """
+    count = len(velocity)
+    phase = 2 * np.pi * np.arange(count) / count
+    omegas: FloatArray = omega * np.fft.fftfreq(count, 1 / count).astype(np.float64)
+    spinning = np.fft.fft(velocity[:, 2]) / count
     mean_turn = float(spinning[0].real)
     swing = np.real(
         np.exp(1j * np.outer(phase / omega, omegas[1:])) @ (spinning[1:] / (1j * omegas[1:]))
     )
     swing -= swing[0]
     # In the world the velocity is exp(j mean_turn t) times something periodic.
-    slip = np.fft.fft((velocity[:, 0] + 1j * velocity[:, 1]) * np.exp(1j * swing)) / SAMPLES
+    slip = np.fft.fft((velocity[:, 0] + 1j * velocity[:, 1]) * np.exp(1j * swing)) / count
     time_s = np.append(phase, 2 * np.pi) / omega
     path = _integral(omegas + mean_turn, time_s) @ slip
-    turn = 2 * np.pi * mean_turn / omega
-    return Motion(path[:-1], mean_turn * time_s[:-1] + swing, angles, complex(path[-1]), turn)
+    heading = mean_turn * time_s[:-1] + swing
+    return path[:-1], heading, complex(path[-1]), 2 * np.pi * mean_turn / omega
 
 
 SAMPLES = 128

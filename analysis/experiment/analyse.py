@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -16,11 +16,14 @@ from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import Robot
 
+from ..body.connection import MIN_GAITS
+from ..body.connection import MOST_CONDITION as MOST_SHAPE_CONDITION
 from ..estimators.intervals import CONFIDENCE, EQUIVALENT_GAIN, EQUIVALENT_LAG_RAD
 from ..oscillators.predictions import body_oscillators
 from ..response.fitting import GaitFit
 from ..response.response import gain_estimate, lag_estimate
 from ..results.analysis import Analysis
+from ..results.body_connection import BodyConnection
 from ..results.coupling import LocalCoupling
 from ..results.estimate import Provenance
 from ..results.experiment import Experiment, Headings, PooledJoint, PooledRuns, Reversal, Run
@@ -39,6 +42,7 @@ from ..session.runs import (
 )
 from ..signals.stretch import Options
 from .answer import broken_first, experiment_answer, kick_answer, sweep_answer
+from .body_connection import MOST_DISTANCE, GaitSession, body_connection, connection_answer
 from .kicks.coupling import kick_coupling
 from .kicks.local import ROW_TOLERANCE
 from .kicks.runs import MOST_KICK, MOST_PATTERN, SAME, find_kicks
@@ -82,6 +86,11 @@ def analyse_experiment(
     sweep = find_sweep(examined.commanded) if kicks is None else None
     if sweep is not None:
         return _of_sweep(sweep, examined.commanded, analyses, runs, options)
+    body = None
+    if kicks is None:
+        body, apart = body_connection(examined.cycles)
+        if body is not None and body.fitted and len(sort_runs(runs)[0]) < MIN_GAITS:
+            return _of_perturbed(body, apart, examined, options)
     parts = [None if kicks is None else kicks.role(k) for k in range(len(runs))]
     rest = [k for k, part in enumerate(parts) if part in (None, "base")]
     own_roles, own_why = sort_runs([runs[k] for k in rest])
@@ -136,6 +145,7 @@ def analyse_experiment(
         provenance=_provenance(analyses, options),
         oscillators=body_oscillators(coupling) if isinstance(coupling, LocalCoupling) else None,
         pooled=None if pooled is None else _pooled(pooled),
+        body_connection=body,
     )
 
 
@@ -148,6 +158,7 @@ class _Examined:
     gaits: list[GaitFit | None] = field(default_factory=list[GaitFit | None])
     robots: list[Robot | None] = field(default_factory=list[Robot | None])
     commanded: list[CommandTones | None] = field(default_factory=list[CommandTones | None])
+    cycles: list[GaitSession | None] = field(default_factory=list[GaitSession | None])
     periodic: list[MultisineRun | str | None] = field(
         default_factory=list[MultisineRun | str | None]
     )
@@ -163,12 +174,14 @@ def _examine(sessions: Iterable[SessionView], options: Options) -> _Examined:
     for session in sessions:
         measured = measure_session(session, options)
         analysis, gait, robot = measured.analysis, measured.gait, session.robot
+        cycle = measured.cycle
         del measured  # heavy: no two at a time
         label, lay = Path(analysis.session.path).name, posture(session, analysis.gait.windows)
         name = analysis.session.robot
         found.runs.append(gait_run(label, robot, analysis, gait, lay))
         found.analyses.append(analysis)
         found.gaits.append(gait)
+        found.cycles.append(None if cycle is None else GaitSession(analysis.session.path, cycle))
         found.robots.append(robot)
         found.commanded.append(command_tones(session, options, gait, name))
         found.periodic.append(multisine_run(session, options, name) if gait is None else None)
@@ -204,6 +217,28 @@ def _of_sweep(
         reversal=None,
         coupling=coupling,
         warnings=tuple(warnings),
+        provenance=_provenance(analyses, options),
+    )
+
+
+def _of_perturbed(
+    body: BodyConnection, apart: Mapping[int, str], examined: _Examined, options: Options
+) -> Experiment:
+    """Return the experiment of gaits around one gait, each other than the rest."""
+    analyses, runs = examined.analyses, examined.runs
+    none = np.zeros((0, 0), dtype=np.complex128)
+    return Experiment(
+        answer=broken_first(analyses, connection_answer(body)),
+        sessions=tuple(analyses),
+        runs=tuple(
+            _run(one, run, None if k in apart else "perturbed", apart.get(k))
+            for k, (one, run) in enumerate(zip(analyses, runs, strict=True))
+        ),
+        heterogeneity=experiment_indices(none, none, None),
+        reversal=None,
+        coupling=coupling_of_one_gait(0),
+        body_connection=body,
+        warnings=tuple(f"{runs[k].label} {why}; it is left out" for k, why in apart.items()),
         provenance=_provenance(analyses, options),
     )
 
@@ -348,6 +383,9 @@ def _provenance(analyses: Sequence[Analysis], options: Options) -> Provenance:
             "row_tolerance": ROW_TOLERANCE,
             "most_condition": MOST_CONDITION,
             "nonlinear": NONLINEAR,
+            "least_gaits": MIN_GAITS,
+            "most_gait_distance": MOST_DISTANCE,
+            "most_shape_condition": MOST_SHAPE_CONDITION,
             "margin_gain": EQUIVALENT_GAIN,
             "margin_lag_rad": EQUIVALENT_LAG_RAD,
         },

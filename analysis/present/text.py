@@ -19,6 +19,7 @@ from ..results.estimate import Estimate
 from ..results.null_model import ModelledAnalysis, null_model_text
 from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, LoopMode
 from . import tables
+from .body_shape import shape_lines
 from .tables import TERMINAL, Cell, Column, Ends, PValue, Quantity, Table
 
 _ABOUT = {
@@ -34,6 +35,7 @@ _SPANS = 3
 
 def more_lines(analysis: Analysis) -> Iterator[str]:
     """Yield the lines of text after the tables."""
+    yield from shape_lines(analysis.body_shape)
     if analysis.energy is not None:
         yield from _energy(analysis.energy)
     yield from _over_time(analysis)

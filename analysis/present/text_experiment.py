@@ -10,6 +10,7 @@ from undulog.capture.common.console import UNLIMITED, plain
 
 from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, margin_text
 from ..experiment.answer import kick_detail, sweep_detail, sweep_method
+from ..experiment.body_connection import CONNECTION_METHOD, connection_detail
 from ..experiment.reversal.modules import SIGNIFICANT
 from ..experiment.sweep.best_linear import multisine_method
 from ..results import formats
@@ -18,6 +19,7 @@ from ..results.coupling import LinearCoupling, LocalCoupling
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, FloorTilt, Headings, Reversal
 from .best_linear import best_linear_table
+from .body_shape import refusals, travel_table
 from .tables import difference_table, mirror_table, run_table, waveform_table
 from .text import Sheet, body_detail, unidentified
 
@@ -114,13 +116,22 @@ def render_experiment(
     if experiment.best_linear is not None:
         sheet.print()
         sheet.table(best_linear_table(experiment.best_linear.joints))
+    body = experiment.body_connection
+    if body is not None and body.fitted:
+        sheet.lines(connection_detail(body))
+        sheet.print()
+        sheet.table(travel_table(body))
+        sheet.lines(refusals(body))
     sheet.print()
     sheet.table(run_table(experiment))
     sheet.print()
     own = [f"{warning} ({names})" for warning, names in by_sentence(experiment, "warnings")]
     sheet.lines(f"Warning: {warning}" for warning in (*experiment.warnings, *own))
-    if not experiment.coupling.identifiable and experiment.best_linear is None:
+    fitted = body is not None and body.fitted
+    if not experiment.coupling.identifiable and experiment.best_linear is None and not fitted:
         sheet.print(unidentified(experiment.coupling))
+    if body is not None and not fitted and experiment.reversal is None:
+        sheet.print(f"How shape moves the body: not identifiable: {body.why}.")
     sheet.print(f"Method: {method(experiment)}", "dim")
     notes = by_sentence(experiment, "notes")
     sheet.lines((f"Note: {note} ({names})" for note, names in notes), "dim")
@@ -207,7 +218,9 @@ def by_sentence(
 
 def method(experiment: Experiment) -> str:
     """Return the method of an experiment as one sentence, beginning in lower case."""
-    coupling = experiment.coupling
+    coupling, body = experiment.coupling, experiment.body_connection
+    if body is not None and body.fitted and experiment.reversal is None:
+        return CONNECTION_METHOD
     if experiment.best_linear is not None:
         return multisine_method(experiment.best_linear)
     if isinstance(coupling, LocalCoupling):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from .answer import Answer
 from .artefact import Artefact, DeadBand, Span
+from .body_shape import BodyShape
 from .coupling import Coupling
 from .estimate import Estimate, Provenance, WithInterval
 from .free_motion import FreeMotion
@@ -380,6 +381,8 @@ class Analysis(PresentedResult):
     Attributes:
         joints: In chain order, head to tail.
         body: Head, middle and tail; None with a note where it is unknown.
+        body_shape: Principal modes, the nearest serpenoid and the travel of a cycle; None where
+            nothing moves periodically.
         coupling: Identifiable or not.
         warnings: One sentence each, worst first: what is missing or doubtful, and changes what a
             reader does.
@@ -404,6 +407,7 @@ class Analysis(PresentedResult):
     body: BodyResult | None
     heterogeneity: dict[str, Index]
     coupling: Coupling
+    body_shape: BodyShape | None = None
     over_time: ResponseOverTime | None = None
     energy: EnergyResult | None = None
     oscillators: tuple[ChainCoupling, ...] = ()
@@ -425,6 +429,7 @@ class Analysis(PresentedResult):
             "gait": _record(self.gait) | {"groups": [_record(one) for one in self.gait.groups]},
             "joints": [_record(joint) for joint in self.joints],
             "body": None if self.body is None else _body_dict(self.body),
+            "body_shape": None if self.body_shape is None else _shape_dict(self.body_shape),
             "energy": None if self.energy is None else _energy_dict(self.energy),
             "frequency_response": [_record(one) for one in self.frequency_response],
             "free_motion": None if self.free_motion is None else _motion_dict(self.free_motion),
@@ -471,6 +476,15 @@ def _energy_dict(energy: EnergyResult) -> dict[str, Any]:
 def _motion_dict(motion: FreeMotion) -> dict[str, Any]:
     waves = [_record(one) | {"direction": one.direction} for one in motion.waves]
     return {"joints": [_record(one) for one in motion.joints], "waves": waves}
+
+
+def _shape_dict(shape: BodyShape) -> dict[str, Any]:
+    planes = [
+        dataclasses.asdict(one)
+        | {"modes": [_record(mode) for mode in one.modes], "serpenoid": _record(one.serpenoid)}
+        for one in shape.planes
+    ]
+    return {"planes": planes, "travel": None if shape.travel is None else _record(shape.travel)}
 
 
 def _body_dict(body: BodyResult) -> dict[str, Any]:

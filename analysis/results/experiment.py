@@ -13,6 +13,7 @@ from enum import StrEnum
 from typing import Any
 
 from .analysis import Analysis, Index
+from .body_connection import BodyConnection
 from .coupling import Coupling
 from .estimate import Estimate, Provenance
 from .frequency_response import BestLinearResponses
@@ -32,7 +33,7 @@ class Run:
     Attributes:
         wave: ``head-to-tail``, ``tail-to-head``, ``standing`` or None.
         role: ``forward`` (wave from head to tail), ``reverse``; among kicks ``base``, ``kick`` or
-            ``held-out``; ``sweep``; ``multisine``; or None where it has none.
+            ``held-out``; ``sweep``; ``multisine``; ``perturbed``; or None where it has none.
     """
 
     id: str
@@ -215,6 +216,8 @@ class Experiment(PresentedResult):
         oscillators: From kicks around one gait: how oscillators that feel their servos would
             synchronise through the body; None without such kicks.
         pooled: The response over the runs, where all of them are of one direction.
+        body_connection: From gaits around one gait: how shape moves the body; None without the
+            head's pose.
         best_linear: Frequency responses with their nonlinear distortion, where the sessions are
             runs of one multisine experiment over a band.
     """
@@ -228,6 +231,7 @@ class Experiment(PresentedResult):
     coupling: Coupling
     oscillators: BodyOscillators | None = None
     best_linear: BestLinearResponses | None = None
+    body_connection: BodyConnection | None = None
     warnings: tuple[str, ...]
     provenance: Provenance
 

@@ -20,7 +20,9 @@ from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
 from ..artefacts.find import find_artefacts
+from ..body.chassis import GaitCycle
 from ..body.motion import body_motion
+from ..body.shape import body_shape
 from ..dead_band.find import dead_bands
 from ..energy import (
     GAP_SHARE,
@@ -35,7 +37,7 @@ from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..estimators.series import Series, clean_together, coverage
 from ..estimators.spectrum import BINS_PER_SIDE
 from ..estimators.trends import Trend
-from ..free_motion import MotionFit, fit_motion, free_motion
+from ..free_motion import MotionFit, free_motion
 from ..frequency_response.estimate import frequency_responses
 from ..oscillators.chain import session_couplings
 from ..response.fitting import GaitFit, fit_gait
@@ -136,6 +138,7 @@ class SessionMeasurement:
         span: Whole cycles over which energies are taken.
         offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
         motion: The periodic motion of a session without commands, or None.
+        cycle: One cycle of shape and motion of the body, where its pose is known, or None.
     """
 
     analysis: Analysis
@@ -145,6 +148,7 @@ class SessionMeasurement:
     span: Span
     offsets: Mapping[str, FloatArray]
     motion: MotionFit | None = None
+    cycle: GaitCycle | None = None
 
 
 def analyse_session(session: SessionView, options: Options | None = None) -> Analysis:
@@ -247,7 +251,7 @@ def measure_session(
         commanded=commanded,
         offsets=follows.offsets,
     )
-    moved = None if columns.command or gait is None else fit_motion(responses, gait)
+    shape = body_shape(session, responses, sound, gait, span=span, warn=warn)
     analysis = Analysis(
         session=SessionFacts(
             id=session.session_id,
@@ -260,9 +264,10 @@ def measure_session(
         gait=_gait_facts(session, gait, span, stretch),
         joints=joints,
         body=body,
+        body_shape=shape.shape,
         heterogeneity=heterogeneity,
         coupling=coupling_of_one_gait(0 if gait is None else len(gait.all_answered)),
-        free_motion=None if columns.command else _free_motion(session.robot, moved, warn),
+        free_motion=None if columns.command else _free_motion(session.robot, shape.motion, warn),
         closed_loop=closed_loop(session, options, warn) if swept else None,
         warnings=warn.warnings(session.warnings),
         provenance=_provenance(session, options),
@@ -285,7 +290,11 @@ def measure_session(
         motion=analysis.free_motion,
     )
     analysis = dataclasses.replace(analysis, answer=compose(facts))
-    return SessionMeasurement(analysis, gait, sound, energies, span, follows.offsets, moved)
+    return SessionMeasurement(
+        *(analysis, gait, sound, energies, span, follows.offsets),
+        motion=None if columns.command else shape.motion,
+        cycle=shape.cycle,
+    )
 
 
 def _free_motion(robot: Robot | None, moved: MotionFit | None, warn: Warn) -> FreeMotion:

@@ -23,6 +23,8 @@ from undulog.capture.common.files import part_file
 
 from ...results.analysis import Analysis, BodyPoint, GaitFacts, Index, JointResult
 from ...results.artefact import Artefact, Span
+from ...results.body_connection import PredictedTravel
+from ...results.body_shape import BodyTravel, Serpenoid
 from ...results.comparison import Change, Comparison, Difference, Equivalence, NamedJoint
 from ...results.coupling import (
     Coupling,
@@ -149,6 +151,14 @@ def _of_analysis(result: Analysis) -> Frames:
         models = {"measured": result.body.observed} | result.body.null
         names = [model for model, points in models.items() for _ in points]
         frames["body"] = table(BodyPoint, chain.from_iterable(models.values()), model=names)
+    shape = result.body_shape
+    if shape is not None and shape.planes:
+        planes = [str(one.plane or "") for one in shape.planes]
+        frames["serpenoid"] = table(
+            Serpenoid, [one.serpenoid for one in shape.planes], plane=planes
+        )
+    if shape is not None and shape.travel is not None:
+        frames["travel"] = table(BodyTravel, [shape.travel])
     frames["artefacts"] = _artefacts(result.artefacts)
     return frames | _oscillators(result.oscillators)
 
@@ -167,6 +177,8 @@ def _of_experiment(result: Experiment) -> Frames:
     artefacts = [each for one in sessions for each in one.artefacts]
     paths = [one.session.path for one in sessions for _ in one.artefacts]
     frames["artefacts"] = _artefacts(artefacts, paths)
+    if result.body_connection is not None and result.body_connection.predicted:
+        frames["travel"] = table(PredictedTravel, result.body_connection.predicted)
     if result.oscillators is not None:
         frames["modes"] = table(Mode, result.oscillators.modes)
     return frames | frames_of(result.coupling)

@@ -14,6 +14,7 @@ from undulog.capture.common.arrays import FloatArray, frozen
 from undulog.capture.common.palette import joint_hex
 
 from ...experiment.answer import kick_checks, sweep_checks
+from ...experiment.body_connection import connection_detail
 from ...experiment.sweep.coupling import NONLINEAR
 from ...results import formats
 from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
@@ -22,6 +23,7 @@ from ...results.experiment import Experiment, Reversal
 from ...results.formats import degrees, estimate, relative, short
 from ...results.oscillators import BodyOscillators
 from ..best_linear import best_linear_table
+from ..body_shape import travel_table
 from ..text_experiment import by_sentence, method, reversal_detail
 from .bode import best_linear_bode
 from .matrix import Entries, entries_of, matrix_picture
@@ -107,7 +109,8 @@ _BOUND = "no joint differs more from its mirror, 95 %"
 def experiment_view(experiment: Experiment) -> dict[str, Any]:
     """Return what the template shows of an experiment, by name."""
     reversal, coupling, body = experiment.reversal, experiment.coupling, experiment.oscillators
-    best = experiment.best_linear
+    best, connection = experiment.best_linear, experiment.body_connection
+    connection = connection if connection is not None and connection.fitted else None
     joints = [joint for one in experiment.sessions for joint in one.joints]
     known = {joint.name for joint in joints if joint.gain.value is not None}
     names = tuple(name for name in dict.fromkeys(j.name for j in joints) if name in known)
@@ -134,6 +137,8 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
             matrix_picture(one, f"matrix-{k + 1}", small=k > 0) for k, one in enumerate(entries)
         ],
         "checks": _checks(coupling),
+        "travel": None if connection is None else travel_table(connection),
+        "travel_detail": [] if connection is None else connection_detail(connection),
         "modes": None if body is None else modes_drawing(body),
         "body_facts": [] if body is None else body_facts(body),
         "entrainment": None if body is None else entrainment_entries(body),

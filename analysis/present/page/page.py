@@ -36,6 +36,7 @@ from ...results.estimate import Provenance
 from ...results.experiment import Experiment
 from ...session.cycles import CycleMaps
 from .. import tables
+from ..body_shape import shape_lines
 from .comparison_view import comparison_view
 from .experiment_view import experiment_view
 from .fleet_view import change_text, fleet_view, spread_text
@@ -193,6 +194,7 @@ def environment() -> Environment:
         body_gradient=", ".join(joint_hex(9)),
         MISSING=formats.MISSING,
         LEVEL_NOTE=LEVEL_NOTE,
+        shape_lines=shape_lines,
     )
     return made
 

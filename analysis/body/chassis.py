@@ -1,0 +1,211 @@
+"""The virtual chassis: a frame of the body that follows from where its links are.
+
+Its origin is the mean of the link centres, its axes are the principal axes of the centres about it
+(Rollinson, Buchan & Choset, Advanced Robotics 26, 2012, doi 10.1080/01691864.2012.728696: the
+singular value decomposition of the positions), here of their places on the ground. In the plane,
+with z = x + j y from the origin, the long axis is at arg(sum z^2) / 2, and the squared semi-axes
+are (mean |z|^2 +- |mean z^2|) / 2. It points the way the head does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from undulog.capture.common.arrays import ComplexArray, FloatArray
+from undulog.capture.common.errors import DataError
+from undulog.capture.robot.model import Plane, Robot
+
+from ..estimators.harmonic import HarmonicModel, fit_at
+from ..estimators.series import Series
+from ..response.rhythm import NYQUIST_SHARE
+from .motion import link_centres
+from .null import SAMPLES, travel
+
+ROUND = 0.7
+"""Beyond this ratio of the short to the long semi-axis the axes are not those of a long body."""
+
+HARMONICS = 6
+"""Of shape and velocity within a cycle."""
+
+
+@dataclass(frozen=True)
+class ChassisPath:
+    """The virtual chassis over n samples.
+
+    Attributes:
+        t_s: Times [s], shape (n,).
+        place: Origin x + j y on the ground [m], shape (n,).
+        heading: Of the long axis towards the head, unwrapped [rad], shape (n,).
+        semi_axes: Root mean square distance of the links along and across [m], shape (n, 2).
+    """
+
+    t_s: FloatArray
+    place: ComplexArray
+    heading: FloatArray
+    semi_axes: FloatArray
+
+
+@dataclass(frozen=True)
+class GaitCycle:
+    """One cycle of a periodic motion, the mean of many; m joints, Fourier order h.
+
+    Shape and velocity are Re sum_k c_k exp(j k phase), with the phase 0 at the series' origin.
+
+    Attributes:
+        joints: The horizontal ones, head to tail.
+        shape: Their angles [rad], shape (m, h + 1).
+        velocity: Forward, left and turning of the virtual chassis in its own axes, for each radian
+            of phase [m/rad, m/rad, 1], shape (3, h + 1).
+        omega: Angular frequency [rad/s].
+        steps: Forward and left along the mean heading and turn of each whole cycle
+            [m, m, rad], shape (cycles, 3).
+    """
+
+    joints: tuple[str, ...]
+    shape: ComplexArray
+    velocity: ComplexArray
+    omega: float
+    steps: FloatArray
+
+
+def virtual_chassis(centres: FloatArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
+    """Return origin, heading and semi-axes of the virtual chassis.
+
+    Args:
+        centres: Of the links, head first, on the ground [m], shape (n, links, 2).
+
+    Returns:
+        Origin x + j y [m], shape (n,); heading in (-pi, pi], shape (n,); semi-axes [m], shape
+        (n, 2).
+    """
+    place: ComplexArray = centres[..., 0] + 1j * centres[..., 1]
+    origin: ComplexArray = place.mean(axis=1)
+    off = place - origin[:, None]
+    second = np.mean(off**2, axis=1)
+    power = np.mean(np.abs(off) ** 2, axis=1)
+    axis = np.exp(0.5j * np.angle(second))
+    axis *= np.where(np.real((off[:, 0] - off[:, -1]) * np.conj(axis)) < 0, -1.0, 1.0)
+    squares = np.stack([power + np.abs(second), power - np.abs(second)], axis=-1) / 2
+    return origin, np.angle(axis), np.sqrt(np.maximum(squares, 0.0))
+
+
+def chassis_path(
+    robot: Robot,
+    poses: tuple[FloatArray, FloatArray, FloatArray],
+    angles: Mapping[str, Series],
+) -> ChassisPath:
+    """Follow the virtual chassis.
+
+    Args:
+        poses: Times [s], positions [m] and quaternions of the head.
+        angles: Of every joint.
+
+    Raises:
+        DataError: If the body is curled, so that its long axis is not defined.
+    """
+    parts = [
+        (t_s, *virtual_chassis(centres[..., :2]))
+        for t_s, centres in link_centres(robot, *poses, [angles[n] for n in robot.joint_names])
+    ]
+    if not parts:
+        raise DataError("the head's poses and the joint angles have no common time")
+    t_s, place, heading, semi_axes = map(np.concatenate, zip(*parts, strict=True))
+    roundest = float(np.max(semi_axes[:, 1] / np.maximum(semi_axes[:, 0], 1e-12)))
+    if roundest > ROUND:
+        raise DataError(
+            f"the body curls up to {roundest:.2f} as wide as long (root mean square; at most "
+            f"{ROUND:g}), so it has no long axis to measure against"
+        )
+    return ChassisPath(t_s, place, np.unwrap(heading), semi_axes)
+
+
+def gait_cycle(
+    robot: Robot, path: ChassisPath, angles: Mapping[str, Series], omega: float, start_s: float
+) -> GaitCycle:
+    """Fit one cycle of shape and velocity.
+
+    Between two samples the chassis is taken to move along a screw, whose velocity in its own axes
+    is the logarithm of the motion.
+
+    Args:
+        angles: Of every joint, periodic.
+        omega: Angular frequency [rad/s].
+        start_s: Start of the whole cycles [s].
+
+    Raises:
+        DataError: If there are too few samples.
+    """
+    names = tuple(joint.name for joint in robot.joints if joint.plane is Plane.HORIZONTAL)
+    step_s = np.diff(path.t_s)
+    turn = np.diff(path.heading)
+    half = 0.5 * turn
+    # d turn j / (exp(j turn) - 1) = d exp(-j turn / 2) / sinc
+    moved = np.diff(path.place) * np.exp(-1j * (path.heading[:-1] + half)) / np.sinc(half / np.pi)
+    rates = np.stack([moved.real, moved.imag, turn]) / (omega * step_s)
+    middle = path.t_s[:-1] + 0.5 * step_s
+    series = [Series(name, middle, row) for name, row in zip("xyt", rates, strict=True)]
+    shapes = [angles[name] for name in names]
+    slowest = max(one.period_s for one in (*shapes, series[0]))
+    highest = int(NYQUIST_SHARE * 2 * np.pi / (slowest * omega))
+    model = HarmonicModel(harmonics=int(np.clip(highest, 1, HARMONICS)))
+    shape, velocity = (fit_at(some, omega, model) for some in (shapes, series))
+    parts = np.zeros((2, max(len(names), 3), HARMONICS + 1), dtype=np.complex128)
+    for part, one in zip(parts, (shape, velocity), strict=True):
+        part[: len(one.trend), 0] = one.trend[:, 0]
+        part[: len(one.trend), 1 : 1 + model.harmonics] = one.amplitudes
+    shaped, moved_by = parts[0, : len(names)], parts[1, :3]
+    return GaitCycle(names, shaped, moved_by, omega, _cycle_steps(path, omega, start_s))
+
+
+def _cycle_steps(path: ChassisPath, omega: float, start_s: float) -> FloatArray:
+    """Return displacement along the mean heading and turn of each whole cycle, shape (c, 3)."""
+    period = 2 * np.pi / omega
+    count = int((path.t_s[-1] - max(start_s, path.t_s[0])) / period + 1e-6)
+    first = max(start_s, path.t_s[0])
+    steps = np.zeros((count, 3))
+    for k in range(count):
+        ends = first + period * np.array([k, k + 1])
+        i, j = np.searchsorted(path.t_s, ends)
+        x, y, heading = (
+            np.interp(ends, path.t_s, part)
+            for part in (path.place.real, path.place.imag, path.heading)
+        )
+        mean = float(path.heading[i : max(j, i + 1)].mean())
+        gone = complex(x[1] - x[0], y[1] - y[0]) * np.exp(-1j * mean)
+        steps[k] = gone.real, gone.imag, heading[1] - heading[0]
+    return steps
+
+
+def wave_at(coefficients: ComplexArray, phase: FloatArray) -> FloatArray:
+    """Return Re sum_k c_k exp(j k phase).
+
+    Args:
+        coefficients: Shape (..., h + 1).
+        phase: [rad], shape (n,).
+
+    Returns:
+        Shape (..., n).
+    """
+    order: FloatArray = np.arange(float(coefficients.shape[-1]))
+    return np.real(coefficients @ np.exp(1j * np.outer(order, phase)))
+
+
+def step_of_cycle(velocity: FloatArray) -> FloatArray:
+    """Return displacement along the mean heading and turn over a cycle.
+
+    Args:
+        velocity: Forward, left and turning for each radian of phase, at even phases, shape (3, n).
+
+    Returns:
+        Forward and left [m], turn [rad], shape (3,).
+    """
+    _, heading, displacement, turn = travel(velocity.T, 1.0)
+    gone = displacement * np.exp(-1j * float(heading.mean()))
+    return np.array([gone.real, gone.imag, turn])
+
+
+PHASES: FloatArray = 2 * np.pi * np.arange(SAMPLES) / SAMPLES
+"""Of one cycle, at which velocities are integrated [rad]."""

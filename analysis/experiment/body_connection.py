@@ -1,0 +1,186 @@
+"""From the cycles of several sessions to how shape moves the body, each session held out once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.errors import DataError
+
+from ..body.chassis import GaitCycle, wave_at
+from ..body.connection import Connection, condition_of, distances, fit_connection
+from ..body.shape import mean_step
+from ..estimators.intervals import around
+from ..results import formats
+from ..results.body_connection import BodyConnection, ConnectionEntry, PredictedTravel
+from ..results.body_shape import ShapeMode
+from ..results.estimate import Estimate
+
+MOST_DISTANCE = 0.3
+"""A gait whose joints differ from the central one by more than this share is another gait."""
+
+_VELOCITIES = ("forward", "left", "turn")
+_PHASES: FloatArray = 2 * np.pi * np.arange(24) / 24
+
+
+@dataclass(frozen=True)
+class GaitSession:
+    """One session with its cycle."""
+
+    path: str
+    cycle: GaitCycle
+
+
+def body_connection(
+    sessions: Sequence[GaitSession | None],
+) -> tuple[BodyConnection | None, dict[int, str]]:
+    """Fit the model to sessions of one gait and its perturbations.
+
+    Args:
+        sessions: In the experiment's order; None without a cycle of the body.
+
+    Returns:
+        The model, or the reason why there is none; None where no session has a cycle. And by index
+        why a session has no part in it.
+    """
+    known = {k: one for k, one in enumerate(sessions) if one is not None}
+    if not known:
+        return None, {}
+    why = dict.fromkeys(
+        (k for k, one in enumerate(sessions) if one is None),
+        "has no planar gait with the head's pose and all joint angles",
+    )
+    joints = next(iter(known.values())).cycle.joints
+    other = {k: "has other joints" for k, one in known.items() if one.cycle.joints != joints}
+    seen: dict[bytes, int] = {}
+    for k, one in known.items():
+        first = seen.setdefault(one.cycle.shape.tobytes(), k)
+        if first != k:
+            other[k] = "is a copy of another session"
+    used = [k for k in known if k not in other]
+    off = distances([known[k].cycle for k in used])
+    far = {
+        k: f"is another gait: its joint angles differ from the central one by {100 * share:.0f} %"
+        for k, share in zip(used, off.tolist(), strict=True)
+        if share > MOST_DISTANCE
+    }
+    inside = [k for k in used if k not in far]
+    result = _result({k: known[k] for k in used}, inside)
+    return result, why | other | far
+
+
+def _result(sessions: dict[int, GaitSession], inside: Sequence[int]) -> BodyConnection:
+    cycles = [sessions[k].cycle for k in inside]
+    number = condition_of(cycles)
+    condition = number if np.isfinite(number) else None
+    try:
+        model = fit_connection(cycles)
+    except DataError as error:
+        return BodyConnection(False, str(error), len(cycles), condition)
+    base = model.base
+    shape = base.modes.T @ base.mean.reshape(-1, 1) + wave_at(base.cycle, _PHASES)
+    modes = zip(base.share.tolist(), base.modes.T.tolist(), strict=True)
+    return BodyConnection(
+        fitted=True,
+        why=f"{len(cycles)} gaits around one gait",
+        gaits=len(cycles),
+        condition_number=condition,
+        identified=model.identified,
+        joints=cycles[0].joints,
+        modes=tuple(ShapeMode(Estimate(share), tuple(weights)) for share, weights in modes),
+        phase_rad=tuple(_PHASES.tolist()),
+        shape_rad=tuple(tuple(row) for row in shape.tolist()),
+        A=_entries(model) if model.identified else (),
+        predicted=tuple(_held_out(sessions, inside, model, k) for k in sessions),
+    )
+
+
+def _entries(model: Connection) -> tuple[ConnectionEntry, ...]:
+    value, half = model.matrices(_PHASES)
+    return tuple(
+        ConnectionEntry(name, k + 1, tuple(value[:, c, k].tolist()), tuple(half[:, c, k].tolist()))
+        for c, name in enumerate(_VELOCITIES)
+        for k in range(value.shape[2])
+    )
+
+
+def _held_out(
+    sessions: dict[int, GaitSession], inside: Sequence[int], model: Connection, own: int
+) -> PredictedTravel:
+    """Predict a session from the others."""
+    session, nothing = sessions[own], Estimate()
+    cycle = session.cycle
+    forward, left, turn = map(mean_step, cycle.steps.T)
+    measured = PredictedTravel(
+        *(session.path, cycle.omega / (2 * np.pi)),
+        *(nothing, nothing, nothing),
+        *(forward, left, turn),
+    )
+    try:
+        if own in inside:
+            model = fit_connection([sessions[k].cycle for k in inside if k != own])
+        why = model.outside(cycle.shape)
+    except DataError as error:
+        why = f"without it: {error}"
+    if why is not None:
+        return replace(measured, why=why)
+    value, half = model.predict(cycle.shape)
+    forward, left, turn = (
+        Estimate(one, around(one, width))
+        for one, width in zip(value.tolist(), half.tolist(), strict=True)
+    )
+    return replace(measured, forward_m=forward, left_m=left, turn_rad=turn)
+
+
+def connection_answer(found: BodyConnection) -> str:
+    """Answer from the model in one sentence without its full stop."""
+    known = [one for one in found.predicted if one.why is None]
+    lead = f"how shape moves the body, from {found.why} (effective, first order)"
+    if not known:
+        return f"{lead}: no session is within the range of the others, so none is predicted"
+    distance = [(np.hypot(_of(one.forward_m), _of(one.left_m)), _gone(one)) for one in known]
+    off = float(np.median([abs(a - b) for a, b in distance]))
+    gone = float(np.median([b for _, b in distance]))
+    turn = [abs(_of(one.turn_rad) - _of(one.measured_turn_rad)) for one in known]
+    outside = len(found.predicted) - len(known)
+    rest = f"; {outside} outside the range of the others" if outside else ""
+    return (
+        f"{lead}: each of {len(known)} sessions predicted from the others, median error of a "
+        f"cycle's displacement {formats.number(1000 * off, 1)} mm of "
+        f"{formats.number(1000 * gone, 0)} mm, of its turn "
+        f"{formats.number(float(np.degrees(np.median(turn))), 2)}°{rest}"
+    )
+
+
+def _of(one: Estimate) -> float:
+    return one.value or 0.0
+
+
+def _gone(one: PredictedTravel) -> float:
+    return float(np.hypot(_of(one.measured_forward_m), _of(one.measured_left_m)))
+
+
+def connection_detail(found: BodyConnection) -> list[str]:
+    """Return sentences on the modes and what is identified."""
+    shares = ", ".join(f"{100 * _of(mode.share):.2g} %" for mode in found.modes)
+    number = "infinite" if found.condition_number is None else f"{found.condition_number:.3g}"
+    if found.identified:
+        known = "the connection A is identified (--json)"
+    else:
+        known = (
+            "the connection A itself is not identified, only what perturbations of these kinds do"
+        )
+    modes = f"Shape modes with {shares} of the variance of all shapes"
+    return [f"{modes}; condition number {number}: {known}.", formats.sentence(found.label)]
+
+
+CONNECTION_METHOD = (
+    "xi = A r' + B (r - r0) in the axes of the virtual chassis, A and B Fourier series in the "
+    "gait's phase, least squares over the mean cycles of all gaits; each session predicted from "
+    "its measured joint angles by a model of the others; intervals at 95 % from what the gaits "
+    "leave when left out (Student's t)."
+)
+"""The method as one sentence, beginning in lower case."""
