@@ -286,10 +286,6 @@ class Paths:
         suite = next(value for word, value in steps if word == "FROM").partition(":")[2]
         root = self.work / "chroot"
         run(debootstrap, "--variant=minbase", suite.removesuffix("-slim"), root, *_mirror())
-        for place in ("/etc/resolv.conf", "/etc/ssl/certs/ca-certificates.crt"):
-            if Path(place).is_file():  # the build's own network, as a container engine hands it on
-                (root / place[1:]).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(place, root / place[1:])
         (entry,) = (json.loads(value) for word, value in steps if word == "ENTRYPOINT")
         kept = {k: v for k, v in os.environ.items() if k in KEPT_IN_CHROOT}
         variables = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root"} | kept
@@ -301,9 +297,18 @@ class Paths:
                 for path in dist.parent.glob(source):
                     shutil.copy(path, root / target[1:])
             elif word == "RUN":
+                _hand_on_network(root)  # each time: installing certificates replaces ours
                 run(*inside, "/bin/sh", "-c", value)
         run(*inside, *entry, "--help")
         return "its steps in a Debian chroot; not tried as an image (no podman or docker)"
+
+
+def _hand_on_network(root: Path) -> None:
+    """Copy name servers and certificates into a chroot, as a container engine hands them on."""
+    for place in ("/etc/resolv.conf", "/etc/ssl/certs/ca-certificates.crt"):
+        if Path(place).is_file():
+            (root / place[1:]).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(place, root / place[1:])
 
 
 def _mirror() -> list[str]:
