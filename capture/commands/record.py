@@ -298,9 +298,9 @@ def unit(*, install: bool = False, folder: Path = _UNITS, force: bool = False) -
         )
     else:
         echo(*text.splitlines())
-    if (folder := hidden_folder(program)) is not None:
+    if (hidden := hidden_folder(program)) is not None:
         complain(
-            f"warning: {program} lies below {folder}, which this unit hides from the service; "
+            f"warning: {program} lies below {hidden}, which this unit hides from the service; "
             "install undulog elsewhere, e.g. in /opt/undulog"
         )
 
