@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 from ..common.console import emit, progress
 from ..common.errors import DataError
 from ..log.columns.topics import Channel
+from ..log.messages.contract import CONTRACT_VERSION
 from ..log.messages.frames import FD_TOPIC_PREFIX
 from ..log.read.session import Session
-from ..log.write.writer import CONTRACT_VERSION
 from .sessions import Line, each, sessions_of, show, stated_gait
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ def _contract_facts(path: Path, found: Sequence[Violation]) -> dict[str, Any]:
     violations = [asdict(one) for one in found]
     return {
         "path": str(path),
-        "contract": CONTRACT_VERSION,
+        "contract": str(CONTRACT_VERSION),
         "follows": not found,
         "violations": violations,
     }

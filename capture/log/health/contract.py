@@ -23,6 +23,7 @@ from ...common.remote import as_path
 from ..columns.topics import Channel
 from ..mcap.chunk import MAGIC, walk_records
 from ..mcap.file import McapFile
+from ..messages.contract import CONTRACT_VERSION
 from ..messages.definitions import is_of_contract
 from ..messages.frames import (
     FD_FRAME_DTYPE,
@@ -33,7 +34,6 @@ from ..messages.frames import (
 )
 from ..read.open_log import OpenLog
 from ..read.session_view import SessionView
-from ..write.writer import CONTRACT_VERSION
 
 RULES: Mapping[str, str] = MappingProxyType(
     {
@@ -318,7 +318,7 @@ def _record(log: OpenLog) -> Iterator[Violation]:
     for key in _REQUIRED:
         if key not in record:
             yield Violation("record", f"record undulog: {key}", "nothing", "write the key")
-    if record.get("contract", CONTRACT_VERSION) != CONTRACT_VERSION:
+    if record.get("contract", str(CONTRACT_VERSION)) != str(CONTRACT_VERSION):
         found, fix = repr(record["contract"]), f"follow version {CONTRACT_VERSION}, and write it"
         yield Violation("record", "record undulog: contract", found, fix)
     if not re.fullmatch(r"\d{1,19}", record.get("epoch_ns", "0")):
