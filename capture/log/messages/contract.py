@@ -1,4 +1,4 @@
-"""Version of the log contract (``docs/reference/log-contract.md``): what is written, and what can be read."""
+"""Version of the log contract: what is written, and what can be read (the manual has the contract)."""
 
 from __future__ import annotations
 
