@@ -202,7 +202,8 @@ class Answer:
         not_following: Joints that do not follow their command, in chain order.
         stand_out: Joints that stand out, worst first.
         undecided: Why it can't be decided which joint differs, or None.
-        shape: Shapes of the rest, largest first; each simultaneous interval excludes zero.
+        shape: Shapes of the rest, those that explain most first; each simultaneous interval
+            excludes zero.
         alike: Whether all commanded joints are shown to be alike; None where it is open.
     """
 

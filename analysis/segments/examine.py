@@ -72,7 +72,8 @@ class Findings:
 
     Attributes:
         stand_out: Joints that stand out, worst first.
-        shape: Shapes of the rest whose simultaneous interval excludes zero, largest first.
+        shape: Shapes of the rest whose simultaneous interval excludes zero; those that explain
+            most come first.
         undecided: Planes and groups in which joints differ and which one can't be decided.
         alike: Whether the rest of the compared joints is shown to be alike; None where it isn't.
         compared: Names of the joints that were compared.
@@ -100,7 +101,7 @@ def examine(chains: Iterable[Chain]) -> Findings:
     ]
     critical = critical_value([family_of(profile) for _, _, profile in profiles], LEVEL)
     out: list[StandOut] = []
-    shapes: list[Shape] = []
+    shapes: list[tuple[float, Shape]] = []
     undecided: dict[tuple[str, int], None] = {}
     excluded: dict[int, set[int]] = {id(chain): set() for chain in some}
     for chain, quantity, profile in profiles:
@@ -123,12 +124,15 @@ def examine(chains: Iterable[Chain]) -> Findings:
             if found:
                 undecided[chain.plane, chain.group] = None
             continue
-        shapes += [_shape(chain, quantity, each, critical) for each in found]
+        shapes += [
+            (each.spread / _MARGINS[quantity], _shape(chain, quantity, each, critical))
+            for each in found
+        ]
     alike = bool(some) and all(_alike(chain, excluded[id(chain)]) for chain in some)
     out.sort(key=lambda each: -abs(each.deviation) / _MARGINS.get(each.quantity, OFFSET_RAD))
     return Findings(
         stand_out=_ranked(out),
-        shape=tuple(sorted(shapes, key=lambda each: -abs(each.value) / _MARGINS[each.quantity])),
+        shape=tuple(shape for _, shape in sorted(shapes, key=lambda each: -each[0])),
         undecided=tuple(undecided),
         alike=True if alike else None,
         compared=tuple(name for chain in some for name in chain.names),

@@ -200,12 +200,14 @@ class Contrast:
             regression line), ``mirror`` (outer minus inner half, symmetric to the middle) or
             ``each`` (largest deviation of a joint from the common value).
         value: In the unit of the profile.
+        spread: Root mean square over the joints of what it explains of them, likewise.
         joint: For ``each``: index into the profile.
     """
 
     kind: str
     value: float
     error: float
+    spread: float
     joint: int | None = None
 
 
@@ -264,14 +266,18 @@ def contrasts(profile: Profile, active: BoolArray) -> list[Contrast]:
     found: list[Contrast] = []
     for kind, row in shape_weights(profile, active):
         variance = float(profile.scatter.variance(row[None, :])[0])
-        found.append(Contrast(kind, float(row @ profile.values), variance**0.5))
+        value = float(row @ profile.values)
+        # A contrast c^T y of unit weights explains (c^T y)^2 / c^T c of the sum of squares.
+        spread = abs(value) / float(row @ row * np.count_nonzero(active)) ** 0.5
+        found.append(Contrast(kind, value, variance**0.5, spread))
     if np.count_nonzero(active) > 1:
         rows = deviation_weights(profile, active, [])
         index = np.flatnonzero(active)
         value = rows[index] @ profile.values
         error = np.sqrt(profile.scatter.variance(rows[index]))
         k = int(np.argmax(np.abs(value) / np.maximum(error, 1e-300)))
-        found.append(Contrast("each", float(value[k]), float(error[k]), int(index[k])))
+        spread = abs(float(value[k])) / index.size**0.5
+        found.append(Contrast("each", float(value[k]), float(error[k]), spread, int(index[k])))
     return found
 
 

@@ -15,7 +15,7 @@ RUN_ELSEWHERE = {"conf.py", "notebook_page.py", "reference_pages.py"}
 PICTURES = {"pictures.py", "side_by_side.py"}
 """Need the viewer's driver."""
 
-OWN_TESTS = {"paper_figures.py", "oscillator_tables.py"}
+OWN_TESTS = {"paper_figures.py", "oscillator_tables.py", "real_robots.py"}
 TABLES = sorted({path.name for path in DOCS.glob("*.py")} - RUN_ELSEWHERE - PICTURES - OWN_TESTS)
 
 pytestmark = pytest.mark.slow

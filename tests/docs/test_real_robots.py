@@ -1,0 +1,21 @@
+"""The page on recordings of real robots has the numbers that its commands give."""
+
+import sys
+
+import pytest
+
+from support.paths import DOCS, SHARED
+from support.processes import run
+
+
+@pytest.mark.slow
+def test_the_page_is_what_its_script_writes(tmp_path):
+    if not SHARED.is_dir():
+        pytest.skip(f"the real recordings {SHARED.name} are not beside this checkout")
+    script = DOCS / "real_robots.py"
+    done = run(sys.executable, str(script), str(SHARED), "--out", str(tmp_path), timeout=1800)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "explanation" / "real-robots.md").read_text()
+    assert page == (DOCS / "explanation" / "real-robots.md").read_text()
+    for picture in (tmp_path / "images").iterdir():
+        assert (DOCS / "images" / picture.name).stat().st_size > 1000
