@@ -1,4 +1,4 @@
-"""Version of the log contract: what is written, and what can be read (the manual has the contract)."""
+"""Version of the log contract: what is written, and what can be read."""
 
 from __future__ import annotations
 
