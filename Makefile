@@ -111,6 +111,7 @@ pictures: demo  ## the pictures of README and manual, from recorded sessions
 	$(BIN)/python docs/pictures.py $(DEMO) docs/images
 	$(BIN)/python docs/side_by_side.py docs/images
 	$(BIN)/python docs/paper_figures.py out/paper docs/images
+	$(BIN)/python docs/readme_figures.py docs/images
 
 golden: $(READY)  ## the golden pictures that every view is held to, anew; look at each
 	$(BIN)/python tests/support/golden_pictures.py
