@@ -7,17 +7,18 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.console import emit, progress
-from ..common.errors import DataError
+from ..common.errors import DataError, UsageError
 from ..log.columns.topics import Channel
 from ..log.messages.contract import CONTRACT_VERSION
 from ..log.messages.frames import FD_TOPIC_PREFIX
 from ..log.read.session import Session
-from .sessions import Line, each, sessions_of, show, stated_gait
+from .sessions import CONTRACT, JointTopicOptions, Line, each, sessions_of, show, stated_gait
 
 if TYPE_CHECKING:
     from ..log.health.bus_tally import SourceHealth
@@ -172,7 +173,14 @@ def _utc(t_ns: int) -> str:
     return datetime.fromtimestamp(t_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-def log_check(file: Path, /, *more: Path, contract: bool = False, json: bool = False) -> int:
+def log_check(
+    file: Path,
+    /,
+    *more: Path,
+    contract: bool = False,
+    topics: JointTopicOptions = CONTRACT,
+    json: bool = False,
+) -> int:
     """Judge whether a recorded session is good, degraded or bad, and why.
 
     Everything is computed from the data: rhythm, gaps, jitter and dropped messages of every
@@ -184,22 +192,29 @@ def log_check(file: Path, /, *more: Path, contract: bool = False, json: bool = F
 
     Example: `undulog log check run.mcap`
 
+    A bag of ROS: `undulog log check BAG --response-topic /arm/joint_states`
+
     Args:
         file: An MCAP file, of any make, or its URL, which is fetched whole.
         more: More of them; a folder has all logs in it, a pattern such as 'runs/**/*.mcap' too.
         contract: Check against the log contract; exit code 1 for a log that breaks it.
+        topics: Where commands and responses are.
         json: Print one JSON object, or for several logs a list of them.
     """
     from ..log.health.session_check import check_session
 
+    if contract and topics != CONTRACT:
+        why = "--contract checks all topics; leave out --command-topic and --response-topic"
+        raise UsageError(why)
     paths = sessions_of([file, *more])
     if contract:
         return _check_contracts(paths, as_json=json)
     if len(paths) > 1:
-        return show(each(paths, "log check", _check_line), as_json=json)
+        work = partial(_check_line, topics=topics)
+        return show(each(paths, "log check", work), as_json=json)
     (file,) = paths
     with progress(f"checking {file.name}", 1.0) as bar:
-        health = check_session(file, bar.update)
+        health = check_session(file, bar.update, topics=topics.names)
     emit(as_json(health), _check_lines(health), as_json=json)
     return int(health.verdict == "bad")
 
@@ -244,10 +259,10 @@ def _contract_facts(path: Path, found: Sequence[Violation]) -> dict[str, Any]:
     }
 
 
-def _check_line(path: Path) -> Line:
+def _check_line(path: Path, topics: JointTopicOptions) -> Line:
     from ..log.health.session_check import check_session
 
-    health = check_session(path)
+    health = check_session(path, topics=topics.names)
     with Session.open(path) as session:
         gait = stated_gait(session.metadata)
     said = (*health.reasons, *health.notes, "nothing is wrong with it")

@@ -16,6 +16,8 @@ from cyclopts import Parameter
 from ..common.console import UNLIMITED, Column, emit_json, progress, table
 from ..common.errors import UndulogError
 from ..common.remote import RemotePath, as_path
+from ..log.file.bag import is_bag
+from ..log.file.bag_parts import METADATA
 from ..log.file.parts import first_part
 from ..log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..log.read.session_view import SessionView
@@ -95,10 +97,10 @@ def sessions_of(given: Iterable[Path]) -> list[Path]:
     """Return the sessions that paths, URLs, folders and patterns name, in that order.
 
     Args:
-        given: Of a folder, all sessions in it and in the folders in it, in order of name; a
-            rosbag2 folder and the parts of a split session are one. A pattern (``*``, ``?``,
-            ``[...]``, ``**``) is a path that isn't there. What names no session stays, for the
-            command to refuse.
+        given: Of a folder, all sessions (``.mcap``, ``.bag``, ``.db3``) in it and in the folders
+            in it, in order of name; a rosbag2 folder and the parts of a split session are one. A
+            pattern (``*``, ``?``, ``[...]``, ``**``) is a path that isn't there. What names no
+            session stays, for the command to refuse.
     """
     found: list[Path] = []
     for path in map(as_path, given):
@@ -113,23 +115,36 @@ def _named(path: Path) -> list[Path]:
     if path.is_dir():
         found = _in_folder(path)
         alone = len(found) == 1 and found[0].parent == path
-        return [path] if alone or not found else found
+        plain = alone and found[0].suffix == ".mcap" and not found[0].is_dir()
+        return [path] if plain or not found else found
     if glob.has_magic(str(path)) and not path.exists():
         matches = sorted(map(Path, glob.glob(str(path), recursive=True)))  # noqa: PTH207 - absolute too
-        whole = [each if each.is_dir() else first_part(each) for each in matches]
-        return [one for each in dict.fromkeys(whole) for one in _named(each)] or [path]
+        return list(dict.fromkeys(one for each in matches for one in _matched(each))) or [path]
     return [path]
+
+
+def _matched(path: Path) -> list[Path]:
+    """Return the sessions that a match of a pattern belongs to."""
+    if path.is_dir():
+        return _in_folder(path)
+    return [path.parent if _is_rosbag2(path.parent) else first_part(path)]
+
+
+def _is_rosbag2(folder: Path) -> bool:
+    return (folder / METADATA).is_file()
 
 
 def _in_folder(folder: Path) -> list[Path]:
     """Return the sessions in a folder and, behind them, in its folders."""
-    if (folder / "metadata.yaml").is_file():  # as rosbag2 writes it
+    if _is_rosbag2(folder):
         return [folder]
     found: dict[Path, None] = {}
     entries = sorted(folder.iterdir())
     for entry in entries:
         if entry.suffix == ".mcap" and entry.is_file():
             found[first_part(entry)] = None
+        elif entry.is_file() and is_bag(entry):
+            found[entry] = None
         elif entry.name.endswith(".mcap.wal") and entry.is_dir():
             found[entry.with_name(entry.name.removesuffix(".wal"))] = None
     for entry in entries:

@@ -22,6 +22,7 @@ from ..common.errors import DataError, ImportFormatError, MissingChannelError, s
 from ..common.files import check_stop
 from ..common.process import StopRequest
 from ..following.session import MOST_JOINTS
+from ..log.edit.cut import cut_log
 from ..log.edit.raw_messages import RawLog
 from ..log.file.bag import check_room, is_bag
 from ..log.mcap.chunk import LAST_NS
@@ -59,6 +60,8 @@ def import_bag(
 ) -> ImportReport:
     """Turn a recording of ROS into a session, one window after the other.
 
+    A session that was exported as a rosbag2 folder is copied, messages and records as they are.
+
     Args:
         robot: Description of its robot, a name or a file.
         topics: Of commands and responses, as :meth:`.SessionView.joint_topics` takes them.
@@ -66,7 +69,8 @@ def import_bag(
 
     Raises:
         NotALogError: If the recording is damaged or of an unknown kind.
-        ImportFormatError: If it is a session already, or has no joints.
+        ImportFormatError: If it is the file of a session, has no joints, or is an exported
+            session whose robot or topics were to be chosen.
         MissingChannelError: If a topic that was chosen is not there.
         LogError: If the disk has no room.
         OutputExistsError: If the output is there and ``force`` is not given.
@@ -88,7 +92,8 @@ def import_bag(
             )
         )
         if session.library.startswith("undulog/"):
-            raise ImportFormatError(source, "is a session of undulog already")
+            _check_exported(source, robot, topics)
+            return _restored(source, session, output, force=force, stop=stop)
         found = _found(source, session, topics)
         report = ImportReport(
             source, output, session.robot.name if session.robot else "unknown robot"
@@ -118,6 +123,40 @@ def import_bag(
         report.problems += [one for one in session.warnings if one not in report.problems]
         writer.set_verdict(report.verdict, [*report.problems, *report.notes])
     return report
+
+
+def _check_exported(source: Path, robot: str | None, topics: tuple[str, str]) -> None:
+    """Check that a recording that undulog wrote can be copied as a session.
+
+    Raises:
+        ImportFormatError: If it is a session's file, or options would change the session.
+    """
+    if not source.is_dir():
+        why = f"is a session of undulog already; use it as it is: undulog analyse {source.name}"
+        raise ImportFormatError(source, why)
+    if robot is not None or topics != (COMMAND_TOPIC, RESPONSE_TOPIC):
+        why = (
+            "was exported by undulog and is copied as it is; leave out --robot, --command-topic "
+            "and --response-topic here and give them to the commands that read the session"
+        )
+        raise ImportFormatError(source, why)
+
+
+def _restored(
+    source: Path, session: Session, output: Path, *, force: bool, stop: StopRequest | None
+) -> ImportReport:
+    """Copy an exported session, with its messages, records and attachments as they are."""
+    copied = cut_log(source, output, force=force, stop=stop)
+    return ImportReport(
+        source,
+        output,
+        session.robot.name if session.robot else "unknown robot",
+        session.start_ns,
+        session.end_ns,
+        samples=copied.messages,
+        problems=copied.warnings,
+        notes=[f"session {session.session_id}, exported by undulog, is copied as it is"],
+    )
 
 
 def _found(source: Path, session: Session, topics: tuple[str, str]) -> JointTopics:

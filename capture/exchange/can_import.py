@@ -24,6 +24,7 @@ from ..common.process import StopRequest
 from ..log.health.bus_tally import undecoded
 from ..log.messages.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd
 from ..log.write.channels import FrameChannel
+from ..log.write.mcap_sink import McapSink
 from ..log.write.writer import SessionWriter
 from ..robot.model import Robot
 from .can_logs import log_suffix, open_frame_log
@@ -95,6 +96,10 @@ def digest_of(files: Sequence[Path]) -> str:
     return hashlib.sha256(parts.encode()).hexdigest()
 
 
+_LEVEL = 2
+"""Of compression: a third less time than level 3 for a few per cent more bytes."""
+
+
 @contextmanager
 def imported_session(
     source: Path,
@@ -132,7 +137,7 @@ def imported_session(
             robot=robot,
             clock={"log": str(robot.clock)} if robot else {},
             metadata={"source": source.name, "source.sha256": digest, **facts},
-            force=True,
+            sink=McapSink(part, force=True, level=_LEVEL),
         ) as writer,
     ):
         yield writer

@@ -72,7 +72,11 @@ class JointTopic:
             for k, joint in enumerate(self._joints):
                 if (cells := values.get((joint, quantity))) is not None:
                     field[:, k] = cells
-        sampled: BoolArray = ~np.all(np.isnan(fields), axis=0)
+        absent = np.isnan(fields)
+        if not absent.any():
+            self._write_part(t_ns, fields, np.ones(len(self._joints), dtype=bool))
+            return len(t_ns)
+        sampled: BoolArray = ~np.all(absent, axis=0)
         filled = np.any(sampled, axis=1)
         if not filled.all():
             t_ns, fields, sampled = t_ns[filled], fields[:, filled], sampled[filled]
@@ -81,13 +85,17 @@ class JointTopic:
         changes = np.flatnonzero(np.any(sampled[1:] != sampled[:-1], axis=1)) + 1
         edges = [0, *changes.tolist(), len(t_ns)]
         for start, stop in pairwise(edges):
-            channel, which = self._part(sampled[start])
-            rows = iter(fields[:, start:stop, which])
-            none = np.empty((stop - start, 0))
-            position = next(rows)
-            velocity, effort = (next(rows) if present else none for present in self._rest)
-            channel.write_rows(t_ns[start:stop], position, velocity, effort)
+            self._write_part(t_ns[start:stop], fields[:, start:stop], sampled[start])
         return len(t_ns)
+
+    def _write_part(self, t_ns: IntArray, fields: FloatArray, sampled: BoolArray) -> None:
+        """Write rows, of shape (fields, n, joints), that all have samples of the same joints."""
+        channel, which = self._part(sampled)
+        rows = iter(fields if which.all() else fields[:, :, which])
+        none = np.empty((len(t_ns), 0))
+        position = next(rows)
+        velocity, effort = (next(rows) if present else none for present in self._rest)
+        channel.write_rows(t_ns, position, velocity, effort)
 
     def _part(self, sampled: BoolArray) -> tuple[JointStateChannel, BoolArray]:
         """Return the channel of some joints, and which they are; all if there are too many sets."""

@@ -384,11 +384,13 @@ class _Source:
         except (ValueError, TypeError) as error:
             bad = next((str(cell)[:40] for cell in cells if not _is_number(cell)), "")
             raise ImportFormatError(path, f"column {name!r}: {bad!r} is not a number") from error
-        known = ~np.isnan(values)
-        if not np.all(np.abs(values[known]) < _MOST):
-            raise ImportFormatError(
-                path, f"column {name!r} has a number that is not finite or beyond {_MOST:g}"
-            )
+        known = np.abs(values) < _MOST
+        if not known.all():
+            known = ~np.isnan(values)
+            if not np.all(np.abs(values[known]) < _MOST):
+                raise ImportFormatError(
+                    path, f"column {name!r} has a number that is not finite or beyond {_MOST:g}"
+                )
         self._missing[name] = self._missing.get(name, 0) + int(len(values) - known.sum())
         if column.wrap and known.any():
             raw = values[known]

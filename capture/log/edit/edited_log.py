@@ -13,20 +13,22 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from mcap.records import Attachment, Channel
-from mcap.writer import Writer
 
 from ...common.arrays import NS
 from ...common.console import progress, refuse_existing
 from ...common.errors import DataError, UndulogError, UsageError
 from ...common.files import part_file
 from ...common.process import StopRequest
-from ..write.mcap_sink import library_name
+from ..mcap.writer import McapWriter
+from ..write.mcap_sink import chunk_group, library_name
 from .raw_messages import RawLog, RawMessage
 
 EDIT_RECORD = "undulog.edit"
 """Metadata record of the sources of an edited log."""
 HEALTH_RECORD = "undulog.health"
 _MOST_CHANNELS = 2**16 - 1
+_MOST_GROUPS = 128
+"""Of topics with chunks of their own, each of which takes up to a chunk's bytes of memory."""
 _STOP_CHECKED_EVERY = 1024
 
 
@@ -74,7 +76,8 @@ class EditedLog:
 
     def __init__(self, stream: BinaryIO, profile: str) -> None:
         """Begin the file."""
-        self._writer = Writer(stream)
+        self._groups: set[str] = set()
+        self._writer = McapWriter(stream, group_of=self._group_of)
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[tuple[str, str, int, str], int] = {}
         self._topics: dict[int, str] = {}
@@ -82,6 +85,13 @@ class EditedLog:
         self.first_ns: int | None = None
         self.last_ns = 0
         self._writer.start(profile=profile, library=library_name())
+
+    def _group_of(self, topic: str, type_name: str) -> str:
+        group = chunk_group(topic, type_name)
+        if group not in self._groups and len(self._groups) == _MOST_GROUPS:
+            return ""
+        self._groups.add(group)
+        return group
 
     def channel(self, source: RawLog, channel: Channel) -> int:
         """Open a copy of a channel, or find an equal one, and return its id in the new file.

@@ -318,8 +318,9 @@ def _record(log: OpenLog) -> Iterator[Violation]:
     for key in _REQUIRED:
         if key not in record:
             yield Violation("record", f"record undulog: {key}", "nothing", "write the key")
-    if record.get("contract", str(CONTRACT_VERSION)) != str(CONTRACT_VERSION):
-        found, fix = repr(record["contract"]), f"follow version {CONTRACT_VERSION}, and write it"
+    version = str(CONTRACT_VERSION)
+    if record.get("contract", version) != version:
+        found, fix = repr(record["contract"]), f"follow version {version}, and write it"
         yield Violation("record", "record undulog: contract", found, fix)
     if not re.fullmatch(r"\d{1,19}", record.get("epoch_ns", "0")):
         fix = "write the Unix time of the start, whole ns"

@@ -331,9 +331,8 @@ def judge_joints(joints: Sequence[JointHealth], start_ns: int) -> list[Fault]:
     return found
 
 
-def judge_body(joints: Sequence[JointHealth]) -> list[Finding]:
-    """Return findings on all joints together."""
-    measured = [joint for joint in joints if joint.topic == "/joint_states"]
+def judge_body(measured: Sequence[JointHealth]) -> list[Finding]:
+    """Return findings on all measured joints together."""
     names = {joint.name for joint in measured}
     dead = {
         joint.name
@@ -394,23 +393,26 @@ def judge_silences(buses: Iterable[BusHealth], start_ns: int) -> list[Finding]:
 
 def judge_topics(
     types: dict[str, str],
+    topics: tuple[str, str],
     joints: Sequence[str],
     seen: Iterable[str],
     undecoded: str | None = None,
 ) -> list[Finding]:
-    """Return findings on topics of the log contract that the session lacks.
+    """Return findings on topics of joints that the session lacks.
 
     Args:
         types: Topic with messages to type.
+        topics: Of commands and responses.
         joints: The robot's joints; empty without a robot.
-        seen: Joints that ``/joint_states`` carries.
+        seen: Joints that the topic of responses carries.
         undecoded: Why almost no raw CAN frame could be decoded, which then is the only reason for
             missing topics; None otherwise.
     """
     found = [] if undecoded is None else [Finding(1, undecoded)]
     framed = any(topic.startswith(FRAME_TOPIC_PREFIXES) for topic in types)
     others = sorted(topic for topic, kind in types.items() if kind in JOINT_TYPES)
-    for topic in ("/joint_states", "/joint_commands"):
+    commands, responses = topics
+    for topic in dict.fromkeys((responses, commands)):
         if topic in types:
             continue
         if others:
@@ -425,7 +427,7 @@ def judge_topics(
     present = set(seen)
     missing = [name for name in joints if name not in present]
     if present and missing:
-        found.append(Finding(1, f"/joint_states never carries {', '.join(missing)}"))
+        found.append(Finding(1, f"{responses} never carries {', '.join(missing)}"))
     return found
 
 

@@ -28,6 +28,8 @@ from ...following.session import faults_in_session
 from ..file.parts import check_chain
 from ..mcap.chunk import MAGIC, PREFIX_SIZE, Block, chunk_at, read_message_heads, walk_records
 from ..mcap.file import McapFile
+from ..read.joint_messages import joint_source
+from ..read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..read.open_log import OpenLog
 from ..read.session_view import SessionView
 from .rules import Finding, judge_file, judge_following, judge_made_times, verdict_of
@@ -148,22 +150,31 @@ class SessionHealth(SessionMeasures):
         return (*(finding.sentence for finding in self.following), *super().reasons)
 
 
+CONTRACT_TOPICS = (COMMAND_TOPIC, RESPONSE_TOPIC)
+
+
 def check_session(
-    path: Path | str, on_part: Callable[[float], None] | None = None
+    path: Path | str,
+    on_part: Callable[[float], None] | None = None,
+    *,
+    topics: tuple[str, str] = CONTRACT_TOPICS,
 ) -> SessionHealth:
     """Measure and judge a session from its data alone.
 
     Args:
         path: An MCAP file, of any make; of a split session any part, or the folder.
         on_part: Called with the part that has been read, 0 to 1.
+        topics: Of commands and responses, as :meth:`.SessionView.joint_topics` takes them.
 
     Raises:
         NotALogError: If it is not an MCAP file or nothing in it can be read.
         LogError: If it can't be opened.
+        MissingChannelError: If a topic that was chosen is not there.
+        DataError: If an array was chosen whose joints are unknown.
     """
     log = OpenLog(as_path(path), None, threads_or_default(None))
     try:
-        return _Check(log).run(on_part or (lambda _: None))
+        return _Check(log, topics).run(on_part or (lambda _: None))
     finally:
         log.file.close()
 
@@ -171,10 +182,15 @@ def check_session(
 class _Check:
     """The pass over one open file."""
 
-    def __init__(self, log: OpenLog) -> None:
+    def __init__(self, log: OpenLog, topics: tuple[str, str]) -> None:
         self._log = log
         self._file = log.file
-        self._scan = SessionScan(log.robot)
+        self._view = SessionView(log)
+        if topics != CONTRACT_TOPICS:
+            found = self._view.joint_topics(*topics)
+            self._view = self._view.with_joints(*topics)
+            topics = _recorded(log, found.command), _recorded(log, found.response)
+        self._scan = SessionScan(log.robot, topics=topics)
         self._notes = log.warnings[len(log.file.warnings) :]
         for key in log.file.channels:
             self._define(key)
@@ -204,7 +220,7 @@ class _Check:
         if file.damage:
             return []
         try:
-            faults = faults_in_session(SessionView(self._log))
+            faults = faults_in_session(self._view)
         except DataError as error:
             why = str(error).removeprefix(f"{self._file.path}: ")
             return [Finding(0, f"whether joints follow their command is not known: {why}")]
@@ -359,6 +375,12 @@ class _Check:
         if kind is not None and kind.name != type_name:  # a second type on one topic
             kind = None
         self._scan.define(key, channel.topic, type_name, kind, channel.metadata)
+
+
+def _recorded(log: OpenLog, name: str) -> str:
+    """Return the topic that a name of joints is read from."""
+    source = joint_source(name, log.topics.channels)
+    return name if source is None else source.topic
 
 
 def _unlisted(file: McapFile, chunk: Block) -> str:

@@ -100,16 +100,24 @@ class ChannelMeasures:
 class SessionScan:
     """The scan of one session, channel by channel."""
 
-    def __init__(self, robot: Robot | None, *, horizon_s: int | None = None) -> None:
+    def __init__(
+        self,
+        robot: Robot | None,
+        *,
+        horizon_s: int | None = None,
+        topics: tuple[str, str] = (COMMANDS, STATES),
+    ) -> None:
         """Start without channels.
 
         Args:
             robot: The robot of the session; None without a usable description.
+            topics: Of commands and responses.
             horizon_s: How far stamps may go back in a running recording [s]. Older samples are
                 summed up, so that memory is bounded, and later ones are not checked for frozen
                 joints. None for a file.
         """
         self._robot, self._horizon_s = robot, horizon_s
+        self._angles = self._commands, self._states = topics
         self._freezes: dict[tuple[int, tuple[str, ...], int, tuple[str, ...]], FreezeTally] = {}
         self._scans: dict[int, ChannelScan] = {}
         self._types: dict[int, str] = {}
@@ -129,7 +137,7 @@ class SessionScan:
             kind: Its type; None if it can't be read: then only times are used.
             metadata: Of the channel, e.g. ``unit``.
         """
-        angles = topic in (COMMANDS, STATES) and metadata.get("unit", "rad") == "rad"
+        angles = topic in self._angles and metadata.get("unit", "rad") == "rad"
         limits: Limits | None = {} if angles else None
         if angles and self._robot is not None:
             limits = {joint.name: (joint.lower, joint.upper) for joint in self._robot.joints}
@@ -199,10 +207,10 @@ class SessionScan:
         )
         types = {channel.topic: channel.type_name for channel in channels}
         chain = self._robot.joint_names if self._robot is not None else ()
-        seen = [joint.name for joint in joints if joint.topic == STATES]
+        seen = [joint.name for joint in joints if joint.topic == self._states]
         unseen = set(chain).difference(one.name for one in joints if one.nan < one.samples)
         why = self._undecoded([scan for _, scan in found], all_joints=not unseen)
-        findings = [*before, *judge_topics(types, chain, seen, why)]
+        findings = [*before, *judge_topics(types, self._angles, chain, seen, why)]
         faults = [fault for channel in channels for fault in judge_channel(channel)]
         # Messages of frames come when a batch is full; the frames themselves are judged.
         framed = {bus.topic for bus in buses}
@@ -210,7 +218,7 @@ class SessionScan:
             if each.topic not in framed:
                 faults += judge_series(each, start_ns, end_ns)
         findings += joined([*faults, *judge_joints(joints, start_ns)])
-        findings += judge_body(joints)
+        findings += judge_body([joint for joint in joints if joint.topic == self._states])
         for bus in buses:
             findings += judge_bus(bus)
         findings += judge_silences(buses, start_ns)
@@ -252,9 +260,9 @@ class SessionScan:
         found: dict[tuple[str, str], JointHealth] = {}
         for key, scan in scans:
             for series in scan.series.values():
-                runs = self._frozen(key, series, scans) if scan.topic == STATES else {}
+                runs = self._frozen(key, series, scans) if scan.topic == self._states else {}
                 for k, name in enumerate(series.names):
-                    bounded = name in limited and scan.topic in (COMMANDS, STATES) and series.rows
+                    bounded = name in limited and scan.topic in self._angles and series.rows
                     longest = max(runs.get(k, ()), default=None)
                     joint = JointHealth(
                         topic=scan.topic,
@@ -267,7 +275,7 @@ class SessionScan:
                     )
                     had = found.get((scan.topic, name))
                     found[scan.topic, name] = joint if had is None else had.with_more(joint)
-        closed = _closed(scans)
+        closed = self._closed(scans)
         for _, scan in scans:
             for series in scan.series.values():
                 series.ranges.forget(closed)
@@ -279,9 +287,9 @@ class SessionScan:
         """Return frozen seconds and the first one, for each joint with a command, by its index."""
         measured = series.ranges.result(len(series.names))
         runs: dict[int, list[tuple[int, int]]] = {}
-        closed = _closed(scans)
+        closed = self._closed(scans)
         for other, scan in scans:
-            for command in scan.series.values() if scan.topic == COMMANDS else ():
+            for command in scan.series.values() if scan.topic == self._commands else ():
                 if len(self._freezes) >= _MOST_PAIRS:
                     return runs
                 pair = (key, series.names, other, command.names)
@@ -295,6 +303,16 @@ class SessionScan:
                 for k, *run in zip(freeze.columns, lasted.tolist(), since.tolist(), strict=True):
                     runs.setdefault(k, []).append((run[0], run[1]))
         return runs
+
+    def _closed(self, scans: list[tuple[int, ChannelScan]]) -> int | None:
+        """Return the second before which no series of angles will change."""
+        every = [
+            series.ranges.closed
+            for _, scan in scans
+            for series in scan.series.values()
+            if scan.topic in self._angles
+        ]
+        return min((second for second in every if second is not None), default=None)
 
     def last_load(self, topic: str) -> tuple[float, float] | None:
         """Return the load of a bus in its last whole second; see :meth:`.BusTally.last_second`."""
@@ -322,14 +340,3 @@ def _series(topic: str, type_name: str, tally: Series) -> SeriesHealth:
         numbers=tally.numbers,
         nan=tally.nan,
     )
-
-
-def _closed(scans: list[tuple[int, ChannelScan]]) -> int | None:
-    """Return the second before which no series of angles will change."""
-    every = [
-        series.ranges.closed
-        for _, scan in scans
-        for series in scan.series.values()
-        if scan.topic in (COMMANDS, STATES)
-    ]
-    return min((second for second in every if second is not None), default=None)

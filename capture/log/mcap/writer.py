@@ -90,6 +90,7 @@ class McapWriter:
         stream: Stream,
         chunk_size: int = CHUNK_SIZE,
         group_of: Callable[[str, str], str] | None = None,
+        level: int = 3,
     ) -> None:
         """Write to a stream; :meth:`start` begins.
 
@@ -97,9 +98,10 @@ class McapWriter:
             chunk_size: A chunk is written when it has more bytes than this.
             group_of: Topic and type name to the group of a channel; channels of one group share
                 chunks. None for one group, named "".
+            level: Compression level of zstd.
         """
         self._stream, self._chunk_size = stream, chunk_size
-        self._zstd = zstandard.ZstdCompressor(write_checksum=True)
+        self._zstd = zstandard.ZstdCompressor(level, write_checksum=True)
         self._group_of = group_of
         self._shared = _OpenChunk("")
         self._open = {"": self._shared}
@@ -234,6 +236,7 @@ class McapWriter:
         records["sequence"] = (sequence + np.arange(count)) & 0xFFFF_FFFF
         records["log_time"] = records["publish_time"] = times_ns
         records["payload"] = payloads
+        data = records.view(np.uint8).reshape(count, records.itemsize)
         chunk, length = self._chunk_of[channel_id], records.itemsize
         at = 0
         while at < count:
@@ -243,7 +246,7 @@ class McapWriter:
             entries[:, 0] = some["log_time"]
             entries[:, 1] = len(chunk.data) + length * np.arange(len(some))
             self._index(chunk, channel_id).frombytes(entries.tobytes())
-            chunk.data += some.tobytes()
+            chunk.data += data[at : at + len(some)].data
             self.messages += len(some)
             at += len(some)
             if len(chunk.data) > self._chunk_size:

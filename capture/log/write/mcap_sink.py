@@ -86,8 +86,11 @@ PROFILE = "ros2"
 class McapSink:
     """Writes one MCAP file; it is finalised by :meth:`close`."""
 
-    def __init__(self, path: Path | str, *, force: bool = False) -> None:
+    def __init__(self, path: Path | str, *, force: bool = False, level: int = 3) -> None:
         """Create the file.
+
+        Args:
+            level: Compression level of zstd.
 
         Raises:
             OutputExistsError: If the file exists and ``force`` is not given.
@@ -96,7 +99,8 @@ class McapSink:
         self.path = Path(path)
         self._open = True
         self._stream = create_file(self.path, force=force)
-        self._writer = McapWriter(_Guarded(self._stream, self.path), group_of=chunk_group)
+        guarded = _Guarded(self._stream, self.path)
+        self._writer = McapWriter(guarded, group_of=chunk_group, level=level)
         self._writer.start(profile=PROFILE, library=library_name())
 
     def define(self, record: Description) -> None:

@@ -1,13 +1,17 @@
 """Several logs in one command: what is found in folders and patterns, and the table."""
 
 import shutil
+from functools import partial
 
 import pytest
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 
 from support.paths import ROOT
+from support.ros_bags import Filler, ticks, write_bag
 from undulog.capture.commands.sessions import first_sentence, sessions_of
 
 GOLDEN = ROOT / "tests/replay/golden/session.mcap"
+MESSAGES = (CompressionMode.MESSAGE, CompressionFormat.ZSTD)
 
 
 @pytest.fixture
@@ -44,6 +48,70 @@ def test_a_rosbag2_folder_is_one_session(folder):
     (folder / "sub/metadata.yaml").write_text("rosbag2_bagfile_information: {}")
     shutil.copy(GOLDEN, folder / "sub/b_1.mcap")
     assert sessions_of([folder])[-1] == folder / "sub"
+
+
+def fill_joints(bag, first=0.0, last=3.0):
+    fill = Filler(bag)
+    for tick in ticks(last):
+        if tick[1] >= first:
+            fill.controller(*tick)
+
+
+def write_parts(folder):
+    """A recording of two files: written as two, and put together."""
+    write_bag(folder, partial(fill_joints, last=1.5), storage=StoragePlugin.SQLITE3)
+    rest = folder.with_name("rest")
+    write_bag(rest, partial(fill_joints, first=1.5), storage=StoragePlugin.SQLITE3)
+    (rest / "rest.db3").rename(folder / "b_1.db3")
+    shutil.rmtree(rest)
+    lines = (folder / "metadata.yaml").read_text().splitlines()
+    at = next(k for k, line in enumerate(lines) if line.strip() == "- b.db3")
+    lines.insert(at + 1, lines[at].replace("b.db3", "b_1.db3"))
+    (folder / "metadata.yaml").write_text("\n".join(lines))
+
+
+@pytest.fixture
+def bags(tmp_path):
+    """A bag of each kind, in a folder of its own, and one of several files."""
+    paths = [tmp_path / name for name in ("day/a.bag", "day/b", "day/c", "day/d.db3", "one/e.bag")]
+    a, b, c, d, e = paths
+    for folder in ("day", "one", "alone"):
+        (tmp_path / folder).mkdir()
+    for path in (a, e):
+        write_bag(path, fill_joints)
+    write_parts(b)
+    write_bag(c, fill_joints, storage=StoragePlugin.MCAP, compression=MESSAGES)
+    shutil.copy(b / "b.db3", d)
+    shutil.copytree(c, tmp_path / "alone/f")
+    shutil.copy(GOLDEN, tmp_path / "day/g.mcap")
+    return tmp_path
+
+
+def test_bags_in_folders_and_patterns_are_one_session_each(bags):
+    day = [bags / "day" / name for name in ("a.bag", "d.db3", "g.mcap", "b", "c")]
+    assert sessions_of([bags / "day"]) == day
+    assert sessions_of([bags / "one"]) == [bags / "one/e.bag"]
+    assert sessions_of([bags / "alone"]) == [bags / "alone/f"]
+    assert sessions_of([bags / "day/b"]) == [bags / "day/b"]
+    assert sessions_of([bags / "day/**/*.db3"]) == [bags / "day/b", bags / "day/d.db3"]
+    assert sorted(sessions_of([bags / "day/**/*"])) == sorted(day)
+    assert sorted(sessions_of([bags / "d*"])) == sorted(day)
+    assert sessions_of([bags / "day/b/*"]) == [bags / "day/b"]
+    assert sessions_of([bags / "day", bags / "day/b"]) == [*day, bags / "day/b"]
+    single = bags / "day/b/b_1.db3"
+    assert sessions_of([single]) == [single]
+
+
+@pytest.mark.parametrize("line", [("log", "info"), ("log", "check"), ("analyse",)])
+def test_commands_read_the_bags_of_a_folder(line, bags, report_of, command):
+    rows = report_of(*line, bags / "day")
+    assert len(rows) == 5
+    assert not [row for row in rows if "error" in row]
+
+
+def test_a_report_has_the_bags_of_a_folder(bags, tmp_path, report_of):
+    report = report_of("report", bags / "day", "-o", tmp_path / "page.html")
+    assert [len(one["sentence"]) > 0 for one in report["answers"]] == [True] * 5
 
 
 @pytest.mark.parametrize("verb", ["info", "check"])

@@ -180,7 +180,7 @@ def test_refusals_name_the_option(tmp_path, command, monkeypatch):
     assert command("import", bag, "-o", output, "--command-topic", named).err == ""
     assert "exists already" in command("import", bag, "-o", output, code=2).err
     err = command("import", output, "-o", tmp_path / "y.mcap", code=1).err
-    assert "is a session of undulog already" in err
+    assert "is a session of undulog already; use it as it is: undulog analyse x.mcap" in err
     err = command("import", bag, "-o", tmp_path / "y.mcap", "--bus", "can0", code=2).err
     assert "is a bag of ROS; --bus: for logs of another kind" in err
     full = shutil._ntuple_diskusage(10, 10, 0)

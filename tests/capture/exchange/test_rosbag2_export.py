@@ -14,6 +14,9 @@ from support.written_sessions import EPOCH_NS, NAMES, samples, write_session
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError
 from undulog.capture.exchange.rosbag2_export import export_rosbag2
+from undulog.capture.log.edit.edited_log import EDIT_RECORD
+from undulog.capture.log.edit.raw_messages import RawLog
+from undulog.capture.log.health.contract import check_contract
 
 
 def messages_of(path):
@@ -81,6 +84,42 @@ def test_the_bag_is_read_as_the_session(bag, tmp_path):
         expected, got = session.joints("/joint_states"), back.joints("/joint_states")
         for name in NAMES:
             np.testing.assert_array_equal(got.signal(name).values, expected.signal(name).values)
+
+
+def records_of(path):
+    with RawLog(path) as log:
+        own = [each for each in log.metadata if each.name != EDIT_RECORD]
+        return own, log.attachments
+
+
+def test_an_exported_session_comes_back_bit_for_bit(bag, tmp_path, command, report_of):
+    folder, exported = bag
+    session, back = tmp_path / "run.mcap", tmp_path / "back.mcap"
+    report = report_of("import", folder, "-o", back)
+    assert report["messages"] == exported.messages
+    assert (report["verdict"], report["problems"]) == ("good", [])
+    assert "exported by undulog, is copied as it is" in report["notes"][0]
+    assert sorted(messages_of(back)) == sorted(messages_of(session))
+    assert records_of(back) == records_of(session)
+    with Session.open(back) as one, Session.open(session) as other:
+        assert (one.session_id, one.start_ns) == (other.session_id, other.start_ns)
+        for topic in ("/joint_states", "/joint_commands"):
+            got, expected = one.joints(topic), other.joints(topic)
+            np.testing.assert_array_equal(got.t_ns, expected.t_ns)
+            np.testing.assert_array_equal(got.values, expected.values)
+    assert "exists already" in command("import", folder, "-o", back, code=2).err
+    other = tmp_path / "other.mcap"
+    chosen = ("--response-topic", "/encoders")
+    refused = command("import", folder, "-o", other, *chosen, code=1).err
+    assert "copied as it is; leave out --robot, --command-topic and --response-topic" in refused
+    assert not other.exists()
+
+
+def test_an_edit_keeps_the_chunks_of_the_contract(bag, tmp_path, command):
+    back, part = tmp_path / "back.mcap", tmp_path / "part.mcap"
+    command("import", bag[0], "-o", back)
+    command("log", "cut", back, "--start", 1, "-o", part)
+    assert [one for path in (back, part) for one in check_contract(path)] == []
 
 
 def write_mcap(path, channels):
