@@ -413,6 +413,7 @@ def _with_changes(facts: GroupFacts, gait: GaitFit) -> GroupFacts:
         time_constant_s=changes.time_constant_s,
         oscillation_hz=turn / (2 * np.pi * changes.period_s) or None,
         cycle_correlation=max(changes.found.correlation) if changes.varies else None,
+        effective_cycles=changes.found.effective if changes.varies else None,
         amplitude_drift_per_cycle=changes.amplitude_drift or Estimate(),
     )
 
