@@ -130,7 +130,8 @@ def tone_response(
 
 def _rest(series: Series, left: FloatArray, at_hz: FloatArray) -> ComplexArray:
     """Return the complex amplitudes of what the tones leave, at other frequencies."""
-    return 2.0 / series.count * (np.exp(-2j * np.pi * np.outer(at_hz, series.t_s)) @ left)
+    turns = np.exp(-2j * np.pi * np.outer(at_hz, series.t_s))
+    return np.asarray(2.0 / series.count * (turns @ left), dtype=np.complex128)
 
 
 def _level(power: FloatArray) -> float:
