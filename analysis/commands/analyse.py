@@ -37,6 +37,7 @@ def analyse(
     stop: float | None = None,
     topics: JointTopicOptions = CONTRACT,
     reference_topic: str | None = None,
+    excitation_topic: str | None = None,
     robot: str | None = None,
     null: Path | None = None,
     each: bool = False,
@@ -66,6 +67,8 @@ def analyse(
         stop: Its end [s].
         topics: Where commands and responses are.
         reference_topic: JointState topic of a second sensor of the same positions, to be compared.
+        excitation_topic: JointState topic of what the commands follow from outside, where they
+            depend on measured motion, too; frequency responses are by the indirect method then.
         robot: Description of the robot of a log without one, a name or a TOML file.
         null: Model of identical modules (see `undulog sim null`) to hold the one session to.
         each: Analyse several sessions one by one instead of as one experiment.
@@ -73,7 +76,7 @@ def analyse(
     """
     if not files:
         raise UsageError("analyse needs at least one session, e.g. undulog analyse run.mcap")
-    options = chosen(start, stop, topics, reference_topic)
+    options = chosen(start, stop, topics, reference_topic, excitation_topic)
     paths = sessions_of(files)
     if null is not None and len(paths) > 1:
         raise UsageError("--null takes one session; with both directions recorded leave it out")
@@ -212,6 +215,7 @@ def chosen(
     stop: float | None,
     topics: JointTopicOptions = CONTRACT,
     reference_topic: str | None = None,
+    excitation_topic: str | None = None,
 ) -> Options:
     """Check and collect the options of the analysis of each session.
 
@@ -219,6 +223,7 @@ def chosen(
         start: From the session's start [s].
         stop: From the session's start [s].
         reference_topic: Of a second sensor.
+        excitation_topic: Of what the commands follow from outside.
 
     Raises:
         UsageError: If the window is empty.
@@ -229,7 +234,7 @@ def chosen(
         raise UsageError(f"--stop {stop:g} is not after --start {start or 0.0:g}")
     from ..signals.stretch import Options
 
-    return Options(start, stop, *topics.names, reference_topic)
+    return Options(start, stop, *topics.names, reference_topic, excitation_topic)
 
 
 def opened(

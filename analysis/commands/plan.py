@@ -290,24 +290,18 @@ def check_servos(base: BaseGait, runs: tuple[PlannedRun, ...], session: SessionV
         session: Of that robot; without a description nothing is checked.
 
     Raises:
-        UsageError: If a command is faster than its joint, or an error as large as the command
-            saturates its servo (duty Kp (q_ref - q) beyond 1).
+        UsageError: If an error as large as the command saturates its servo (duty Kp (q_ref - q)
+            beyond 1).
     """
     if session.robot is None:
         return
     joints = {joint.name: joint for joint in session.robot.joints}
     tones = runs[0].tones(base.omega)
     size = np.sum([np.abs(tone.amplitude) for tone in tones], axis=0)
-    speed = np.sum([tone.omega * np.abs(tone.amplitude) for tone in tones], axis=0)
     for row, k in enumerate(base.driven):
         joint = joints.get(base.names[k])
         if joint is None:
             continue
-        if speed[row] > joint.max_velocity:
-            raise UsageError(
-                f"{joint.name} would be commanded up to {speed[row]:.3g} rad/s, its limit is "
-                f"{joint.max_velocity:g} rad/s; lower --amplitude"
-            )
         if joint.servo.proportional_gain * size[row] > 1:
             raise UsageError(
                 f"the servo of {joint.name} would saturate: its gain times {size[row]:.3g} rad is "

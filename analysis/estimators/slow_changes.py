@@ -56,6 +56,7 @@ EXCESS = 0.05
 _CORRELATIONS = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
 _CELLS = (0.4, 0.2, 0.15, 0.1, 0.075, 0.04, 0.035)  # between them, of a flat prior
 _WHITE = (0.0, 0.1, 0.25, 0.5, 0.75)  # share of the variance
+_SAME = 0.5  # probability that gains and lags have one correlation and white share
 _TRIALS = {"drifting": 1.0, "settling": 4.0, "ringing": 20.0}
 _LIKELY = 0.05
 _UNLIKE = 2.0  # standard errors of the logarithm of a ratio of variances
@@ -95,6 +96,8 @@ class SlowChanges:
         residuals: Independent errors of equal variance, of which ``level`` would have that times
             ``share``, shape (k, c - p).
         share: See ``residuals``; of gains and of lags.
+        effective: How many independent cycles would show the level as well; the lower of gains and
+            lags.
         explained: What the trend says of each series, shape (k, c).
     """
 
@@ -111,6 +114,7 @@ class SlowChanges:
     excess: float
     residuals: FloatArray
     share: tuple[float, float]
+    effective: float
     explained: FloatArray
 
 
@@ -274,9 +278,9 @@ def _posterior(
     shapes: Shapes, fits: Sequence[_Fits], noises: Sequence[_Noise], series: FloatArray
 ) -> _Posterior:
     """Weigh the grid; gains and lags share the trend, but have each their correlation."""
-    prior = np.log([one.prior for one in noises])[None, :, None]
+    prior = np.array([one.prior for one in noises])[:, None]
     log = np.stack([one.restricted.T for one in fits], axis=1)  # (2, noises, s)
-    weights, best = _weighed(log + prior)
+    weights, best = _weighed(log, prior)
     half = series.shape[0] // 2
     # What joints share shows once their scatter is white.
     white = [
@@ -284,13 +288,16 @@ def _posterior(
         for part, (i, s) in enumerate(best)
     ]
     temper = _independent(np.concatenate(white)) / (2 * half)
-    weights, best = _weighed(temper * log + prior)
+    weights, best = _weighed(temper * log, prior)
     return _Posterior(weights, best, temper)
 
 
-def _weighed(log: FloatArray) -> tuple[FloatArray, list[tuple[int, int]]]:
-    each = np.maximum(np.exp(log - log.max(axis=(1, 2), keepdims=True)), _TINY)
-    weights = each * each.sum(axis=1, keepdims=True)[::-1]
+def _weighed(log: FloatArray, prior: FloatArray) -> tuple[FloatArray, list[tuple[int, int]]]:
+    """Return the weights of gains and lags, which have one correlation with probability _SAME."""
+    likely = np.maximum(np.exp(log - log.max(axis=(1, 2), keepdims=True)), _TINY)
+    other = likely[::-1]
+    apart = np.sum(prior * other, axis=1, keepdims=True) / prior.sum()
+    weights = prior * likely * (_SAME * other + (1 - _SAME) * apart)
     weights /= weights.sum(axis=(1, 2), keepdims=True)
     return weights, [_best(one) for one in weights]
 
@@ -413,6 +420,7 @@ def _inferred(
     level, turned = (
         _mixture(fits, found.weights, each, dof, alike=alike) for each in (firsts, change)
     )
+    own_shares = np.stack([fit.cov[:, 0, 0] for fit in fits])  # of the variance, (noises, s)
     residuals: list[FloatArray] = []
     shares: list[float] = []
     explained: list[FloatArray] = []
@@ -437,6 +445,7 @@ def _inferred(
         excess=excess,
         residuals=np.concatenate(residuals),
         share=(shares[0], shares[1]),
+        effective=1 / float((found.weights * own_shares).sum(axis=(1, 2)).max()),
         explained=np.concatenate(explained),
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 
@@ -14,9 +14,10 @@ from undulog.capture.common.console import Warn
 
 from ..estimators.series import Series
 from ..results.estimate import Estimate, Interval
-from ..results.frequency_response import JointFrequencyResponse
+from ..results.frequency_response import DIRECT, INDIRECT, JointFrequencyResponse
 from .delay_model import DelayModel, fit_delay
 from .excitation import Excitation, Kind, excited_bins, find_excitation
+from .indirect import indirect_response
 from .local_polynomial import local_response, window
 from .periodic import excited_lines, line_power
 from .tones import LineResponse, resampled, tone_response
@@ -40,13 +41,18 @@ _COMPARED = 4096  # samples by which commands are compared
 
 
 def frequency_responses(
-    commands: Mapping[str, Series], responses: Mapping[str, Series], warn: Warn
+    commands: Mapping[str, Series],
+    responses: Mapping[str, Series],
+    warn: Warn,
+    references: Mapping[str, Series] | None = None,
 ) -> tuple[JointFrequencyResponse, ...]:
     """Estimate the response of each joint to its own command.
 
     Args:
         commands: By joint, without gaps.
         responses: By joint; those without a command that moves are left out.
+        references: By joint, what its command follows from outside. Responses are by the indirect
+            method where there is one that moves.
 
     Returns:
         One result a joint, in the order of the commands, of the first :data:`MOST_JOINTS`.
@@ -59,19 +65,27 @@ def frequency_responses(
     sharing = _same_commands({name: commands[name] for name in known})
     results = list[JointFrequencyResponse]()
     for name in known:
-        command, response = _unbroken(commands[name], responses[name])
-        excitation = find_excitation(command)
-        lines = None if excitation is None else estimate(command, response, excitation)
+        external = (references or {}).get(name)
+        if external is not None and not (external.count and np.ptp(external.values) > 0):
+            external = None
+        known_series = [commands[name], responses[name], *([] if external is None else [external])]
+        command, response, *reference = _unbroken(known_series)
+        excitation = find_excitation((reference or [command])[0])
+        lines = None if excitation is None else estimate(command, response, excitation, *reference)
         if excitation is not None and lines is not None and lines.frequency_hz.size:
-            results.append(_result(excitation, sharing[name], lines, command, response))
+            result = _result(excitation, sharing[name], lines, [command, response, *reference])
+            results.append(result)
     return tuple(results)
 
 
-def estimate(command: Series, response: Series, excitation: Excitation) -> LineResponse | None:
+def estimate(
+    command: Series, response: Series, excitation: Excitation, reference: Series | None = None
+) -> LineResponse | None:
     """Estimate the response of one joint.
 
     Args:
-        excitation: Of the command.
+        excitation: Of the command, or of the external reference.
+        reference: What the command follows from outside; the method is the indirect one then.
 
     Returns:
         At the tones, or at up to :data:`LINES` frequencies of the excited band; None where the
@@ -80,21 +94,29 @@ def estimate(command: Series, response: Series, excitation: Excitation) -> LineR
     if response.count <= 2 * excitation.tones_hz.size + 16:
         return None
     if excitation.tones_hz.size:
-        return sound_lines(tone_response(command, response, excitation.tones_hz))
-    step = max(command.period_s, response.period_s)
+        tones = excitation.tones_hz
+        return sound_lines(tone_response(command, response, tones, looped=reference is not None))
+    driving = command if reference is None else reference
+    step = max(command.period_s, response.period_s, driving.period_s)
     t_s = np.arange(command.t_s[0], command.t_s[-1], step)
     u, y = (_spectrum(resampled(one, t_s)) for one in (command, response))
+    r = u if reference is None else _spectrum(resampled(reference, t_s))
     half = window(1, freedom=_FREEDOM)
-    bins = excited_bins(np.abs(u) ** 2)
+    bins = excited_bins(np.abs(r) ** 2)
     bins = bins[(bins > half // 2) & (bins < 2 * _HIGHEST * u.size)]
     if u.size <= 4 * half or not bins.size:
         return None
     wanted = _log_spaced(float(bins[0]), float(bins[-1]), LINES)
     chosen = np.array(sorted({int(bins[np.abs(bins - each).argmin()]) for each in wanted}))
-    found = local_response(y, u[None], chosen, half)
+    if reference is None:
+        found = local_response(y, u[None], chosen, half)
+        value, variance, freedom = found.value[:, 0], found.variance[:, 0], found.freedom
+    else:
+        value, variance, freedom = indirect_response(y, u, r, chosen, half)
     frequency = chosen / (t_s.size * step)
-    freedom = np.full(chosen.size, float(found.freedom))
-    return sound_lines(LineResponse(frequency, found.value[:, 0], found.variance[:, 0], freedom))
+    return sound_lines(
+        LineResponse(frequency, value, variance, np.full(chosen.size, float(freedom)))
+    )
 
 
 def sound_lines(lines: LineResponse) -> LineResponse:
@@ -116,12 +138,12 @@ def _spectrum(values: FloatArray) -> ComplexArray:
     return np.fft.rfft(values - values.mean())
 
 
-def _unbroken(command: Series, response: Series) -> tuple[Series, Series]:
-    """Return the longest stretch that both have without a long gap; short ones are bridged."""
-    start = max(command.t_s[0], response.t_s[0])
-    stop = min(command.t_s[-1], response.t_s[-1])
+def _unbroken(series: Sequence[Series]) -> list[Series]:
+    """Return the longest stretch that all have without a long gap; short ones are bridged."""
+    start = max(one.t_s[0] for one in series)
+    stop = min(one.t_s[-1] for one in series)
     breaks = [(stop, start)] if start > stop else []
-    for one in (command, response):
+    for one in series:
         step = np.diff(one.t_s)
         long = np.flatnonzero(step > _LONG_GAP * (stop - start))
         breaks.extend(zip(one.t_s[long].tolist(), one.t_s[long + 1].tolist(), strict=True))
@@ -129,7 +151,7 @@ def _unbroken(command: Series, response: Series) -> tuple[Series, Series]:
     stops = [min([stop, *(before for before, _ in breaks if before >= one)]) for one in starts]
     k = int(np.argmax(np.subtract(stops, starts)))
     limits = starts[k], stops[k] + 1e-9
-    return command.between(*limits), response.between(*limits)
+    return [one.between(*limits) for one in series]
 
 
 def _same_commands(commands: Mapping[str, Series]) -> dict[str, tuple[str, ...]]:
@@ -156,13 +178,15 @@ def _result(
     excitation: Excitation,
     sharing: tuple[str, ...],
     lines: LineResponse,
-    command: Series,
-    response: Series,
+    series: Sequence[Series],
 ) -> JointFrequencyResponse:
+    """Return the result of one joint from command, response and, if any, external reference."""
+    command, response, *reference = series
     return replace(
         joint_response(response.name, str(excitation.kind), sharing, lines),
-        distortion=_distortion(command, response, excitation),
-        halves_agree=_halves(command, response, excitation),
+        distortion=None if reference else _distortion(command, response, excitation),
+        halves_agree=_halves(series, excitation),
+        method=INDIRECT if reference else DIRECT,
     )
 
 
@@ -261,15 +285,16 @@ def _distortion(command: Series, response: Series, excitation: Excitation) -> fl
     return max(share, 0.0) ** 0.5
 
 
-def _halves(command: Series, response: Series, excitation: Excitation) -> tuple[int, int] | None:
+def _halves(series: Sequence[Series], excitation: Excitation) -> tuple[int, int] | None:
     """Compare the two halves of a record, at the lines that both have."""
     if excitation.kind is Kind.CHIRP:
         return None  # the halves excite different bands
-    middle = (command.t_s[0] + command.t_s[-1]) / 2
-    limits = (command.t_s[0], middle), (middle, command.t_s[-1])
-    first, second = (
-        estimate(command.between(*each), response.between(*each), excitation) for each in limits
-    )
+    start, stop = series[0].t_s[0], series[0].t_s[-1]
+    halves: list[LineResponse | None] = []
+    for limits in (start, (start + stop) / 2), ((start + stop) / 2, stop):
+        command, response, *reference = [one.between(*limits) for one in series]
+        halves.append(estimate(command, response, excitation, *reference))
+    first, second = halves
     if first is None or second is None:
         return None
     if first.frequency_hz.size != second.frequency_hz.size:

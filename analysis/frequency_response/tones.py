@@ -100,24 +100,38 @@ def find_tones(command: Series) -> FloatArray | None:
     return found if left <= 1 - EXPLAINED else None
 
 
-def tone_response(command: Series, response: Series, tones_hz: FloatArray) -> LineResponse:
+def tone_response(
+    command: Series, response: Series, tones_hz: FloatArray, *, looped: bool = False
+) -> LineResponse:
     """Estimate the response at some tones.
 
     Args:
         command: Its samples.
         response: Samples of the same stretch, at times of their own.
         tones_hz: From :func:`find_tones`.
+        looped: Whether the tones are those of an external reference, and the command contains
+            noise that a loop feeds back: the noise is that of y - G u then.
     """
     inputs, outputs = _amplitudes(command, tones_hz), _amplitudes(response, tones_hz)
-    residual = response.values - _fitted(response, tones_hz)
+    value = outputs / inputs
+    used = (response, command) if looped else (response,)
+    left = [one.values - _fitted(one, tones_hz) for one in used]
     length_s = response.t_s[-1] - response.t_s[0]
     noise, freedom = np.empty(tones_hz.size), np.empty(tones_hz.size)
     for k, tone in enumerate(tones_hz):
         bins = _bins_beside(tone, tones_hz, length_s, 0.5 / response.period_s)
-        turns = np.exp(-2j * np.pi * np.outer(bins, response.t_s))
-        noise[k] = _level(np.abs(2.0 / response.count * (turns @ residual)) ** 2)
+        rest = _rest(response, left[0], bins)
+        if looped:
+            rest = rest - value[k] * _rest(command, left[1], bins)
+        noise[k] = _level(np.abs(rest) ** 2)
         freedom[k] = bins.size * np.log(2) ** 2
-    return LineResponse(tones_hz, outputs / inputs, noise / np.abs(inputs) ** 2, freedom)
+    return LineResponse(tones_hz, value, noise / np.abs(inputs) ** 2, freedom)
+
+
+def _rest(series: Series, left: FloatArray, at_hz: FloatArray) -> ComplexArray:
+    """Return the complex amplitudes of what the tones leave, at other frequencies."""
+    turns = np.exp(-2j * np.pi * np.outer(at_hz, series.t_s))
+    return np.asarray(2.0 / series.count * (turns @ left), dtype=np.complex128)
 
 
 def _level(power: FloatArray) -> float:

@@ -253,14 +253,15 @@ def write_plan(
         facts: More for the metadata record of every run.
 
     Raises:
-        UsageError: If a command would leave the robot's joint limits, or a file is there already;
-            nothing is written then.
+        UsageError: If a command would leave the robot's joint limits or is faster than its joint,
+            or a file is there already; nothing is written then.
         LogWriteError: If the folder or a file can't be written.
     """
     length_ns = round((settle_s + measure_s) * 1e9)
     t_ns = np.arange(0, length_ns + 1, 1_000_000_000 // RATE_HZ, dtype=np.int64)
     t_s: FloatArray = t_ns.astype(np.float64) * 1e-9
-    _check_limits(base, runs, like, t_s)
+    ramp_s = min(RAMP_S, settle_s)
+    _check_limits(base, runs, like, t_s, ramp_s)
     files = [folder / f"run{k:03d}-{_file_stem(run.label)}.mcap" for k, run in enumerate(runs)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -273,7 +274,7 @@ def write_plan(
     plan_id, epoch_ns = uuid.uuid4().hex, time.time_ns()
     for k, (file, run) in enumerate(zip(files, runs, strict=True)):
         start_ns = epoch_ns + k * length_ns
-        values = commands(base, run, t_s, min(RAMP_S, settle_s))
+        values = commands(base, run, t_s, ramp_s)
         with (
             part_file(file) as part,
             SessionWriter(
@@ -327,22 +328,33 @@ def commands(base: BaseGait, run: PlannedRun, t_s: FloatArray, ramp_s: float) ->
 
 
 def _check_limits(
-    base: BaseGait, runs: Sequence[PlannedRun], like: SessionView, t_s: FloatArray
+    base: BaseGait, runs: Sequence[PlannedRun], like: SessionView, t_s: FloatArray, ramp_s: float
 ) -> None:
+    """Refuse commands beyond the limits of position and rate of their joints."""
     if like.robot is None:
         return
     joints = {joint.name: joint for joint in like.robot.joints}
+    highest = [joint.max_velocity for joint in like.robot.joints]
+    if like.robot.safety is not None:
+        highest = np.fmin(highest, like.robot.safety.values("max_rate", tuple(joints))).tolist()
+    fastest = dict(zip(joints, highest, strict=True))
+    known = [k for k in base.driven if base.names[k] in joints]
     for run in runs:
-        values = commands(base, run, t_s, 0.0)
-        for k in base.driven:
-            joint = joints.get(base.names[k])
-            if joint is None:
-                continue
-            low, high = float(values[:, k].min()), float(values[:, k].max())
+        values = commands(base, run, t_s, ramp_s)
+        rates = np.abs(np.diff(values, axis=0)).max(axis=0, initial=0.0) * RATE_HZ
+        for k in known:
+            joint = joints[base.names[k]]
+            low, high, rate = float(values[:, k].min()), float(values[:, k].max()), float(rates[k])
             if low < joint.lower or high > joint.upper:
                 raise UsageError(
                     f"{like.path}: {run.label} would command {joint.name} from {low:.3f} to "
                     f"{high:.3f} rad, its limits are {joint.lower:.3f} and {joint.upper:.3f}; "
                     "take a smaller amplitude, or record a session whose offsets are further "
                     "from the limits"
+                )
+            if rate > fastest[joint.name]:
+                raise UsageError(
+                    f"{like.path}: {run.label} would command {joint.name} at up to {rate:.3g} "
+                    f"rad/s, its limit is {fastest[joint.name]:g} rad/s; take a smaller amplitude "
+                    "or a lower frequency"
                 )

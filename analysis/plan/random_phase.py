@@ -23,11 +23,9 @@ import numpy as np
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import UsageError
-from undulog.capture.robot.model import Robot
 
 from ..frequency_response.design import KIND, MOST_LINES, Inputs
-from .designs import RATE_HZ, PlannedRun, Tone, commands, dft
-from .gait_base import BaseGait
+from .designs import RATE_HZ, PlannedRun, Tone, dft
 
 GROUP = 4
 """Consecutive odd lines of which one is left out."""
@@ -169,26 +167,3 @@ def _phases(
         least = int(np.argmin(peak))
         best[j], peaks[j] = phasors[least], peak[least]
     return best, peaks
-
-
-def check_rates(
-    base: BaseGait, runs: tuple[PlannedRun, ...], robot: Robot | None, period_s: float
-) -> None:
-    """Refuse commands that are faster than their joints.
-
-    Raises:
-        UsageError: If one is.
-    """
-    if robot is None:
-        return
-    t_s = np.arange(round(period_s * RATE_HZ) + 1) / RATE_HZ
-    limits = {joint.name: joint.max_velocity for joint in robot.joints}
-    for run in runs:
-        rates = np.abs(np.diff(commands(base, run, t_s, 0.0), axis=0)).max(axis=0) * RATE_HZ
-        for k in base.driven:
-            limit = limits.get(base.names[k], np.inf)
-            if rates[k] > limit:
-                raise UsageError(
-                    f"{run.label} would command {base.names[k]} at up to {rates[k]:.3g} rad/s, its "
-                    f"limit is {limit:g} rad/s; lower --amplitude or the upper end of --band"
-                )

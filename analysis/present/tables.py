@@ -28,7 +28,7 @@ from ..results.estimate import Estimate
 from ..results.experiment import Experiment, MirrorJoint, Reversal, Run
 from ..results.formats import degrees, scaled
 from ..results.free_motion import BodyWave, JointMotion
-from ..results.frequency_response import JointFrequencyResponse
+from ..results.frequency_response import DIRECT, JointFrequencyResponse
 
 Row = TypeVar("Row")
 Digits = int | Callable[[Sequence[Estimate]], int]
@@ -153,9 +153,12 @@ def frequency_table(found: Sequence[JointFrequencyResponse]) -> Table[JointFrequ
     def model(one: JointFrequencyResponse) -> str:
         return "group delay" if one.delay_model is None else "model {}/{}".format(*one.delay_model)
 
+    def excitation(one: JointFrequencyResponse) -> str:
+        return one.excitation if one.method == DIRECT else f"{one.excitation}, {one.method}"
+
     columns: list[Column[JointFrequencyResponse]] = [
         Column("joint", "joint", lambda one: one.joint, kind="word"),
-        Column("command", "command", lambda one: one.excitation, kind="word", spare=2),
+        Column("command", "command", excitation, kind="word", spare=2),
         Column("from Hz", "from [Hz]", lambda one: one.frequency_hz[0], (3, 4)),
         Column("to Hz", "to [Hz]", lambda one: one.frequency_hz[-1], (2, 3)),
         Column("gain there (95 %)", "gain at the lowest [1]", at_lowest, (typical(4), typical(4))),

@@ -44,6 +44,11 @@ MOVING = 1e-3
 """Change of a command's amplitude over the window, and phase [rad] by which a frequency that is
 constant misses it, below which the gait counts as steady."""
 
+LEAST_EFFECTIVE = 4.0
+LEAST_CYCLES = 8
+"""With fewer cycles, or fewer independent ones, variation shows its correlation too poorly for an
+interval of 95 %."""
+
 _SIGNIFICANT = 1e-3
 _CLEAR_EXCESS = 1e-3
 _ROUNDING = 1e-9  # of an amplitude
@@ -95,6 +100,12 @@ class ResponseChanges:
     def trend(self) -> Trend:
         """What of the trend is large enough to count."""
         return self.found.trend if self.largest > DRIFT_PER_CYCLE else Trend.STEADY
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether the variation shows too few independent cycles for its interval to hold."""
+        few = self.found.effective < LEAST_EFFECTIVE or self.cycles < LEAST_CYCLES
+        return self.varies and few
 
     @property
     def varies(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -15,7 +16,16 @@ from ..estimators.spectrum import Noise, omega_variance, residual_noise, residua
 from ..estimators.trends import Trend
 from ..results.answer import Lacking, Note, distinct, percent
 from ..results.estimate import Estimate
-from .changes import MOVING, Pace, ResponseChanges, moving_pace, response_changes, with_changes
+from .changes import (
+    LEAST_CYCLES,
+    LEAST_EFFECTIVE,
+    MOVING,
+    Pace,
+    ResponseChanges,
+    moving_pace,
+    response_changes,
+    with_changes,
+)
 from .groups import (
     RESOLUTION,
     Groups,
@@ -341,6 +351,18 @@ def _warn_changes(
                 "degrees): their intervals contain this"
             )
         )
+    if changes.uncertain:
+        warn(
+            f"gain and lag vary from cycle to cycle: {changes.cycles} cycles show their means only "
+            f"as well as {changes.found.effective:.2g} independent ones would, so the intervals "
+            f"may be too narrow; record at least {_needed(changes)} cycles"
+        )
+
+
+def _needed(changes: ResponseChanges) -> int:
+    """Return the number of cycles of which enough would be independent, in tens."""
+    needed = changes.cycles * 1.5 * LEAST_EFFECTIVE / min(changes.found.effective, LEAST_EFFECTIVE)
+    return -(-max(math.ceil(needed), 2 * LEAST_CYCLES) // 10) * 10
 
 
 def _within(value: Estimate, unit: str, scale: float = 1.0) -> str:

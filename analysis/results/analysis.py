@@ -232,6 +232,8 @@ class GroupFacts:
         oscillation_hz: Frequency by which a transient that rings is off the gait's; None of others.
         cycle_correlation: Of gain or lag from one cycle to the next, the larger; None where cycles
             do not vary by more than noise.
+        effective_cycles: How many independent cycles would show the mean as well, where they vary;
+            below 4 intervals may be too narrow.
         frequency_drift_hz_per_s: Of the commands; empty where their frequency stays.
         amplitude_drift_per_cycle: Of the commands, relative; empty where it stays.
     """
@@ -245,6 +247,7 @@ class GroupFacts:
     time_constant_s: Estimate = field(default_factory=Estimate)
     oscillation_hz: float | None = None
     cycle_correlation: float | None = None
+    effective_cycles: float | None = None
     frequency_drift_hz_per_s: Estimate = field(default_factory=Estimate)
     amplitude_drift_per_cycle: Estimate = field(default_factory=Estimate)
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from .estimate import Estimate, Interval
 
+DIRECT, INDIRECT = "direct", "indirect"
+
 
 @dataclass(frozen=True)
 class JointFrequencyResponse:
@@ -29,6 +31,8 @@ class JointFrequencyResponse:
             more than both intervals; else None.
         distortion: Standard deviation of the nonlinear distortion over the gain, root mean square
             over the lines; None where it can't be separated from noise.
+        method: ``direct``: response over command; ``indirect``: response over external reference,
+            over command over external reference, which noise in a closed loop does not bias.
         halves_agree: Lines whose two halves differ by no more than their combined 95 % interval,
             and lines compared; None where halves can't be compared.
     """
@@ -48,6 +52,7 @@ class JointFrequencyResponse:
     resonance_hz: float | None
     distortion: float | None = None
     halves_agree: tuple[int, int] | None = None
+    method: str = DIRECT
 
 
 @dataclass(frozen=True)

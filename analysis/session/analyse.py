@@ -183,7 +183,13 @@ def measure_session(
     warn = Remarks()
     session = fetched_part(session, options, warn)
     topics = (options.command_topic, options.response_topic)
-    columns = read_columns(session, *topics, warn, reference_topic=options.reference_topic)
+    columns = read_columns(
+        session,
+        *topics,
+        warn,
+        reference_topic=options.reference_topic,
+        excitation_topic=options.excitation_topic,
+    )
     options = dataclasses.replace(
         options,
         command_topic=columns.topics.get("command", options.command_topic),
@@ -217,7 +223,14 @@ def measure_session(
     # Plateaus of stopped joints are no dead bands.
     moving = {name: one for name, one in sound.items() if name not in stopped(faulty)}
     dead = dead_bands(columns, commands, moving, gait, origin_ns) if with_dead_bands else {}
-    swept = frequency_responses(commands, sound, warn) if gait is None else ()
+    swept = (
+        ()
+        if gait is not None
+        else frequency_responses(
+            *(commands, sound, warn),
+            _series(columns.names, columns.excitation, stretch, origin_ns),
+        )
+    )
     del commands
     session.forget()
     energies = joint_energies(session, columns, held, span, warn)
@@ -268,7 +281,7 @@ def measure_session(
         heterogeneity=heterogeneity,
         coupling=coupling_of_one_gait(0 if gait is None else len(gait.all_answered)),
         free_motion=None if columns.command else _free_motion(session.robot, shape.motion, warn),
-        closed_loop=closed_loop(session, options, warn) if swept else None,
+        closed_loop=closed_loop(session, options, swept, warn),
         warnings=warn.warnings(session.warnings),
         provenance=_provenance(session, options),
         artefacts=artefacts,
@@ -413,6 +426,7 @@ def _with_changes(facts: GroupFacts, gait: GaitFit) -> GroupFacts:
         time_constant_s=changes.time_constant_s,
         oscillation_hz=turn / (2 * np.pi * changes.period_s) or None,
         cycle_correlation=max(changes.found.correlation) if changes.varies else None,
+        effective_cycles=changes.found.effective if changes.varies else None,
         amplitude_drift_per_cycle=changes.amplitude_drift or Estimate(),
     )
 

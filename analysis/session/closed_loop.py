@@ -8,14 +8,16 @@ Ljung, Automatica 35, 1999, doi 10.1016/S0005-1098(99)00022-9).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from undulog.capture import SessionView
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError, LogError
 
 from ..oscillators.chain import session_couplings
+from ..results.answer import Note
 from ..results.estimate import leaves_out_zero
+from ..results.frequency_response import DIRECT, INDIRECT, JointFrequencyResponse
 from ..signals.stretch import GAIT_TOPIC, Options
 
 _ADAPTIVE = {
@@ -27,18 +29,45 @@ _ADAPTIVE = {
 """First parts of the names on ``/gait`` that only a controller logs."""
 
 
-def closed_loop(session: SessionView, options: Options, warn: Warn) -> str | None:
+def closed_loop(
+    session: SessionView,
+    options: Options,
+    responses: Sequence[JointFrequencyResponse],
+    warn: Warn,
+) -> str | None:
     """Find what makes the commands depend on measured motion, and warn of its bias.
+
+    Args:
+        responses: The frequency responses; those by the indirect method have no such bias.
 
     Returns:
         A noun phrase, or None where the log shows nothing of the kind.
     """
+    if not responses:
+        if options.excitation_topic is not None:
+            warn(f"{options.excitation_topic}: not used, as there are no frequency responses")
+        return None
     cause = _cause(session, options)
-    if cause is not None:
+    direct = [one.joint for one in responses if one.method == DIRECT]
+    if indirect := [one.joint for one in responses if one.method == INDIRECT]:
+        warn(
+            Note(
+                f"{', '.join(indirect)}: frequency response by the indirect method, response over "
+                f"command, each to {options.excitation_topic}: noise that a loop feeds back does "
+                "not bias it"
+            )
+        )
+    if direct and options.excitation_topic is not None:
+        warn(
+            f"{', '.join(direct)}: no samples that move on {options.excitation_topic}; the "
+            "frequency response is by the direct method"
+        )
+    if cause is not None and direct:
         warn(
             f"the commands depend on measured motion, through {cause}: noise that the loop feeds "
             "back biases a frequency response from command to position towards the inverse of the "
-            "controller; record with commands from a plan instead"
+            "controller; record with commands from a plan instead, or name the topic of what the "
+            "commands follow from outside (--excitation-topic)"
         )
     return cause
 

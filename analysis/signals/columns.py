@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -49,6 +49,7 @@ class Columns:
         reference: Positions by a second sensor [rad].
         powers: Mean powers [W] that were accumulated within each sampling interval, by topic.
         topics: Quantity, as the attributes above are called, to the topic that it was read from.
+        excitation: What the commands follow from outside, of any unit.
     """
 
     names: tuple[str, ...]
@@ -61,6 +62,7 @@ class Columns:
     reference: Mapping[str, Signal]
     powers: Mapping[PowerTopic, Mapping[str, Signal]]
     topics: Mapping[str, str]
+    excitation: Mapping[str, Signal] = field(default_factory=dict[str, Signal])
 
     def of(self, quantity: str) -> Mapping[str, Signal]:
         """Return one of ``QUANTITIES``, signals by joint name."""
@@ -85,6 +87,7 @@ def read_columns(
     warn: Warn,
     *,
     reference_topic: str | None = None,
+    excitation_topic: str | None = None,
 ) -> Columns:
     """Read the joints' signals; warn of those that are missing.
 
@@ -93,6 +96,7 @@ def read_columns(
         response_topic: Topic of the responses, likewise.
         warn: Takes one sentence for each thing missing.
         reference_topic: JointState topic of a second sensor of the positions, or None.
+        excitation_topic: JointState topic of what the commands follow from outside, or None.
 
     Raises:
         MissingChannelError: If neither topic is there, or one that was chosen is not; the message
@@ -110,10 +114,11 @@ def read_columns(
         "voltage": (topics.quantities.get(VOLTAGE_TOPIC, VOLTAGE_TOPIC), "position"),
         **{topic: (topic, "position") for topic in PowerTopic},
     }
-    if reference_topic is not None:
-        wanted["reference"] = (reference_topic, "position")
+    chosen = {"reference": reference_topic, "excitation": excitation_topic}
+    chosen = {key: topic for key, topic in chosen.items() if topic is not None}
+    wanted |= {key: (topic, "position") for key, topic in chosen.items()}
     asked = [(command_topic, response_topic)]
-    asked += [] if reference_topic is None else [(reference_topic,)]
+    asked += [(topic,) for topic in chosen.values()]
     for names in asked:
         if not any(session.joint_channel(name) for name in names):
             damage = f" ({'; '.join(session.warnings)})" if session.warnings else ""
@@ -164,6 +169,7 @@ def read_columns(
         **{key: by_name.get(key, absent) for key in QUANTITIES},
         powers={topic: by_name.get(topic, absent) for topic in PowerTopic},
         topics={key: wanted[key][0] for key in found},
+        excitation=by_name.get("excitation", absent),
     )
 
 
@@ -190,16 +196,16 @@ def by_plane(robot: Robot | None, names: Iterable[str]) -> dict[str, list[str]]:
 def _read(session: SessionView, wanted: Mapping[str, tuple[str, str]]) -> dict[str, JointSignals]:
     """All in one pass if all are there; else one by one, leaving out what is empty."""
     topics: dict[str, list[str]] = {topic: [] for topic, _ in wanted.values()}
-    for topic, field in dict.fromkeys(wanted.values()):
-        topics[topic].append(field)
+    for topic, kind in dict.fromkeys(wanted.values()):
+        topics[topic].append(kind)
     try:
         found = session.joint_columns(topics)
         return {key: found[one] for key, one in wanted.items()}
     except MissingChannelError:
         some: dict[str, JointSignals] = {}
-        for key, (topic, field) in wanted.items():
+        for key, (topic, kind) in wanted.items():
             try:
-                some[key] = session.joints(topic, field)
+                some[key] = session.joints(topic, kind)
             except MissingChannelError:
                 continue
         return some

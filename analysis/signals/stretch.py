@@ -39,6 +39,7 @@ class Options:
         command_topic: Topic of the commands, as :meth:`.SessionView.joint_topics` takes it.
         response_topic: Topic of the responses, likewise.
         reference_topic: JointState topic of a second sensor of the same positions, or None.
+        excitation_topic: JointState topic of what the commands follow from outside, or None.
     """
 
     start_s: float | None = None
@@ -46,6 +47,7 @@ class Options:
     command_topic: str = COMMAND_TOPIC
     response_topic: str = RESPONSE_TOPIC
     reference_topic: str | None = None
+    excitation_topic: str | None = None
 
     def arguments(self) -> list[str]:
         """Return the command-line arguments for these options, without defaults."""
@@ -104,6 +106,7 @@ def without_breaks(
     kept = replace(
         columns,
         **{quantity: parts_of(columns.of(quantity)) for quantity in QUANTITIES},
+        excitation=parts_of(columns.excitation),
         powers={topic: parts_of(signals) for topic, signals in columns.powers.items()},
     )
     return kept, str(found) if found.others else ""

@@ -11,6 +11,7 @@ from undulog.analysis.experiment.kicks.runs import Kind, missing_kicks, sort_kic
 from undulog.analysis.plan.designs import reversal, tones
 from undulog.analysis.plan.gait_base import slowest_mode, transverse_mass
 from undulog.capture import Session, load_robot
+from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Plane
 
 ROBOT = load_robot("snake25")
@@ -18,11 +19,11 @@ YAW = ROBOT.joint_indices(Plane.HORIZONTAL)[:4]
 BASE = 0.3 * np.exp(-1j * np.pi / 3 * np.arange(4) + 0.7j)
 
 
-def write_gait(path, amplitude=BASE, overtone=0.0):
+def write_gait(path, amplitude=BASE, overtone=0.0, robot=ROBOT):
     turn = turns(0.8, 300)
     asked = np.tile(np.linspace(-0.1, 0.1, 25), (300, 1))
     asked[:, YAW] += np.real(amplitude * (turn + overtone * turn**2))
-    return write_joints(path, ROBOT.joint_names, asked, [asked], robot=ROBOT)
+    return write_joints(path, ROBOT.joint_names, asked, [asked], robot=robot)
 
 
 def phasors(path, start_s, seconds=5.0, frequency_hz=0.8):
@@ -211,3 +212,20 @@ def test_sweeps_that_are_refused(like, tmp_path, command):
     command("plan", "multisine", *words[2:], "--tones", "1", code=2)
     assert not (tmp_path / "x").exists()
     assert "Warning: it needs 12 s to settle; 2 s is less" in command(*words, "--settle", "2").out
+
+
+LIMITS = [
+    ("max_velocity = 10.0", "max_velocity = 0.05"),  # of the servo
+    ("[safety]\nmax_rate = 4.0", "[safety]\nmax_rate = 0.05"),  # of driving
+]
+
+
+@pytest.mark.parametrize("plan", ["phase-kicks", "reversal", "lag-sweep", "multisine"])
+@pytest.mark.parametrize("limit", LIMITS)
+def test_commands_faster_than_a_joint_are_refused(plan, limit, tmp_path, command):
+    slow = parse_robot(ROBOT.toml.replace(*limit), "slow.toml", dict(ROBOT.databases))
+    path = write_gait(tmp_path / "a.mcap", robot=slow)
+    error = command("plan", plan, "--like", path, "-o", tmp_path / "x", code=2).err
+    assert f"would command {ROBOT.joint_names[YAW[0]]} at up to" in error
+    assert "its limit is 0.05 rad/s" in error
+    assert not (tmp_path / "x").exists()

@@ -103,7 +103,7 @@ def test_what_is_refused(like, tmp_path, command):
         (("--band", 0.1, 40), "up to 12.5 Hz"),
         (("--band", 0.1, 4, "--period", 1.2345), "not a multiple"),
         (("--band", 0.05, 0.5, "--period", 40, "--amplitude", 0.9), "its limits are"),
-        (("--band", 2, 12, "--amplitude", 0.3), "rad/s, its limit is"),
+        (("--band", 2, 12, "--amplitude", 0.15), "rad/s, its limit is"),
         (("--band", 0.1, 4, "--tones", 4), "leave out --tones"),
         (("--band", 0.1, 4, "--joint", "elbow"), "no commands of elbow"),
         (("--band", 0.1, 4, "--realisations", 0), "at least 1"),

@@ -155,11 +155,17 @@ def test_intervals_hold_in_19_of_20_repetitions(case, cycles):
     found = outcome(planted, cycles, 200, seed=7)
     assert 0.91 <= found.gain <= 0.98, found
     assert 0.91 <= found.lag <= 0.98, found
-    # An unknown correlation costs more than an unknown trend.
-    most = 1.3 if case == "variation" else 1.2
-    assert found.width <= most * oracle(planted, cycles, columns), found
+    assert found.width <= 1.2 * oracle(planted, cycles, columns), found
     if case == "none":
         assert found.trends[Trend.STEADY] >= 190, found
+
+
+@pytest.mark.slow
+def test_variation_of_one_joint():
+    """One joint shows its correlation poorly: the interval holds, but is wider."""
+    found = outcome(CASES["variation"][0], 24, 200, seed=7, joints=1)
+    assert 0.91 <= found.gain <= 0.98, found
+    assert 0.91 <= found.lag <= 0.98, found
 
 
 @pytest.mark.slow
@@ -245,6 +251,23 @@ def test_variation_that_joints_share_counts_once():
         found = slow_changes(series, np.arange(24.0), noise)
         inside.append(np.abs(found.level.value - 1) <= found.level.half)
     assert np.mean(inside) >= 0.88
+
+
+@pytest.mark.parametrize(
+    ("cycles", "correlation", "least", "most"), [(24, 0.95, 5, 8), (6, 0.0, 7, 8), (40, 0.0, 0, 0)]
+)
+def test_too_few_independent_cycles_are_named(cycles, correlation, least, most):
+    rng = np.random.default_rng(4)
+    planted = Planted(sd=0.03, correlation=correlation)
+    warned = 0
+    for _ in range(8):
+        commands, responses, _, duration_s = planted_session(rng, planted, cycles, 2)
+        notes = []
+        gait = fit_gait(commands, responses, duration_s, notes.append)
+        assert 1.0 <= gait.changes.found.effective <= cycles
+        named = "may be too narrow; record at least"
+        warned += any(named in text for text in notes)
+    assert least <= warned <= most
 
 
 def test_exact_signals_and_few_cycles_have_no_trend():

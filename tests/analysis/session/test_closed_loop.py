@@ -5,6 +5,7 @@ import pytest
 
 from support.analysed import analysed
 from support.written_sessions import EPOCH_NS
+from undulog.analysis.signals.stretch import Options
 from undulog.capture import SessionWriter
 
 
@@ -25,11 +26,13 @@ def test_a_controller_in_the_log_is_named(tmp_path, adaptive):
         sent = writer.joint_state("/joint_commands", ["q"], unit="rad")
         measured = writer.joint_state("/joint_states", ["q"], unit="rad")
         gait = writer.joint_state("/gait", names, unit="1")
+        given = writer.joint_state("/reference", ["q"], unit="rad")
         for k in range(t.size):
             stamp = EPOCH_NS + round(t[k] * 1e9)
             sent.write(stamp, [command[k]])
             measured.write(stamp, [position[k]])
             gait.write(stamp, [0.1] * len(names))
+            given.write(stamp, [reference[k]])
     result = analysed(path)
     assert result.frequency_response
     named = [text for text in result.warnings if "commands depend on measured motion" in text]
@@ -42,3 +45,35 @@ def test_a_controller_in_the_log_is_named(tmp_path, adaptive):
     else:
         assert result.closed_loop is None
         assert not named
+
+
+def test_the_external_reference_gives_the_indirect_method(tmp_path, command):
+    rng = np.random.default_rng(3)
+    gain, control, count = 0.8, 0.5, 3000
+    reference, noise = rng.normal(0, 0.2, count), rng.normal(0, 0.05, count)
+    asked, measured = np.zeros(count), np.zeros(count)
+    for k in range(1, count):
+        asked[k] = control * (reference[k] - measured[k - 1])
+        measured[k] = gain * asked[k] + noise[k]
+    path = tmp_path / "loop.mcap"
+    topics = {"/joint_commands": asked, "/joint_states": measured, "/reference": reference}
+    with SessionWriter(path, session_id="loop", epoch_ns=EPOCH_NS) as writer:
+        channels = {name: writer.joint_state(name, ["q"], unit="rad") for name in topics}
+        gait = writer.joint_state("/gait", ["steer.offset"], unit="1")
+        for k in range(count):
+            for name, values in topics.items():
+                channels[name].write(EPOCH_NS + k * 10_000_000, [values[k]])
+            gait.write(EPOCH_NS + k * 10_000_000, [0.1])
+    result = analysed(path, Options(excitation_topic="/reference"))
+    (found,) = result.frequency_response
+    assert found.method == "indirect"
+    low, high = np.array(found.gain_ci95).T
+    assert np.mean((low <= gain) & (gain <= high)) > 0.85
+    assert not [text for text in result.warnings if "biases a frequency response" in text]
+    assert result.closed_loop == "an adaptive controller (steering)"
+    text = command("analyse", path, "--excitation-topic", "/reference").out
+    assert "broadband, indirect" in text
+    assert "frequency response by the indirect method" in " ".join(text.split())
+    assert "--excitation-topic /reference" in result.provenance.command
+    error = command("analyse", path, "--excitation-topic", "/none", code=1).err
+    assert "/none" in error
