@@ -203,7 +203,10 @@ def connection_detail(found: BodyConnection) -> list[str]:
             "the connection A itself is not identified, only what perturbations of these kinds do"
         )
     modes = f"Shape modes with {shares} of the variance of all shapes"
-    lines = [f"{modes}; condition number {number}: {known}.", formats.sentence(found.label)]
+    lines = [
+        f"{modes}; condition number {number}: {known}.",
+        formats.sentence(f"the model is {found.label}"),
+    ]
     bare = sum(one.why is None and one.forward_m.ci95 is None for one in found.predicted)
     if bare:
         lines.append(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from support.viscous_swimmer import Swimmer, perturbed_gaits
+from undulog.analysis import load
 from undulog.analysis.body.chassis import wave_at
 from undulog.analysis.body.connection import MOST_CONDITION, distances, fit_connection
 from undulog.analysis.experiment.body_connection import (
@@ -91,6 +92,13 @@ def test_a_prediction_at_another_speed_has_no_interval_or_is_refused(known):
     found, why = body_connection([*sessions[:5], at(5, 4.0), *sessions[6:]])
     assert list(why) == [5]
     assert "inertia is not in the model" in found.predicted[5].why
+
+
+def test_an_experiment_with_a_model_is_saved_and_loaded(known, both_ways, tmp_path):
+    body, _ = body_connection([GaitSession(f"{k}", one) for k, one in enumerate(known[:9])])
+    assert body.A
+    whole = dataclasses.replace(both_ways, body_connection=body)
+    assert load(whole.save(tmp_path / "experiment.json")) == whole
 
 
 def test_outside_the_range_names_the_mode_and_how_far(known):
