@@ -40,6 +40,10 @@ ORDER = HARMONICS
 _ALONE = 1 - 1e-6
 """Largest share of its own prediction that a gait may have."""
 
+_CLOSED = 0.01
+"""Equations of a shift in phase that are weaker than this share of the strongest are dropped: small
+harmonics of the gait would tie A and B together beyond the order that they are known to."""
+
 _GRID: FloatArray = 2 * np.pi * np.arange(32) / 32
 
 
@@ -289,7 +293,7 @@ def _fitted(
     velocity = np.stack(
         [wave_at(turned(one.velocity, base.phase(one.shape)), _GRID).T for one in cycles]
     )
-    free = null_space(_same_gait(base))
+    free = null_space(_same_gait(base), rcond=_CLOSED)
     power, vectors = np.linalg.eigh(np.einsum("gnq,gnr->qr", rows @ free, rows @ free))
     shown = power > power[-1] / MOST_CONDITION**2
     own, hidden = free @ vectors[:, shown], free @ vectors[:, ~shown]

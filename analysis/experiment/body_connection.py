@@ -22,6 +22,15 @@ from ..results.estimate import Estimate
 MOST_DISTANCE = 0.3
 """A gait whose joints differ from the central one by more than this share is another gait."""
 
+SAME_SPEED = 1.05
+"""Ratio of a gait's frequency to those of the model up to which intervals hold without inertia."""
+
+MOST_SPEED = 2 * SAME_SPEED
+"""The same up to which a value is predicted, but without an interval."""
+
+SPEED_IN_MODEL = 1.5 * SAME_SPEED
+"""Ratio of the frequency of a gait of the model to the median, at most."""
+
 _VELOCITIES = ("forward", "left", "turn")
 _PHASES: FloatArray = 2 * np.pi * np.arange(24) / 24
 
@@ -67,9 +76,16 @@ def body_connection(
         for k, share in zip(used, off.tolist(), strict=True)
         if share > MOST_DISTANCE
     }
-    inside = [k for k in used if k not in far]
+    near = [k for k in used if k not in far]
+    middle = float(np.median([known[k].cycle.omega for k in near]))
+    fast = {
+        k: f"has another speed: its frequency is {factor:.3g} times the median of the sessions"
+        for k in near
+        if not 1 / SPEED_IN_MODEL <= (factor := known[k].cycle.omega / middle) <= SPEED_IN_MODEL
+    }
+    inside = [k for k in near if k not in fast]
     result = _result({k: known[k] for k in used}, inside)
-    return result, why | other | far
+    return result, why | other | far | fast
 
 
 def _result(sessions: dict[int, GaitSession], inside: Sequence[int]) -> BodyConnection:
@@ -119,20 +135,33 @@ def _held_out(
         *(nothing, nothing, nothing),
         *(forward, left, turn),
     )
+    others = [sessions[k].cycle for k in inside if k != own]
+    ratio = _speed_ratio(cycle, others)
     try:
         if own in inside:
-            model = fit_connection([sessions[k].cycle for k in inside if k != own])
+            model = fit_connection(others)
         why = model.outside(cycle.shape)
     except DataError as error:
         why = f"without it: {error}"
+    if why is None and ratio > MOST_SPEED:
+        why = (
+            f"its frequency is outside that of the model's gaits by a factor of {ratio:.3g}, of "
+            f"which at most {MOST_SPEED:g} is allowed: inertia is not in the model"
+        )
     if why is not None:
         return replace(measured, why=why)
     value, half = model.predict(cycle.shape)
     forward, left, turn = (
-        Estimate(one, around(one, width))
+        Estimate(one, around(one, width) if ratio <= SAME_SPEED else None)
         for one, width in zip(value.tolist(), half.tolist(), strict=True)
     )
     return replace(measured, forward_m=forward, left_m=left, turn_rad=turn)
+
+
+def _speed_ratio(cycle: GaitCycle, others: Sequence[GaitCycle]) -> float:
+    """Return by which factor a gait's frequency is outside the others', 1 or less if inside."""
+    omega = [one.omega for one in others]
+    return max(cycle.omega / max(omega), min(omega) / cycle.omega)
 
 
 def connection_answer(found: BodyConnection) -> str:
@@ -174,13 +203,24 @@ def connection_detail(found: BodyConnection) -> list[str]:
             "the connection A itself is not identified, only what perturbations of these kinds do"
         )
     modes = f"Shape modes with {shares} of the variance of all shapes"
-    return [f"{modes}; condition number {number}: {known}.", formats.sentence(found.label)]
+    lines = [
+        f"{modes}; condition number {number}: {known}.",
+        formats.sentence(f"the model is {found.label}"),
+    ]
+    bare = sum(one.why is None and one.forward_m.ci95 is None for one in found.predicted)
+    if bare:
+        lines.append(
+            f"No interval for {bare} of the predictions: the gait's frequency is more than "
+            f"{100 * (SAME_SPEED - 1):.0f} % outside that of the others, and inertia is not in "
+            "the model."
+        )
+    return lines
 
 
 CONNECTION_METHOD = (
     "xi = A r' + B (r - r0) in the axes of the virtual chassis, A and B Fourier series in the "
     "gait's phase, least squares over the mean cycles of all gaits; each session predicted from "
     "its measured joint angles by a model of the others; intervals at 95 % from what the gaits "
-    "leave when left out (Student's t)."
+    "leave when left out (Student's t), none at another speed."
 )
 """The method as one sentence, beginning in lower case."""

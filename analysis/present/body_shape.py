@@ -68,14 +68,13 @@ def travel_table(found: BodyConnection) -> Table[PredictedTravel]:
 
     columns: list[Column[PredictedTravel]] = [
         Column("session", "session", lambda one: formats.filename(one.path), kind="word"),
-        Column("Hz", "frequency [Hz]", lambda one: one.frequency_hz, (3, 4), spare=3),
+        Column("Hz", None, lambda one: one.frequency_hz, (3, 3), spare=3),
         column("forward", "mm", mm(lambda one: one.forward_m)),
         column("measured", "mm", mm(lambda one: one.measured_forward_m)),
         column("left", "mm", mm(lambda one: one.left_m), 2),
         column("measured left", "mm", mm(lambda one: one.measured_left_m), 2),
         column("turn", "°", lambda one: formats.degrees(one.turn_rad)),
         column("measured turn", "°", lambda one: formats.degrees(one.measured_turn_rad)),
-        Column(None, "not predicted because", lambda one: one.why or "", kind="sentence"),
     ]
     return Table(columns, found.predicted)
 

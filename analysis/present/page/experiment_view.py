@@ -23,7 +23,7 @@ from ...results.experiment import Experiment, Reversal
 from ...results.formats import degrees, estimate, relative, short
 from ...results.oscillators import BodyOscillators
 from ..best_linear import best_linear_table
-from ..body_shape import travel_table
+from ..body_shape import refusals, travel_table
 from ..text_experiment import by_sentence, method, reversal_detail
 from .bode import best_linear_bode
 from .matrix import Entries, entries_of, matrix_picture
@@ -139,6 +139,7 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
         "checks": _checks(coupling),
         "travel": None if connection is None else travel_table(connection),
         "travel_detail": [] if connection is None else connection_detail(connection),
+        "travel_refusals": [] if connection is None else list(refusals(connection)),
         "modes": None if body is None else modes_drawing(body),
         "body_facts": [] if body is None else body_facts(body),
         "entrainment": None if body is None else entrainment_entries(body),

@@ -1,12 +1,19 @@
 """The fitted connection against that of a viscous swimmer in closed form, and what is refused."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from support.viscous_swimmer import Swimmer, perturbed_gaits
+from undulog.analysis import load
 from undulog.analysis.body.chassis import wave_at
 from undulog.analysis.body.connection import MOST_CONDITION, distances, fit_connection
-from undulog.analysis.experiment.body_connection import GaitSession, body_connection
+from undulog.analysis.experiment.body_connection import (
+    GaitSession,
+    body_connection,
+    connection_detail,
+)
 from undulog.capture.common.errors import DataError
 
 PHASES = 2 * np.pi * np.arange(24) / 24
@@ -66,6 +73,32 @@ def test_speed_and_phase_of_a_gait_do_not_matter(known):
     one, other = fit_connection(known), fit_connection([known[0], *moved, *known[4:]])
     shape = known[5].shape
     np.testing.assert_allclose(one.predict(shape)[0], other.predict(shape * shift)[0], rtol=1e-6)
+
+
+def test_a_prediction_at_another_speed_has_no_interval_or_is_refused(known):
+    def at(k, frequency):
+        return GaitSession(f"{k}", dataclasses.replace(known[k], omega=2 * np.pi * frequency))
+
+    speeds = {3: 0.52, 5: 1.0, 7: 0.72}
+    sessions = [at(k, speeds.get(k, 0.5)) for k in range(len(known))]
+    found, why = body_connection(sessions)
+    assert why == {5: "has another speed: its frequency is 2 times the median of the sessions"}
+    assert found.gaits == 15
+    bare = [one.path for one in found.predicted if one.why is None and one.forward_m.ci95 is None]
+    assert set(bare) <= {"5", "7"}
+    assert "7" in bare
+    sentence = f"No interval for {len(bare)} of the predictions: the gait's frequency is more"
+    assert any(line.startswith(sentence) for line in connection_detail(found))
+    found, why = body_connection([*sessions[:5], at(5, 4.0), *sessions[6:]])
+    assert list(why) == [5]
+    assert "inertia is not in the model" in found.predicted[5].why
+
+
+def test_an_experiment_with_a_model_is_saved_and_loaded(known, both_ways, tmp_path):
+    body, _ = body_connection([GaitSession(f"{k}", one) for k, one in enumerate(known[:9])])
+    assert body.A
+    whole = dataclasses.replace(both_ways, body_connection=body)
+    assert load(whole.save(tmp_path / "experiment.json")) == whole
 
 
 def test_outside_the_range_names_the_mode_and_how_far(known):
