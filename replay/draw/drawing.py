@@ -19,8 +19,7 @@ from undulog.capture.robot.model import Robot
 
 from ..samples import content as entities
 from ..samples.content import Content, Layer, Named, Start
-from ..samples.quantities import quantities
-from ..samples.survey import GAIT, Survey, survey
+from ..samples.quantities import GAIT, Survey, quantities, survey
 from ..samples.timeline import Clock, Span, Stretch
 from ..samples.tracks import Track, drawn_topics, read_columns
 from . import facts, lines

@@ -28,8 +28,7 @@ from ..draw.plots import Plot
 from ..draw.steps import CYCLES, SEGMENTS
 from ..samples.content import GAIN, LAG, Chart, Color, Quantity
 from ..samples.content import Series as Lines
-from ..samples.quantities import products
-from ..samples.survey import GAIT, refined
+from ..samples.quantities import GAIT, products, refined
 from ..samples.timeline import SESSION_TIME, Clock
 from ..samples.tracks import Track, one_after_another
 from .decode import PATIENCE_NS, Batch

@@ -27,8 +27,7 @@ from ..draw.plots import Plots
 from ..layout import build_blueprint
 from ..samples import content as entities
 from ..samples.content import Content, Start
-from ..samples.quantities import power_limit, quantities
-from ..samples.survey import refined
+from ..samples.quantities import power_limit, quantities, refined
 from ..samples.timeline import Clock
 from ..samples.tracks import Columns, Track, hold, ordered, sampled_together
 from .cycles import CycleBars, CycleMeter
