@@ -14,7 +14,7 @@ from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
-from undulog.capture.following.session import times_made
+from undulog.capture.following.find import times_made
 from undulog.capture.log.health.rules import judge_made_times
 from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot

@@ -21,7 +21,7 @@ from ..common.console import progress, refuse_existing
 from ..common.errors import DataError, ImportFormatError, MissingChannelError, some_names
 from ..common.files import check_stop
 from ..common.process import StopRequest
-from ..following.session import MOST_JOINTS
+from ..following.find import MOST_JOINTS
 from ..log.edit.raw_messages import RawLog
 from ..log.file.bag import check_room, is_bag
 from ..log.mcap.chunk import LAST_NS
