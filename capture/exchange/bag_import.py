@@ -26,8 +26,7 @@ from ..log.edit.raw_messages import RawLog
 from ..log.file.bag import check_room, is_bag
 from ..log.mcap.chunk import LAST_NS
 from ..log.messages.definitions import TRAJECTORY, is_of_contract
-from ..log.read.joint_messages import INTERFACE_UNITS, UNITS, joint_source
-from ..log.read.joint_rows import JointRows
+from ..log.read.joint_messages import INTERFACE_UNITS, UNITS, JointRows, joint_source
 from ..log.read.joint_topics import COMMAND_TOPIC, HOW_TO_CHOOSE, RESPONSE_TOPIC, JointTopics
 from ..log.read.session import Session
 from ..log.write.channels import JointStateChannel
