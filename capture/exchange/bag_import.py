@@ -22,7 +22,7 @@ from ..common.errors import DataError, ImportFormatError, MissingChannelError, s
 from ..common.files import check_stop
 from ..common.process import StopRequest
 from ..following.find import MOST_JOINTS
-from ..log.edit.raw_messages import RawLog
+from ..log.edit.edited_log import RawLog
 from ..log.file.bag import check_room, is_bag
 from ..log.mcap.chunk import LAST_NS
 from ..log.messages.definitions import TRAJECTORY, is_of_contract

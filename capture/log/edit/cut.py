@@ -22,16 +22,18 @@ from ...common.process import StopRequest
 from ..messages.definitions import adds_up, is_latched
 from .edited_log import (
     EDIT_RECORD,
+    FOREVER_NS,
     HEALTH_RECORD,
     NS,
     EditedLog,
     EditReport,
+    RawLog,
+    RawMessage,
     earlier_edit_name,
     edited_log,
     portable,
     refuse_output,
 )
-from .raw_messages import FOREVER_NS, RawLog, RawMessage
 
 
 def cut_log(

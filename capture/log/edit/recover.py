@@ -16,11 +16,11 @@ from .edited_log import (
     HEALTH_RECORD,
     EditedLog,
     EditReport,
+    RawLog,
     edited_log,
     portable,
     refuse_output,
 )
-from .raw_messages import RawLog
 
 RECOVERED_RECORD = "undulog.recovered"
 """Metadata record of the sources of a recovered log."""
