@@ -343,7 +343,7 @@ def _one_by_one(files: Sequence[Path], options: Options, robot: str | None) -> _
     """Return one page on sessions by themselves."""
     from undulog.capture import Session
 
-    from ..present.page.sessions_page import SessionsPage
+    from ..present.page.page import SessionsPage
     from ..session.analyse import measure_session
     from ..session.cycles import cycle_maps
 

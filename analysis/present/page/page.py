@@ -1,4 +1,4 @@
-"""Render the report: one self-contained HTML file.
+"""Render the report, of one session or several: one self-contained HTML file.
 
 No outside reference: style, figures and one script (values under the pointer, zoom) are inside, and
 a content security policy (W3C CSP3) makes the browser refuse anything else. Without the script the
@@ -11,6 +11,7 @@ import base64
 import hashlib
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -41,17 +42,7 @@ from .comparison_view import comparison_view
 from .experiment_view import experiment_view
 from .fleet_view import change_text, fleet_view, spread_text
 from .session_view import session_view
-from .tables import (
-    digits,
-    estimate,
-    grid,
-    known,
-    number,
-    p_value,
-    sentence,
-    softer,
-    typeset,
-)
+from .tables import digits, estimate, grid, known, number, p_value, sentence, softer, typeset
 from .trials import LEVEL_NOTE
 
 LARGEST_BYTES = 3_000_000
@@ -206,3 +197,81 @@ def _commands_to_reproduce(provenance: Provenance) -> str:
     if not command.startswith(numbers):
         return f"{command} -o comparison.html"
     return f"{command}\nundulog report {command.removeprefix(numbers)} -o report.html"
+
+
+@dataclass
+class _Part:
+    analysis: Analysis
+    at: str
+    html: str
+
+
+class SessionsPage:
+    """Collects sessions, one open at a time, and keeps within ``LARGEST_BYTES``.
+
+    Where the page would grow larger, the samples and the cycles of all sessions are left out.
+    """
+
+    def __init__(self) -> None:
+        """Start with no session."""
+        self._parts: dict[Path, _Part] = {}
+        self._left_out = False
+
+    def add(
+        self, path: Path, analysis: Analysis, session: SessionView, cycles: CycleMaps | None
+    ) -> None:
+        """Add a session that is still open."""
+        at = f"s{len(self._parts) + 1}-"
+        drawn = (None, None) if self._left_out else (session, cycles)
+        self._parts[path] = _Part(analysis, at, self._rendered(analysis, at, *drawn))
+        if self._bytes() > LARGEST_BYTES and not self._left_out:
+            self._left_out = True
+            for part in self._parts.values():
+                part.html = self._rendered(part.analysis, part.at)
+
+    def check_size(self) -> None:
+        """Check whether the page is not too large yet, even without samples and cycles.
+
+        Raises:
+            UsageError: If it is.
+        """
+        if self._bytes() > LARGEST_BYTES:
+            raise UsageError(
+                f"{len(self._parts)} sessions make a page of more than {LARGEST_BYTES / 1e6:g} MB: "
+                "put fewer on it, or give each a page of its own with -o FOLDER"
+            )
+
+    def render(self, lines: Sequence[tuple[Path, tuple[str, Line]]]) -> str:
+        """Return the page.
+
+        Args:
+            lines: Path, name and line of every session; one that was not added has a line only.
+
+        Raises:
+            UsageError: If the page would be too large even without samples and cycles.
+        """
+        self.check_size()
+        targets = {path: f"#{part.at}answer" for path, part in self._parts.items()}
+        rows = [
+            (name, line, targets.get(path), first_sentence(line.sentence))
+            for path, (name, line) in lines
+        ]
+        parts = [
+            (part.at, Markup(part.html))  # noqa: S704  rendered above
+            for part in self._parts.values()
+        ]
+        return environment().get_template("sessions.html.j2").render(rows=rows, parts=parts)
+
+    def _bytes(self) -> int:
+        return sum(len(part.html.encode()) for part in self._parts.values())
+
+    def _rendered(
+        self,
+        analysis: Analysis,
+        at: str,
+        session: SessionView | None = None,
+        cycles: CycleMaps | None = None,
+    ) -> str:
+        view = session_view(analysis, session, cycles, at)
+        template = environment().get_template("session_part.html.j2")
+        return template.render(v=view, at=at, top=2, left_out=self._left_out)
