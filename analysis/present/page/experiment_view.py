@@ -22,9 +22,8 @@ from ...results.estimate import Estimate, leaves_out_zero
 from ...results.experiment import Experiment, Reversal
 from ...results.formats import degrees, estimate, relative, short
 from ...results.oscillators import BodyOscillators
-from ..best_linear import best_linear_table
 from ..body_shape import travel_table
-from ..text_experiment import by_sentence, method, reversal_detail
+from ..text_experiment import best_linear_table, by_sentence, method, reversal_detail
 from .bode import best_linear_bode
 from .matrix import Entries, entries_of, matrix_picture
 from .svg import (
