@@ -54,7 +54,7 @@ from ..results.analysis import (
 from ..results.answer import Note, Remarks
 from ..results.artefact import KINDS, Artefact, DeadBand, flags_by_joint
 from ..results.estimate import Estimate, Provenance
-from ..results.free_motion import FreeMotion
+from ..results.frequency_response import FreeMotion
 from ..segments.answer import Facts, compose
 from ..segments.session import (
     compare_joints,
