@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from undulog.analysis.estimators.cycle_sums import weigh
-from undulog.analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate
+from undulog.analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate, weigh
 from undulog.analysis.estimators.series import Series, clean
 from undulog.analysis.session.cycles import LEAST_COVERED
 from undulog.analysis.session.over_time import LoggedGait
