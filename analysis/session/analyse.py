@@ -39,7 +39,7 @@ from ..estimators.spectrum import BINS_PER_SIDE
 from ..estimators.trends import Trend
 from ..free_motion import MotionFit, free_motion
 from ..frequency_response.estimate import frequency_responses
-from ..oscillators.chain import session_couplings
+from ..oscillators.chain import closed_loop, session_couplings
 from ..response.fitting import GaitFit, fit_gait
 from ..response.response import gain_estimate, lag_estimate
 from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED, phase_step, wave_name
@@ -74,7 +74,6 @@ from ..signals.stretch import (
     without_breaks,
 )
 from ..signals.windows import Span, Stretch, whole_cycles
-from .closed_loop import closed_loop
 from .heterogeneity import heterogeneity_indices
 from .over_time import response_over_time
 from .runs import coupling_of_one_gait
