@@ -118,7 +118,7 @@ VERBS: dict[str, tuple[str, str]] = {
     ),
     "compare": ("analysis compare:compare", "What differs between two sessions or groups."),
     "plan compensate": (
-        "analysis compensate:compensate",
+        "analysis predict:compensate",
         "Commands that make the response homogeneous, from kicks.",
     ),
     "plan lag-sweep": (
@@ -126,7 +126,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "Commands that identify the coupling without contact.",
     ),
     "plan multisine": (
-        "analysis multisine:multisine",
+        "analysis plan:multisine",
         "Commands at many frequencies at once: a band, or tones without contact.",
     ),
     "plan phase-kicks": ("analysis plan:phase_kicks", "Commands that identify the coupling."),

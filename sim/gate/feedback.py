@@ -1,4 +1,4 @@
-"""What the bus reports back: feedback checked against its limits, and commands confirmed by it.
+r"""What the bus reports back: feedback checked against its limits, and commands confirmed by it.
 
 Whether a bus is silent, measured against the interval at which its joints report.
 

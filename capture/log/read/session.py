@@ -124,7 +124,6 @@ class Session(SessionView):
 
     def _repr_html_(self) -> str:
         """Return what it is, its topics and warnings, for a notebook."""
-
         return session_html(self)
 
     def close(self) -> None:
