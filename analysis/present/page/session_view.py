@@ -24,8 +24,7 @@ from ...results.formats import degrees, estimate, short
 from ...results.oscillators import ChainCoupling
 from ...session.cycles import CycleMaps
 from ..text import chain_detail
-from .bode import bode
-from .maps import cycle_drawings
+from .bode import bode, cycle_drawings
 from .matrix import Entries, entries_of, matrix_picture
 from .segments import body_motion, segments
 from .svg import COMMAND, Drawing, drawing, inline_svg, key, legend
