@@ -262,7 +262,7 @@ def main() -> None:
     if not sys.stderr.isatty():
         os.environ.setdefault("NO_COLOR", "1")  # Rerun's log is coloured anyway: no-color.org
     try:
-        from undulog.capture.common.lazy import defer
+        from undulog.capture.common.extras import defer
 
         defer()
         code = run(sys.argv[1:])
