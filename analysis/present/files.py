@@ -24,7 +24,7 @@ from ..results.coupling import Coupling, LinearCoupling, LocalCoupling
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, Reversal
 from ..results.shown import PresentedResult
-from .notebook.frames import frames_of as frames
+from .frames import frames_of as frames
 from .notebook.pictures import picture_of as picture
 from .text import render, unidentified
 from .text_experiment import render_comparison, render_experiment, reversal_detail
