@@ -25,7 +25,7 @@ from ..results.estimate import Estimate
 from ..results.experiment import Experiment, Reversal
 from ..results.shown import PresentedResult
 from .frames import frames_of as frames
-from .notebook.pictures import picture_of as picture
+from .pictures import picture_of as picture
 from .text import render, unidentified
 from .text_experiment import render_comparison, render_experiment, reversal_detail
 
