@@ -52,7 +52,7 @@ from ..results.estimate import Estimate, Provenance
 from ..session.analyse import SessionMeasurement, measure_session
 from ..session.runs import SAME_COMMAND, SAME_FREQUENCY
 from ..signals.stretch import Options
-from .reversal.mirror import parts
+from .mirror import parts
 
 DRAWS = 1999
 

@@ -51,7 +51,7 @@ from ...estimators.intervals import (
 )
 from ...results.estimate import Estimate, Interval
 from ...results.experiment import FloorTilt, Headings, MirrorJoint, OrderedPair, Reversal
-from .mirror import MirrorTest, mirror_test
+from ..mirror import MirrorTest, mirror_test
 
 MODULE_RATIO = 1.0
 """Common over contrast below which the pattern is a module's rather than a tilt's."""

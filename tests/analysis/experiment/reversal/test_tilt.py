@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from undulog.analysis.experiment.mirror import Strata, mirror_test
 from undulog.analysis.experiment.reversal import modules
-from undulog.analysis.experiment.reversal.mirror import Strata, mirror_test
 from undulog.capture.common.errors import UsageError
 
 M = 7
