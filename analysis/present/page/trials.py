@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from undulog.capture.common.console import plain
 
-from ...experiment.reversal_test import SIGNIFICANT
+from ...experiment.reversal import SIGNIFICANT
 from ...results import formats
 from ...results.analysis import Index
 from ...results.coupling import LocalCoupling, RowCheck

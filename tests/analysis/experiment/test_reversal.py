@@ -9,7 +9,7 @@ from scipy.stats import PermutationMethod, nct, ttest_ind
 from scipy.stats import t as t_distribution
 
 from undulog.analysis.experiment.mirror import Strata, mirror_test
-from undulog.analysis.experiment.reversal_test import ordered_pairs, reversal_of, variance_shares
+from undulog.analysis.experiment.reversal import ordered_pairs, reversal_of, variance_shares
 from undulog.capture.common.errors import UsageError
 
 
