@@ -20,8 +20,7 @@ from undulog.capture.common.arrays import FloatArray, IntArray
 
 from ..draw import lines, stage
 from ..draw.body import Look, body_title
-from ..draw.drawing import palette_of, start_of
-from ..draw.facts import code, document, listed, log_facts
+from ..draw.drawing import code, document, listed, log_facts, palette_of, start_of
 from ..draw.motion import HeadPath, assemble, frames_of, still_head
 from ..draw.plots import Plots
 from ..layout import build_blueprint
