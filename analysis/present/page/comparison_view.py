@@ -34,8 +34,7 @@ from .svg import (
     legend,
     plot_estimate,
 )
-from .tables import Fact, joint_mark
-from .trials import Trial
+from .tables import Fact, Trial, joint_mark
 
 
 class Panel(NamedTuple):

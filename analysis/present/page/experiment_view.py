@@ -40,8 +40,7 @@ from .svg import (
     legend,
     plot_estimate,
 )
-from .tables import Fact, digits
-from .trials import Trial, experiment_trials
+from .tables import Fact, Trial, digits, experiment_trials
 
 AGREE = 0.1
 """Largest relative difference of Z from torques and Z from the described servos that agree."""

@@ -42,8 +42,18 @@ from .comparison_view import comparison_view
 from .experiment_view import experiment_view
 from .fleet_view import change_text, fleet_view, spread_text
 from .session_view import session_view
-from .tables import digits, estimate, grid, known, number, p_value, sentence, softer, typeset
-from .trials import LEVEL_NOTE
+from .tables import (
+    LEVEL_NOTE,
+    digits,
+    estimate,
+    grid,
+    known,
+    number,
+    p_value,
+    sentence,
+    softer,
+    typeset,
+)
 
 LARGEST_BYTES = 3_000_000
 """A page must open on a phone."""

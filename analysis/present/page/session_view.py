@@ -28,8 +28,7 @@ from .bode import bode, cycle_drawings
 from .matrix import Entries, entries_of, matrix_picture
 from .segments import body_motion, segments
 from .svg import COMMAND, Drawing, drawing, inline_svg, key, legend
-from .tables import element, is_driven, joint_mark, key_figures
-from .trials import session_trials
+from .tables import element, is_driven, joint_mark, key_figures, session_trials
 
 CYCLES = 2.5
 """Gait cycles shown."""
