@@ -38,9 +38,8 @@ from ...results.experiment import Experiment
 from ...session.cycles import CycleMaps
 from .. import tables
 from ..body_shape import shape_lines
-from .comparison_view import comparison_view
+from .comparison_view import change_text, comparison_view, fleet_view, spread_text
 from .experiment_view import experiment_view
-from .fleet_view import change_text, fleet_view, spread_text
 from .session_view import session_view
 from .tables import (
     LEVEL_NOTE,
