@@ -351,7 +351,7 @@ class Drawing:
             What is missing or was assumed by now, a sentence each.
         """
         notes = list(dict.fromkeys([*layer.notes, *self._sources.warnings, *session.warnings]))
-        text = facts.markdown(
+        text = markdown(
             session,
             layer.analysis,
             notes=notes,
@@ -361,7 +361,7 @@ class Drawing:
             has_cycles=self._clock.rhythm is not None,
             awaited=awaited,
         )
-        facts.log_facts(self._rec, text)
+        log_facts(self._rec, text)
         return notes
 
     def _written(self) -> Content:

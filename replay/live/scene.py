@@ -331,7 +331,7 @@ class LiveScene:
         self._rec.send_blueprint(build_blueprint(content))
 
     def _facts(self, content: Content, dropped: int, *, ended: bool) -> str:
-        """Return the session's facts as text, as in :mod:`.replay.draw.facts`."""
+        """Return the session's facts as text, as in :mod:`.replay.draw.drawing`."""
         robot = content.robot
         start = datetime.fromtimestamp(self._clock.start_ns // 1_000_000_000, UTC)
         made = "no robot description"

@@ -162,10 +162,10 @@ def test_the_ratio_of_common_to_contrast():
 
 
 def test_without_a_contrast_nothing_is_infinite():
-    reversal = reversal.reversal_of(NAMES, *runs(np.random.default_rng(3), scatter=0.02))
-    assert (reversal.middle, reversal.tilt.middle) == ("d", None)
-    assert not reversal.tilt.excluded
-    json.dumps(dataclasses.asdict(reversal), allow_nan=False)
+    found = reversal.reversal_of(NAMES, *runs(np.random.default_rng(3), scatter=0.02))
+    assert (found.middle, found.tilt.middle) == ("d", None)
+    assert not found.tilt.excluded
+    json.dumps(dataclasses.asdict(found), allow_nan=False)
 
 
 def test_strata_from_headings():
