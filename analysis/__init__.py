@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from .compare.compare import compare_sessions as compare_sessions
     from .compare.decisions import Margins as Margins
     from .experiment.analyse import analyse_experiment as analyse_experiment
-    from .present.files import load as load
+    from .present.notebook.files import load as load
     from .present.pictures import Picture as Picture
     from .present.text import render as render
     from .results.analysis import Analysis as Analysis
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 def _presentation() -> Any:
-    from .present import files
+    from .present.notebook import files
 
     return files
 
@@ -76,7 +76,7 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "analyse_fleet": "catalog.fleet",
         "analyse_session": "session.analyse",
         "compare_sessions": "compare.compare",
-        "load": "present.files",
+        "load": "present.notebook.files",
         "render": "present.text",
     },
 )

@@ -16,18 +16,18 @@ from undulog.capture.common.console import plain, refuse_existing
 from undulog.capture.common.errors import DataError, MissingExtraError
 from undulog.capture.common.files import check_output, part_file, read_input, write_text
 
-from ..experiment.answer import kick_answer, kick_detail, pair_order, sweep_answer, sweep_detail
-from ..results import analysis, formats, oscillators
-from ..results.analysis import Analysis, interval_key
-from ..results.comparison import Comparison
-from ..results.coupling import Coupling, LinearCoupling, LocalCoupling
-from ..results.estimate import Estimate
-from ..results.experiment import Experiment, Reversal
-from ..results.shown import PresentedResult
-from .frames import frames_of as frames
-from .pictures import picture_of as picture
-from .text import render, unidentified
-from .text_experiment import render_comparison, render_experiment, reversal_detail
+from ...experiment.answer import kick_answer, kick_detail, pair_order, sweep_answer, sweep_detail
+from ...results import analysis, formats, oscillators
+from ...results.analysis import Analysis, interval_key
+from ...results.comparison import Comparison
+from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
+from ...results.estimate import Estimate
+from ...results.experiment import Experiment, Reversal
+from ...results.shown import PresentedResult
+from ..frames import frames_of as frames
+from ..pictures import picture_of as picture
+from ..text import render, unidentified
+from ..text_experiment import render_comparison, render_experiment, reversal_detail
 
 __all__ = ["frames", "headline", "html", "load", "picture", "save", "save_tables", "text"]
 

@@ -1,0 +1,5 @@
+"""Results in a notebook: they print, plot, become pandas frames, and go to files and back.
+
+Every result is a :class:`.analysis.results.shown.PresentedResult`; its methods are here, and are
+imported when they are used.
+"""
