@@ -21,12 +21,12 @@ from undulog.capture.common.csv_text import as_text, csv_writer, number_cells
 from undulog.capture.common.errors import OutputExistsError, UsageError
 from undulog.capture.common.files import part_file
 
-from ..results.analysis import Analysis, BodyPoint, GaitFacts, Index, JointResult
-from ..results.artefact import Artefact, Span
-from ..results.body_connection import PredictedTravel
-from ..results.body_shape import BodyTravel, Serpenoid
-from ..results.comparison import Change, Comparison, Difference, Equivalence, NamedJoint
-from ..results.coupling import (
+from ...results.analysis import Analysis, BodyPoint, GaitFacts, Index, JointResult
+from ...results.artefact import Artefact, Span
+from ...results.body_connection import PredictedTravel
+from ...results.body_shape import BodyTravel, Serpenoid
+from ...results.comparison import Change, Comparison, Difference, Equivalence, NamedJoint
+from ...results.coupling import (
     Coupling,
     HeldOut,
     LinearCoupling,
@@ -35,9 +35,9 @@ from ..results.coupling import (
     RowCheck,
     ToneCoupling,
 )
-from ..results.estimate import Estimate
-from ..results.experiment import Experiment, MirrorJoint, OrderedPair, Reversal, Run
-from ..results.oscillators import ChainCoupling, Link, Mode, Rate
+from ...results.estimate import Estimate
+from ...results.experiment import Experiment, MirrorJoint, OrderedPair, Reversal, Run
+from ...results.oscillators import ChainCoupling, Link, Mode, Rate
 
 _UNITS = ("_rad", "_hz", "_m_s", "_m", "_j", "_s", "_deg")
 
