@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from .compare.decisions import Margins as Margins
     from .experiment.analyse import analyse_experiment as analyse_experiment
     from .present.notebook.files import load as load
-    from .present.pictures import Picture as Picture
+    from .present.notebook.pictures import Picture as Picture
     from .present.text import render as render
     from .results.analysis import Analysis as Analysis
     from .results.analysis import Index as Index
@@ -70,7 +70,7 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "LocalCoupling": "results.coupling",
         "Margins": "compare.decisions",
         "Options": "signals.stretch",
-        "Picture": "present.pictures",
+        "Picture": "present.notebook.pictures",
         "Reversal": "results.experiment",
         "analyse_experiment": "experiment.analyse",
         "analyse_fleet": "catalog.fleet",

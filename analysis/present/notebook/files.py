@@ -24,10 +24,10 @@ from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
 from ...results.estimate import Estimate
 from ...results.experiment import Experiment, Reversal
 from ...results.shown import PresentedResult
-from ..pictures import picture_of as picture
 from ..text import render, unidentified
 from ..text_experiment import render_comparison, render_experiment, reversal_detail
 from .frames import frames_of as frames
+from .pictures import picture_of as picture
 
 __all__ = ["frames", "headline", "html", "load", "picture", "save", "save_tables", "text"]
 

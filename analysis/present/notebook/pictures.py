@@ -16,14 +16,14 @@ from undulog.capture.common.console import plain
 from undulog.capture.common.errors import MissingExtraError, UsageError
 from undulog.capture.common.files import check_output, write_text
 
-from ..results.analysis import Analysis
-from ..results.comparison import Comparison
-from ..results.coupling import Coupling
-from ..results.experiment import Experiment, Reversal
-from ..results.formats import degrees, relative
+from ...results.analysis import Analysis
+from ...results.comparison import Comparison
+from ...results.coupling import Coupling
+from ...results.experiment import Experiment, Reversal
+from ...results.formats import degrees, relative
 
 if TYPE_CHECKING:
-    from .page.svg import Drawing
+    from ..page.svg import Drawing
 
 
 _ROOT = re.compile(r":root\s*\{([^}]*)\}")
@@ -153,7 +153,7 @@ def pictures_of(result: object) -> Pictures:
         case Coupling() if result.matrix is None:
             raise UsageError(f"{result!r}: there is no matrix to draw")
         case Coupling():
-            from .page.matrix import entries_of, matrix_picture
+            from ..page.matrix import entries_of, matrix_picture
 
             return {one.symbol: partial(matrix_picture, one) for one in entries_of(result, ())}
         case _:
@@ -161,14 +161,14 @@ def pictures_of(result: object) -> Pictures:
 
 
 def _of_analysis(result: Analysis) -> Pictures:
-    from .page.segments import body_motion, segments
+    from ..page.segments import body_motion, segments
 
     body = {} if result.body is None else {"body": partial(body_motion, result.body)}
     return {"segments": partial(segments, result.joints), **body}
 
 
 def _of_experiment(result: Experiment) -> Pictures:
-    from .page.experiment_view import mirror_profile, profiles
+    from ..page.experiment_view import mirror_profile, profiles
 
     reversal = result.reversal
     known: Pictures = {}
@@ -182,14 +182,14 @@ def _of_experiment(result: Experiment) -> Pictures:
 
 
 def _of_comparison(result: Comparison) -> Pictures:
-    from .page.comparison_view import differences_of, waveforms_drawing
+    from ..page.comparison_view import differences_of, waveforms_drawing
 
     waves = {"waveforms": partial(waveforms_drawing, result)} if result.waveforms else {}
     return {"differences": partial(differences_of, result), **waves}
 
 
 def _mirror_differences(result: Reversal, prefix: str) -> Drawing:
-    from .page.comparison_view import Panel, differences_drawing
+    from ..page.comparison_view import Panel, differences_drawing
 
     gains = [relative(one.log_gain_difference) for one in result.joints]
     lags = [degrees(one.lag_difference_rad) for one in result.joints]
