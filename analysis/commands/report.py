@@ -220,7 +220,7 @@ class _Figures:
     """Where the figures of pages go, and as what."""
 
     def __init__(self, folder: Path, kind: _Format, *, force: bool) -> None:
-        from ..present.plot_files import check_plots
+        from ..present.notebook.plot_files import check_plots
 
         check_plots(folder, kind, force=force)
         self._folder, self._force = folder, force
@@ -228,7 +228,7 @@ class _Figures:
 
     def save(self, page: str, drawn: Mapping[str, Any], name: str | None = None) -> list[Path]:
         """Write the figures of a page, into a folder of a name in the folder if there is one."""
-        from ..present.plot_files import save_plots
+        from ..present.notebook.plot_files import save_plots
 
         folder = self._folder
         if name is not None:
