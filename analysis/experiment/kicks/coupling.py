@@ -40,7 +40,8 @@ from .local import (
     lti_reading,
     nonlinearity,
 )
-from .runs import MOST_KICK, Kick, KickExperiment, Kind, RunErrors, missing_kicks, sides
+from .runs import MOST_KICK, Kick, KickExperiment, Kind, missing_kicks
+from .scatter import RunErrors, sides
 
 RESOLVED = 0.1
 """Coupling between joints that kicks should be able to show: what the robot's body brings back with

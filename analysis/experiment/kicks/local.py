@@ -43,7 +43,8 @@ from undulog.capture.common.errors import UsageError
 from ...estimators.intervals import CONFIDENCE, Noisy, noise_draws, norm_ratio, welch_satterthwaite
 from ...results.coupling import LTI_LABEL, Lti, rows_of
 from ...results.estimate import Estimate
-from .runs import Kick, Kind, RunErrors, run_errors, sides
+from .runs import Kick, Kind
+from .scatter import RunErrors, run_errors, sides
 
 
 @dataclass(frozen=True)

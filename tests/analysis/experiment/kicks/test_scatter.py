@@ -11,7 +11,8 @@ from support.kick_runs import kicked
 from undulog.analysis.experiment.answer import kick_answer
 from undulog.analysis.experiment.kicks.coupling import kick_coupling
 from undulog.analysis.experiment.kicks.local import local_matrices
-from undulog.analysis.experiment.kicks.runs import Kick, Kind, run_errors, sort_kicks
+from undulog.analysis.experiment.kicks.runs import Kick, Kind, sort_kicks
+from undulog.analysis.experiment.kicks.scatter import run_errors
 
 H, C = kick_tables.chain(5)
 KICKS = kick_tables.plan(5)
