@@ -24,8 +24,6 @@ from urllib.parse import quote
 from undulog.capture.common.errors import MissingExtraError, UndulogError, UsageError
 from undulog.capture.common.process import StopRequest, interruptible
 
-from .samples.timeline import ENSEMBLE_CYCLE, SESSION_TIME
-
 if TYPE_CHECKING:
     from rerun.experimental import View, ViewerClient
 
@@ -301,6 +299,8 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         Args:
             seconds: Place on ``session_time`` [s].
         """
+        from .samples.timeline import SESSION_TIME
+
         self._client.set_time(SESSION_TIME, duration=seconds, play_state="paused")
 
     def seek_phase(self, degrees: int) -> None:
@@ -309,6 +309,8 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         Args:
             degrees: Place on ``ensemble_cycle`` [degrees].
         """
+        from .samples.timeline import ENSEMBLE_CYCLE
+
         self._client.set_time(ENSEMBLE_CYCLE, sequence=degrees, play_state="paused")
 
     @property
