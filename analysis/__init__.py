@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from undulog.capture.common.lazy import attach
+from undulog.capture.common.extras import attach
 
 from .results.shown import present_with
 

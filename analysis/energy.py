@@ -28,7 +28,7 @@ from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
 from .body.steps import GRAVITY, body_steps
-from .estimators.cycle_sums import Weighed, cycle_sums, weigh
+from .estimators.demodulation import Weighed, cycle_sums, weigh
 from .estimators.intervals import around, t_factor
 from .estimators.series import Series, clean
 from .results.analysis import Closure, Each, EnergyResult, JointCycles, Transport

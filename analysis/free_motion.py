@@ -26,7 +26,7 @@ from .estimators.series import Series
 from .estimators.spectrum import ResidualBins, residual_spectrum
 from .response.fitting import GaitFit
 from .results.estimate import Estimate, Interval
-from .results.free_motion import BodyWave, FreeMotion, JointMotion
+from .results.frequency_response import BodyWave, FreeMotion, JointMotion
 from .signals.columns import by_plane
 
 _GRID = 16

@@ -27,7 +27,7 @@ from rerun.experimental import ViewerClient
 
 from undulog.capture import Session
 from undulog.replay import write_recording
-from undulog.replay.headless import client_of
+from undulog.replay.viewer import client_of
 
 BAR_S = 3.0
 REST_S = 5.0

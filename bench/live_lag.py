@@ -32,8 +32,8 @@ from rerun.experimental import ViewerClient
 
 from undulog.capture.log.write.mcap_sink import Description
 from undulog.capture.recorder.live_feed import LiveFeed
-from undulog.replay.headless import client_of
 from undulog.replay.samples.timeline import SESSION_TIME
+from undulog.replay.viewer import client_of
 
 LAG_MS = 150.0
 """The bar."""

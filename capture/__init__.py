@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .common.lazy import attach
+from .common.extras import attach
 
 if TYPE_CHECKING:
     from .log.columns.topics import Channel as Channel

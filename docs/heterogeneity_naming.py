@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 from heterogeneity_tables import LEVEL, WAYS, responses, with_weak_servo
 
-from undulog.analysis.experiment.reversal.mirror import mirror_test
-from undulog.analysis.experiment.reversal.modules import ordered_pairs
+from undulog.analysis.experiment.mirror import mirror_test
+from undulog.analysis.experiment.reversal import ordered_pairs
 from undulog.sim import Wave, load_scenario, parse_scenario
 from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.recording import record

@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 from heterogeneity_tables import responses
 
-from undulog.analysis.experiment.reversal.mirror import mirror_test
-from undulog.analysis.experiment.reversal.modules import SIGNIFICANT, ordered_pairs, tilt_check
+from undulog.analysis.experiment.mirror import mirror_test
+from undulog.analysis.experiment.reversal import SIGNIFICANT, ordered_pairs, tilt_check
 from undulog.sim import load_scenario
 from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.recording import record

@@ -16,13 +16,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from undulog.analysis import analyse_session
-from undulog.analysis.experiment.reversal.mirror import (
-    Strata,
-    family_wise_p,
-    mirror_test,
-    parts,
-)
-from undulog.analysis.experiment.reversal.modules import ordered_pairs
+from undulog.analysis.experiment.mirror import Strata, family_wise_p, mirror_test, parts
+from undulog.analysis.experiment.reversal import ordered_pairs
 from undulog.capture import Session
 from undulog.sim import load_scenario
 from undulog.sim.scenario.scenario import Kernels, Modules

@@ -16,7 +16,7 @@ from pathlib import Path
 from PIL import Image
 
 import undulog
-from undulog.replay.headless import HeadlessViewer
+from undulog.replay.viewer import HeadlessViewer
 
 SECONDS = 12.3
 DEGREES = 90

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from undulog.capture.common.lazy import attach
+from undulog.capture.common.extras import attach
 
 if TYPE_CHECKING:
     from .feed.recording import Recording as Recording

@@ -21,7 +21,7 @@ from rerun.encodings import EntityPathLike
 
 from undulog.capture.robot.model import Plane, Robot
 
-from .draw import body, facts, lines, mean_cycle
+from .draw import body, drawing, lines, mean_cycle
 from .draw import stage as trail
 from .draw.body import body_title
 from .draw.heat_maps import VISIBLE
@@ -75,7 +75,7 @@ class Views:
 
 def build_views(content: Content) -> Views:
     """Return the views of a recording's content."""
-    words: list[rrb.View] = [rrb.TextDocumentView(name="Session", contents=[facts.FACTS])]
+    words: list[rrb.View] = [rrb.TextDocumentView(name="Session", contents=[drawing.FACTS])]
     if content.has_events:
         words.append(rrb.TextLogView(name="Events", contents=[f"{lines.EVENTS}/**"]))
     mode = rrb.StateTimelineView(name="Gait mode", contents=[lines.MODE])

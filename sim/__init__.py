@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from undulog.capture.common.lazy import attach
+from undulog.capture.common.extras import attach
 
 if TYPE_CHECKING:
     from .batch.batch import BatchRun as BatchRun

@@ -118,7 +118,7 @@ VERBS: dict[str, tuple[str, str]] = {
     ),
     "compare": ("analysis compare:compare", "What differs between two sessions or groups."),
     "plan compensate": (
-        "analysis compensate:compensate",
+        "analysis predict:compensate",
         "Commands that make the response homogeneous, from kicks.",
     ),
     "plan lag-sweep": (
@@ -126,7 +126,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "Commands that identify the coupling without contact.",
     ),
     "plan multisine": (
-        "analysis multisine:multisine",
+        "analysis plan:multisine",
         "Commands at many frequencies at once: a band, or tones without contact.",
     ),
     "plan phase-kicks": ("analysis plan:phase_kicks", "Commands that identify the coupling."),
@@ -262,7 +262,7 @@ def main() -> None:
     if not sys.stderr.isatty():
         os.environ.setdefault("NO_COLOR", "1")  # Rerun's log is coloured anyway: no-color.org
     try:
-        from undulog.capture.common.lazy import defer
+        from undulog.capture.common.extras import defer
 
         defer()
         code = run(sys.argv[1:])

@@ -187,7 +187,7 @@ class _Outputs:
         self.first = self.paths[0]
         self._browser = ""
         if pdf is not None:
-            from ..present.page.pdf import find_browser
+            from ..present.page.page import find_browser
 
             self._browser = find_browser(browser)
 
@@ -195,7 +195,7 @@ class _Outputs:
         if self._page is not None:
             write_text(self._page, page)
         if self._pdf is not None:
-            from ..present.page.pdf import write_pdf
+            from ..present.page.page import write_pdf
 
             with progress("print", total=1) as bar:
                 bar.update(0, note=self._pdf.name)
@@ -343,7 +343,7 @@ def _one_by_one(files: Sequence[Path], options: Options, robot: str | None) -> _
     """Return one page on sessions by themselves."""
     from undulog.capture import Session
 
-    from ..present.page.sessions_page import SessionsPage
+    from ..present.page.page import SessionsPage
     from ..session.analyse import measure_session
     from ..session.cycles import cycle_maps
 

@@ -29,8 +29,7 @@ from ..segments.examine import OFFSET_RAD
 from ..session.runs import SAME_COMMAND, GaitRun, command_change, other_frequency
 from ..signals.stretch import Options
 from .decisions import Margins, answer_of, decide, differ, estimates_of, family
-from .motion import Motion, common_motion, motion_estimates
-from .quantities import Quantities
+from .quantities import Motion, Quantities, common_motion, motion_estimates
 from .side import ComparedSession, changes, phases_rad, see, turned
 
 

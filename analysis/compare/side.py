@@ -31,8 +31,7 @@ from ..session.analyse import SessionMeasurement, measure_session
 from ..session.runs import GaitRun, gait_run
 from ..signals.stretch import Options
 from ..signals.windows import Span
-from .motion import Motion, motion_of
-from .quantities import Key, Known, Quantities, from_runs
+from .quantities import Key, Known, Motion, Quantities, from_runs, motion_of
 
 PHASES = 72
 """Phases of a mean cycle, every 5 degrees."""

@@ -46,9 +46,9 @@ from .body_connection import MOST_DISTANCE, GaitSession, body_connection, connec
 from .kicks.coupling import kick_coupling
 from .kicks.local import ROW_TOLERANCE
 from .kicks.runs import MOST_KICK, MOST_PATTERN, SAME, find_kicks
+from .mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
 from .pooling import PooledResponse, experiment_indices, pool_runs, pooled_answer
-from .reversal.mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
-from .reversal.modules import RESAMPLES, SAME_HEADING_RAD, SIGNIFICANT, floor_lean, reversal_of
+from .reversal import RESAMPLES, SAME_HEADING_RAD, SIGNIFICANT, floor_lean, reversal_of
 from .sweep.best_linear import best_linear_responses, multisine_answer
 from .sweep.coupling import NONLINEAR, sweep_coupling
 from .sweep.multisine_runs import MultisineRun, MultisineRuns, find_multisine, multisine_run

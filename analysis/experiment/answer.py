@@ -25,7 +25,7 @@ from ..results.experiment import OrderedPair, Reversal
 from ..segments.answer import NAMED, fault_in_words
 from ..session.runs import Role
 from .pooling import PooledResponse
-from .reversal.modules import SIGNIFICANT
+from .reversal import SIGNIFICANT
 
 
 def kick_answer(coupling: Coupling) -> str:

@@ -40,8 +40,7 @@ from ..response.fitting import GaitFit
 from ..response.response import Response
 from ..results.analysis import Analysis
 from ..results.answer import beyond, distinct
-from ..results.estimate import Estimate, Provenance
-from ..results.null_model import (
+from ..results.comparison import (
     SIGNIFICANT,
     ModelledAnalysis,
     ModuleDeviation,
@@ -49,10 +48,11 @@ from ..results.null_model import (
     SharedEstimate,
     null_answer,
 )
+from ..results.estimate import Estimate, Provenance
 from ..session.analyse import SessionMeasurement, measure_session
 from ..session.runs import SAME_COMMAND, SAME_FREQUENCY
 from ..signals.stretch import Options
-from .reversal.mirror import parts
+from .mirror import parts
 
 DRAWS = 1999
 

@@ -30,7 +30,7 @@ from ..segments.examine import Chain, examine
 from ..segments.profile import Scatter
 from ..session.heterogeneity import spread
 from ..signals.columns import by_plane
-from .reversal.mirror import MIN_RUNS, parts
+from .mirror import MIN_RUNS, parts
 
 _LABELS = {
     "mirror_response": ("1", "T of H1: identical modules, by reversal"),

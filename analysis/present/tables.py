@@ -27,8 +27,7 @@ from ..results.comparison import Comparison, Difference, NamedJoint, Waveform, o
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, MirrorJoint, Reversal, Run
 from ..results.formats import degrees, scaled
-from ..results.free_motion import BodyWave, JointMotion
-from ..results.frequency_response import DIRECT, JointFrequencyResponse
+from ..results.frequency_response import DIRECT, BodyWave, JointFrequencyResponse, JointMotion
 
 Row = TypeVar("Row")
 Digits = int | Callable[[Sequence[Estimate]], int]

@@ -14,9 +14,9 @@ from undulog.capture.common.console import UNLIMITED, plain
 
 from ..results import formats
 from ..results.analysis import Analysis, EnergyResult
+from ..results.comparison import ModelledAnalysis, null_model_text
 from ..results.coupling import Coupling
 from ..results.estimate import Estimate
-from ..results.null_model import ModelledAnalysis, null_model_text
 from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, LoopMode
 from . import tables
 from .body_shape import shape_lines

@@ -21,7 +21,7 @@ from scipy.special import fdtrc
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
-from ..estimators.cycle_sums import amplitudes, cycle_sums, starts_of
+from ..estimators.demodulation import amplitudes, cycle_sums, starts_of
 from ..estimators.harmonic import HarmonicFit, cos_sin
 from ..estimators.intervals import ResponseErrors, around, t_factor
 from ..estimators.series import Series

@@ -17,8 +17,7 @@ from .artefact import Artefact, DeadBand, Span
 from .body_shape import BodyShape
 from .coupling import Coupling
 from .estimate import Estimate, Provenance, WithInterval
-from .free_motion import FreeMotion
-from .frequency_response import JointFrequencyResponse
+from .frequency_response import FreeMotion, JointFrequencyResponse
 from .shown import PresentedResult
 
 if TYPE_CHECKING:

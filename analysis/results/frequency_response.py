@@ -1,4 +1,4 @@
-"""Frequency responses of a session without a gait: chirps, multisines, steps, noise."""
+"""Results of sessions without a gait: frequency responses, and motion without commands."""
 
 from __future__ import annotations
 
@@ -120,3 +120,70 @@ class BestLinearResponses:
     lines: tuple[int, ...]
     joints: tuple[BestLinearJoint, ...]
     cross: tuple[CrossResponse, ...] = ()
+
+
+@dataclass(frozen=True)
+class JointMotion:
+    """Motion of one joint at the common frequency.
+
+    Attributes:
+        plane: None without a robot description.
+        amplitude_rad: Of the fundamental.
+        offset_rad: Mean over whole cycles.
+        lag_rad: Lag behind the moving joint before it in its plane, in (-pi, pi], positive = late;
+            empty for the first, and where noise leaves it open. Whole turns more would look alike.
+    """
+
+    name: str
+    plane: str | None
+    amplitude_rad: Estimate
+    offset_rad: Estimate
+    lag_rad: Estimate
+
+
+@dataclass(frozen=True)
+class BodyWave:
+    """The wave that runs along the joints of one plane.
+
+    Attributes:
+        plane: None without a robot description.
+        joints: Those with a phase, in chain order.
+        wave_number: Lag from joint to joint: the slope of a line through the phases [rad/joint];
+            positive where the wave runs from the first joint to the last.
+        waves: Waves between the first and the last of the joints, without sign.
+        speed: Of the wave [joints/s].
+        speed_m_s: Of the wave [m/s]; empty without a robot description.
+        travelling_index: 1 of a purely travelling, 0 of a standing wave: the smaller over the
+            larger semi-axis of the complex amplitudes (Feeny, J. Sound and Vibration 310, 2008).
+        deviation_rad: Root mean square of the phases about the line, weighted by amplitude.
+    """
+
+    plane: str | None
+    joints: tuple[str, ...]
+    wave_number: Estimate
+    waves: Estimate
+    speed: Estimate
+    speed_m_s: Estimate
+    travelling_index: Estimate
+    deviation_rad: float
+
+    @property
+    def direction(self) -> str:
+        """``first-to-last``, ``last-to-first``, or ``undecided``, by the interval."""
+        ci95 = self.wave_number.ci95
+        if ci95 is None or ci95[0] <= 0 <= ci95[1]:
+            return "undecided"
+        return "first-to-last" if ci95[0] > 0 else "last-to-first"
+
+
+@dataclass(frozen=True)
+class FreeMotion:
+    """A periodic motion whose commands were not logged.
+
+    Attributes:
+        joints: Those that move, in chain order.
+        waves: One for each plane with at least two joints that have a phase.
+    """
+
+    joints: tuple[JointMotion, ...] = ()
+    waves: tuple[BodyWave, ...] = ()

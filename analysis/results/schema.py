@@ -19,8 +19,7 @@ from .analysis import Analysis, interval_key
 from .comparison import Comparison
 from .estimate import Estimate
 from .experiment import Experiment
-from .free_motion import BodyWave, JointMotion
-from .frequency_response import JointFrequencyResponse
+from .frequency_response import BodyWave, JointFrequencyResponse, JointMotion
 
 VERSION = 1
 

@@ -19,8 +19,7 @@ from ..results import formats
 from ..results.analysis import GaitFacts, Index, JointResult
 from ..results.answer import Answer, NotFollowing, Shape, StandOut, Verdict
 from ..results.estimate import Estimate, Interval
-from ..results.free_motion import BodyWave, FreeMotion
-from ..results.frequency_response import JointFrequencyResponse
+from ..results.frequency_response import BodyWave, FreeMotion, JointFrequencyResponse
 from .examine import Findings
 
 NAMED = 4

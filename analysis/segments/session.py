@@ -10,9 +10,8 @@ import numpy as np
 from undulog.capture import SessionView
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.following.fault import Fault
-from undulog.capture.following.find import joints_not_following
+from undulog.capture.following.find import joints_not_following, motions_of, times_made
 from undulog.capture.following.motion import BLOCKS, COHERENT, JointMotion, Samples
-from undulog.capture.following.session import motions_of, times_made
 from undulog.capture.robot.model import Robot
 
 from ..response.fitting import GaitFit

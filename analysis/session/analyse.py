@@ -14,7 +14,7 @@ from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
-from undulog.capture.following.session import times_made
+from undulog.capture.following.find import times_made
 from undulog.capture.log.health.rules import judge_made_times
 from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
@@ -39,7 +39,7 @@ from ..estimators.spectrum import BINS_PER_SIDE
 from ..estimators.trends import Trend
 from ..free_motion import MotionFit, free_motion
 from ..frequency_response.estimate import frequency_responses
-from ..oscillators.chain import session_couplings
+from ..oscillators.chain import closed_loop, session_couplings
 from ..response.fitting import GaitFit, fit_gait
 from ..response.response import gain_estimate, lag_estimate
 from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED, phase_step, wave_name
@@ -54,7 +54,7 @@ from ..results.analysis import (
 from ..results.answer import Note, Remarks
 from ..results.artefact import KINDS, Artefact, DeadBand, flags_by_joint
 from ..results.estimate import Estimate, Provenance
-from ..results.free_motion import FreeMotion
+from ..results.frequency_response import FreeMotion
 from ..segments.answer import Facts, compose
 from ..segments.session import (
     compare_joints,
@@ -74,7 +74,6 @@ from ..signals.stretch import (
     without_breaks,
 )
 from ..signals.windows import Span, Stretch, whole_cycles
-from .closed_loop import closed_loop
 from .heterogeneity import heterogeneity_indices
 from .over_time import response_over_time
 from .runs import coupling_of_one_gait

@@ -16,7 +16,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray, frozen
 
-from ..estimators.cycle_sums import amplitudes, weigh
+from ..estimators.demodulation import amplitudes, weigh
 from .analyse import SessionMeasurement
 
 LEAST_COVERED = 0.9

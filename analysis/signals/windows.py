@@ -24,7 +24,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
-from ..estimators.cycle_sums import starts_of
+from ..estimators.demodulation import starts_of
 from ..estimators.harmonic import cos_sin
 from ..estimators.series import Series
 from ..response.groups import find_groups

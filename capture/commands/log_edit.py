@@ -12,8 +12,8 @@ from ..common.console import emit
 from ..common.process import interruptible
 
 if TYPE_CHECKING:
+    from ..log.edit.cut import RecoverReport
     from ..log.edit.edited_log import EditReport
-    from ..log.edit.recover import RecoverReport
 
 
 def log_recover(
@@ -41,7 +41,7 @@ def log_recover(
         force: Replace an existing output.
         json: Report as one JSON object.
     """
-    from ..log.edit.recover import recover_log, recovered_path
+    from ..log.edit.cut import recover_log, recovered_path
 
     with interruptible() as request:
         report = recover_log(file, output or recovered_path(file), force=force, stop=request)

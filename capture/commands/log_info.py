@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ..common.console import emit, progress
 from ..common.errors import DataError, UsageError
 from ..log.columns.topics import Channel
-from ..log.messages.contract import CONTRACT_VERSION
+from ..log.messages.definitions import CONTRACT_VERSION
 from ..log.messages.frames import FD_TOPIC_PREFIX
 from ..log.read.session import Session
 from .sessions import CONTRACT, JointTopicOptions, Line, each, sessions_of, show, stated_gait

@@ -21,14 +21,13 @@ from ..common.console import progress, refuse_existing
 from ..common.errors import DataError, ImportFormatError, MissingChannelError, some_names
 from ..common.files import check_stop
 from ..common.process import StopRequest
-from ..following.session import MOST_JOINTS
+from ..following.find import MOST_JOINTS
 from ..log.edit.cut import cut_log
-from ..log.edit.raw_messages import RawLog
+from ..log.edit.edited_log import RawLog
 from ..log.file.bag import check_room, is_bag
 from ..log.mcap.chunk import LAST_NS
 from ..log.messages.definitions import TRAJECTORY, is_of_contract
-from ..log.read.joint_messages import INTERFACE_UNITS, UNITS, joint_source
-from ..log.read.joint_rows import JointRows
+from ..log.read.joint_messages import INTERFACE_UNITS, UNITS, JointRows, joint_source
 from ..log.read.joint_topics import COMMAND_TOPIC, HOW_TO_CHOOSE, RESPONSE_TOPIC, JointTopics
 from ..log.read.session import Session
 from ..log.write.channels import JointStateChannel

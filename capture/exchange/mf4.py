@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import NS, BoolArray, IntArray
 from ..common.errors import ImportFormatError, MissingExtraError
-from ..common.lazy import undefer
+from ..common.extras import undefer
 from ..log.messages.frames import (
     DIR_RX,
     DIR_TX,

@@ -20,8 +20,7 @@ from mcap.records import Channel
 from ..common.errors import DataError, some_names
 from ..common.files import part_folder
 from ..common.process import StopRequest
-from ..log.edit.edited_log import EditedLog
-from ..log.edit.raw_messages import RawLog
+from ..log.edit.edited_log import EditedLog, RawLog
 from ..log.messages.definitions import is_latched
 
 MARKER = Path("metadata.yaml")

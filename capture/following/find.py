@@ -1,4 +1,4 @@
-"""Find the joints that do not follow their command, and when.
+"""The joints of a session that do not follow their command, and when.
 
 Each joint's response is fitted in windows of one cycle and compared with the response that all
 joints have in common; its residual against its own usual response is searched for times at which
@@ -8,14 +8,19 @@ one of them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import bdtrc
 
+from ..common.arrays import FloatArray, IntArray
+from ..common.errors import DataError, LogError, MissingChannelError
 from ..common.process import in_threads
+from ..log.read.facts import TIMES_FROM_FPS
+from ..log.read.sample_times import LARGEST, Signal, longest_unbroken
+from ..log.read.session_view import SessionView
 from .excursions import Excursions, departures, find_excursions, find_holds
 from .fault import Fault, Span, Symptom
 from .kinds import fault_of, powerless, usual_effort
@@ -27,6 +32,7 @@ from .motion import (
     UNIT_SLACK,
     JointMotion,
     Judged,
+    Samples,
     common_response,
     complex_median,
     judge,
@@ -346,3 +352,132 @@ def _shared(span: Span, spans: Sequence[Sequence[Span]], own: int) -> bool:
         if k != own
         for start, stop in other
     )
+
+
+COMMANDS = "/joint_commands"
+STATES = "/joint_states"
+MOST_JOINTS = 2000
+"""Of a session whose joints are judged; a file that claims more of them describes no robot."""
+
+QUANTITIES = ("command", "position", "velocity", "effort", "current", "reference")
+
+
+def faults_in_session(session: SessionView) -> tuple[Fault, ...]:
+    """Find the joints of a session that do not follow their command.
+
+    Returns:
+        The faults, in chain order, times from the session's start; none where the session lacks
+        commands or states. Of a session with breaks the longest unbroken stretch is looked at.
+
+    Raises:
+        DataError: If a topic has more than :data:`MOST_JOINTS`.
+    """
+    session = session.with_joints()
+    quantities = {
+        "command": (COMMANDS, "position"),
+        "position": (STATES, "position"),
+        "velocity": (STATES, "velocity"),
+        "effort": (STATES, "effort"),
+        "current": ("/joint_current", "position"),
+    }
+    columns: dict[str, dict[str, Signal]] = {}
+    for quantity, (topic, field) in quantities.items():
+        if topic not in session.channels:
+            continue
+        try:
+            signals = session.joints(topic, field)
+        except (MissingChannelError, DataError, LogError):
+            continue  # the health check itself reports a channel that can't be read
+        if (count := len(signals.names)) > MOST_JOINTS:
+            why = f"{topic} has {count} joints; at most {MOST_JOINTS} are judged"
+            raise DataError(f"{session.path}: {why}")
+        columns[quantity] = {name: signals.signal(name) for name in signals.names}
+    if "command" not in columns or "position" not in columns:
+        return ()
+    both = (*columns["command"].values(), *columns["position"].values())
+    whole = longest_unbroken(one.t_ns for one in both)
+    if whole is None:
+        return ()
+    window_ns = (whole.start_ns, whole.last_ns + 1) if whole.others else None
+    motions = motions_of(session, columns, columns["command"], window_ns)
+    return () if times_made(session) else joints_not_following(motions)
+
+
+def times_made(session: SessionView) -> bool:
+    """Whether times were made from a frame rate, so that no joint can be judged by its lag.
+
+    A frame holds what was sampled at times of its own, commands and positions alike.
+    """
+    return TIMES_FROM_FPS in session.metadata.get("undulog", {})
+
+
+def motions_of(
+    session: SessionView,
+    columns: Mapping[str, Mapping[str, Signal]],
+    names: Iterable[str],
+    window_ns: tuple[int, int] | None = None,
+) -> list[JointMotion]:
+    """Take the recorded signals of joints, times from the session's start.
+
+    Args:
+        columns: ``command``, ``position`` and whichever of ``velocity``, ``effort``, ``current``
+            and ``reference`` there are, to signals by joint name.
+        window_ns: Half-open window [Unix ns]; None for all.
+
+    Returns:
+        The joints that have a command; a joint without positions has an empty record.
+    """
+    robot = session.robot
+    limits = {} if robot is None else {j.name: (j.lower, j.upper) for j in robot.joints}
+    empty = Samples(np.zeros(0), np.zeros(0))
+    motions: list[JointMotion] = []
+    for name in names:
+        times = _Times(session.start_ns, window_ns)
+        found = {key: times.samples(columns.get(key, {}).get(name)) for key in QUANTITIES}
+        if (command := found["command"]) is None:
+            continue
+        motions.append(
+            JointMotion(
+                name=name,
+                command=command,
+                position=found["position"] or empty,
+                velocity=found["velocity"],
+                effort=found["effort"] or found["current"],
+                reference=found["reference"],
+                limits=limits.get(name),
+            )
+        )
+    return motions
+
+
+class _Times:
+    """The sampling times of one joint; those that several quantities share are converted once."""
+
+    def __init__(self, origin_ns: int, window_ns: tuple[int, int] | None) -> None:
+        self._origin_ns = np.int64(origin_ns)
+        self._window_ns = window_ns
+        self._known: dict[int, tuple[slice, IntArray, FloatArray]] = {}
+
+    def samples(self, signal: Signal | None) -> Samples | None:
+        """The samples that are no larger than LARGEST, at increasing times; None without any."""
+        if signal is None:
+            return None
+        part, t_ns, t_s = self._converted(signal.t_ns)
+        values = signal.values[part]
+        possible = np.abs(values) <= LARGEST
+        if not possible.all():
+            t_ns, t_s, values = t_ns[possible], t_s[possible], values[possible]
+        if t_ns.size > 1 and (np.diff(t_ns) <= 0).any():
+            first = np.unique(t_ns, return_index=True)[1]
+            t_s, values = t_s[first], values[first]
+        return Samples(t_s, values) if t_s.size else None
+
+    def _converted(self, t_ns: IntArray) -> tuple[slice, IntArray, FloatArray]:
+        if id(t_ns) not in self._known:
+            part = slice(None)
+            if self._window_ns is not None:
+                part = slice(*np.searchsorted(t_ns, self._window_ns).tolist())
+            inside = t_ns[part]
+            t_s = (inside - self._origin_ns).astype(np.float64) * 1e-9
+            self._known[id(t_ns)] = part, inside, t_s
+        return self._known[id(t_ns)]

@@ -21,13 +21,13 @@ from ..robot.model import ClockDomain
 from .contract import SourceAddress, flag, only
 from .events import Tally
 from .link import LinkedSource
-from .reader_thread import DrainedLink
-from .receive_many import (
+from .reader_thread import (
     SO_RCVBUFFORCE,
     SO_RXQ_OVFL,
     SO_TIMESTAMPNS,
     ArrivalClock,
     Batch,
+    DrainedLink,
     ReceiveMany,
     enlarge_buffer,
 )

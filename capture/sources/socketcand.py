@@ -27,8 +27,7 @@ from ..robot.model import ClockDomain
 from .contract import SourceAddress, number, only, pack_record, records
 from .events import IMPLAUSIBLE_TIME, Tally
 from .link import LinkedSource
-from .reader_thread import ReceiveThread
-from .receive_many import ArrivalClock
+from .reader_thread import ArrivalClock, ReceiveThread
 
 _FRAMES = re.compile(
     r"< frame ([0-9A-Fa-f]{1,8}) (\d{1,10})\.(\d{6}) ((?:[0-9A-Fa-f]{2} ?){0,8}) ?>", re.ASCII

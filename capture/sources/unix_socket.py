@@ -48,8 +48,7 @@ from .contract import (
     only,
 )
 from .events import BusWatch, Tally
-from .reader_thread import ReceiveThread
-from .receive_many import SO_SNDBUFFORCE, ArrivalClock, Batch, enlarge_buffer
+from .reader_thread import SO_SNDBUFFORCE, ArrivalClock, Batch, ReceiveThread, enlarge_buffer
 
 _MOST_PACKETS = 8192  # in one poll, of one sender
 _BACKLOG = 64

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from undulog.analysis.experiment.reversal.modules import variance_shares
+from undulog.analysis.experiment.reversal import variance_shares
 from undulog.capture.common.arrays import FloatArray
 from undulog.replay.sweep.plan import points_of, read_plan
 

@@ -21,10 +21,9 @@ from pathlib import Path
 
 from undulog.analysis.present.notebook.files import load
 from undulog.analysis.results.analysis import Analysis
-from undulog.analysis.results.comparison import Comparison
+from undulog.analysis.results.comparison import Comparison, ModelledAnalysis
 from undulog.analysis.results.experiment import Experiment
 from undulog.analysis.results.formats import p_value_text
-from undulog.analysis.results.null_model import ModelledAnalysis
 from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.session.cycles import cycle_maps
 from undulog.analysis.signals.stretch import Options

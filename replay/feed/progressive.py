@@ -47,7 +47,7 @@ from ..samples.content import (
     Series,
     Tab,
 )
-from ..samples.survey import GAIT, Survey, comes, survey
+from ..samples.quantities import GAIT, Survey, comes, survey
 from ..samples.timeline import STRETCH_NS, Rhythm, Span, Stretch, stretches
 from ..samples.tracks import wanted_fields
 from ..viewer import Viewer

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from undulog.analysis.estimators.cycle_sums import weigh
-from undulog.analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate
+from undulog.analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate, weigh
 from undulog.analysis.estimators.series import Series, clean
 from undulog.analysis.session.cycles import LEAST_COVERED
 from undulog.analysis.session.over_time import LoggedGait
@@ -28,8 +27,7 @@ from ..draw.plots import Plot
 from ..draw.steps import CYCLES, SEGMENTS
 from ..samples.content import GAIN, LAG, Chart, Color, Quantity
 from ..samples.content import Series as Lines
-from ..samples.quantities import products
-from ..samples.survey import GAIT, refined
+from ..samples.quantities import GAIT, products, refined
 from ..samples.timeline import SESSION_TIME, Clock
 from ..samples.tracks import Track, one_after_another
 from .decode import PATIENCE_NS, Batch

@@ -17,7 +17,7 @@ from undulog.capture.log.columns.layouts import LayoutSorter, Matrix, names_of, 
 from undulog.capture.log.columns.topics import decoder_of
 from undulog.capture.log.messages.cdr import Layout, layout_of
 from undulog.capture.log.messages.definitions import MessageType, parse_message_type
-from undulog.capture.log.read.joint_rows import JointRows, merge_rows
+from undulog.capture.log.read.joint_messages import JointRows, merge_rows
 from undulog.capture.log.read.joint_states import OFFSET_TOPICS
 from undulog.capture.log.read.sample_times import clock_shift_ns, moved
 from undulog.capture.log.write.mcap_sink import Description

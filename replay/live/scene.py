@@ -20,15 +20,13 @@ from undulog.capture.common.arrays import FloatArray, IntArray
 
 from ..draw import lines, stage
 from ..draw.body import Look, body_title
-from ..draw.drawing import palette_of, start_of
-from ..draw.facts import code, document, listed, log_facts
+from ..draw.drawing import code, document, listed, log_facts, palette_of, start_of
 from ..draw.motion import HeadPath, assemble, frames_of, still_head
 from ..draw.plots import Plots
 from ..layout import build_blueprint
 from ..samples import content as entities
 from ..samples.content import Content, Start
-from ..samples.quantities import power_limit, quantities
-from ..samples.survey import refined
+from ..samples.quantities import power_limit, quantities, refined
 from ..samples.timeline import Clock
 from ..samples.tracks import Columns, Track, hold, ordered, sampled_together
 from .cycles import CycleBars, CycleMeter
@@ -333,7 +331,7 @@ class LiveScene:
         self._rec.send_blueprint(build_blueprint(content))
 
     def _facts(self, content: Content, dropped: int, *, ended: bool) -> str:
-        """Return the session's facts as text, as in :mod:`.replay.draw.facts`."""
+        """Return the session's facts as text, as in :mod:`.replay.draw.drawing`."""
         robot = content.robot
         start = datetime.fromtimestamp(self._clock.start_ns // 1_000_000_000, UTC)
         made = "no robot description"

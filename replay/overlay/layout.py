@@ -15,8 +15,8 @@ from undulog.analysis.results.formats import short, utc
 from ..draw import lines
 from ..draw import stage as ranges
 from ..draw.body import COMMANDED, LABELS, MARKERS, MEASURED
-from ..draw.facts import FACTS as SESSION
-from ..draw.facts import code, document, escaped, listed
+from ..draw.drawing import FACTS as SESSION
+from ..draw.drawing import code, document, escaped, listed
 from ..draw.stage import TRAIL
 from ..layout import bar_chart, blueprint, build_views, plot, tabs, trail_window
 from ..samples.content import Content, Series

@@ -32,7 +32,7 @@ from undulog.capture.common.process import StopRequest
 from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 
 from ..draw.body import body_title
-from ..draw.facts import log_facts
+from ..draw.drawing import log_facts
 from ..draw.plots import Plot
 from ..feed.recording import Recording, recording_file, recording_id
 from ..samples.content import Color

@@ -1,16 +1,40 @@
-"""What is plotted of a session: as logged, and what follows from it."""
+"""What is plotted of a session, as logged and what follows from it, and the survey of the whole.
+
+It goes through the session once, stretch by stretch, before anything is drawn, and keeps a few
+thousand samples of each line. Where the picture can't wait for the whole, the first stretch and a
+little of some others are enough to choose colours, scales and the joints that stand for the body.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
 
-from undulog.capture.common.arrays import FloatArray
+from undulog.capture import SessionView
+from undulog.capture.common.arrays import FloatArray, IntArray
+from undulog.capture.common.errors import DataError, MissingChannelError
 
 from .content import COMMANDED, ERROR, MEASURED, MECHANICAL, TOTAL
-from .tracks import Columns, Track, hold, interpolate, pairs
+from .timeline import STRETCH_NS, stretches
+from .tracks import (
+    GAP_STEPS,
+    OFFSETS,
+    Columns,
+    Track,
+    decimate,
+    hold,
+    in_turn,
+    interpolate,
+    one_after_another,
+    pairs,
+    read_columns,
+    resampled,
+    typical_step_ns,
+    wanted_fields,
+)
 
 
 def tracking_errors(measured: Sequence[Track], commanded: Sequence[Track]) -> tuple[Track, ...]:
@@ -167,3 +191,185 @@ def quantities(columns: Columns) -> dict[str, tuple[Track, ...]]:
         if topic not in DRAWN and field == "position"
     }
     return {entity: tracks for entity, tracks in found.items() if tracks}
+
+
+GAIT = "/gait"
+
+_KEPT = 4000  # samples of each line that are kept, about
+_CONTEXT_NS = (500_000_000, 60_000_000_000)
+_REACH_STEPS = 1.2 * GAP_STEPS
+
+_LOOKS = 8  # how many stretches after the first one are looked into where not all is read, at most
+_LOOK_NS = 2_000_000_000  # how long is looked into each of them [ns]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Content of a session.
+
+    Attributes:
+        wanted: JointState topic to the fields that come.
+        samples: Entity to its lines, some of their samples each, in chain order.
+        parts: Entity to the names of its lines, those in one part that are drawn at common times.
+        drawing_ns: Sampling times of the first measured joint, thinned [ns], shape (n,).
+        power_limit_w: Power at which a segment's colour is full [W]; None where none is known.
+        context_ns: How far about a stretch its drawing has to look [ns].
+        seen: (topic, field) to the joints of which a sample was read.
+        is_whole: Whether all of the session was read.
+    """
+
+    wanted: Mapping[str, Sequence[str]]
+    samples: Mapping[str, tuple[Track, ...]]
+    parts: Mapping[str, tuple[tuple[str, ...], ...]]
+    drawing_ns: IntArray
+    power_limit_w: float | None
+    context_ns: int
+    seen: Mapping[tuple[str, str], set[str]]
+    is_whole: bool
+
+
+def survey(session: SessionView, rate_hz: float, *, brief: bool = False) -> Survey:
+    """Survey a session.
+
+    Args:
+        rate_hz: How many drawing times a second are kept, at most.
+        brief: Of a long session, read the first stretch and a little of some others only.
+
+    Returns:
+        What it holds, as far as it was read.
+    """
+    session.forget()  # an hour's index, as pages of the file
+    looks = _looks(session) if brief else []
+    share, begin = 1.0, session
+    if looks:
+        read_ns = sum(stop_ns - start_ns for start_ns, stop_ns in looks)
+        share = read_ns / (session.end_ns - session.start_ns)
+        begin = session.view(start_ns=looks[0][0], stop_ns=looks[0][1])
+    wanted = _carried(begin)
+    every = {topic: 1 + round(share * session.channels[topic].count) // _KEPT for topic in wanted}
+    thin = max(every.values(), default=1)
+    takes_turns = any(topic in session.channels for topic in OFFSETS)
+    names = () if session.robot is None else session.robot.joint_names
+    chain = {name: i for i, name in enumerate(names)}
+    lines: dict[str, dict[str, list[Track]]] = {}
+    parts: dict[str, list[tuple[str, ...]]] = {}
+    times: list[IntArray] = []
+    powers: list[FloatArray] = []
+    seen: dict[tuple[str, str], set[str]] = {}
+    step_ns = 0
+    for columns in _columns(session, wanted, looks):
+        for key, tracks in columns.items():
+            seen.setdefault(key, set()).update(track.name for track in tracks)
+            step_ns = max([step_ns, *(typical_step_ns(track.t_ns) for track in tracks)])
+        for entity, tracks in quantities(columns).items():
+            own = lines.setdefault(entity, {})
+            for track in tracks:
+                # Not a view, which keeps all.
+                some = Track(track.name, track.t_ns[::thin].copy(), track.values[::thin].copy())
+                own.setdefault(track.name, []).append(some)
+            parts[entity] = refined(parts.get(entity, []), _parts(tracks, turns=takes_turns))
+            if entity == MEASURED:
+                times.append(tracks[0].t_ns[decimate(tracks[0].t_ns, rate_hz)])
+            if entity == MECHANICAL and session.robot is not None:
+                power = resampled(tracks, names, tracks[0].t_ns[::thin], interpolate)
+                powers.append(segment_power(power))
+    return Survey(
+        wanted={topic: fields for topic, fields in wanted.items() if fields},
+        samples={
+            entity: tuple(
+                one_after_another(own[name])
+                for name in sorted(own, key=lambda name: chain.get(name, 1 << 30))
+            )
+            for entity, own in lines.items()
+        },
+        parts={entity: _in_order(found, chain) for entity, found in parts.items()},
+        drawing_ns=np.concatenate([np.zeros(0, dtype=np.int64), *times]),
+        power_limit_w=power_limit(np.concatenate(powers)) if powers else None,
+        context_ns=int(np.clip(round(_REACH_STEPS * step_ns), *_CONTEXT_NS)),
+        seen=seen,
+        is_whole=not looks,
+    )
+
+
+def _looks(session: SessionView) -> list[tuple[int, int]]:
+    """Half-open windows that stand for a long session [Unix ns]; none for a short one."""
+    first_ns, last_ns = session.start_ns, session.end_ns
+    every_ns = STRETCH_NS * (1 + (last_ns - first_ns) // (STRETCH_NS * _LOOKS))
+    if every_ns == STRETCH_NS:
+        return []
+    later = range(first_ns + every_ns, last_ns - STRETCH_NS // 2, every_ns)
+    return [(first_ns, first_ns + STRETCH_NS), *((at_ns, at_ns + _LOOK_NS) for at_ns in later)]
+
+
+def _columns(
+    session: SessionView, wanted: Mapping[str, Sequence[str]], looks: Sequence[tuple[int, int]]
+) -> Iterator[Columns]:
+    """Columns of windows of a session; without windows, of all of it, stretch by stretch."""
+    if not looks:
+        yield from (stretch.columns for stretch in stretches(session, wanted, 0))
+    for start_ns, stop_ns in looks:
+        columns = read_columns(session, wanted, start_ns=start_ns, stop_ns=stop_ns)
+        session.forget()
+        yield columns
+
+
+def _carried(session: SessionView) -> dict[str, list[str]]:
+    """The fields that come, but for the gait's, which is read as a whole.
+
+    They are searched in the first second, and if one is missing in the whole session, once.
+    """
+    wanted = {topic: one for topic, one in wanted_fields(session).items() if topic != GAIT}
+    stop_ns = session.start_ns + 1_000_000_000
+    try:
+        session.joint_columns(wanted, stop_ns=stop_ns)
+    except (MissingChannelError, DataError):
+        every = wanted.items()
+        return {k: [one for one in fields if comes(session, k, one)] for k, fields in every}
+    return wanted
+
+
+def comes(session: SessionView, topic: str, one: str) -> bool:
+    """Whether a field of a JointState topic ever comes."""
+    try:
+        session.joints(topic, one)
+    except (MissingChannelError, DataError):
+        return False
+    return True
+
+
+def _parts(tracks: Sequence[Track], *, turns: bool) -> list[tuple[str, ...]]:
+    """Lines that were sampled together, or by one message in turn."""
+    found: list[tuple[IntArray, list[str]]] = []
+    for track in tracks:
+        for t_ns, names in found:
+            if np.array_equal(t_ns, track.t_ns) or (turns and in_turn(t_ns, track.t_ns)):
+                names.append(track.name)
+                break
+        else:
+            found.append((track.t_ns, [track.name]))
+    return [tuple(names) for _, names in found]
+
+
+def refined(
+    before: Sequence[tuple[str, ...]], now: Sequence[tuple[str, ...]]
+) -> list[tuple[str, ...]]:
+    """Return parts that are together in both; a line in one of them only follows that one."""
+    label = {name: i for i, part in enumerate(now) for name in part}
+    found: list[tuple[str, ...]] = []
+    for part in before:
+        split: dict[int, list[str]] = {}
+        first = next((label[name] for name in part if name in label), -1)
+        for name in part:
+            split.setdefault(label.get(name, first), []).append(name)
+        found += [tuple(names) for names in split.values()]
+    known = {name for part in before for name in part}
+    found += [new for part in now if (new := tuple(n for n in part if n not in known))]
+    return found
+
+
+def _in_order(
+    parts: Sequence[tuple[str, ...]], chain: Mapping[str, int]
+) -> tuple[tuple[str, ...], ...]:
+    """Parts in the order of their first lines, lines in chain order."""
+    inside = [tuple(sorted(part, key=lambda name: chain.get(name, 1 << 30))) for part in parts]
+    return tuple(sorted(inside, key=lambda part: chain.get(part[0], 1 << 30)))

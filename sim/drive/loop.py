@@ -20,8 +20,7 @@ from undulog.capture.log.messages.frames import FrameArray, empty_frames
 from undulog.capture.robot.model import Direction, Quantity, Robot
 
 from ..gait.contract import CONTROL_RATE_HZ
-from ..gate.confirmation import Confirmation
-from ..gate.feedback import BusCheck
+from ..gate.feedback import BusCheck, Confirmation
 from ..gate.gate import Gate
 from ..gate.limits import Spacing
 from ..gate.outcome import FaultKind, GateFault, GateInput, GateStep, Phase

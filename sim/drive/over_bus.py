@@ -17,7 +17,7 @@ from undulog.capture.sources.contract import SourceAddress, SourceCounts, parse_
 from undulog.capture.sources.events import Tally
 
 from ..gait.contract import CONTROL_RATE_HZ
-from ..gate.confirmation import Confirmation
+from ..gate.feedback import Confirmation
 from ..gate.gate import Gate
 from ..gate.limits import Spacing, gate_limits
 from ..gate.outcome import DriveEnding, FaultKind, GateFault, Outcome, jitter

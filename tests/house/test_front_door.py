@@ -111,7 +111,7 @@ def test_a_full_device_behind_the_output_is_an_error(words):
 
 def test_reading_a_robot_loads_python_can_only_when_it_is_used():
     code = (
-        "import sys; from undulog.capture.common.lazy import defer; defer();"
+        "import sys; from undulog.capture.common.extras import defer; defer();"
         "from undulog.capture import load_robot; load_robot('snake25');"
         "assert 'cantools' in sys.modules; assert 'can' not in sys.modules;"
         "import cantools; assert issubclass(cantools.tester.Tester, object)"

@@ -230,7 +230,7 @@ def test_notebooks_show_names_as_text(folder):
 
 
 def test_markdown_shows_names_as_text():
-    from undulog.replay.draw.facts import code, escaped
+    from undulog.replay.draw.drawing import code, escaped
 
     assert escaped("[x](http://y)<b>*a*\n# h") == r"\[x\]\(http://y\)\<b\>\*a\*\\n\# h"
     assert code("a|b\n") == r"`a\|b\n`"

@@ -258,7 +258,7 @@ def rerun_command():
 @pytest.fixture(scope="module")
 def show(vulkan):
     """Opens a recording at a time in a headless viewer of its own: a viewer keeps its layout."""
-    from undulog.replay.headless import HeadlessViewer
+    from undulog.replay.viewer import HeadlessViewer
 
     with ExitStack() as stack:
 

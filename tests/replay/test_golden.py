@@ -10,7 +10,7 @@ from rerun.chunk import Chunk, RrdReader
 from scipy.spatial.transform import Rotation
 
 from support import golden_pictures
-from undulog.replay.headless import HeadlessViewer
+from undulog.replay.viewer import HeadlessViewer
 
 pytestmark = pytest.mark.slow
 

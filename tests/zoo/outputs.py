@@ -16,7 +16,7 @@ from undulog.capture.common.errors import UndulogError
 from undulog.capture.following.find import joints_not_following
 from undulog.capture.following.motion import JointMotion, Samples
 from undulog.capture.log.health.session_check import check_session
-from undulog.replay.draw.facts import markdown
+from undulog.replay.draw.drawing import markdown
 from undulog.replay.samples.content import Content
 
 from .robot import SECOND_TOPIC

@@ -22,9 +22,8 @@ from ...results.estimate import Estimate, leaves_out_zero
 from ...results.experiment import Experiment, Reversal
 from ...results.formats import degrees, estimate, relative, short
 from ...results.oscillators import BodyOscillators
-from ..best_linear import best_linear_table
 from ..body_shape import refusals, travel_table
-from ..text_experiment import by_sentence, method, reversal_detail
+from ..text_experiment import best_linear_table, by_sentence, method, reversal_detail
 from .bode import best_linear_bode
 from .matrix import Entries, entries_of, matrix_picture
 from .svg import (
@@ -41,8 +40,7 @@ from .svg import (
     legend,
     plot_estimate,
 )
-from .tables import Fact, digits
-from .trials import Trial, experiment_trials
+from .tables import Fact, Trial, digits, experiment_trials
 
 AGREE = 0.1
 """Largest relative difference of Z from torques and Z from the described servos that agree."""

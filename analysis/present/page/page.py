@@ -1,4 +1,4 @@
-"""Render the report: one self-contained HTML file.
+"""Render the report, of one session or several: one self-contained HTML file, or a PDF.
 
 No outside reference: style, figures and one script (values under the pointer, zoom) are inside, and
 a content security policy (W3C CSP3) makes the browser refuse anything else. Without the script the
@@ -9,8 +9,15 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import re
+import shutil
+import signal
+import subprocess
+import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -24,7 +31,8 @@ from markupsafe import Markup
 from undulog.capture import SessionView
 from undulog.capture.commands.sessions import Line, first_sentence
 from undulog.capture.common.console import plain
-from undulog.capture.common.errors import UsageError
+from undulog.capture.common.errors import UndulogError, UsageError
+from undulog.capture.common.files import part_file
 from undulog.capture.common.palette import joint_hex
 
 from ...catalog.fleet import Fleet
@@ -37,11 +45,11 @@ from ...results.experiment import Experiment
 from ...session.cycles import CycleMaps
 from .. import tables
 from ..body_shape import shape_lines
-from .comparison_view import comparison_view
+from .comparison_view import change_text, comparison_view, fleet_view, spread_text
 from .experiment_view import experiment_view
-from .fleet_view import change_text, fleet_view, spread_text
 from .session_view import session_view
 from .tables import (
+    LEVEL_NOTE,
     digits,
     estimate,
     grid,
@@ -52,7 +60,6 @@ from .tables import (
     softer,
     typeset,
 )
-from .trials import LEVEL_NOTE
 
 LARGEST_BYTES = 3_000_000
 """A page must open on a phone."""
@@ -206,3 +213,193 @@ def _commands_to_reproduce(provenance: Provenance) -> str:
     if not command.startswith(numbers):
         return f"{command} -o comparison.html"
     return f"{command}\nundulog report {command.removeprefix(numbers)} -o report.html"
+
+
+@dataclass
+class _Part:
+    analysis: Analysis
+    at: str
+    html: str
+
+
+class SessionsPage:
+    """Collects sessions, one open at a time, and keeps within ``LARGEST_BYTES``.
+
+    Where the page would grow larger, the samples and the cycles of all sessions are left out.
+    """
+
+    def __init__(self) -> None:
+        """Start with no session."""
+        self._parts: dict[Path, _Part] = {}
+        self._left_out = False
+
+    def add(
+        self, path: Path, analysis: Analysis, session: SessionView, cycles: CycleMaps | None
+    ) -> None:
+        """Add a session that is still open."""
+        at = f"s{len(self._parts) + 1}-"
+        drawn = (None, None) if self._left_out else (session, cycles)
+        self._parts[path] = _Part(analysis, at, self._rendered(analysis, at, *drawn))
+        if self._bytes() > LARGEST_BYTES and not self._left_out:
+            self._left_out = True
+            for part in self._parts.values():
+                part.html = self._rendered(part.analysis, part.at)
+
+    def check_size(self) -> None:
+        """Check whether the page is not too large yet, even without samples and cycles.
+
+        Raises:
+            UsageError: If it is.
+        """
+        if self._bytes() > LARGEST_BYTES:
+            raise UsageError(
+                f"{len(self._parts)} sessions make a page of more than {LARGEST_BYTES / 1e6:g} MB: "
+                "put fewer on it, or give each a page of its own with -o FOLDER"
+            )
+
+    def render(self, lines: Sequence[tuple[Path, tuple[str, Line]]]) -> str:
+        """Return the page.
+
+        Args:
+            lines: Path, name and line of every session; one that was not added has a line only.
+
+        Raises:
+            UsageError: If the page would be too large even without samples and cycles.
+        """
+        self.check_size()
+        targets = {path: f"#{part.at}answer" for path, part in self._parts.items()}
+        rows = [
+            (name, line, targets.get(path), first_sentence(line.sentence))
+            for path, (name, line) in lines
+        ]
+        parts = [
+            (part.at, Markup(part.html))  # noqa: S704  rendered above
+            for part in self._parts.values()
+        ]
+        return environment().get_template("sessions.html.j2").render(rows=rows, parts=parts)
+
+    def _bytes(self) -> int:
+        return sum(len(part.html.encode()) for part in self._parts.values())
+
+    def _rendered(
+        self,
+        analysis: Analysis,
+        at: str,
+        session: SessionView | None = None,
+        cycles: CycleMaps | None = None,
+    ) -> str:
+        view = session_view(analysis, session, cycles, at)
+        template = environment().get_template("session_part.html.j2")
+        return template.render(v=view, at=at, top=2, left_out=self._left_out)
+
+
+VARIABLE = "UNDULOG_BROWSER"
+"""Environment variable that names the browser."""
+
+_NAMES = (
+    *("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"),
+    *("microsoft-edge", "microsoft-edge-stable", "msedge"),
+    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
+    "/Applications/Microsoft Edge.app/Contents/MacOS/Microsoft Edge",
+)
+
+LONGEST_S = 120.0
+"""After which a browser is ended [s]."""
+
+_FLAGS = (
+    *("--headless", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"),
+    *("--no-default-browser-check", "--disable-extensions", "--disable-default-apps"),
+    # No network: neither by the page, whose policy forbids it, nor by the browser itself.
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    *("--disable-domain-reliability", "--disable-features=NetworkTimeServiceQuerying,MediaRouter"),
+    *("--host-resolver-rules=MAP * ~NOTFOUND", "--proxy-server=127.0.0.1:9"),  # port 9: discard
+    *("--no-pdf-header-footer", "--generate-pdf-document-outline"),
+)
+
+
+def find_browser(given: str | None = None) -> str:
+    """Return the path of the browser that prints.
+
+    Args:
+        given: Name or path; None for that of ``UNDULOG_BROWSER`` or else the first that is found.
+
+    Raises:
+        UsageError: If there is none.
+    """
+    source = "--browser"
+    if given is None:
+        given, source = os.environ.get(VARIABLE) or None, VARIABLE
+    if given is not None:
+        if (path := shutil.which(given)) is None:
+            raise UsageError(f"{source}: there is no program {given} to print with")
+        return path
+    if path := next(filter(None, map(shutil.which, _NAMES)), None):
+        return path
+    raise UsageError(
+        "a PDF needs a browser to print with, and none of Chromium, Google Chrome and Microsoft "
+        f"Edge is on the path: install one (Debian: apt-get install chromium), name it by "
+        f"--browser or {VARIABLE}, or write the page with -o PAGE.html and print it by hand"
+    )
+
+
+def write_pdf(page: str, output: Path, browser: str, longest_s: float = LONGEST_S) -> None:
+    """Print a page; the browser and its processes have ended when this returns or raises.
+
+    Args:
+        page: HTML without outside references.
+        output: The PDF file, under a partial name until it is complete.
+        browser: From :func:`find_browser`.
+        longest_s: Time limit [s].
+
+    Raises:
+        UndulogError: If the browser fails or exceeds the time limit.
+    """
+    # Beside the output, since a confined browser reads and writes in no temporary folder.
+    with (
+        tempfile.TemporaryDirectory(
+            prefix="undulog-pdf-", dir=output.parent, ignore_cleanup_errors=True
+        ) as scratch,
+        part_file(output) as part,
+    ):
+        folder = Path(scratch).resolve()
+        source, printed = folder / "page.html", folder / "page.pdf"
+        source.write_text(page, encoding="utf-8")
+        flags = [*_FLAGS, f"--user-data-dir={folder / 'profile'}", f"--print-to-pdf={printed}"]
+        if hasattr(os, "geteuid") and os.geteuid() == 0:
+            flags.append("--no-sandbox")  # Chromium has no sandbox for the superuser
+        _run([browser, *flags, source.as_uri()], folder / "messages", longest_s)
+        if not printed.is_file() or printed.read_bytes()[:5] != b"%PDF-":
+            raise _failure(browser, "wrote no PDF", folder / "messages")
+        shutil.copyfile(printed, part)
+
+
+def _run(command: list[str], messages: Path, longest_s: float) -> None:
+    """Run a browser and end the group of its processes, whatever happens."""
+    with messages.open("wb") as log:
+        process = subprocess.Popen(  # noqa: S603  our own arguments
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=log,
+            process_group=0,  # a Ctrl-C ends it through us
+        )
+        try:
+            code = process.wait(longest_s)
+        except subprocess.TimeoutExpired:
+            why = f"did not print the page within {longest_s:g} s and was ended"
+            raise _failure(command[0], why, messages) from None
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+    if code:
+        raise _failure(command[0], f"ended with exit code {code}", messages)
+
+
+def _failure(browser: str, why: str, messages: Path) -> UndulogError:
+    lines = messages.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    said = f"; its last message: {lines[-1]}" if lines else ""
+    return UndulogError(
+        f"{browser} {why}{said}; name another browser by --browser, or write the page with "
+        "-o PAGE.html and print it by hand"
+    )

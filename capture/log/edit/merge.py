@@ -37,13 +37,14 @@ from .edited_log import (
     NS,
     EditedLog,
     EditReport,
+    RawLog,
+    RawMessage,
     earlier_edit_name,
     edited_log,
     free_name,
     portable,
     refuse_output,
 )
-from .raw_messages import RawLog, RawMessage
 
 Record = tuple[str, dict[str, str]]
 

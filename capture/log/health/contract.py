@@ -23,8 +23,7 @@ from ...common.remote import as_path
 from ..columns.topics import Channel
 from ..mcap.chunk import MAGIC, walk_records
 from ..mcap.file import McapFile
-from ..messages.contract import CONTRACT_VERSION
-from ..messages.definitions import is_of_contract
+from ..messages.definitions import CONTRACT_VERSION, is_of_contract
 from ..messages.frames import (
     FD_FRAME_DTYPE,
     FD_FRAME_LAYOUT,

@@ -24,7 +24,7 @@ from mcap.opcode import Opcode
 from ...common.errors import DataError, LogError
 from ...common.process import threads_or_default
 from ...common.remote import as_path
-from ...following.session import faults_in_session
+from ...following.find import faults_in_session
 from ..file.parts import check_chain
 from ..mcap.chunk import MAGIC, PREFIX_SIZE, Block, chunk_at, read_message_heads, walk_records
 from ..mcap.file import McapFile

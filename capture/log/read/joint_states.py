@@ -21,17 +21,19 @@ from ..messages.definitions import FLOAT_ARRAY, JOINT_STATE, TRAJECTORY
 from .joint_messages import (
     INTERFACE_UNITS,
     UNITS,
+    JointRows,
     JointSource,
     Trajectory,
     carried,
     check_source,
     joint_source,
     leaf_paths,
+    merge_rows,
     points_in_force,
+    rows_of,
     sampled,
     trajectories,
 )
-from .joint_rows import JointRows, merge_rows, rows_of
 from .sample_times import JointSignals, Series, StampClock, cut, own_times
 
 SLACK_NS = 5 * NS

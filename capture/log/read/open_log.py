@@ -23,9 +23,9 @@ from ..columns.columns import Messages
 from ..columns.layouts import Group, names_of
 from ..columns.topics import Channel, Topics
 from ..file.log_file import LogFile
-from ..messages.contract import newer_contract
+from ..messages.definitions import newer_contract
 from ..messages.frames import FrameArray, join_batches
-from .joint_rows import JointRows
+from .joint_messages import JointRows
 from .joint_states import JointReader
 from .joint_topics import JointTopicFinder, JointTopics, check_joints
 from .sample_times import JointSignals, StampClock

@@ -15,7 +15,7 @@ from ..columns.blocks import Window
 from ..columns.topics import Channel
 from ..messages.definitions import MessageType
 from ..messages.frames import FD_FRAME_DTYPE, FD_FRAME_LAYOUT, FRAME_DTYPE, FRAME_LAYOUT, FrameArray
-from .joint_rows import JointRows
+from .joint_messages import JointRows
 from .joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC, JointTopics
 from .open_log import OpenLog, SessionFacts
 from .sample_times import JointSignals

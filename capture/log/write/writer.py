@@ -21,8 +21,7 @@ from ...common.errors import DataError, LogWriteError
 from ...robot.kinematics import mesh_type
 from ...robot.model import Robot, Sensor, SensorKind
 from ..messages.cdr import encode, layout_of
-from ..messages.contract import CONTRACT_VERSION
-from ..messages.definitions import message_type, schema_text
+from ..messages.definitions import CONTRACT_VERSION, message_type, schema_text
 from .channels import (
     DiagnosticsChannel,
     FrameChannel,

@@ -8,7 +8,7 @@ import pytest
 
 from undulog.analysis import Choices, compare_sessions
 from undulog.analysis.compare.decisions import Margins, decide, differ, estimates_of, family
-from undulog.analysis.compare.motion import common_motion, motion_estimates, motion_of
+from undulog.analysis.compare.quantities import common_motion, motion_estimates, motion_of
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.free_motion import fit_motion
 from undulog.analysis.response.fitting import fit_gait

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from undulog.analysis.estimators.cycle_sums import cycle_sums, starts_of
+from undulog.analysis.estimators.demodulation import cycle_sums, starts_of
 from undulog.analysis.estimators.harmonic import cos_sin
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from undulog.analysis.estimators.cycle_sums import amplitudes, starts_of
+from undulog.analysis.estimators.demodulation import amplitudes, starts_of
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.session.cycles import cycle_maps

@@ -10,7 +10,7 @@ from hostile_logs import gait
 
 from undulog.analysis import Options, analyse_session
 from undulog.capture import Session
-from undulog.capture.following.session import faults_in_session
+from undulog.capture.following.find import faults_in_session
 from undulog.capture.log.read.sample_times import BREAK_S, longest_unbroken
 
 NS = 1_000_000_000

@@ -16,7 +16,7 @@ from support.can_messages import can_message
 from undulog.capture.common.errors import SourceError
 from undulog.capture.log.messages.frames import DIR_RX, DIR_TX, FD_BRS, FD_ESI
 from undulog.capture.robot.model import ClockDomain
-from undulog.capture.sources import receive_many
+from undulog.capture.sources import reader_thread
 from undulog.capture.sources.contract import open_source, parse_address
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.socketcan import SocketcanLink, frames_of
@@ -29,7 +29,7 @@ def packed(frame):
 @pytest.fixture
 def pair(sockets):
     """A bound datagram socket that stamps and counts drops, and one connected to it."""
-    for option in (receive_many.SO_TIMESTAMPNS, receive_many.SO_RXQ_OVFL):
+    for option in (reader_thread.SO_TIMESTAMPNS, reader_thread.SO_RXQ_OVFL):
         sockets[0].setsockopt(socket.SOL_SOCKET, option, 1)
     return sockets
 
@@ -112,7 +112,7 @@ def test_can_fd_frames_and_what_is_no_frame(pair, traffic, fd_traffic, same):
 
 def test_frames_of_this_computer_are_marked(traffic):
     raw = np.frombuffer(b"".join(packed(f) for f in traffic(2)), dtype=np.uint8).reshape(2, 16)
-    batch = receive_many.Batch(raw, [16, 16], [0, socket.MSG_DONTROUTE], [5, 6], None)
+    batch = reader_thread.Batch(raw, [16, 16], [0, socket.MSG_DONTROUTE], [5, 6], None)
     assert frames_of(batch, [5, 6])["dir"].tolist() == [DIR_RX, DIR_TX]
 
 
@@ -126,7 +126,7 @@ def test_a_socket_that_fails_is_a_lost_connection(pair):
 
 def test_more_packets_than_fit_one_call(pair):
     ours, theirs = pair
-    receive = receive_many.ReceiveMany(8, 16)
+    receive = reader_thread.ReceiveMany(8, 16)
     for number in range(20):
         theirs.send(bytes([number]) * (number % 5))
     sizes, firsts = [], []
@@ -143,7 +143,7 @@ def test_a_wall_clock_that_is_set_can_not_move_arrivals_beyond_what_is_known():
     def now_ns():
         return 10**18 + time.monotonic_ns() - start_ns
 
-    clock, now = receive_many.ArrivalClock(now_ns), now_ns()
+    clock, now = reader_thread.ArrivalClock(now_ns), now_ns()
     hour = 3600 * 10**9
     stamps = [time.time_ns(), wall_ns + hour, wall_ns - hour, 0]
     for stamp in stamps:

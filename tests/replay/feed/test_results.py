@@ -5,7 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from undulog.analysis.results.comparison import Comparison, NamedJoint
+from undulog.analysis.results.comparison import (
+    Comparison,
+    ModelledAnalysis,
+    ModuleDeviation,
+    NamedJoint,
+    NullModelResult,
+)
 from undulog.analysis.results.coupling import Coupling
 from undulog.analysis.results.estimate import Estimate, Provenance
 from undulog.analysis.results.experiment import (
@@ -16,7 +22,6 @@ from undulog.analysis.results.experiment import (
     Reversal,
     Run,
 )
-from undulog.analysis.results.null_model import ModelledAnalysis, ModuleDeviation, NullModelResult
 from undulog.capture.common.errors import DataError
 from undulog.capture.robot.kinematics import link_poses
 from undulog.replay.feed.numbers import saved

@@ -12,8 +12,7 @@ import pytest
 
 from support import golden_pictures, processes
 from support.processes import freeze
-from undulog.replay.headless import client_of
-from undulog.replay.viewer import Viewer
+from undulog.replay.viewer import Viewer, client_of
 
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,7 @@ from undulog.capture import Session, SessionWriter
 from undulog.capture.robot.model import Plane
 from undulog.replay.feed.recording import write_recording
 from undulog.replay.samples import timeline as stretches
-from undulog.replay.samples.survey import survey
+from undulog.replay.samples.quantities import survey
 from undulog.replay.samples.timeline import Span
 
 START = 1_735_689_600_000_000_000

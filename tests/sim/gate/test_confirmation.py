@@ -12,8 +12,7 @@ import pytest
 
 from support.far_end import beyond_rate, largest_burst
 from undulog.capture import load_robot
-from undulog.sim.gate.confirmation import Confirmation
-from undulog.sim.gate.feedback import Silence
+from undulog.sim.gate.feedback import Confirmation, Silence
 from undulog.sim.gate.limits import Clamp, gate_limits
 
 LIMITS = gate_limits(load_robot("snake25"))

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from undulog.analysis.present.page import tables as typeset
-from undulog.analysis.present.page.artefacts import artefact_rows, times_text
 from undulog.analysis.present.page.experiment_view import profiles
 from undulog.analysis.present.page.matrix import Entries, entries_of, matrix_picture
 from undulog.analysis.present.page.page import render
-from undulog.analysis.present.page.trials import experiment_trials, session_trials
+from undulog.analysis.present.page.session_view import artefact_rows, times_text
+from undulog.analysis.present.page.tables import experiment_trials, session_trials
 from undulog.analysis.results.artefact import Artefact
 from undulog.analysis.results.formats import sentence
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from undulog.analysis.present.page import artefacts as signals
+from undulog.analysis.present.page import session_view as signals
 from undulog.analysis.present.page.page import render
 from undulog.capture import SessionWriter
 from undulog.capture.common.errors import UsageError

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from undulog.capture import Session, SessionWriter
-from undulog.capture.log.messages.contract import CONTRACT_VERSION
+from undulog.capture.log.messages.definitions import CONTRACT_VERSION
 
 EARLIER = Path(__file__).parent / "earlier"
 FILES = sorted(EARLIER.glob("*.mcap"))

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy.stats import PermutationMethod, nct, ttest_ind
 from scipy.stats import t as t_distribution
 
-from undulog.analysis.experiment.reversal.mirror import Strata, mirror_test
-from undulog.analysis.experiment.reversal.modules import ordered_pairs, reversal_of, variance_shares
+from undulog.analysis.experiment.mirror import Strata, mirror_test
+from undulog.analysis.experiment.reversal import ordered_pairs, reversal_of, variance_shares
 from undulog.capture.common.errors import UsageError
 
 

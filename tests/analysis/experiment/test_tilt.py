@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from undulog.analysis.experiment.reversal import modules
-from undulog.analysis.experiment.reversal.mirror import Strata, mirror_test
+from undulog.analysis.experiment import reversal
+from undulog.analysis.experiment.mirror import Strata, mirror_test
 from undulog.capture.common.errors import UsageError
 
 M = 7
@@ -87,7 +87,7 @@ def test_turned_runs_cancel_a_tilt_that_one_heading_leaves():
     rng = np.random.default_rng(3)
     one = mirror_test(*runs(rng, tilt=1.0, scatter=1e-6))
     np.testing.assert_allclose(one.difference, 2 * FALL, atol=1e-5)
-    strata = modules.heading_strata(*TURNED)
+    strata = reversal.heading_strata(*TURNED)
     both = mirror_test(*runs(rng, tilt=1.0, turned=True, scatter=1e-6), strata)
     assert np.abs(both.difference).max() < 1e-5
     # The scatter is that within the strata: a tilt a thousand times as large isn't in it.
@@ -98,18 +98,18 @@ def test_a_tilt_names_no_module_in_either_plan():
     """Identical modules on a floor whose effect is ten times a run's scatter, 300 experiments."""
     rng = np.random.default_rng(4)
     stated = named = single = 0
-    strata = modules.heading_strata(*TURNED)
+    strata = reversal.heading_strata(*TURNED)
     for _ in range(300):
         named += bool(
-            modules.ordered_pairs(NAMES, mirror_test(*runs(rng, tilt=1.0, turned=True), strata))
+            reversal.ordered_pairs(NAMES, mirror_test(*runs(rng, tilt=1.0, turned=True), strata))
         )
     assert named / 300 < 0.065
     for _ in range(60):
         one = runs(rng, tilt=1.0)
         test = mirror_test(*one)
-        pairs = modules.ordered_pairs(NAMES, test)
+        pairs = reversal.ordered_pairs(NAMES, test)
         stated += bool(pairs)
-        single += bool(pairs) and modules.tilt_check(*one, test).excluded
+        single += bool(pairs) and reversal.tilt_check(*one, test).excluded
         assert test.p == pytest.approx(2 / 924)
     assert single == 0
     assert stated > 0  # a pair may be stated; never without the tilt
@@ -123,10 +123,10 @@ def test_a_module_is_ordered_whatever_the_floor(joint, size):
     module[joint] = size * (1 + 1j)
     pair = (NAMES[joint], NAMES[-1 - joint])
     expected = pair if size < 0 else pair[::-1]
-    balanced = modules.reversal_of(NAMES, *runs(rng, tilt=3.0, module=module, turned=True), TURNED)
+    balanced = reversal.reversal_of(NAMES, *runs(rng, tilt=3.0, module=module, turned=True), TURNED)
     assert (balanced.pairs[0].name, balanced.pairs[0].mirror) == expected
     assert balanced.tilt.headings == "balanced"
-    level = modules.reversal_of(NAMES, *runs(rng, module=module))
+    level = reversal.reversal_of(NAMES, *runs(rng, module=module))
     assert (level.pairs[0].name, level.pairs[0].mirror) == expected
     assert level.tilt.headings == "unknown"
     assert level.tilt.excluded
@@ -135,8 +135,10 @@ def test_a_module_is_ordered_whatever_the_floor(joint, size):
     # Gravity that leans by more than the motion makes speaks against it; a small lean doesn't.
     forward, reverse = runs(rng, module=module)
     for lean, excluded in ((0.02, False), (0.0005, True)):
-        gravity = modules.floor_lean(np.full(12, lean) + rng.normal(0, 1e-5, 12), np.zeros(12))
-        assert modules.reversal_of(NAMES, forward, reverse, None, gravity).tilt.excluded == excluded
+        gravity = reversal.floor_lean(np.full(12, lean) + rng.normal(0, 1e-5, 12), np.zeros(12))
+        assert (
+            reversal.reversal_of(NAMES, forward, reverse, None, gravity).tilt.excluded == excluded
+        )
 
 
 def test_the_ratio_of_common_to_contrast():
@@ -148,35 +150,35 @@ def test_the_ratio_of_common_to_contrast():
     for _ in range(40):
         z = rng.normal(0.0, 0.2, (2, 2, 6, M))
         forward = d + z[0, 0] + 1j * z[0, 1]
-        low, high = modules.common_ratio(forward, np.zeros((6, M)) + z[1, 0] + 1j * z[1, 1]).ci95
+        low, high = reversal.common_ratio(forward, np.zeros((6, M)) + z[1, 0] + 1j * z[1, 1]).ci95
         held += low <= truth <= high
     # 40 at 90 % or more: standard error 5 %.
     assert held >= 33
     alike = np.tile(BOUNDARY, (6, 1))
-    assert modules.common_ratio(alike, alike[:, ::-1]).value is None
+    assert reversal.common_ratio(alike, alike[:, ::-1]).value is None
     even = np.ones((6, 4), dtype=complex) + rng.normal(0, 0.01, (6, 4))
     tested = mirror_test(even, 1.1 * even[:, ::-1])
-    assert modules.tilt_check(even, 1.1 * even[:, ::-1], tested).middle is None
+    assert reversal.tilt_check(even, 1.1 * even[:, ::-1], tested).middle is None
 
 
 def test_without_a_contrast_nothing_is_infinite():
-    reversal = modules.reversal_of(NAMES, *runs(np.random.default_rng(3), scatter=0.02))
-    assert (reversal.middle, reversal.tilt.middle) == ("d", None)
-    assert not reversal.tilt.excluded
-    json.dumps(dataclasses.asdict(reversal), allow_nan=False)
+    found = reversal.reversal_of(NAMES, *runs(np.random.default_rng(3), scatter=0.02))
+    assert (found.middle, found.tilt.middle) == ("d", None)
+    assert not found.tilt.excluded
+    json.dumps(dataclasses.asdict(found), allow_nan=False)
 
 
 def test_strata_from_headings():
     forward = np.array([0.0, 0.05, np.pi, -np.pi])
-    index = modules.heading_strata(forward, np.array([np.pi, -3.1, 0.0, 2 * np.pi]))
+    index = reversal.heading_strata(forward, np.array([np.pi, -3.1, 0.0, 2 * np.pi]))
     assert [part.tolist() for part in index] == [[0, 0, 1, 1], [0, 0, 1, 1]]
     # Turned along with its wave, every run is in one stratum.
-    index = modules.heading_strata(np.zeros(2), np.full(2, np.pi))
+    index = reversal.heading_strata(np.zeros(2), np.full(2, np.pi))
     assert [part.tolist() for part in index] == [[0, 0], [0, 0]]
     # One heading alone, an unknown one, or too few of a mirror image leave no strata.
-    assert modules.heading_strata(np.zeros(3), np.zeros(3)) is None
-    assert modules.heading_strata(forward, np.array([np.pi, -3.1, 0.0, np.nan])) is None
-    assert modules.heading_strata(forward, np.array([np.pi, np.pi, np.pi, 0.0])) is None
+    assert reversal.heading_strata(np.zeros(3), np.zeros(3)) is None
+    assert reversal.heading_strata(forward, np.array([np.pi, -3.1, 0.0, np.nan])) is None
+    assert reversal.heading_strata(forward, np.array([np.pi, np.pi, np.pi, 0.0])) is None
 
 
 def test_recorded_gravity_takes_the_sensors_offset_out_where_headings_differ():
@@ -185,14 +187,14 @@ def test_recorded_gravity_takes_the_sensors_offset_out_where_headings_differ():
     held = {"both": 0, "one": 0}
     for _ in range(200):
         lean = 0.01 * np.cos(heading) + 0.03 + rng.normal(0.0, 0.002, 12)
-        low, high = modules.floor_lean(lean, heading).ci95
+        low, high = reversal.floor_lean(lean, heading).ci95
         held["both"] += low <= 0.01 <= high
-        one = modules.floor_lean(lean[::2], np.full(6, np.nan))
+        one = reversal.floor_lean(lean[::2], np.full(6, np.nan))
         held["one"] += one.ci95[0] <= 0.04 <= one.ci95[1]
     t = stats.t.ppf(0.975, 5) * lean[::2].std(ddof=1) / 6**0.5
     assert one.ci95[1] - one.ci95[0] == pytest.approx(2 * t, rel=1e-9)
     assert all(0.91 <= count / 200 <= 0.99 for count in held.values())
-    assert modules.floor_lean(np.array([0.1, np.nan, 0.1]), np.zeros(3)).value is None
+    assert reversal.floor_lean(np.array([0.1, np.nan, 0.1]), np.zeros(3)).value is None
 
 
 def test_pairs_are_ordered_by_their_contrast_not_by_one_direction():
@@ -202,5 +204,5 @@ def test_pairs_are_ordered_by_their_contrast_not_by_one_direction():
     module[1] = -0.02
     forward, reverse = runs(rng, module=module)
     forward[:, [1, 5]] += 0.05
-    pairs = modules.ordered_pairs(NAMES, mirror_test(forward, reverse))
+    pairs = reversal.ordered_pairs(NAMES, mirror_test(forward, reverse))
     assert [(one.name, one.mirror) for one in pairs] == [("b", "f")]

@@ -41,7 +41,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
-from ...estimators.intervals import (
+from ..estimators.intervals import (
     CONFIDENCE,
     EQUIVALENT_GAIN,
     EQUIVALENT_LAG_RAD,
@@ -49,8 +49,8 @@ from ...estimators.intervals import (
     equivalence_p,
     t_factor,
 )
-from ...results.estimate import Estimate, Interval
-from ...results.experiment import FloorTilt, Headings, MirrorJoint, OrderedPair, Reversal
+from ..results.estimate import Estimate, Interval
+from ..results.experiment import FloorTilt, Headings, MirrorJoint, OrderedPair, Reversal
 from .mirror import MirrorTest, mirror_test
 
 MODULE_RATIO = 1.0

@@ -43,7 +43,7 @@ import numpy as np
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray, frozen
 from undulog.capture.common.errors import UsageError
 
-from ...estimators.intervals import CONFIDENCE, welch_satterthwaite
+from ..estimators.intervals import CONFIDENCE, welch_satterthwaite
 
 MOST_LABELLINGS = 20_000
 """Up to so many labellings all are tried; else a random subset."""

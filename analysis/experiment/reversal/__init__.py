@@ -1,1 +1,0 @@
-"""Boundary or module: the wave run the other way must mirror the profile."""
