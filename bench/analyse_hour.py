@@ -24,7 +24,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from measuring import HOUR_S, add_place, arguments, verdict, write_hour
+from measuring import HOUR_S, add_place, arguments, write_hour
+from records import verdict
 
 MIB = 1 << 20
 ANALYSE_S, ANALYSE_MIB, REPORT_S, PAGE_MIB = 10.0, 1.5e9 / MIB, 30.0, 3e6 / MIB

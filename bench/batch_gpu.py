@@ -15,8 +15,9 @@ import sys
 import time
 
 import numpy as np
-from measuring import arguments, chain, verdict
+from measuring import arguments, chain
 from numba import cuda
+from records import verdict
 
 from undulog.capture.common.arrays import FloatArray
 from undulog.sim import BatchRun, Scenario, load_scenario, run_batch

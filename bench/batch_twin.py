@@ -26,8 +26,9 @@ from functools import partial
 
 import mujoco
 import numpy as np
-from measuring import arguments, chain, verdict
+from measuring import arguments, chain
 from mujoco import rollout
+from records import verdict
 from twin_step import least, step_builtin, step_twin
 
 from undulog.capture.common.arrays import FloatArray

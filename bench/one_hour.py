@@ -33,7 +33,8 @@ import zstandard
 from hour_session import BUS, EPOCH_NS, JOINT_TOPICS, write_session
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from measuring import HOUR_S, arguments, verdict
+from measuring import HOUR_S, arguments
+from records import verdict
 
 from undulog.capture import Session
 from undulog.capture.common.console import progress

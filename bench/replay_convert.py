@@ -29,7 +29,8 @@ from typing import NamedTuple
 import numpy as np
 import rerun as rr
 from analyse_hour import cost
-from measuring import HOUR_S, add_place, arguments, verdict, write_hour
+from measuring import HOUR_S, add_place, arguments, write_hour
+from records import verdict
 
 from undulog.capture import Session
 from undulog.replay.draw.body import capsule_poses, capsule_shape

@@ -21,7 +21,8 @@ from pathlib import Path
 
 import numpy as np
 from dynamixel_sdk import Protocol2PacketHandler
-from measuring import arguments, verdict
+from measuring import arguments
+from records import verdict
 from scservo_sdk import PacketHandler
 
 from undulog.capture import SessionWriter

@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-from measuring import arguments, verdict
+from measuring import arguments
 from pyarrow import parquet as arrow_parquet
+from records import verdict
 
 from undulog.capture.exchange.lerobot_import import import_lerobot
 from undulog.capture.exchange.table_import import import_tables, open_tables
