@@ -117,7 +117,8 @@ def compared(
     interval = "" if low is None else f" ({low:.3g} to {high:.3g})"
     mine, other = (f"{np.median(costs):.4g} {unit}" for costs in (ours, peers))
     figure = f"{ratio:.3g}{interval} times {peer}, {mine} and {other}"
-    print(f"{_word(met)}  {what}: {_with_bar(figure, bar, '', most=True)}", flush=True)
+    figure = f"{value:.4g} {unit}".rstrip()
+    print(f"{_word(met)}  {what}: {_with_bar(figure, bar, unit, most=most)}", flush=True)
     return met is not False
 
 
