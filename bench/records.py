@@ -78,9 +78,8 @@ def verdict(
     """
     met = None if bar is None else bool(value <= bar if most else value >= bar)
     keep(Record(what=what, value=value, unit=unit, bar=bar, most=most, met=met, peer=peer))
-    print(
-        f"{_word(met)}  {what}: {_with_bar(f'{value:.2f} {unit}'.rstrip(), bar, unit, most=most)}"
-    )
+    figure = f"{value:.4g} {unit}".rstrip()
+    print(f"{_word(met)}  {what}: {_with_bar(figure, bar, unit, most=most)}", flush=True)
     return met is not False
 
 
@@ -117,8 +116,7 @@ def compared(
     interval = "" if low is None else f" ({low:.3g} to {high:.3g})"
     mine, other = (f"{np.median(costs):.4g} {unit}" for costs in (ours, peers))
     figure = f"{ratio:.3g}{interval} times {peer}, {mine} and {other}"
-    figure = f"{value:.4g} {unit}".rstrip()
-    print(f"{_word(met)}  {what}: {_with_bar(figure, bar, unit, most=most)}", flush=True)
+    print(f"{_word(met)}  {what}: {_with_bar(figure, bar, '', most=True)}", flush=True)
     return met is not False
 
 
