@@ -34,6 +34,7 @@ from contention import (
     start_undulog,
 )
 from measuring import arguments, cpu_s, start, wait_for
+from records import compared, verdict, versions
 
 from undulog.capture import Session
 
@@ -53,6 +54,7 @@ class Outcome:
     size: int = 0
     tick_p99_ms: float | None = None
     worst_behind_ms: float = 0.0
+    packages: tuple[str, ...] = ()
 
     @property
     def lost(self) -> int:
@@ -142,7 +144,8 @@ def over_socketcand(folder: Path, seconds: float) -> Outcome:
 
 def peer(folder: Path, seconds: float, kind: str, name: str) -> Outcome:
     """Measure a recorder of another make on the same buses."""
-    outcome = Outcome(name)
+    packages = ("mcap-ros2-support",) if kind == "mcap-ros2" else ("python-can",)
+    outcome = Outcome(name, packages=packages)
     with ExitStack() as stack:
         senders = start_senders(stack, "socketcand", (0, 0), seconds)
         recorder = start_peer(stack, kind, folder, served(senders))
@@ -175,7 +178,9 @@ def main() -> None:
     """Run everything and judge it."""
     parser = arguments(__doc__)
     parser.add_argument("seconds", type=float, nargs="?", default=60.0, help="of each run")
-    seconds = parser.parse_args().seconds
+    parser.add_argument("--contended", type=float, default=6.0, help="of each run, 0: none [s]")
+    options = parser.parse_args()
+    seconds: float = options.seconds
     print(f"two buses of {RATE:.0f} frames/s, {seconds:.0f} s\n{HEAD}", flush=True)
     runs = [
         (over_unix, seconds),
@@ -191,28 +196,29 @@ def main() -> None:
         with tempfile.TemporaryDirectory(prefix="undulog-bench-") as folder:
             outcomes.append(run(Path(folder), *options))
         print(outcomes[-1].line(), flush=True)
-    print(f"\nbeside two busy loops a core and dd with fsync\n{contention.HEAD}", flush=True)
-    contended = contention.measure(6.0, runs=3)
-    ours, text, frozen, burst, *peers = outcomes
+    ours, text, frozen, _, *peers = outcomes
     growth = ours.rss_mb[-1] - ours.rss_mb[len(ours.rss_mb) // 3]
     more_ms = (frozen.tick_p99_ms or 0) - (ours.tick_p99_ms or 0)
-    least = min(peers, key=lambda outcome: outcome.cpu)
-    for passed, words in (
-        (ours.lost == 0, f"AF_UNIX: {ours.lost} lost (bar 0)"),
-        (ours.cpu <= 0.15, f"AF_UNIX: {ours.cpu:.1%} of a core (bar 15 %)"),
-        (growth < 5, f"AF_UNIX: resident memory grows by {growth:+.1f} MB in the last two thirds"),
-        (text.lost == 0, f"socketcand: {text.lost} lost (bar 0)"),
-        (text.cpu <= 0.25, f"socketcand: {text.cpu:.1%} of a core (bar 25 %)"),
-        (burst.lost == 0, f"burst: {burst.lost} of {burst.offered} lost (bar 0)"),
-        (frozen.lost == 0, f"frozen viewer: {frozen.lost} lost (bar 0)"),
-        (more_ms <= 0.5, f"frozen viewer: p99 of the tick {more_ms:+.2f} ms (bar +0.5 ms)"),
-        (
-            text.cpu < least.cpu,
-            f"socketcand: {least.cpu / text.cpu:.1f} times as cheap as {least.name}",
+    good = [
+        *(verdict(f"{one.name}: frames lost", one.lost, 0, "frames") for one in outcomes[:4]),
+        verdict(f"{ours.name}: memory growth in the last two thirds", growth, 5, "MB"),
+        verdict("frozen viewer: more at the 99th percentile of the tick", more_ms, 0.5, "ms"),
+        *(
+            compared(
+                f"record two buses, {mine.name.removeprefix('undulog, ')}: processor share",
+                [100 * mine.cpu], [100 * other.cpu],
+                f"{other.name} ({versions(*other.packages)})", bar=1 / 2, unit="%",
+            )
+            for mine in (text, ours)
+            for other in peers
         ),
-        *contention.verdicts(contended),
-    ):
-        print("PASS" if passed else "FAIL", words)
+    ]  # fmt: skip
+    for other in peers:
+        verdict(f"{other.name}: frames lost", other.lost, None, "frames")
+    if options.contended:
+        print(f"\nbeside two busy loops a core and dd with fsync\n{contention.HEAD}", flush=True)
+        good.append(contention.judge(contention.measure(options.contended, runs=3)))
+    sys.exit(not all(good))
 
 
 if __name__ == "__main__":
