@@ -45,6 +45,7 @@ class Bench(NamedTuple):
     quick: str = ""
 
 
+TARGET = "--seeds 100-101 --follow-limit 60 --walk-limit 5 -o out/target_quick.json"
 BENCHES = {
     "starting": Bench("starting", "", "--runs 2"),
     "reading": Bench("read_jointstate", "", "--minutes 0.5"),
@@ -68,7 +69,7 @@ BENCHES = {
     "batch-gpu": Bench("batch_gpu", "", "--worlds 1024"),
     "sweep": Bench("sweep", "", "--runs 100"),
     "fleet": Bench("fleet", "", "--seeds 1"),
-    "target-following": Bench("target_following", "", "--seeds 100-101 --follow-limit 30 --walk-limit 5 -o out/target_quick.json"),
+    "target-following": Bench("target_following", "", TARGET),
     "converting": Bench("replay_convert", "--minutes 5", "--minutes 1 --runs 2 --rows 5"),
     "merging": Bench("replay_merge", "", "1"),
     "first-picture": Bench("first_picture", "5", "1"),

@@ -24,7 +24,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from measuring import HOUR_S, add_place, arguments, write_hour
+from measuring import HERE, HOUR_S, add_place, arguments, write_hour
 from records import compared, verdict, versions
 
 MIB = 1 << 20
@@ -72,7 +72,7 @@ def cost(*words: str) -> Cost:
 
 def decode_s(path: Path, seconds: float) -> float:
     """Return the processor time of decoding the JointStates of so much of a session [s]."""
-    child = subprocess.Popen([sys.executable, "-c", DECODE, str(path), str(seconds)])
+    child = subprocess.Popen([sys.executable, "-c", DECODE, str(path), str(seconds)], cwd=HERE)
     _, status, usage = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:

@@ -40,7 +40,7 @@ from undulog.replay.samples.quantities import quantities
 from undulog.replay.samples.tracks import read_columns, wanted_fields
 from undulog.replay.viewer import viewer_binary
 
-CONVERT, SIZE, PEAK_MB = 0.1, 0.5, 500.0
+COST, SIZE, PEAK_MB = 0.1, 0.5, 500.0
 """The bars; memory is not to grow with the session."""
 
 CONVERT = """
@@ -171,7 +171,7 @@ def measure(path: Path, minutes: float, runs: int, rows_s: float) -> bool:
     good = list[bool]()
     for what, costs in (("MCAP to .rrd", ours), ("view --save, which analyses", commands)):
         cpu = [one.processor_s for one in costs]
-        good.append(compared(what, cpu, rows_cpu, by_row, bar=CONVERT, scale=scale))
+        good.append(compared(what, cpu, rows_cpu, by_row, bar=COST, scale=scale))
         compared(what, cpu, itself, own)
         peak_mb = max(one.peak_mb for one in costs)
         good.append(verdict(f"{what}, peak memory", peak_mb, PEAK_MB, "MB"))
