@@ -58,7 +58,7 @@ BENCHES = {
     "serial": Bench("serial_listen", "", "--frames 4000"),
     "recording": Bench("record_buses", "", "12 --contended 0"),
     "contention": Bench("contention", "", "3 --runs 1 --only unix"),
-    "small-computer": Bench("small_computer", "", "--seconds 10 --loads 5000"),
+    "small-computer": Bench("small_computer", "", "--seconds 20"),
     "live-feed": Bench("live_view", "", "--seconds 2"),
     "live-lag": Bench("live_lag", "", ""),
     "analysing": Bench("analyse_hour", "", "--minutes 2"),

@@ -24,11 +24,11 @@ Bar
 """
 
 QUICK = """
-:::{note}
+```{note}
 Some rows are from short runs, on a machine that was busy with other work: `quick` and the load in
 the table of runs. Their intervals are wide, and the cost of starting weighs more in them than in a
 long run. A busy machine disturbs times of the wall clock; ratios of processor time it hardly does.
-:::
+```
 """
 
 
