@@ -192,9 +192,9 @@ def main() -> None:
         (peer, seconds, "mcap-ros2", "mcap-ros2-support, a message a frame"),
     ]
     outcomes = []
-    for run, *options in runs:
+    for run, *how in runs:
         with tempfile.TemporaryDirectory(prefix="undulog-bench-") as folder:
-            outcomes.append(run(Path(folder), *options))
+            outcomes.append(run(Path(folder), *how))
         print(outcomes[-1].line(), flush=True)
     ours, text, frozen, _, *peers = outcomes
     growth = ours.rss_mb[-1] - ours.rss_mb[len(ours.rss_mb) // 3]
