@@ -56,7 +56,7 @@ BENCHES = {
     "durable": Bench("durable", "", "--messages 10000"),
     "sources": Bench("sources", "", "--frames 4000"),
     "serial": Bench("serial_listen", "", "--frames 4000"),
-    "recording": Bench("record_buses", "", "12 --contended 0"),
+    "recording": Bench("record_buses", "", "8 --contended 0"),
     "contention": Bench("contention", "", "3 --runs 1 --only unix"),
     "small-computer": Bench("small_computer", "", "--seconds 20"),
     "live-feed": Bench("live_view", "", "--seconds 2"),

@@ -54,12 +54,18 @@ class Outcome:
     size: int = 0
     tick_p99_ms: float | None = None
     worst_behind_ms: float = 0.0
+    used_s: float = 0.0
     packages: tuple[str, ...] = ()
 
     @property
     def lost(self) -> int:
         """Frames offered that are not in the file, and those the sender could not send in time."""
         return self.offered - self.in_file + self.lost_by_sender
+
+    @property
+    def frame_us(self) -> float:
+        """Processor time of a frame in the file [us]."""
+        return 1e6 * self.used_s / max(self.in_file, 1)
 
     def line(self) -> str:
         """Return one line of the table."""
@@ -84,6 +90,7 @@ def rss_mb(pid: int) -> float:
 
 def watch(outcome: Outcome, pid: int, seconds: float, senders: list[subprocess.Popen[str]]) -> None:
     """Measure the recorder while the senders send; then take what these say."""
+    at_first = cpu_s(pid)
     time.sleep(SETTLE_S)
     begun, used = time.monotonic(), cpu_s(pid)
     while time.monotonic() < begun + seconds - SETTLE_S - 2:
@@ -96,6 +103,8 @@ def watch(outcome: Outcome, pid: int, seconds: float, senders: list[subprocess.P
         outcome.offered += said["offered"]
         outcome.lost_by_sender += said["late"]
         outcome.worst_behind_ms = max(outcome.worst_behind_ms, said["worst_behind_ms"])
+    time.sleep(1.0)  # what is buffered is taken
+    outcome.used_s = cpu_s(pid) - at_first
 
 
 def start_senders(
@@ -149,6 +158,8 @@ def peer(folder: Path, seconds: float, kind: str, name: str) -> Outcome:
     with ExitStack() as stack:
         senders = start_senders(stack, "socketcand", (0, 0), seconds)
         recorder = start_peer(stack, kind, folder, served(senders))
+        assert recorder.stdout is not None
+        recorder.stdout.readline()  # it is ready
         watch(outcome, recorder.pid, seconds, senders)
         outcome.in_file = json.loads(ended(recorder).splitlines()[-1])["frames"]
         outcome.size = sum(file.stat().st_size for file in folder.glob("peer.*"))
@@ -205,9 +216,9 @@ def main() -> None:
         verdict("frozen viewer: more at the 99th percentile of the tick", more_ms, 0.5, "ms"),
         *(
             compared(
-                f"record two buses, {mine.name.removeprefix('undulog, ')}: processor share",
-                [100 * mine.cpu], [100 * other.cpu],
-                f"{other.name} ({versions(*other.packages)})", bar=1 / 2, unit="%",
+                f"record two buses, {mine.name.removeprefix('undulog, ')}: time a frame",
+                [mine.frame_us], [other.frame_us],
+                f"{other.name} ({versions(*other.packages)})", bar=1.0, unit="us",
             )
             for mine in (text, ours)
             for other in peers
