@@ -85,7 +85,7 @@ def _row(name: str, row: dict[str, Any], *, quick: bool) -> str:
 def _figure(row: dict[str, Any]) -> str:
     if row["value"] is None:
         return row["note"]
-    figure = f"{row['value']:.3g} {row['unit']}".rstrip()
+    figure = f"{_number(row['value'])} {row['unit']}".rstrip()
     if row["low"] is not None:
         figure += f" ({row['low']:.3g} to {row['high']:.3g})"
     return figure
@@ -95,4 +95,8 @@ def _bar(row: dict[str, Any]) -> str:
     if row["bar"] is None:
         return ""
     sign = "at most" if row["most"] else "at least"
-    return f"{sign} {row['bar']:.3g} {row['unit']}".rstrip()
+    return f"{sign} {_number(row['bar'])} {row['unit']}".rstrip()
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
