@@ -118,6 +118,11 @@ def run_bench(name: str, *, quick: bool) -> dict[str, Any]:
     }
 
 
+def missing(data: dict[str, Any]) -> list[str]:
+    """Return the names of the benches without figures."""
+    return [name for name in BENCHES if name not in data]
+
+
 def machine() -> str:
     """Return processor, cores, memory, kernel and Python."""
     facts = Path("/proc/cpuinfo").read_text().splitlines()
@@ -145,9 +150,9 @@ def main() -> int:
         partial = DATA.with_suffix(".partial")
         partial.write_text(json.dumps(ordered, indent=1) + "\n")
         partial.replace(DATA)
-        PAGE.write_text(page_of(ordered))
+        PAGE.write_text(page_of(ordered, missing(ordered)))
     if options.page_only:
-        PAGE.write_text(page_of(data))
+        PAGE.write_text(page_of(data, missing(data)))
     print(f"\n{PAGE.relative_to(ROOT)} and {DATA.relative_to(ROOT)} are written")
     return int(failed)
 

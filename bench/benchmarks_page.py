@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from collections.abc import Sequence
 from typing import Any
 
 HEAD = """# Benchmarks
@@ -32,8 +33,8 @@ long run. A busy machine disturbs times of the wall clock; ratios of processor t
 """
 
 
-def page_of(data: dict[str, Any]) -> str:
-    """Return the page of the benches, by name."""
+def page_of(data: dict[str, Any], missing: Sequence[str] = ()) -> str:
+    """Return the page of the benches, by name, and name those that were not run."""
     parts = [HEAD]
     if any(bench["quick"] for bench in data.values()):
         parts.append(QUICK)
@@ -47,6 +48,7 @@ def page_of(data: dict[str, Any]) -> str:
         for name, bench in data.items()
         for row in bench["rows"]
     ]
+    parts += [f"| {name} | | | | not run yet | | |" for name in missing]
     parts += [
         "\n## Runs\n",
         "| bench | command | date (UTC) | length | load | took | exit code | machine |",

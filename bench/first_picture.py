@@ -41,7 +41,7 @@ SIZE = "--window-size=1440x900"
 VIEW = f"""
 import sys
 import undulog
-from undulog.replay.viewer import viewer
+from undulog.replay import viewer
 
 def without_window(*options):
     window = viewer.Viewer(["--headless", "{SIZE}", "--hide-welcome-screen", *options])

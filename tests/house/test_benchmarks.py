@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from all import BENCHES, DATA, PAGE
+from all import BENCHES, DATA, PAGE, missing
 from benchmarks_page import page_of
 from measuring import HERE
 from records import RECORDS, compared, not_run, ratio_of, verdict
@@ -18,7 +18,8 @@ def test_every_script_with_a_command_line_is_a_bench():
 
 
 def test_the_page_shows_the_committed_figures():
-    assert PAGE.read_text() == page_of(json.loads(DATA.read_text()))
+    data = json.loads(DATA.read_text())
+    assert PAGE.read_text() == page_of(data, missing(data))
 
 
 def test_interval_of_a_ratio():
