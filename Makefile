@@ -82,24 +82,8 @@ format: $(READY)  ## fix what lint and format can fix
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(READY)  ## speed, as ratios against named peers
-	$(BIN)/python bench/read_jointstate.py
-	$(BIN)/python bench/limits.py
-	$(BIN)/python bench/durable.py
-	$(BIN)/python bench/sources.py
-	$(BIN)/python bench/record_buses.py
-	$(BIN)/python bench/live_view.py
-	$(BIN)/python bench/live_lag.py
-	$(BIN)/python bench/one_hour.py
-	$(BIN)/python bench/analyse_hour.py
-	$(BIN)/python bench/analyse_hour.py --adaptive
-	$(BIN)/python bench/twin_step.py
-	$(BIN)/python bench/batch_twin.py
-	$(BIN)/python bench/sweep.py
-	$(BIN)/python bench/catalog.py
-	$(BIN)/python bench/replay_convert.py --minutes 5
-	$(BIN)/python bench/replay_merge.py
-	$(BIN)/python bench/first_picture.py 5
+bench: $(READY)  ## speed, as ratios against named peers, onto one page (QUICK=1 for short runs)
+	$(BIN)/python bench/all.py $(if $(QUICK),--quick)
 
 docs: $(READY)  ## the manual, as HTML under docs/_build/html
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build/html

@@ -24,11 +24,24 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from measuring import HOUR_S, add_place, arguments, verdict, write_hour
+from measuring import HERE, HOUR_S, add_place, arguments, write_hour
+from records import compared, verdict, versions
 
 MIB = 1 << 20
-ANALYSE_S, ANALYSE_MIB, REPORT_S, PAGE_MIB = 10.0, 1.5e9 / MIB, 30.0, 3e6 / MIB
-"""The bars, for an hour."""
+ANALYSE, REPORT = 0.25, 0.5
+"""The bars, shares of the peer's processor time."""
+ANALYSE_MIB, PAGE_MIB = 1.5e9 / MIB, 3e6 / MIB
+PEER_S = 120.0
+"""What the peer decodes at most; its time is scaled to the whole session [s]."""
+
+DECODE = """
+import sys
+from pathlib import Path
+from hour_session import EPOCH_NS, JOINT_TOPICS
+from one_hour import OWN_TIMES, decode
+window = EPOCH_NS, EPOCH_NS + round(float(sys.argv[2]) * 1e9)
+decode(Path(sys.argv[1]), [*JOINT_TOPICS, *OWN_TIMES], window)
+"""
 
 
 class Cost(NamedTuple):
@@ -57,32 +70,52 @@ def cost(*words: str) -> Cost:
     return Cost(took, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / MIB)
 
 
+def decode_s(path: Path, seconds: float) -> float:
+    """Return the processor time of decoding the JointStates of so much of a session [s]."""
+    child = subprocess.Popen([sys.executable, "-c", DECODE, str(path), str(seconds)], cwd=HERE)
+    _, status, usage = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise SystemExit(f"the peer failed with exit code {child.returncode}")
+    return usage.ru_utime + usage.ru_stime
+
+
 def measure(path: Path, part: float, runs: int, *, adaptive: bool = False) -> bool:
-    """Run both commands and print; return whether all bars are met.
+    """Run both commands and the peer in turn, print; return whether all bars are met.
 
     Args:
         path: The session.
-        part: Its length over an hour; the bars of time shrink with it.
+        part: Its length over an hour.
         runs: Runs of each command.
         adaptive: Whether its gait varies all the time.
     """
     page = path.with_suffix(".html")
-    analysed = [cost("analyse", str(path)) for _ in range(runs)]
-    reported = [cost("report", str(path), "-o", str(page), "--force") for _ in range(runs)]
     length = f"{part * 60:g} min{', adaptive' if adaptive else ''}"
+    seconds = part * HOUR_S
+    peer_s = min(PEER_S, seconds)
+    turns = [
+        (
+            cost("analyse", str(path)),
+            cost("report", str(path), "-o", str(page), "--force"),
+            decode_s(path, peer_s),
+        )
+        for _ in range(runs)
+    ]
+    analysed, reported, theirs = zip(*turns, strict=True)
+    peer = f"{versions('mcap', 'mcap-ros2-support')} decoding the JointStates"
+    if peer_s < seconds:
+        peer += f" (scaled from {peer_s:g} s)"
     good: list[bool] = []
-    for verb, costs, bar in (("analyse", analysed, ANALYSE_S), ("report", reported, REPORT_S)):
-        best = min(costs)
+    for verb, costs, bar in (("analyse", analysed, ANALYSE), ("report", reported, REPORT)):
         what = f"undulog {verb}, {length}"
-        good.append(verdict(what, best.wall_s, round(bar * part, 2), "s"))
-        print(f"      processor time {min(one.processor_s for one in costs):.2f} s")
+        ours = [one.processor_s for one in costs]
+        good.append(compared(what, ours, theirs, peer, bar=bar, scale=seconds / peer_s))
+        verdict(f"{what}, wall-clock time", min(one.wall_s for one in costs), None, "s")
         peak = max(one.peak_mib for one in costs)
-        if verb == "analyse":
-            good.append(verdict(f"{what}, peak memory", peak, round(ANALYSE_MIB), "MiB"))
-        else:
-            print(f"      peak memory {peak:.0f} MiB")
-            size = page.stat().st_size / MIB
-            good.append(verdict(f"{what}, page", size, round(PAGE_MIB, 2), "MiB"))
+        bar_mib = round(ANALYSE_MIB) if verb == "analyse" else None
+        good.append(verdict(f"{what}, peak memory", peak, bar_mib, "MiB"))
+    size = page.stat().st_size / MIB
+    good.append(verdict(f"undulog report, {length}, page", size, round(PAGE_MIB, 2), "MiB"))
     return all(good)
 
 

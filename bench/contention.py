@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 from measuring import HERE, arguments, cpu_s, start, wait_for
+from records import verdict, versions
 
 from undulog.capture import Session
 
@@ -262,26 +263,29 @@ def measure(
     return found
 
 
-def verdicts(found: Sequence[Shares]) -> list[tuple[bool, str]]:
-    """Return for each bar whether the runs reach it, and the figures."""
-    lines = []
+def judge(found: Sequence[Shares]) -> bool:
+    """Print and keep the figures of the runs by case; return whether all bars are met."""
+    good: list[bool] = []
     for name in dict.fromkeys(each.name for each in found if each.name != PYTHON_CAN):
         runs = [each for each in found if each.name == name]
         offered = sum(each.offered for each in runs)
-        refused = sum(each.refused for each in runs) / offered
-        late = sum(each.late or 0 for each in runs) / offered
+        refused = 100 * sum(each.refused for each in runs) / offered
+        late = 100 * sum(each.late or 0 for each in runs) / offered
         lost = sum(each.lost for each in runs)
-        bar = 0.0 if "granted" in name else 0.005
-        lines.append((lost == 0, f"{name}: {lost} accepted frames lost (bar 0)"))
-        lines.append((refused <= bar, f"{name}: {refused:.3%} refused (bar {bar:.1%})"))
+        what = f"contention, {name}"
+        good.append(verdict(f"{what}: accepted frames lost", lost, 0, "frames"))
+        bar = 0.0 if "granted" in name else 0.5
+        good.append(verdict(f"{what}: refused", refused, bar, "%"))
         if "granted" in name:
-            lines.append((late <= 0.001, f"{name}: {late:.3%} stamped > 5 ms off (bar 0.1 %)"))
-    peers = [each.lost for each in found if each.name == PYTHON_CAN]
+            good.append(verdict(f"{what}: stamped > 5 ms off", late, 0.1, "%"))
+    peers = [each for each in found if each.name == PYTHON_CAN]
     if peers:
         ours = sum(each.lost for each in found if "socketcand" in each.name)
-        text = f"socketcand: {ours} lost; {PYTHON_CAN} on the same load: {sum(peers)} lost"
-        lines.append((ours <= sum(peers), text))
-    return lines
+        peer = f"{versions('python-can')} Logger, BLF, on the same load"
+        theirs = sum(each.lost for each in peers)
+        what = "contention, socketcand: accepted frames lost"
+        good.append(verdict(what, ours, theirs, "frames", peer=peer))
+    return all(good)
 
 
 def main() -> None:
@@ -294,8 +298,7 @@ def main() -> None:
     args = parser.parse_args()
     print(HEAD, flush=True)
     found = measure(args.seconds, runs=args.runs, only=args.only, folder=args.folder)
-    for passed, words in verdicts(found):
-        print("PASS" if passed else "FAIL", words)
+    sys.exit(not judge(found))
 
 
 if __name__ == "__main__":

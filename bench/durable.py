@@ -23,6 +23,7 @@ import numpy as np
 from mcap.records import Channel
 from mcap.writer import Writer
 from measuring import arguments
+from records import compared, versions
 
 from undulog.capture.log.wal.writer import WriteAheadLog
 from undulog.capture.log.write import durable_sink
@@ -151,6 +152,9 @@ def compare(payloads: list[bytes], runs: int, folder: Path | None) -> None:
             took[way].append(run_in(folder, way, measure, payloads))
             own[way].append(run_in(folder, way, processor_time, payloads))
     means = {way: float(np.median(found)) for way, found in own.items()}
+    peer = f"{versions('mcap')} Writer"
+    what = f"keep a message of {len(payloads[0])} B, recorder's sink"
+    compared(what, own["DurableSink"], own["mcap.Writer"], peer, unit="us")
     for way, found in took.items():
         every = np.concatenate(found) / 1e3
         p50, p999, worst = np.percentile(every, (50, 99.9, 100))

@@ -22,7 +22,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from measuring import arguments, verdict
+from measuring import arguments
+from records import verdict
 
 from undulog.analysis import analyse_session
 from undulog.analysis.catalog.fleet import analyse_fleet

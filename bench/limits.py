@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from hostile_logs import EPOCH_NS, NS, HostileLog, Message, joint_state, zeros
 from measuring import arguments
+from records import verdict
 
 import undulog
 
@@ -162,6 +163,9 @@ def main() -> int:
                 ratio = (twice - nothing) / max(once - nothing, 1e-3)
                 worst = max(worst, ratio if judged else 0.0)
                 shown = f"{ratio:6.2f}" if judged else "     -"
+                if judged:
+                    what = f"twice as many: {dimension}, {verb}"
+                    verdict(what, ratio, MOST, "times", peer="linear growth and 15 %")
                 print(f"{dimension:<20} {verb:<8} {once:7.2f} {twice:8.2f} {shown} {peak:6.0f}")
     print(f"twice as much costs at most {worst:.2f} times the time; bar {MOST}")
     return int(worst > MOST)

@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 from mcap.records import Channel, Metadata, Schema
 from measuring import arguments, start, wait_for
+from records import verdict
 
 from undulog.capture import load_robot
 from undulog.capture.log.messages.cdr import encode, layout_of
@@ -95,6 +96,7 @@ def measure(feed: LiveFeed, seconds: float, label: str) -> None:
     pump = np.array(pumps) / 1e3
     p50, p99 = np.percentile(pump, [50, 99])
     mean = (sum(offers) * len(TOPICS) + sum(pumps)) / count / 1e3
+    verdict(f"live feed, {label}: cost a message", mean, None, "us")
     sent, dropped = feed.counts.sent - before[0], feed.counts.dropped - before[1]
     print(
         f"{label:28s} {mean:6.2f} us a message; offer {np.median(offers) / 1e3:5.2f} us; pump "

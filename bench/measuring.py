@@ -1,4 +1,4 @@
-"""Helpers of the benches: command line, verdicts, processes, and an hour to measure."""
+"""Helpers of the benches: command line, processes, and an hour to measure."""
 
 from __future__ import annotations
 
@@ -24,14 +24,6 @@ def arguments(doc: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-
-
-def verdict(what: str, value: float, bar: float, unit: str, *, most: bool = True) -> bool:
-    """Print a figure beside its bar; return whether the bar is met."""
-    good = value <= bar if most else value >= bar
-    sign = "at most" if most else "at least"
-    print(f"{'PASS' if good else 'FAIL'}  {what}: {value:.2f} {unit} (bar: {sign} {bar:g} {unit})")
-    return good
 
 
 def start(stack: ExitStack, *command: object, **options: object) -> subprocess.Popen[str]:

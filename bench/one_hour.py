@@ -33,7 +33,8 @@ import zstandard
 from hour_session import BUS, EPOCH_NS, JOINT_TOPICS, write_session
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from measuring import HOUR_S, arguments, verdict
+from measuring import HOUR_S, arguments
+from records import compared, verdict, versions
 
 from undulog.capture import Session
 from undulog.capture.common.console import progress
@@ -47,6 +48,7 @@ MIB = 1 << 20
 PEER_S = 30
 """Seconds of the session that the slow peer reads."""
 LATER_WINDOWS = 7
+WINDOW_BAR = 1 / 10
 
 AXES = ("x", "y", "z")
 OWN_TIMES = tuple(sorted({*OFFSET_TOPICS.values()}))
@@ -117,8 +119,8 @@ def load_frames(path: Path) -> object:
 
 def message_times(
     path: Path, window: tuple[int, int], threads: Sequence[int], runs: int
-) -> tuple[list[float], float]:
-    """Return wall-clock times a message [s]: ours for each number of threads, and the peer's.
+) -> tuple[list[list[float]], list[float]]:
+    """Return wall-clock times a message, turn by turn [us]: ours by threads, and the peer's.
 
     Ours reads the whole session, the peer a window of it [Unix ns], half-open.
     """
@@ -133,18 +135,24 @@ def message_times(
 
     def peer() -> None:
         nonlocal read
-        with path.open("rb") as stream:
-            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-            messages = reader.iter_decoded_messages(
-                topics=topics, starting_at=window[0], ending_before=window[1]
-            )
-            read = sum(1 for _ in messages)
+        read = decode(path, topics, window)
 
     took = [
         [wall_s(partial(ours, number)) for number in threads] + [wall_s(peer)] for _ in range(runs)
     ]
-    *each, theirs = (statistics.median(times) for times in zip(*took, strict=True))
-    return [seconds / count for seconds in each], theirs / read
+    *each, theirs = zip(*took, strict=True)
+    ours_us = [[1e6 * seconds / count for seconds in times] for times in each]
+    return ours_us, [1e6 * seconds / read for seconds in theirs]
+
+
+def decode(path: Path, topics: Sequence[str], window: tuple[int, int]) -> int:
+    """Decode the messages of a half-open window [Unix ns] as the peer does; return how many."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        messages = reader.iter_decoded_messages(
+            topics=topics, starting_at=window[0], ending_before=window[1]
+        )
+        return sum(1 for _ in messages)
 
 
 def window_ms(path: Path, start_s: int, threads: int) -> tuple[float, float]:
@@ -206,8 +214,8 @@ def measure(path: Path, without: Path, seconds: int, runs: int) -> bool:
     """Measure all and print; whether all bars are met."""
     part = HOUR_S / seconds
     good = [
-        verdict("an hour with raw frames", path.stat().st_size * part / 1e6, 850, "MB"),
-        verdict("an hour without", without.stat().st_size * part / 1e6, 550, "MB"),
+        verdict("size of an hour with raw frames", path.stat().st_size * part / 1e6, 850, "MB"),
+        verdict("size of an hour without", without.stat().st_size * part / 1e6, 550, "MB"),
     ]
     loaded_topics = topics_loaded(path)
     load(path, 1)  # memory that was never used costs more the first time, file pages too
@@ -219,30 +227,37 @@ def measure(path: Path, without: Path, seconds: int, runs: int) -> bool:
         )
         for _ in range(runs)
     ]
-    reference, loaded, frames = (statistics.median(each) for each in zip(*took, strict=True))
-    print(f"      decompress the chunks they lie in and drop them, one thread: {reference:.2f} s")
-    what = "load joint, time, power and sensor columns, one thread"
-    good.append(verdict(what, loaded / reference, 2.0, "x that"))
-    print(f"      load the raw frames, one thread: {frames / reference:.2f} x that")
+    reference, loaded, frames = zip(*took, strict=True)
+    peer = f"{versions('zstandard')}, decompressing the same chunks"
+    what = "load joint, time, power and sensor columns, 1 thread"
+    good.append(compared(what, loaded, reference, peer, bar=2.0))
+    compared("load the raw frames, 1 thread", frames, reference, peer)
     threads = threads_or_default(None)
     command = [sys.executable, __file__, "--memory", str(path)]
     figures = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
     print(f"      arrays: {figures['arrays'] / 1e6:.0f} MB")
     what = f"beyond arrays and mapped file, {threads} threads"
     good.append(verdict(what, figures["over"] / MIB, 64, "MiB"))
-    _, alone = window_ms(path, seconds // 3, 1)
-    first, later = window_ms(path, seconds // 3, threads)
-    print(f"      first window of an open session: {first:.1f} ms; later, 1 thread: {alone:.1f} ms")
-    good.append(verdict(f"ten seconds of joint states, {threads} threads", later, 10, "ms"))
+    peer = versions("mcap", "mcap-ros2-support")
+    begin = EPOCH_NS + seconds // 3 * 10**9
+    ten = begin, begin + 10 * 10**9
+    windows = [
+        (
+            *window_ms(path, seconds // 3, threads),
+            1e3 * wall_s(partial(decode, path, ["/joint_states"], ten)),
+        )
+        for _ in range(runs)
+    ]
+    first, later, theirs = zip(*windows, strict=True)
+    print(f"      first window of an open session: {statistics.median(first):.1f} ms")
+    what = f"ten seconds of joint states, {threads} threads"
+    good.append(compared(what, later, theirs, peer, bar=WINDOW_BAR, unit="ms"))
     middle = EPOCH_NS + seconds // 2 * 10**9
     part = middle, middle + min(PEER_S, seconds // 2) * 10**9
-    (one, ours), peer = message_times(path, part, (1, threads), runs)
-    print(
-        f"      JointState: ours {ours * 1e6:.2f} us a message, 1 thread {one * 1e6:.2f} us "
-        f"({peer / one:.0f} times as fast as the peer), peer {peer * 1e6:.1f} us"
-    )
-    what = f"mcap + mcap-ros2-support, ours with {threads} threads"
-    good.append(verdict(what, peer / ours, 50, "x our time", most=False))
+    (alone, ours), theirs = message_times(path, part, (1, threads), runs)
+    compared("a JointState message, 1 thread", alone, theirs, peer, unit="us")
+    what = f"a JointState message, {threads} threads"
+    good.append(compared(what, ours, theirs, peer, bar=1 / 50, unit="us"))
     return all(good)
 
 

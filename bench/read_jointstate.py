@@ -3,28 +3,39 @@
 Both read the same file in the same run, the file in the page cache; the ratio of the medians of
 wall-clock time is what counts, since machines differ. The peer has one thread, ours as many as a
 session has by default, and one for comparison. The values are compared, so all did the work.
+pybag-sdk and small-mcap are further peers where ``UNDULOG_BENCH_PYTHON`` names an interpreter that
+has them; each runs in a process of its own (``foreign_reader.py``).
 
 Run: python bench/read_jointstate.py [--minutes 5] [--runs 3]
 """
 
 from __future__ import annotations
 
-import statistics
+import json
+import os
+import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from foreign_reader import READERS
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from measuring import arguments
+from measuring import HERE, arguments
+from records import compared, not_run, versions
 
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.process import threads_or_default
 
+PYTHON = "UNDULOG_BENCH_PYTHON"
+BAR = 1 / 20
+ONE_TOPIC = "/joint_states"
 EPOCH_NS = 1_700_000_000_000_000_000
 NAMES = [f"joint{i:02d}" for i in range(1, 26)]
 TOPICS = {
@@ -55,10 +66,12 @@ def write_session(path: Path, minutes: float) -> int:
     return ticks * len(TOPICS)
 
 
-def read_ours(path: Path, threads: int) -> dict[str, FloatArray]:
+def read_ours(
+    path: Path, threads: int, topics: Mapping[str, Sequence[str]] = TOPICS
+) -> dict[str, FloatArray]:
     """Return all columns through the session reader."""
     with Session.open(path, threads=threads) as session:
-        found = session.joint_columns(TOPICS)
+        found = session.joint_columns(topics)
     return {f"{topic}.{field}": np.array(found[topic, field].values) for topic, field in found}
 
 
@@ -91,16 +104,21 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=3)
     options = parser.parse_args()
     threads = threads_or_default(None)
+    peer = versions("mcap", "mcap-ros2-support")
     readers: dict[str, Callable[[Path], dict[str, FloatArray]]] = {
-        f"undulog, {threads} threads": partial(read_ours, threads=threads),
-        "undulog, 1 thread": partial(read_ours, threads=1),
-        "mcap + mcap-ros2-support": read_peer,
+        f"{threads} threads": partial(read_ours, threads=threads),
+        "1 thread": partial(read_ours, threads=1),
+        peer: read_peer,
     }
-    took: dict[str, list[float]] = {name: [] for name in readers}
+    of_one_topic = partial(read_ours, threads=1, topics={ONE_TOPIC: TOPICS[ONE_TOPIC]})
+    took: dict[str, list[float]] = defaultdict(list)
+    known: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.mcap"
         count = write_session(path, options.minutes)
-        size = path.stat().st_size / 1e6
+        print(
+            f"{count} JointState messages, {len(NAMES)} joints, {path.stat().st_size / 1e6:.0f} MB"
+        )
         for _ in range(options.runs):  # in turn, so that a drift of the machine hits all
             found: list[dict[str, FloatArray]] = []
             for name, read in readers.items():
@@ -111,18 +129,38 @@ def main() -> None:
             for mine in ours:
                 for name, values in mine.items():
                     np.testing.assert_array_equal(values, theirs[name])
-    by_default, alone, peer = (statistics.median(seconds) for seconds in took.values())
-    print(
-        f"{peer / by_default:.0f} times as fast as mcap + mcap-ros2-support, {threads} threads, "
-        f"{peer / alone:.0f} times with one; values equal"
-    )
-    print(f"{count} JointState messages, {len(NAMES)} joints, {size:.0f} MB zstd")
-    for name, seconds in took.items():
-        each = statistics.median(seconds) / count * 1e6
-        print(
-            f"{name:<26} {statistics.median(seconds):8.3f} s "
-            f"(min {min(seconds):.3f}, max {max(seconds):.3f})  {each:8.2f} us a message"
-        )
+            for library in READERS:
+                if (read_by := foreign(library, path)) is not None:
+                    assert read_by["messages"] == count // len(TOPICS), read_by
+                    took[library].append(read_by["seconds"])
+                    took[ours_to(library)].append(timed(of_one_topic, path)[0])
+                    known[library] = read_by["version"]
+    what = "read all joint columns"
+    for way, bar in ((f"{threads} threads", BAR), ("1 thread", None)):
+        compared(f"{what}, {way}", took[way], took[peer], peer, bar=bar)
+    what = f"read the columns of {ONE_TOPIC}, 1 thread"
+    for library in READERS:
+        if library in known:
+            compared(what, took[ours_to(library)], took[library], known[library])
+        else:
+            not_run(f"{what}, against {library}", f"{PYTHON} names no interpreter that has it")
+
+
+def ours_to(library: str) -> str:
+    """Return the name of our turns beside a reader that isn't locked."""
+    return f"1 thread, beside {library}"
+
+
+def foreign(library: str, path: Path) -> dict[str, Any] | None:
+    """Return what a reader that isn't locked printed; None if there is none."""
+    if PYTHON not in os.environ:
+        return None
+    command = [os.environ[PYTHON], HERE / "foreign_reader.py", library, path, ONE_TOPIC]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if "ModuleNotFoundError" in done.stderr:
+        return None
+    done.check_returncode()
+    return json.loads(done.stdout)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ Run: python bench/replay_convert.py [--minutes 60] [--runs 2] [--can] [--rows 20
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -29,16 +30,18 @@ from typing import NamedTuple
 import numpy as np
 import rerun as rr
 from analyse_hour import cost
-from measuring import HOUR_S, add_place, arguments, verdict, write_hour
+from measuring import add_place, arguments, write_hour
+from records import compared, verdict, versions
 
 from undulog.capture import Session
 from undulog.replay.draw.body import capsule_poses, capsule_shape
 from undulog.replay.draw.motion import assemble, frames_of, read_head
 from undulog.replay.samples.quantities import quantities
 from undulog.replay.samples.tracks import read_columns, wanted_fields
+from undulog.replay.viewer import viewer_binary
 
-CONVERT_S, SIZE_MB, PEAK_MB = 30.0, 350.0, 500.0
-"""The bars, for an hour; memory is not to grow with the session."""
+COST, SIZE, PEAK_MB = 0.1, 0.5, 500.0
+"""The bars; memory is not to grow with the session."""
 
 CONVERT = """
 import json, resource, sys, time
@@ -85,8 +88,19 @@ def converted_by_command(session: Path, recording: Path) -> Figures:
     return Figures(took.wall_s, took.processor_s, peak_mb, recording.stat().st_size / 1e6)
 
 
-def row_by_row(path: Path, seconds: float, recording: Path) -> tuple[float, float, int]:
-    """The beginning of the session, a log call for each sample; seconds, megabytes and calls."""
+def rerun_itself(path: Path, recording: Path) -> float:
+    """Convert the MCAP file by Rerun's own reader; return the processor time [s]."""
+    command = [viewer_binary(), "mcap", "convert", path, "-o", recording]
+    child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    _, status, used = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise SystemExit(f"rerun mcap convert ended with exit code {child.returncode}")
+    return used.ru_utime + used.ru_stime
+
+
+def row_by_row(path: Path, seconds: float, recording: Path) -> Figures:
+    """Convert the beginning of the session by a log call for each sample."""
     with Session.open(path) as session:
         start_ns = session.start_ns
         stop_ns = start_ns + round(seconds * 1e9)
@@ -118,7 +132,7 @@ def row_by_row(path: Path, seconds: float, recording: Path) -> tuple[float, floa
         rec.set_time("session_time", duration=np.timedelta64(t_ns - start_ns, "ns"))
         rec.set_time("gait_cycle", duration=np.timedelta64((t_ns - start_ns) // 2, "ns"))
 
-    start = time.perf_counter()
+    start, used = time.perf_counter(), time.process_time()
     for t_ns, entity, value in samples:
         stand_at(t_ns)
         rec.log(entity, rr.Scalars(value))
@@ -131,37 +145,39 @@ def row_by_row(path: Path, seconds: float, recording: Path) -> tuple[float, floa
             shape = rr.Capsules3D(lengths=lengths, radii=radii, translations=place, quaternions=way)
             rec.log(entity, shape)
     rec.disconnect()
-    calls = len(samples) + 2 * motion.t_ns.size
-    return time.perf_counter() - start, recording.stat().st_size / 1e6, calls
+    took_s, used_s = time.perf_counter() - start, time.process_time() - used
+    return Figures(took_s, used_s, 0.0, recording.stat().st_size / 1e6)
 
 
 def measure(path: Path, minutes: float, runs: int, rows_s: float) -> bool:
     """Convert and print; whether all bars are met."""
-    part = minutes * 60 / HOUR_S
     recording = path.with_name("bench.rrd")
     print(f"{minutes:g} min, 25 joints at 100 Hz, {path.stat().st_size / 1e6:.0f} MB of MCAP")
-    ours = [converted(path, recording) for _ in range(runs)]
-    good = [
-        verdict("MCAP to .rrd", min(one.wall_s for one in ours), round(CONVERT_S * part, 2), "s"),
-        verdict("size", ours[0].size_mb, round(SIZE_MB * part, 1), "MB"),
-        verdict("peak memory", max(one.peak_mb for one in ours), PEAK_MB, "MB"),
-    ]
-    print(f"      processor time {min(one.processor_s for one in ours):.1f} s")
-    command = converted_by_command(path, recording)
-    print(
-        f"      undulog view --save, which analyses first: processor time "
-        f"{command.processor_s:.1f} s, {command.size_mb:.0f} MB"
-    )
-    good += [
-        verdict("with the analysis", command.wall_s, round(CONVERT_S * part, 2), "s"),
-        verdict("peak memory with the analysis", command.peak_mb, PEAK_MB, "MB"),
-    ]
-    took_s, size_mb, calls = row_by_row(path, rows_s, recording)
     scale = minutes * 60 / rows_s
-    print(
-        f"      row by row, {rows_s:g} s of it: {took_s:.1f} s and {size_mb:.1f} MB for {calls} "
-        f"calls; scaled to {minutes:g} min {took_s * scale:.0f} s and {size_mb * scale:.0f} MB"
-    )
+    turns = [
+        (
+            converted(path, recording),
+            converted_by_command(path, recording),
+            row_by_row(path, rows_s, recording),
+            rerun_itself(path, recording),
+        )
+        for _ in range(runs)
+    ]
+    ours, commands, rows, itself = zip(*turns, strict=True)
+    rerun = versions("rerun-sdk")
+    by_row = f"{rerun}, a log call for each sample (scaled from {rows_s:g} s)"
+    own = f"{rerun} mcap convert of the MCAP, nothing derived"
+    rows_cpu = [one.processor_s for one in rows]
+    good = list[bool]()
+    for what, costs in (("MCAP to .rrd", ours), ("view --save, which analyses", commands)):
+        cpu = [one.processor_s for one in costs]
+        good.append(compared(what, cpu, rows_cpu, by_row, bar=COST, scale=scale))
+        compared(what, cpu, itself, own)
+        peak_mb = max(one.peak_mb for one in costs)
+        good.append(verdict(f"{what}, peak memory", peak_mb, PEAK_MB, "MB"))
+    verdict("MCAP to .rrd, wall-clock time", min(one.wall_s for one in ours), None, "s")
+    sizes = [ours[0].size_mb], [rows[0].size_mb]
+    good.append(compared(".rrd, size", *sizes, by_row, bar=SIZE, unit="MB", scale=scale))
     recording.unlink()
     return all(good)
 

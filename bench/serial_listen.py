@@ -21,7 +21,8 @@ from pathlib import Path
 
 import numpy as np
 from dynamixel_sdk import Protocol2PacketHandler
-from measuring import arguments, verdict
+from measuring import arguments
+from records import compared, versions
 from scservo_sdk import PacketHandler
 
 from undulog.capture import SessionWriter
@@ -173,9 +174,13 @@ def main() -> None:
             (sdk_s(protocol, data, len(packets)), *our_s(protocol, data, len(packets)))
             for _ in range(args.runs)
         ]
-        sdk, framing, decoding = np.min(np.array(rows), axis=0) / len(packets) * 1e6
+        per_packet = np.array(rows) / len(packets) * 1e6
+        sdk, framing, decoding = np.min(per_packet, axis=0)
         line_us = len(data) / len(packets) * 10
-        verdict(f"{protocol}: share of the SDK's", (framing + decoding) / sdk, 2.0, "times")
+        peer = versions("feetech-servo-sdk" if protocol == "feetech" else "dynamixel-sdk")
+        both = per_packet[:, 1:].sum(axis=1).tolist()
+        what = f"take and decode a packet, {protocol}"
+        compared(what, both, per_packet[:, 0].tolist(), peer, bar=2.0, unit="us")
         ours = framing + decoding
         print(
             f"  SDK's parser {sdk:.1f} us a packet; ours {framing:.1f} us to records and "

@@ -31,6 +31,7 @@ from typing import Any
 import can
 import numpy as np
 from measuring import arguments
+from records import compared, versions
 
 from undulog.capture import SessionWriter
 from undulog.capture.log.messages.frames import FRAME_DTYPE, empty_frames
@@ -263,6 +264,10 @@ def main() -> None:
         mine = min(figure for figure, _ in figures)
         others = [figure for _, figure in figures if figure is not None]
         print(f"{name:26}{mine:10.2f}{f'{min(others):14.2f}' if others else '             -'}")
+        if len(others) == len(figures):
+            mine_of = [figure for figure, _ in figures]
+            peer = versions("python-can")
+            compared(f"take a frame, {name}", mine_of, others, peer, unit="us")
     print(f"python {sys.version.split()[0]}, {threading.active_count()} thread(s) left")
 
 

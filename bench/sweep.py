@@ -16,6 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from measuring import arguments
+from records import verdict
 
 from undulog.replay.sweep.plan import read_plan
 from undulog.replay.sweep.rows import Row, RowStore
@@ -86,6 +87,11 @@ def main() -> None:
     print(f"overhead:  {100 * overhead:.1f} % of the workers' time")
     print(f"Dask, 2:   {dask:.2f} runs/s, {dask / one:.2f} times one worker")
     print(f"overhead:  {100 * dask_overhead:.1f} % of the workers' time")
+    verdict("sweep, 2 workers, 5 joints: runs/s to one worker", two / one, None, "times")
+    verdict("sweep, 2 workers: overhead", 100 * overhead, None, "% of the workers' time")
+    what = "the same on a Dask cluster of 2: runs/s to one worker"
+    verdict(what, dask / one, None, "times")
+    verdict("sweep, rows of both equal", float(same), 1, "", most=False)
     print(f"same rows: {'yes' if same else 'NO'}")
 
 

@@ -1,7 +1,7 @@
 """Import of tables, against the readers of the same files: pandas.read_csv, and pyarrow.
 
-Each pair reads the same file in the same run, in turn; the ratio of the medians of processor time
-counts. The peer only reads; the import also writes a session, one message a row.
+Each pair reads the same file in the same run, in turn; the ratio of processor time counts. The
+peer only reads; the import also writes a session, one message a row.
 
 Run: python bench/table_import.py [--rows 60000] [--runs 3]
 """
@@ -9,7 +9,6 @@ Run: python bench/table_import.py [--rows 60000] [--runs 3]
 from __future__ import annotations
 
 import json
-import statistics
 import sys
 import tempfile
 import time
@@ -20,8 +19,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-from measuring import arguments, verdict
+from measuring import arguments
 from pyarrow import parquet as arrow_parquet
+from records import compared, versions
 
 from undulog.capture.exchange.lerobot_import import import_lerobot
 from undulog.capture.exchange.table_import import import_tables, open_tables
@@ -60,15 +60,18 @@ def write_dataset(folder: Path, rows: int) -> Path:
     return data / "file-000.parquet"
 
 
-def compare(ours: Callable[[], object], peer: Callable[[], object], runs: int) -> list[float]:
-    """Return the medians of processor time [s] of both."""
-    took: list[list[float]] = [[], []]
+def turns(
+    ours: Callable[[], object], peer: Callable[[], object], runs: int
+) -> tuple[list[float], list[float]]:
+    """Return processor times [s] of both, turn by turn."""
+    took: tuple[list[float], list[float]] = ([], [])
+    ours(), peer()  # what is imported late is imported now
     for _ in range(runs):
         for seconds, work in zip(took, (ours, peer), strict=True):
             start = time.process_time()
             work()
             seconds.append(time.process_time() - start)
-    return [statistics.median(seconds) for seconds in took]
+    return took
 
 
 def main() -> int:
@@ -78,26 +81,26 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=3)
     options = parser.parse_args()
     good = True
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
         log, out, columns = folder / "log.csv", folder / "run.mcap", ["action", "observation.state"]
         write_csv(log, options.rows)
         frames = write_dataset(folder / "set", options.rows)
-        for what, ours, peer in (
+        for what, name, ours, peer in (
             (
-                "CSV import / pandas.read_csv",
+                f"import CSV, {options.rows} rows, {JOINTS} joints",
+                f"{versions('pandas')} read_csv",
                 lambda: import_tables(open_tables(log), out, force=True),
                 lambda: pd.read_csv(log),
             ),
             (
-                "LeRobot import / pyarrow reading the same columns",
+                f"import LeRobot, {options.rows} rows, {JOINTS} joints",
+                f"{versions('pyarrow')} read_table",
                 lambda: import_lerobot(folder / "set", out, force=True),
                 lambda: parquet.read_table(frames, columns=columns),
             ),
         ):
-            mine, theirs = compare(ours, peer, options.runs)
-            good &= verdict(what, mine / theirs, BAR, "times")
-            print(f"      {mine:.3f} s and {theirs:.3f} s for {options.rows} rows, {JOINTS} joints")
+            good &= compared(what, *turns(ours, peer, options.runs), name, bar=BAR)
     return 0 if good else 1
 
 

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from measuring import arguments
+from records import verdict
 from scipy.stats import binom
 
 from undulog.sim import load_scenario
@@ -173,6 +174,10 @@ def main() -> None:
     kept = {"summary": found, "runs": sorted(results, key=lambda r: (r["controller"], r["seed"]))}
     options.output.write_text(json.dumps(kept, indent=1) + "\n")
     print(text(found, limits_s))
+    met, (ratio, low, high) = found[FOLLOW]["met"] / len(seeds), found["time_s_ratio"]
+    verdict("target following: targets met", 100 * met, 90, "%", most=False)
+    what = f"target following: random walk's time over its own ({low:.3g} to {high:.3g})"
+    verdict(what, ratio, None, "times", peer="random walk")
     print(f"{options.output} has every run")
 
 

@@ -23,6 +23,7 @@ from typing import TypeVar
 
 import pybullet
 from measuring import arguments, chain
+from records import compared, versions
 
 from undulog.capture.robot.model import Plane, Robot
 from undulog.sim.gait.contract import CONTROL_RATE_HZ, Readings
@@ -121,13 +122,18 @@ def built_in_body(robot: Robot, client: int) -> int:
     return body
 
 
-def least(ways: dict[_Way, Callable[[], float]], runs: int) -> dict[_Way, float]:
-    """Return microseconds a step of each way, the least of some runs in turn."""
-    found = dict.fromkeys(ways, math.inf)
+def turns(ways: dict[_Way, Callable[[], float]], runs: int) -> dict[_Way, list[float]]:
+    """Return microseconds a step of each way, turn by turn."""
+    found: dict[_Way, list[float]] = {name: [] for name in ways}
     for _ in range(runs):
         for name, step in ways.items():
-            found[name] = min(found[name], 1e6 * step())
+            found[name].append(1e6 * step())
     return found
+
+
+def least(ways: dict[_Way, Callable[[], float]], runs: int) -> dict[_Way, float]:
+    """Return microseconds a step of each way, the least of some runs in turn."""
+    return {name: min(each) for name, each in turns(ways, runs).items()}
 
 
 def main() -> None:
@@ -140,7 +146,7 @@ def main() -> None:
     flat = dataclasses.replace(whole, sensing=dataclasses.replace(whole.sensing, enabled=False))
     mujoco = dataclasses.replace(flat, engine=EngineKind.MUJOCO)
     step_twin(flat.changed(duration_s=0.05), Kernels.NUMBA)  # compiles, the first time
-    each = least(
+    took = turns(
         {
             f"{name}{more}": partial(step_twin, scenario, kernels)
             for more, scenario in (("", flat), (", MuJoCo", mujoco), (", all sensors", whole))
@@ -149,7 +155,12 @@ def main() -> None:
         | {BUILT_IN: partial(step_builtin, flat)},
         options.runs,
     )
+    each = {name: min(costs) for name, costs in took.items()}
     theirs = each[BUILT_IN]
+    peer = f"{versions('pybullet')}, its contacts and motors"
+    for name in (NUMPY, NUMBA):
+        what = f"step of 25 joints, {name}"
+        compared(what, took[name], took[BUILT_IN], peer, unit="us")
     print(
         f"25 joints at 1 kHz: {1e3 / each[NUMPY]:.1f} x real time with NumPy and "
         f"{1e3 / each[NUMBA]:.1f} x with numba; a step {theirs / each[NUMPY]:.1f} and "
