@@ -21,14 +21,6 @@ from undulog.capture.robot.model import Plane, Robot
 
 from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series
-from ..free_motion import (
-    MotionFit,
-    Oscillation,
-    absolute,
-    best_lag,
-    fit_motion,
-    wave_speed,
-)
 from ..response.fitting import GaitFit
 from ..results.answer import Note
 from ..results.body_shape import BodyShape, BodyTravel, PlaneShape, Serpenoid, ShapeMode
@@ -36,6 +28,14 @@ from ..results.estimate import Estimate
 from ..signals.columns import by_plane
 from ..signals.windows import Span
 from .chassis import ChassisPath, GaitCycle, chassis_path, gait_cycle
+from .free_motion import (
+    MotionFit,
+    Oscillation,
+    absolute,
+    best_lag,
+    fit_motion,
+    wave_speed,
+)
 from .motion import ODOMETRY_TOPIC, head_poses
 from .steps import mean_of_cycles
 

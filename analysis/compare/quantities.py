@@ -23,8 +23,15 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.robot.model import Robot
 
+from ..body.free_motion import (
+    MotionFit,
+    Oscillation,
+    amplitude,
+    phase_lag,
+    phase_line,
+    travelling_index,
+)
 from ..estimators.intervals import CONFIDENCE, welch_satterthwaite
-from ..free_motion import MotionFit, Oscillation, amplitude, phase_lag, phase_line, travelling_index
 from ..results.comparison import BODY
 from ..signals.columns import by_plane
 

@@ -21,6 +21,7 @@ from undulog.capture.robot.model import Robot
 
 from ..artefacts.find import find_artefacts
 from ..body.chassis import GaitCycle
+from ..body.free_motion import MotionFit, free_motion
 from ..body.motion import body_motion
 from ..body.shape import body_shape
 from ..dead_band.find import dead_bands
@@ -37,7 +38,6 @@ from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..estimators.series import Series, clean_together, coverage
 from ..estimators.spectrum import BINS_PER_SIDE
 from ..estimators.trends import Trend
-from ..free_motion import MotionFit, free_motion
 from ..frequency_response.estimate import frequency_responses
 from ..oscillators.chain import closed_loop, session_couplings
 from ..response.fitting import GaitFit, fit_gait

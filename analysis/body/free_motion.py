@@ -20,14 +20,14 @@ from scipy.special import fdtri
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from undulog.capture.robot.model import Robot
 
-from .estimators.harmonic import HarmonicFit, fit_at
-from .estimators.intervals import CONFIDENCE, around, t_factor
-from .estimators.series import Series
-from .estimators.spectrum import ResidualBins, residual_spectrum
-from .response.fitting import GaitFit
-from .results.estimate import Estimate, Interval
-from .results.frequency_response import BodyWave, FreeMotion, JointMotion
-from .signals.columns import by_plane
+from ..estimators.harmonic import HarmonicFit, fit_at
+from ..estimators.intervals import CONFIDENCE, around, t_factor
+from ..estimators.series import Series
+from ..estimators.spectrum import ResidualBins, residual_spectrum
+from ..response.fitting import GaitFit
+from ..results.estimate import Estimate, Interval
+from ..results.frequency_response import BodyWave, FreeMotion, JointMotion
+from ..signals.columns import by_plane
 
 _GRID = 16
 """Trial wave numbers for each joint; the peak's width is one over the number of joints."""

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from undulog.analysis.body.free_motion import fit_motion, free_motion
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.free_motion import fit_motion, free_motion
 from undulog.analysis.response.fitting import fit_gait
 from undulog.capture.robot.description import load_robot
 
