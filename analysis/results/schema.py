@@ -16,6 +16,7 @@ from typing import Any, Union, cast, get_args, get_origin, get_type_hints
 
 from . import analysis, artefact, oscillators
 from .analysis import Analysis, interval_key
+from .body_shape import BodyTravel, Serpenoid, ShapeMode
 from .comparison import Comparison
 from .estimate import Estimate
 from .experiment import Experiment
@@ -38,9 +39,12 @@ _FLAT = frozenset(
         analysis.GroupFacts,
         analysis.JointResult,
         analysis.Transport,
+        BodyTravel,
         BodyWave,
         JointFrequencyResponse,
         JointMotion,
+        Serpenoid,
+        ShapeMode,
     }
 )
 """Records of a session whose estimates are two keys each, as :meth:`.Analysis.to_dict` has them."""
