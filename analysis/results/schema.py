@@ -73,7 +73,7 @@ def result_schema(name: str) -> dict[str, Any]:
         name: One of :data:`RESULTS`.
     """
     cls, command = RESULTS[name]
-    writer = _Writer(flat=cls is Analysis)
+    writer = _Writer(flat=issubclass(cls, Analysis))
     root = writer.record(cls)
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -152,7 +152,7 @@ class _Writer:
         }
 
     def _reference(self, cls: type) -> dict[str, Any]:
-        outside, self._flat = self._flat, self._flat or cls is Analysis
+        outside, self._flat = self._flat, self._flat or issubclass(cls, Analysis)
         key = (cls, self._flat and cls in _FLAT)
         if key not in self._names:
             self._names[key] = name = self._free_name(cls)
