@@ -352,8 +352,8 @@ def point_table(body: BodyResult) -> Table[tuple[str, BodyPoint]]:
         Column(None, "place", lambda row: row[1].place, kind="word"),
         Column(None, "link", lambda row: row[1].link, kind="word"),
         Column(None, "of", lambda row: row[0], kind="word"),
-        Column(None, "amplitude [mm]", lambda row: _amplitude_mm(0, row[1:]), (1, 1)),
-        Column(None, "phase [°]", lambda row: _phase_deg(0, row[1:]), (1, 1)),
+        Column(None, "amplitude [mm]", lambda row: _point(0, row[1:], phase=False), (1, 1)),
+        Column(None, "phase [°]", lambda row: _point(0, row[1:], phase=True), (1, 1)),
     ]
     return Table(columns, rows)
 
