@@ -36,7 +36,7 @@ from typing import Protocol
 import numpy as np
 from scipy.special import chdtri, stdtr, stdtrit
 
-from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
+from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 from ..results.estimate import Estimate, Interval
 from .spectrum import ResidualBins
@@ -232,3 +232,32 @@ def _norm(
     squared = float(np.linalg.norm(value)) ** 2 - float(np.mean(sizes**2))
     # Two norms share the 5 %.
     return max(0.0, squared) ** 0.5, float(np.quantile(sizes, 1 - (1 - CONFIDENCE) / 2))
+
+
+def mixture_interval(
+    share: FloatArray, mean: FloatArray, scale: FloatArray, dof: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the mean and the half width of a mixture of Student's t, each of shape (k,)."""
+    centre = (share * mean).sum(axis=0)
+    reach = 12.0 * (scale.max(axis=0) + np.ptp(mean, axis=0))
+    ends: list[FloatArray] = []
+    for quantile in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2):
+        low: FloatArray = centre - reach
+        high: FloatArray = centre + reach
+        for _ in range(40):
+            middle: FloatArray = (low + high) / 2
+            chance: FloatArray = stdtr(dof, (middle - mean) / scale)
+            below: BoolArray = np.sum(share * chance, axis=0) < quantile
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        ends.append((low + high) / 2)
+    return centre, np.maximum(ends[1] - centre, centre - ends[0])
+
+
+def positive_interval(values: FloatArray, weights: FloatArray) -> tuple[float, float, float]:
+    """Return the median of a positive quantity and its interval."""
+    order = np.argsort(values, kind="stable")
+    running = np.cumsum(weights[order])
+    middle = running - weights[order] / 2
+    levels = (0.5, (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
+    found = np.exp(np.interp(levels, middle, np.log(values[order])))
+    return float(found[0]), float(found[1]), float(found[2])

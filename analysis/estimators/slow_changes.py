@@ -36,11 +36,11 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.special import gammaincc, psi, stdtr, zeta
+from scipy.special import gammaincc, psi, zeta
 
-from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.common.arrays import FloatArray
 
-from .intervals import CONFIDENCE
+from .intervals import mixture_interval, positive_interval
 from .trends import MIN_CYCLES, Shapes, Trend, families, finer, steady, transients
 
 MOST_CYCLES = 160
@@ -61,7 +61,6 @@ _TRIALS = {"drifting": 1.0, "settling": 4.0, "ringing": 20.0}
 _LIKELY = 0.05
 _UNLIKE = 2.0  # standard errors of the logarithm of a ratio of variances
 _HALF = 0.5
-_HALVINGS = 40
 _ZOOMS = 8
 _ENOUGH = 8  # points that a fine grid spreads over
 _LEAST_WEIGHT = 1e-3
@@ -436,7 +435,7 @@ def _inferred(
         p=p,
         level=level,
         change=turned,
-        tau=_interval_of(shapes.tau, found.weights[0].sum(axis=0)),
+        tau=positive_interval(shapes.tau, found.weights[0].sum(axis=0)),
         turn=float(shapes.turn[found.best[0][1]]),
         correlation=(noises[found.best[0][0]].correlation, noises[found.best[1][0]].correlation),
         correlated=(float(correlated[0]), float(correlated[1])),
@@ -487,36 +486,9 @@ def _mixture(
         if alike:
             scale = (scale + np.stack([fits[i].rss[s][other] for i, s in index]) / dof) / 2
         scale *= np.array([rows[s] @ fits[i].cov[s] @ rows[s] for i, s in index])[:, None]
-        parts.append(_central(share, mean, np.sqrt(np.maximum(scale, _TINY)), dof * (1 + alike)))
+        parts.append(
+            mixture_interval(share, mean, np.sqrt(np.maximum(scale, _TINY)), dof * (1 + alike))
+        )
     return Coefficients(
         np.concatenate([one[0] for one in parts]), np.concatenate([one[1] for one in parts])
     )
-
-
-def _central(
-    share: FloatArray, mean: FloatArray, scale: FloatArray, dof: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return the mean and the half width of a mixture of Student's t, each of shape (k,)."""
-    centre = (share * mean).sum(axis=0)
-    reach = 12.0 * (scale.max(axis=0) + np.ptp(mean, axis=0))
-    ends: list[FloatArray] = []
-    for quantile in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2):
-        low: FloatArray = centre - reach
-        high: FloatArray = centre + reach
-        for _ in range(_HALVINGS):
-            middle: FloatArray = (low + high) / 2
-            chance: FloatArray = stdtr(dof, (middle - mean) / scale)
-            below: BoolArray = np.sum(share * chance, axis=0) < quantile
-            low, high = np.where(below, middle, low), np.where(below, high, middle)
-        ends.append((low + high) / 2)
-    return centre, np.maximum(ends[1] - centre, centre - ends[0])
-
-
-def _interval_of(values: FloatArray, weights: FloatArray) -> tuple[float, float, float]:
-    """Return the median of a positive quantity and its interval."""
-    order = np.argsort(values, kind="stable")
-    running = np.cumsum(weights[order])
-    middle = running - weights[order] / 2
-    levels = (0.5, (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
-    found = np.exp(np.interp(levels, middle, np.log(values[order])))
-    return float(found[0]), float(found[1]), float(found[2])

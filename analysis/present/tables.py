@@ -331,18 +331,14 @@ def body_table(body: BodyResult) -> Table[tuple[BodyPoint, ...]]:
     names = [("seen mm (95 %)", "phase° (95 %)"), *((f"{n} null mm", "phase°") for n in body.null)]
     for k, (amplitude, phase) in enumerate(names):
         columns += [
-            Column(amplitude, None, partial(_amplitude_mm, k), (1, 1), spare=2 if k else 0),
-            Column(phase, None, partial(_phase_deg, k), (1, 1), spare=1 if k else 0),
+            Column(amplitude, None, partial(_point, k, phase=False), (1, 1), spare=2 if k else 0),
+            Column(phase, None, partial(_point, k, phase=True), (1, 1), spare=1 if k else 0),
         ]
     return Table(columns, list(zip(body.observed, *body.null.values(), strict=True)))
 
 
-def _amplitude_mm(k: int, points: tuple[BodyPoint, ...]) -> Estimate:
-    return scaled(points[k].amplitude_m, 1000.0)
-
-
-def _phase_deg(k: int, points: tuple[BodyPoint, ...]) -> Estimate:
-    return degrees(points[k].phase_rad)
+def _point(k: int, points: tuple[BodyPoint, ...], *, phase: bool) -> Estimate:
+    return degrees(points[k].phase_rad) if phase else scaled(points[k].amplitude_m, 1000.0)
 
 
 def point_table(body: BodyResult) -> Table[tuple[str, BodyPoint]]:
@@ -356,8 +352,8 @@ def point_table(body: BodyResult) -> Table[tuple[str, BodyPoint]]:
         Column(None, "place", lambda row: row[1].place, kind="word"),
         Column(None, "link", lambda row: row[1].link, kind="word"),
         Column(None, "of", lambda row: row[0], kind="word"),
-        Column(None, "amplitude [mm]", lambda row: _amplitude_mm(0, row[1:]), (1, 1)),
-        Column(None, "phase [°]", lambda row: _phase_deg(0, row[1:]), (1, 1)),
+        Column(None, "amplitude [mm]", lambda row: _point(0, row[1:], phase=False), (1, 1)),
+        Column(None, "phase [°]", lambda row: _point(0, row[1:], phase=True), (1, 1)),
     ]
     return Table(columns, rows)
 

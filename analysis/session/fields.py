@@ -1,0 +1,200 @@
+"""Fields of a session's result, from the fits of its gait: rhythm, waves and joints."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from undulog.capture import SessionView
+from undulog.capture.robot.model import Robot
+
+from ..energy import (
+    GAP_SHARE,
+    TERMS,
+    Energies,
+)
+from ..estimators.intervals import around, t_factor
+from ..estimators.series import Series, coverage
+from ..estimators.trends import Trend
+from ..response.fitting import GaitFit
+from ..response.response import gain_estimate, lag_estimate
+from ..response.rhythm import phase_step, wave_name
+from ..results.analysis import (
+    GaitFacts,
+    GroupFacts,
+    JointResult,
+    Window,
+)
+from ..results.artefact import DeadBand
+from ..results.estimate import Estimate
+from ..signals.columns import Columns, by_plane, planes_of
+from ..signals.windows import Span, Stretch, whole_cycles
+
+_NS = 1e9
+
+
+def gait_facts(
+    session: SessionView, gait: GaitFit | None, span: Span, stretch: Stretch
+) -> GaitFacts:
+    """Return frequency, windows and wave of the gait, and of each group of joints."""
+    shift_s = (span.origin_ns - session.start_ns) / _NS
+    window = Window(span.start_s + shift_s, span.stop_s + shift_s, float(span.cycles))
+    if gait is None:
+        return GaitFacts(Estimate(), (window,))
+    groups = _group_facts(session.robot, gait, span, stretch, session.start_ns)
+    return GaitFacts(
+        frequency_hz=groups[0].frequency_hz,
+        windows=(window,),
+        wave=groups[0].wave,
+        lag_per_joint_rad=groups[0].lag_per_joint_rad,
+        fitted=Window(
+            (stretch.start_ns - session.start_ns) / _NS,
+            (stretch.stop_ns - session.start_ns) / _NS,
+            stretch.duration_s * gait.fit.frequency_hz,
+        ),
+        groups=groups,
+    )
+
+
+def _group_facts(
+    robot: Robot | None, gait: GaitFit, span: Span, stretch: Stretch, start_ns: int
+) -> tuple[GroupFacts, ...]:
+    """Return frequency, whole cycles and wave of each group, the largest first.
+
+    Args:
+        span: The largest group's whole cycles.
+        start_ns: Unix time of the session's start [ns].
+    """
+    ends = [(t - start_ns) / _NS for t in (stretch.start_ns, stretch.stop_ns)]
+    shift_s = (span.origin_ns - start_ns) / _NS
+    result: list[GroupFacts] = []
+    for index, group in enumerate(gait.groups):
+        frequency = group.fit.frequency_hz
+        half = t_factor(group.omega_dof) * group.omega_error / (2 * np.pi)
+        if index == 0:
+            window = Window(span.start_s + shift_s, span.stop_s + shift_s, float(span.cycles))
+        else:
+            first_s, last_s, cycles = whole_cycles(ends[0], ends[1], frequency)
+            window = Window(first_s, last_s, float(cycles))
+        wave, steps = _wave(robot, group)
+        estimate = Estimate(frequency, around(frequency, half))
+        facts = GroupFacts(estimate, group.driven, (window,), wave, steps)
+        result.append(_with_changes(facts, group))
+    return tuple(result)
+
+
+def _with_changes(facts: GroupFacts, gait: GaitFit) -> GroupFacts:
+    """Add how the gait of a group and its responses change."""
+    if gait.pace is not None:
+        facts = dataclasses.replace(facts, frequency_drift_hz_per_s=gait.pace.hz_per_s)
+    changes = gait.changes
+    if changes is None:
+        return facts
+    turn = changes.found.turn if changes.trend is Trend.SETTLING else 0.0
+    return dataclasses.replace(
+        facts,
+        trend=str(changes.trend),
+        time_constant_s=changes.time_constant_s,
+        oscillation_hz=turn / (2 * np.pi * changes.period_s) or None,
+        cycle_correlation=max(changes.found.correlation) if changes.varies else None,
+        effective_cycles=changes.found.effective if changes.varies else None,
+        amplitude_drift_per_cycle=changes.amplitude_drift or Estimate(),
+    )
+
+
+def _wave(robot: Robot | None, gait: GaitFit) -> tuple[str | None, dict[str, float]]:
+    """Direction of the wave of the plane with the largest command, and each plane's phase step."""
+    steps: dict[str, float] = {}
+    main, largest = None, 0.0
+    for plane, names in by_plane(robot, gait.driven).items():
+        if len(names) > 1:
+            waves = gait.fit.fundamental[[gait.driven.index(name) for name in names]]
+            steps[plane] = phase_step(waves)
+            if np.abs(waves).max() > largest:
+                main, largest = plane, float(np.abs(waves).max())
+    return None if main is None else wave_name(steps[main]), steps
+
+
+def joint_results(
+    robot: Robot | None,
+    columns: Columns,
+    *,
+    responses: Mapping[str, Series],
+    gait: GaitFit | None,
+    energies: Mapping[str, Energies],
+    flags: Mapping[str, Sequence[str]],
+    dead: Mapping[str, DeadBand],
+    span: Span,
+) -> tuple[JointResult, ...]:
+    """Return the results of all joints, head to tail.
+
+    Args:
+        flags: Artefacts of each joint in the analysed window, by name.
+        dead: Dead bands, by name.
+        span: The window of energies and coverage.
+    """
+    planes = planes_of(robot)
+    results: list[JointResult] = []
+    for name in columns.names:
+        response = responses.get(name)
+        part = None if response is None else response.between(span.start_s, span.stop_s)
+        fraction = 0.0 if part is None else coverage(part.t_s, span.start_s, span.stop_s)
+        own = [flag for flag in flags.get(name, ()) if flag != "gaps"]
+        if fraction < 1 - GAP_SHARE and "not_recorded" not in own:
+            own.append("gaps")
+        index = None if gait is None else gait.group_of(name)
+        group = None if gait is None or index is None else gait.groups[index]
+        gain, lag = _estimates(group, name)
+        per_cycle = {term: energies[name].per_cycle(term) for term in TERMS}
+        results.append(
+            JointResult(
+                name=name,
+                plane=planes.get(name),
+                command_amplitude_rad=None if gait is None else gait.command_amplitudes.get(name),
+                gain=gain,
+                lag_rad=lag,
+                **{
+                    f"energy_{term}_j": None if found is None else float(np.sum(found))
+                    for term, found in per_cycle.items()
+                },
+                coverage=fraction,
+                samples=0 if part is None else part.count,
+                flags=tuple(own),
+                group=index,
+                frequency_hz=None if group is None else group.fit.frequency_hz,
+                dead_band=dead.get(name),
+                **_changes(group, name),
+            )
+        )
+    return tuple(results)
+
+
+def _estimates(gait: GaitFit | None, name: str) -> tuple[Estimate, Estimate]:
+    if gait is None or gait.response is None or name not in gait.answered:
+        return Estimate(), Estimate()
+    place = gait.answered.index(name)
+    lag = lag_estimate(gait.response, place)
+    # A phase that noise leaves open means an amplitude that isn't there.
+    return (gain_estimate(gait.response, place) if lag.value is not None else Estimate()), lag
+
+
+def _changes(gait: GaitFit | None, name: str) -> dict[str, Any]:
+    """Return the fields of a joint's changes from cycle to cycle."""
+    if gait is None or gait.changes is None or name not in gait.answered:
+        return {}
+    changes, place = gait.changes, gait.answered.index(name)
+    found: dict[str, Any] = {}
+    if changes.trend is not Trend.STEADY:
+        drifts = changes.trend is Trend.DRIFTING
+        keys = (
+            ("gain_drift_per_cycle", "lag_drift_rad_per_cycle")
+            if drifts
+            else ("gain_transient", "lag_transient_rad")
+        )
+        found |= zip(keys, changes.of_joint(place), strict=True)
+    if changes.varies:
+        found["gain_cycle_sd"], found["lag_cycle_sd_rad"] = changes.scatter[:, place].tolist()
+    return found
