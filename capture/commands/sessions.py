@@ -9,18 +9,17 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cyclopts import Parameter
 
 from ..common.console import UNLIMITED, Column, emit_json, progress, table
 from ..common.errors import UndulogError
 from ..common.remote import RemotePath, as_path
-from ..log.file.bag import is_bag
-from ..log.file.bag_parts import METADATA
-from ..log.file.parts import first_part
-from ..log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
-from ..log.read.session_view import SessionView
+from ..log.messages.definitions import COMMAND_TOPIC, RESPONSE_TOPIC
+
+if TYPE_CHECKING:
+    from ..log.read.session_view import SessionView
 
 
 @Parameter(name="*")
@@ -125,17 +124,24 @@ def _named(path: Path) -> list[Path]:
 
 def _matched(path: Path) -> list[Path]:
     """Return the sessions that a match of a pattern belongs to."""
+    from ..log.file.parts import first_part
+
     if path.is_dir():
         return _in_folder(path)
     return [path.parent if _is_rosbag2(path.parent) else first_part(path)]
 
 
 def _is_rosbag2(folder: Path) -> bool:
+    from ..log.file.bag_parts import METADATA
+
     return (folder / METADATA).is_file()
 
 
 def _in_folder(folder: Path) -> list[Path]:
     """Return the sessions in a folder and, behind them, in its folders."""
+    from ..log.file.bag import is_bag
+    from ..log.file.parts import first_part
+
     if _is_rosbag2(folder):
         return [folder]
     found: dict[Path, None] = {}

@@ -14,11 +14,8 @@ import shlex
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, requires
 from types import ModuleType
 from typing import Any
-
-from packaging.requirements import Requirement
 
 DEFERRED = ("asammdf",)
 """Packages that are hidden until they are asked for."""
@@ -130,6 +127,10 @@ def extra_packages(extra: str) -> dict[str, str]:
         Name to requirement (``rerun-sdk`` to ``rerun-sdk<0.42,>=0.41``); empty if undulog is not
         installed as a package.
     """
+    from importlib.metadata import PackageNotFoundError, requires
+
+    from packaging.requirements import Requirement
+
     try:
         lines = requires("undulog") or []
     except PackageNotFoundError:

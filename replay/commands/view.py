@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from undulog.capture import Session
+from undulog import capture
 from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import complain, echo, emit_json, progress
 from undulog.capture.common.errors import UsageError
@@ -147,7 +147,7 @@ def _convert(
     options = Options(command_topic=command, response_topic=response)
     folder = output.parent  # on a disk, so that an hour's columns need not be in memory
     with ExitStack() as stack:
-        session = stack.enter_context(Session.open(file, column_folder=folder, robot=robot))
+        session = stack.enter_context(capture.Session.open(file, column_folder=folder, robot=robot))
         bar = stack.enter_context(progress("view", total=2))
         bar.update(0, note="results" if single.result else "analysis")
         layer = saved(session, single.result or (), options)
@@ -239,7 +239,7 @@ def _view_session(
         viewer.require_display()
     with ExitStack() as stack:
         stop = stack.enter_context(interruptible())
-        session = topics.view(stack.enter_context(Session.open(file, robot=robot)))
+        session = topics.view(stack.enter_context(capture.Session.open(file, robot=robot)))
         known = Layer(None)
         if single.result:
             from ..feed.numbers import read_results

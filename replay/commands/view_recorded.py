@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from undulog.capture import Session
+from undulog import capture
 from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import MissingExtraError, UsageError
@@ -132,7 +132,7 @@ def view_clip(
     with (
         interruptible() as stop,
         tempfile.TemporaryDirectory(prefix="undulog-clip-") as folder,
-        Session.open(file, robot=robot) as opened,
+        capture.Session.open(file, robot=robot) as opened,
     ):
         session = topics.view(opened)
         shot = _shot(options, session.duration_s, file)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from undulog.analysis.results.analysis import Analysis
-from undulog.analysis.results.formats import decimals_for_values, number
-from undulog.analysis.session.cycles import CycleMaps
-from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import COMMANDED_RGB
-from undulog.capture.robot.model import Plane, Robot
+
+if TYPE_CHECKING:
+    from undulog.analysis.results.analysis import Analysis
+    from undulog.analysis.session.cycles import CycleMaps
+    from undulog.capture.common.arrays import FloatArray
+    from undulog.capture.robot.model import Plane, Robot
 
 COMMANDED = "/joints/commanded"
 MEASURED = "/joints/measured"
@@ -142,6 +143,8 @@ class HeatMap:
     @property
     def ends(self) -> tuple[str, str]:
         """The range of the colours in words."""
+        from undulog.analysis.results.formats import decimals_for_values, number
+
         digits = decimals_for_values([self.low, self.high], 3)
         return number(self.low, digits), number(self.high, digits)
 

@@ -21,6 +21,9 @@ from mcap.records import Channel
 
 from ...common.errors import DataError
 
+COMMAND_TOPIC, RESPONSE_TOPIC = "/joint_commands", "/joint_states"
+"""Topics of the log contract for commanded and measured joints."""
+
 CONTRACT_VERSION = 1
 """Version that sessions are written by.
 

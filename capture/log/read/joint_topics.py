@@ -12,16 +12,17 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...common.errors import DataError, JointSetError, MissingChannelError, some_names
-from ..columns.topics import Topics
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import (
+    COMMAND_TOPIC,
     CONTROLLER_STATE,
     DYNAMIC_STATE,
     FLOAT_ARRAY,
     JOINT_STATE,
+    RESPONSE_TOPIC,
     TRAJECTORY,
     PowerTopic,
 )
@@ -35,6 +36,9 @@ from .joint_messages import (
     is_of_joints,
     joint_source,
 )
+
+if TYPE_CHECKING:
+    from ..columns.topics import Topics
 
 _LOOKED_AT = 2000
 """Messages of a topic; one with a message a joint names all its joints in them."""
@@ -111,9 +115,6 @@ def check_joints(path: Path, topics: Topics, joints: Sequence[str], robot: str) 
             " (undulog robot new --from writes one for a log)"
         )
 
-
-COMMAND_TOPIC = "/joint_commands"
-RESPONSE_TOPIC = "/joint_states"
 
 CONTRACT_TOPICS = frozenset(
     {
