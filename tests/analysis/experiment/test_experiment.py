@@ -202,6 +202,7 @@ def test_the_json_object(weak, tmp_path, report_of):
     printed = report_of(*words, "-o", out)
     assert json.loads(out.read_text()) == printed
     keys = "answer sessions runs heterogeneity reversal pooled coupling oscillators best_linear"
+    keys += " body_connection"
     assert list(printed) == [*keys.split(), "warnings", "provenance"]
     assert [one["session"]["path"] for one in printed["sessions"]] == [str(path) for path in weak]
     reversal = printed["reversal"]
