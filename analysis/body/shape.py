@@ -88,7 +88,7 @@ def body_shape(
         sound: Those of them that no sensor falsifies.
         gait: The fitted gait.
         span: Whole cycles to look at.
-        warn: Told why travel is unknown where it could be known.
+        warn: Receives why travel is unknown where it could be known.
 
     Returns:
         The shape, None where no plane has four moving joints and no travel is known; nothing of

@@ -117,14 +117,14 @@ def read_columns(
     chosen = {"reference": reference_topic, "excitation": excitation_topic}
     chosen = {key: topic for key, topic in chosen.items() if topic is not None}
     wanted |= {key: (topic, "position") for key, topic in chosen.items()}
-    asked = [(command_topic, response_topic)]
-    asked += [(topic,) for topic in chosen.values()]
-    for names in asked:
+    asked = [((command_topic, response_topic), HOW_TO_CHOOSE)]
+    asked += [((topic,), f"choose with --{key}-topic") for key, topic in chosen.items()]
+    for names, how in asked:
         if not any(session.joint_channel(name) for name in names):
             damage = f" ({'; '.join(session.warnings)})" if session.warnings else ""
             there = topics.others or sorted(session.channels)
             missing = " or ".join(names) + damage
-            raise MissingChannelError(session.path, missing, there, HOW_TO_CHOOSE)
+            raise MissingChannelError(session.path, missing, there, how)
     wanted = {key: one for key, one in wanted.items() if session.joint_channel(one[0])}
     found = _read(session, wanted)
     if response_topic == RESPONSE_TOPIC:

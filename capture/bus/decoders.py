@@ -85,7 +85,7 @@ class RequestMatcher:
         """Whether a Feetech packet is the reply that is due: of a length that was asked for.
 
         A reply has its error bits where an instruction has its number; a repeated request of the
-        same two bytes is told by its parameters.
+        same two bytes is distinguished by its parameters.
         """
         asked = self._asked.get(servo)
         if asked is None or packet[3] != asked[1] + 2:
