@@ -146,7 +146,7 @@ def _compared(healthy, path, options):
 
 
 def _heading(page):
-    found = re.search(r'<h1 id="answer"[^>]*>(.*?)</h1>', page, re.DOTALL)
+    found = re.search(r'<h1\b[^>]*\bid="answer"[^>]*>(.*?)</h1>', page, re.DOTALL)
     return "" if found is None else found[1]
 
 

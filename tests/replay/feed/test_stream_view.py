@@ -22,7 +22,7 @@ LONG_S = 4000
 HEADLESS = """
 import sys
 import undulog
-from undulog.replay.viewer import viewer
+from undulog.replay import viewer
 
 def without_window(*options):
     window = viewer.Viewer(["--headless", "--hide-welcome-screen", "--window-size=1440x900"])
