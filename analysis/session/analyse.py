@@ -110,8 +110,9 @@ def _warn_flags(
 
 UNDECIDED_ENDS = (
     "without a robot description the order of the joints is that of the record, and which end is "
-    "the head is unknown; a lag from joint to joint is known up to whole turns, the smallest is "
-    "given"
+    "the head is unknown: directions are relative to that order, and whether the wave runs towards "
+    "the head or the tail isn't known; a lag from joint to joint is known up to whole turns, the "
+    "smallest is given"
 )
 
 _FEW = 1e-3
