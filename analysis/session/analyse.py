@@ -19,6 +19,7 @@ from undulog.capture.robot.model import Robot
 from ..artefacts.find import find_artefacts
 from ..body.chassis import GaitCycle
 from ..body.free_motion import MotionFit, free_motion
+from ..body.ground_contact import ground_contact
 from ..body.motion import body_motion
 from ..body.shape import body_shape
 from ..dead_band.find import dead_bands
@@ -269,6 +270,7 @@ def measure_session(
         joints=joints,
         body=body,
         body_shape=shape.shape,
+        ground_contact=ground_contact(session, columns, sound, span=span, warn=warn),
         heterogeneity=heterogeneity,
         coupling=coupling_of_one_gait(0 if gait is None else len(gait.all_answered)),
         free_motion=None if columns.command else _free_motion(session.robot, shape.motion, warn),
