@@ -11,8 +11,9 @@ Problems, 1974). All scales are multiples of the mean weight W and length L of a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 from scipy.optimize import nnls
@@ -39,7 +40,7 @@ from .steps import GRAVITY, MIN_CYCLES, mean_of_cycles
 PHASES = 32
 """Parts of a cycle, over each of which angles and torques are averaged."""
 
-MOST_CYCLES = 16
+MOST_CYCLES = 8
 MOST_LINKS = 128
 
 _TORQUE = 0.7
@@ -59,6 +60,9 @@ TOUCHES = 0.35
 
 MISFIT = 2.0
 """Root mean square of the normalised residuals from which on no loads explain the torques."""
+
+OPPOSITE = 0.8
+"""Torques of the other sign whose residuals are smaller than so much of them have a wrong sign."""
 
 
 def link_loads(
@@ -197,43 +201,62 @@ def ground_contact(
         return None
     try:
         t_s, _, quaternion = head_poses(session, robot.links[0].name, span)
+        vertical = rotation_from_quaternion(quaternion)[:, 2]  # world's z in the head's frame
+        up = [Series(axis, t_s, one) for axis, one in zip("xyz", vertical.T, strict=True)]
+        parts = _cycles([angles[n] for n in names], [torques[n] for n in names], factors, span)
+        loads = _explained(robot, up, list(parts))
     except (DataError, LogError) as error:
         warn(Note(f"no ground contact: {error}"))
         return None
-    vertical = rotation_from_quaternion(quaternion)[:, 2]  # the world's z axis in the head's frame
-    up = [Series(axis, t_s, one) for axis, one in zip("xyz", vertical.T, strict=True)]
+    return None if len(loads) < MIN_CYCLES else GroundContact(source, _links(robot, loads))
+
+
+_Cycle: TypeAlias = tuple[list[Series], list[Series], FloatArray]
+"""Angles, torques, and ends of the parts of one cycle."""
+
+
+def _cycles(
+    angles: Sequence[Series], torques: Sequence[Signal], factors: FloatArray, span: Span
+) -> Iterator[_Cycle]:
+    """Yield some of the cycles, those without samples left out."""
     ends = np.linspace(span.start_s, span.stop_s, span.cycles + 1)
-    loads: list[FloatArray] = []
-    misfits: list[float] = []
     for k in np.unique(np.linspace(0, span.cycles - 1, MOST_CYCLES).astype(np.int64)).tolist():
         edges = np.linspace(ends[k], ends[k + 1], PHASES + 1)
         start_ns, stop_ns = (span.origin_ns + round(t * 1e9) for t in edges[[0, -1]].tolist())
         shared: SharedTimes = {}
-        parts = [part_of(torques[name], start_ns, stop_ns, shared) for name in names]
-        acting = [clean(one.name, one.t_ns, one.values, span.origin_ns) for one in parts]
-        bent = [angles[name].between(edges[0], edges[-1]) for name in names]
-        if min(one.count for one in (*acting, *bent)) < PHASES // 2:
-            continue
-        if not any(np.ptp(one.values) > 0 for one in acting):  # a driver that fills in a constant
-            continue
-        acting = [
-            replace(one, values=factor * one.values)
-            for one, factor in zip(acting, factors.tolist(), strict=True)
-        ]
-        found, misfit = cycle_loads(robot, bent, acting, up, edges)
-        loads.append(found)
-        misfits.append(misfit)
-    if len(loads) < MIN_CYCLES:
-        return None
-    if (worst := float(np.median(misfits))) > MISFIT:
-        warn(
-            Note(
-                "no ground contact: the joints' torques are not those of a chain that lies on the "
-                f"ground by its own weight (residuals {worst:.1f} times what is expected)"
-            )
+        acting: list[Series] = []
+        for signal, factor in zip(torques, factors.tolist(), strict=True):
+            part = part_of(signal, start_ns, stop_ns, shared)
+            one = clean(part.name, part.t_ns, part.values, span.origin_ns)
+            acting.append(replace(one, values=factor * one.values))
+        bent = [one.between(edges[0], edges[-1]) for one in angles]
+        sampled = min(one.count for one in (*acting, *bent)) >= PHASES // 2
+        # A driver without torques fills in a constant.
+        if sampled and any(np.ptp(one.values) > 0 for one in acting):
+            yield bent, acting, edges
+
+
+def _explained(robot: Robot, up: Sequence[Series], cycles: Sequence[_Cycle]) -> FloatArray:
+    """Return the loads, shape (cycles, phases, links).
+
+    Raises:
+        DataError: If no loads explain the torques, or the opposite torques fit better.
+    """
+    found = [cycle_loads(robot, bent, acting, up, edges) for bent, acting, edges in cycles]
+    if not found:
+        return np.zeros((0, PHASES, len(robot.links)))
+    misfit = float(np.median([one for _, one in found]))
+    if misfit > MISFIT:
+        raise DataError(
+            f"no loads of links explain the joints' torques (residuals of {misfit:.1f} times what "
+            f"is expected, at most {MISFIT:g}); are they in N m, and is nothing but the ground "
+            "touched?"
         )
-        return None
-    return GroundContact(source, _links(robot, np.stack(loads)))
+    bent, acting, edges = cycles[0]
+    turned = [replace(one, values=-one.values) for one in acting]
+    if cycle_loads(robot, bent, turned, up, edges)[1] < OPPOSITE * found[0][1]:
+        raise DataError("the joints' torques seem to have the other sign than their angles")
+    return np.stack([loads for loads, _ in found])
 
 
 def _torques(

@@ -9,8 +9,10 @@ import pytest
 from undulog.analysis.body.ground_contact import TOUCHES, link_loads, means_between
 from undulog.analysis.body.steps import GRAVITY
 from undulog.analysis.results.ground_contact import TWIN_ACCURACY
+from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.description import load_robot
 from undulog.capture.robot.model import Plane
+from undulog.sim import run_batch
 
 ROBOT = load_robot("snake13")
 WEIGHT = GRAVITY * ROBOT.links[0].mass
@@ -89,3 +91,30 @@ def test_a_session_of_the_twin_states_its_contact_and_how_often_that_is_right(tm
     assert all(one["share_ci95"][0] <= one["share"] for one in contact["links"])
     np.testing.assert_allclose([np.mean(one["by_phase"]) for one in contact["links"]], shares)
     assert "chance: 50 %" in " ".join(command("analyse", path).out.split())
+
+
+@pytest.mark.slow
+def test_efforts_of_another_sign_or_unit_give_no_contact(tmp_path, command):
+    random = np.random.default_rng(4)
+    (run,) = run_batch([contact_tables.varied("snake13-vertical-pi2", random)[0]])
+
+    def result(effort):
+        path = tmp_path / "s.mcap"
+        with SessionWriter(path, session_id="s", epoch_ns=0, robot=ROBOT, force=True) as writer:
+            names = ROBOT.joint_names
+            states = writer.joint_state("/joint_states", names, unit="rad", effort=True)
+            head = writer.odometry("/odom", frame="world", child=ROBOT.links[0].name)
+            for k in range(800, len(run.angle)):
+                t_ns = k * 10_000_000
+                states.write(t_ns, run.angle[k], effort=effort[k])
+                pose = run.head[k], run.head_quaternion[k]
+                head.write(t_ns, *pose, run.head_velocity[k], run.head_spin[k])
+        return json.loads(command("analyse", path, "--json").out)
+
+    assert result(run.effort)["ground_contact"]["source"] == "effort"
+    for factor, why in ((-1.0, ["the other sign"]), (100.0, ["no loads of links"]), (0.0, [])):
+        found = result(factor * run.effort)
+        assert found["ground_contact"] is None
+        notes = [one for one in found["notes"] if "no ground contact" in one]
+        assert len(notes) == len(why)
+        assert all(part in note for part, note in zip(why, notes, strict=True))
