@@ -1,4 +1,4 @@
-"""The shape of the body and its travel, in sentences."""
+"""The shape of the body, its travel and its ground contact, in sentences."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from ..results import formats
 from ..results.body_connection import BodyConnection, PredictedTravel
 from ..results.body_shape import BodyShape, PlaneShape
 from ..results.estimate import Estimate
+from ..results.ground_contact import GroundContact
 from .tables import Column, Table, typical
+
+_LIFTED = 0.9
+"""Where links are on the ground for more of a cycle, on the mean, nothing is lifted."""
 
 
 def shape_lines(shape: BodyShape | None) -> Iterator[str]:
@@ -25,6 +29,23 @@ def shape_lines(shape: BodyShape | None) -> Iterator[str]:
             f"{1000 * travel.length_m:.0f} mm along and {1000 * travel.width_m:.0f} mm across from "
             "their mean, root mean square)."
         )
+
+
+def contact_lines(contact: GroundContact | None) -> Iterator[str]:
+    """Yield a sentence on which links are on the ground, where they are lifted."""
+    if contact is None:
+        return
+    links = sorted(contact.links, key=lambda one: one.share.value or 0.0)
+    mean = sum(one.share.value or 0.0 for one in links) / len(links)
+    if mean > _LIFTED:
+        return
+    least, most = (f"{_percent(one.share)} ({one.link})" for one in (links[0], links[-1]))
+    right = " to ".join(f"{100 * one:.0f}" for one in contact.twin_accuracy)
+    yield (
+        f"Ground contact, from the joints' {contact.source}: links are on the ground {least} to "
+        f"{most} of a cycle, {100 * mean:.0f} % on the mean. In the twin contact and lift are "
+        f"recognised in {right} %, by the gait (chance: 50 %)."
+    )
 
 
 def _plane_line(plane: PlaneShape) -> str:

@@ -19,7 +19,7 @@ from ..results.coupling import Coupling
 from ..results.estimate import Estimate
 from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, LoopMode
 from . import tables
-from .body_shape import shape_lines
+from .body_shape import contact_lines, shape_lines
 from .tables import TERMINAL, Cell, Column, Ends, PValue, Quantity, Table
 
 _ABOUT = {
@@ -36,6 +36,7 @@ _SPANS = 3
 def more_lines(analysis: Analysis) -> Iterator[str]:
     """Yield the lines of text after the tables."""
     yield from shape_lines(analysis.body_shape)
+    yield from contact_lines(analysis.ground_contact)
     if analysis.energy is not None:
         yield from _energy(analysis.energy)
     yield from _over_time(analysis)

@@ -18,6 +18,7 @@ from .body_shape import BodyShape
 from .coupling import Coupling
 from .estimate import Estimate, Provenance, WithInterval
 from .frequency_response import FreeMotion, JointFrequencyResponse
+from .ground_contact import GroundContact
 from .shown import PresentedResult
 
 if TYPE_CHECKING:
@@ -385,6 +386,8 @@ class Analysis(PresentedResult):
         body: Head, middle and tail; None with a note where it is unknown.
         body_shape: Principal modes, the nearest serpenoid and the travel of a cycle; None where
             nothing moves periodically.
+        ground_contact: Which links are on the ground, from the joints' torques; None where effort
+            and current, the head's orientation or the robot description are missing.
         coupling: Identifiable or not.
         warnings: One sentence each, worst first: what is missing or doubtful, and changes what a
             reader does.
@@ -410,6 +413,7 @@ class Analysis(PresentedResult):
     heterogeneity: dict[str, Index]
     coupling: Coupling
     body_shape: BodyShape | None = None
+    ground_contact: GroundContact | None = None
     over_time: ResponseOverTime | None = None
     energy: EnergyResult | None = None
     oscillators: tuple[ChainCoupling, ...] = ()
@@ -432,6 +436,9 @@ class Analysis(PresentedResult):
             "joints": [_record(joint) for joint in self.joints],
             "body": None if self.body is None else _body_dict(self.body),
             "body_shape": None if self.body_shape is None else _shape_dict(self.body_shape),
+            "ground_contact": None
+            if self.ground_contact is None
+            else _contact_dict(self.ground_contact),
             "energy": None if self.energy is None else _energy_dict(self.energy),
             "frequency_response": [_record(one) for one in self.frequency_response],
             "free_motion": None if self.free_motion is None else _motion_dict(self.free_motion),
@@ -487,6 +494,10 @@ def _shape_dict(shape: BodyShape) -> dict[str, Any]:
         for one in shape.planes
     ]
     return {"planes": planes, "travel": None if shape.travel is None else _record(shape.travel)}
+
+
+def _contact_dict(contact: GroundContact) -> dict[str, Any]:
+    return dataclasses.asdict(contact) | {"links": [_record(one) for one in contact.links]}
 
 
 def _body_dict(body: BodyResult) -> dict[str, Any]:

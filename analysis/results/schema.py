@@ -21,6 +21,7 @@ from .comparison import Comparison
 from .estimate import Estimate
 from .experiment import Experiment
 from .frequency_response import BodyWave, JointFrequencyResponse, JointMotion
+from .ground_contact import LinkContact
 
 VERSION = 1
 
@@ -43,6 +44,7 @@ _FLAT = frozenset(
         BodyWave,
         JointFrequencyResponse,
         JointMotion,
+        LinkContact,
         Serpenoid,
         ShapeMode,
     }

@@ -19,6 +19,7 @@ from undulog.capture.robot.model import Robot
 from ..artefacts.find import find_artefacts
 from ..body.chassis import GaitCycle
 from ..body.free_motion import MotionFit, free_motion
+from ..body.ground_contact import ground_contact
 from ..body.motion import body_motion
 from ..body.shape import body_shape
 from ..dead_band.find import dead_bands
@@ -110,8 +111,9 @@ def _warn_flags(
 
 UNDECIDED_ENDS = (
     "without a robot description the order of the joints is that of the record, and which end is "
-    "the head is unknown; a lag from joint to joint is known up to whole turns, the smallest is "
-    "given"
+    "the head is unknown: directions are relative to that order, and whether the wave runs towards "
+    "the head or the tail isn't known; a lag from joint to joint is known up to whole turns, the "
+    "smallest is given"
 )
 
 _FEW = 1e-3
@@ -268,6 +270,7 @@ def measure_session(
         joints=joints,
         body=body,
         body_shape=shape.shape,
+        ground_contact=ground_contact(session, columns, sound, span=span, warn=warn),
         heterogeneity=heterogeneity,
         coupling=coupling_of_one_gait(0 if gait is None else len(gait.all_answered)),
         free_motion=None if columns.command else _free_motion(session.robot, shape.motion, warn),

@@ -1,0 +1,287 @@
+"""Which links are on the ground, from the torques of the joints.
+
+Gravity, the ground's loads and its friction on the links behind a joint have a moment about its
+axis that the joint's torque balances; of the whole body their sum and their moment are zero. Both
+are linear in the loads N >= 0 of the links. Inertia is left out. Friction is not known: it counts
+as random forces along the ground, independent from link to link, in the covariance of the
+equations. A chain has more links than equations that tell their loads apart, so an even load is
+the prior. What is left is non-negative least squares (Lawson & Hanson, Solving Least Squares
+Problems, 1974). All scales are multiples of the mean weight W and length L of a link.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+from scipy.optimize import nnls
+
+from undulog.capture import SessionView
+from undulog.capture.common.arrays import FloatArray
+from undulog.capture.common.console import Warn
+from undulog.capture.common.errors import DataError, LogError
+from undulog.capture.log.read.sample_times import Signal
+from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
+from undulog.capture.robot.model import Plane, Robot
+
+from ..estimators.intervals import around, t_factor
+from ..estimators.series import Series, clean
+from ..results.answer import Note
+from ..results.estimate import Estimate
+from ..results.ground_contact import GroundContact, LinkContact
+from ..signals.columns import Columns
+from ..signals.stretch import SharedTimes, part_of
+from ..signals.windows import Span
+from .motion import ODOMETRY_TOPIC, head_poses
+from .steps import GRAVITY, MIN_CYCLES, mean_of_cycles
+
+PHASES = 32
+"""Parts of a cycle, over each of which angles and torques are averaged."""
+
+MOST_CYCLES = 8
+MOST_LINKS = 128
+
+_TORQUE = 0.7
+"""Standard error of a torque [W L]."""
+
+_FRICTION = 0.5
+"""Standard deviation of a link's friction along and across [W]."""
+
+_FORCE, _MOMENT = 0.3, 1.0
+"""Standard errors of the balances of the whole body, for inertia [W], [W L]."""
+
+_EVEN = 5.0
+"""Prior standard deviation of a link's load about W [W]."""
+
+TOUCHES = 0.35
+"""A link with this load or more is on the ground [W]."""
+
+MISFIT = 2.0
+"""Root mean square of the normalised residuals from which on no loads explain the torques."""
+
+OPPOSITE = 0.8
+"""Torques of the other sign whose residuals are smaller than so much of them have a wrong sign."""
+
+
+def link_loads(
+    robot: Robot, angles: FloatArray, torques: FloatArray, up: FloatArray
+) -> tuple[FloatArray, float]:
+    """Return the load of each link.
+
+    Args:
+        robot: The robot, m joints.
+        angles: [rad], shape (n, m).
+        torques: Of the joints on their rear links [N m], shape (n, m).
+        up: Unit vector against gravity in the frame of the head link, shape (n, 3).
+
+    Returns:
+        Loads over the mean weight of a link, shape (n, m + 1), and the root mean square of the
+        residuals, each over its standard error.
+    """
+    mass = np.array([link.mass for link in robot.links])
+    radius = np.array([link.radius for link in robot.links])
+    weight = GRAVITY * float(mass.mean())
+    length = float(np.mean([link.length for link in robot.links]))
+    m = len(robot.joints)
+    errors = np.repeat([_TORQUE * length, _FORCE, _MOMENT * length], [m, 3, 3]) * weight
+    prior = np.eye(m + 1) / _EVEN
+    yaw = np.array([[joint.plane is Plane.HORIZONTAL] for joint in robot.joints])
+    half = np.array([[link.length / 2] for link in robot.links])
+    centres, turns = link_poses(robot, np.zeros(3), np.eye(3), angles)
+    loads, squares = np.zeros((len(angles), m + 1)), 0.0
+    for k, vertical in enumerate(up):
+        turn, middle = turns[k, :-1], mass @ centres[k] / mass.sum()
+        pivot = centres[k, :-1] - half[:-1] * turn[:, :, 0]
+        axis = np.where(yaw, turn[:, :, 2], turn[:, :, 1])
+        ground = _moments(centres[k] - radius[:, None] * vertical, pivot, axis, middle)
+        level = np.linalg.svd(vertical[None])[2][1:]
+        slip = np.einsum("rni,ti->rnt", ground, level).reshape(m + 6, -1)
+        body = _moments(centres[k], pivot, axis, middle)
+        weights = -GRAVITY * np.einsum("rni,i,n->r", body, vertical, mass)
+        asked = np.concatenate([torques[k], np.zeros(6)]) - weights
+        covariance = np.diag(errors**2) + (_FRICTION * weight) ** 2 * slip @ slip.T
+        rows = np.column_stack([weight * (ground @ vertical), asked])
+        rows = np.linalg.solve(np.linalg.cholesky(covariance), rows)
+        matrix = np.vstack([rows[:, :-1], prior])
+        loads[k] = nnls(matrix, np.concatenate([rows[:, -1], prior.sum(axis=1)]))[0]
+        left = rows[:, -1] - rows[:, :-1] @ loads[k]
+        squares += float(left @ left) / left.size
+    return loads, (squares / max(len(up), 1)) ** 0.5
+
+
+def _moments(
+    point: FloatArray, pivot: FloatArray, axis: FloatArray, middle: FloatArray
+) -> FloatArray:
+    """Return the joints' torques against unit forces on the links, and the body's balances.
+
+    Args:
+        point: Where the forces act, one a link [m], shape (m + 1, 3).
+        pivot: Of the joints [m], shape (m, 3).
+        axis: Of the joints, shape (m, 3).
+        middle: Point of the body's moments [m], shape (3,).
+
+    Returns:
+        Torques [m], sum [1] and moment [m] per unit force, shape (m + 6, m + 1, 3).
+    """
+    behind = np.arange(len(point)) > np.arange(len(pivot))[:, None]
+    about = np.cross(axis[:, None], point - pivot[:, None]) * behind[..., None]
+    whole = np.cross(np.eye(3)[:, None], point - middle)
+    force = np.broadcast_to(np.eye(3)[:, None], whole.shape)
+    return np.concatenate([-about, force, whole])
+
+
+def means_between(t_s: FloatArray, values: FloatArray, edges_s: FloatArray) -> FloatArray:
+    """Return the means of a sampled course, linear between samples, over successive intervals.
+
+    Args:
+        t_s: Times [s], shape (n,).
+        values: Shape (n,).
+        edges_s: Ends of the intervals [s], shape (k + 1,).
+
+    Returns:
+        Shape (k,).
+    """
+    inside = (t_s > edges_s[0]) & (t_s < edges_s[-1])
+    times = np.unique(np.concatenate([edges_s, t_s[inside]]))
+    course = np.interp(times, t_s, values)
+    area = np.concatenate([[0.0], np.cumsum(np.diff(times) * (course[1:] + course[:-1]) / 2)])
+    return np.diff(area[np.searchsorted(times, edges_s)]) / np.diff(edges_s)
+
+
+def cycle_loads(
+    robot: Robot,
+    angles: Sequence[Series],
+    torques: Sequence[Series],
+    up: Sequence[Series],
+    edges_s: FloatArray,
+) -> tuple[FloatArray, float]:
+    """Return the loads of the links in successive parts of a cycle, as :func:`link_loads`.
+
+    Args:
+        angles: Of the m joints [rad].
+        torques: Of the m joints [N m].
+        up: Components of the unit vector against gravity in the frame of the head link.
+        edges_s: Ends of the parts [s], shape (n + 1,).
+    """
+
+    def averaged(series: Sequence[Series]) -> FloatArray:
+        return np.stack([means_between(one.t_s, one.values, edges_s) for one in series], axis=-1)
+
+    vertical = averaged(up)
+    vertical /= np.linalg.norm(vertical, axis=1, keepdims=True)
+    return link_loads(robot, averaged(angles), averaged(torques), vertical)
+
+
+def ground_contact(
+    session: SessionView,
+    columns: Columns,
+    angles: Mapping[str, Series],
+    *,
+    span: Span,
+    warn: Warn,
+) -> GroundContact | None:
+    """Find which links are on the ground, cycle by cycle.
+
+    Args:
+        angles: Joint angles by name, of joints whose sensors are sound.
+        span: Whole cycles to look at.
+        warn: Receives why there is no result where the torques are known.
+
+    Returns:
+        The contact; None where torques, angles, the head's orientation or the robot are unknown.
+    """
+    robot = session.robot
+    if robot is None or ODOMETRY_TOPIC not in session.channels or span.cycles < MIN_CYCLES:
+        return None
+    names = robot.joint_names
+    source, torques, factors = _torques(session, robot, columns)
+    if not torques or len(names) >= MOST_LINKS or any(name not in angles for name in names):
+        return None
+    try:
+        t_s, _, quaternion = head_poses(session, robot.links[0].name, span)
+        vertical = rotation_from_quaternion(quaternion)[:, 2]  # world's z in the head's frame
+        up = [Series(axis, t_s, one) for axis, one in zip("xyz", vertical.T, strict=True)]
+        parts = _cycles([angles[n] for n in names], [torques[n] for n in names], factors, span)
+        loads = _explained(robot, up, list(parts))
+    except (DataError, LogError) as error:
+        warn(Note(f"no ground contact: {error}"))
+        return None
+    return None if len(loads) < MIN_CYCLES else GroundContact(source, _links(robot, loads))
+
+
+_Cycle: TypeAlias = tuple[list[Series], list[Series], FloatArray]
+"""Angles, torques, and ends of the parts of one cycle."""
+
+
+def _cycles(
+    angles: Sequence[Series], torques: Sequence[Signal], factors: FloatArray, span: Span
+) -> Iterator[_Cycle]:
+    """Yield some of the cycles, those without samples left out."""
+    ends = np.linspace(span.start_s, span.stop_s, span.cycles + 1)
+    for k in np.unique(np.linspace(0, span.cycles - 1, MOST_CYCLES).astype(np.int64)).tolist():
+        edges = np.linspace(ends[k], ends[k + 1], PHASES + 1)
+        start_ns, stop_ns = (span.origin_ns + round(t * 1e9) for t in edges[[0, -1]].tolist())
+        shared: SharedTimes = {}
+        acting: list[Series] = []
+        for signal, factor in zip(torques, factors.tolist(), strict=True):
+            part = part_of(signal, start_ns, stop_ns, shared)
+            one = clean(part.name, part.t_ns, part.values, span.origin_ns)
+            acting.append(replace(one, values=factor * one.values))
+        bent = [one.between(edges[0], edges[-1]) for one in angles]
+        sampled = min(one.count for one in (*acting, *bent)) >= PHASES // 2
+        # A driver without torques fills in a constant.
+        if sampled and any(np.ptp(one.values) > 0 for one in acting):
+            yield bent, acting, edges
+
+
+def _explained(robot: Robot, up: Sequence[Series], cycles: Sequence[_Cycle]) -> FloatArray:
+    """Return the loads, shape (cycles, phases, links).
+
+    Raises:
+        DataError: If no loads explain the torques, or the opposite torques fit better.
+    """
+    found = [cycle_loads(robot, bent, acting, up, edges) for bent, acting, edges in cycles]
+    if not found:
+        return np.zeros((0, PHASES, len(robot.links)))
+    misfit = float(np.median([one for _, one in found]))
+    if misfit > MISFIT:
+        raise DataError(
+            f"no loads of links explain the joints' torques (residuals of {misfit:.1f} times what "
+            f"is expected, at most {MISFIT:g}); are they in N m, and is nothing but the ground "
+            "touched?"
+        )
+    bent, acting, edges = cycles[0]
+    turned = [replace(one, values=-one.values) for one in acting]
+    if cycle_loads(robot, bent, turned, up, edges)[1] < OPPOSITE * found[0][1]:
+        raise DataError("the joints' torques seem to have the other sign than their angles")
+    return np.stack([loads for loads, _ in found])
+
+
+def _torques(
+    session: SessionView, robot: Robot, columns: Columns
+) -> tuple[str, Mapping[str, Signal], FloatArray]:
+    """Return where all joints' torques are from, their signals and the factors that make [N m]."""
+    if all(name in columns.effort for name in robot.joint_names):
+        return "effort", columns.effort, np.ones(len(robot.joints))
+    known = session.run is not None or "servo" not in robot.assumed
+    if known and all(name in columns.current for name in robot.joint_names):
+        constants = np.array([joint.servo.torque_constant for joint in robot.joints])
+        return "current", columns.current, constants
+    return "", {}, np.zeros(0)
+
+
+def _links(robot: Robot, loads: FloatArray) -> tuple[LinkContact, ...]:
+    """Return the links' contact from their loads, shape (cycles, phases, links)."""
+    touching = loads >= TOUCHES
+    found: list[LinkContact] = []
+    for k, link in enumerate(robot.links):
+        share = Estimate()
+        if (mean := mean_of_cycles(touching[..., k].mean(axis=1))) is not None:
+            value, variance, dof = mean
+            low, high = around(value, t_factor(dof) * variance**0.5)
+            share = Estimate(value, (max(0.0, low), min(1.0, high)))
+        by_phase = tuple(touching[..., k].mean(axis=0).tolist())
+        found.append(LinkContact(link.name, share, float(loads[..., k].mean()), by_phase))
+    return tuple(found)
