@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import glob
 import re
-import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from cyclopts import Parameter
 
-from ..common.console import UNLIMITED, Column, emit_json, progress, table
+from ..common.console import Column, emit_json, output_width, progress, table
 from ..common.errors import UndulogError
-from ..common.remote import RemotePath, as_path
 from ..log.messages.definitions import COMMAND_TOPIC, RESPONSE_TOPIC
 
 if TYPE_CHECKING:
@@ -101,6 +98,8 @@ def sessions_of(given: Iterable[Path]) -> list[Path]:
             pattern (``*``, ``?``, ``[...]``, ``**``) is a path that isn't there. What names no
             session stays, for the command to refuse.
     """
+    from ..common.remote import as_path
+
     found: list[Path] = []
     for path in map(as_path, given):
         own = _named(path)
@@ -108,7 +107,18 @@ def sessions_of(given: Iterable[Path]) -> list[Path]:
     return found
 
 
+def are_as_given(paths: Sequence[Path], given: Iterable[Path]) -> bool:
+    """Return whether each session was named by its own path or URL: no folder, no pattern."""
+    from ..common.remote import as_path
+
+    return list(paths) == [*map(as_path, given)]
+
+
 def _named(path: Path) -> list[Path]:
+    from glob import glob, has_magic
+
+    from ..common.remote import RemotePath
+
     if isinstance(path, RemotePath):
         return [path]
     if path.is_dir():
@@ -116,8 +126,8 @@ def _named(path: Path) -> list[Path]:
         alone = len(found) == 1 and found[0].parent == path
         plain = alone and found[0].suffix == ".mcap" and not found[0].is_dir()
         return [path] if plain or not found else found
-    if glob.has_magic(str(path)) and not path.exists():
-        matches = sorted(map(Path, glob.glob(str(path), recursive=True)))  # noqa: PTH207 - absolute too
+    if has_magic(str(path)) and not path.exists():
+        matches = sorted(map(Path, glob(str(path), recursive=True)))  # noqa: PTH207 - absolute too
         return list(dict.fromkeys(one for each in matches for one in _matched(each))) or [path]
     return [path]
 
@@ -190,12 +200,10 @@ def show(lines: Mapping[str, Line], *, as_json: bool) -> int:
     if as_json:
         emit_json([line.facts for line in lines.values()])
     else:
-        terminal = sys.stdout.isatty()
-        width = shutil.get_terminal_size().columns if terminal else UNLIMITED
         rows = [
             [(text or "-", "") for text in (name, *_cells(line))] for name, line in lines.items()
         ]
-        texts, _ = table(_COLUMNS, rows, width, cropped=terminal)
+        texts, _ = table(_COLUMNS, rows, output_width(), cropped=sys.stdout.isatty())
         sys.stdout.write("".join(f"{text.plain.rstrip()}\n" for text in texts))
     return int(not all(line.good for line in lines.values()))
 

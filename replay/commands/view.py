@@ -18,13 +18,12 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output
 from undulog.capture.common.process import interruptible
 
-from .. import viewer
-from ..samples.content import Layer
 from .view_recorded import ClipOptions, OverlayOptions, SingleOptions, view_clip, view_overlay
 
 if TYPE_CHECKING:
     from ..feed.recording import Recording
     from ..live.relay import RelayReport
+    from ..viewer import Viewer
 
 _NICENESS, _LIVE_NICENESS = 5, 10
 _WINDOW, _SERVER = "--memory-limit=1GB", "--server-memory-limit=256MB"  # of a live view
@@ -192,6 +191,7 @@ def _view_live(
     path: Path, *, save: Path | None, web: bool, connect: str | None, json: bool
 ) -> None:
     """Show what a recorder on this machine records, until it is closed or interrupted."""
+    from .. import viewer
     from ..live.relay import relay_to_file, relay_to_viewer
 
     if not (web or connect or save):
@@ -235,6 +235,9 @@ def _view_session(
     file: Path, single: SingleOptions, topics: JointTopicOptions, robot: str | None, *, web: bool
 ) -> None:
     """Show a session until the viewer is closed or a stop is requested."""
+    from .. import viewer
+    from ..samples.content import Layer
+
     if not web:
         viewer.require_display()
     with ExitStack() as stack:
@@ -267,8 +270,10 @@ def _view_session(
         process.wait(stop)
 
 
-def _open_viewer(*options: str, web: bool) -> viewer.Viewer:
+def _open_viewer(*options: str, web: bool) -> Viewer:
     """Start a window, or a server whose page is printed once it is there."""
+    from .. import viewer
+
     if not web:
         return viewer.open_window(*options)
     server, page = viewer.open_server(*options)

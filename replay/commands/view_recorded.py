@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
@@ -17,9 +16,6 @@ from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import MissingExtraError, UsageError
 from undulog.capture.common.process import interruptible
-
-from .. import viewer
-from ..samples.content import Tab
 
 if TYPE_CHECKING:
     from ..feed.film import Shot
@@ -55,7 +51,7 @@ class SingleOptions(_Options):
     """
 
     result: Annotated[list[Path] | None, Parameter(negative=())] = None
-    tab: Tab | None = None
+    tab: Literal["session", "cycles", "mean-cycle"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,13 +121,15 @@ def view_clip(
         from ..feed.film import check_film, film, scene_only
     except ModuleNotFoundError as error:
         raise MissingExtraError("'undulog view --clip'", "replay", error.name or "av") from error
+    from tempfile import TemporaryDirectory
+
     from ..draw.body import body_title
     from ..feed.recording import write_recording
 
     refuse_existing(clip, force=force)
     with (
         interruptible() as stop,
-        tempfile.TemporaryDirectory(prefix="undulog-clip-") as folder,
+        TemporaryDirectory(prefix="undulog-clip-") as folder,
         capture.Session.open(file, robot=robot) as opened,
     ):
         session = topics.view(opened)
@@ -215,6 +213,9 @@ def view_overlay(
     Raises:
         UsageError: If the names don't fit, or a session has no gait to be aligned by.
     """
+    from tempfile import TemporaryDirectory
+
+    from .. import viewer
     from ..overlay.sessions import Align, names_of
     from ..overlay.write import Place, combine_sessions, steps
 
@@ -225,7 +226,7 @@ def view_overlay(
     with ExitStack() as stack:
         path = save
         if path is None:  # it is only looked at
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="undulog-view-"))
+            folder = stack.enter_context(TemporaryDirectory(prefix="undulog-view-"))
             path = Path(folder) / "beside.rrd"
         with interruptible() as stop, progress("view", total=steps(len(files))) as bar:
             beside = combine_sessions(

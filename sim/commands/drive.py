@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
-import sys
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -18,6 +16,7 @@ from undulog.capture.common.console import (
     UNLIMITED,
     complain,
     emit,
+    output_width,
     progress,
     refuse_existing,
 )
@@ -134,9 +133,8 @@ def dry_run_on_bus(
             stop=stop,
             on_time=lambda time_s: bar.update(time_s, speed_text(time_s, start)),
         )
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED
     hint = ["", f"To send it to {on}, the same with --arm and -o SESSION.mcap"]
-    lines = [*summary_lines(dry, width), *(hint if dry.verdict.fit else [])]
+    lines = [*summary_lines(dry, output_width()), *(hint if dry.verdict.fit else [])]
     emit({"on": on, **reported(dry)}, lines, as_json=as_json)
     return 0 if dry.verdict.fit else 1
 
