@@ -186,7 +186,7 @@ class Paths:
     def base(self, version: str) -> str:
         """Install without extras; check what works, and that the rest names its extra."""
         bin_ = self.environment(f"base{version}", version)
-        run(bin_ / "pip", "install", "--quiet", self.wheel())
+        run(bin_ / "pip", "install", "--quiet", "--no-compile", self.wheel())
         self.check_base(bin_ / "undulog", self.work / f"work{version}")
         return f"{len(NEEDS_NONE)} commands work, {len(NEEDS_EXTRA)} name their extra"
 

@@ -10,16 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import (
-    CONTRACT,
-    FAILED,
-    JointTopicOptions,
-    Line,
-    are_as_given,
-    sessions_of,
-    show,
-)
+from undulog.capture.commands.sessions import FAILED, Line, are_as_given, sessions_of, show
 from undulog.capture.commands.sessions import each as each_session
+from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output, write_text

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 from ..common.console import emit, progress
 from ..common.errors import DataError, UsageError
 from ..log.messages.definitions import CONTRACT_VERSION
-from .sessions import CONTRACT, JointTopicOptions, Line, each, sessions_of, show, stated_gait
+from .sessions import Line, each, sessions_of, show, stated_gait
+from .topic_options import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:
     from ..log.columns.topics import Channel

@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from ..common.console import UNLIMITED, Column, echo, emit, emit_json, table
 from ..common.errors import RobotFileError
 from ..common.files import check_output, write_text
-from .sessions import CONTRACT, JointTopicOptions
+from .topic_options import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:
     from ..robot.model import Robot

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import CommandTopic, Line, each, sessions_of, show
+from undulog.capture.commands.sessions import Line, each, sessions_of, show
+from undulog.capture.commands.topic_options import CommandTopic
 from undulog.capture.common.console import (
     UNLIMITED,
     complain,
