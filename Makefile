@@ -103,8 +103,8 @@ golden: $(READY)  ## the golden pictures that every view is held to, anew; look 
 release: $(READY)  ## wheel, source archive, notes, bill of materials of the last commit, under dist/
 	$(BIN)/python .ci/release.py dist
 
-install-paths: $(READY)  ## every way to install, one line each (minutes, gigabytes)
-	$(BIN)/python .ci/install_paths.py
+install-paths: $(READY)  ## every way to install, one line each: minutes, gigabytes (STEPS=base for fewer)
+	$(BIN)/python .ci/install_paths.py $(STEPS)
 
 lock: $(READY)  ## renew requirements.lock (needs uv on the path)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header \

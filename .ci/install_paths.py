@@ -149,7 +149,8 @@ class Paths:
             yield f"wheel[all] by pip, Python {version}", partial(self.everything, version)
         yield "base wheel by pipx", self.pipx
         yield "base wheel by uv tool", self.uv_tool
-        yield "base dependencies as wheels for aarch64", self.aarch64
+        for title, extra in (("base", ""), ("simulation", "sim")):
+            yield f"{title} dependencies as wheels for aarch64", partial(self.aarch64, extra)
         yield "container: the steps of Containerfile", self.container
 
     def source(self) -> str:
@@ -166,16 +167,17 @@ class Paths:
             run("git", "clone", "--quiet", "--no-hardlinks", ROOT, clone)
         return clone
 
-    def environment(self, name: str, version: str) -> Path:
-        """Return the folder of programs of a new virtual environment."""
+    def environment(self, name: str, version: str = "3.11") -> Path:
+        """Return the folder of programs of a virtual environment, a new one if there is none."""
         place = self.work / name
-        run(find_python(version), "-m", "venv", place)
+        if not place.is_dir():
+            run(find_python(version), "-m", "venv", place)
         return place / "bin"
 
     def wheel(self) -> Path:
         """Return the wheel of the last commit."""
         if self._wheel is None:
-            bin_ = self.environment("build", "3.11")
+            bin_ = self.environment("build")
             run(bin_ / "pip", "install", "--quiet", "hatchling")
             run(bin_ / "python", "-m", "hatchling", "build", "-d", "dist", cwd=self.clone())
             (self._wheel,) = (self.clone() / "dist").glob("*.whl")
@@ -184,7 +186,7 @@ class Paths:
     def base(self, version: str) -> str:
         """Install without extras; check what works, and that the rest names its extra."""
         bin_ = self.environment(f"base{version}", version)
-        run(bin_ / "pip", "install", "--quiet", self.wheel())
+        run(bin_ / "pip", "install", "--quiet", "--no-compile", self.wheel())
         self.check_base(bin_ / "undulog", self.work / f"work{version}")
         return f"{len(NEEDS_NONE)} commands work, {len(NEEDS_EXTRA)} name their extra"
 
@@ -245,26 +247,20 @@ class Paths:
         self.check_base(home / "bin/undulog", self.work / "uv-work")
         return "installed"
 
-    def aarch64(self) -> str:
-        """Find a wheel of every base dependency, and of MuJoCo, for 64-bit ARM."""
+    def aarch64(self, extra: str) -> str:
+        """Find a wheel for 64-bit ARM of every dependency: those of an extra, or the base."""
         project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-        simulation = [
-            line.partition(";")[0]
-            for line in project["optional-dependencies"]["sim"]
-            if "pybullet" not in line
-        ]
-        bin_ = self.environment("aarch64", "3.11")
-        run(bin_ / "pip", "install", "--quiet", "--upgrade", "pip")
+        lines = project["optional-dependencies"][extra] if extra else project["dependencies"]
+        # PyBullet has no such wheel: MuJoCo takes its place there.
+        wanted = [line.partition(";")[0] for line in lines if "pybullet" not in line]
         platforms = (
             f"--platform={name}_aarch64"
             for name in ("manylinux_2_28", "manylinux_2_27", "manylinux_2_17", "manylinux2014")
         )
-        folder = self.work / "aarch64-wheels"
-        run(
-            *(bin_ / "pip", "download", "--quiet", "--only-binary=:all:", "--python-version=3.11"),
-            *platforms,
-            *("-d", folder, *project["dependencies"], *simulation),
-        )
+        folder = self.work / f"aarch64-{extra}"
+        pip = self.environment("build") / "pip"
+        options = ("--quiet", "--only-binary=:all:", "--python-version=3.11", *platforms)
+        run(pip, "download", *options, "-d", folder, *wanted)
         names = [path.name for path in folder.iterdir()]
         native = [name for name in names if "aarch64" in name]
         return f"{len(names)} wheels, {len(native)} of them for aarch64"

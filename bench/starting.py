@@ -1,8 +1,9 @@
-"""Starting: the help of every command, and a small command, against importing NumPy.
+"""Starting: all help, and a small command, against importing NumPy.
 
-``undulog COMMAND --help`` may take twice the processor time of ``python -c 'import numpy'``, and
-``undulog log info`` of a small session three times. Each turn runs all of them and the peer, in
-turn, in processes of their own, after a first turn that fills the caches.
+``undulog --help`` and ``undulog COMMAND --help`` may each take twice the processor time of
+``python -c 'import numpy'``, and ``undulog log info`` of a small session three times. Each turn
+runs all of them and the peer, in turn, in processes of their own, after a first turn that fills the
+caches; compiled modules are kept, as an installation has them.
 
 Run: python bench/starting.py [--runs 5]
 """
@@ -24,9 +25,15 @@ from undulog.capture import SessionWriter
 HELP, INFO = 2.0, 3.0
 
 
-def processor_s(*command: str) -> float:
-    """Return the processor time of a command, its children included [s]."""
-    child = subprocess.Popen([sys.executable, *command], stdout=subprocess.DEVNULL)
+def processor_s(bytecode: str, *command: str) -> float:
+    """Return the processor time of a command, its children included [s].
+
+    Args:
+        bytecode: Folder of compiled modules.
+        command: Arguments of Python.
+    """
+    env = os.environ | {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": bytecode}
+    child = subprocess.Popen([sys.executable, *command], stdout=subprocess.DEVNULL, env=env)
     _, status, used = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:
@@ -50,15 +57,17 @@ def main() -> int:
     runs: int = parser.parse_args().runs
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "small.mcap"
+        bytecode = f"{folder}/bytecode"
         write_session(session)
-        commands = {f"{verb} --help": [*verb.split(), "--help"] for verb in undulog.VERBS}
+        commands = {"--help": ["--help"]}
+        commands |= {f"{verb} --help": [*verb.split(), "--help"] for verb in undulog.VERBS}
         commands["log info, a small session"] = ["log", "info", str(session)]
         ours: dict[str, list[float]] = {name: [] for name in commands}
         peer: dict[str, list[float]] = {name: [] for name in commands}
         for turn in range(runs + 1):
             for name, words in commands.items():
-                mine = processor_s("-m", "undulog", *words)
-                theirs = processor_s("-c", "import numpy")
+                mine = processor_s(bytecode, "-m", "undulog", *words)
+                theirs = processor_s(bytecode, "-c", "import numpy")
                 if turn:
                     ours[name].append(mine)
                     peer[name].append(theirs)

@@ -7,6 +7,7 @@ the work failed, 2 wrong usage.
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -164,25 +165,28 @@ def build(arguments: Sequence[str] = ()) -> App:
     Returns:
         The application.
     """
-    from importlib.metadata import version
-
     from cyclopts import App, Parameter
 
+    from .help_layout import HelpLayout
+
+    completion = list(arguments[:1]) == [_COMPLETION]
     app = App(
         name="undulog",
         help="Record, simulate, measure and replay undulating robots. "
         "Every session is one MCAP file that explains itself. "
         "Every command takes `--max-chunk-mib N`: larger chunks (256 MiB by default) are not read.",
-        version=lambda: version("undulog"),
-        help_format="markdown",
-        help_epilogue="Example: `undulog sim run flat -o run.mcap && undulog analyse run.mcap`",
+        version=_version,
+        help_format="markdown" if completion else "plaintext",
+        help_formatter=HelpLayout(),
+        help_epilogue="Example: undulog sim run flat -o run.mcap && undulog analyse run.mcap",
         default_parameter=Parameter(negative=()),
         result_action="return_value",
         suppress_keyboard_interrupt=False,  # run() says so, and ends with 1
     )
-    app.register_install_completion_command(  # pyright: ignore[reportUnknownMemberType] untyped **
-        _COMPLETION, help="Install completion of commands and options for bash, zsh or fish."
-    )
+    if not arguments or arguments[0].startswith("-"):  # no other command can be the one meant
+        app.register_install_completion_command(  # pyright: ignore[reportUnknownMemberType] untyped **
+            _COMPLETION, help="Install completion of commands and options for bash, zsh or fish."
+        )
     groups = {name: _group(name, arguments) for name in _GROUPS}
     for group in groups.values():
         app.command(group)
@@ -196,6 +200,12 @@ def build(arguments: Sequence[str] = ()) -> App:
             _in_commands(target), name=name, help=None if asked else summary, help_epilogue=""
         )
     return app
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("undulog")
 
 
 def _in_commands(target: str) -> str:
@@ -259,6 +269,8 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Run the process's own command line and exit."""
+    if "--help" in sys.argv:
+        gc.disable()  # a seventh of the time, and the process ends with the help
     if not sys.stderr.isatty():
         os.environ.setdefault("NO_COLOR", "1")  # Rerun's log is coloured anyway: no-color.org
     try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
@@ -12,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions, Line, sessions_of
+from undulog.capture.commands.sessions import Line, are_as_given, sessions_of
 from undulog.capture.commands.sessions import each as each_session
 from undulog.capture.commands.sessions import show as show_table
-from undulog.capture.common.console import UNLIMITED, Progress, echo, emit_json, progress
+from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
+from undulog.capture.common.console import Progress, echo, emit_json, output_width, progress
 from undulog.capture.common.errors import UndulogError, UsageError
 from undulog.capture.common.files import check_output, write_text
-from undulog.capture.common.remote import as_path
 
 if TYPE_CHECKING:
     from undulog.capture import SessionView
@@ -83,7 +82,7 @@ def analyse(
     if output is not None:
         why = "the result file is JSON; end its name in .json (a page is made by undulog report)"
         check_output(output, (".json",), why, force=force)
-    one_by_one = len(paths) > 1 and (each or paths != [*map(as_path, files)])
+    one_by_one = len(paths) > 1 and (each or not are_as_given(paths, files))
     if csv is not None:
         from ..present.notebook.frames import check_csv
 
@@ -261,8 +260,8 @@ def show(render: Callable[[int, bool], str], output: Path | None) -> None:
         render: Returns the text for a width in columns, with or without bold and dim type.
         output: The file that was written.
     """
-    terminal = sys.stdout.isatty()
-    width = shutil.get_terminal_size().columns if terminal else UNLIMITED
-    sys.stdout.write(render(width, terminal))  # its names are escaped; the rest are styles
+    sys.stdout.write(
+        render(output_width(), sys.stdout.isatty())
+    )  # its names are escaped; the rest are styles
     if output is not None:
         echo(f"Result: {output}")

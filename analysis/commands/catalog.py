@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,6 +14,7 @@ from undulog.capture.common.console import (
     complain,
     echo,
     emit_json,
+    output_width,
     progress,
     table,
 )
@@ -127,7 +126,7 @@ def _write(rows: Any, output: Path) -> None:
 
 
 def _print(rows: Any, names: tuple[str, ...] | None, report: ScanReport | None) -> None:
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED
+    width = output_width()
     names = tuple(rows.columns) if names is None else names
     cells = [
         [(_text(value), "") for value in row]

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
+from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json
 from undulog.capture.common.errors import UsageError
 
@@ -297,7 +296,7 @@ def check_servos(base: BaseGait, runs: tuple[PlannedRun, ...], session: SessionV
         return
     joints = {joint.name: joint for joint in session.robot.joints}
     tones = runs[0].tones(base.omega)
-    size = np.sum([np.abs(tone.amplitude) for tone in tones], axis=0)
+    size = sum(abs(tone.amplitude) for tone in tones)
     for row, k in enumerate(base.driven):
         joint = joints.get(base.names[k])
         if joint is None:

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
+from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import emit_json
 from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.common.files import check_output
 
 from .analyse import chosen, experiment_of, show
-from .plan import Planned, check_numbers, write_sessions
 
 if TYPE_CHECKING:
     from undulog.capture import SessionView
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from ..plan.gait_base import BaseGait
     from ..results.coupling import Coupling, LocalCoupling
     from ..session.runs import GaitRun
+    from .plan import Planned
 
 
 def predict(
@@ -175,6 +175,8 @@ def compensate(
         topics: Where commands and responses of the sessions are.
         json: Print one JSON object.
     """
+    from .plan import Planned, check_numbers, write_sessions
+
     check_numbers(runs, settle, measure)
     coupling = coupling_of_result(kicks)
     driven = _runs(after or (), start, topics)

@@ -10,19 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import (
-    CONTRACT,
-    FAILED,
-    JointTopicOptions,
-    Line,
-    sessions_of,
-    show,
-)
+from undulog.capture.commands.sessions import FAILED, Line, are_as_given, sessions_of, show
 from undulog.capture.commands.sessions import each as each_session
+from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output, write_text
-from undulog.capture.common.remote import as_path
 
 from .analyse import PAGES, chosen, experiment_of, line_of
 
@@ -113,7 +106,7 @@ def report(
             made = _fleet(catalog, find, outputs.first)
         elif not several:
             made = _one(paths[0], options, robot)
-        elif each or paths != [*map(as_path, files)]:
+        elif each or not are_as_given(paths, files):
             made = _one_by_one(paths, options, robot)
         else:
             made = _several(paths, options, robot)

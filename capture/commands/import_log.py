@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from ..common.console import emit
 from ..common.errors import ImportFormatError, UsageError
 from ..common.files import check_output, is_file
-from .sessions import CONTRACT, JointTopicOptions
+from .topic_options import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:
     from ..exchange.can_import import ImportReport

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-from importlib.metadata import PackageNotFoundError, version
 
 from ..common.console import emit
 from ..common.extras import EXTRAS, extra_packages, install_command
@@ -13,6 +12,8 @@ _BASE = ("undulog", "numpy", "scipy", "pandas", "mcap", "python-can", "cantools"
 
 def package_version(name: str) -> str | None:
     """Return the version of a package, None if it is not installed."""
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version(name)
     except PackageNotFoundError:

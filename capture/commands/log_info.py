@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 from ..common.console import emit, progress
 from ..common.errors import DataError, UsageError
-from ..log.columns.topics import Channel
 from ..log.messages.definitions import CONTRACT_VERSION
-from ..log.messages.frames import FD_TOPIC_PREFIX
-from ..log.read.session import Session
-from .sessions import CONTRACT, JointTopicOptions, Line, each, sessions_of, show, stated_gait
+from .sessions import Line, each, sessions_of, show, stated_gait
+from .topic_options import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:
+    from ..log.columns.topics import Channel
     from ..log.health.bus_tally import SourceHealth
     from ..log.health.contract import Violation
     from ..log.health.session_check import SessionHealth
     from ..log.health.tallies import BusHealth, SeriesHealth
+    from ..log.read.session import Session
 
 _MESSAGES_PER_LOOK = 1000
 
@@ -78,6 +78,8 @@ def describe(session: Session) -> dict[str, Any]:
 
 def _fd_frames(session: Session, channel: Channel) -> int | None:
     """Count the CAN FD frames of a topic, a window at a time; None for any other topic."""
+    from ..log.messages.frames import FD_TOPIC_PREFIX
+
     if not channel.topic.startswith(FD_TOPIC_PREFIX) or not channel.is_ros2:
         return None
     windows = max(1, channel.count // _MESSAGES_PER_LOOK)
@@ -104,6 +106,8 @@ def log_info(file: Path, /, *more: Path, json: bool = False) -> int:
         more: More of them; a folder has all logs in it, a pattern such as 'runs/**/*.mcap' too.
         json: Print one JSON object, or for several logs a list of them.
     """
+    from ..log.read.session import Session
+
     paths = sessions_of([file, *more])
     if len(paths) > 1:
         return show(each(paths, "log info", _info_line), as_json=json)
@@ -114,6 +118,8 @@ def log_info(file: Path, /, *more: Path, json: bool = False) -> int:
 
 
 def _info_line(path: Path) -> Line:
+    from ..log.read.session import Session
+
     with Session.open(path) as session:
         facts, gait = describe(session), stated_gait(session.metadata)
     first = next(_info_lines(facts)).removeprefix(f"{facts['session']['id']}: ")
@@ -235,6 +241,7 @@ def _check_contracts(paths: Sequence[Path], *, as_json: bool) -> int:
 
 def _contract_line(path: Path) -> Line:
     from ..log.health.contract import check_contract
+    from ..log.read.session import Session
 
     found = check_contract(path)
     with Session.open(path) as session:
@@ -261,6 +268,7 @@ def _contract_facts(path: Path, found: Sequence[Violation]) -> dict[str, Any]:
 
 def _check_line(path: Path, topics: JointTopicOptions) -> Line:
     from ..log.health.session_check import check_session
+    from ..log.read.session import Session
 
     health = check_session(path, topics=topics.names)
     with Session.open(path) as session:
@@ -384,6 +392,8 @@ def _source_line(source: SourceHealth) -> str:
 
 
 def _bus_line(bus: BusHealth) -> str:
+    from ..log.messages.frames import FD_TOPIC_PREFIX
+
     rate = f", {bus.rate_hz:.1f} Hz" if bus.rate_hz is not None else ""
     fd = bus.topic.startswith(FD_TOPIC_PREFIX)
     load = ", load not estimated" if fd else ", load unknown (no bitrate)"

@@ -1,65 +1,16 @@
-"""Sessions of a command: paths, folders and patterns in, a table out; topics of their joints."""
+"""Sessions of a command: paths, folders and patterns in, a table out."""
 
 from __future__ import annotations
 
-import glob
 import re
-import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from cyclopts import Parameter
-
-from ..common.console import UNLIMITED, Column, emit_json, progress, table
+from ..common.console import Column, emit_json, output_width, progress, table
 from ..common.errors import UndulogError
-from ..common.remote import RemotePath, as_path
-from ..log.messages.definitions import COMMAND_TOPIC, RESPONSE_TOPIC
-
-if TYPE_CHECKING:
-    from ..log.read.session_view import SessionView
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class CommandTopic:
-    """Where the commands are.
-
-    Attributes:
-        command_topic: Topic of the commands: of JointStates or JointTrajectories,
-            `TOPIC.reference` of a controller state, or `TOPIC:JOINT,JOINT,...` of a
-            Float64MultiArray.
-    """
-
-    command_topic: str = COMMAND_TOPIC
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class JointTopicOptions(CommandTopic):
-    """Where commands and responses are; by default found by type if those topics are missing.
-
-    Attributes:
-        response_topic: Topic of the responses: of JointStates or DynamicJointStates, or
-            `TOPIC.feedback` of a controller state.
-    """
-
-    response_topic: str = RESPONSE_TOPIC
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """Topics of commands and responses."""
-        return self.command_topic, self.response_topic
-
-    def view(self, session: SessionView) -> SessionView:
-        """View a session with its joints on the topics of the log contract."""
-        return session.with_joints(*self.names)
-
-
-CONTRACT = JointTopicOptions()
-
 
 _COLUMNS = (
     Column("session", left=True),
@@ -101,6 +52,8 @@ def sessions_of(given: Iterable[Path]) -> list[Path]:
             pattern (``*``, ``?``, ``[...]``, ``**``) is a path that isn't there. What names no
             session stays, for the command to refuse.
     """
+    from ..common.remote import as_path
+
     found: list[Path] = []
     for path in map(as_path, given):
         own = _named(path)
@@ -108,7 +61,18 @@ def sessions_of(given: Iterable[Path]) -> list[Path]:
     return found
 
 
+def are_as_given(paths: Sequence[Path], given: Iterable[Path]) -> bool:
+    """Return whether each session was named by its own path or URL: no folder, no pattern."""
+    from ..common.remote import as_path
+
+    return list(paths) == [*map(as_path, given)]
+
+
 def _named(path: Path) -> list[Path]:
+    from glob import glob, has_magic
+
+    from ..common.remote import RemotePath
+
     if isinstance(path, RemotePath):
         return [path]
     if path.is_dir():
@@ -116,8 +80,8 @@ def _named(path: Path) -> list[Path]:
         alone = len(found) == 1 and found[0].parent == path
         plain = alone and found[0].suffix == ".mcap" and not found[0].is_dir()
         return [path] if plain or not found else found
-    if glob.has_magic(str(path)) and not path.exists():
-        matches = sorted(map(Path, glob.glob(str(path), recursive=True)))  # noqa: PTH207 - absolute too
+    if has_magic(str(path)) and not path.exists():
+        matches = sorted(map(Path, glob(str(path), recursive=True)))  # noqa: PTH207 - absolute too
         return list(dict.fromkeys(one for each in matches for one in _matched(each))) or [path]
     return [path]
 
@@ -190,12 +154,10 @@ def show(lines: Mapping[str, Line], *, as_json: bool) -> int:
     if as_json:
         emit_json([line.facts for line in lines.values()])
     else:
-        terminal = sys.stdout.isatty()
-        width = shutil.get_terminal_size().columns if terminal else UNLIMITED
         rows = [
             [(text or "-", "") for text in (name, *_cells(line))] for name, line in lines.items()
         ]
-        texts, _ = table(_COLUMNS, rows, width, cropped=terminal)
+        texts, _ = table(_COLUMNS, rows, output_width(), cropped=sys.stdout.isatty())
         sys.stdout.write("".join(f"{text.plain.rstrip()}\n" for text in texts))
     return int(not all(line.good for line in lines.values()))
 

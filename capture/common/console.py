@@ -13,12 +13,12 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-from rich.cells import cell_len
-from rich.text import Text
+from typing import TYPE_CHECKING, Any
 
 from .errors import OutputExistsError, UsageError
+
+if TYPE_CHECKING:
+    from rich.text import Text
 
 _UNSAFE = ("Cc", "Cf", "Cs", "Cn", "Co", "Zl", "Zp")
 """Unicode categories: control, format (also text direction), surrogate, unassigned, private, line
@@ -139,6 +139,13 @@ UNLIMITED = 10_000
 """A width at which nothing wraps."""
 
 
+def output_width() -> int:
+    """Return the width of the terminal that the output goes to [cells], unlimited if it is none."""
+    from shutil import get_terminal_size
+
+    return get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED
+
+
 Warn = Callable[[str], None]
 
 
@@ -179,6 +186,9 @@ def table(
     Returns:
         The head and one line a row; the titles of the columns left out, in the order they went.
     """
+    from rich.cells import cell_len
+    from rich.text import Text
+
     texts = [[_printable(text) for text, _ in row] for row in rows]
     needed = [
         max(column.width, cell_len(plain(column.title)), *(cell_len(row[k]) for row in texts), 0)
@@ -221,12 +231,16 @@ def table(
 
 def fit(text: str, width: int) -> str:
     """Cut or pad a text to a width in cells of a terminal."""
+    from rich.cells import cell_len
+
     short = cut(text, width)
     return short + " " * (width - cell_len(short))
 
 
 def cut(text: str, width: int) -> str:
     """Escape control characters and cut a text to a width in cells of a terminal."""
+    from rich.text import Text
+
     clean = Text(_printable(text))
     clean.truncate(max(width, 1), overflow="ellipsis")
     return clean.plain

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import os
-import secrets
-import shutil
-import socket
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from .console import refuse_existing
 from .errors import (
@@ -23,8 +19,12 @@ from .errors import (
     UndulogError,
     UsageError,
 )
-from .process import StopRequest
-from .strict_table import listed
+
+if TYPE_CHECKING:
+    import socket
+    from importlib.resources.abc import Traversable
+
+    from .process import StopRequest
 
 
 def is_file(path: Path) -> bool:
@@ -94,6 +94,8 @@ class Shelf:
         path = Path(name_or_path)
         is_path = bool(path.suffix) or len(path.parts) > 1
         if not is_path and not is_file(path):
+            from .strict_table import listed
+
             near = listed(self.names(), str(name_or_path))
             raise UsageError(f"no {self.kind} {str(name_or_path)!r}: not a file, nor one of {near}")
         try:
@@ -103,6 +105,8 @@ class Shelf:
             raise self.error(path, [fault]) from error
 
     def _place(self) -> Traversable:
+        from importlib import resources
+
         return resources.files(self.package) / self.folder
 
 
@@ -163,6 +167,8 @@ def part_folder(output: Path, *, marker: Path, force: bool) -> Generator[Path]:
             there.
         LogWriteError: If it can't be written; nothing is left behind then.
     """
+    import shutil
+
     if not output.name:
         raise UsageError(f"{output}: name a folder to be made")
     part = output.with_name(f"{output.name}.part")
@@ -234,7 +240,7 @@ def listen_at(listener: socket.socket, path: Path, backlog: int) -> None:
     os.fchmod(listener.fileno(), 0o600)  # before it has a name: no moment without
     # As long as the path itself, whose length is bounded (sun_path).
     length = len(os.fsencode(path.name))
-    draft = path.with_name(("~" + secrets.token_hex(8)).ljust(length, "~")[:length])
+    draft = path.with_name(("~" + os.urandom(8).hex()).ljust(length, "~")[:length])
     listener.bind(os.fspath(draft))
     try:
         listener.listen(backlog)

@@ -13,9 +13,6 @@ from numpy.typing import NDArray
 
 from .arrays import FloatArray, frozen
 
-COMMANDED_RGB: tuple[int, int, int] = (140, 140, 140)
-"""Grey of everything commanded, a null or a reference."""
-
 # Control points of a quadratic Bezier curve in OKLab (lightness, a, b): blue, green, amber.
 _CURVE = np.array([[0.53, -0.02, -0.18], [0.64, -0.20, 0.02], [0.77, 0.07, 0.16]])
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -152,6 +151,8 @@ def in_threads(
 
     if samples < MANY or threads == 1:
         return work(items)
+    from concurrent.futures import ThreadPoolExecutor
+
     # Shares of many items, since handing out one costs some 30 us.
     size = max(1, len(items) // (threads * _SHARES))
     shares = [items[first : first + size] for first in range(0, len(items), size)]

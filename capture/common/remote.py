@@ -10,9 +10,7 @@ from __future__ import annotations
 import io
 import os
 import re
-import uuid
 from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
@@ -117,6 +115,8 @@ class RemoteFile:
 
     def read_many(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
         """Fetch ranges, several at a time; see :meth:`read`."""
+        from concurrent.futures import ThreadPoolExecutor
+
         pieces = [
             (k, at, min(at + _PIECE, stop))
             for k, (start, stop) in enumerate(ranges)
@@ -316,7 +316,7 @@ class ObjectStore:
         path = self.path(name)
         with _errors(LogWriteError, f"{self.where}/{name}"):
             if self.is_local:
-                part = Path(f"{path}.{os.getpid()}-{uuid.uuid4().hex[:8]}.part")
+                part = Path(f"{path}.{os.getpid()}-{os.urandom(4).hex()}.part")
                 try:
                     part.write_bytes(data)
                     part.replace(path)

@@ -8,11 +8,9 @@ once at the end. Keys that were not read are faults too: a mistyped key never pa
 
 from __future__ import annotations
 
-import difflib
 import math
 import operator
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -41,6 +39,8 @@ def read_toml(text: str) -> dict[str, Any]:
         ValueError: If it is not TOML, has an integer of more than 64 bits, or nests tables and
             arrays more than 64 deep.
     """
+    import tomllib
+
     try:
         values = tomllib.loads(text)
     except RecursionError:
@@ -75,8 +75,11 @@ def shown(value: object) -> str:
 
 def listed(words: Iterable[str], found: object = None) -> str:
     """List the valid words, ``a, b, c``, and ``(did you mean b?)`` if ``found`` is close to one."""
-    valid = list(words)
-    near = difflib.get_close_matches(found, valid, n=1) if isinstance(found, str) else []
+    valid, near = list(words), list[str]()
+    if isinstance(found, str):
+        from difflib import get_close_matches
+
+        near = get_close_matches(found, valid, n=1)
     return (", ".join(valid) or "none") + (f" (did you mean {near[0]}?)" if near else "")
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from importlib.metadata import entry_points
 
 from ..common.config import read
 from ..common.strict_table import Table, listed
@@ -285,6 +284,8 @@ _DEFAULT_BITRATE = 1_000_000
 
 def family_names() -> tuple[str, ...]:
     """Return every family that a robot's description may name."""
+    from importlib.metadata import entry_points
+
     return (*CAN_FAMILIES, *SERVOS, *sorted(entry_points(group=DECODERS).names))
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
+from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_stop

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
+from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import interruptible

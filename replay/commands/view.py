@@ -12,19 +12,18 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from undulog import capture
-from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
+from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import complain, echo, emit_json, progress
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import check_output
 from undulog.capture.common.process import interruptible
 
-from .. import viewer
-from ..samples.content import Layer
-from .view_recorded import ClipOptions, OverlayOptions, SingleOptions, view_clip, view_overlay
+from .view_options import ClipOptions, OverlayOptions, SingleOptions, given
 
 if TYPE_CHECKING:
     from ..feed.recording import Recording
     from ..live.relay import RelayReport
+    from ..viewer import Viewer
 
 _NICENESS, _LIVE_NICENESS = 5, 10
 _WINDOW, _SERVER = "--memory-limit=1GB", "--server-memory-limit=256MB"  # of a live view
@@ -82,16 +81,18 @@ def view(
     """
     _check_usage(files, live, save=save, web=web, connect=connect, clip=clip, json=json)
     if beside is not None and len(files) < 2:
-        raise UsageError(f"{', '.join(beside.given)}: needs two sessions or more, side by side")
+        raise UsageError(f"{given(beside)}: needs two sessions or more, side by side")
     if single is not None and (len(files) != 1 or clip is not None):
-        raise UsageError(f"{', '.join(single.given)}: needs one session, and no --clip")
+        raise UsageError(f"{given(single)}: needs one session, and no --clip")
     if shot is not None and clip is None:
-        raise UsageError(f"{', '.join(shot.given)}: an option of clips; give --clip as well")
+        raise UsageError(f"{given(shot)}: an option of clips; give --clip as well")
     if live is not None and robot is not None:
         raise UsageError("--robot is for recorded logs; a recorder sends its robot's description")
     if clip is not None:
-        given = shot or ClipOptions()
-        view_clip(files[0], clip, given, topics=topics, robot=robot, force=force, json=json)
+        from .view_recorded import view_clip
+
+        filmed = shot or ClipOptions()
+        view_clip(files[0], clip, filmed, topics=topics, robot=robot, force=force, json=json)
         return
     if save is not None:
         check_output(save, [".rrd"], "a Rerun recording; end its name in .rrd", force=force)
@@ -102,8 +103,10 @@ def view(
     elif len(files) == 1:
         _view_session(files[0], single or SingleOptions(), topics, robot, web=web)
     else:
-        given = beside or OverlayOptions()
-        view_overlay(files, given, topics=topics, robot=robot, save=save, web=web, json=json)
+        from .view_recorded import view_overlay
+
+        laid = beside or OverlayOptions()
+        view_overlay(files, laid, topics=topics, robot=robot, save=save, web=web, json=json)
 
 
 def _check_usage(
@@ -192,6 +195,7 @@ def _view_live(
     path: Path, *, save: Path | None, web: bool, connect: str | None, json: bool
 ) -> None:
     """Show what a recorder on this machine records, until it is closed or interrupted."""
+    from .. import viewer
     from ..live.relay import relay_to_file, relay_to_viewer
 
     if not (web or connect or save):
@@ -235,6 +239,9 @@ def _view_session(
     file: Path, single: SingleOptions, topics: JointTopicOptions, robot: str | None, *, web: bool
 ) -> None:
     """Show a session until the viewer is closed or a stop is requested."""
+    from .. import viewer
+    from ..samples.content import Layer
+
     if not web:
         viewer.require_display()
     with ExitStack() as stack:
@@ -267,8 +274,10 @@ def _view_session(
         process.wait(stop)
 
 
-def _open_viewer(*options: str, web: bool) -> viewer.Viewer:
+def _open_viewer(*options: str, web: bool) -> Viewer:
     """Start a window, or a server whose page is printed once it is there."""
+    from .. import viewer
+
     if not web:
         return viewer.open_window(*options)
     server, page = viewer.open_server(*options)

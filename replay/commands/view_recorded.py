@@ -1,99 +1,26 @@
-"""Command ``view`` of recorded sessions: its options, a clip, several sessions side by side."""
+"""Command ``view`` of recorded sessions: a clip, several sessions side by side."""
 
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any
 
 from undulog import capture
-from undulog.capture.commands.sessions import CONTRACT, JointTopicOptions
+from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import echo, emit_json, progress, refuse_existing
 from undulog.capture.common.errors import MissingExtraError, UsageError
 from undulog.capture.common.process import interruptible
 
-from .. import viewer
-from ..samples.content import Tab
+from .view_options import ClipOptions, OverlayOptions
 
 if TYPE_CHECKING:
     from ..feed.film import Shot
     from ..feed.recording import Recording
     from ..overlay.sessions import Align
     from ..overlay.write import Overlay, Place
-
-_TYPED = {"start": "from", "end": "to"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Options:
-    """Options of the command line that belong together."""
-
-    @property
-    def given(self) -> list[str]:
-        """Options that were given, as they are typed."""
-        names = [one.name for one in fields(self) if getattr(self, one.name) is not None]
-        return [f"--{_TYPED.get(name, name.replace('_', '-'))}" for name in names]
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class SingleOptions(_Options):
-    """How one session is shown; None where an option is not given.
-
-    Attributes:
-        result: With one session: show what was found before instead of analysing now, `.json` of
-            `undulog analyse`. Results of an experiment or a comparison that it is part of mark the
-            modules they name. May be given several times.
-        tab: With one session: the tab in front, `session` by default; the mean cycle's
-            plays at once.
-    """
-
-    result: Annotated[list[Path] | None, Parameter(negative=())] = None
-    tab: Tab | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClipOptions(_Options):
-    """The command line's options of a clip; None for those not given.
-
-    Attributes:
-        start: With `--clip`: where it begins, in seconds of the session.
-        end: With `--clip`: where it ends.
-        fps: With `--clip`: frames a second; 25 by default.
-        speed: With `--clip`: seconds of the session in a second of the clip, e.g. 0.25.
-        size: With `--clip`: WIDTHxHEIGHT in pixels; 960x540 by default.
-    """
-
-    start: Annotated[float | None, Parameter(name="--from")] = None
-    end: Annotated[float | None, Parameter(name="--to")] = None
-    fps: Annotated[int | None, Parameter(name="--fps")] = None
-    speed: Annotated[float | None, Parameter(name="--speed")] = None
-    size: Annotated[str | None, Parameter(name="--size")] = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class OverlayOptions(_Options):
-    """The command line's options of sessions side by side; None for those not given.
-
-    Attributes:
-        align: With several sessions, what happens at once: the same `time` since each one's first
-            sample (the default), the same time since the start of its `gait`, or the
-            same `phase` of the gait.
-        names: With several sessions: what they are called, with commas, e.g. `robot,twin`; the
-            files' names by default.
-        place: With several sessions: whether bodies are laid on the first one at the `start`
-            (the default) or stay where each session's `world` has them.
-    """
-
-    align: Annotated[Literal["time", "gait", "phase"] | None, Parameter(name="--align")] = None
-    names: Annotated[str | None, Parameter(name="--names")] = None
-    place: Annotated[Literal["start", "world"] | None, Parameter(name="--place")] = None
 
 
 def view_clip(
@@ -125,13 +52,15 @@ def view_clip(
         from ..feed.film import check_film, film, scene_only
     except ModuleNotFoundError as error:
         raise MissingExtraError("'undulog view --clip'", "replay", error.name or "av") from error
+    from tempfile import TemporaryDirectory
+
     from ..draw.body import body_title
     from ..feed.recording import write_recording
 
     refuse_existing(clip, force=force)
     with (
         interruptible() as stop,
-        tempfile.TemporaryDirectory(prefix="undulog-clip-") as folder,
+        TemporaryDirectory(prefix="undulog-clip-") as folder,
         capture.Session.open(file, robot=robot) as opened,
     ):
         session = topics.view(opened)
@@ -215,6 +144,9 @@ def view_overlay(
     Raises:
         UsageError: If the names don't fit, or a session has no gait to be aligned by.
     """
+    from tempfile import TemporaryDirectory
+
+    from .. import viewer
     from ..overlay.sessions import Align, names_of
     from ..overlay.write import Place, combine_sessions, steps
 
@@ -225,7 +157,7 @@ def view_overlay(
     with ExitStack() as stack:
         path = save
         if path is None:  # it is only looked at
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="undulog-view-"))
+            folder = stack.enter_context(TemporaryDirectory(prefix="undulog-view-"))
             path = Path(folder) / "beside.rrd"
         with interruptible() as stop, progress("view", total=steps(len(files))) as bar:
             beside = combine_sessions(

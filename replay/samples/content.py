@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from undulog.capture.common.palette import COMMANDED_RGB
-
 if TYPE_CHECKING:
     from undulog.analysis.results.analysis import Analysis
     from undulog.analysis.session.cycles import CycleMaps
@@ -20,8 +18,8 @@ SCALARS = "Scalars:scalars"
 
 Color = tuple[int, int, int, int]
 
-GREY: Color = (*COMMANDED_RGB, 255)
-"""The grey of everything commanded."""
+GREY: Color = (140, 140, 140, 255)
+"""Grey of everything commanded, a null or a reference."""
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
-import sys
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -13,11 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from undulog.capture.commands.sessions import CommandTopic, Line, each, sessions_of, show
+from undulog.capture.commands.sessions import Line, each, sessions_of, show
+from undulog.capture.commands.topic_options import CommandTopic
 from undulog.capture.common.console import (
     UNLIMITED,
     complain,
     emit,
+    output_width,
     progress,
     refuse_existing,
 )
@@ -134,9 +134,8 @@ def dry_run_on_bus(
             stop=stop,
             on_time=lambda time_s: bar.update(time_s, speed_text(time_s, start)),
         )
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED
     hint = ["", f"To send it to {on}, the same with --arm and -o SESSION.mcap"]
-    lines = [*summary_lines(dry, width), *(hint if dry.verdict.fit else [])]
+    lines = [*summary_lines(dry, output_width()), *(hint if dry.verdict.fit else [])]
     emit({"on": on, **reported(dry)}, lines, as_json=as_json)
     return 0 if dry.verdict.fit else 1
 

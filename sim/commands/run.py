@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import re
-import sys
 import time
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
-from importlib.metadata import version
 from importlib.util import find_spec
 from json import dumps
 from pathlib import Path
-from shutil import get_terminal_size
 from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from cyclopts import Parameter
 
-from undulog.capture.common.console import UNLIMITED, Column, emit, progress, refuse_existing, table
+from undulog.capture.common.console import (
+    UNLIMITED,
+    Column,
+    emit,
+    output_width,
+    progress,
+    refuse_existing,
+    table,
+)
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import interruptible
 
@@ -55,6 +59,8 @@ def null(
         force: Replace the output if it is there.
         json: Print one JSON object instead of text.
     """
+    from importlib.metadata import version
+
     from undulog.capture.robot.null_model import write_null_model
 
     from ..scenario.scenario_file import load_scenario
@@ -103,9 +109,8 @@ def list_scenarios(*, json: bool = False) -> None:
     from ..scenario.scenario_file import load_scenario, scenario_names
 
     scenarios = [load_scenario(name) for name in scenario_names()]
-    columns = get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED
     described = [_described(scenario) for scenario in scenarios]
-    emit(described, _listed(scenarios, columns), as_json=json)
+    emit(described, _listed(scenarios, output_width()), as_json=json)
 
 
 def run(
@@ -307,6 +312,8 @@ def show(scenario: str, /, *, json: bool = False) -> None:
         scenario: Name of a shipped scenario (see `undulog sim list`), or a TOML file.
         json: Print one JSON object: each key with value and unit.
     """
+    import tomllib
+
     from ..scenario.scenario_file import load_scenario
 
     found = load_scenario(scenario)

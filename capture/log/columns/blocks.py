@@ -13,12 +13,11 @@ import mmap
 import struct
 from collections import deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
-from typing import Generic, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -37,6 +36,9 @@ from ..mcap.chunk import (
     gather,
     read_message_heads,
 )
+
+if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
 
 _T = TypeVar("_T")
 
@@ -75,6 +77,8 @@ def helpers(threads: int) -> Generator[ThreadPoolExecutor | None]:
     if threads == 1:
         yield None
         return
+    from concurrent.futures import ThreadPoolExecutor
+
     pool = ThreadPoolExecutor(threads - 1, thread_name_prefix="undulog-read")
     try:
         yield pool

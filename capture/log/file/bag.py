@@ -12,14 +12,10 @@ from __future__ import annotations
 
 import errno
 import re
-import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory, gettempdir
 from typing import TYPE_CHECKING, BinaryIO
-
-from mcap.writer import Writer
 
 from ...common.errors import LogError, MissingExtraError, NotALogError, UndulogError
 from ..messages.definitions import CONTROLLER_STATE, DYNAMIC_STATE
@@ -197,6 +193,8 @@ class BagCopy:
             from .bag_ros1 import BoundedReader
         except ImportError as error:
             raise MissingExtraError("reading a recording of ROS", "bags", "rosbags") from error
+        from tempfile import TemporaryDirectory, gettempdir
+
         ros1 = path.suffix == _ROS1
         scratch = folder or Path(gettempdir())
         size = check_room(path, scratch)
@@ -252,9 +250,11 @@ def check_room(path: Path, folder: Path) -> int:
     Raises:
         LogError: If it has not.
     """
+    from shutil import disk_usage
+
     files = [path] if path.is_file() else [each for each in path.iterdir() if each.is_file()]
     size = sum(each.stat().st_size for each in files)
-    free = shutil.disk_usage(folder).free
+    free = disk_usage(folder).free
     if free < size:
         why = f"its copy needs {size} bytes, {folder} has {free}; choose a larger disk (TMPDIR)"
         raise LogError(path, why)
@@ -272,6 +272,8 @@ class _Copy:
     def __init__(
         self, path: Path, stream: BinaryIO, allowance: Allowance, on_part: Callable[[float], None]
     ) -> None:
+        from mcap.writer import Writer
+
         self._path, self._allowance, self._on_part = path, allowance, on_part
         self._writer = Writer(stream)
         self._writer.start(profile="ros2", library="undulog")

@@ -9,7 +9,6 @@ Formats: https://github.com/ros2/rosbag2, https://mcap.dev/spec.
 from __future__ import annotations
 
 import io
-import sqlite3
 import struct
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
@@ -25,6 +24,8 @@ from ..mcap.chunk import BODY_AT, PREFIX_SIZE, walk_records
 from ..mcap.file import McapFile
 
 if TYPE_CHECKING:
+    import sqlite3
+
     from rosbags.interfaces import Connection
 
 METADATA = "metadata.yaml"
@@ -264,9 +265,12 @@ def _end(data: Any, at: int) -> int:
 
 @contextmanager
 def _sqlite(path: Path) -> Generator[Part]:
+    import sqlite3
+
     try:
         name = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         with closing(sqlite3.connect(name, uri=True)) as base:
+            base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, 1 << 20))
             yield _database(path, base)
     except sqlite3.Error as error:
         why = " ".join(str(error).split())
@@ -282,7 +286,6 @@ _REINDEX = "run 'ros2 bag reindex' on a copy of its folder"
 
 def _database(path: Path, base: sqlite3.Connection) -> Part:
     base.text_factory = _readable
-    base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, 1 << 20))
     # A view or a table of a module is a program, which may never end.
     tables = base.execute(
         "SELECT name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'"

@@ -7,11 +7,9 @@ one more block, in memory, after the files' blocks; nothing on the disk is chang
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import mmap
 import os
 import sys
-import tempfile
 import weakref
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -89,8 +87,10 @@ class FilePages:
         """
         if sys.platform != "linux":
             return new_pages(size)
+        from tempfile import TemporaryFile
+
         try:
-            with tempfile.TemporaryFile(dir=self._folder) as file:
+            with TemporaryFile(dir=self._folder) as file:
                 # A hole in a mapped file ends the process when the disk is full: reserve it all.
                 os.posix_fallocate(file.fileno(), 0, size)
                 found = mmap.mmap(file.fileno(), size)
@@ -280,7 +280,9 @@ class LogFile:
         tags = [file.remote.tag for file in self.files if file.remote is not None]
         if tags:
             return f"etag {' '.join(tags)}"
-        digest = hashlib.sha256()
+        from hashlib import sha256
+
+        digest = sha256()
         for file in self.files:
             with file.path.open("rb") as stream:
                 while piece := stream.read(1 << 20):

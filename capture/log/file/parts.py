@@ -6,7 +6,6 @@ part has the requested name, whether the session will be split or not.
 
 from __future__ import annotations
 
-import hashlib
 import re
 from dataclasses import dataclass, field
 from itertools import count, takewhile
@@ -133,6 +132,8 @@ def open_parts(first: Path, *, bare: bool) -> PartFiles:
 
 def check_chain(parts: PartFiles) -> list[str]:
     """Compare each part with its hash in the next one; return the faults, one sentence each."""
+    from hashlib import file_digest
+
     wrong: list[str] = []
     for number, file in parts.files.items():
         stated = _part_record(file).get("previous_sha256")
@@ -140,7 +141,7 @@ def check_chain(parts: PartFiles) -> list[str]:
         if stated is None or former is None:
             continue
         with former.path.open("rb") as stream:
-            found = hashlib.file_digest(stream, "sha256").hexdigest()
+            found = file_digest(stream, "sha256").hexdigest()
         if found != stated:
             wrong.append(
                 f"{former.path.name} is not the file that {file.path.name} was recorded after: "

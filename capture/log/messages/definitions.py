@@ -16,10 +16,12 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache
 from types import MappingProxyType
-
-from mcap.records import Channel
+from typing import TYPE_CHECKING
 
 from ...common.errors import DataError
+
+if TYPE_CHECKING:
+    from mcap.records import Channel
 
 COMMAND_TOPIC, RESPONSE_TOPIC = "/joint_commands", "/joint_states"
 """Topics of the log contract for commanded and measured joints."""

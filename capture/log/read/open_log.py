@@ -15,9 +15,6 @@ from numpy.typing import NDArray
 from ...common.arrays import IntArray
 from ...common.errors import DataError, RobotFileError, UndulogError
 from ...common.remote import as_path
-from ...robot.description import load_robot, robot_in_session
-from ...robot.model import Robot
-from ...robot.run import RUN_RECORD, Run, run_from_record, run_from_scenario
 from ..columns.blocks import Window
 from ..columns.columns import Messages
 from ..columns.layouts import Group, names_of
@@ -32,6 +29,12 @@ from .sample_times import JointSignals, StampClock
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from ...robot.model import Robot
+    from ...robot.run import Run
+
+DESCRIPTION = "robot.toml"
+"""Attachment that describes the robot."""
 
 
 class OpenLog:
@@ -52,7 +55,11 @@ class OpenLog:
     ) -> None:
         """Open a log; see :meth:`.Session.open`."""
         self.path = path = as_path(path)
-        described = None if robot is None else load_robot(robot)
+        described = None
+        if robot is not None:
+            from ...robot.description import load_robot
+
+            described = load_robot(robot)
         self.file = LogFile(path, column_folder, on_copied)
         self.warnings = list(self.file.warnings)
         if (newer := newer_contract(self.file.metadata.get("undulog", {}))) is not None:
@@ -67,6 +74,10 @@ class OpenLog:
         """The robot whose description is attached, or was given for a log without one; or None."""
         if self.robot_given is not None:
             return self.robot_given[1]
+        if DESCRIPTION not in self.file.attachments:
+            return None
+        from ...robot.description import robot_in_session
+
         attached = {name: item.data for name, item in self.file.attachments.items()}
         try:
             return robot_in_session(attached, self.path)
@@ -76,7 +87,7 @@ class OpenLog:
 
     def _given(self, name: str, robot: Robot) -> tuple[str, Robot] | None:
         """Return a robot given for the log, as it was named, if the log has none of its own."""
-        if "robot.toml" in self.file.attachments:
+        if DESCRIPTION in self.file.attachments:
             self._warn(f"the log has a description of its robot; the one given, {name}, isn't used")
             return None
         try:
@@ -89,6 +100,8 @@ class OpenLog:
     @cached_property
     def run(self) -> Run | None:
         """Servos, contact and physics rate of a twin's run; None for other sessions."""
+        from ...robot.run import RUN_RECORD, run_from_record, run_from_scenario
+
         facts = self.file.metadata.get(RUN_RECORD)
         if facts is not None:
             try:

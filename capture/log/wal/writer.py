@@ -32,7 +32,6 @@ from __future__ import annotations
 
 import errno
 import os
-import secrets
 import threading
 import time
 from contextlib import suppress
@@ -106,7 +105,7 @@ class WriteAheadLog:
             )
         self.folder = Path(folder)
         self._segment_size, self._interval_s = segment_size, sync_interval_s
-        self._log_id = secrets.token_bytes(16)
+        self._log_id = os.urandom(16)
         self._position = self._defined = 0
         self._released = -1
         self._synced = 0
@@ -318,7 +317,7 @@ class WriteAheadLog:
     def _reserve(self, stream: int, size: int) -> Segment:
         number = self._numbers[stream] + 1
         path = self.folder / segment_name(stream, number)
-        salt, size = secrets.randbits(32), (size + 7) & -8
+        salt, size = int.from_bytes(os.urandom(4)), (size + 7) & -8
         segment = Segment(path, SegmentHeader(stream, salt, number, size, self._log_id))
         self._numbers[stream] = number
         return segment

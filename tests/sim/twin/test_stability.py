@@ -8,6 +8,7 @@ import pytest
 from support.twin_runs import simulate
 from undulog import sim
 from undulog.capture.common.errors import SimulationError
+from undulog.capture.exchange.robot_draft import SeenJoint, draft
 from undulog.capture.robot.model import Plane
 from undulog.sim.twin.stability import likely_cause, stability, warnings
 
@@ -139,6 +140,19 @@ def test_the_default_robot_on_the_default_ground(nudged, links, planar, rate_hz,
     scenario = nudged(links, planar=planar, rate_hz=rate_hz, world=sim.World(), **servo)
     assert bool(warnings(scenario)) is not stable
     assert (restless(scenario) < 1e-4) is stable
+
+
+@pytest.mark.parametrize("joints", [1, 2, 25])
+def test_a_drafted_robot_is_calm_at_the_default_step_and_follows(make_scenario, joints):
+    names = [f"joint{k}" for k in range(joints)]
+    robot = draft("mine", [SeenJoint(name, -0.5, 0.5, 2.0) for name in names], "run.mcap")
+    scenario = make_scenario(robot, amplitude=0.3, ramp_s=0.5)
+    assert warnings(scenario) == ()
+    samples = simulate(scenario)[-20:]
+    rates = np.array([sample.step.body.rate for sample in samples])
+    assert np.abs(rates).max() < 2.0  # 0.3 rad at 0.5 Hz: 0.94 rad/s
+    errors = [sample.gait.command - sample.step.body.angle for sample in samples]
+    assert np.abs(errors).max() < 0.1
 
 
 @pytest.mark.parametrize("name", sim.scenario_names())
