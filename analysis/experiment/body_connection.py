@@ -15,8 +15,7 @@ from ..body.connection import Connection, condition_of, distances, fit_connectio
 from ..body.shape import mean_step
 from ..estimators.intervals import around
 from ..results import formats
-from ..results.body_connection import BodyConnection, ConnectionEntry, PredictedTravel
-from ..results.body_shape import ShapeMode
+from ..results.body_shape import BodyConnection, ConnectionEntry, PredictedTravel, ShapeMode
 from ..results.estimate import Estimate
 
 MOST_DISTANCE = 0.3

@@ -1,4 +1,4 @@
-"""Parameters of the controllers. All distances in m, offsets in rad; the laws: :mod:`.laws`."""
+"""Parameters of the controllers. All distances in m, offsets in rad; see :mod:`.sim.control`."""
 
 from __future__ import annotations
 

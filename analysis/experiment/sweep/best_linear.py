@@ -10,8 +10,7 @@ import numpy as np
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 
-from ...frequency_response.estimate import joint_response, sound_lines
-from ...frequency_response.excitation import Kind
+from ...frequency_response.estimate import Kind, joint_response, sound_lines
 from ...frequency_response.periodic import (
     BestLinearApproximation,
     detection_lines,

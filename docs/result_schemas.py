@@ -14,13 +14,17 @@ from enum import Enum
 from types import NoneType, UnionType
 from typing import Any, Union, cast, get_args, get_origin, get_type_hints
 
-from . import analysis, artefact, oscillators
-from .analysis import Analysis, interval_key
-from .body_shape import BodyTravel, Serpenoid, ShapeMode
-from .comparison import Comparison
-from .estimate import Estimate
-from .experiment import Experiment
-from .frequency_response import BodyWave, JointFrequencyResponse, JointMotion
+from undulog.analysis.results import analysis, artefact, oscillators
+from undulog.analysis.results.analysis import Analysis, interval_key
+from undulog.analysis.results.body_shape import BodyTravel, Serpenoid, ShapeMode
+from undulog.analysis.results.comparison import Comparison
+from undulog.analysis.results.estimate import Estimate
+from undulog.analysis.results.experiment import Experiment
+from undulog.analysis.results.frequency_response import (
+    BodyWave,
+    JointFrequencyResponse,
+    JointMotion,
+)
 
 VERSION = 1
 
