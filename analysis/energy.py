@@ -27,7 +27,7 @@ from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
-from .body.steps import GRAVITY, body_steps
+from .body.travel import GRAVITY, body_steps
 from .estimators.demodulation import Weighed, cycle_sums, weigh
 from .estimators.intervals import around, t_factor
 from .estimators.series import Series, clean

@@ -21,7 +21,7 @@ from undulog.capture.common.console import Warn
 from undulog.capture.common.strict_table import read_toml
 
 from ..body.free_motion import MotionFit
-from ..body.steps import body_steps, cost_of_transport, mean_of_cycles, speed
+from ..body.travel import body_steps, cost_of_transport, mean_of_cycles, speed
 from ..energy import in_all
 from ..estimators.harmonic import HarmonicFit
 from ..estimators.series import GAP_FACTOR, Series

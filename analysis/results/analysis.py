@@ -16,9 +16,8 @@ from .answer import Answer
 from .artefact import Artefact, DeadBand, Span
 from .body_shape import BodyShape
 from .coupling import Coupling
-from .estimate import Estimate, Provenance, WithInterval
+from .estimate import Estimate, PresentedResult, Provenance, WithInterval
 from .frequency_response import FreeMotion, JointFrequencyResponse
-from .shown import PresentedResult
 
 if TYPE_CHECKING:
     from .oscillators import ChainCoupling

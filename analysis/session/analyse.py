@@ -17,10 +17,10 @@ from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
 from ..artefacts.find import find_artefacts
-from ..body.chassis import GaitCycle
 from ..body.free_motion import MotionFit, free_motion
 from ..body.motion import body_motion
 from ..body.shape import body_shape
+from ..body.travel import GaitCycle
 from ..dead_band.find import dead_bands
 from ..energy import (
     Energies,

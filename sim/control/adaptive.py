@@ -14,8 +14,7 @@ from ..gait.contract import WALK, Gait, GaitTick, Generator, Modulation, Reading
 from ..scenario.controllers import Controller, RandomTurns, TargetHeading
 from ..scenario.gaits import generator
 from ..scenario.sensors import layout
-from .dead_reckoning import DeadReckoning, turned
-from .filters import BodyWave, LowPass
+from .filters import BodyWave, DeadReckoning, LowPass, turned
 from .reactions import (
     AmplitudeReduction,
     ControlInput,

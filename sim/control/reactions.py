@@ -24,8 +24,7 @@ from ..gait.contract import Readings
 from ..scenario.controllers import HeadSteering, SideShrinking, TailHaste
 from ..scenario.controllers import Lookout as Parameters
 from ..scenario.sensors import Layout, bearing
-from .dead_reckoning import Pose, turned
-from .filters import LowPass, NearMemory, PhaseHistory, SideLatch
+from .filters import LowPass, NearMemory, PhaseHistory, Pose, SideLatch, turned
 
 
 class ControlInput(NamedTuple):

@@ -36,7 +36,7 @@ class Calibration:
     """Calibration of a robot's gait on free ground.
 
     Attributes:
-        slip_ratio: K of :class:`.sim.control.dead_reckoning.SlipOdometry`.
+        slip_ratio: K of :class:`.sim.control.filters.SlipOdometry`.
         turn_gain: c of :class:`.sim.control.filters.PathHeading`.
         turn_radius_m: Of the turn with the course's largest offset [m].
     """

@@ -111,7 +111,7 @@ Frames = dict[str, pd.DataFrame]
 
 
 def frames_of(result: object) -> Frames:  # noqa: PLR0911 - one kind of result a case
-    """Return the tables of a result; see :meth:`.analysis.results.shown.PresentedResult.frames`.
+    """Return the tables of a result; see :meth:`.analysis.results.estimate.PresentedResult.frames`.
 
     Raises:
         TypeError: If it is no result of this package.

@@ -19,7 +19,7 @@ from undulog.sim.control.adaptive import (
     StraightOn,
     TargetHeadingPolicy,
 )
-from undulog.sim.control.dead_reckoning import Pose, SlipOdometry
+from undulog.sim.control.filters import Pose, SlipOdometry
 from undulog.sim.control.reactions import ControlInput, Distances, ObstacleMonitor
 from undulog.sim.gait.contract import WALK
 from undulog.sim.scenario.controllers import (
