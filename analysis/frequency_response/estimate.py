@@ -21,8 +21,7 @@ from ..results.estimate import Estimate, Interval
 from ..results.frequency_response import DIRECT, INDIRECT, JointFrequencyResponse
 from .delay_model import DelayModel, fit_delay
 from .local_polynomial import indirect_response, local_response, window
-from .periodic import excited_lines, line_power
-from .tones import LineResponse, find_tones, resampled, tone_response
+from .tones import LineResponse, excited_lines, find_tones, line_power, resampled, tone_response
 
 LEAST_SAMPLES = 128
 REPEATED = 1e-3

@@ -9,6 +9,8 @@ with a quadratic drift. The response is fitted with the same frequencies, and it
 them is the power of the residual in the nearest bins that no tone is in. Tones of other joints and
 distortion are lines in some of these bins, the same in every period: they are no noise, so the
 power is that of the median bin.
+
+The lines of a periodic multisine are found by their power over the periods.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal, stats
 
-from undulog.capture.common.arrays import ComplexArray, FloatArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 
 from ..estimators.series import Series
 
@@ -26,6 +28,10 @@ LEAST_AMPLITUDE = 0.01
 """Of the largest tone's; smaller ones are left in the residual."""
 
 MOST_TONES = 64
+
+EXCITED_SHARE = 1e-3
+"""A line is excited if it has more than this share of the strongest line's power."""
+
 EXPLAINED = 0.999
 """Share of the command's variance that the tones of a sum of sines explain."""
 
@@ -187,3 +193,42 @@ def _step(series: Series, tones_hz: FloatArray) -> FloatArray:
     slope = -moved * (amplitude.real * np.sin(angle) + amplitude.imag * np.cos(angle))
     design = np.hstack([_design(series.t_s, tones_hz), slope])
     return _solve(series, design)[-tones_hz.size :]
+
+
+def excited_lines(spectra: ComplexArray) -> IntArray:
+    """Return the lines that a multisine excites.
+
+    Args:
+        spectra: Of one period of each realisation, from line 0 on, shape (M, n).
+    """
+    power = np.mean(np.abs(spectra) ** 2, axis=0)
+    power[0] = 0.0
+    return np.flatnonzero(power > EXCITED_SHARE * power.max())
+
+
+def noise_power(spectra: ComplexArray) -> FloatArray:
+    """Return E|e|^2 of the mean over the periods, by their scatter.
+
+    Args:
+        spectra: Of each of P periods, shape (..., P, n).
+
+    Returns:
+        Shape (..., n); NaN from one period.
+    """
+    periods = spectra.shape[-2]
+    if periods < 2:
+        return np.full((*spectra.shape[:-2], spectra.shape[-1]), np.nan)
+    mean = spectra.mean(axis=-2, keepdims=True)
+    return np.sum(np.abs(spectra - mean) ** 2, axis=-2) / (periods - 1) / periods
+
+
+def line_power(spectra: ComplexArray) -> FloatArray:
+    """Return the power of each line without that of the noise, which may leave less than zero.
+
+    Args:
+        spectra: Of each of P periods, shape (..., P, n), P at least 2.
+
+    Returns:
+        Shape (..., n).
+    """
+    return np.abs(spectra.mean(axis=-2)) ** 2 - noise_power(spectra)
