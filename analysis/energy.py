@@ -32,8 +32,7 @@ from .estimators.demodulation import Weighed, cycle_sums, weigh
 from .estimators.intervals import around, t_factor
 from .estimators.series import Series, clean
 from .results.analysis import Closure, Each, EnergyResult, JointCycles, Transport
-from .results.answer import Note
-from .results.artefact import Artefact
+from .results.answer import Artefact, Note
 from .results.estimate import Estimate
 from .signals.columns import Columns
 from .signals.windows import Span

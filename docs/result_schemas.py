@@ -14,7 +14,7 @@ from enum import Enum
 from types import NoneType, UnionType
 from typing import Any, Union, cast, get_args, get_origin, get_type_hints
 
-from undulog.analysis.results import analysis, artefact, oscillators
+from undulog.analysis.results import analysis, answer, oscillators
 from undulog.analysis.results.analysis import Analysis, interval_key
 from undulog.analysis.results.body_shape import BodyTravel, Serpenoid, ShapeMode
 from undulog.analysis.results.comparison import Comparison
@@ -54,7 +54,7 @@ _FLAT = frozenset(
 """Records of a session whose estimates are two keys each, as :meth:`.Analysis.to_dict` has them."""
 
 _DERIVED: dict[type, dict[str, Any]] = {
-    artefact.Artefact: {"about": {"type": "string"}},
+    answer.Artefact: {"about": {"type": "string"}},
     BodyWave: {"direction": {"enum": ["first-to-last", "last-to-first", "undecided"]}},
 }
 _INTERVAL = {

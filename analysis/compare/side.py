@@ -27,7 +27,8 @@ from ..estimators.harmonic import HarmonicFit
 from ..estimators.series import GAP_FACTOR, Series
 from ..results.analysis import Analysis
 from ..results.comparison import BODY, Change
-from ..session.analyse import SessionMeasurement, measure_session
+from ..session.analyse import measure_session
+from ..session.fields import SessionMeasurement
 from ..session.runs import GaitRun, gait_run
 from ..signals.stretch import Options
 from ..signals.windows import Span

@@ -12,8 +12,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
-from .answer import Answer
-from .artefact import Artefact, DeadBand, Span
+from .answer import Answer, Artefact, DeadBand, Span
 from .body_shape import BodyShape
 from .coupling import Coupling
 from .estimate import Estimate, PresentedResult, Provenance, WithInterval

@@ -21,7 +21,7 @@ from undulog.capture.common.errors import OutputExistsError, UsageError
 from undulog.capture.common.files import as_text, csv_writer, number_cells, part_file
 
 from ...results.analysis import Analysis, BodyPoint, GaitFacts, Index, JointResult
-from ...results.artefact import Artefact, Span
+from ...results.answer import Artefact, Span
 from ...results.body_shape import BodyTravel, PredictedTravel, Serpenoid
 from ...results.comparison import Change, Comparison, Difference, Equivalence, NamedJoint
 from ...results.coupling import (
