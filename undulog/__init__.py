@@ -116,7 +116,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "analysis predict:predict",
         "From kicks: how oscillators that feel their servos synchronise.",
     ),
-    "compare": ("analysis analyse:compare", "What differs between two sessions or groups."),
+    "compare": ("analysis compare:compare", "What differs between two sessions or groups."),
     "plan compensate": (
         "analysis predict:compensate",
         "Commands that make the response homogeneous, from kicks.",

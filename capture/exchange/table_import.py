@@ -27,7 +27,7 @@ from ..robot.model import Quantity, Robot
 from .can_import import ImportReport, digest_of, imported_session
 from .column_map import COMMANDS, STATES, Column, ColumnMap
 from .frame_log import EARLIEST_NS, LATEST_NS, RELATIVE_EPOCH_NS
-from .joint_topics import JointTopic, topics_of
+from .column_map import JointTopic, topics_of
 from .marker_tracks import as_joints, with_fps
 from .table_guess import guess_map
 from .tables import TABLE_SUFFIXES, TableFile, is_time, open_csv, open_table, words
