@@ -11,8 +11,7 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Plane, Robot, SensorKind
 
 from ..gait.contract import WALK, Gait, GaitTick, Generator, Modulation, Readings
-from ..scenario.controllers import Controller, RandomTurns, TargetHeading
-from ..scenario.gaits import generator
+from ..scenario.motion import Controller, RandomTurns, TargetHeading, generator
 from ..scenario.sensors import layout
 from .filters import BodyWave, DeadReckoning, LowPass, turned
 from .reactions import (

@@ -26,7 +26,7 @@ from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.robot.model import Plane, Robot
 
 from ..gait.contract import Readings
-from ..scenario.controllers import Calibration
+from ..scenario.motion import Calibration
 
 
 class PhaseHistory:
