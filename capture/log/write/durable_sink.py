@@ -22,7 +22,6 @@ from .disk_thread import DiskThread, FileDeletedError, PartStream
 from .mcap_sink import (
     PROFILE,
     Description,
-    MessageFields,
     chunk_group,
     library_name,
     write_description,
@@ -169,7 +168,14 @@ class DurableSink:
         self._known.append(record)
         self._disk.write(self._part, 0)
 
-    def write(self, *message: *MessageFields) -> None:
+    def write(
+        self,
+        channel_id: int,
+        log_time_ns: int,
+        publish_time_ns: int,
+        sequence: int,
+        payload: bytes,
+    ) -> None:
         """See :meth:`MessageSink.write`; after the call, a crash of the process does not lose it.
 
         Raises:
@@ -177,13 +183,12 @@ class DurableSink:
                 ones are.
             DataError: If a number is out of range.
         """
-        channel_id, log_time_ns, publish_time_ns, sequence, payload = message
         if self._disk.trouble is not None or self._refused is not None or not self._open:
             self._refuse(len(payload))
         if log_time_ns >= self._split_at_ns:
             self._split_by_time(log_time_ns)
         try:
-            self._wal.append(*message)
+            self._wal.append(channel_id, log_time_ns, publish_time_ns, sequence, payload)
         except LogWriteError as error:
             self._refused = error  # for good: a gap in what was accepted would be worse
             raise
