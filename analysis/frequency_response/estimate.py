@@ -20,8 +20,17 @@ from ..estimators.series import Series
 from ..results.estimate import Estimate, Interval
 from ..results.frequency_response import DIRECT, INDIRECT, JointFrequencyResponse
 from .delay_model import DelayModel, fit_delay
-from .local_polynomial import indirect_response, local_response, window
-from .tones import LineResponse, excited_lines, find_tones, line_power, resampled, tone_response
+from .nonparametric import (
+    LineResponse,
+    excited_lines,
+    find_tones,
+    indirect_response,
+    line_power,
+    local_response,
+    resampled,
+    tone_response,
+    window,
+)
 
 LEAST_SAMPLES = 128
 REPEATED = 1e-3

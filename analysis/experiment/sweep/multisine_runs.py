@@ -15,7 +15,7 @@ from undulog.capture.common.errors import DataError
 
 from ...estimators.series import Series
 from ...frequency_response.estimate import REPEATED, SAME_COMMAND, Kind, find_excitation
-from ...frequency_response.tones import excited_lines, resampled
+from ...frequency_response.nonparametric import excited_lines, resampled
 from ...response.rhythm import DRIVEN_SHARE
 from ...signals.stretch import Options
 from .runs import read_signals
