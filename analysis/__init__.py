@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from undulog.capture.common.extras import attach
 
-from .results.shown import present_with
+from .results.estimate import present_with
 
 if TYPE_CHECKING:
     from .catalog.catalog import Catalog as Catalog
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from .compare.compare import compare_sessions as compare_sessions
     from .compare.decisions import Margins as Margins
     from .experiment.analyse import analyse_experiment as analyse_experiment
+    from .present.notebook.files import Picture as Picture
     from .present.notebook.files import load as load
-    from .present.notebook.pictures import Picture as Picture
     from .present.text import render as render
     from .results.analysis import Analysis as Analysis
     from .results.analysis import Index as Index
@@ -70,7 +70,7 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "LocalCoupling": "results.coupling",
         "Margins": "compare.decisions",
         "Options": "signals.stretch",
-        "Picture": "present.notebook.pictures",
+        "Picture": "present.notebook.files",
         "Reversal": "results.experiment",
         "analyse_experiment": "experiment.analyse",
         "analyse_fleet": "catalog.fleet",

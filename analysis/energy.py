@@ -27,13 +27,12 @@ from undulog.capture.log.messages.definitions import PowerTopic
 from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
-from .body.steps import GRAVITY, body_steps
+from .body.travel import GRAVITY, body_steps
 from .estimators.demodulation import Weighed, cycle_sums, weigh
 from .estimators.intervals import around, t_factor
 from .estimators.series import Series, clean
 from .results.analysis import Closure, Each, EnergyResult, JointCycles, Transport
-from .results.answer import Note
-from .results.artefact import Artefact
+from .results.answer import Artefact, Note
 from .results.estimate import Estimate
 from .signals.columns import Columns
 from .signals.windows import Span

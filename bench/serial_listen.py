@@ -28,10 +28,10 @@ from scservo_sdk import PacketHandler
 from undulog.capture import SessionWriter
 from undulog.capture.bus.decoders import open_decoder
 from undulog.capture.robot.description import parse_robot
+from undulog.capture.robot.serial_servos import dynamixel_packet, feetech_packet
 from undulog.capture.sources.contract import SourceContext, open_source, parse_address
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.serial_port import PacketClock
-from undulog.capture.sources.servo_packets import dynamixel_packet, feetech_packet
 
 SERVOS = range(1, 13)
 ROBOT = """name = "line"

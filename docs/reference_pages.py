@@ -11,8 +11,9 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+from result_schemas import RESULTS, result_schema
+
 import undulog
-from undulog.analysis.results.schema import RESULTS, result_schema
 
 REFERENCE = Path(__file__).parent / "reference"
 SCHEMAS = Path(__file__).parents[1] / "analysis/results/schemas"

@@ -24,7 +24,7 @@ from undulog.capture.log.read.sample_times import LARGEST, Signal
 from undulog.capture.robot.model import Joint
 
 from ..estimators.series import Series, clean_together
-from ..results.artefact import FALSIFYING, Artefact, Span
+from ..results.answer import FALSIFYING, Artefact, Span
 from ..signals.columns import QUANTITIES, Columns
 from .holds import clipped, frozen, stale
 from .scales import (

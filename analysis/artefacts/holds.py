@@ -13,7 +13,7 @@ from scipy.stats import binom
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 from ..estimators.series import Series
-from ..results.artefact import Span
+from ..results.answer import Span
 from .scales import resolution_of, runs, spans_of, turns
 
 FROZEN_TRAVEL = 0.29

@@ -15,7 +15,7 @@ import numpy as np
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
 from ..estimators.series import GAP_FACTOR, Series
-from ..results.artefact import Span
+from ..results.answer import Span
 
 
 def runs(marked: BoolArray) -> tuple[IntArray, IntArray]:

@@ -27,7 +27,7 @@ from undulog.capture.common.arrays import ComplexArray, FloatArray, frozen
 from undulog.capture.common.errors import DataError
 
 from ..estimators.intervals import t_factor
-from .chassis import HARMONICS, PHASES, GaitCycle, step_of_cycle, wave_at
+from .travel import HARMONICS, PHASES, GaitCycle, step_of_cycle, wave_at
 
 MIN_GAITS = 8
 MOST_MODES = 3

@@ -35,7 +35,7 @@ from ..signals.columns import Columns
 from ..signals.stretch import SharedTimes, part_of
 from ..signals.windows import Span
 from .motion import ODOMETRY_TOPIC, head_poses
-from .steps import GRAVITY, MIN_CYCLES, mean_of_cycles
+from .travel import GRAVITY, MIN_CYCLES, mean_of_cycles
 
 PHASES = 32
 """Parts of a cycle, over each of which angles and torques are averaged."""
@@ -102,8 +102,8 @@ def link_loads(
         weights = -GRAVITY * np.einsum("rni,i,n->r", body, vertical, mass)
         asked = np.concatenate([torques[k], np.zeros(6)]) - weights
         covariance = np.diag(errors**2) + (_FRICTION * weight) ** 2 * slip @ slip.T
-        rows = np.column_stack([weight * (ground @ vertical), asked])
-        rows = np.linalg.solve(np.linalg.cholesky(covariance), rows)
+        lines = np.column_stack([weight * (ground @ vertical), asked])
+        rows: FloatArray = np.linalg.solve(np.linalg.cholesky(covariance), lines)
         matrix = np.vstack([rows[:, :-1], prior])
         loads[k] = nnls(matrix, np.concatenate([rows[:, -1], prior.sum(axis=1)]))[0]
         left = rows[:, -1] - rows[:, :-1] @ loads[k]

@@ -27,7 +27,6 @@ from ..results.body_shape import BodyShape, BodyTravel, PlaneShape, Serpenoid, S
 from ..results.estimate import Estimate
 from ..signals.columns import by_plane
 from ..signals.windows import Span
-from .chassis import ChassisPath, GaitCycle, chassis_path, gait_cycle
 from .free_motion import (
     MotionFit,
     Oscillation,
@@ -37,7 +36,7 @@ from .free_motion import (
     wave_speed,
 )
 from .motion import ODOMETRY_TOPIC, head_poses
-from .steps import mean_of_cycles
+from .travel import ChassisPath, GaitCycle, chassis_path, gait_cycle, mean_of_cycles
 
 LEAST_JOINTS = 4
 """Of a plane: fewer have no more than two modes and hardly a wave."""

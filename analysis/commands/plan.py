@@ -296,7 +296,7 @@ def check_servos(base: BaseGait, runs: tuple[PlannedRun, ...], session: SessionV
         return
     joints = {joint.name: joint for joint in session.robot.joints}
     tones = runs[0].tones(base.omega)
-    size = sum(abs(tone.amplitude) for tone in tones)
+    size = sum((abs(tone.amplitude) for tone in tones[1:]), start=abs(tones[0].amplitude))
     for row, k in enumerate(base.driven):
         joint = joints.get(base.names[k])
         if joint is None:

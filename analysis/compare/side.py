@@ -21,13 +21,14 @@ from undulog.capture.common.console import Warn
 from undulog.capture.common.strict_table import read_toml
 
 from ..body.free_motion import MotionFit
-from ..body.steps import body_steps, cost_of_transport, mean_of_cycles, speed
+from ..body.travel import body_steps, cost_of_transport, mean_of_cycles, speed
 from ..energy import in_all
 from ..estimators.harmonic import HarmonicFit
 from ..estimators.series import GAP_FACTOR, Series
 from ..results.analysis import Analysis
 from ..results.comparison import BODY, Change
-from ..session.analyse import SessionMeasurement, measure_session
+from ..session.analyse import measure_session
+from ..session.fields import SessionMeasurement
 from ..session.runs import GaitRun, gait_run
 from ..signals.stretch import Options
 from ..signals.windows import Span

@@ -10,13 +10,12 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import DataError
 
-from ..body.chassis import GaitCycle, wave_at
 from ..body.connection import Connection, condition_of, distances, fit_connection
 from ..body.shape import mean_step
+from ..body.travel import GaitCycle, wave_at
 from ..estimators.intervals import around
 from ..results import formats
-from ..results.body_connection import BodyConnection, ConnectionEntry, PredictedTravel
-from ..results.body_shape import ShapeMode
+from ..results.body_shape import BodyConnection, ConnectionEntry, PredictedTravel, ShapeMode
 from ..results.estimate import Estimate
 
 MOST_DISTANCE = 0.3

@@ -49,7 +49,8 @@ from ..results.comparison import (
     null_answer,
 )
 from ..results.estimate import Estimate, Provenance
-from ..session.analyse import SessionMeasurement, measure_session
+from ..session.analyse import measure_session
+from ..session.fields import SessionMeasurement
 from ..session.runs import SAME_COMMAND, SAME_FREQUENCY
 from ..signals.stretch import Options
 from .mirror import parts

@@ -14,12 +14,13 @@ from undulog.capture.common.console import UNLIMITED, plain
 
 from ..results import formats
 from ..results.analysis import Analysis, EnergyResult
+from ..results.body_shape import BodyShape, PlaneShape
 from ..results.comparison import ModelledAnalysis, null_model_text
 from ..results.coupling import Coupling
 from ..results.estimate import Estimate
+from ..results.ground_contact import GroundContact
 from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, LoopMode
 from . import tables
-from .body_shape import contact_lines, shape_lines
 from .tables import TERMINAL, Cell, Column, Ends, PValue, Quantity, Table
 
 _ABOUT = {
@@ -31,6 +32,9 @@ _ABOUT = {
 
 _SPANS = 3
 """Stretches of an artefact that a line names at most."""
+
+_LIFTED = 0.9
+"""Where links are on the ground for more of a cycle, on the mean, nothing is lifted."""
 
 
 def more_lines(analysis: Analysis) -> Iterator[str]:
@@ -328,3 +332,63 @@ def _mostly(mode: LoopMode, joints: tuple[str, ...]) -> str:
         f"{'+' if math.cos(turn[k]) >= 0 else formats.MINUS}{joints[k]}"
         for k in np.flatnonzero(share >= _PART * share.max()).tolist()
     )
+
+
+def shape_lines(shape: BodyShape | None) -> Iterator[str]:
+    """Yield a sentence for each plane, and one on the travel of a cycle."""
+    if shape is None:
+        return
+    for plane in shape.planes:
+        yield _plane_line(plane)
+    travel = shape.travel
+    if travel is not None:
+        yield (
+            f"Travel of a cycle: {_mm(travel.forward_m)} forward, {_mm(travel.left_m)} to the "
+            f"left, turn {_degrees(travel.turn_rad)} (virtual chassis; the links are "
+            f"{1000 * travel.length_m:.0f} mm along and {1000 * travel.width_m:.0f} mm across from "
+            "their mean, root mean square)."
+        )
+
+
+def contact_lines(contact: GroundContact | None) -> Iterator[str]:
+    """Yield a sentence on which links are on the ground, where they are lifted."""
+    if contact is None:
+        return
+    links = sorted(contact.links, key=lambda one: one.share.value or 0.0)
+    mean = sum(one.share.value or 0.0 for one in links) / len(links)
+    if mean > _LIFTED:
+        return
+    least, most = (f"{_percent(one.share)} ({one.link})" for one in (links[0], links[-1]))
+    right = " to ".join(f"{100 * one:.0f}" for one in contact.twin_accuracy)
+    yield (
+        f"Ground contact, from the joints' {contact.source}: links are on the ground {least} to "
+        f"{most} of a cycle, {100 * mean:.0f} % on the mean. In the twin contact and lift are "
+        f"recognised in {right} %, by the gait (chance: 50 %)."
+    )
+
+
+def _plane_line(plane: PlaneShape) -> str:
+    curve = plane.serpenoid
+    where = "" if plane.plane is None else f", {plane.plane}"
+    shares = ", ".join(_percent(mode.share) for mode in plane.modes)
+    speed = formats.estimate(curve.speed, " joints/s", most=2)
+    if curve.speed_m_s.value is not None:
+        speed += f" ({formats.estimate(curve.speed_m_s, ' m/s', most=3)})"
+    return (
+        f"Body shape{where}: modes with {shares} of the variance; serpenoid of "
+        f"{_degrees(curve.amplitude_rad)}, {_degrees(curve.wave_number)} a joint, "
+        f"{formats.estimate(curve.waves, most=3)} waves at {speed}, offset "
+        f"{_degrees(curve.offset_rad)}, leaves {_percent(curve.unexplained)} unexplained."
+    )
+
+
+def _mm(metres: Estimate) -> str:
+    return formats.estimate(formats.scaled(metres, 1000.0), " mm", most=2)
+
+
+def _degrees(angle: Estimate) -> str:
+    return formats.estimate(formats.degrees(angle), "°", most=2)
+
+
+def _percent(share: Estimate) -> str:
+    return formats.estimate(formats.scaled(share, 100.0), " %", most=2)

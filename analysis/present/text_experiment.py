@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -15,13 +15,13 @@ from ..experiment.body_connection import CONNECTION_METHOD, connection_detail
 from ..experiment.reversal import SIGNIFICANT
 from ..experiment.sweep.best_linear import multisine_method
 from ..results import formats
+from ..results.body_shape import BodyConnection, PredictedTravel
 from ..results.comparison import Change, Comparison
 from ..results.coupling import LinearCoupling, LocalCoupling
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, FloorTilt, Headings, Reversal
 from ..results.formats import scaled
 from ..results.frequency_response import BestLinearJoint
-from .body_shape import refusals, travel_table
 from .tables import (
     Column,
     Table,
@@ -328,3 +328,35 @@ def _reversal_method(reversal: Reversal | None) -> str:
         "5 % is the level of the whole answer; intervals hold together at 95 %, those of shares by "
         "bootstrap over runs."
     )
+
+
+def travel_table(found: BodyConnection) -> Table[PredictedTravel]:
+    """Return the travel of each session, predicted from the others and measured."""
+
+    def column(
+        name: str, unit: str, of: Callable[[PredictedTravel], Estimate], spare: int = 0
+    ) -> Column[PredictedTravel]:
+        digits = (typical(2), typical(3))
+        return Column(f"{name} {unit} (95 %)", f"{name} [{unit}]", of, digits, spare=spare)
+
+    def mm(of: Callable[[PredictedTravel], Estimate]) -> Callable[[PredictedTravel], Estimate]:
+        return lambda one: formats.scaled(of(one), 1000.0)
+
+    columns: list[Column[PredictedTravel]] = [
+        Column("session", "session", lambda one: formats.filename(one.path), kind="word"),
+        Column("Hz", None, lambda one: one.frequency_hz, (3, 3), spare=3),
+        column("forward", "mm", mm(lambda one: one.forward_m)),
+        column("measured", "mm", mm(lambda one: one.measured_forward_m)),
+        column("left", "mm", mm(lambda one: one.left_m), 2),
+        column("measured left", "mm", mm(lambda one: one.measured_left_m), 2),
+        column("turn", "°", lambda one: formats.degrees(one.turn_rad)),
+        column("measured turn", "°", lambda one: formats.degrees(one.measured_turn_rad)),
+    ]
+    return Table(columns, found.predicted)
+
+
+def refusals(found: BodyConnection) -> Iterator[str]:
+    """Yield a sentence on each session that is not predicted."""
+    for one in found.predicted:
+        if one.why is not None:
+            yield f"{formats.filename(one.path)} is not predicted: {one.why}."

@@ -12,14 +12,12 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
-from .answer import Answer
-from .artefact import Artefact, DeadBand, Span
+from .answer import Answer, Artefact, DeadBand, Span
 from .body_shape import BodyShape
 from .coupling import Coupling
-from .estimate import Estimate, Provenance, WithInterval
+from .estimate import Estimate, PresentedResult, Provenance, WithInterval
 from .frequency_response import FreeMotion, JointFrequencyResponse
 from .ground_contact import GroundContact
-from .shown import PresentedResult
 
 if TYPE_CHECKING:
     from .oscillators import ChainCoupling

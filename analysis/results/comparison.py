@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 
 from . import formats
 from .analysis import Analysis, SessionFacts
-from .estimate import Estimate, Provenance, leaves_out_zero
-from .shown import PresentedResult
+from .estimate import Estimate, PresentedResult, Provenance, leaves_out_zero
 
 BODY = "body"
 """Where a difference is that belongs to no joint."""

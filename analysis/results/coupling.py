@@ -7,8 +7,7 @@ from enum import StrEnum
 
 from undulog.capture.common.arrays import FloatArray
 
-from .estimate import Estimate
-from .shown import PresentedResult
+from .estimate import Estimate, PresentedResult
 
 
 @dataclass(frozen=True, repr=False)

@@ -13,12 +13,11 @@ from enum import StrEnum
 from typing import Any
 
 from .analysis import Analysis, Index
-from .body_connection import BodyConnection
+from .body_shape import BodyConnection
 from .coupling import Coupling
-from .estimate import Estimate, Provenance
+from .estimate import Estimate, PresentedResult, Provenance
 from .frequency_response import BestLinearResponses
 from .oscillators import BodyOscillators
-from .shown import PresentedResult
 
 BLIND = (
     "blind to what is alike at both joints of a mirror pair and to the middle joint of an odd "

@@ -16,8 +16,7 @@ from undulog.capture.robot.model import Robot
 
 from ..response.fitting import GaitFit
 from ..results.analysis import JointResult
-from ..results.answer import NotFollowing
-from ..results.artefact import Artefact
+from ..results.answer import Artefact, NotFollowing
 from ..signals.columns import QUANTITIES, Columns, by_plane
 from ..signals.windows import Stretch
 from .examine import Chain, Findings, examine

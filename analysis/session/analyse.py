@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 from undulog.capture import SessionView
 from undulog.capture.commands.info import base_versions
-from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.console import Warn
 from undulog.capture.following.find import times_made
 from undulog.capture.log.health.rules import judge_made_times
@@ -17,14 +16,12 @@ from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
 from ..artefacts.find import find_artefacts
-from ..body.chassis import GaitCycle
 from ..body.free_motion import MotionFit, free_motion
 from ..body.ground_contact import ground_contact
 from ..body.motion import body_motion
 from ..body.shape import body_shape
 from ..dead_band.find import dead_bands
 from ..energy import (
-    Energies,
     check_ledger,
     energy_result,
     joint_energies,
@@ -42,8 +39,7 @@ from ..results.analysis import (
     JointResult,
     SessionFacts,
 )
-from ..results.answer import Note, Remarks
-from ..results.artefact import KINDS, Artefact, flags_by_joint
+from ..results.answer import KINDS, Artefact, Note, Remarks, flags_by_joint
 from ..results.estimate import Provenance
 from ..results.frequency_response import FreeMotion
 from ..segments.answer import Facts, compose
@@ -65,9 +61,9 @@ from ..signals.stretch import (
     without_breaks,
 )
 from ..signals.windows import Span, Stretch, whole_cycles
-from .fields import gait_facts, joint_results
+from .cycles import response_over_time
+from .fields import SessionMeasurement, gait_facts, joint_results
 from .heterogeneity import heterogeneity_indices
-from .over_time import response_over_time
 from .runs import coupling_of_one_gait
 
 _NS = 1e9
@@ -118,29 +114,6 @@ UNDECIDED_ENDS = (
 
 _FEW = 1e-3
 """Up to one sample in a thousand left out is a note: no loss for a fit."""
-
-
-@dataclass(frozen=True)
-class SessionMeasurement:
-    """One session's numbers with what they were computed from; heavy, so not to be kept.
-
-    Attributes:
-        gait: The fitted gait, or None.
-        responses: Measured joint angles by name, on the analysed stretch.
-        span: Whole cycles over which energies are taken.
-        offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
-        motion: The periodic motion of a session without commands, or None.
-        cycle: One cycle of shape and motion of the body, where its pose is known, or None.
-    """
-
-    analysis: Analysis
-    gait: GaitFit | None
-    responses: Mapping[str, Series]
-    energies: Mapping[str, Energies]
-    span: Span
-    offsets: Mapping[str, FloatArray]
-    motion: MotionFit | None = None
-    cycle: GaitCycle | None = None
 
 
 def analyse_session(session: SessionView, options: Options | None = None) -> Analysis:

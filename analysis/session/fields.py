@@ -1,16 +1,20 @@
-"""Fields of a session's result, from the fits of its gait: rhythm, waves and joints."""
+"""A session's measurement, and the fields of its result: rhythm, waves and joints."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from undulog.capture import SessionView
+from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Robot
 
+from ..body.free_motion import MotionFit
+from ..body.travel import GaitCycle
 from ..energy import (
     GAP_SHARE,
     TERMS,
@@ -23,17 +27,41 @@ from ..response.fitting import GaitFit
 from ..response.response import gain_estimate, lag_estimate
 from ..response.rhythm import phase_step, wave_name
 from ..results.analysis import (
+    Analysis,
     GaitFacts,
     GroupFacts,
     JointResult,
     Window,
 )
-from ..results.artefact import DeadBand
+from ..results.answer import DeadBand
 from ..results.estimate import Estimate
 from ..signals.columns import Columns, by_plane, planes_of
 from ..signals.windows import Span, Stretch, whole_cycles
 
 _NS = 1e9
+
+
+@dataclass(frozen=True)
+class SessionMeasurement:
+    """One session's numbers with what they were computed from; heavy, so not to be kept.
+
+    Attributes:
+        gait: The fitted gait, or None.
+        responses: Measured joint angles by name, on the analysed stretch.
+        span: Whole cycles over which energies are taken.
+        offsets: Mean of the position less that of the command, cycle by cycle [rad], by joint.
+        motion: The periodic motion of a session without commands, or None.
+        cycle: One cycle of shape and motion of the body, where its pose is known, or None.
+    """
+
+    analysis: Analysis
+    gait: GaitFit | None
+    responses: Mapping[str, Series]
+    energies: Mapping[str, Energies]
+    span: Span
+    offsets: Mapping[str, FloatArray]
+    motion: MotionFit | None = None
+    cycle: GaitCycle | None = None
 
 
 def gait_facts(

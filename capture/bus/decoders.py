@@ -21,8 +21,7 @@ from ..log.messages.frames import DIR_TX, SERIAL_MORE, SERIAL_NOISE, FrameArray
 from ..robot.bus_map import SESSION_UNIT, unit_for
 from ..robot.families import DECODERS, is_serial
 from ..robot.model import BusSignal, Quantity, Robot
-from ..robot.servo_registers import SERVOS, Register
-from ..sources.servo_packets import (
+from ..robot.serial_servos import (
     ACTION,
     BROADCAST,
     BULK_READ,
@@ -30,11 +29,13 @@ from ..sources.servo_packets import (
     PLAIN,
     READ,
     REG_WRITE,
+    SERVOS,
     STATUS,
     STUFFED,
     SYNC_READ,
     SYNC_WRITE,
     WRITE,
+    Register,
 )
 from .decoding import BusDecoder, Carrier, DecodedSignals, Decoder, FrameTally
 

@@ -1,13 +1,21 @@
-"""Files: read whole, written whole or not at all, and those that come with the package."""
+"""Files: read whole, written whole or not at all, and those that come with the package.
+
+A spreadsheet takes text in a CSV that begins with ``=``, ``+``, ``-`` or ``@`` for a formula. So in
+every CSV file text that begins with such a character, with a tab, a line end or an apostrophe has
+an apostrophe before it, and only there: take one leading apostrophe away to have the text. Numbers
+are never changed.
+"""
 
 from __future__ import annotations
 
+import csv
+import math
 import os
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TextIO
 
 from .console import refuse_existing
 from .errors import (
@@ -24,6 +32,7 @@ if TYPE_CHECKING:
     import socket
     from importlib.resources.abc import Traversable
 
+    from .arrays import FloatArray
     from .process import StopRequest
 
 
@@ -247,3 +256,24 @@ def listen_at(listener: socket.socket, path: Path, backlog: int) -> None:
         path.hardlink_to(draft)
     finally:
         draft.unlink(missing_ok=True)
+
+
+_FORMULA = tuple("=+-@\t\r\n'＝＋－＠")
+"""How text begins that a spreadsheet may run, and the apostrophe that marks it as text."""
+
+
+def csv_writer(stream: TextIO, texts: Sequence[str]) -> Any:
+    """Return a writer of rows with some texts, quoted if one has a carriage return."""
+    odd = any("\r" in text for text in texts)  # the module doesn't quote for it
+    quoting = csv.QUOTE_NONNUMERIC if odd else csv.QUOTE_MINIMAL
+    return csv.writer(stream, lineterminator="\n", quoting=quoting)
+
+
+def as_text(name: str) -> str:
+    """Escape a text that a spreadsheet takes for a formula."""
+    return f"'{name}" if name.startswith(_FORMULA) else name
+
+
+def number_cells(values: FloatArray) -> list[object]:
+    """Return numbers for cells, all digits kept; NaN is an empty cell."""
+    return ["" if math.isnan(value) else value for value in values.tolist()]

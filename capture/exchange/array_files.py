@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError
-from .packing import MOST_BYTES, UNZIPPING, check_cells, read_entry, refuse
+from .column_blocks import MOST_BYTES, UNZIPPING, check_cells, read_entry, refuse
 
 _MOST_PICKLE, _MOST_NAMES, _LONGEST_NAME, _DEEPEST = 1 << 20, 1 << 16, 4096, 64
 _DTYPES = {

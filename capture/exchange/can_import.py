@@ -28,7 +28,7 @@ from ..log.write.mcap_sink import McapSink
 from ..log.write.writer import SessionWriter
 from ..robot.model import Robot
 from .can_logs import log_suffix, open_frame_log
-from .frame_log import FrameLog, LogBlock
+from .frame_log import DIRECTIONS_KEY, FrameLog, LogBlock
 
 
 @dataclass
@@ -142,9 +142,6 @@ def imported_session(
     ):
         yield writer
 
-
-DIRECTIONS_KEY = "import.directions"
-"""Metadata key: ``recorded``, or ``none`` for a log without directions."""
 
 _BATCH_NS = 50_000_000  # one message of raw frames spans at most this
 

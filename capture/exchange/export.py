@@ -7,11 +7,12 @@ of its topic, and nothing in the columns of other topics. Nothing is resampled o
 that were sampled one after the other have rows at different times. Rows are sorted by time within a
 topic.
 
-Names in a CSV are escaped as :mod:`.capture.common.csv_text` says.
+Names in a CSV are escaped as :mod:`.capture.common.files` says.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -19,22 +20,86 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import FloatArray, IntArray
 from ..common.console import progress, refuse_existing
-from ..common.csv_text import as_text, csv_writer, number_cells
 from ..common.errors import MissingChannelError, MissingExtraError, UsageError
-from ..common.files import check_stop, part_file
+from ..common.files import as_text, check_stop, csv_writer, number_cells, part_file
 from ..common.process import StopRequest
 from ..log.messages.definitions import JOINT_STATE
+from ..log.messages.frames import (
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    FD_BRS,
+    FD_ESI,
+    ID_MASK,
+    REMOTE_FLAG,
+    FrameArray,
+)
 from ..log.read.joint_messages import UNITS
 from ..log.read.sample_times import JointSignals
 from ..log.read.session import Session
-from .frame_blocks import LossTally, chosen_buses, frame_blocks, frame_facts
 from .frame_formats import FRAME_FORMATS
+from .frame_log import LogBlock, chosen_buses, frame_blocks, frame_facts, is_error, is_remote
 
 _Format = TypeVar("_Format")
+
+_FLAGS = ERROR_FLAG | REMOTE_FLAG | EXTENDED_FLAG
+
+_FIELDS: dict[str, Callable[[FrameArray], NDArray[Any]]] = {
+    "identifier": lambda frames: frames["id_flags"] & ID_MASK,
+    "flags": lambda frames: frames["id_flags"] & _FLAGS,
+    "length code": lambda frames: frames["len"],
+    "data": lambda frames: frames["data"],
+    "direction": lambda frames: frames["dir"],
+    "time below 1 us": lambda frames: frames["t_host_ns"],
+    "bit rate switch": lambda frames: frames["fd_flags"] & FD_BRS,
+    "error state": lambda frames: frames["fd_flags"] & FD_ESI,
+}
+"""Field of a frame that a format may lose to its values, one row a frame."""
+
+_FD_NAMES = {"length code": "length"}
+"""Names that differ for CAN FD frames."""
+
+
+class LossTally:
+    """Count of the facts that are lost from a session to a format."""
+
+    def __init__(self) -> None:
+        """Start with nothing lost."""
+        self._lost: Counter[tuple[str, str]] = Counter()
+
+    def add(self, block: LogBlock, kept: FrameArray) -> None:
+        """Compare frames with those that the format keeps, of the same shape."""
+        frames, classic = block.frames, ~block.is_fd
+        error, remote = is_error(frames), is_remote(frames)
+        kinds = {
+            "CAN FD frame": block.is_fd,
+            "error frame": classic & error,
+            "remote frame": classic & remote,
+            "data frame": classic & ~error & ~remote,
+        }
+        for name, values in _FIELDS.items():
+            lost = values(frames) != values(kept)
+            lost = lost if lost.ndim == 1 else lost.any(axis=1)
+            for kind, mask in kinds.items():
+                shown = _FD_NAMES.get(name, name) if kind == "CAN FD frame" else name
+                self._lost[kind, shown] += int(np.count_nonzero(lost & mask))
+        device, host = frames["t_device_ns"], frames["t_host_ns"]
+        no_host = (device != 0) & (device != host)
+        self._lost["frame", "device time"] += int(np.count_nonzero(no_host))
+
+    def sentences(self) -> list[str]:
+        """Return a sentence for each kind of frame and field that lost something."""
+        return [
+            f"{count} {kind} loses its {name}"
+            if count == 1
+            else f"{count} {kind}s lose their {name}"
+            for (kind, name), count in sorted(self._lost.items())
+            if count
+        ]
 
 
 @dataclass

@@ -41,8 +41,7 @@ from ..log.messages.frames import (
     FrameArray,
 )
 from .candump import candump_lines
-from .frame_blocks import FrameFacts, is_error, is_remote
-from .frame_log import LogBlock
+from .frame_log import FrameFacts, LogBlock, is_error, is_remote
 
 if TYPE_CHECKING:
     from can.io.generic import MessageWriter

@@ -1,22 +1,30 @@
-"""A foreign log of CAN frames as a stream of blocks, independent of its format."""
+"""CAN frames as a stream of blocks, independent of a format: of a foreign log, and of a session."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from itertools import islice
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from ..common.arrays import BoolArray, IntArray
+from ..common.errors import MissingChannelError
 from ..log.messages.frames import (
+    ERROR_FLAG,
+    FD_TOPIC_PREFIX,
+    FRAME_TOPIC_PREFIX,
+    FRAME_TOPIC_PREFIXES,
+    REMOTE_FLAG,
     FrameArray,
+    bus_of,
     empty_fd_frames,
     empty_frames,
     holds_fd,
     widened,
 )
+from ..log.read.session_view import SessionView
 
 RELATIVE_EPOCH_NS = 946_684_800_000_000_000
 """Start of a log without a date: 2000-01-01T00:00:00Z [Unix ns]."""
@@ -29,6 +37,9 @@ LATEST_NS = 2**31 * 1_000_000_000
 
 FRAMES_PER_BLOCK = 65_536
 """Frames of a block; only one block of a log is in memory at a time."""
+
+DIRECTIONS_KEY = "import.directions"
+"""Metadata key: ``recorded``, or ``none`` for a log without directions."""
 
 
 class FrameRow(NamedTuple):
@@ -181,3 +192,131 @@ class FrameLog:
         if name not in self.buses:
             self.buses.append(name)
         return self.buses.index(name)
+
+
+def is_error(frames: FrameArray) -> BoolArray:
+    """Return which frames are error frames, shape (n,)."""
+    return (frames["id_flags"] & ERROR_FLAG) != 0
+
+
+def is_remote(frames: FrameArray) -> BoolArray:
+    """Return which frames are remote frames and not error frames, shape (n,)."""
+    return ((frames["id_flags"] & REMOTE_FLAG) != 0) & ~is_error(frames)
+
+
+_MESSAGES_PER_BLOCK = 200  # of 10 to 100 ms each
+_LATEST_NS = 1_000_000_000  # a frame is logged at most this long after its time
+
+
+@dataclass(frozen=True)
+class FrameFacts:
+    """What is known of a session's frames before any is written.
+
+    Attributes:
+        counts: Bus to number of classic frames, in the order of the bus indices.
+        directions: Whether the frames' directions were recorded.
+        start_ns: Earliest time of a frame [Unix ns]; 0 where there is none.
+        end_ns: Latest time of a frame [Unix ns]; 0 where there is none.
+        nanoseconds: Whether a time isn't a whole microsecond.
+        fd_counts: Bus to number of CAN FD frames.
+    """
+
+    session_id: str
+    counts: Mapping[str, int]
+    directions: bool
+    start_ns: int
+    end_ns: int
+    nanoseconds: bool
+    fd_counts: Mapping[str, int] = field(default_factory=dict[str, int])
+
+    @property
+    def buses(self) -> list[str]:
+        """Names of the buses."""
+        return list(self.counts)
+
+
+def chosen_buses(session: SessionView, bus: str | None) -> list[str]:
+    """Return the buses to export: one, or all if ``bus`` is None.
+
+    Raises:
+        MissingChannelError: If the session has no raw frames, or no such bus.
+    """
+    names = sorted(
+        {bus_of(topic) for topic in session.channels if topic.startswith(FRAME_TOPIC_PREFIXES)}
+    )
+    if not names:
+        raise MissingChannelError(session.path, "raw CAN frames", sorted(session.channels))
+    if bus is not None and bus not in names:
+        raise MissingChannelError(session.path, f"bus {bus}", names)
+    return [bus] if bus is not None else names
+
+
+def frame_blocks(
+    session: SessionView, buses: Sequence[str], *, fd: bool = True
+) -> Iterator[LogBlock]:
+    """Read the frames of some buses, a window of log times at a time.
+
+    The frames of one topic, which is one kind of frame of one bus, come in the order they were
+    logged. Those of several are sorted by their times; among equal ones classic frames come first,
+    and then the order of ``buses`` holds.
+
+    Args:
+        fd: Whether to read CAN FD frames, too.
+
+    Yields:
+        Blocks; the bus of a frame is its index into ``buses``.
+    """
+    topics = [
+        (prefix + bus, index, session.fd_frames if prefix == FD_TOPIC_PREFIX else session.frames)
+        for prefix in (FRAME_TOPIC_PREFIXES if fd else (FRAME_TOPIC_PREFIX,))
+        for index, bus in enumerate(buses)
+        if prefix + bus in session.channels
+    ]
+    held = block_of(empty_fd_frames(0), 0)
+    windows = list(pairwise(_edges(session, [topic for topic, _, _ in topics])))
+    for number, (start_ns, stop_ns) in enumerate(windows, start=1):
+        found = [
+            block_of(read(topic, start_ns=start_ns, stop_ns=stop_ns), bus)
+            for topic, bus, read in topics
+        ]
+        block = joined([held, *found])
+        if len(topics) > 1:
+            block = block[np.lexsort((block.bus, block.is_fd, block.times_ns()))]
+            if stop_ns is not None:
+                # Frames of the next window may be earlier than these, so they wait for it.
+                ready = int(np.searchsorted(block.times_ns(), stop_ns - _LATEST_NS))
+                block, held = block[:ready], block[ready:]
+        if len(block):
+            yield replace(block, done=number / len(windows))
+
+
+def frame_facts(session: SessionView, buses: Sequence[str]) -> FrameFacts:
+    """Look once over all frames."""
+    counts, fd_counts = np.zeros((2, len(buses)), dtype=np.int64)
+    times: list[int] = []
+    nanoseconds = False
+    for block in frame_blocks(session, buses):
+        t_ns = block.times_ns()
+        counts += np.bincount(block.bus[~block.is_fd], minlength=len(buses))
+        fd_counts += np.bincount(block.bus[block.is_fd], minlength=len(buses))
+        times += [int(t_ns.min()), int(t_ns.max())]
+        nanoseconds |= bool((t_ns % 1000).any())
+    facts = session.metadata.get("undulog", {})
+    return FrameFacts(
+        session_id=session.session_id,
+        counts=dict(zip(buses, counts.tolist(), strict=True)),
+        directions=facts.get(DIRECTIONS_KEY, "recorded") == "recorded",
+        start_ns=min(times, default=0),
+        end_ns=max(times, default=0),
+        nanoseconds=nanoseconds,
+        fd_counts=dict(zip(buses, fd_counts.tolist(), strict=True)),
+    )
+
+
+def _edges(session: SessionView, topics: Sequence[str]) -> list[int | None]:
+    """Return borders of the windows of log times; open at both ends."""
+    messages = sum(session.channels[topic].count for topic in topics)
+    count = max(1, -(-messages // _MESSAGES_PER_BLOCK))
+    span = session.end_ns - session.start_ns
+    inner = [session.start_ns + span * k // count for k in range(1, count)]
+    return [None, *sorted(set(inner)), None]

@@ -30,8 +30,8 @@ from ..common.files import check_stop, part_folder
 from ..common.process import StopRequest
 from ..log.read.session import Session
 from ..robot.bus_map import SESSION_UNIT
+from .column_blocks import arrow
 from .lerobot_import import FEATURES
-from .parquet_files import arrow
 
 VERSION = "v3.0"
 MARKER = Path("meta", "info.json")

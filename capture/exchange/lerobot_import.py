@@ -29,9 +29,8 @@ from ..robot.bus_map import SESSION_UNIT
 from ..robot.description import numbered
 from ..robot.model import Quantity, Robot
 from .can_import import ImportReport, file_digest
+from .column_blocks import Block, read_parquet, refuse, rows_of_block, vectors_of
 from .column_map import STATES, Column, ColumnMap
-from .packing import Block, refuse, rows_of_block
-from .parquet_files import read_parquet, vectors_of
 from .table_import import TableSet, import_tables
 from .tables import TableFile
 

@@ -22,10 +22,10 @@ from ..common.strict_table import NAME_PATTERN
 from ..robot.bus_map import JOINT_QUANTITIES, SESSION_UNIT, TIME_UNITS, UNITS, valid_units
 from ..robot.description import numbered
 from ..robot.model import Quantity
+from .column_blocks import WIDEST, Block
 from .column_map import COMMANDS, STATES, Column, ColumnMap
 from .frame_log import LATEST_NS
 from .marker_tracks import is_frame_number
-from .packing import WIDEST, Block
 from .tables import TableFile, is_time, words
 
 _COMMAND = {

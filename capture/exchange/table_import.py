@@ -25,9 +25,8 @@ from ..log.write.writer import SessionWriter
 from ..robot.bus_map import TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
 from .can_import import ImportReport, digest_of, imported_session
-from .column_map import COMMANDS, STATES, Column, ColumnMap
+from .column_map import COMMANDS, STATES, Column, ColumnMap, JointTopic, topics_of
 from .frame_log import EARLIEST_NS, LATEST_NS, RELATIVE_EPOCH_NS
-from .joint_topics import JointTopic, topics_of
 from .marker_tracks import as_joints, with_fps
 from .table_guess import guess_map
 from .tables import TABLE_SUFFIXES, TableFile, is_time, open_csv, open_table, words

@@ -26,8 +26,16 @@ from numpy.typing import NDArray
 from ..common.errors import ImportFormatError
 from ..common.strict_table import listed
 from .array_files import read_mat, read_npz, read_tensors
-from .packing import WIDEST, Block, check_rows, refuse, rows_of_block, spread
-from .parquet_files import block_of, read_parquet
+from .column_blocks import (
+    WIDEST,
+    Block,
+    block_of,
+    check_rows,
+    read_parquet,
+    refuse,
+    rows_of_block,
+    spread,
+)
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".mat", ".parquet", ".pt", ".pth")
 ARRAY_SUFFIXES = TABLE_SUFFIXES[3:]

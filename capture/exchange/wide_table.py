@@ -23,16 +23,15 @@ import numpy as np
 from ..bus.decoded_topics import JOINT_TOPIC
 from ..common.arrays import NS, FloatArray, IntArray
 from ..common.console import progress
-from ..common.csv_text import as_text, csv_writer
 from ..common.errors import DataError, UsageError, some_names
-from ..common.files import check_stop, part_file
+from ..common.files import as_text, check_stop, csv_writer, part_file
 from ..common.process import StopRequest
 from ..common.strict_table import NAME_PATTERN
 from ..log.read.session import Session
 from ..robot.bus_map import SESSION_UNIT
 from ..robot.model import Quantity
+from .column_blocks import arrow
 from .export import chosen_format, joint_fields, joint_topics
-from .parquet_files import arrow
 
 _MOST_COLUMNS = 2000
 _MOST_CELLS = 2_000_000  # of a block

@@ -23,7 +23,7 @@ from ..log.health.tallies import BusHealth, JointHealth
 from ..log.mcap.chunk import BODY_AT, FIXED_SIZE, HEAD
 from ..log.messages.definitions import parse_message_type
 from ..log.messages.frames import FRAME_TOPIC_PREFIX, FRAME_TOPIC_PREFIXES, SERIAL_TOPIC_PREFIX
-from ..log.write.mcap_sink import Description
+from ..log.write.mcap_sink import Description, MessageFields
 from ..robot.model import Robot
 from ..sources.contract import Source
 from .source_clock import SourceClock
@@ -102,15 +102,9 @@ class LiveHealth:
         self._topics[record.id] = _Topic(record.topic)
         self._scan.define(record.id, record.topic, name, kind, record.metadata)
 
-    def offer(
-        self,
-        channel_id: int,
-        log_time_ns: int,
-        publish_time_ns: int,  # noqa: ARG002 - all listeners have the same arguments
-        sequence: int,
-        payload: bytes,
-    ) -> None:
+    def offer(self, *message: *MessageFields) -> None:
         """Keep a message for the next round; see :meth:`MessageSink.write`."""
+        channel_id, log_time_ns, _, sequence, payload = message
         self._pending[channel_id].append((log_time_ns, sequence, payload))
 
     def step(self, now_ns: int) -> None:

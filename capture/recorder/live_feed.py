@@ -26,7 +26,7 @@ from typing import NamedTuple
 from mcap.records import Channel
 
 from ..common.errors import MissingExtraError, UndulogError
-from ..log.write.mcap_sink import Description
+from ..log.write.mcap_sink import Description, MessageFields
 from .live_wire import (
     HEAD_SIZE,
     MAX_DATAGRAM,
@@ -230,15 +230,9 @@ class LiveFeed:
                 self._due[record.id] = 0
             self._unsent_definitions.append(self._pack(Kind.DEFINITIONS, [packed]))
 
-    def offer(
-        self,
-        channel_id: int,
-        log_time_ns: int,
-        publish_time_ns: int,
-        sequence: int,
-        payload: bytes,
-    ) -> None:
+    def offer(self, *message: *MessageFields) -> None:
         """Queue a message if a relay was found; see :meth:`MessageSink.write`."""
+        channel_id, log_time_ns, publish_time_ns, sequence, payload = message
         due = self._due.get(channel_id)
         is_state = channel_id in self._states
         if due is None and not is_state:

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from ..common.config import read
 from ..common.strict_table import Table, listed
 from .model import Bus, BusSignal, Direction, Joint, Motor, Quantity
-from .servo_registers import SERVOS
+from .serial_servos import SERVOS
 
 TX, RX = Direction.TX, Direction.RX
 

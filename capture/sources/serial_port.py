@@ -30,11 +30,11 @@ from ..common.process import share_priority
 from ..common.strict_table import listed
 from ..log.messages.frames import DIR_TX, SERIAL_MORE, SERIAL_NOISE, FrameArray
 from ..robot.model import ClockDomain
+from ..robot.serial_servos import PROTOCOLS, PacketSplitter
 from .contract import SourceAddress, fd_records, number, only, pack_fd_record
 from .events import Tally
 from .link import LinkedSource
 from .reader_thread import DrainedLink
-from .servo_packets import PROTOCOLS, PacketSplitter
 
 DEFAULT_BAUD = 1_000_000
 """Of both families' servos in robots [bit/s]."""

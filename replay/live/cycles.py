@@ -16,8 +16,7 @@ import rerun as rr
 
 from undulog.analysis.estimators.demodulation import DRIVEN_SHARE, Phase, demodulate, weigh
 from undulog.analysis.estimators.series import Series, clean
-from undulog.analysis.session.cycles import LEAST_COVERED
-from undulog.analysis.session.over_time import LoggedGait
+from undulog.analysis.session.cycles import LEAST_COVERED, LoggedGait
 from undulog.analysis.signals.columns import planes_of
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.robot.model import Robot

@@ -97,39 +97,23 @@ def require_gpu() -> None:
         )
 
 
-def run_block_on_gpu(
-    links: FloatArray,
-    head: FloatArray,
-    carried: FloatArray,
-    ground: FloatArray,
-    gravity: FloatArray,
-    vertical: BoolArray,
-    law: int,
-    commands: FloatArray,
-    samples: FloatArray,
-    poses: FloatArray,
-    failure: FloatArray,
-    limits: FloatArray,
-    step_s: float,
-    steps: int,
-    first: int,
-    last: int,
-    lanes: int,
-) -> None:
+def run_block_on_gpu(*block: Any) -> None:
     """Run a block, its state taken to the GPU and back: :func:`.kernels.run_lanes`.
 
     Raises:
         UsageError: If there is no GPU.
     """
-    del carried  # each thread has its own
     require_gpu()
+    # Each thread has work space of its own, in place of what is carried.
+    links, head, _, ground, gravity, vertical, law, commands, samples, poses, *rest = block
+    failure, limits, *times, lanes = rest
     state = [cuda.to_device(array) for array in (links, head, failure)]
     filled = [cuda.device_array(array.shape, array.dtype) for array in (samples, poses)]
     filled[0][0].copy_to_device(samples[0])
     known = [cuda.to_device(array) for array in (ground, gravity, vertical, commands, limits)]
     _kernel(links.dtype)[-(-lanes // _THREADS), _THREADS](
         *(state[0], state[1], *known[:3], law, known[3], *filled, state[2], known[4]),
-        *(step_s, steps, first, last),
+        *times,
     )
     for array, copy in zip((links, head, failure), state, strict=True):
         copy.copy_to_host(array)

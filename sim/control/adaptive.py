@@ -11,11 +11,9 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Plane, Robot, SensorKind
 
 from ..gait.contract import WALK, Gait, GaitTick, Generator, Modulation, Readings
-from ..scenario.controllers import Controller, RandomTurns, TargetHeading
-from ..scenario.gaits import generator
+from ..scenario.motion import Controller, RandomTurns, TargetHeading, generator
 from ..scenario.sensors import layout
-from .dead_reckoning import DeadReckoning, turned
-from .filters import BodyWave, LowPass
+from .filters import BodyWave, DeadReckoning, LowPass, turned
 from .reactions import (
     AmplitudeReduction,
     ControlInput,

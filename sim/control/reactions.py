@@ -21,11 +21,10 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Plane, Robot
 
 from ..gait.contract import Readings
-from ..scenario.controllers import HeadSteering, SideShrinking, TailHaste
-from ..scenario.controllers import Lookout as Parameters
+from ..scenario.motion import HeadSteering, SideShrinking, TailHaste
+from ..scenario.motion import Lookout as Parameters
 from ..scenario.sensors import Layout, bearing
-from .dead_reckoning import Pose, turned
-from .filters import LowPass, NearMemory, PhaseHistory, SideLatch
+from .filters import LowPass, NearMemory, PhaseHistory, Pose, SideLatch, turned
 
 
 class ControlInput(NamedTuple):

@@ -68,7 +68,7 @@ from ..gait.wave import (
     WaveState,
     started,
 )
-from ..scenario.gaits import read_gait
+from ..scenario.motion import read_gait
 from ..scenario.scenario import LONGEST_S, Length, Scenario
 from ..scenario.scenario_file import load_scenario, scenario_names
 

@@ -1,4 +1,4 @@
-"""The twin's force laws, compiled: as :class:`.sim.physics.laws.NumpyLaws`, within rounding.
+"""The twin's force laws, compiled: as :class:`.sim.physics.steps.NumpyLaws`, within rounding.
 
 The same equations as :mod:`.sim.physics.contact` and :mod:`.sim.physics.servo`, which say what they
 mean, and are what these are held against.

@@ -1,4 +1,6 @@
-"""Consecutive physics steps in one table, so that what adds them up works on whole columns.
+"""Consecutive physics steps in one table, and the force laws of ground and servos that fill it in.
+
+What adds the steps up works on whole columns of the table.
 
 A row of the table is one step, everything that acts during it as it stands at its start. The fields
 of :class:`Step` are views of the rows: of one row, or with a leading axis of time, of all. What
@@ -9,16 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple, overload
+from typing import NamedTuple, Protocol, overload
 
 import numpy as np
 
 from undulog.capture.common.arrays import FloatArray
+from undulog.capture.robot.model import Robot
 
-from .contact import Contact
+from ..scenario.world import Ground
+from .contact import Contact, GroundContact
 from .engine import BodyState
 from .obstacle_contact import NO_CONTACT, ObstacleContact
-from .servo import Drive, Rotors
+from .servo import Drive, Rotors, Servos
 
 
 class Step(NamedTuple):
@@ -156,3 +160,64 @@ def _fields(table: FloatArray, n: int, m: int) -> Step:
         Rotors(motors[..., 0, :], motors[..., 1, :]),
         Drive(motors[..., 2, :], motors[..., 3, :], motors[..., 4, :]),
     )
+
+
+class Laws(Protocol):
+    """What fills in a step once its body is there."""
+
+    def start(self, k: int) -> None:
+        """Complete a step whose body and rotors are there."""
+
+    def follow(self, k: int) -> None:
+        """Complete a step whose body is there, and which follows the row before it.
+
+        Args:
+            k: Its row, not the first.
+        """
+
+    def command(self, k: int, reference: FloatArray) -> None:
+        """Give the servos a command, which they hold until the next.
+
+        Args:
+            k: Row of the step at which it comes.
+            reference: Joint angles q_ref [rad], shape (m,).
+        """
+
+
+class NumpyLaws:
+    """The laws by :mod:`.sim.physics.contact` and :mod:`.sim.physics.servo`."""
+
+    def __init__(
+        self, steps: Steps, robot: Robot, ground: Ground | None, servos: Servos, dt: float
+    ) -> None:
+        """Get ready for one body.
+
+        Args:
+            steps: The table that is filled in.
+            ground: What carries it, if anything does.
+            dt: Step [s].
+        """
+        radius = np.array([link.radius for link in robot.links])
+        self._rows = tuple(steps)
+        self._ground = tuple(
+            GroundContact(ground, radius, row.body, row.contact) for row in self._rows
+        )
+        self._servos, self._dt = servos, dt
+        self._reference = np.zeros(steps.joint_count)
+
+    def start(self, k: int) -> None:
+        """Complete a step whose body and rotors are there."""
+        self._ground[k].act()
+        self.command(k, self._reference)
+
+    def follow(self, k: int) -> None:
+        """Complete a step whose body is there, and which follows the row before it."""
+        before = self._rows[k - 1]
+        self._servos.advance(before.rotors, before.drive, self._dt, self._rows[k].rotors)
+        self.start(k)
+
+    def command(self, k: int, reference: FloatArray) -> None:
+        """Give the servos a command, which they hold until the next."""
+        self._reference = reference
+        row = self._rows[k]
+        self._servos.drive(reference, row.body.angle, row.body.rate, row.rotors, row.drive)

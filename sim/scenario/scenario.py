@@ -28,8 +28,7 @@ from undulog.capture.robot.model import Robot, Servo
 
 from ..gait.contract import CONTROL_RATE_HZ
 from .bus_faults import BusFault
-from .controllers import Controller
-from .gaits import GaitParameters, gait_table
+from .motion import Controller, GaitParameters, gait_table
 from .obstacles import Seed
 from .sensors import Noise, SensorModels
 from .world import Push, World, body_length, world_table

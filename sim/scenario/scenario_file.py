@@ -101,8 +101,7 @@ from undulog.capture.robot.model import Plane, Robot
 
 from ..gait.contract import CONTROL_RATE_HZ
 from .bus_faults import read_faults
-from .controllers import read_controller
-from .gaits import read_gait
+from .motion import read_controller, read_gait
 from .scenario import LONGEST_S, Scenario, read_modules
 from .sensors import Noise, read_sensing
 from .world import read_pushes, read_world

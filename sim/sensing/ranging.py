@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 
@@ -139,38 +140,46 @@ def _boxes(shapes: Boxes, origin: FloatArray, direction: FloatArray) -> FloatArr
     return _hit(enter, leave)
 
 
-class Ranging:
-    """Sensors that measure the distance along bundles of rays."""
+_Model = TypeVar("_Model")
+
+
+class Ranging(Generic[_Model]):
+    """A robot's sensors of one kind, which measure the distance along bundles of rays.
+
+    Attributes:
+        stream: Number of the random stream that the sensors' noise is drawn from.
+        sees_ground: Whether the ground stops the rays.
+    """
+
+    stream: ClassVar[int]
+    sees_ground: ClassVar[bool]
 
     def __init__(
         self,
+        model: _Model,
         sensors: Sequence[Sensor],
         robot: Robot,
         caster: RayCaster,
         *,
-        period_s: float,
-        bundles: FloatArray,
-        sees_ground: bool,
         dt: float,
-        seed: Sequence[int],
+        seed: int,
     ) -> None:
-        """Start before the first control period; the sensors take turns.
+        """Start before the first control period; the sensors take turns, staggered evenly.
 
         Args:
-            period_s: From one measurement of a sensor to its next [s].
-            bundles: Unit vectors of each sensor's rays in its frame, shape (k, 3, r).
-            sees_ground: Whether the ground stops the rays.
             dt: Physics step [s].
-            seed: Of the noise.
+            seed: Of the run.
         """
+        self._model = model
+        period_s, bundles = self._rays(sensors)
         self._names = [sensor.name for sensor in sensors]
         self._mounts = Mounts(sensors, robot)
         self._caster = caster
         self._schedule = Schedule(period_s, len(sensors), dt)
         self._bundles = (self._mounts.rotation @ bundles).transpose(1, 0, 2)  # (3, k, r)
-        self._sees_ground, self._dt = sees_ground, dt
+        self._dt = dt
         self._limits = np.array([(one.range_min, one.range_max) for one in sensors], np.float64)
-        self._random = np.random.default_rng(seed)
+        self._random = np.random.default_rng([seed, self.stream])
 
     def observe(self, steps: Steps, start: int) -> list[RangeSample]:
         """Measure what is due in one control period.
@@ -191,7 +200,7 @@ class Ranging:
         way = self._caster.distance(
             np.repeat(origin, count, axis=1),
             out_of_frames(np.repeat(quaternion, count, axis=1), ray),
-            ground=self._sees_ground,
+            ground=self.sees_ground,
         )
         shortest, longest = self._limits[which].T
         distance = self._measured(way.reshape(-1, count).min(axis=1), shortest)
@@ -201,13 +210,19 @@ class Ranging:
             for k, i, each in zip(step.tolist(), which.tolist(), reported, strict=True)
         ]
 
+    def _rays(self, sensors: Sequence[Sensor]) -> tuple[float, FloatArray]:
+        """Return how the sensors measure.
+
+        Returns:
+            From one measurement of a sensor to its next [s]; unit vectors of each sensor's rays in
+            its frame, shape (k, 3, r).
+        """
+        raise NotImplementedError
+
     def _measured(self, distance: FloatArray, shortest: FloatArray) -> FloatArray:
         """Return what sensors of some shortest ranges measure at true distances [m], (p,)."""
         raise NotImplementedError
 
-
-IR_STREAM = 3
-"""Number of the random stream that the sensors' noise is drawn from."""
 
 _SCALE, _SHIFT, _BIAS = 0.9005, 0.1346, 0.137  # V m, m, V
 
@@ -239,31 +254,14 @@ def decoded(volts: FloatArray) -> FloatArray:
     return _SCALE / (volts + _BIAS) - _SHIFT
 
 
-class Infrared(Ranging):
-    """A robot's infrared sensors; each measures along one ray, its x axis."""
+class Infrared(Ranging[InfraredModel]):
+    """Infrared sensors; each measures along one ray, its x axis."""
 
-    def __init__(
-        self,
-        model: InfraredModel,
-        sensors: Sequence[Sensor],
-        robot: Robot,
-        caster: RayCaster,
-        *,
-        dt: float,
-        seed: int,
-    ) -> None:
-        """Start before the first control period; the sensors' clocks are staggered evenly."""
-        self._model = model
-        super().__init__(
-            sensors,
-            robot,
-            caster,
-            period_s=model.hold_s,
-            bundles=np.tile([[1.0], [0.0], [0.0]], (len(sensors), 1, 1)),
-            sees_ground=True,
-            dt=dt,
-            seed=[seed, IR_STREAM],
-        )
+    stream = 3
+    sees_ground = True
+
+    def _rays(self, sensors: Sequence[Sensor]) -> tuple[float, FloatArray]:
+        return self._model.hold_s, np.tile([[1.0], [0.0], [0.0]], (len(sensors), 1, 1))
 
     def _measured(self, distance: FloatArray, shortest: FloatArray) -> FloatArray:  # noqa: ARG002
         model = self._model
@@ -273,9 +271,6 @@ class Infrared(Ranging):
             quantised(np.clip(volts, 0.0, model.adc_v), model.adc_v / (2**model.adc_bits - 1))
         )
 
-
-SONAR_STREAM = 4
-"""Number of the random stream that the sensors' noise is drawn from."""
 
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
@@ -295,31 +290,15 @@ def cone(count: int, angle: float) -> FloatArray:
     return np.array([np.cos(off), np.sin(off) * np.cos(turn), np.sin(off) * np.sin(turn)])
 
 
-class Sonar(Ranging):
-    """A robot's sonars, mostly one; what is nearer than the least range reads as that."""
+class Sonar(Ranging[SonarModel]):
+    """Sonars, mostly one; what is nearer than the least range reads as that."""
 
-    def __init__(
-        self,
-        model: SonarModel,
-        sensors: Sequence[Sensor],
-        robot: Robot,
-        caster: RayCaster,
-        *,
-        dt: float,
-        seed: int,
-    ) -> None:
-        """Start before the first control period."""
-        self._model = model
-        super().__init__(
-            sensors,
-            robot,
-            caster,
-            period_s=1.0 / model.rate_hz,
-            bundles=np.array([cone(model.rays, one.field_of_view or 0.0) for one in sensors]),
-            sees_ground=False,
-            dt=dt,
-            seed=[seed, SONAR_STREAM],
-        )
+    stream = 4
+    sees_ground = False
+
+    def _rays(self, sensors: Sequence[Sensor]) -> tuple[float, FloatArray]:
+        cones = [cone(self._model.rays, one.field_of_view or 0.0) for one in sensors]
+        return 1.0 / self._model.rate_hz, np.array(cones)
 
     def _measured(self, distance: FloatArray, shortest: FloatArray) -> FloatArray:
         noise = self._model.noise * self._random.standard_normal(len(distance))

@@ -2,7 +2,7 @@
 
 The driver's port is the one that a program drives the servos through, as through a USB adapter. The
 listener's port gets every byte of both ways and takes none: a second adapter, of which only the
-receive line is connected. Registers are those of :mod:`.capture.robot.servo_registers`; servo k is
+receive line is connected. Registers are those of :mod:`.capture.robot.serial_servos`; servo k is
 the robot's joint k, head to tail, from 1.
 """
 
@@ -22,13 +22,13 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.robot.model import Quantity, Robot
-from undulog.capture.robot.servo_registers import SERVOS
-from undulog.capture.sources.servo_packets import (
+from undulog.capture.robot.serial_servos import (
     ACTION,
     BROADCAST,
     PING,
     READ,
     REG_WRITE,
+    SERVOS,
     SYNC_READ,
     SYNC_WRITE,
     WRITE,

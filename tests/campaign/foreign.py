@@ -18,9 +18,9 @@ from support.bus_robots import TWO_JOINTS
 from support.serial_lines import Captured
 from undulog.capture import SessionWriter
 from undulog.capture.robot.description import parse_robot
+from undulog.capture.robot.serial_servos import STATUS, dynamixel_packet, feetech_packet
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.serial_port import PacketClock
-from undulog.capture.sources.servo_packets import STATUS, dynamixel_packet, feetech_packet
 
 from .base import EPOCH_NS, PERIOD_NS, Base, files_below
 

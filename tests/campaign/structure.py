@@ -2,7 +2,7 @@
 
 import json
 
-from undulog.capture.sources.servo_packets import dynamixel_packet, feetech_packet
+from undulog.capture.robot.serial_servos import dynamixel_packet, feetech_packet
 
 from .mutate import HUGE, NUMBERS, WORDS
 from .packed import PACKED, one_of

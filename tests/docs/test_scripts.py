@@ -9,7 +9,7 @@ from support.paths import ROOT
 from support.processes import run
 
 DOCS = ROOT / "docs"
-RUN_ELSEWHERE = {"conf.py", "notebook_page.py", "reference_pages.py"}
+RUN_ELSEWHERE = {"conf.py", "notebook_page.py", "reference_pages.py", "result_schemas.py"}
 """Run by Sphinx (``make docs``), the others by tests of their own, too."""
 
 PICTURES = {"pictures.py", "side_by_side.py"}

@@ -1,5 +1,5 @@
 """Results in a notebook: they print, plot, become pandas frames, and go to files and back.
 
-Every result is a :class:`.analysis.results.shown.PresentedResult`; its methods are here, and are
+Every result is a :class:`.analysis.results.estimate.PresentedResult`; its methods are here, and are
 imported when they are used.
 """

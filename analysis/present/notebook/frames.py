@@ -2,7 +2,7 @@
 
 Columns have names that end in their unit: ``lag_rad``, and the ends of its 95 % interval
 ``lag_low_rad`` and ``lag_high_rad``. In CSV, numbers have all digits that they need; a value that
-could not be computed is an empty cell. Text is escaped as :mod:`.capture.common.csv_text` says.
+could not be computed is an empty cell. Text is escaped as :mod:`.capture.common.files` says.
 """
 
 from __future__ import annotations
@@ -17,14 +17,12 @@ import numpy as np
 import pandas as pd
 
 from undulog.capture.common.console import refuse_existing
-from undulog.capture.common.csv_text import as_text, csv_writer, number_cells
 from undulog.capture.common.errors import OutputExistsError, UsageError
-from undulog.capture.common.files import part_file
+from undulog.capture.common.files import as_text, csv_writer, number_cells, part_file
 
 from ...results.analysis import Analysis, BodyPoint, GaitFacts, Index, JointResult
-from ...results.artefact import Artefact, Span
-from ...results.body_connection import PredictedTravel
-from ...results.body_shape import BodyTravel, Serpenoid
+from ...results.answer import Artefact, Span
+from ...results.body_shape import BodyTravel, PredictedTravel, Serpenoid
 from ...results.comparison import Change, Comparison, Difference, Equivalence, NamedJoint
 from ...results.coupling import (
     Coupling,
@@ -113,7 +111,7 @@ Frames = dict[str, pd.DataFrame]
 
 
 def frames_of(result: object) -> Frames:  # noqa: PLR0911 - one kind of result a case
-    """Return the tables of a result; see :meth:`.analysis.results.shown.PresentedResult.frames`.
+    """Return the tables of a result; see :meth:`.analysis.results.estimate.PresentedResult.frames`.
 
     Raises:
         TypeError: If it is no result of this package.

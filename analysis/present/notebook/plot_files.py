@@ -23,7 +23,7 @@ from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import part_file, write_text
 
 from ..page.svg import CSS_VARIABLES, STYLE, Axes, Figure, drawing
-from .pictures import Picture, paper_colors
+from .files import Picture, paper_colors
 
 Format = Literal["svg", "png", "pdf"]
 

@@ -22,8 +22,14 @@ from ...results.estimate import Estimate, leaves_out_zero
 from ...results.experiment import Experiment, Reversal
 from ...results.formats import degrees, estimate, relative, short
 from ...results.oscillators import BodyOscillators
-from ..body_shape import refusals, travel_table
-from ..text_experiment import best_linear_table, by_sentence, method, reversal_detail
+from ..text_experiment import (
+    best_linear_table,
+    by_sentence,
+    method,
+    refusals,
+    reversal_detail,
+    travel_table,
+)
 from .bode import best_linear_bode
 from .matrix import Entries, entries_of, matrix_picture
 from .svg import (

@@ -44,7 +44,7 @@ from ...results.estimate import Provenance
 from ...results.experiment import Experiment
 from ...session.cycles import CycleMaps
 from .. import tables
-from ..body_shape import contact_lines, shape_lines
+from ..text import contact_lines, shape_lines
 from .comparison_view import change_text, comparison_view, fleet_view, spread_text
 from .experiment_view import experiment_view
 from .session_view import session_view

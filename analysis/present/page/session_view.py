@@ -18,8 +18,7 @@ from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 
 from ...results import formats
 from ...results.analysis import Analysis, JointResult
-from ...results.answer import Verdict
-from ...results.artefact import KINDS, Artefact, Span
+from ...results.answer import KINDS, Artefact, Span, Verdict
 from ...results.formats import degrees, estimate, short
 from ...results.oscillators import ChainCoupling
 from ...session.cycles import CycleMaps

@@ -24,7 +24,7 @@ from ...common.amounts import format_size
 from ...common.errors import LogWriteError, UndulogError
 from ..messages.definitions import adds_up, is_latched
 from ..wal.segment import sync_folder
-from .mcap_sink import Description, McapSink, MessageSink, write_error
+from .mcap_sink import Description, McapSink, MessageFields, MessageSink, write_error
 
 MARK_RECORD = "undulog.mark"
 """Metadata record of a mark: its number, time, text, and the number of messages dropped before."""
@@ -140,19 +140,13 @@ class RingSink:
             if adds_up(record):
                 self._adds_up.add(record.id)
 
-    def write(
-        self,
-        channel_id: int,
-        log_time_ns: int,
-        publish_time_ns: int,
-        sequence: int,
-        payload: bytes,
-    ) -> None:
+    def write(self, *message: *MessageFields) -> None:
         """See :meth:`MessageSink.write`; messages that are too old are dropped."""
         if not self._open:
             raise LogWriteError(self._path, "the ring is closed")
         messages = self._messages
-        messages.append(RingMessage(channel_id, log_time_ns, publish_time_ns, sequence, payload))
+        _, log_time_ns, _, _, payload = message
+        messages.append(RingMessage(*message))
         self.accepted += 1
         self.size += len(payload) + MESSAGE_OVERHEAD
         if log_time_ns > self._newest_ns:  # noqa: PLR1730 - a call costs, and this is the hot path

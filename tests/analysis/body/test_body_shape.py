@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.viscous_swimmer import Swimmer
-from undulog.analysis.body.chassis import step_of_cycle, virtual_chassis
 from undulog.analysis.body.free_motion import fit_motion
 from undulog.analysis.body.shape import plane_shapes
+from undulog.analysis.body.travel import step_of_cycle, virtual_chassis
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.response.fitting import fit_gait
 from undulog.analysis.signals.windows import Span

@@ -7,8 +7,8 @@ import pytest
 
 from support.viscous_swimmer import Swimmer, perturbed_gaits
 from undulog.analysis import load
-from undulog.analysis.body.chassis import wave_at
 from undulog.analysis.body.connection import MOST_CONDITION, distances, fit_connection
+from undulog.analysis.body.travel import wave_at
 from undulog.analysis.experiment.body_connection import (
     GaitSession,
     body_connection,

@@ -8,9 +8,9 @@ import pytest
 
 from support import twin_chains
 from support.viscous_swimmer import Swimmer
-from undulog.analysis.body.chassis import chassis_path, gait_cycle, wave_at
 from undulog.analysis.body.connection import fit_connection, turned
 from undulog.analysis.body.null import one_cycle, viscous_chain
+from undulog.analysis.body.travel import chassis_path, gait_cycle, wave_at
 from undulog.analysis.estimators.series import Series
 from undulog.capture.robot.model import Plane
 from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, load_scenario, run_batch

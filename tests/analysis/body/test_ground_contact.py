@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from undulog.analysis.body.ground_contact import TOUCHES, link_loads, means_between
-from undulog.analysis.body.steps import GRAVITY
+from undulog.analysis.body.travel import GRAVITY
 from undulog.analysis.results.ground_contact import TWIN_ACCURACY
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.description import load_robot

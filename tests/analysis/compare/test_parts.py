@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from undulog.analysis.body.steps import GRAVITY, Steps, centre_of_mass, cost_of_transport, speed
+from undulog.analysis.body.travel import GRAVITY, Steps, centre_of_mass, cost_of_transport, speed
 from undulog.analysis.compare.quantities import Quantities
 from undulog.analysis.compare.side import changes, cycles_by_phase, phases_rad, turned
 from undulog.analysis.estimators.harmonic import HarmonicModel, fit_at

@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from undulog.analysis.estimators.demodulation import Phase, cycles_of, demodulate
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.session.over_time import response_over_time
+from undulog.analysis.session.cycles import response_over_time
 from undulog.analysis.signals.columns import read_columns
 from undulog.capture import Session, SessionWriter
 

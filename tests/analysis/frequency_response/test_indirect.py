@@ -5,8 +5,11 @@ import pytest
 from scipy import signal
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.frequency_response.estimate import estimate, frequency_responses
-from undulog.analysis.frequency_response.excitation import find_excitation
+from undulog.analysis.frequency_response.estimate import (
+    estimate,
+    find_excitation,
+    frequency_responses,
+)
 
 STEP_S, COUNT, DRAWS = 0.01, 4000, 60
 POLE, SIZE, CONTROL = 0.6, 0.3, 0.8  # G = SIZE / (1 - POLE / z)

@@ -7,10 +7,10 @@ from importlib.resources import files
 import pytest
 import reference_pages
 from jsonschema import Draft202012Validator
+from result_schemas import RESULTS, result_schema
 
 from support import linear_chain
 from support.paths import ROOT, SHARED
-from undulog.analysis.results.schema import RESULTS, result_schema
 
 GOLDEN = ROOT / "tests/replay/golden/session.mcap"
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from undulog.analysis.results.artefact import Artefact
+from undulog.analysis.results.answer import Artefact
 from undulog.analysis.segments.session import Following, not_following
 
 

@@ -18,9 +18,9 @@ from support.bus_robots import TWO_JOINTS
 from support.serial_lines import Captured
 from undulog.capture.bus.decoders import open_decoder
 from undulog.capture.robot.description import load_robot, parse_robot
+from undulog.capture.robot.serial_servos import dynamixel_packet, feetech_packet
 from undulog.capture.sources.events import Tally
 from undulog.capture.sources.serial_port import PacketClock
-from undulog.capture.sources.servo_packets import dynamixel_packet, feetech_packet
 
 ARM = f"""{TWO_JOINTS}[bus]
 family = "dynamixel2"

@@ -214,7 +214,7 @@ def test_stretches_make_no_difference(suffix, tmp_path, monkeypatch):
         buses[bus] = frames
     source = write_session(tmp_path / "run.mcap", buses, batch=3)
     whole = export_log(source, tmp_path / f"whole{suffix}")
-    monkeypatch.setattr("undulog.capture.exchange.frame_blocks._MESSAGES_PER_BLOCK", 7)
+    monkeypatch.setattr("undulog.capture.exchange.frame_log._MESSAGES_PER_BLOCK", 7)
     parts = export_log(source, tmp_path / f"parts{suffix}")
     assert (whole.buses, whole.warnings) == (parts.buses, parts.warnings)
     assert whole.buses == dict.fromkeys(buses, len(every_kind()))

@@ -17,8 +17,8 @@ from scservo_sdk import PortHandler
 from support.serial_lines import Line
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import SERIAL_MORE, SERIAL_NOISE
+from undulog.capture.robot.serial_servos import dynamixel_packet, feetech_packet
 from undulog.capture.sources.contract import open_source, parse_address
-from undulog.capture.sources.servo_packets import dynamixel_packet, feetech_packet
 
 
 @pytest.fixture

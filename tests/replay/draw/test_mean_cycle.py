@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import undulog
 from support.twin_chains import chain, wave
-from undulog.analysis.results.artefact import Artefact
+from undulog.analysis.results.answer import Artefact
 from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.session.cycles import cycle_maps

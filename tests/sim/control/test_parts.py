@@ -19,10 +19,10 @@ from undulog.sim.control.adaptive import (
     StraightOn,
     TargetHeadingPolicy,
 )
-from undulog.sim.control.dead_reckoning import Pose, SlipOdometry
+from undulog.sim.control.filters import Pose, SlipOdometry
 from undulog.sim.control.reactions import ControlInput, Distances, ObstacleMonitor
 from undulog.sim.gait.contract import WALK
-from undulog.sim.scenario.controllers import (
+from undulog.sim.scenario.motion import (
     Controller,
     ControllerKind,
     HeadSteering,
@@ -30,9 +30,9 @@ from undulog.sim.scenario.controllers import (
     SideShrinking,
     TailHaste,
     TargetHeading,
+    generator,
 )
-from undulog.sim.scenario.controllers import Lookout as LookoutParameters
-from undulog.sim.scenario.gaits import generator
+from undulog.sim.scenario.motion import Lookout as LookoutParameters
 from undulog.sim.scenario.sensors import layout
 
 SNAKE = load_robot("snake25")

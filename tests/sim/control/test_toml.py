@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.twin_runs import SNAKE13, SNAKE25, check_keys, faults_of
 from undulog.sim import Readings, load_scenario, parse_scenario
 from undulog.sim.control.adaptive import build_gait
-from undulog.sim.scenario.controllers import (
+from undulog.sim.scenario.motion import (
     Calibration,
     Controller,
     ControllerKind,

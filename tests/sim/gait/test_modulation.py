@@ -15,7 +15,7 @@ from undulog.sim import PlaneGait, Readings, Serpentine, Wave
 from undulog.sim.gait.contract import Modulation
 from undulog.sim.gait.delay_blocks import DelayBlocks, DelayLine
 from undulog.sim.gait.oscillators import OscillatorChain, OscillatorChains, OscillatorKind
-from undulog.sim.scenario.gaits import generator
+from undulog.sim.scenario.motion import generator
 
 NOTHING = Readings(np.full(7, np.nan), np.full(7, np.nan))
 STEP_S = 0.01

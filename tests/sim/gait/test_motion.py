@@ -14,7 +14,7 @@ import pytest
 from undulog.capture import Session
 from undulog.capture.robot.model import Plane
 from undulog.sim import Readings, Twin, load_scenario, record
-from undulog.sim.scenario.gaits import generator
+from undulog.sim.scenario.motion import generator
 
 CYCLE = 200  # ticks
 

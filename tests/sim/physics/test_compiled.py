@@ -14,9 +14,8 @@ from undulog.sim.physics.bullet import BulletEngine
 from undulog.sim.physics.compiled_bullet import CompiledBulletEngine
 from undulog.sim.physics.compiled_kernels import CompiledLaws
 from undulog.sim.physics.engine import BodyStart
-from undulog.sim.physics.laws import NumpyLaws
 from undulog.sim.physics.servo import Servos
-from undulog.sim.physics.steps import Steps
+from undulog.sim.physics.steps import NumpyLaws, Steps
 from undulog.sim.scenario.scenario import EngineKind, Kernels
 
 START = BodyStart((0.3, 0, -9.81), 0.3, 0.7, (0.2, 0.1, 0.0), 1e-3)

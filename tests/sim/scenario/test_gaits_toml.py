@@ -15,7 +15,7 @@ from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Readings, Serpentine, Wave, parse_scenario
 from undulog.sim.gait.delay_blocks import DelayBlocks, DelayLine
 from undulog.sim.gait.oscillators import OscillatorChain, OscillatorChains, OscillatorKind
-from undulog.sim.scenario.gaits import gait_table, generator, read_gait
+from undulog.sim.scenario.motion import gait_table, generator, read_gait
 
 ROBOT = load_robot("snake13")  # 6 joints in each plane
 

@@ -9,7 +9,7 @@ import pytest
 from undulog.capture.robot.model import Servo
 from undulog.sim import load_scenario, scenario_names
 from undulog.sim.commands.run import leaves, unit_of
-from undulog.sim.scenario.controllers import HeadSteering, TailHaste
+from undulog.sim.scenario.motion import HeadSteering, TailHaste
 from undulog.sim.scenario.sensors import AccelerometerModel, CompassModel, InfraredModel, SonarModel
 from undulog.sim.scenario.world import Ground
 

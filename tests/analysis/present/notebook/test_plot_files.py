@@ -9,7 +9,7 @@ from matplotlib import colors
 from PIL import Image
 
 from support.joint_runs import write_joints
-from undulog.analysis.present.notebook.pictures import paper_colors
+from undulog.analysis.present.notebook.files import paper_colors
 from undulog.analysis.present.notebook.plot_files import _mixed, figure_of, figures_of, save_plots
 from undulog.analysis.present.page.matrix import Entries, matrix_picture
 from undulog.analysis.present.page.svg import CSS_VARIABLES, drawing, inline_svg, kept_figures

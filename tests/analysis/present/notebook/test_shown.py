@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from undulog.analysis import Choices, Estimate, Experiment, compare_sessions, load
-from undulog.analysis.results.artefact import Artefact
+from undulog.analysis.results.answer import Artefact
 from undulog.analysis.results.coupling import Route
 from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 from undulog.capture import Session

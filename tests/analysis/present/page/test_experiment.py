@@ -14,7 +14,7 @@ from undulog.analysis.present.page.matrix import Entries, entries_of, matrix_pic
 from undulog.analysis.present.page.page import render
 from undulog.analysis.present.page.session_view import artefact_rows, times_text
 from undulog.analysis.present.page.tables import experiment_trials, session_trials
-from undulog.analysis.results.artefact import Artefact
+from undulog.analysis.results.answer import Artefact
 from undulog.analysis.results.formats import sentence
 
 

@@ -4,17 +4,28 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from undulog.analysis.frequency_response.periodic import (
-    best_linear_approximation,
+from undulog.analysis.experiment.sweep.best_linear import (
     detection_lines,
     input_inverse,
-    line_power,
+    over_realisations,
     realisation_response,
 )
+from undulog.analysis.frequency_response.nonparametric import line_power
 from undulog.analysis.results.estimate import Estimate
 
 N = 512
 ODD = np.arange(1, 120, 2)
+
+
+def best_linear_approximation(inputs, outputs, lines):
+    """Of one input and one output, from samples of whole steady periods, shape (M, P, n)."""
+    length = inputs.shape[2]
+    u, y = (np.fft.rfft(values, axis=2)[:, :, lines] / length for values in (inputs, outputs))
+    each = [
+        realisation_response(input_inverse(one.mean(axis=0)[None, None]), out[None])
+        for one, out in zip(u, y, strict=True)
+    ]
+    return over_realisations(*map(np.stack, zip(*((v[0], n[0]) for v, n in each), strict=True)))
 
 
 def multisine(rng, lines, realisations, n=N):

@@ -14,14 +14,18 @@ from enum import Enum
 from types import NoneType, UnionType
 from typing import Any, Union, cast, get_args, get_origin, get_type_hints
 
-from . import analysis, artefact, oscillators
-from .analysis import Analysis, interval_key
-from .body_shape import BodyTravel, Serpenoid, ShapeMode
-from .comparison import Comparison
-from .estimate import Estimate
-from .experiment import Experiment
-from .frequency_response import BodyWave, JointFrequencyResponse, JointMotion
-from .ground_contact import LinkContact
+from undulog.analysis.results import analysis, answer, oscillators
+from undulog.analysis.results.analysis import Analysis, interval_key
+from undulog.analysis.results.body_shape import BodyTravel, Serpenoid, ShapeMode
+from undulog.analysis.results.comparison import Comparison
+from undulog.analysis.results.estimate import Estimate
+from undulog.analysis.results.experiment import Experiment
+from undulog.analysis.results.frequency_response import (
+    BodyWave,
+    JointFrequencyResponse,
+    JointMotion,
+)
+from undulog.analysis.results.ground_contact import LinkContact
 
 VERSION = 1
 
@@ -52,7 +56,7 @@ _FLAT = frozenset(
 """Records of a session whose estimates are two keys each, as :meth:`.Analysis.to_dict` has them."""
 
 _DERIVED: dict[type, dict[str, Any]] = {
-    artefact.Artefact: {"about": {"type": "string"}},
+    answer.Artefact: {"about": {"type": "string"}},
     BodyWave: {"direction": {"enum": ["first-to-last", "last-to-first", "undecided"]}},
 }
 _INTERVAL = {

@@ -11,15 +11,15 @@ from scservo_sdk import PacketHandler as Feetech
 from campaign.structure import nested_packets
 from support.serial_lines import Captured
 from undulog.capture.log.messages.frames import SERIAL_MORE, SERIAL_NOISE
-from undulog.capture.sources.events import Tally
-from undulog.capture.sources.serial_port import PacketClock
-from undulog.capture.sources.servo_packets import (
+from undulog.capture.robot.serial_servos import (
     PROTOCOLS,
     PacketSplitter,
     crc16,
     dynamixel_packet,
     feetech_packet,
 )
+from undulog.capture.sources.events import Tally
+from undulog.capture.sources.serial_port import PacketClock
 
 MANUAL = {
     # ROBOTIS e-Manual, DYNAMIXEL Protocol 2.0: ping, its status, read, its status, write, sync

@@ -1,17 +1,94 @@
-"""Parquet files as blocks of named columns; a column of vectors stands for one an element."""
+"""Blocks of named columns, read from files with bounds on what these may expand to.
+
+Also those of Parquet files, where a column of vectors stands for one an element.
+"""
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NoReturn, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.errors import ImportFormatError, LogError, MissingExtraError
-from .packing import WIDEST, Block, check_rows, refuse, spread
+
+Block: TypeAlias = dict[str, NDArray[Any]]
+"""Column to its cells, (n,): numbers, or texts where they are none."""
+
+WIDEST = 4096
+"""Most columns of a table."""
+
+MOST_BYTES = 1 << 29
+"""More bytes of numbers than this in a file of arrays are refused [B]: they are read at once."""
+
+UNZIPPING = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError)
+"""Errors of a damaged zip, the last of a kind of compression that its header invents."""
+
+_ROWS, _CELLS = 16384, 1 << 20  # most of a block
+_MANY_ROWS = 1 << 22
+_ROWS_A_BYTE = 4
+_MANY_CELLS, _CELLS_A_BYTE = 1 << 25, 16
+_PIECE = 1 << 20
+
+
+def spread(name: str, vectors: NDArray[Any]) -> Block:
+    """Return vectors, (n, m), as the columns ``name[0]`` to ``name[m - 1]``."""
+    return {f"{name}[{i}]": vectors[:, i] for i in range(vectors.shape[1])}
+
+
+def refuse(path: Path, why: str) -> NoReturn:
+    """Raise ImportFormatError."""
+    raise ImportFormatError(path, why)
+
+
+def rows_of_block(columns: int) -> int:
+    """Return how many rows a block of so many columns has."""
+    return max(1, min(_ROWS, _CELLS // max(1, columns)))
+
+
+def check_rows(path: Path, rows: int) -> None:
+    """Refuse a file that packs far more rows than a recording has.
+
+    Raises:
+        ImportFormatError: If it has millions of rows and hardly a bit for each.
+    """
+    size = path.stat().st_size
+    if rows > max(_MANY_ROWS, _ROWS_A_BYTE * size):
+        refuse(path, f"has {rows} rows in {size} bytes: so many equal rows are no recording")
+
+
+def check_cells(path: Path, cells: int) -> None:
+    """Refuse a file that packs far more numbers than a recording has into what is read at once.
+
+    Raises:
+        ImportFormatError: If there are millions, and hardly a bit for each.
+    """
+    size = path.stat().st_size
+    if cells > max(_MANY_CELLS, _CELLS_A_BYTE * size):
+        refuse(path, f"has {cells} numbers in {size} bytes: so many equal ones are no recording")
+
+
+def read_entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytearray:
+    """Return the bytes of an entry, never more than its directory declares.
+
+    Raises:
+        ValueError: If it is packed by a method that has no bound on what it expands to.
+    """
+    if info.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+        raise ValueError(f"{info.filename} is neither stored nor deflated")
+    data, at = bytearray(info.file_size), 0
+    with archive.open(info) as stream:  # without a size, a stream is expanded whole
+        while piece := stream.read(min(_PIECE, len(data) - at)):
+            data[at : at + len(piece)] = piece
+            at += len(piece)
+    if at < len(data):
+        raise ValueError(f"{info.filename} has {at} bytes of {len(data)}")
+    return data
 
 
 def arrow(what: str) -> Any:
