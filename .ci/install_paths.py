@@ -74,7 +74,13 @@ class NotTriedError(Exception):
 
 
 class FailedError(Exception):
-    """A step that went wrong."""
+    """A step that went wrong.
+
+    Attributes:
+        output: All that the command printed.
+    """
+
+    output = ""
 
 
 def run(*words: str | Path, code: int = 0, **options: object) -> str:
@@ -99,7 +105,9 @@ def run(*words: str | Path, code: int = 0, **options: object) -> str:
     if done.returncode != code:
         last = (done.stdout.strip().splitlines() or ["no output"])[-1]
         shown = " ".join(str(word) for word in words)
-        raise FailedError(f"{shown}: exit code {done.returncode}: {last}")
+        error = FailedError(f"{shown}: exit code {done.returncode}: {last}")
+        error.output = done.stdout
+        raise error
     return done.stdout
 
 
@@ -242,8 +250,16 @@ class Paths:
         """Install as a tool."""
         uv, home = find_tool("uv"), self.work / "uv"
         places = {"UV_TOOL_DIR": str(home), "UV_TOOL_BIN_DIR": str(home / "bin")}
-        python = find_python("3.11")
-        run(uv, "tool", "install", "--python", python, self.wheel(), env=places)
+        if index := os.environ.get("PIP_INDEX_URL"):  # uv has no settings of pip
+            places |= {"UV_DEFAULT_INDEX": os.environ.get("UV_DEFAULT_INDEX", index)}
+        command = (uv, "tool", "install", "--python", find_python("3.11"), self.wheel())
+        try:
+            run(*command, env=places)
+        except FailedError as error:
+            if "client error (Connect)" not in error.output:
+                raise
+            why = "uv reaches no registry; UV_DEFAULT_INDEX names another"
+            raise NotTriedError(why) from error
         self.check_base(home / "bin/undulog", self.work / "uv-work")
         return "installed"
 

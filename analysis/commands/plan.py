@@ -294,9 +294,11 @@ def check_servos(base: BaseGait, runs: tuple[PlannedRun, ...], session: SessionV
     """
     if session.robot is None:
         return
+    import numpy as np
+
     joints = {joint.name: joint for joint in session.robot.joints}
     tones = runs[0].tones(base.omega)
-    size = sum((abs(tone.amplitude) for tone in tones[1:]), start=abs(tones[0].amplitude))
+    size = np.sum([np.abs(tone.amplitude) for tone in tones], axis=0)
     for row, k in enumerate(base.driven):
         joint = joints.get(base.names[k])
         if joint is None:
