@@ -106,7 +106,9 @@ def link_loads(
         rows: FloatArray = np.column_stack([weight * (ground @ vertical), asked])
         rows = solve_triangular(cholesky(covariance, lower=True), rows, lower=True)
         matrix = np.vstack([rows[:, :-1], prior])
-        loads[k] = nnls(matrix, np.concatenate([rows[:, -1], prior.sum(axis=1)]))[0]
+        loads[k] = nnls(
+            matrix, np.concatenate([rows[:, -1], prior.sum(axis=1)]), maxiter=30 * (m + 1)
+        )[0]
         left = rows[:, -1] - rows[:, :-1] @ loads[k]
         squares += float(left @ left) / left.size
     return loads, (squares / max(len(up), 1)) ** 0.5
