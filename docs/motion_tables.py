@@ -4,7 +4,8 @@
 
 The twin runs each gait once. Its true joint angles, without the commands, are read at the times of
 another log (each joint's own, jittered, at another rate) and get noise: as often as there are
-draws. The truth is what the same analysis gives for the twin's own samples without noise.
+draws. The truth is what the same analysis gives for the twin's own samples without noise. A second
+table has windows of longer runs against what all of these runs together have.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import math
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,6 @@ from undulog.analysis.body.free_motion import fit_motion, free_motion
 from undulog.analysis.estimators.intervals import t_factor
 from undulog.analysis.estimators.series import Series
 from undulog.analysis.response.fitting import fit_gait
-from undulog.capture.robot.model import Plane
 from undulog.sim import load_scenario, run_batch
 
 JOINTS = 9
@@ -79,21 +79,30 @@ class Coverage:
     width: dict[str, float]
 
 
-def twin_motion(servo, tables, cycles):
-    """Run the twin once."""
+def twin_motions(servo, tables, cycles, runs=1):
+    """Run the twin, each run from another phase of the gait."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "wave.toml"
         (path.parent / "chain.toml").write_text(twin_chains.chain(JOINTS, **servo))
         duration_s = SETTLE_S + (cycles + 1) / FREQUENCY_HZ
         path.write_text(twin_chains.wave(duration_s=duration_s, settle_s=SETTLE_S, **tables))
         scenario = load_scenario(path)
-    (run,) = run_batch([scenario])
-    if run.error is not None:
-        raise run.error
-    planes = {Plane.HORIZONTAL} | ({Plane.VERTICAL} if "gait" in tables else set())
-    driven = [k for k, joint in enumerate(scenario.robot.joints) if joint.plane in planes]
-    names = tuple(scenario.robot.joint_names[k] for k in driven)
-    return Motion(scenario.robot, names, run.time_s, run.angle[:, driven])
+    scenarios = []
+    for k in range(runs):
+        planes = {
+            plane: replace(wave, phase=wave.phase + 2 * math.pi * k / runs)
+            for plane, wave in scenario.gait.planes.items()
+        }
+        scenarios.append(replace(scenario, gait=replace(scenario.gait, planes=planes)))
+    robot = scenario.robot
+    driven = [k for k, joint in enumerate(robot.joints) if joint.plane in scenario.gait.planes]
+    names = tuple(robot.joint_names[k] for k in driven)
+    found = []
+    for run in run_batch(scenarios):
+        if run.error is not None:
+            raise run.error
+        found.append(Motion(robot, names, run.time_s, run.angle[:, driven]))
+    return found
 
 
 def foreign(motion, cycles, random, noise):
@@ -221,8 +230,24 @@ def coverage(motion, cycles, draws, *, noise=NOISE, seed=1):
             width[name].append((ends[:, 1] - ends[:, 0]) / (2 * 1.96 * least[name]))
     return Coverage(
         {name: float(np.mean(parts)) for name, parts in inside.items()},
-        {name: float(np.median(np.median(parts, axis=0).max())) for name, parts in width.items()},
+        {name: float(np.median(parts, axis=0).max()) for name, parts in width.items()},
     )
+
+
+def lasting(motions, whole, cycles):
+    """Return the shares of windows whose intervals hold the values of all runs together."""
+    random = np.random.default_rng(cycles)
+    known = [truth(motion, whole) for motion in motions]
+    inside = {name: [] for name in QUANTITIES}
+    for motion in motions:
+        for first in range(0, whole - cycles + 1, cycles):
+            part = replace(motion, t_s=motion.t_s - first / FREQUENCY_HZ)
+            found = measure(part.robot, foreign(part, cycles, random, NOISE), cycles / FREQUENCY_HZ)
+            for name in QUANTITIES:
+                value = np.mean([one[name] for one in known], axis=0)
+                ends = np.array([ends for _, ends in found[name]])
+                inside[name].append((ends[:, 0] <= value) & (value <= ends[:, 1]))
+    return {name: float(np.mean(parts)) for name, parts in inside.items()}
 
 
 def main():
@@ -232,13 +257,22 @@ def main():
     print("| gait | cycles | " + " | ".join(f"{one} | width" for one in QUANTITIES) + " |")
     print("|---" * 8 + "|")
     for name, (servo, tables) in GAITS.items():
-        motion = twin_motion(servo, tables, max(lengths))
+        (motion,) = twin_motions(servo, tables, max(lengths))
         for cycles in lengths:
             found = coverage(motion, cycles, draws)
             cells = " | ".join(
                 f"{100 * found.inside[one]:.1f} % | {found.width[one]:.2f}" for one in QUANTITIES
             )
             print(f"| {name} | {cycles} | {cells} |", flush=True)
+    runs, whole = (2, 18) if quick else (8, 390)
+    name = "wave that lifts the body"
+    print(f"\n{name}, windows of {runs} runs of {whole} cycles\n")
+    print(f"| cycles | {' | '.join(QUANTITIES)} |")
+    print("|---" * 4 + "|")
+    motions = twin_motions(*GAITS[name], whole, runs)
+    for cycles in lengths:
+        found = lasting(motions, whole, cycles)
+        print(f"| {cycles} | {' | '.join(f'{found[one]:.0%}' for one in QUANTITIES)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
+from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 
 from undulog.capture import SessionView
@@ -101,11 +102,13 @@ def link_loads(
         body = _moments(centres[k], pivot, axis, middle)
         weights = -GRAVITY * np.einsum("rni,i,n->r", body, vertical, mass)
         asked = np.concatenate([torques[k], np.zeros(6)]) - weights
-        covariance = np.diag(errors**2) + (_FRICTION * weight) ** 2 * slip @ slip.T
-        lines = np.column_stack([weight * (ground @ vertical), asked])
-        rows: FloatArray = np.linalg.solve(np.linalg.cholesky(covariance), lines)
+        covariance: FloatArray = np.diag(errors**2) + (_FRICTION * weight) ** 2 * slip @ slip.T
+        rows: FloatArray = np.column_stack([weight * (ground @ vertical), asked])
+        rows = solve_triangular(cholesky(covariance, lower=True), rows, lower=True)
         matrix = np.vstack([rows[:, :-1], prior])
-        loads[k] = nnls(matrix, np.concatenate([rows[:, -1], prior.sum(axis=1)]))[0]
+        loads[k] = nnls(
+            matrix, np.concatenate([rows[:, -1], prior.sum(axis=1)]), maxiter=30 * (m + 1)
+        )[0]
         left = rows[:, -1] - rows[:, :-1] @ loads[k]
         squares += float(left @ left) / left.size
     return loads, (squares / max(len(up), 1)) ** 0.5

@@ -13,7 +13,7 @@ from undulog.capture.log.write.writer import SessionWriter
 @pytest.fixture(scope="module")
 def motion():
     servo, tables = motion_tables.GAITS["weak servos"]
-    return motion_tables.twin_motion(servo, tables, max(motion_tables.CYCLES))
+    return motion_tables.twin_motions(servo, tables, max(motion_tables.CYCLES))[0]
 
 
 @pytest.mark.slow
