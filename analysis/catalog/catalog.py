@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
 import tempfile
 import time
 import uuid
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -28,13 +27,14 @@ import pyarrow.parquet as pq
 from undulog.capture.common.errors import (
     DataError,
     InputFileError,
+    MissingExtraError,
     UndulogError,
     UsageError,
 )
 from undulog.capture.common.process import StopRequest
-from undulog.capture.common.remote import ObjectStore, StoredFile
+from undulog.capture.common.remote import ObjectStore
 from undulog.capture.log.file.parts import split_part_path
-from undulog.capture.log.read.facts import LogFacts, read_facts
+from undulog.capture.log.read.facts import LogFacts
 
 from .rows import (
     SCHEMAS,
@@ -47,12 +47,10 @@ from .rows import (
     sweep_rows,
     table_of,
 )
+from .sources import FOLDER, Scanned, Source, list_sources, source_facts
 
 _ARROW: Any = pa  # comes without types
 _PARQUET: Any = pq
-
-FOLDER = ".undulog-catalog"
-"""Folder of the catalogue, beside the sessions."""
 
 _BATCH = 2000
 """Files that are read before their rows are written."""
@@ -64,6 +62,7 @@ _MOST_ROWS = 50_000
 
 _MOST_RESULT = 256 << 20
 _REMOTE_THREADS = 16
+_UNREAD = -1  # a size that no file has
 _ANALYSED = "analysis of "
 
 
@@ -178,16 +177,15 @@ class Catalog:
             LogWriteError: If the catalogue can't be written.
         """
         begun, stop = time.monotonic(), stop or StopRequest()
-        listed = {file.name: file for file in self._listed()}
         known = self._known()
+        listed = {file.name: file for file in list_sources(self._store, known)}
         # Later than all scans before, whatever the clocks of others say.
         scanned_ns = max([time.time_ns(), *(scanned + 1 for _, _, scanned in known.values())])
         facts = {name: (file.size, file.modified_ns) for name, file in listed.items()}
         fresh = [one for one in listed.values() if known.get(one.name, (0,))[:2] != facts[one.name]]
         gone = [name for name in known if name not in listed and not name.startswith(_ANALYSED)]
-        changed = [*gone, *(file.name for file in fresh if file.name in known)]
-        stale = [_ANALYSED + name for name in changed if name.endswith(".mcap")]
-        self._remove([*gone, *stale], scanned_ns)
+        changed = [file.name for file in fresh if file.is_log and file.name in known]
+        self._remove([*gone, *(_ANALYSED + name for name in (*gone, *changed))], scanned_ns)
         read = damaged = 0
         for start in range(0, len(fresh), _BATCH):
             if stop.requested:
@@ -207,7 +205,7 @@ class Catalog:
                 self._write(kind, table_of(kind, own))
             self._write("sources", _ARROW.Table.from_pylist(sources, _SOURCES))
         self._put_together()
-        n_sessions = sum(name.endswith(".mcap") for name in listed)
+        n_sessions = sum(file.is_log for file in listed.values())
         return ScanReport(
             n_sessions, read, len(gone), damaged, time.monotonic() - begun, read == len(fresh)
         )
@@ -264,18 +262,7 @@ class Catalog:
 
     # -- inside ----------------------------------------------------------------------------------
 
-    def _listed(self) -> list[StoredFile]:
-        """Sessions and files that may hold results."""
-        return [
-            file
-            for file in self._store.files("", [".mcap", ".json", ".parquet"], recursive=True)
-            for path in [PurePosixPath(file.name)]
-            if FOLDER not in path.parts
-            and not (path.suffix == ".json" and path.parent.name in ("pending", "settings"))
-            and not (path.suffix == ".parquet" and path.parent.name != "rows")
-        ]
-
-    def _known(self) -> dict[str, tuple[int, int, int]]:
+    def _known(self) -> dict[str, Scanned]:
         """Name of each file that was read and is there to its size, modification and scan."""
         latest: dict[str, tuple[int, int, int, bool]] = {}
         for name in self._files("sources"):
@@ -287,42 +274,44 @@ class Catalog:
         return {name: facts[:3] for name, facts in latest.items() if not facts[3]}
 
     def _read_files(
-        self, files: Sequence[StoredFile]
-    ) -> Iterable[tuple[StoredFile, dict[str, list[Row]], str]]:
+        self, files: Sequence[Source]
+    ) -> Iterable[tuple[Source, dict[str, list[Row]], str]]:
         if self._store.is_local:
             return map(self._read_file, files)
         with ThreadPoolExecutor(_REMOTE_THREADS) as pool:
             return list(pool.map(self._read_file, files))
 
-    def _read_file(self, file: StoredFile) -> tuple[StoredFile, dict[str, list[Row]], str]:
+    def _read_file(self, file: Source) -> tuple[Source, dict[str, list[Row]], str]:
         """Return the rows of a file, and why it has none."""
         try:
-            if file.name.endswith(".mcap"):
-                facts = self._facts(file)
-                return file, {"sessions": [_session(file, facts)]}, facts.damage
+            if file.is_log:
+                found = source_facts(self._store, file)
+                return file, {"sessions": [self._session(file, found)]}, found.damage
             if file.name.endswith(".parquet"):
                 return file, self._sweep(file), ""
-            return file, self._result(file), ""
+            return file, self._result(file) if file.name.endswith(".json") else {}, ""
+        except MissingExtraError as error:  # read again, when the extra may be there
+            rows = [self._session(file, LogFacts(damage=str(error)))]
+            return replace(file, size=_UNREAD), {"sessions": rows}, str(error)
         except (UndulogError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            facts = [LogFacts(damage=str(error))] if file.name.endswith(".mcap") else []
-            return file, {"sessions": [_session(file, one) for one in facts]}, str(error)
+            facts = [LogFacts(damage=str(error))] if file.is_log else []
+            return file, {"sessions": [self._session(file, one) for one in facts]}, str(error)
 
-    def _facts(self, file: StoredFile) -> LogFacts:
-        path = self._store.path(file.name)
-        if self._store.is_local:
-            with open(path, "rb", buffering=0) as stream:  # noqa: PTH123 - unbuffered, of a path
-                own = stream.fileno()
-                return read_facts(path, file.size, lambda a, b: os.pread(own, b - a, a))
-        with self._store.filesystem.open_input_file(path) as stream:
-            return read_facts(path, file.size, lambda a, b: stream.read_at(b - a, a))
+    def _session(self, file: Source, facts: LogFacts) -> Row:
+        row = session_row(facts)
+        head = split_part_path(Path(file.name))[0].as_posix() if row["part"] > 1 else file.name
+        name = PurePosixPath(self._store.path(head)).stem  # as a session without an id calls itself
+        return {**row, "session_id": row["session_id"] or name, "path": file.name, "head": head} | {
+            "size": file.size
+        }
 
-    def _sweep(self, file: StoredFile) -> dict[str, list[Row]]:
+    def _sweep(self, file: Source) -> dict[str, list[Row]]:
         every = map(sweep_rows, self._store.read_table(file.name).to_pylist())
         known = [found for found in every if found is not None]
         joints = [joint for _, own in known for joint in own]
         return {"analyses": [analysis for analysis, _ in known], "joints": joints}
 
-    def _result(self, file: StoredFile) -> dict[str, list[Row]]:
+    def _result(self, file: Source) -> dict[str, list[Row]]:
         if file.size > _MOST_RESULT:
             return {}
         value = json.loads(self._store.read(file.name))
@@ -434,15 +423,6 @@ def _lock(path: Path) -> Generator[bool]:
             yield False
             return
         yield True
-
-
-def _session(file: StoredFile, facts: LogFacts) -> Row:
-    row = session_row(facts)
-    head = split_part_path(Path(file.name))[0].as_posix() if row["part"] > 1 else file.name
-    name = PurePosixPath(head).stem  # as a session without an id calls itself
-    return {**row, "session_id": row["session_id"] or name, "path": file.name, "head": head} | {
-        "size": file.size
-    }
 
 
 def _checked(source: str, result: Mapping[str, Any]) -> tuple[Row, list[Row]]:

@@ -51,9 +51,10 @@ def catalog(
     """Find sessions by robot, gait, date, verdict and results.
 
     Reads what is new or changed in a folder and its subfolders, or under a URL of an object store,
-    and keeps it there in `.undulog-catalog`: of each session its first and last bytes, of each
-    result that `undulog analyse -o` or `undulog sweep` wrote its numbers. Conditions are SQL for
-    DuckDB; angles are in rad, `NAME_low` and `NAME_high` are the ends of 95 % intervals.
+    and keeps it there in `.undulog-catalog`: of each session (`.mcap`, `.bag`, `.db3`, rosbag2
+    folder) topics, times and counts, of each result that `undulog analyse -o` or `undulog sweep`
+    wrote its numbers. Conditions are SQL for DuckDB; angles are in rad, `NAME_low` and `NAME_high`
+    are the ends of 95 % intervals.
 
     Example: `undulog catalog lab --where "robot = 'snake25' and lag_sd > 0.05"`
 

@@ -88,39 +88,25 @@ def _named(path: Path) -> list[Path]:
 
 def _matched(path: Path) -> list[Path]:
     """Return the sessions that a match of a pattern belongs to."""
-    from ..log.file.parts import first_part
+    from ..log.file.bag_metadata import is_rosbag2
 
     if path.is_dir():
         return _in_folder(path)
-    return [path.parent if _is_rosbag2(path.parent) else first_part(path)]
-
-
-def _is_rosbag2(folder: Path) -> bool:
-    from ..log.file.bag_parts import METADATA
-
-    return (folder / METADATA).is_file()
+    return [path.parent if is_rosbag2(path.parent) else _session_of(path)]
 
 
 def _in_folder(folder: Path) -> list[Path]:
     """Return the sessions in a folder and, behind them, in its folders."""
-    from ..log.file.bag import is_bag
+    from ..log.file.log_paths import log_paths
+
+    return list(dict.fromkeys(map(_session_of, log_paths(folder))))
+
+
+def _session_of(path: Path) -> Path:
+    """Return the session that a log belongs to: of a part, the first one."""
     from ..log.file.parts import first_part
 
-    if _is_rosbag2(folder):
-        return [folder]
-    found: dict[Path, None] = {}
-    entries = sorted(folder.iterdir())
-    for entry in entries:
-        if entry.suffix == ".mcap" and entry.is_file():
-            found[first_part(entry)] = None
-        elif entry.is_file() and is_bag(entry):
-            found[entry] = None
-        elif entry.name.endswith(".mcap.wal") and entry.is_dir():
-            found[entry.with_name(entry.name.removesuffix(".wal"))] = None
-    for entry in entries:
-        if entry.is_dir() and not entry.name.startswith(".") and entry.suffix != ".wal":
-            found |= dict.fromkeys(_in_folder(entry))
-    return list(found)
+    return first_part(path) if path.suffix == ".mcap" and not path.is_dir() else path
 
 
 def each(what: Sequence[Any], verb: str, work: Callable[[Any], Line]) -> dict[str, Line]:

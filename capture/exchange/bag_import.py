@@ -25,6 +25,7 @@ from ..following.find import MOST_JOINTS
 from ..log.edit.cut import cut_log
 from ..log.edit.edited_log import RawLog
 from ..log.file.bag import check_room, is_bag
+from ..log.file.bag_metadata import is_rosbag2
 from ..log.mcap.chunk import LAST_NS
 from ..log.messages.definitions import TRAJECTORY, is_of_contract
 from ..log.read.joint_messages import INTERFACE_UNITS, UNITS, JointRows, joint_source
@@ -44,7 +45,7 @@ _COPYING = 0.4
 def is_recording(path: Path) -> bool:
     """Whether a path is a recording of ROS: an MCAP, .db3 or .bag file, or a folder of rosbag2."""
     if path.is_dir():
-        return (path / "metadata.yaml").is_file()
+        return is_rosbag2(path)
     return path.suffix.lower() in {".mcap", ".db3", ".bag"}
 
 

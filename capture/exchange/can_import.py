@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from zstandard import STRATEGY_FAST, ZstdCompressionParameters
 
 from ..bus.decoded_topics import DecodedTopics, Message
 from ..bus.decoders import open_decoder
@@ -22,6 +23,7 @@ from ..common.errors import ImportFormatError
 from ..common.files import part_file
 from ..common.process import StopRequest
 from ..log.health.bus_tally import undecoded
+from ..log.mcap.writer import Compression
 from ..log.messages.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd
 from ..log.write.channels import FrameChannel
 from ..log.write.mcap_sink import McapSink
@@ -96,8 +98,22 @@ def digest_of(files: Sequence[Path]) -> str:
     return hashlib.sha256(parts.encode()).hexdigest()
 
 
-_LEVEL = 2
+LEVEL: Compression = 2
 """Of compression: a third less time than level 3 for a few per cent more bytes."""
+
+FLOAT32: Compression = ZstdCompressionParameters(
+    window_log=20,
+    hash_log=12,
+    chain_log=12,
+    search_log=1,
+    min_match=5,
+    target_length=1,
+    strategy=STRATEGY_FAST,
+    write_checksum=True,
+)
+"""Of messages whose numbers had single precision: those of neighbours share few bytes, so that a
+table of matches in the nearest cache finds as many. A quarter to a third less time than level 2,
+for 2 % fewer to 5 % more bytes; rounded decimals take up to twice as many."""
 
 
 @contextmanager
@@ -110,6 +126,7 @@ def imported_session(
     facts: Mapping[str, str],
     force: bool,
     digest: str | None = None,
+    compression: Compression = LEVEL,
 ) -> Generator[SessionWriter]:
     """Write an imported session, which appears under its name only when it is whole.
 
@@ -121,6 +138,7 @@ def imported_session(
         epoch_ns: Time of its first sample [Unix ns].
         facts: For the session's metadata.
         digest: Of the log, where that is more than the file ``source``.
+        compression: Of the messages.
 
     Raises:
         OutputExistsError: If the output is there and ``force`` is not given.
@@ -137,7 +155,7 @@ def imported_session(
             robot=robot,
             clock={"log": str(robot.clock)} if robot else {},
             metadata={"source": source.name, "source.sha256": digest, **facts},
-            sink=McapSink(part, force=True, level=_LEVEL),
+            sink=McapSink(part, force=True, compression=compression),
         ) as writer,
     ):
         yield writer

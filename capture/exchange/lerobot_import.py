@@ -28,7 +28,7 @@ from ..log.read.facts import TIMES_FROM_FPS
 from ..robot.bus_map import SESSION_UNIT
 from ..robot.description import numbered
 from ..robot.model import Quantity, Robot
-from .can_import import ImportReport, file_digest
+from .can_import import FLOAT32, ImportReport, file_digest
 from .column_blocks import Block, read_parquet, refuse, rows_of_block, vectors_of
 from .column_map import STATES, Column, ColumnMap
 from .table_import import TableSet, import_tables
@@ -230,7 +230,9 @@ def _episode(dataset: LeRobotDataset, number: int, paths: Sequence[Path]) -> Tab
     }
     # A file may hold several episodes, and each is a session of its own.
     digest = hashlib.sha256(f"{file_digest(paths[0])} {number}".encode()).hexdigest()
-    return TableSet(dataset.folder, {STATES: table}, digest=digest, facts=facts)
+    return TableSet(
+        dataset.folder, {STATES: table}, digest=digest, facts=facts, compression=FLOAT32
+    )
 
 
 def _of_episode(path: Path, number: int, columns: Sequence[str], rows: int) -> Iterator[Any]:

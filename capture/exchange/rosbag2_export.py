@@ -17,13 +17,14 @@ from typing import Any, cast
 
 from mcap.records import Channel
 
-from ..common.errors import DataError, some_names
+from ..common.errors import DataError, UsageError, some_names
 from ..common.files import part_folder
 from ..common.process import StopRequest
 from ..log.edit.edited_log import EditedLog, RawLog
+from ..log.file.bag_metadata import METADATA, is_rosbag2
 from ..log.messages.definitions import is_latched
 
-MARKER = Path("metadata.yaml")
+MARKER = Path(METADATA)
 """The file by which a folder is a bag."""
 
 _VERSION = 8
@@ -76,6 +77,8 @@ def export_rosbag2(
         LogError: If the session can't be read, or the bag can't be written.
         UndulogError: If a stop was requested; nothing is left behind then.
     """
+    if (output / MARKER).is_file() and not is_rosbag2(output):
+        raise UsageError(f"{output}: its {MARKER} is not of rosbag2: it is not replaced")
     with part_folder(output, marker=MARKER, force=force) as part, RawLog(source) as log:
         kept = [_offered(log, each) for each in log.file.channels.values() if _is_ros(log, each)]
         _check_types(log, kept)

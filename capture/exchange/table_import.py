@@ -20,11 +20,12 @@ from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError, UsageError, some_names
 from ..common.files import write_text
 from ..common.process import StopRequest
+from ..log.mcap.writer import Compression
 from ..log.read.facts import TIMES_FROM_FPS
 from ..log.write.writer import SessionWriter
 from ..robot.bus_map import TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
-from .can_import import ImportReport, digest_of, imported_session
+from .can_import import LEVEL, ImportReport, digest_of, imported_session
 from .column_map import COMMANDS, STATES, Column, ColumnMap, JointTopic, topics_of
 from .frame_log import EARLIEST_NS, LATEST_NS, RELATIVE_EPOCH_NS
 from .marker_tracks import as_joints, with_fps
@@ -62,6 +63,7 @@ class TableSet:
         digest: Of all files' bytes.
         left_out: Names of files that were not read.
         facts: For the session's metadata, beside those of any import.
+        compression: Of the session.
     """
 
     source: Path
@@ -71,6 +73,7 @@ class TableSet:
     digest: str = ""
     left_out: tuple[str, ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict[str, str])
+    compression: Compression = LEVEL
 
 
 def open_tables(source: Path, commands: Path | None = None, fps: float | None = None) -> TableSet:
@@ -248,7 +251,7 @@ def _write(
     with (
         imported_session(
             found.source, report.output, robot, epoch_ns=report.start_ns, facts=facts, force=force,
-            digest=found.digest,
+            digest=found.digest, compression=found.compression,
         ) as writer,
         progress(f"import {found.source.name}", 1.0) as bar,
     ):  # fmt: skip
@@ -384,13 +387,15 @@ class _Source:
             bad = next((str(cell)[:40] for cell in cells if not _is_number(cell)), "")
             raise ImportFormatError(path, f"column {name!r}: {bad!r} is not a number") from error
         known = np.abs(values) < _MOST
+        missing = 0
         if not known.all():
             known = ~np.isnan(values)
             if not np.all(np.abs(values[known]) < _MOST):
                 raise ImportFormatError(
                     path, f"column {name!r} has a number that is not finite or beyond {_MOST:g}"
                 )
-        self._missing[name] = self._missing.get(name, 0) + int(len(values) - known.sum())
+            missing = int(len(values) - known.sum())
+        self._missing[name] = self._missing.get(name, 0) + missing
         if column.wrap and known.any():
             raw = values[known]
             before = self._unwrapped.get(name, (raw[0], raw[0]))

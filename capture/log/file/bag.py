@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from ...common.errors import LogError, MissingExtraError, NotALogError, UndulogError
 from ..messages.definitions import CONTROLLER_STATE, DYNAMIC_STATE
-from .bag_parts import METADATA, Allowance, Stated, metadata_text, opened, read_stated
+from .bag_metadata import METADATA, Stated, is_rosbag2, metadata_text, read_stated
+from .bag_parts import Allowance, opened
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -152,11 +153,11 @@ _WHAT = (
 
 def is_bag(path: Path) -> bool:
     """Whether a path is a recording of ROS that must be copied to be read."""
-    if path.suffix in _FILES:
-        return path.is_file()
-    stated = path / METADATA
-    if not stated.is_file():
+    if not path.is_dir():
+        return path.suffix in _FILES and path.is_file()
+    if not is_rosbag2(path):
         return False
+    stated = path / METADATA
     try:
         plain = len(list(path.glob("*.mcap"))) == 1
         return not plain or bool(_PER_MESSAGE.search(metadata_text(stated)))

@@ -1,7 +1,7 @@
 """The files of a recording of ROS 2 as messages: MCAP and sqlite3, whole or compressed.
 
-Every size in them is checked before it is used: a metadata.yaml is text alone, without merges and
-tags, a compressed file or message expands no further than an :class:`Allowance`.
+Every size in them is checked before it is used: a compressed file or message expands no further
+than an :class:`Allowance`.
 
 Formats: https://github.com/ros2/rosbag2, https://mcap.dev/spec.
 """
@@ -13,7 +13,7 @@ import struct
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import zstandard
@@ -22,22 +22,19 @@ from mcap.opcode import Opcode
 from ...common.errors import LogError, NotALogError
 from ..mcap.chunk import BODY_AT, PREFIX_SIZE, walk_records
 from ..mcap.file import McapFile
+from .bag_metadata import Stated
 
 if TYPE_CHECKING:
     import sqlite3
 
     from rosbags.interfaces import Connection
 
-METADATA = "metadata.yaml"
-LARGEST_METADATA = 1 << 20
-"""Of a metadata.yaml [byte]: hours in thousands of parts take less."""
-
 _RATIO, _LEAST = 100, 64 << 20
 _PIECE = 1 << 16
 _FIXED = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time
-_INFORMATION = "rosbag2_bagfile_information"
-_NONE = ("", "none", "null", "~")
 _SUFFIXES = (".mcap", ".db3")
+_MOST_TOPICS = 1 << 16
+_ROW_SIZE = 8  # of the shortest message in a database [byte]
 
 
 class Allowance:
@@ -83,83 +80,12 @@ class Part:
     warnings: list[str]
 
 
-@dataclass(frozen=True)
-class Stated:
-    """What a metadata.yaml states of the files beside it.
-
-    Attributes:
-        files: In the order of time.
-        mode: ``file``, ``message`` or empty: what is compressed.
-    """
-
-    files: list[Path]
-    mode: str
-
-
-def read_stated(folder: Path) -> Stated:
-    """Read the metadata.yaml of a folder.
-
-    Raises:
-        NotALogError: If it is damaged, or names files that are not there.
-    """
-    from ruamel.yaml import YAML
-
-    path = folder / METADATA
-    text = metadata_text(path)
-    try:
-        # Kinds other than text would be computed: merges of merges expand without limit.
-        tree: Any = cast("Any", YAML(typ="base", pure=True)).load(text)
-    except Exception as error:  # its parser has errors of many bases
-        why = " ".join(str(error).split()) or type(error).__name__
-        raise NotALogError(path, f"is no YAML: {why[:200]}; run 'ros2 bag reindex'") from error
-    facts = _field(tree, _INFORMATION)
-    names = _field(facts, "relative_file_paths")
-    listed = cast("list[Any]", names) if isinstance(names, list) else []
-    if not listed or not all(isinstance(name, str) for name in listed):
-        raise NotALogError(path, "lists no files in relative_file_paths; run 'ros2 bag reindex'")
-    files = [folder / PurePath(name).name for name in listed]
-    if len(set(files)) < len(files):
-        raise NotALogError(path, "names a file twice; run 'ros2 bag reindex'")
-    for each in files:
-        if "\0" in each.name or not each.is_file():
-            raise NotALogError(
-                path, f"names {each.name}, which is not there; run 'ros2 bag reindex'"
-            )
-    mode, form = (_text(facts, f"compression_{name}") for name in ("mode", "format"))
-    if mode not in ("", "file", "message", "storage") or (mode and form not in ("zstd", "")):
-        raise NotALogError(path, f"states the compression {mode[:40]} by {form[:40]}, not zstd")
-    return Stated(files, mode)
-
-
-def metadata_text(path: Path) -> str:
-    """Return the text of a metadata.yaml.
-
-    Raises:
-        NotALogError: If it is too large to be one.
-        OSError: If it can't be read.
-    """
-    if path.stat().st_size > LARGEST_METADATA:
-        why = f"has more than {LARGEST_METADATA >> 20} MiB; run 'ros2 bag reindex'"
-        raise NotALogError(path, why)
-    return path.read_text("utf-8", errors="replace")
-
-
-def _field(tree: object, name: str) -> object:
-    return cast("dict[str, object]", tree).get(name) if isinstance(tree, dict) else None
-
-
-def _text(facts: object, name: str) -> str:
-    value = _field(facts, name)
-    text = value.strip().lower() if isinstance(value, str) else ""
-    return "" if text in _NONE else text
-
-
 @contextmanager
 def opened(path: Path, mode: str, scratch: Path, allowance: Allowance) -> Generator[Part]:
     """Open one file of a recording.
 
     Args:
-        mode: What is compressed, as in :class:`Stated`.
+        mode: What is compressed, as in :class:`.Stated`.
         scratch: A name for the file decompressed; removed afterwards.
 
     Raises:
@@ -265,16 +191,55 @@ def _end(data: Any, at: int) -> int:
 
 @contextmanager
 def _sqlite(path: Path) -> Generator[Part]:
+    with _connected(path) as (base, tables):
+        yield _database(path, base, tables)
+
+
+@contextmanager
+def _connected(path: Path) -> Generator[tuple[sqlite3.Connection, set[str]]]:
+    """Open a database; give its tables, of which topics and messages are two."""
     import sqlite3
 
     try:
         name = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         with closing(sqlite3.connect(name, uri=True)) as base:
+            base.text_factory = _readable
             base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, 1 << 20))
-            yield _database(path, base)
+            # A view or a table of a module is a program, which may never end.
+            tables = base.execute(
+                "SELECT name FROM sqlite_master "
+                "WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'"
+            )
+            known = {str(name) for (name,) in tables}
+            if not {"topics", "messages"} <= known:
+                raise NotALogError(path, f"has no tables of topics and messages; {_REINDEX}")
+            yield base, known
     except sqlite3.Error as error:
         why = " ".join(str(error).split())
         raise NotALogError(path, f"is a damaged database: {why}; {_REINDEX}") from error
+
+
+def read_database_facts(path: Path) -> Stated:
+    """Read times, number and topics of the messages of a .db3 file, and not the messages.
+
+    Its index of times is read, which has a few bytes a message.
+
+    Raises:
+        NotALogError: If it is damaged.
+    """
+    with _connected(path) as (base, _):
+        most = path.stat().st_size // _ROW_SIZE  # pages that lead to themselves have no end
+        topics = base.execute("SELECT name FROM topics LIMIT ?", (_MOST_TOPICS,)).fetchall()
+        count, first, last = base.execute(
+            "SELECT count(*), min(timestamp), max(timestamp) "
+            "FROM (SELECT timestamp FROM messages LIMIT ?)", (most,)
+        ).fetchone()  # fmt: skip
+    if count >= most:
+        raise NotALogError(path, f"is a damaged database: more messages than bytes; {_REINDEX}")
+    names = tuple(str(name) for (name,) in topics)
+    if not (isinstance(first, int) and isinstance(last, int) and first >= 0):
+        return Stated([path], "", messages=count, topics=names)
+    return Stated([path], "", first, last - first, count, names)
 
 
 def _readable(data: bytes) -> str:
@@ -284,15 +249,7 @@ def _readable(data: bytes) -> str:
 _REINDEX = "run 'ros2 bag reindex' on a copy of its folder"
 
 
-def _database(path: Path, base: sqlite3.Connection) -> Part:
-    base.text_factory = _readable
-    # A view or a table of a module is a program, which may never end.
-    tables = base.execute(
-        "SELECT name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'"
-    )
-    known = {str(name) for (name,) in tables}
-    if not {"topics", "messages"} <= known:
-        raise NotALogError(path, f"has no tables of topics and messages; {_REINDEX}")
+def _database(path: Path, base: sqlite3.Connection, known: set[str]) -> Part:
     # Pages that are part of two trees, or of themselves, would be read without end.
     if (found := str(base.execute("PRAGMA quick_check(1)").fetchone()[0])) != "ok":
         why = " ".join(found.split())[:200]

@@ -89,6 +89,17 @@ class BoundedReader(Reader):
         return found
 
 
+class SummaryReader(BoundedReader):
+    """A reader of what the end of a bag states: topics, and times and counts of its chunks."""
+
+    def read_chunk(self) -> Chunk:
+        """Leave a chunk unread."""
+        return Chunk(0, 0, bytes)
+
+    def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
+        """Leave its index unread."""
+
+
 def _bz2(size: int, data: bytes) -> bytes:
     if size > largest_chunk():
         raise ReaderError(f"A chunk declares {size} bytes, more than {largest_chunk() >> 20} MiB.")

@@ -15,6 +15,7 @@ from ...common.errors import InputFileError, LogError, NotALogError, some_names
 from ...common.remote import RemoteFile, RemotePath
 from ..mcap.file import McapFile
 from ..wal.writer import wal_folder
+from .bag_metadata import is_rosbag2
 
 PART_RECORD = "undulog.part"
 """Metadata record of a part: ``part`` (its number), ``previous`` and ``previous_sha256`` (file
@@ -289,9 +290,13 @@ def _session_in(folder: Path) -> Path:
             heads[first_part(path)] = None
         elif path.name.endswith(".mcap.wal") and path.is_dir():
             heads[path.with_name(path.name.removesuffix(".wal"))] = None
-    bag = folder / "metadata.yaml" in names  # as rosbag2 writes it
+    bag = is_rosbag2(folder)
     if not heads and bag:
         why = "a rosbag2 folder without .mcap; convert it: ros2 bag convert, storage_id: mcap"
+        raise NotALogError(folder, why)
+    if not heads and (parts := [path.name for path in names if path.suffix == ".db3"]):
+        listed = some_names(parts, _MOST_LISTED)
+        why = f"has no metadata.yaml of rosbag2; run 'ros2 bag reindex', or name a file: {listed}"
         raise NotALogError(folder, why)
     if not heads:
         raise NotALogError(folder, "no session (.mcap) is in this folder; name a session's file")

@@ -16,8 +16,7 @@ import zlib
 from array import array
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
-from typing import Any, Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import zstandard
@@ -41,16 +40,20 @@ from mcap.records import (
 from numpy.typing import NDArray
 
 from ...common.arrays import IntArray
-from .chunk import FIXED_SIZE, MAGIC, MESSAGE
+from .chunk import BODY_AT, FIXED_SIZE, HEAD, MAGIC, MESSAGE, PREFIX_SIZE
 
 CHUNK_SIZE = 1 << 20
 """Bytes of messages after which a chunk is written."""
+
+Compression: TypeAlias = int | zstandard.ZstdCompressionParameters
+"""Level of zstd, or its parameters, ``write_checksum`` among them."""
 
 _LONGEST_WAIT_NS = 10 * 10**9  # of log time, once a chunk of other channels is full
 _COMPRESSION = "zstd"
 _CHUNK = struct.Struct("<BQQQQII4sQ")
 _INDEX = struct.Struct("<BQHI")
 _OPCODE = int(Opcode.MESSAGE)
+_HEAD = np.dtype([*HEAD.descr, ("publish", "<u8")])
 
 
 class Stream(Protocol):
@@ -90,7 +93,7 @@ class McapWriter:
         stream: Stream,
         chunk_size: int = CHUNK_SIZE,
         group_of: Callable[[str, str], str] | None = None,
-        level: int = 3,
+        compression: Compression = 3,
     ) -> None:
         """Write to a stream; :meth:`start` begins.
 
@@ -98,10 +101,14 @@ class McapWriter:
             chunk_size: A chunk is written when it has more bytes than this.
             group_of: Topic and type name to the group of a channel; channels of one group share
                 chunks. None for one group, named "".
-            level: Compression level of zstd.
+            compression: Level or parameters of zstd.
         """
         self._stream, self._chunk_size = stream, chunk_size
-        self._zstd = zstandard.ZstdCompressor(level, write_checksum=True)
+        self._zstd = (
+            zstandard.ZstdCompressor(compression, write_checksum=True)
+            if isinstance(compression, int)
+            else zstandard.ZstdCompressor(compression_params=compression)
+        )
         self._group_of = group_of
         self._shared = _OpenChunk("")
         self._open = {"": self._shared}
@@ -216,42 +223,40 @@ class McapWriter:
                 self._finish_behind(log_time)
 
     def add_messages(
-        self, channel_id: int, times_ns: IntArray, payloads: NDArray[np.uint8], sequence: int = 0
+        self, channel_id: int, times_ns: IntArray, records: NDArray[np.uint8], sequence: int = 0
     ) -> None:
         """Add messages of one size to the chunk of their channel; the same bytes as one by one.
 
         Args:
             channel_id: Their channel, which is registered.
             times_ns: When each was sampled and recorded [Unix ns], from 0, shape (n,).
-            payloads: Shape (n, size).
+            records: Room for the head of a record, which is filled here, and the message, shape
+                (n, BODY_AT + size), C-contiguous.
             sequence: The channel's own counter at the first one.
 
         Raises:
             OSError: If the stream can't take a chunk that is full now.
         """
-        count, size = payloads.shape
-        records = np.empty(count, _record_of(size))
-        records["opcode"], records["length"] = _OPCODE, FIXED_SIZE + size
-        records["channel"] = channel_id
-        records["sequence"] = (sequence + np.arange(count)) & 0xFFFF_FFFF
-        records["log_time"] = records["publish_time"] = times_ns
-        records["payload"] = payloads
-        data = records.view(np.uint8).reshape(count, records.itemsize)
-        chunk, length = self._chunk_of[channel_id], records.itemsize
-        at = 0
+        count, length = records.shape
+        heads = records[:, :BODY_AT].view(_HEAD)[:, 0]
+        heads["opcode"], heads["length"] = _OPCODE, length - PREFIX_SIZE
+        heads["channel"] = channel_id
+        heads["sequence"] = (sequence + np.arange(count)) & 0xFFFF_FFFF
+        heads["log"] = heads["publish"] = times_ns
+        chunk, at = self._chunk_of[channel_id], 0
         while at < count:
             room = max(0, self._chunk_size - len(chunk.data)) // length + 1
             some = records[at : at + room]
             entries = np.empty((len(some), 2), np.uint64)
-            entries[:, 0] = some["log_time"]
+            entries[:, 0] = times_ns[at : at + room]
             entries[:, 1] = len(chunk.data) + length * np.arange(len(some))
             self._index(chunk, channel_id).frombytes(entries.tobytes())
-            chunk.data += data[at : at + len(some)].data
+            chunk.data += some.data
             self.messages += len(some)
             at += len(some)
             if len(chunk.data) > self._chunk_size:
                 self._finish_chunk(chunk)
-                self._finish_behind(int(some["log_time"][-1]))
+                self._finish_behind(int(times_ns[at - 1]))
 
     def _index(self, chunk: _OpenChunk, channel_id: int) -> array[int]:
         """Return the index of a channel in a chunk, which begins with its first message."""
@@ -429,16 +434,6 @@ class McapWriter:
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )
-
-
-@cache
-def _record_of(size: int) -> np.dtype[Any]:
-    """Return the layout of a message's record, its payload of a constant size."""
-    fields = [
-        ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"),
-        ("log_time", "<u8"), ("publish_time", "<u8"), ("payload", "u1", (size,)),
-    ]  # fmt: skip
-    return np.dtype(fields)
 
 
 def _encoded(record: McapRecord) -> bytes:

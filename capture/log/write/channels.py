@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...common.arrays import NS, FloatArray, IntArray
 from ...common.errors import DataError
+from ..mcap.chunk import BODY_AT
 from ..messages.cdr import Leaf, encode, layout_of
 from ..messages.definitions import JOINT_STATE, DiagnosticStatus, message_type
 from ..messages.frames import (
@@ -35,7 +36,8 @@ Send = Callable[[int, int, bytes], None]
 """Writes one message: log time [ns], publish time [ns], bytes."""
 
 SendRows = Callable[[IntArray, NDArray[np.uint8]], None]
-"""Writes messages of one size, at times of recording and sampling [ns], (n,), bytes (n, size)."""
+"""Writes messages of one size, at times of recording and sampling [ns], (n,), as the records of
+:meth:`.McapWriter.add_messages`, (n, BODY_AT + size)."""
 
 _TIME = struct.Struct("<iI")
 _END_NS = 2**31 * NS
@@ -87,22 +89,23 @@ class Template:
             raise DataError(f"times from {t_ns.min()} to {t_ns.max()} ns don't fit 32 bits of s")
         stamp = ("header.stamp.sec", "header.stamp.nanosec")
         leaves = [self.leaves[path] for path in (*stamp, *values)]
+        size = BODY_AT + len(self.message)
         layout = np.dtype(
             {
                 "names": [leaf.path for leaf in leaves],
                 "formats": [
                     (leaf.dtype, (leaf.count,)) if leaf.is_array else leaf.dtype for leaf in leaves
                 ],
-                "offsets": [leaf.offset for leaf in leaves],
-                "itemsize": len(self.message),
+                "offsets": [BODY_AT + leaf.offset for leaf in leaves],
+                "itemsize": size,
             }
         )
-        step = max(1, _AT_ONCE // len(self.message))
-        payloads = np.empty((min(step, len(t_ns)), len(self.message)), np.uint8)
-        payloads[:] = np.frombuffer(self.message, np.uint8)
+        step = max(1, _AT_ONCE // size)
+        records = np.empty((min(step, len(t_ns)), size), np.uint8)
+        records[:, BODY_AT:] = np.frombuffer(self.message, np.uint8)
         for at in range(0, len(t_ns), step):
             times_ns = t_ns[at : at + step]
-            mine = payloads[: len(times_ns)]
+            mine = records[: len(times_ns)]
             rows = mine.view(layout)[:, 0]
             rows[stamp[0]], rows[stamp[1]] = np.divmod(times_ns, NS)
             for path, numbers in values.items():

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import IntArray
 from ...common.errors import DataError, LogWriteError, OutputExistsError
-from ..mcap.writer import McapWriter
+from ..mcap.writer import Compression, McapWriter
 
 _BULKY = frozenset(
     {"sensor_msgs/msg/JointState", "std_msgs/msg/UInt8MultiArray", "tf2_msgs/msg/TFMessage"}
@@ -86,11 +86,13 @@ PROFILE = "ros2"
 class McapSink:
     """Writes one MCAP file; it is finalised by :meth:`close`."""
 
-    def __init__(self, path: Path | str, *, force: bool = False, level: int = 3) -> None:
+    def __init__(
+        self, path: Path | str, *, force: bool = False, compression: Compression = 3
+    ) -> None:
         """Create the file.
 
         Args:
-            level: Compression level of zstd.
+            compression: Level or parameters of zstd.
 
         Raises:
             OutputExistsError: If the file exists and ``force`` is not given.
@@ -100,7 +102,7 @@ class McapSink:
         self._open = True
         self._stream = create_file(self.path, force=force)
         guarded = _Guarded(self._stream, self.path)
-        self._writer = McapWriter(guarded, group_of=chunk_group, level=level)
+        self._writer = McapWriter(guarded, group_of=chunk_group, compression=compression)
         self._writer.start(profile=PROFILE, library=library_name())
 
     def define(self, record: Description) -> None:
@@ -118,14 +120,14 @@ class McapSink:
         self._writer.add_message(channel_id, log_time_ns, payload, publish_time_ns, sequence)
 
     def write_rows(
-        self, channel_id: int, times_ns: IntArray, sequence: int, payloads: NDArray[np.uint8]
+        self, channel_id: int, times_ns: IntArray, sequence: int, records: NDArray[np.uint8]
     ) -> None:
         """Store messages of one size at once; see :meth:`.McapWriter.add_messages`.
 
         Raises:
             LogWriteError: If they can't be stored.
         """
-        self._writer.add_messages(channel_id, times_ns, payloads, sequence)
+        self._writer.add_messages(channel_id, times_ns, records, sequence)
 
     def close(self, last: tuple[Metadata, ...]) -> None:
         """See :meth:`MessageSink.close`."""

@@ -20,6 +20,7 @@ from ...common.arrays import FloatArray, IntArray
 from ...common.errors import DataError, LogWriteError
 from ...robot.kinematics import mesh_type
 from ...robot.model import Robot, Sensor, SensorKind
+from ..mcap.chunk import BODY_AT
 from ..messages.cdr import encode, layout_of
 from ..messages.definitions import CONTRACT_VERSION, message_type, schema_text
 from .channels import (
@@ -366,15 +367,15 @@ class SessionWriter:
             write(channel_id, log_time_ns, stamp_ns, sequence, data)
             sequence = (sequence + 1) & 0xFFFF_FFFF
 
-        def send_rows(times_ns: IntArray, payloads: NDArray[np.uint8]) -> None:
+        def send_rows(times_ns: IntArray, records: NDArray[np.uint8]) -> None:
             nonlocal sequence
             if not isinstance(sink, McapSink):
-                for t_ns, payload in zip(times_ns.tolist(), payloads, strict=True):
-                    send(t_ns, t_ns, payload.tobytes())
+                for t_ns, record in zip(times_ns.tolist(), records, strict=True):
+                    send(t_ns, t_ns, record[BODY_AT:].tobytes())
                 return
             if not self._open:
                 raise LogWriteError(self.path, f"{topic}: the session is closed")
-            sink.write_rows(channel_id, times_ns, sequence, payloads)
+            sink.write_rows(channel_id, times_ns, sequence, records)
             sequence = (sequence + len(times_ns)) & 0xFFFF_FFFF
 
         return send, send_rows

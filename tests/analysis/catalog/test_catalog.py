@@ -10,12 +10,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from mcap.reader import make_reader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 
 from support import durable_child as recorder
 from support.analysed import analysed as analysed_session
 from support.bucket import s3_bucket
 from support.linear_chain import CHAIN, WAVE, write_run
 from support.processes import undulog
+from support.ros_bags import Filler, ticks, write_bag
 from support.written_sessions import write_foreign, write_session
 from undulog.analysis.catalog.catalog import FOLDER, Catalog
 from undulog.capture import Session
@@ -198,6 +200,96 @@ def test_parts_of_a_session_are_one_row(tmp_path):
         assert rows.messages["run.mcap"] == sum(one.count for one in session.channels.values())
         assert rows.duration_s["run.mcap"] == session.duration_s
         assert rows.start_ns["run.mcap"] == session.start_ns
+
+
+MESSAGES = (CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+FILES = (CompressionMode.FILE, CompressionFormat.ZSTD)
+
+
+def _fill(bag):
+    fill = Filler(bag)
+    for tick in ticks(1.0):
+        fill.controller(*tick)
+        fill.state(*tick)
+
+
+@pytest.fixture
+def bags(tmp_path):
+    """A bag of each kind, and folders of other tools with a metadata.yaml."""
+    (tmp_path / "day").mkdir()
+    write_bag(tmp_path / "day/one.bag", _fill)
+    write_bag(tmp_path / "day/plain", _fill)
+    write_bag(tmp_path / "day/messages", _fill, compression=MESSAGES)
+    write_bag(tmp_path / "day/files", _fill, storage=StoragePlugin.SQLITE3, compression=FILES)
+    write_bag(tmp_path / "day/sql", _fill, storage=StoragePlugin.SQLITE3)
+    shutil.copy(tmp_path / "day/sql/sql.db3", tmp_path / "alone.db3")
+    for name in ("tool", "tool/deep"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "metadata.yaml").write_text("# rosbag2_bagfile_information:\nname: x\n")
+        write_session(tmp_path / name / "run.mcap")
+    return tmp_path
+
+
+BAGS = ["alone.db3", *(f"day/{name}" for name in ("files", "messages", "one.bag", "plain", "sql"))]
+SESSIONS = ["tool/deep/run.mcap", "tool/run.mcap"]
+
+
+def test_bags_are_rows_with_the_facts_of_their_sessions(bags):
+    catalog = Catalog(str(bags))
+    report = catalog.scan()
+    assert (report.sessions, report.damaged) == (8, 0)
+    rows = catalog.find().set_index("path")
+    assert rows.index.to_list() == BAGS + SESSIONS
+    for path in BAGS:
+        row = rows.loc[path]
+        with Session.open(bags / path) as session:
+            assert list(row.topics) == sorted(session.channels)
+            assert row.messages == sum(channel.count for channel in session.channels.values())
+            assert (row.start_ns, row.duration_s) == (session.start_ns, session.duration_s)
+            assert row.session_id == session.session_id
+        files = [bags / path] if "." in path else (bags / path).iterdir()
+        assert row["size"] == sum(file.stat().st_size for file in files)
+
+
+def test_bags_are_opened_again_only_when_a_file_of_theirs_has_changed(bags):
+    catalog = Catalog(str(bags))
+    catalog.scan()
+    before = catalog.find()
+    files = [path for path in bags.rglob("*") if path.is_file() and FOLDER not in path.parts]
+    for path in files:  # an open file would show: the catalogue compares size and time
+        facts = path.stat()
+        path.write_bytes(b"?" * facts.st_size)
+        os.utime(path, ns=(facts.st_atime_ns, facts.st_mtime_ns))
+    report = catalog.scan()
+    assert (report.sessions, report.read, report.removed) == (8, 0, 0)
+    pd.testing.assert_frame_equal(catalog.find(), before)
+    os.utime(bags / "day/sql/sql.db3")
+    report = catalog.scan()  # whose metadata.yaml is none now: a file without a folder
+    assert (report.sessions, report.read, report.removed, report.damaged) == (8, 2, 1, 1)
+    assert catalog.find("damage is not null").path.to_list() == ["day/sql/sql.db3"]
+
+
+def test_a_bag_alone_and_damaged_ones(bags):
+    catalog = Catalog(str(bags / "day/plain"))
+    catalog.scan()
+    assert catalog.find().path.to_list() == ["."]
+    assert catalog.find().session_id.to_list() == ["plain"]
+    (bags / "day/sql/sql.db3").unlink()
+    for name in ("alone.db3", "day/one.bag"):
+        os.truncate(bags / name, 3000)
+    catalog = Catalog(str(bags))
+    assert catalog.scan().damaged == 3
+    reasons = catalog.find("damage is not null").set_index("path").damage
+    assert reasons.index.to_list() == ["alone.db3", "day/one.bag", "day/sql"]
+    assert all("reindex" in reason for reason in reasons)
+
+
+def test_analyses_of_bags_are_made_on_request(bags):
+    catalog = Catalog(str(bags))
+    catalog.scan()
+    assert catalog.analyse(["day/one.bag", "day/messages"]) == {}
+    rows = catalog.find("status = 'analysed'")
+    assert rows.path.to_list() == ["day/messages", "day/one.bag"]
 
 
 def _write_many(arguments):

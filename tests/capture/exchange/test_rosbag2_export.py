@@ -165,3 +165,12 @@ def test_the_verb(tmp_path, command, report_of):
     assert "--to rosbag2 takes one session, not 2" in refused
     refused = command(*line, "--fps", 3, "--force", code=2).err
     assert "--fps is for LeRobot; --to rosbag2 has all messages" in refused
+
+
+def test_a_folder_with_the_metadata_of_another_tool_is_not_replaced(tmp_path, command):
+    write_session(tmp_path / "run.mcap", count=20)
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set/metadata.yaml").write_text("name: a tool\n")
+    words = ("log", "export", tmp_path / "run.mcap", "--to", "rosbag2", "-o", tmp_path / "set")
+    assert "not of rosbag2" in command(*words, "--force", code=2).err
+    assert (tmp_path / "set/metadata.yaml").read_text() == "name: a tool\n"

@@ -122,7 +122,8 @@ def test_metadata_of_merges_is_read_as_text(tmp_path):
         (lambda text: re.sub(r"(- bag.db3\n)", r"\1  - bag.db3\n", text), "names a file twice"),
         (lambda text: text.replace("- bag.db3", "- /etc/hostname"), "hostname, which is not there"),
         (lambda text: text.replace("- bag.db3", "- ../bag/gone.db3"), "gone.db3, which is not"),
-        (lambda _: "a: 1", "lists no files"),
+        (lambda _: "rosbag2_bagfile_information: 1", "lists no files"),
+        (lambda _: "a: 1", "no metadata.yaml of rosbag2"),
         (lambda text: text.replace("compression_mode: ''", "compression_mode: x"), "compression x"),
     ],
 )

@@ -20,6 +20,7 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
+from undulog.capture.log.mcap.chunk import BODY_AT
 from undulog.capture.log.mcap.writer import McapWriter
 
 NUMBER = st.integers(0, 2**64 - 1)
@@ -56,7 +57,10 @@ def add_rows(writer, channel, times, data, sequence):
     """Add messages of one size: at once by our writer, one by one by the library."""
     payloads = [bytes(b ^ k for b in data) for k in range(len(times))]
     if isinstance(writer, McapWriter):
-        rows = np.frombuffer(b"".join(payloads), np.uint8).reshape(len(times), len(data))
+        rows = np.zeros((len(times), BODY_AT + len(data)), np.uint8)
+        rows[:, BODY_AT:] = np.frombuffer(b"".join(payloads), np.uint8).reshape(
+            len(times), len(data)
+        )
         writer.add_messages(channel, np.array(times, np.uint64), rows, sequence)
         return
     for k, (t_ns, payload) in enumerate(zip(times, payloads, strict=True)):

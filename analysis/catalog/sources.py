@@ -1,0 +1,125 @@
+"""Files that a catalogue reads: logs, and files that may hold results.
+
+The logs of a folder are those that commands find in it. Of a rosbag2 folder size and time are those
+of its files, so that it is opened again only when one of them has changed; and of a folder whose
+metadata.yaml is of another tool that file is kept in mind as one without rows.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from stat import S_ISDIR
+from typing import TypeAlias
+
+from undulog.capture.common.errors import InputFileError
+from undulog.capture.common.remote import ObjectStore, StoredFile
+from undulog.capture.log.file.bag import is_bag
+from undulog.capture.log.file.bag_metadata import METADATA, is_rosbag2
+from undulog.capture.log.file.log_paths import log_paths
+from undulog.capture.log.read.bag_facts import read_bag_facts
+from undulog.capture.log.read.facts import LogFacts, read_facts
+
+FOLDER = ".undulog-catalog"
+"""Folder of the catalogue, beside the sessions."""
+
+Scanned: TypeAlias = tuple[int, int, int]
+"""Size [byte], last change and scan [Unix ns] of a file that was read."""
+
+
+@dataclass(frozen=True)
+class Source(StoredFile):
+    """A file or a rosbag2 folder: a log, or what may hold results."""
+
+    is_log: bool = False
+
+
+def list_sources(store: ObjectStore, known: Mapping[str, Scanned]) -> list[Source]:
+    """List logs and files that may hold results; none that is known and unchanged is opened.
+
+    Args:
+        known: Name of each file that was read to its facts then.
+
+    Raises:
+        InputFileError: If a folder can't be listed.
+    """
+    endings = [".json", ".parquet"] if store.is_local else [".mcap", ".json", ".parquet"]
+    files = [
+        Source(file.name, file.size, file.modified_ns, path.suffix == ".mcap")
+        for file in store.files("", endings, recursive=True)
+        for path in [PurePosixPath(file.name)]
+        if FOLDER not in path.parts
+        and not (path.suffix == ".json" and path.parent.name in ("pending", "settings"))
+        and not (path.suffix == ".parquet" and path.parent.name != "rows")
+    ]
+    return [*files, *_local_logs(Path(store.base), known)] if store.is_local else files
+
+
+def source_facts(store: ObjectStore, source: Source) -> LogFacts:
+    """Read the facts of a log from as few of its bytes as have them.
+
+    Raises:
+        NotALogError: If it is no log, or a damaged one.
+        OSError: If it can't be read.
+        MissingExtraError: If it is a recording of ROS, and the package that reads it is missing.
+    """
+    path = store.path(source.name)
+    if not store.is_local:
+        with store.filesystem.open_input_file(path) as stream:
+            return read_facts(path, source.size, lambda a, b: stream.read_at(b - a, a))
+    plain = Path(path)
+    if is_bag(plain):
+        return read_bag_facts(plain)
+    if plain.is_dir():
+        plain = next(plain.glob("*.mcap"))
+    with open(plain, "rb", buffering=0) as stream:  # noqa: PTH123 - unbuffered
+        own = stream.fileno()
+        size = os.fstat(own).st_size
+        return read_facts(str(plain), size, lambda a, b: os.pread(own, b - a, a))
+
+
+def _local_logs(base: Path, known: Mapping[str, Scanned]) -> list[Source]:
+    """Return the logs of a folder, and each metadata.yaml there that is of another tool."""
+    others: list[Source] = []
+
+    def is_recording(folder: Path) -> bool:
+        whole, own = _source(base, folder, is_log=True), _source(base, folder / METADATA)
+        if whole is None or own is None:
+            return False
+        if _is_known(whole, known):
+            return True
+        if not _is_known(own, known) and is_rosbag2(folder):
+            return True
+        others.append(own)
+        return False
+
+    try:
+        paths = dict.fromkeys(log_paths(base, is_recording))
+    except OSError as error:
+        why = f"can't be listed: {error.strerror}"
+        raise InputFileError(error.filename or base, why) from error
+    logs = (_source(base, path, is_log=True) for path in paths)
+    return [*(each for each in logs if each is not None), *others]
+
+
+def _is_known(source: Source, known: Mapping[str, Scanned]) -> bool:
+    return known.get(source.name, ())[:2] == (source.size, source.modified_ns)
+
+
+def _source(base: Path, path: Path, *, is_log: bool = False) -> Source | None:
+    """Return a file or folder; None where it isn't there.
+
+    That is the file of a write-ahead log alone, or one that was removed meanwhile.
+    """
+    try:
+        facts = path.stat()
+        own = [facts]
+        if S_ISDIR(facts.st_mode):
+            with os.scandir(path) as entries:
+                own = [each.stat() for each in entries if each.is_file()] or own
+    except FileNotFoundError:
+        return None
+    size, modified_ns = sum(each.st_size for each in own), max(each.st_mtime_ns for each in own)
+    return Source(path.relative_to(base).as_posix(), size, modified_ns, is_log)
