@@ -1,8 +1,8 @@
 """Many runs of the twin at once, on one core or a GPU.
 
-For sweeps: open-loop gaits or given commands on open ground, or without contact. Laws, integrator, start and checks
-are those of :class:`.sim.twin.twin.Twin`, and results agree with its runs on MuJoCo within
-rounding. A run's results don't depend on the runs beside it, bit for bit.
+For sweeps: open-loop gaits or given commands on open ground, or without contact. Laws, integrator,
+start and checks are those of :class:`.sim.twin.twin.Twin`, and results agree with its runs on
+MuJoCo within rounding. A run's results don't depend on the runs beside it, bit for bit.
 """
 
 from __future__ import annotations

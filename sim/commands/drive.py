@@ -197,7 +197,8 @@ def _twin_runs(
     for what, output in outputs.items():
         if list(outputs.values()).count(output) > 1 or output.resolve() == Path(what).resolve():
             raise UsageError(f"{what}: {output} would replace another session; name another folder")
-        refuse_existing(output, force=force)
+        if folder.is_dir():
+            refuse_existing(output, force=force)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

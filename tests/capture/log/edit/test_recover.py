@@ -457,8 +457,8 @@ def damage(rng, folder):
 def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_reported(tmp_path, runs):
     source = tmp_path / "source"
     source.mkdir()
-    total = 900
-    unfinished(source / "run.mcap", total, splits=[300, 600], segment_size=1 << 15)
+    total = 300
+    unfinished(source / "run.mcap", total, splits=[100, 200], segment_size=1 << 13)
     truth = set(recorder.truth(total))
     place = tmp_path / "damaged"
     outcomes = Counter()
