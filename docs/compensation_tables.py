@@ -44,10 +44,10 @@ def print_chain(m, stall, runs, rounds, keep=KEEP):
     coupling = stage.kicks(wave, 1)
     planned = stage.compensate(coupling, wave, 2, rounds, keep)
     print(f"{m} yaw joints, {stall} N m, held-out patterns to {coupling.valid_to} rad")
-    before = [stage.drive(wave, wave.phasors, [3, k]) for k in range(runs)]
+    before = stage.drive(wave, [wave.phasors] * runs, [[3, k] for k in range(runs)])
     print(f"  before: {figures(before, wave)}")
     for k, (plan, commands) in enumerate(planned):
-        after = [stage.drive(wave, commands, [4, k, j]) for j in range(runs)]
+        after = stage.drive(wave, [commands] * runs, [[4, k, j] for j in range(runs)])
         print(f"  after step {k + 1}: {figures(after, wave)}")
         for now, then in zip(indices(after, wave), indices(before, wave), strict=True):
             value, low, high = ratio(now, then)
@@ -68,10 +68,8 @@ def print_chain(m, stall, runs, rounds, keep=KEEP):
     for name, other in gaits(wave):
         commands = other.phasors * np.exp(x)
         cut = commands * np.minimum(1.0, limit / np.abs(commands))
-        pair = [
-            indices([stage.drive(other, one, [5, k])], other)
-            for k, one in enumerate((other.phasors, cut))
-        ]
+        driven = stage.drive(other, [other.phasors, cut], [[5, 0], [5, 1]])
+        pair = [indices([one], other) for one in driven]
         (cv, lag), (cv_after, lag_after) = pair
         print(
             f"  {name}: CV {cv.value:.2%} to {cv_after.value:.2%}, lag "

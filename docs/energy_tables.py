@@ -12,6 +12,7 @@ import tempfile
 from pathlib import Path
 
 from undulog.analysis.energy import TERMS, booked_energies, joint_energies, whole_robot
+from undulog.analysis.results.analysis import Analysis
 from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.signals.columns import RESPONSE_TOPIC, read_columns
 from undulog.capture import Session
@@ -39,14 +40,19 @@ class Figures:
         errors: Of the accumulated powers, shares of the booked energy (E_net: see ``NET_FLOOR``).
         sampled: Of products of samples alone, likewise.
         balance: What is left of the ledger's mechanical and electrical balance, shares of E_abs.
-        flags: Joints and what their sensors are blamed for; nothing, on the twin.
+        analysis: All results.
     """
 
     booked: dict[str, float]
     errors: dict[str, float]
     sampled: dict[str, float]
     balance: tuple[float, float]
-    flags: tuple[tuple[str, str], ...]
+    analysis: Analysis
+
+    @property
+    def flags(self) -> list[tuple[str, str]]:
+        """Joints and what their sensors are blamed for; nothing, on the twin."""
+        return [(one.joint, one.flag) for one in self.analysis.artefacts if one.about == "sensor"]
 
 
 def figures(path):
@@ -64,10 +70,9 @@ def figures(path):
         whole = whole_robot(energies.values())
         return {name: (whole[name] - booked[name]) / abs(scale[name]) for name in TERMS}
 
-    artefacts = measured.analysis.artefacts
-    flags = tuple((one.joint, one.flag) for one in artefacts if one.about == "sensor")
     left = (ledger[f"{kind}_residual"] / booked["abs"] for kind in ("mechanical", "electrical"))
-    return Figures(booked, errors(measured.energies), errors(products), tuple(left), flags)
+    own = errors(measured.energies), errors(products), tuple(left)
+    return Figures(booked, *own, measured.analysis)
 
 
 def run(name, folder):

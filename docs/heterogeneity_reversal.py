@@ -8,8 +8,8 @@ The robot is its own mirror image, so the reversed wave is the wave read from ta
 floor that falls the other way along the body. That relation gives the reversed wave of single
 modules; it is checked on runs, and the runs of identical modules and of joint05 need it not.
 
-``.venv/bin/python docs/heterogeneity_reversal.py`` prints the tables; it takes about a quarter of
-an hour of one core, nearly all of it for the runs of the twin, which ``--profiles FOLDER`` keeps.
+``.venv/bin/python docs/heterogeneity_reversal.py`` prints the tables; ``--profiles FOLDER`` keeps
+the profiles.
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from heterogeneity_tables import responses
 
+from undulog.analysis.estimators.series import Series
 from undulog.analysis.experiment.mirror import mirror_test
 from undulog.analysis.experiment.reversal import SIGNIFICANT, ordered_pairs, tilt_check
-from undulog.sim import load_scenario
-from undulog.sim.scenario.scenario import Kernels
-from undulog.sim.twin.recording import record
+from undulog.analysis.response.fitting import fit_gait
+from undulog.sim import load_scenario, run_batch
 
 TILTS_DEG = (0.3, 1.0, 2.0)
 DIRECTIONS = {"fore-aft": 0.0, "sideways": math.pi / 2}
@@ -77,11 +76,23 @@ def profile(case, folder):
     if case.joint:
         changes[f"servo_of.{case.joint}.stall_torque"] = 0.25 * (1 + case.share)
     scenario = load_scenario("weak-servo-pi3" + ("-reverse" if case.reverse else ""), changes)
-    path = folder / "run.mcap"
-    record(scenario, path, kernels=Kernels.NUMBA, force=True)
-    names, y = responses(path)
-    if tuple(names) != YAW:
-        raise RuntimeError(f"{case}: gain and lag of {len(names)} joints only")
+    (run,) = run_batch([scenario])
+    if run.error is not None:
+        raise run.error
+    settled = run.time_s >= scenario.settle_s
+    t_s = run.time_s[settled]
+    commands, angles = (
+        {
+            name: Series(name, t_s, np.ascontiguousarray(column[settled]))
+            for name, column in zip(scenario.robot.joint_names, table.T, strict=True)
+            if name in YAW
+        }
+        for table in (run.command, run.angle)
+    )
+    gait = fit_gait(commands, angles, float(np.ptp(t_s)), lambda _: None)
+    if gait is None or gait.answered != YAW:
+        raise RuntimeError(f"{case}: not all joints have gain and lag")
+    y = np.log(gait.response.ratio)
     np.save(kept, y)
     return y
 

@@ -33,6 +33,7 @@ from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternio
 from undulog.sim import load_scenario
 from undulog.sim.control.reactions import amplitude, bend, frequency
 from undulog.sim.scenario.obstacles import Cylinder, Wall
+from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.scenario.world import World
 from undulog.sim.twin.recording import record
 
@@ -98,7 +99,7 @@ class Runs:
                 duration_s = QUICK_GAIT_S if name.startswith("snake13-") else QUICK_S
                 scenario = dataclasses.replace(scenario, duration_s=duration_s, settle_s=0.0)
             print(f"running {name}, {scenario.duration_s:g} s ...", flush=True)
-            record(scenario, path)
+            record(scenario, path, kernels=Kernels.NUMBA if self._quick else Kernels.NUMPY)
         return path
 
 

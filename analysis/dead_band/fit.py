@@ -7,6 +7,7 @@ read off the profile of the misfit over b, beside the scatter from cycle to cycl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -115,7 +116,16 @@ def fit_dead_bands(
         start = own @ tie.T
         for one, parameters in zip(found, start, strict=True):
             one.fits.append(_Candidate(parameters, tie))
-    return [_chosen(cycles, j, one, scales) for j, one in enumerate(found)]
+    # All joints in step here, too: a call takes as long for one as for many.
+    lefts = [
+        misfit(cycles, joints, np.array([one.fits[k].parameters for one in found]))
+        for k in range(len(_TIES))
+    ]
+    moved = _moved(cycles, joints.tolist(), [one.fits[0] for one in found], scales)
+    return [
+        _chosen(cycles, j, one, scales, lefts=[left.row(j) for left in lefts], moved=moved[j])
+        for j, one in enumerate(found)
+    ]
 
 
 class _Candidate(NamedTuple):
@@ -133,19 +143,31 @@ class _Candidates(NamedTuple):
     costs: FloatArray
 
 
-def _chosen(cycles: Cycles, joint: int, found: _Candidates, scales: _Scales) -> Fitted:
-    """Return the simplest model that none explains more than, with its intervals."""
-    index = np.array([joint])
-    lefts = [misfit(cycles, index, one.parameters[np.newaxis]) for one in found.fits]
+def _chosen(
+    cycles: Cycles,
+    joint: int,
+    found: _Candidates,
+    scales: _Scales,
+    *,
+    lefts: Sequence[Misfit],
+    moved: FloatArray,
+) -> Fitted:
+    """Return the simplest model that none explains more than, with its intervals.
+
+    Args:
+        lefts: What each of the fits leaves over.
+        moved: Of the first fit, see :func:`_moved`.
+    """
     independent = _independent(lefts[-1].residual[0])
     least = min(float(found.costs.min()), *(float(left.cost[0]) for left in lefts))
     taken = 0
-    error = _errors(cycles, joint, found.fits[0], scales, lefts[0])
+    error = _errors(cycles, joint, found.fits[0], scales, lefts[0], nudged=moved)
     for k, needed in zip((1, 2), _NEEDED, strict=True):
         gained = independent * np.log(lefts[taken].cost[0] / lefts[k].cost[0])
         # Ahead of its command no joint is: it would speed up by its inertia, which isn't a step.
         if gained > needed and found.fits[k].parameters[DELAY] >= _AHEAD * cycles.period_s:
-            wider = _errors(cycles, joint, found.fits[k], scales, lefts[k])
+            (more,) = _moved(cycles, [joint], [found.fits[k]], scales)
+            wider = _errors(cycles, joint, found.fits[k], scales, lefts[k], nudged=more)
             if np.any(found.fits[k].parameters[[TOP, BOTTOM]] > wider[2:]):
                 taken, error = k, wider
     chosen, left = found.fits[taken].parameters, lefts[taken]
@@ -293,24 +315,49 @@ def _possible(profile: FloatArray, loss: FloatArray) -> tuple[float, float, floa
     return float(could.min()), float(could.max()), float(steps[inside].max())
 
 
+def _free(fitted: _Candidate, scales: _Scales) -> IntArray:
+    """Which of the fitted parameters are not at their bounds."""
+    n = fitted.tie.shape[1]
+    return np.flatnonzero(~(fitted.parameters[:n] <= scales.lower[:n] + 1e-12))
+
+
+def _moved(
+    cycles: Cycles, joints: Sequence[int], fits: Sequence[_Candidate], scales: _Scales
+) -> list[FloatArray]:
+    """Return the followers of each joint with each of its free parameters nudged [rad]."""
+    free = [_free(one, scales) for one in fits]
+    sets = [
+        one.parameters + one.tie[:, which].T * scales.nudge[joint, which, np.newaxis]
+        for joint, one, which in zip(joints, fits, free, strict=True)
+    ]
+    counts = [which.size for which in free]
+    if not any(counts):
+        return [np.empty((0, *cycles.t_s[:, cycles.first :].shape)) for _ in joints]
+    rows = np.repeat(np.array(joints, dtype=np.int64), counts)
+    found = misfit(cycles, rows, np.concatenate(sets)).follower[:, :, cycles.first :]
+    return np.split(found, np.cumsum(counts)[:-1])
+
+
 def _errors(
-    cycles: Cycles, joint: int, fitted: _Candidate, scales: _Scales, one: Misfit
+    cycles: Cycles,
+    joint: int,
+    fitted: _Candidate,
+    scales: _Scales,
+    one: Misfit,
+    *,
+    nudged: FloatArray,
 ) -> FloatArray:
     """Half widths of W after top and bottom and of both b [rad], shape (4,).
 
     Delete-one jackknife over the cycles; what repeats in all of them, as an encoder's steps do,
     over segments of the mean cycle. The level of a plateau is known to an encoder's step at best.
     """
-    chosen, tie = fitted
+    tie = fitted.tie
     n = tie.shape[1]
     nudge, unit = scales.nudge[joint, :n], scales.unit[joint, :n]
-    free = np.flatnonzero(~(chosen[:n] <= scales.lower[:n] + 1e-12))
-    sets = chosen + tie[:, free].T * nudge[free, np.newaxis]
+    free = _free(fitted, scales)
     still = one.follower[0, :, cycles.first :]
-    moved: FloatArray = np.empty((0, *still.shape))
-    if free.size:
-        follower = misfit(cycles, np.full(free.size, joint), sets).follower
-        moved = follower[:, :, cycles.first :] - still
+    moved = nudged - still
     gain = float(one.gain[0])
     z: FloatArray = still - still.mean()
     columns = [gain * moved[k] * unit[m] / nudge[m] for k, m in enumerate(free)]

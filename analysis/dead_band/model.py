@@ -169,6 +169,11 @@ class Misfit:
         """Sum of squares [rad^2], shape (r,)."""
         return np.square(self.residual).sum(axis=(1, 2))
 
+    def row(self, index: int) -> Misfit:
+        """Return one of the rows, alone."""
+        own = slice(index, index + 1)
+        return Misfit(self.residual[own], self.gain[own], self.follower[own], self.rests[own])
+
 
 def misfit(cycles: Cycles, joint: IntArray, parameters: FloatArray) -> Misfit:
     """Hold the model against what was measured; gain and offset are fitted.

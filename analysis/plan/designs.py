@@ -246,7 +246,7 @@ def write_plan(
     """Write each run's commands to a session of its own.
 
     Args:
-        like: The session the gait is of; its robot, and the twin's scenario, go along.
+        like: The session the gait is of; its robot, and the twin's scenario and kernels, go along.
         folder: Where to; made if it isn't there.
         settle_s: Time before what is to be measured [s].
         measure_s: Length of what is to be measured [s].
@@ -272,6 +272,8 @@ def write_plan(
     if there:
         raise UsageError(f"{there[0]} exists already; name another folder")
     plan_id, epoch_ns = uuid.uuid4().hex, time.time_ns()
+    twin = like.metadata.get("undulog", {})
+    metadata = {"settle_s": f"{settle_s:g}"} | {k: twin[k] for k in ("kernels",) if k in twin}
     for k, (file, run) in enumerate(zip(files, runs, strict=True)):
         start_ns = epoch_ns + k * length_ns
         values = commands(base, run, t_s, ramp_s)
@@ -282,7 +284,7 @@ def write_plan(
                 session_id=uuid.uuid4().hex,
                 epoch_ns=start_ns,
                 robot=like.robot,
-                metadata={"settle_s": f"{settle_s:g}"},
+                metadata=metadata,
                 force=True,
             ) as writer,
         ):

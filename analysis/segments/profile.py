@@ -20,6 +20,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -109,32 +111,61 @@ def critical_value(members: Sequence[Member], level: float = LEVEL, draws: int =
     Returns:
         The (1 - level) quantile of the largest studentised contrast; infinity for no contrasts.
     """
+    some = [member for member in members if member.weights.size]
+    if not some:
+        return float("inf")
+    normals = _normals(draws, tuple(member.scatter.columns.shape for member in some))
+    largest = [_largest(*pair) for pair in zip(some, normals, strict=True)]
+    return float(np.quantile(np.max(largest, axis=0), 1 - level))
+
+
+class _Normals(NamedTuple):
+    """Standard normal draws for one member of m joints and n columns.
+
+    Attributes:
+        shared: Of the columns, shape (n, draws, n + 1).
+        single: Of each joint alone, shape (m, draws, n + 1).
+        own: Of each joint's rounding, shape (m, draws).
+        turn: Of the common turn, shape (draws,).
+    """
+
+    shared: FloatArray
+    single: FloatArray
+    own: FloatArray
+    turn: FloatArray
+
+
+@lru_cache(maxsize=1)  # one session after the other has the same joints
+def _normals(draws: int, shapes: tuple[tuple[int, int], ...]) -> tuple[_Normals, ...]:
+    """Draw what a family of members with these joints and columns needs, always the same."""
     rng = np.random.default_rng(SEED)
-    largest = np.zeros(draws)
-    some = False
-    for member in members:
-        if member.weights.size:
-            np.maximum(largest, _largest(member, rng, draws), out=largest)
-            some = True
-    return float(np.quantile(largest, 1 - level)) if some else float("inf")
+
+    def drawn(*shape: int) -> FloatArray:
+        found = np.ascontiguousarray(rng.standard_normal((draws, *shape)).swapaxes(0, 1))
+        found.setflags(write=False)
+        return found
+
+    return tuple(
+        _Normals(drawn(n, n + 1), drawn(m, n + 1), drawn(m), drawn(1)[0]) for m, n in shapes
+    )
 
 
-def _largest(member: Member, rng: np.random.Generator, draws: int) -> FloatArray:
+def _largest(member: Member, normals: _Normals) -> FloatArray:
     """Return the largest studentised contrast of each draw, shape (draws,)."""
     scatter, weights = member.scatter, member.weights
     columns = scatter.columns
     joints, count = columns.shape
     shrink = _shrinkage(columns)
     sigma = np.sqrt(np.mean(columns**2, axis=1))
-    shared, single = (1 - shrink) ** 0.5, shrink**0.5
-    blocks = columns @ (rng.standard_normal((draws, count, count + 1)) / count**0.5)
-    blocks *= shared
-    blocks += single * sigma[:, None] * rng.standard_normal((draws, joints, count + 1))
-    error = blocks[:, :, -1] + np.sqrt(scatter.own) * rng.standard_normal((draws, joints))
-    error = error + scatter.turn * rng.standard_normal((draws, 1))
-    variance = np.mean((weights @ blocks[:, :, :-1]) ** 2, axis=-1)
-    variance += weights**2 @ scatter.own + (weights @ scatter.turn) ** 2
-    return np.max(np.abs(error @ weights.T) / np.sqrt(np.maximum(variance, _TINY)), axis=1)
+    shared, single = ((1 - shrink) / count) ** 0.5, shrink**0.5
+    blocks = (shared * weights @ columns) @ normals.shared.reshape(count, -1)
+    blocks += (single * weights * sigma) @ normals.single.reshape(joints, -1)
+    blocks = blocks.reshape(len(weights), -1, count + 1)
+    error = blocks[..., -1] + (weights * np.sqrt(scatter.own)) @ normals.own
+    error += np.outer(weights @ scatter.turn, normals.turn)
+    variance = np.mean(blocks[..., :-1] ** 2, axis=-1)
+    variance += (weights**2 @ scatter.own + (weights @ scatter.turn) ** 2)[:, np.newaxis]
+    return np.max(np.abs(error) / np.sqrt(np.maximum(variance, _TINY)), axis=0)
 
 
 def _shrinkage(columns: FloatArray) -> float:

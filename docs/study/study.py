@@ -19,7 +19,7 @@ from study.rows import gather, scatter
 from undulog.capture.common.process import StopRequest, interruptible
 from undulog.replay.sweep.rows import RowStore
 from undulog.replay.sweep.run import software
-from undulog.replay.sweep.sweep import prepare, run_sweep
+from undulog.replay.sweep.sweep import LocalWorkers, prepare, run_sweep
 
 DOCS = Path(__file__).parents[1]
 OUT = DOCS.parent / "out" / "study"
@@ -28,18 +28,20 @@ OUT = DOCS.parent / "out" / "study"
 def run(folder: Path, stop: StopRequest, *, quick: bool, workers: int) -> bool:
     """Run what the folder lacks; return whether all is there."""
     start = time.monotonic()
-    for stage in stages(quick=quick):
-        output = str(folder / stage.name)
-        sweep = prepare(stage.plan, PLANS, output)
-        report = run_sweep(sweep, RowStore(output), workers=workers, stop=stop)
-        print(
-            f"{time.monotonic() - start:6.0f} s  {stage.name}: {report.there_before + report.run} "
-            f"of {report.planned} runs, {report.failed} failed",
-            flush=True,
-        )
-        if not report.complete:
-            print("Interrupted; the same command goes on.")
-            return False
+    with LocalWorkers(workers) as processes:
+        for stage in stages(quick=quick):
+            output = str(folder / stage.name)
+            sweep = prepare(stage.plan, PLANS, output)
+            report = run_sweep(sweep, RowStore(output), workers=processes, stop=stop)
+            print(
+                f"{time.monotonic() - start:6.0f} s  {stage.name}: "
+                f"{report.there_before + report.run} of {report.planned} runs, "
+                f"{report.failed} failed",
+                flush=True,
+            )
+            if not report.complete:
+                print("Interrupted; the same command goes on.")
+                return False
     return True
 
 

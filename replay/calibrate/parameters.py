@@ -10,8 +10,9 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -22,7 +23,7 @@ from undulog.capture.common.errors import DataError, UsageError
 from undulog.capture.log.read.joint_topics import RESPONSE_TOPIC
 from undulog.capture.robot.model import Servo
 from undulog.sim.drive.motion import COMMANDS
-from undulog.sim.gait.contract import Gait
+from undulog.sim.gait.contract import CONTROL_RATE_HZ, Gait, Readings
 from undulog.sim.scenario.scenario import Kernels, Scenario
 from undulog.sim.scenario.sensors import Noise, SensorModels
 from undulog.sim.scenario.world import FrictionLaw
@@ -218,6 +219,21 @@ def read_measured(session: SessionView, settle_s: float, end_s: float) -> Measur
     return Measured(tuple(found), times, values)
 
 
+_BATCH_SAMPLES = 100_000
+"""Joints times ticks of a run of a batch, at most: a block takes 4 kB of memory for each."""
+
+
+def _quiet(scenario: Scenario) -> Scenario:
+    """The scenario without noise."""
+    return dataclasses.replace(scenario, noise=Noise(), sensing=SensorModels())
+
+
+def _late_s(wanted: Sequence[Unknown], x: FloatArray) -> float:
+    """Dead time among the unknowns [s]."""
+    pairs = zip(wanted, x.tolist(), strict=True)
+    return sum(one.value(entry) for one, entry in pairs if one.name == DELAY)
+
+
 @dataclass
 class Answers:
     """The twin under the recorded commands, as a function of x; counts its runs.
@@ -257,9 +273,60 @@ class Answers:
         Raises:
             SimulationError: If the twin fails with these parameters.
         """
-        pairs = zip(wanted, x.tolist(), strict=True)
-        late_s = sum(one.value(entry) for one, entry in pairs if one.name == DELAY)
-        return self.sampled(self.run(with_values(self.scenario, wanted, x)), late_s)
+        track = self.run(with_values(self.scenario, wanted, x))
+        return self.sampled(track, _late_s(wanted, x))
+
+    def near(
+        self, wanted: Sequence[Unknown], points: Sequence[FloatArray]
+    ) -> Iterator[tuple[FloatArray, ...]]:
+        """Yield joint angles as :meth:`at` gives them, of many x, whose differences are wanted.
+
+        They are runs of a batch where that can make them: all on its engine, then.
+
+        Args:
+            wanted: K unknowns.
+            points: Each of shape (K,).
+
+        Yields:
+            For each point angles [rad], shapes (n_j,).
+
+        Raises:
+            SimulationError: If the twin fails with these parameters.
+        """
+        scenarios = [with_values(self.scenario, wanted, x) for x in points]
+        tracks = self._run_batch(scenarios) if self._fits_batch else map(self.run, scenarios)
+        for track, x in zip(tracks, points, strict=True):
+            yield self.sampled(track, _late_s(wanted, x))
+
+    @property
+    def _fits_batch(self) -> bool:
+        """Whether a batch can run the scenario, and has memory for it."""
+        scenario = self.scenario
+        size = scenario.tick_count * len(scenario.robot.joints)
+        plain = not (scenario.world.obstacles or scenario.disturbances)
+        return self.kernels is Kernels.NUMBA and plain and size <= _BATCH_SAMPLES
+
+    def _run_batch(self, scenarios: Sequence[Scenario]) -> list[CubicHermiteSpline]:
+        from undulog.sim import run_batch  # needs numba
+
+        self.on_tick()
+        begun = time.perf_counter()
+        quiet = [_quiet(scenario) for scenario in scenarios]
+        found: list[CubicHermiteSpline] = []
+        for run in run_batch(quiet, commands=[self._commands] * len(quiet)):
+            if run.error is not None:
+                raise run.error
+            found.append(CubicHermiteSpline(run.time_s, run.angle, run.rate))
+        self.runs += len(quiet)
+        self.work_s += time.perf_counter() - begun
+        return found
+
+    @cached_property
+    def _commands(self) -> FloatArray:
+        """The recorded commands at the ticks [rad], shape (k, m)."""
+        gait, nothing = self.make_gait(), Readings.nothing(self.scenario.robot)
+        times_s = np.arange(self.scenario.tick_count) / CONTROL_RATE_HZ
+        return np.array([gait.step(t, nothing).command for t in times_s.tolist()])
 
     def run(self, scenario: Scenario) -> CubicHermiteSpline:
         """Run the twin without noise.
@@ -271,7 +338,7 @@ class Answers:
             SimulationError: If it fails.
         """
         begun = time.perf_counter()
-        quiet = dataclasses.replace(scenario, noise=Noise(), sensing=SensorModels())
+        quiet = _quiet(scenario)
         rows: list[tuple[float, FloatArray, FloatArray]] = []
         with Twin(quiet, self.make_gait(), kernels=self.kernels) as twin:
             for sample in twin.samples():

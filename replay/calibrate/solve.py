@@ -5,7 +5,8 @@ minimises::
 
     Q(x) = sum_j |r_j(x)|^2 / sigma_j^2 + x' P^-1 x
 
-The twin is deterministic and its laws are smooth, so derivatives are central differences of runs.
+The twin is deterministic and its laws are smooth, so derivatives are central differences of runs,
+of a batch where that can make them; its engine differs from the twin's by far less than the steps.
 The weights are those of the last residuals (iteratively reweighted). With A = J' W J + P^-1 and B
 of :mod:`.replay.calibrate.solve` the covariance of the estimate is A^-1 (B + P^-1) A^-1, where
 noise never counts as less than white.
@@ -306,12 +307,13 @@ def derivatives(
     Returns:
         [rad], shapes (n_j, k).
     """
-    found: list[tuple[FloatArray, ...]] = []
-    for i in range(len(wanted)) if only is None else only:
-        shift = np.zeros(len(wanted))
-        shift[i] = STEP
-        up, down = answers.at(wanted, x + shift), answers.at(wanted, x - shift)
-        found.append(tuple((a - b) / (2 * STEP) for a, b in zip(up, down, strict=True)))
+    shifts = STEP * np.eye(len(wanted))[slice(None) if only is None else list(only)]
+    points = [x + s * shift for shift in shifts for s in (1.0, -1.0)]
+    angles = iter(answers.near(wanted, points))
+    found = [
+        tuple((a - b) / (2 * STEP) for a, b in zip(up, down, strict=True))
+        for up, down in zip(angles, angles, strict=True)
+    ]
     return tuple(np.stack(parts, axis=1) for parts in zip(*found, strict=True))
 
 

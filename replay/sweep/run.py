@@ -25,7 +25,7 @@ import tomlkit
 
 from undulog.analysis.results.analysis import Analysis
 from undulog.analysis.results.estimate import Interval
-from undulog.analysis.session.analyse import analyse_session
+from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session
 from undulog.capture.common.config import read
@@ -248,7 +248,7 @@ def _results(setting: Setting, job: Job, path: Path) -> Row:
     scenario = scenario_of(setting, job.changes).changed(seed=job.seed)
     recording = record(scenario, path, kernels=setting.kernels)
     with Session.open(path) as session:
-        result = analyse_session(session, options)
+        result = measure_session(session, options, with_dead_bands=False).analysis  # no column
     return {
         "session_id": recording.session_id,
         "robot": scenario.robot.name,

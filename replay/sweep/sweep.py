@@ -16,11 +16,11 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from multiprocessing import connection, get_context, parent_process
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from undulog.capture.common.console import complain
 from undulog.capture.common.errors import MissingExtraError, SourceError, UndulogError
@@ -185,7 +185,7 @@ def run_sweep(
     sweep: PreparedSweep,
     store: RowStore,
     *,
-    workers: int | None = None,
+    workers: LocalWorkers | int | None = None,
     cluster: str | None = None,
     retry: bool = False,
     stop: StopRequest | None = None,
@@ -194,7 +194,7 @@ def run_sweep(
     """Run what a sweep's store does not hold yet.
 
     Args:
-        workers: Processes of this computer; by default one a processor.
+        workers: Processes of this computer, or how many; by default one a processor.
         cluster: Address of a Dask scheduler, to run there instead.
         retry: Whether runs that failed are run again.
         on_row: Called with each new row and the number of those that were there before.
@@ -215,11 +215,15 @@ def run_sweep(
         before = len(sweep.jobs) - len(jobs)
         keys = {job.key for job in sweep.jobs} - {job.key for job in jobs}
         failed = sum(there[key]["status"] == "failed" for key in keys)
-        if cluster is None:
-            rows = run_local(sweep.setting, jobs, workers or processors(), stop)
-        else:
-            rows = run_on_cluster(sweep.setting, jobs, cluster, stop)
-        with closing(rows):
+        with ExitStack() as stack:
+            if cluster is not None:
+                rows = run_on_cluster(sweep.setting, jobs, cluster, stop)
+            elif isinstance(workers, LocalWorkers):
+                rows = run_local(sweep.setting, jobs, workers, stop)
+            else:
+                own = stack.enter_context(LocalWorkers(workers or processors()))
+                rows = run_local(sweep.setting, jobs, own, stop)
+            stack.enter_context(closing(rows))
             for row in rows:
                 store.add({"setting": sweep.digest, **row})
                 run += 1
@@ -329,8 +333,42 @@ class _Queue:
                 yield failed(job, f"its worker ended {_ATTEMPTS} times")
 
 
+class LocalWorkers:
+    """Processes of this computer, for one sweep or several in turn; use it in a ``with`` block.
+
+    Attributes:
+        count: How many there are.
+    """
+
+    def __init__(self, count: int) -> None:
+        """Begin none yet: they begin with the first runs."""
+        self.count = count
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> Self:
+        """Enter the block that owns the processes."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the processes."""
+        self.end()
+
+    def end(self) -> None:
+        """End the processes; others begin with the next run."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+        self._pool = None
+
+    def submit(self, setting: Setting, job: Job) -> Future[Row]:
+        """Hand out a run."""
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(self.count, get_context("spawn"), _begin_worker)
+        with _one_thread_each():  # the pool starts its processes when it gets work
+            return self._pool.submit(run_job, setting, job)
+
+
 def run_local(
-    setting: Setting, jobs: Iterable[Job], workers: int, stop: StopRequest
+    setting: Setting, jobs: Iterable[Job], workers: LocalWorkers, stop: StopRequest
 ) -> Generator[Row]:
     """Run jobs in processes of this computer.
 
@@ -341,18 +379,20 @@ def run_local(
     lost: list[Job] | None = None
     while lost is None or lost:
         lost = []
-        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_worker)
         running: dict[Future[Row], Job] = {}
         try:
             while not lost:
                 if stop.requested:
                     running = {one: job for one, job in running.items() if not one.cancel()}
-                while len(running) < _AHEAD * workers and not stop.requested:
+                while len(running) < _AHEAD * workers.count and not stop.requested:
                     if (job := queue.next()) is None:
                         break
-                    with _one_thread_each():  # the pool starts its processes when it gets work
-                        running[pool.submit(run_job, setting, job)] = job
-                if not running:
+                    try:
+                        running[workers.submit(setting, job)] = job
+                    except BrokenProcessPool:  # since the sweep before
+                        lost.append(job)
+                        break
+                if not running and not lost:
                     return
                 done, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
                 for future in done:
@@ -362,7 +402,8 @@ def run_local(
                     except BrokenProcessPool:
                         lost.append(job)
         finally:
-            pool.shutdown(cancel_futures=True)
+            if lost or running:  # they were lost, or nobody waits for what they run
+                workers.end()
         lost += running.values()
         yield from queue.put_back(lost)
 

@@ -1,8 +1,8 @@
 """Many runs of the twin at once, on one core or a GPU.
 
-For sweeps: open-loop gaits on open ground, or without contact. Laws, integrator, start and checks
-are those of :class:`.sim.twin.twin.Twin`, and results agree with its runs on MuJoCo within
-rounding. A run's results don't depend on the runs beside it, bit for bit.
+For sweeps: open-loop gaits or given commands on open ground, or without contact. Laws, integrator,
+start and checks are those of :class:`.sim.twin.twin.Twin`, and results agree with its runs on
+MuJoCo within rounding. A run's results don't depend on the runs beside it, bit for bit.
 """
 
 from __future__ import annotations
@@ -116,6 +116,7 @@ class Device(StrEnum):
 def run_batch(
     scenarios: Sequence[Scenario],
     *,
+    commands: Sequence[FloatArray] | None = None,
     dtype: DTypeLike = np.float64,
     device: str = Device.CPU,
 ) -> tuple[BatchRun, ...]:
@@ -126,6 +127,8 @@ def run_batch(
 
     Args:
         scenarios: The runs; what they give stays in memory, 80 bytes a joint and tick.
+        commands: Of each run at its k ticks [rad], shape (k, m), in place of its gait's; they are
+            held from tick to tick.
         dtype: ``float64``, or ``float32`` for gains and lags within 1e-3 at a higher speed.
         device: ``cpu``: one core; ``cuda``: an NVIDIA GPU (package numba-cuda), for
             thousands of runs: results agree with the CPU's within rounding, not bit for bit.
@@ -136,25 +139,40 @@ def run_batch(
     Raises:
         UsageError: If a scenario needs what a batch hasn't: obstacles, pushes, a controller or
             oscillators with feedback; lists all such fields. If there is no such device.
+        ValueError: If commands have another shape than their run.
     """
     precision = np.dtype(dtype)
     if precision.name not in ("float64", "float32"):
         raise UsageError(f"dtype {precision}: use float64 or float32")
     width, advance = _stepper(device)
     for scenario in scenarios:
-        _refuse(scenario)
+        _refuse(scenario, driven=commands is not None)
+    if commands is None:
+        known: _Commands = {}
+        commands = [_commands(scenario, known) for scenario in scenarios]
+    else:
+        commands = [
+            quantised(one, scenario.sensing.servo.command_resolution)
+            for scenario, one in zip(scenarios, commands, strict=True)
+        ]
+    for scenario, one in zip(scenarios, commands, strict=True):
+        if one.shape != (scenario.tick_count, len(scenario.robot.joints)):
+            raise ValueError(
+                f"commands of shape {one.shape}; expected {scenario.tick_count} ticks of "
+                f"{len(scenario.robot.joints)} joints"
+            )
     groups: dict[_Shape, list[int]] = {}
     for i, scenario in enumerate(scenarios):
         groups.setdefault(_shape(scenario), []).append(i)
     runs: dict[int, BatchRun] = {}
-    commands: _Commands = {}
     for group in groups.values():
         one = scenarios[group[0]]
         bytes_a_run = one.tick_count * len(one.robot.joints) * SAMPLE_ROWS * precision.itemsize
         lanes = width or max(1, min(len(group), _BLOCK_BYTES // bytes_a_run))
         for first in range(0, len(group), lanes):
             members = group[first : first + lanes]
-            block = _Block([scenarios[i] for i in members], precision, commands, lanes)
+            of_members = [commands[i] for i in members]
+            block = _Block([scenarios[i] for i in members], of_members, precision, lanes)
             block.run(advance)
             runs |= zip(members, block.results(), strict=True)
     return tuple(runs[i] for i in range(len(scenarios)))
@@ -175,14 +193,14 @@ def _stepper(device: str) -> tuple[int | None, Callable[..., None]]:
     return None, run_block_on_gpu
 
 
-def _refuse(scenario: Scenario) -> None:
-    """Raise for what a batch can't run."""
+def _refuse(scenario: Scenario, *, driven: bool) -> None:
+    """Raise for what a batch can't run; of a driven run the gait doesn't matter."""
     needs = {
         "world.obstacles": bool(scenario.world.obstacles),
         "disturbances": bool(scenario.disturbances),
-        "controller": scenario.controller is not None,
+        "controller": scenario.controller is not None and not driven,
     }
-    if isinstance(scenario.gait, OscillatorChains):
+    if isinstance(scenario.gait, OscillatorChains) and not driven:
         for plane, chain in scenario.gait.planes.items():
             needs[f"gait.{plane}.feedback"] = chain.feedback > 0.0
     if found := [name for name, needed in needs.items() if needed]:
@@ -238,7 +256,11 @@ class _Block:
     """Runs that share their steps; lanes that are left over repeat the last of them."""
 
     def __init__(
-        self, scenarios: Sequence[Scenario], dtype: np.dtype, known: _Commands, width: int
+        self,
+        scenarios: Sequence[Scenario],
+        commands: Sequence[FloatArray],
+        dtype: np.dtype,
+        width: int,
     ) -> None:
         """Set the robots on the ground, straight, their servos at rest."""
         self._scenarios = scenarios
@@ -268,7 +290,7 @@ class _Block:
         self._head[VELOCITY : VELOCITY + 3] = _last([each.world.velocity for each in lanes])
         self._ground[:] = _last([ground_table(each.world.ground) for each in lanes])
         self._gravity[:] = _last([each.world.gravity for each in lanes])
-        self._commands[:] = _last([_commands(each, known) for each in lanes])
+        self._commands[:] = _last([*commands, *[commands[-1]] * (width - len(commands))])
         self._poses[0] = self._head
 
     def run(self, advance: Callable[..., None]) -> None:

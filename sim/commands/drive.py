@@ -21,7 +21,7 @@ from undulog.capture.common.console import (
     progress,
     refuse_existing,
 )
-from undulog.capture.common.errors import UsageError
+from undulog.capture.common.errors import LogWriteError, UsageError
 from undulog.capture.common.process import interruptible
 
 from .run import check_session_name, speed_text, with_progress
@@ -179,6 +179,46 @@ def _dry_runs(
     return each(whats, "dry run", line)
 
 
+def _twin_runs(
+    whats: Sequence[str],
+    world: Scenario | None,
+    folder: Path,
+    duration_s: float | None,
+    topic: str,
+    *,
+    force: bool,
+) -> dict[str, Line]:
+    """Drive motions on the twin, one after the other, each into a session of its name."""
+    from ..drive.in_process import drive_twin
+    from ..drive.motion import find_motion
+
+    outputs = {what: folder / f"{Path(what).stem}.mcap" for what in whats}
+    for what, output in outputs.items():
+        if list(outputs.values()).count(output) > 1 or output.resolve() == Path(what).resolve():
+            raise UsageError(f"{what}: {output} would replace another session; name another folder")
+        if folder.is_dir():
+            refuse_existing(output, force=force)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LogWriteError(folder, f"no folder can be made: {error.strerror or error}") from error
+
+    def line(what: str) -> Line:
+        driven = find_motion(what, world, command_topic=topic)
+        scenario = driven.scenario(world, duration_s)
+        start = time.monotonic()
+        with interruptible() as stop:
+            recording = drive_twin(driven, scenario, outputs[what], force=force, stop=stop)
+        if stop.requested:
+            raise KeyboardInterrupt
+        factor = recording.duration_s / (time.monotonic() - start)
+        facts = _reported(driven, scenario, recording, factor)
+        first = _summary(driven, scenario, recording, factor)[0]
+        return Line(scenario.robot.name, driven.name, "good", first, facts)
+
+    return each(whats, "drive", line)
+
+
 def _motions(given: Sequence[str]) -> list[str]:
     """Return what is named: of a folder its TOML files and sessions, of a pattern what fits it."""
     from ..scenario.scenario_file import scenario_names
@@ -218,10 +258,12 @@ def drive(
     Args:
         what: Name of a shipped scenario, or a scenario's TOML file: its gait is driven. Or a plan,
             a TOML file of segments. Or a session, `.mcap`: its commands are given again.
-        more: More of them, folders or patterns, for dry runs over a bus: a table, a line each.
+        more: More of them, folders or patterns, on the twin or for dry runs over a bus: a table, a
+            line each.
         on: `twin` (the world that it was made for), `twin:SCENARIO`, or a bus,
             `can:INTERFACE:CHANNEL[?KEY=VALUE&...]`.
-        output: The session file to write, `.mcap`; a dry run needs none.
+        output: The session file to write, `.mcap`, or the folder for the sessions of several
+            motions, each with the motion's name; a dry run needs none.
         duration: How long to drive in seconds, instead of the gait's or plan's duration.
         arm: Send the commands.
         robot: The robot on the bus, a name or a TOML file; by default the one that it was made for.
@@ -237,16 +279,17 @@ def drive(
 
     topic = commands.command_topic
     whats = _motions([what, *more])
-    if len(whats) > 1 and (arm or output is not None or on.partition(":")[0] == _TWIN):
+    scheme, colon, rest = on.partition(":")
+    several = len(whats) > 1
+    if several and (arm or (output is not None and scheme != _TWIN)):
         raise UsageError(
-            f"{what}: {len(whats)} motions; several are for dry runs over a bus, without --arm and "
-            "-o; name one"
+            f"{what}: {len(whats)} motions; several are for the twin, or for dry runs over a bus, "
+            "without --arm and -o; name one"
         )
     what = whats[0]
-    if output is not None:
+    if output is not None and not several:
         check_session_name(output)
         refuse_existing(output, force=force)
-    scheme, colon, rest = on.partition(":")
     if scheme == _TWIN and colon and not rest:
         raise UsageError("--on twin: names no scenario; expected twin or twin:SCENARIO")
     if scheme != _TWIN:
@@ -256,7 +299,7 @@ def drive(
 
         bus_address(on)
         described = load_robot(robot) if robot is not None else None
-        if len(whats) > 1:
+        if several:
             return show(_dry_runs(whats, on, described, duration, topic), as_json=json)
         driven = find_motion(what, robot=described, command_topic=topic)
         given: dict[str, Any] = {
@@ -276,6 +319,13 @@ def drive(
             "--arm, --recorder and --robot are for a bus; a run of the twin records itself"
         )
     world = load_scenario(rest) if rest else None
+    if several:
+        if output is None or output.suffix == ".mcap":
+            raise UsageError(
+                f"{len(whats)} runs of the twin are recorded: name their folder, e.g. -o driven"
+            )
+        lines = _twin_runs(whats, world, output, duration, topic, force=force)
+        return show(lines, as_json=json)
     driven = find_motion(what, world, command_topic=topic)
     scenario = driven.scenario(world, duration)
     if output is None:

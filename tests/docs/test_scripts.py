@@ -51,7 +51,8 @@ def test_the_figures_of_the_paper_are_drawn(tmp_path):
 
 def test_the_pictures_of_the_manual_are_drawn(tmp_path, vulkan, command):
     session, result, page = (tmp_path / f for f in ("session.mcap", "result.json", "report.html"))
-    command("sim", "run", "weak-servo-pi3", "--duration", "14.5", "-o", session)
+    words = ("--duration", "14.5", "--kernels", "numba", "-o", session)
+    command("sim", "run", "weak-servo-pi3", *words)
     command("analyse", session, "-o", result)
     command("report", session, "-o", page)
     images = tmp_path / "images"

@@ -104,11 +104,21 @@ def open_loop(folder, m, held_out=()):
     return together(paths)
 
 
-def closed_loop(folder, experiment):
-    """Run kicked generators, and predict them from the open loop without a fitted parameter."""
-    P, R = (np.array(one.value) for one in (experiment.coupling.P, experiment.coupling.R))
+def base_response(experiment):
+    """Return the yaw joints' response to the gait: gain exp(-j lag), shape (m,)."""
     yaw = [one for one in experiment.sessions[0].joints if one.gain.value is not None]
-    ratio = np.array([one.gain.value * np.exp(-1j * one.lag_rad.value) for one in yaw])
+    return np.array([one.gain.value * np.exp(-1j * one.lag_rad.value) for one in yaw])
+
+
+def closed_loop(folder, coupling, ratio):
+    """Run kicked generators, and predict them from the open loop without a fitted parameter.
+
+    Args:
+        folder: Has the robot.
+        coupling: Of the kicks: P and R.
+        ratio: The response to the gait: gain exp(-j lag), shape (m,).
+    """
+    P, R = (np.array(one.value) for one in (coupling.P, coupling.R))
     felt = felt_response(ratio, OMEGA, AGE_S)
     kicked = _phases(folder, "kicked", felt.imag, kick_every_s=KICK_AT_S, kick_size=LARGEST)
     off = kicked - _phases(folder, "free", felt.imag)

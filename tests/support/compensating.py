@@ -21,18 +21,15 @@ from undulog.analysis.plan.gait_base import BaseGait
 from undulog.analysis.response.response import Response
 from undulog.analysis.session.heterogeneity import response_indices
 from undulog.analysis.session.runs import GaitRun
-from undulog.sim import load_scenario
-from undulog.sim.scenario.scenario import Kernels
-from undulog.sim.twin.recording import quick_collections
-from undulog.sim.twin.twin import Twin
+from undulog.sim import load_scenario, run_batch
 
 SETTLE_S, CYCLES = 10.0, 4
 KICK, BASE_RUNS, HELD_OUT = 0.05, 6, (0.05, 0.1, 0.15)
 NOISE = 0.005
 """Of each sample of an angle [rad]."""
 
-ABS, EL_CLIPPED = 2, 4
-"""Rows of the joints' energies."""
+ABS, EL_CLIPPED = 1, 3
+"""Rows of the joints' work in a batch."""
 
 
 @dataclass(frozen=True)
@@ -113,12 +110,13 @@ def ratio(after, before):
 class Stage:
     """A chain on its ground, to be driven."""
 
-    def __init__(self, m, stall=0.25, **servo):
+    def __init__(self, m, stall=0.25, noise=NOISE, **servo):
         """Build it.
 
         Args:
             m: Yaw joints.
             stall: Torque of the servos [N m].
+            noise: Of each sample of an angle [rad].
             servo: More of their parameters.
         """
         with tempfile.TemporaryDirectory() as name:
@@ -128,32 +126,47 @@ class Stage:
             text = twin_chains.wave(duration_s=60.0, settle_s=SETTLE_S)
             (folder / "scenario.toml").write_text(text)
             self.scenario = load_scenario(folder / "scenario.toml")
-        self.m, self.robot = m, self.scenario.robot
+        self.m, self.robot, self.noise = m, self.scenario.robot, noise
 
-    def drive(self, wave, command, seed):
-        """Run commands; the seed is that of the noise and of the phase at the start."""
-        random = np.random.default_rng(seed)
-        turn = np.exp(1j * random.uniform(-np.pi, np.pi))
+    def drive(self, wave, commands, seeds):
+        """Run commands; a seed is that of the noise and of the phase at the start.
+
+        Args:
+            wave: The wanted wave.
+            commands: Complex amplitudes of each run [rad], shape (k, m).
+            seeds: Of each run.
+        """
         length_s = SETTLE_S + CYCLES / wave.frequency_hz
         scenario = self.scenario.changed(duration_s=round(length_s, 2))
-        gait = Sines(command * turn, wave.omega)
-        angles, middle, energy = [], [], []
-        with quick_collections(), Twin(scenario, gait, kernels=Kernels.NUMBA) as twin:
-            for sample in twin.samples():
-                body = sample.step.body
-                angles.append(body.angle[::2].copy())
-                middle.append(body.position[:2].mean(axis=1))
-                energy.append(sample.joint_energy[[ABS, EL_CLIPPED]].sum(axis=1))
-        angles = np.array(angles) + NOISE * random.standard_normal((len(angles), self.m))
+        randoms = [np.random.default_rng(seed) for seed in seeds]
+        turned = [
+            command * np.exp(1j * random.uniform(-np.pi, np.pi))
+            for command, random in zip(commands, randoms, strict=True)
+        ]
+        times_s = np.arange(scenario.tick_count) / 100
+        given = [
+            np.array([gait.step(t, None).command for t in times_s])
+            for gait in (Sines(one, wave.omega) for one in turned)
+        ]
+        runs = run_batch([scenario] * len(given), commands=given)
+        return [
+            self._driven(wave, command, one, random, run)
+            for command, one, random, run in zip(commands, turned, randoms, runs, strict=True)
+        ]
+
+    def _driven(self, wave, command, turned, random, run):
+        assert run.error is None, run.error
+        angles = run.angle[:, ::2] + self.noise * random.standard_normal((len(run.angle), self.m))
         first = round(100 * SETTLE_S)
+        middle, energy = run.centre_of_mass[:, :2], run.work[[ABS, EL_CLIPPED]].sum(axis=2)
         way = float(np.linalg.norm(middle[-1] - middle[first]))
-        spent = energy[-1] - energy[first]
+        spent = energy[:, -1] - energy[:, first]
         weight = 9.81 * sum(link.mass for link in self.robot.links)
         return Driven(
             wave,
             command,
-            _response(angles[first:], command * turn, wave.omega),
-            way / (length_s - SETTLE_S),
+            _response(angles[first:], turned, wave.omega),
+            way / (run.time_s[-1] - SETTLE_S),
             *(spent / (weight * way)),
             spent[1] / CYCLES,
         )
@@ -173,7 +186,7 @@ class Stage:
         off += [s * step * one for step in (KICK * 1j, KICK) for one in unit for s in (1, -1)]
         off += [1j * random.uniform(-size, size, m) for size in HELD_OUT]
         commands = [wave.phasors * np.exp(one) for one in off]
-        runs = [self.drive(wave, one, [seed, k]) for k, one in enumerate(commands)]
+        runs = self.drive(wave, commands, [[seed, k] for k in range(len(commands))])
         commands = np.array(commands)
         experiment = KickExperiment(
             index=tuple(range(len(runs))),
@@ -196,7 +209,7 @@ class Stage:
             base = self.base(wave)
             plan, commands = compensation(coupling, base, self.robot, after, keep=keep)
             found.append((plan, commands))
-            after = (self.drive(wave, commands, [seed, k]).run(),)
+            after = (self.drive(wave, [commands], [[seed, k]])[0].run(),)
         return found
 
 

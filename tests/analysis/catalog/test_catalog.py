@@ -305,7 +305,9 @@ def _write_many(arguments):
 
 @pytest.mark.slow
 def test_many_writers_at_once_lose_no_row(lab):
-    with multiprocessing.get_context("spawn").Pool(16) as pool:
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__, "duckdb", "pyarrow.parquet"])  # imported once
+    with context.Pool(16) as pool:
         pool.map(_write_many, [(str(lab), number) for number in range(16)], chunksize=1)
     catalog = Catalog(str(lab))
     names = catalog.sql("select session_id from analyses where source not like '%.json'").session_id

@@ -7,6 +7,7 @@ from support import twin_chains
 from undulog.analysis import compare_sessions
 from undulog.capture import Session
 from undulog.sim import load_scenario, record
+from undulog.sim.scenario.scenario import Kernels
 
 pytestmark = pytest.mark.slow
 
@@ -32,7 +33,8 @@ def twins(tmp_path_factory):
         (folder / "wave.toml").write_text(twin_chains.wave(**WAVE, **more))
         files.append(folder / f"run{seed}.mcap")
         scenario = load_scenario(folder / "wave.toml").changed(seed=seed)
-        record(scenario, files[-1], on_sample=follow if seed == 1 else None)
+        on_sample = follow if seed == 1 else None
+        record(scenario, files[-1], on_sample=on_sample, kernels=Kernels.NUMBA)
     return files, np.array(path)
 
 

@@ -10,6 +10,7 @@ from support.resting import STEP, found_in
 from undulog.capture import load_robot
 from undulog.capture.robot.model import Plane
 from undulog.sim import PlaneGait, Scenario, Serpentine, Twin, World
+from undulog.sim.scenario.scenario import Kernels
 
 
 @dataclasses.dataclass
@@ -42,7 +43,7 @@ def two_joints(width, stall_torque):
         physics_rate_hz=4000,
         duration_s=12.0,
     )
-    with Twin(scenario) as twin:
+    with Twin(scenario, kernels=Kernels.NUMBA) as twin:
         rows = [
             (one.time_s, one.gait.command.copy(), one.step.body.angle.copy())
             for one in twin.samples()

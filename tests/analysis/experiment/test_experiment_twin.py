@@ -7,6 +7,7 @@ import pytest
 from support import twin_chains
 from support.analysed import experiment
 from undulog.sim import load_scenario, record
+from undulog.sim.scenario.scenario import Kernels
 
 pytestmark = pytest.mark.slow
 
@@ -50,7 +51,7 @@ def answered(tmp_path_factory):
             scenario = load_scenario(folder / "wave.toml")
             for run in range(6):
                 paths.append(folder / f"{way}-{run}.mcap")
-                record(scenario.changed(seed=20 * k + run + 1), paths[-1])
+                record(scenario.changed(seed=20 * k + run + 1), paths[-1], kernels=Kernels.NUMBA)
 
         return experiment(paths)
 
@@ -85,7 +86,7 @@ def test_a_planned_reversal_cancels_a_tilted_floor(tmp_path, driven, command, re
     (tmp_path / "chain.toml").write_text(ROBOT)
     like, folder = tmp_path / "like.mcap", tmp_path / "plan"
     (tmp_path / "like.toml").write_text(wave())
-    command("sim", "run", tmp_path / "like.toml", "-o", like)
+    command("sim", "run", tmp_path / "like.toml", "-o", like, "--kernels", "numba")
     words = ("--like", like, "-o", folder, "--settle", "4", "--measure", "4")
     command("plan", "reversal", *words)
     answers = {}
@@ -125,7 +126,7 @@ def test_kicks_in_contact_predict_what_was_held_out(tmp_path, driven, command, r
     scenario = tmp_path / "wave.toml"
     scenario.write_text(wave(noise=0.0005))
     like, folder = tmp_path / "like.mcap", tmp_path / "kicks"
-    command("sim", "run", scenario, "-o", like)
+    command("sim", "run", scenario, "-o", like, "--kernels", "numba")
     words = ("--like", like, "-o", folder, "--settle", "4", "--measure", "4")
     command("plan", "phase-kicks", *words)
     paths = driven(folder, scenario)

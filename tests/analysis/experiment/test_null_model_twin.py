@@ -31,7 +31,7 @@ def test_from_the_twin_to_a_named_module(tmp_path, capsys, command):
     def analysed(text):
         scenario.write_text(text)
         session = tmp_path / "run.mcap"
-        command("sim", "run", scenario, "-o", session, "--force")
+        command("sim", "run", scenario, "-o", session, "--kernels", "numba", "--force")
         code = undulog.run(["analyse", str(session), "--null", str(model), "--json"])
         printed = capsys.readouterr()
         return json.loads(printed.out)["null_model"] if code == 0 else printed.err

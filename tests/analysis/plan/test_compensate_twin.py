@@ -25,7 +25,7 @@ def commands(stage):
 
 
 def driven(stage, wave, command, stream, runs=3):
-    return indices([stage.drive(wave, command, [stream, k]) for k in range(runs)], wave)
+    return indices(stage.drive(wave, [command] * runs, [[stream, k] for k in range(runs)]), wave)
 
 
 def test_the_spread_of_gain_and_lag_is_more_than_halved(stage, commands):
@@ -53,8 +53,8 @@ def test_the_spread_of_gain_and_lag_is_more_than_halved(stage, commands):
 def test_gaits_near_by_are_not_worse_with_the_same_change(stage, commands, change):
     wave = replace(Wave(M), **change)
     changed = wave.phasors * (commands / Wave(M).phasors)
-    before = driven(stage, wave, wave.phasors, 5, runs=1)
-    after = driven(stage, wave, changed, 6, runs=1)
+    pair = stage.drive(wave, [wave.phasors, changed], [[5, 0], [6, 0]])
+    before, after = (indices([run], wave) for run in pair)
     assert np.abs(changed).max() < math.pi / 6
     for now, then in zip(after, before, strict=True):
         assert now.value <= then.value

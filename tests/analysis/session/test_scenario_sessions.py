@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from support.paths import DOCS
-from undulog.analysis.session.analyse import analyse_session
-from undulog.capture import Session
 from undulog.sim import load_scenario, record, scenario_names
 from undulog.sim.scenario.scenario import EngineKind, Kernels
 
@@ -35,9 +33,9 @@ def analysed(name, folder):
     if scenario.duration_s > LONGEST_S:
         scenario = scenario.changed(duration_s=LONGEST_S)
     record(scenario, path, kernels=Kernels.NUMBA)
-    holds_the_bar(energy_tables.figures(path))
-    with Session.open(path) as session:
-        return analyse_session(session)
+    figures = energy_tables.figures(path)
+    holds_the_bar(figures)
+    return figures.analysis
 
 
 def holds_the_bar(figures):

@@ -253,6 +253,9 @@ def solve_linear(columns, measured, prior):
         def at(self, _wanted, x):
             return tuple(column @ x for column in columns)
 
+        def near(self, wanted, points):
+            return (self.at(wanted, x) for x in points)
+
     wanted = [Unknown(f"p{k}", "1", 1.0, p**-0.5) for k, p in enumerate(prior.tolist())]
     found = solve(Model(), wanted)
     assert found.converged

@@ -12,7 +12,9 @@ from support.processes import UNDULOG, process, run, undulog, wait_for
 from support.sweep_plans import comparable, write_plan
 from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
+from undulog.replay.sweep.plan import read_plan
 from undulog.replay.sweep.rows import RowStore
+from undulog.replay.sweep.sweep import LocalWorkers, prepare, run_sweep
 
 STRENGTHS = (0.1, 0.15, 0.2, 0.25, 0.3)
 
@@ -179,3 +181,19 @@ def test_a_worker_that_is_killed_takes_no_row_with_it(reference, tmp_path):
     report = json.loads(out)
     assert (report["run"], report["failed"], err) == (10, 0, "")
     assert rows_of(tmp_path / "rows") == rows_of(reference / "rows")
+
+
+@pytest.mark.slow
+def test_sweeps_in_turn_share_the_processes(tmp_path):
+    """Also where one of them is killed between two sweeps."""
+    plan, seen = read_plan(write_plan(tmp_path)), []
+    with LocalWorkers(1) as workers:
+        for number in range(3):
+            output = str(tmp_path / f"rows{number}")
+            report = run_sweep(prepare(plan, tmp_path, output), RowStore(output), workers=workers)
+            assert (report.run, report.failed) == (2, 0)
+            (worker,) = {row["worker"] for row in RowStore(output).rows()}
+            seen.append(worker)
+            if number == 1:
+                os.kill(int(worker.rpartition(":")[2]), signal.SIGKILL)
+    assert seen[0] == seen[1] != seen[2]

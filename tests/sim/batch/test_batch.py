@@ -265,6 +265,18 @@ def test_a_run_that_fails_ends_alone_with_its_time_and_place(weak, make_scenario
     assert len(second.angle) == math.ceil(100 * at_s)
 
 
+def test_given_commands_run_as_the_gait_that_gives_them(weak):
+    """Also those of a scenario whose own gait a batch can't run."""
+    (own,) = run_batch([weak])
+    adaptive = load_scenario("oscillators-feedback")
+    driven = dataclasses.replace(weak, gait=adaptive.gait)
+    (run,) = run_batch([driven], commands=[own.command])
+    for name in ("angle", "effort", "work", "head"):
+        np.testing.assert_array_equal(getattr(run, name), getattr(own, name))
+    with pytest.raises(ValueError, match=r"expected \d+ ticks of"):
+        run_batch([weak], commands=[own.command[:-1]])
+
+
 def test_what_a_batch_cannot_run_is_refused_by_name(weak):
     pushed = dataclasses.replace(
         weak,

@@ -10,6 +10,7 @@ import pytest
 from support.paths import ROOT
 from undulog.capture import Session
 from undulog.sim import Target, Twin, load_scenario, record
+from undulog.sim.scenario.scenario import Kernels
 
 PERIOD = 200
 """Ticks of a gait period at 0.5 Hz."""
@@ -50,7 +51,7 @@ def recorded(tmp_path_factory):
             scenario = dataclasses.replace(scenario, controller=changed)
         path = folder / f"{scenario.session_id}.mcap"
         if not path.exists():
-            record(scenario, path)
+            record(scenario, path, kernels=Kernels.NUMBA)
         return Log(path)
 
     return run
@@ -101,7 +102,8 @@ def test_adaptive_amplitude_touches_a_corridor_for_less_time():
     for smallest in (0.3, 1.0):
         side = dataclasses.replace(scenario.controller.side, smallest=smallest)
         controller = dataclasses.replace(scenario.controller, side=side)
-        with Twin(dataclasses.replace(scenario, controller=controller)) as twin:
+        changed = dataclasses.replace(scenario, controller=controller)
+        with Twin(changed, kernels=Kernels.NUMBA) as twin:
             for sample in twin.samples():
                 if sample.step.body.position[0, 0] > 5.0:
                     break
@@ -116,7 +118,7 @@ def test_reckoning_and_course_lead_to_a_target_on_free_ground():
     scenario = load_scenario("target-following")
     world = dataclasses.replace(scenario.world, obstacles=(), target=Target((3.0, 1.5), 0.3))
     scenario = dataclasses.replace(scenario, world=world, duration_s=12.0)
-    with Twin(scenario) as twin:
+    with Twin(scenario, kernels=Kernels.NUMBA) as twin:
         names = twin.gait.names
         samples = []
         for sample in twin.samples():
@@ -155,7 +157,7 @@ def test_the_median_interval_covers_as_often_as_it_says(study):
 def test_following_beats_walking_at_random_on_fresh_seeds(study):
     """Six of the study's thirty seeds; walks are cut at 30 s, so the ratios are lower bounds."""
     limits_s = {"target-following": 90.0, "random-walk": 30.0}
-    found = study.summary(study.study(list(range(101, 107)), limits_s, 2, "numpy", None))
+    found = study.summary(study.study(list(range(101, 107)), limits_s, 2, "numba", None))
     assert found["target-following"]["met"] == 6
     assert found["time_s_ratio"][0] > 3.0
     assert found["electrical_j_ratio"][0] > 3.0

@@ -4,6 +4,7 @@ import dataclasses
 import signal
 import time
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -130,6 +131,39 @@ def test_a_plan_is_driven_and_kept_in_the_session(tmp_path, command, opened):
     assert column_bytes(again) == column_bytes(path)
     # What the commands were made from:
     assert opened(again).attachments["plan.toml"].decode() == PLAN
+
+
+def test_several_motions_are_driven_into_a_folder(plain, tmp_path, command, report_of):
+    """Each under its own name, the same as alone; a table says what came of each."""
+    folder, alone = tmp_path / "driven", tmp_path / "alone.mcap"
+    plan = tmp_path / "bend.toml"
+    plan.write_text(PLAN)
+    drive = ("drive", plain, plan, "--on", "twin", "-o", folder)
+    report = report_of(*drive)
+    assert [one["driven"] for one in report] == ["plain.mcap", "bend"]
+    assert sorted(one.name for one in folder.iterdir()) == ["bend.mcap", "plain.mcap"]
+    for what, output in ((plain, folder / "plain.mcap"), (plan, folder / "bend.mcap")):
+        command("drive", what, "--on", "twin", "-o", alone, "--force")
+        assert output.read_bytes() == alone.read_bytes()
+    assert "plain.mcap exists already" in command(*drive, code=2).err
+    (folder / "broken.mcap").write_bytes(b"no session")
+    out = command("drive", folder, "--on", "twin", "-o", tmp_path / "again", code=1).out
+    names = ["bend.mcap", "broken.mcap", "plain.mcap"]
+    assert [Path(line.split()[0]).name for line in out.splitlines()[1:]] == names
+    assert sorted(one.name for one in (tmp_path / "again").iterdir()) == ["bend.mcap", "plain.mcap"]
+
+
+def test_several_motions_never_share_a_session(plain, tmp_path, command):
+    copy = tmp_path / "copy" / "plain.mcap"
+    copy.parent.mkdir()
+    copy.write_bytes(plain.read_bytes())
+    drive = ("drive", plain, copy, "--on", "twin")
+    assert "replace another session" in command(*drive, "-o", tmp_path / "a", code=2).err
+    words = ("drive", copy, "flat", "--on", "twin", "-o", copy.parent, "--force")
+    assert "replace another session" in command(*words, code=2).err
+    assert copy.read_bytes() == plain.read_bytes()
+    assert "name their folder" in command(*drive, code=2).err
+    assert "name their folder" in command(*drive, "-o", tmp_path / "a.mcap", code=2).err
 
 
 def test_a_gait_can_be_driven_in_another_world(tmp_path, command):

@@ -15,6 +15,7 @@ from undulog.capture import Session
 from undulog.capture.robot.model import Plane
 from undulog.sim import Readings, Twin, load_scenario, record
 from undulog.sim.scenario.motion import generator
+from undulog.sim.scenario.scenario import Kernels
 
 CYCLE = 200  # ticks
 
@@ -32,7 +33,7 @@ class Motion(NamedTuple):
 @cache
 def motion(name):
     positions, rolls = [], []
-    with Twin(load_scenario(name)) as twin:
+    with Twin(load_scenario(name), kernels=Kernels.NUMBA) as twin:
         for sample in twin.samples():
             body = sample.step.body
             x, y, z, w = body.quaternion
@@ -122,7 +123,7 @@ def test_felt_servos_keep_the_wave_and_slow_it_a_little():
     # The responses follow their commands with gains near 1: see the closed form of the drift,
     # -eps^2 g^2 / 2 omega, in test_gait_oscillators.
     scenario = load_scenario("oscillators-feedback")
-    with Twin(scenario) as twin:
+    with Twin(scenario, kernels=Kernels.NUMBA) as twin:
         names = list(twin.gait.names)
         values = np.array([sample.gait.values for sample in twin.samples()])
     joints = scenario.robot.joint_indices(Plane.HORIZONTAL)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -95,20 +96,24 @@ def test_a_killed_session_reads_as_if_it_had_been_closed(path, run, split_size, 
 @pytest.mark.slow
 def test_thirty_kills_lose_no_accepted_message(tmp_path):
     rng = random.Random(5)
-    for run in range(30):
-        path = tmp_path / str(run) / "run.mcap"
-        path.parent.mkdir()
-        options = {"split_size": rng.choice([None, 1 << 17, 1 << 19])}
-        options["split_every"] = rng.choice([0, 0, 300])
-        accepted = killed_after(child_command(path, **options), rng.uniform(0.0, 1.5))
-        warnings = check_killed(path, accepted)
-        assert any("none is missing" in text for text in warnings)
-        output = path.with_name("whole.mcap")
-        assert recover_log(path, output).missing == 0
-        found, warnings = read(output)
-        assert found == recorder.truth(len(found))
-        assert warnings == []
-        shutil.rmtree(path.parent)
+    with ThreadPoolExecutor(1) as killer:  # kills the next ones while one is checked
+        killed = []
+        for run in range(30):
+            path = tmp_path / str(run) / "run.mcap"
+            path.parent.mkdir()
+            options = {"split_size": rng.choice([None, 1 << 17, 1 << 19])}
+            options["split_every"] = rng.choice([0, 0, 300])
+            command, seconds = child_command(path, **options), rng.uniform(0.0, 1.5)
+            killed.append((path, killer.submit(killed_after, command, seconds)))
+        for path, accepted in killed:
+            warnings = check_killed(path, accepted.result())
+            assert any("none is missing" in text for text in warnings)
+            output = path.with_name("whole.mcap")
+            assert recover_log(path, output).missing == 0
+            found, warnings = read(output)
+            assert found == recorder.truth(len(found))
+            assert warnings == []
+            shutil.rmtree(path.parent)
 
 
 @pytest.mark.parametrize("runs", [6, pytest.param(60, marks=pytest.mark.slow)])
@@ -457,8 +462,8 @@ def damage(rng, folder):
 def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_reported(tmp_path, runs):
     source = tmp_path / "source"
     source.mkdir()
-    total = 900
-    unfinished(source / "run.mcap", total, splits=[300, 600], segment_size=1 << 15)
+    total = 300
+    unfinished(source / "run.mcap", total, splits=[100, 200], segment_size=1 << 13)
     truth = set(recorder.truth(total))
     place = tmp_path / "damaged"
     outcomes = Counter()
