@@ -9,7 +9,6 @@ import struct
 import sys
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from subprocess import DEVNULL
@@ -115,13 +114,9 @@ def test_a_killed_recording_has_what_was_accepted(options, tmp_path, command, cy
 @pytest.mark.parametrize("options", [(), ("--split-size", "1MB")], ids=["whole", "split"])
 def test_fifty_kills(options, tmp_path, command, cycle):
     rerun = Path(sys.executable).with_name("rerun")
-    folders = [tmp_path / str(seed) for seed in range(1, 26)]
-    with ThreadPoolExecutor(1) as killer:  # records the next ones while one is checked
-        killed = []
-        for seed, folder in enumerate(folders, start=1):
-            folder.mkdir()
-            killed.append(killer.submit(record_and_kill, cycle, folder, seed, *options))
-        for folder, one in zip(folders, killed, strict=True):
-            for file in check_kill(command, folder, *one.result()):
-                done = run(rerun, "mcap", "check", file)
-                assert done.returncode == 0, (folder, done.stdout, done.stderr)
+    for seed in range(1, 26):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        for file in check_kill(command, folder, *record_and_kill(cycle, folder, seed, *options)):
+            done = run(rerun, "mcap", "check", file)
+            assert done.returncode == 0, (seed, done.stdout, done.stderr)
