@@ -10,20 +10,22 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from stat import S_ISDIR
 from typing import TypeAlias
 
-from undulog.capture.common.errors import InputFileError
+from undulog.capture.common.errors import InputFileError, UndulogError
 from undulog.capture.common.remote import ObjectStore, StoredFile
 from undulog.capture.log.file.bag import is_bag
 from undulog.capture.log.file.bag_metadata import METADATA, is_rosbag2
-from undulog.capture.log.file.log_paths import log_paths
+from undulog.capture.log.file.log_paths import log_paths, walk
 from undulog.capture.log.read.bag_facts import read_bag_facts
 from undulog.capture.log.read.facts import LogFacts, read_facts
 
 FOLDER = ".undulog-catalog"
 """Folder of the catalogue, beside the sessions."""
+
+_RESULTS = (".json", ".parquet")
 
 Scanned: TypeAlias = tuple[int, int, int]
 """Size [byte], last change and scan [Unix ns] of a file that was read."""
@@ -45,16 +47,21 @@ def list_sources(store: ObjectStore, known: Mapping[str, Scanned]) -> list[Sourc
     Raises:
         InputFileError: If a folder can't be listed.
     """
-    endings = [".json", ".parquet"] if store.is_local else [".mcap", ".json", ".parquet"]
-    files = [
+    if store.is_local:
+        try:
+            return [*_local_results(Path(store.base)), *_local_logs(Path(store.base), known)]
+        except UndulogError:
+            raise
+        except OSError as error:
+            why = f"can't be listed: {error.strerror}"
+            raise InputFileError(error.filename or store.base, why) from error
+    files = store.files("", [".mcap", *_RESULTS], recursive=True)
+    paths = ((file, PurePosixPath(file.name)) for file in files)
+    return [
         Source(file.name, file.size, file.modified_ns, path.suffix == ".mcap")
-        for file in store.files("", endings, recursive=True)
-        for path in [PurePosixPath(file.name)]
-        if FOLDER not in path.parts
-        and not (path.suffix == ".json" and path.parent.name in ("pending", "settings"))
-        and not (path.suffix == ".parquet" and path.parent.name != "rows")
+        for file, path in paths
+        if FOLDER not in path.parts and (path.suffix == ".mcap" or _may_be_result(path))
     ]
-    return [*files, *_local_logs(Path(store.base), known)] if store.is_local else files
 
 
 def source_facts(store: ObjectStore, source: Source) -> LogFacts:
@@ -80,6 +87,21 @@ def source_facts(store: ObjectStore, source: Source) -> LogFacts:
         return read_facts(str(plain), size, lambda a, b: os.pread(own, b - a, a))
 
 
+def _may_be_result(path: PurePath) -> bool:
+    """Whether a file may be of ``undulog analyse -o``, or rows of ``undulog sweep``."""
+    folder = path.parent.name
+    return folder not in ("pending", "settings") if path.suffix == ".json" else folder == "rows"
+
+
+def _local_results(base: Path) -> list[Source]:
+    found: list[Source | None] = []
+    for here, folders, files in walk(base):
+        folders[:] = [name for name in folders if name != FOLDER]
+        paths = (here / name for name in files if name.endswith(_RESULTS))
+        found += [_source(base, path) for path in paths if _may_be_result(path)]
+    return [each for each in found if each is not None]
+
+
 def _local_logs(base: Path, known: Mapping[str, Scanned]) -> list[Source]:
     """Return the logs of a folder, and each metadata.yaml there that is of another tool."""
     others: list[Source] = []
@@ -95,11 +117,7 @@ def _local_logs(base: Path, known: Mapping[str, Scanned]) -> list[Source]:
         others.append(own)
         return False
 
-    try:
-        paths = dict.fromkeys(log_paths(base, is_recording))
-    except OSError as error:
-        why = f"can't be listed: {error.strerror}"
-        raise InputFileError(error.filename or base, why) from error
+    paths = dict.fromkeys(log_paths(base, is_recording))
     logs = (_source(base, path, is_log=True) for path in paths)
     return [*(each for each in logs if each is not None), *others]
 
@@ -112,7 +130,13 @@ def _source(base: Path, path: Path, *, is_log: bool = False) -> Source | None:
     """Return a file or folder; None where it isn't there.
 
     That is the file of a write-ahead log alone, or one that was removed meanwhile.
+
+    Raises:
+        InputFileError: If its name is not UTF-8.
     """
+    name = path.relative_to(base).as_posix()
+    if not name.isprintable() and name != name.encode(errors="replace").decode():
+        raise InputFileError(path, "its name is not UTF-8, which a catalogue needs; rename it")
     try:
         facts = path.stat()
         own = [facts]
@@ -122,4 +146,4 @@ def _source(base: Path, path: Path, *, is_log: bool = False) -> Source | None:
     except FileNotFoundError:
         return None
     size, modified_ns = sum(each.st_size for each in own), max(each.st_mtime_ns for each in own)
-    return Source(path.relative_to(base).as_posix(), size, modified_ns, is_log)
+    return Source(name, size, modified_ns, is_log)

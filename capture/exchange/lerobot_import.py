@@ -15,6 +15,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -179,9 +180,10 @@ def import_lerobot(
     if not single:
         output.mkdir(parents=True, exist_ok=True)
     reports: list[ImportReport] = []
+    digest = cache(file_digest)  # a file may hold many episodes
     for number in chosen:
         path = output if single else output / f"episode_{number:06d}.mcap"
-        source = _episode(dataset, number, present[number])
+        source = _episode(dataset, number, present[number], digest(present[number][0]))
         column_map, notes = _map(dataset, units or {})
         report = import_tables(
             source, path, robot=robot, column_map=column_map, said=notes, force=force, stop=stop
@@ -210,7 +212,7 @@ def _map(dataset: LeRobotDataset, units: Mapping[str, str]) -> tuple[ColumnMap, 
     return ColumnMap("time", "ns", tuple(columns)), notes
 
 
-def _episode(dataset: LeRobotDataset, number: int, paths: Sequence[Path]) -> TableSet:
+def _episode(dataset: LeRobotDataset, number: int, paths: Sequence[Path], of_file: str) -> TableSet:
     columns = tuple(f"{name}[{i}]" for name, n in dataset.names.items() for i in range(len(n)))
 
     def read(names: Sequence[str], time: str) -> Iterator[Block]:  # noqa: ARG001
@@ -229,7 +231,7 @@ def _episode(dataset: LeRobotDataset, number: int, paths: Sequence[Path]) -> Tab
         **({"import.task": task} if task else {}),
     }
     # A file may hold several episodes, and each is a session of its own.
-    digest = hashlib.sha256(f"{file_digest(paths[0])} {number}".encode()).hexdigest()
+    digest = hashlib.sha256(f"{of_file} {number}".encode()).hexdigest()
     return TableSet(
         dataset.folder, {STATES: table}, digest=digest, facts=facts, compression=FLOAT32
     )

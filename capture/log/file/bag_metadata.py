@@ -106,7 +106,8 @@ def read_stated(folder: Path) -> Stated:
         _number(_field(facts, "starting_time"), "nanoseconds_since_epoch"),
         _number(_field(facts, "duration"), "nanoseconds"),
         _number(facts, "message_count"),
-        tuple(name for name in names if isinstance(name, str)),
+        # An escape may stand for half a character, which no other text holds.
+        tuple(n.encode(errors="replace").decode() for n in names if isinstance(n, str)),
     )
 
 

@@ -228,6 +228,9 @@ def read_database_facts(path: Path) -> Stated:
         NotALogError: If it is damaged.
     """
     with _connected(path) as (base, _):
+        columns = base.execute("SELECT hidden FROM pragma_table_xinfo('messages')")
+        if any(hidden for (hidden,) in columns):  # the time of each may take as long as it likes
+            raise NotALogError(path, f"has a table of messages that are computed; {_REINDEX}")
         most = path.stat().st_size // _ROW_SIZE  # pages that lead to themselves have no end
         topics = base.execute("SELECT name FROM topics LIMIT ?", (_MOST_TOPICS,)).fetchall()
         count, first, last = base.execute(

@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import os
 import shutil
+import sqlite3
 from pathlib import Path
 
 import numpy as np
@@ -282,6 +283,47 @@ def test_a_bag_alone_and_damaged_ones(bags):
     reasons = catalog.find("damage is not null").set_index("path").damage
     assert reasons.index.to_list() == ["alone.db3", "day/one.bag", "day/sql"]
     assert all("reindex" in reason for reason in reasons)
+
+
+def test_mutated_bags_are_rows_or_damaged_ones(bags):
+    draw = np.random.default_rng(4)
+    paths = [path for path in bags.rglob("*") if path.is_file() and "tool" not in path.parts]
+    whole = {path: path.read_bytes() for path in paths}
+    for _ in range(15):
+        for path, content in whole.items():
+            data = bytearray(content)
+            for at in draw.integers(len(data), size=8):
+                data[at] = draw.integers(256)
+            path.write_bytes(data)
+        catalog = Catalog(str(bags))
+        assert catalog.scan().complete
+        assert set(catalog.find().path) >= {"alone.db3", "day/one.bag", *SESSIONS}
+
+
+def test_a_database_that_computes_its_times_is_damaged(tmp_path):
+    with sqlite3.connect(tmp_path / "slow.db3") as base:
+        base.executescript(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT);"
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER,"
+            " timestamp AS (length(hex(zeroblob(topic_id)))));"
+            "INSERT INTO messages(topic_id) WITH RECURSIVE c(x) AS"
+            " (SELECT 1 UNION ALL SELECT x + 1 FROM c LIMIT 9) SELECT x FROM c"
+        )
+    base.close()
+    catalog = Catalog(str(tmp_path))
+    assert catalog.scan().damaged == 1
+    assert "computed" in catalog.find().damage[0]
+
+
+def test_a_name_that_is_no_text_is_named(tmp_path):
+    write_session(tmp_path / "run.mcap")
+    (tmp_path / "odd").mkdir()
+    (tmp_path / "odd/up").symlink_to(tmp_path)
+    (tmp_path / os.fsdecode(b"odd/\xff.txt")).write_text("no log")
+    assert Catalog(str(tmp_path)).scan().sessions == 1
+    (tmp_path / os.fsdecode(b"odd/\xff.mcap")).write_text("no log")
+    with pytest.raises(InputFileError, match="not UTF-8"):
+        Catalog(str(tmp_path)).scan()
 
 
 def test_analyses_of_bags_are_made_on_request(bags):
