@@ -286,7 +286,7 @@ def drive(
             f"{what}: {len(whats)} motions; several are for the twin, or for dry runs over a bus, "
             "without --arm and -o; name one"
         )
-    what = whats[0]
+    asked, what = what, whats[0]
     if output is not None and not several:
         check_session_name(output)
         refuse_existing(output, force=force)
@@ -322,7 +322,8 @@ def drive(
     if several:
         if output is None or output.suffix == ".mcap":
             raise UsageError(
-                f"{len(whats)} runs of the twin are recorded: name their folder, e.g. -o driven"
+                f"{asked}: {len(whats)} runs of the twin are recorded: name a folder for them, "
+                "e.g. -o driven"
             )
         lines = _twin_runs(whats, world, output, duration, topic, force=force)
         return show(lines, as_json=json)

@@ -162,8 +162,8 @@ def test_several_motions_never_share_a_session(plain, tmp_path, command):
     words = ("drive", copy, "flat", "--on", "twin", "-o", copy.parent, "--force")
     assert "replace another session" in command(*words, code=2).err
     assert copy.read_bytes() == plain.read_bytes()
-    assert "name their folder" in command(*drive, code=2).err
-    assert "name their folder" in command(*drive, "-o", tmp_path / "a.mcap", code=2).err
+    assert "name a folder for them" in command(*drive, code=2).err
+    assert "name a folder for them" in command(*drive, "-o", tmp_path / "a.mcap", code=2).err
 
 
 def test_a_gait_can_be_driven_in_another_world(tmp_path, command):
