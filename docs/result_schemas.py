@@ -16,7 +16,7 @@ from typing import Any, Union, cast, get_args, get_origin, get_type_hints
 
 from undulog.analysis.results import analysis, answer, oscillators
 from undulog.analysis.results.analysis import Analysis, interval_key
-from undulog.analysis.results.body_shape import BodyTravel, Serpenoid, ShapeMode
+from undulog.analysis.results.body import BodyPoint, BodyTravel, LinkContact, Serpenoid, ShapeMode
 from undulog.analysis.results.comparison import Comparison
 from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.results.experiment import Experiment
@@ -25,7 +25,6 @@ from undulog.analysis.results.frequency_response import (
     JointFrequencyResponse,
     JointMotion,
 )
-from undulog.analysis.results.ground_contact import LinkContact
 
 VERSION = 1
 
@@ -39,7 +38,7 @@ RESULTS: dict[str, tuple[type, str]] = {
 
 _FLAT = frozenset(
     {
-        analysis.BodyPoint,
+        BodyPoint,
         analysis.GaitFacts,
         analysis.GroupFacts,
         analysis.JointResult,

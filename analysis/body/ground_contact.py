@@ -30,8 +30,8 @@ from undulog.capture.robot.model import Plane, Robot
 from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series, clean
 from ..results.answer import Note
+from ..results.body import GroundContact, LinkContact
 from ..results.estimate import Estimate
-from ..results.ground_contact import GroundContact, LinkContact
 from ..signals.columns import Columns
 from ..signals.stretch import SharedTimes, part_of
 from ..signals.windows import Span

@@ -20,8 +20,8 @@ from ..estimators.series import Series
 from ..estimators.spectrum import residual_noise
 from ..response.fitting import GaitFit
 from ..response.rhythm import allowed_model
-from ..results.analysis import BodyPoint, BodyResult
 from ..results.answer import Note
+from ..results.body import BodyPoint, BodyResult
 from ..results.estimate import Estimate
 from ..signals.columns import DRAG_RATIO, by_plane, drag_ratio
 from ..signals.windows import Span

@@ -23,7 +23,7 @@ from ..estimators.intervals import around, t_factor
 from ..estimators.series import Series
 from ..response.fitting import GaitFit
 from ..results.answer import Note
-from ..results.body_shape import BodyShape, BodyTravel, PlaneShape, Serpenoid, ShapeMode
+from ..results.body import BodyShape, BodyTravel, PlaneShape, Serpenoid, ShapeMode
 from ..results.estimate import Estimate
 from ..signals.columns import by_plane
 from ..signals.windows import Span

@@ -23,7 +23,7 @@ from ..oscillators.predictions import body_oscillators
 from ..response.fitting import GaitFit
 from ..response.response import gain_estimate, lag_estimate
 from ..results.analysis import Analysis
-from ..results.body_shape import BodyConnection
+from ..results.body import BodyConnection
 from ..results.coupling import LocalCoupling
 from ..results.estimate import Provenance
 from ..results.experiment import Experiment, Headings, PooledJoint, PooledRuns, Reversal, Run

@@ -15,7 +15,7 @@ from ..body.shape import mean_step
 from ..body.travel import GaitCycle, wave_at
 from ..estimators.intervals import around
 from ..results import formats
-from ..results.body_shape import BodyConnection, ConnectionEntry, PredictedTravel, ShapeMode
+from ..results.body import BodyConnection, ConnectionEntry, PredictedTravel, ShapeMode
 from ..results.estimate import Estimate
 
 MOST_DISTANCE = 0.3

@@ -22,7 +22,8 @@ from ..compare.decisions import (
     signed_difference,
 )
 from ..results import formats
-from ..results.analysis import Analysis, BodyPoint, BodyResult, Index, JointResult
+from ..results.analysis import Analysis, Index, JointResult
+from ..results.body import BodyPoint, BodyResult
 from ..results.comparison import Comparison, Difference, NamedJoint, Waveform, of_body
 from ..results.estimate import Estimate
 from ..results.experiment import Experiment, MirrorJoint, Reversal, Run

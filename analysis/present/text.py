@@ -14,11 +14,10 @@ from undulog.capture.common.console import UNLIMITED, plain
 
 from ..results import formats
 from ..results.analysis import Analysis, EnergyResult
-from ..results.body_shape import BodyShape, PlaneShape
+from ..results.body import BodyShape, GroundContact, PlaneShape
 from ..results.comparison import ModelledAnalysis, null_model_text
 from ..results.coupling import Coupling
 from ..results.estimate import Estimate
-from ..results.ground_contact import GroundContact
 from ..results.oscillators import BodyOscillators, ChainCoupling, ClosedLoop, LoopMode
 from . import tables
 from .tables import TERMINAL, Cell, Column, Ends, PValue, Quantity, Table

@@ -15,7 +15,7 @@ from ..experiment.body_connection import CONNECTION_METHOD, connection_detail
 from ..experiment.reversal import SIGNIFICANT
 from ..experiment.sweep.best_linear import multisine_method
 from ..results import formats
-from ..results.body_shape import BodyConnection, PredictedTravel
+from ..results.body import BodyConnection, PredictedTravel
 from ..results.comparison import Change, Comparison
 from ..results.coupling import LinearCoupling, LocalCoupling
 from ..results.estimate import Estimate

@@ -13,11 +13,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
 from .answer import Answer, Artefact, DeadBand, Span
-from .body_shape import BodyShape
+from .body import BodyPoint, BodyResult, BodyShape, GroundContact
 from .coupling import Coupling
 from .estimate import Estimate, PresentedResult, Provenance, WithInterval
 from .frequency_response import FreeMotion, JointFrequencyResponse
-from .ground_contact import GroundContact
 
 if TYPE_CHECKING:
     from .oscillators import ChainCoupling
@@ -327,37 +326,6 @@ class JointResult:
     lag_transient_rad: Estimate = field(default_factory=Estimate)
     gain_cycle_sd: float | None = None
     lag_cycle_sd_rad: float | None = None
-
-
-@dataclass(frozen=True)
-class BodyPoint:
-    """Transverse motion of one link, at the gait frequency.
-
-    Attributes:
-        place: ``head``, ``middle`` or ``tail``.
-        amplitude_m: Amplitude across the mean heading.
-        phase_rad: Phase relative to the head link.
-    """
-
-    place: str
-    link: str
-    amplitude_m: Estimate
-    phase_rad: Estimate
-
-
-@dataclass(frozen=True)
-class BodyResult:
-    """Head, middle and tail, with the perfect-tracking null beside them.
-
-    Attributes:
-        observed: From the logged head pose and joint angles.
-        null: Name of the null's model (``viscous`` or ``free``) to the same three points, with
-            every joint exactly on its command.
-    """
-
-    plane: str
-    observed: tuple[BodyPoint, ...]
-    null: dict[str, tuple[BodyPoint, ...]]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from enum import StrEnum
 from typing import Any
 
 from .analysis import Analysis, Index
-from .body_shape import BodyConnection
+from .body import BodyConnection
 from .coupling import Coupling
 from .estimate import Estimate, PresentedResult, Provenance
 from .frequency_response import BestLinearResponses

@@ -19,7 +19,8 @@ from study.rows import gather, scatter
 from undulog.capture.common.process import StopRequest, interruptible
 from undulog.replay.sweep.rows import RowStore
 from undulog.replay.sweep.run import software
-from undulog.replay.sweep.sweep import LocalWorkers, prepare, run_sweep
+from undulog.replay.sweep.sweep import prepare, run_sweep
+from undulog.replay.sweep.workers import LocalWorkers
 
 DOCS = Path(__file__).parents[1]
 OUT = DOCS.parent / "out" / "study"

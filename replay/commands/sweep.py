@@ -55,7 +55,8 @@ def sweep(
         raise UsageError("--workers and --cluster: give one of them")
     from ..sweep.plan import read_plan
     from ..sweep.rows import RowStore
-    from ..sweep.sweep import cost_of, prepare, processors, run_sweep, workers_of
+    from ..sweep.sweep import cost_of, prepare, run_sweep
+    from ..sweep.workers import processors, workers_of
 
     prepared = prepare(read_plan(plan), plan.parent, output)
     if dry_run:

@@ -20,9 +20,9 @@ from undulog.capture.common.console import refuse_existing
 from undulog.capture.common.errors import OutputExistsError, UsageError
 from undulog.capture.common.files import as_text, csv_writer, number_cells, part_file
 
-from ...results.analysis import Analysis, BodyPoint, GaitFacts, Index, JointResult
+from ...results.analysis import Analysis, GaitFacts, Index, JointResult
 from ...results.answer import Artefact, Span
-from ...results.body_shape import BodyTravel, PredictedTravel, Serpenoid
+from ...results.body import BodyPoint, BodyTravel, PredictedTravel, Serpenoid
 from ...results.comparison import Change, Comparison, Difference, Equivalence, NamedJoint
 from ...results.coupling import (
     Coupling,

@@ -11,7 +11,8 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_hex
 
-from ...results.analysis import BodyPoint, BodyResult, JointResult
+from ...results.analysis import JointResult
+from ...results.body import BodyPoint, BodyResult
 from ...results.estimate import Estimate
 from ...results.formats import degrees, estimate, number, scaled, short
 from .svg import (

@@ -8,7 +8,7 @@ import pytest
 
 from undulog.analysis.body.ground_contact import TOUCHES, link_loads, means_between
 from undulog.analysis.body.travel import GRAVITY
-from undulog.analysis.results.ground_contact import TWIN_ACCURACY
+from undulog.analysis.results.body import TWIN_ACCURACY
 from undulog.capture.log.write.writer import SessionWriter
 from undulog.capture.robot.description import load_robot
 from undulog.capture.robot.model import Plane

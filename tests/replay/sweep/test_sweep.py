@@ -14,7 +14,8 @@ from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
 from undulog.replay.sweep.plan import read_plan
 from undulog.replay.sweep.rows import RowStore
-from undulog.replay.sweep.sweep import LocalWorkers, prepare, run_sweep
+from undulog.replay.sweep.sweep import prepare, run_sweep
+from undulog.replay.sweep.workers import LocalWorkers
 
 STRENGTHS = (0.1, 0.15, 0.2, 0.25, 0.3)
 

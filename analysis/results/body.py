@@ -1,10 +1,45 @@
-"""Shape of the body over a cycle, where a cycle carries it, and how changes of shape move it."""
+"""The body as a whole: motion of its links, shape over a cycle, travel, and ground contact."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from .estimate import Estimate
+
+TWIN_ACCURACY = (0.86, 0.93)
+"""How often it is right in the twin: the least and the largest mean, over gaits that lift links, of
+the shares of contacts and of lifted links that are recognised (``docs/contact_tables.py``)."""
+
+
+@dataclass(frozen=True)
+class BodyPoint:
+    """Transverse motion of one link, at the gait frequency.
+
+    Attributes:
+        place: ``head``, ``middle`` or ``tail``.
+        amplitude_m: Amplitude across the mean heading.
+        phase_rad: Phase relative to the head link.
+    """
+
+    place: str
+    link: str
+    amplitude_m: Estimate
+    phase_rad: Estimate
+
+
+@dataclass(frozen=True)
+class BodyResult:
+    """Head, middle and tail, with the perfect-tracking null beside them.
+
+    Attributes:
+        observed: From the logged head pose and joint angles.
+        null: Name of the null's model (``viscous`` or ``free``) to the same three points, with
+            every joint exactly on its command.
+    """
+
+    plane: str
+    observed: tuple[BodyPoint, ...]
+    null: dict[str, tuple[BodyPoint, ...]]
 
 
 @dataclass(frozen=True)
@@ -176,3 +211,38 @@ class BodyConnection:
     A: tuple[ConnectionEntry, ...] = ()
     predicted: tuple[PredictedTravel, ...] = ()
     label: str = EFFECTIVE
+
+
+@dataclass(frozen=True)
+class LinkContact:
+    """Ground contact of one link.
+
+    Attributes:
+        link: Name of the link.
+        share: Of a cycle that it is on the ground.
+        load: Mean load, over the mean weight of a link.
+        by_phase: Share of the cycles in which it is on the ground, in successive equal parts of a
+            cycle from the start of the whole cycles.
+    """
+
+    link: str
+    share: Estimate
+    load: float
+    by_phase: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class GroundContact:
+    """Ground contact of the links, from the torques of the joints.
+
+    Attributes:
+        source: Where the torques are from: effort or current.
+        links: Head to tail.
+        twin_accuracy: How often contact is recognised rightly in the twin: mean of the shares of
+            contacts and of lifted links that are recognised, of the worst and the best gait; 0.5
+            is chance.
+    """
+
+    source: str
+    links: tuple[LinkContact, ...]
+    twin_accuracy: tuple[float, float] = TWIN_ACCURACY
