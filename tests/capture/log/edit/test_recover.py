@@ -458,12 +458,16 @@ def damage(rng, folder):
         path.unlink() if damaged is None else path.write_bytes(damaged)
 
 
-@pytest.mark.parametrize("runs", [40, pytest.param(1000, marks=pytest.mark.slow)])
-def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_reported(tmp_path, runs):
+@pytest.mark.parametrize(
+    ("runs", "total"), [(40, 900), pytest.param(1000, 300, marks=pytest.mark.slow)]
+)
+def test_whatever_is_damaged_true_messages_come_out_once_and_losses_are_reported(
+    tmp_path, runs, total
+):
     source = tmp_path / "source"
     source.mkdir()
-    total = 300
-    unfinished(source / "run.mcap", total, splits=[100, 200], segment_size=1 << 13)
+    splits, size = [total // 3, total // 3 * 2], 1 << (13 if total == 300 else 15)
+    unfinished(source / "run.mcap", total, splits=splits, segment_size=size)
     truth = set(recorder.truth(total))
     place = tmp_path / "damaged"
     outcomes = Counter()
