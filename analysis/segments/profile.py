@@ -18,7 +18,8 @@ diagonal (Ledoit & Wolf, J. Multivariate Analysis 88, 2004).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -35,6 +36,9 @@ LEVEL = 0.05
 DRAWS = 2000
 SEED = 20110901
 """Of the simulation, fixed: the same data give the same intervals."""
+
+_BLOCK, _KEPT = 1 << 21, 1 << 23
+"""Normal numbers that are drawn at a time, and that are kept for the next session, at most."""
 
 _TINY = 1e-300
 
@@ -114,55 +118,66 @@ def critical_value(members: Sequence[Member], level: float = LEVEL, draws: int =
     some = [member for member in members if member.weights.size]
     if not some:
         return float("inf")
-    normals = _normals(draws, tuple(member.scatter.columns.shape for member in some))
+    shapes = tuple(member.scatter.columns.shape for member in some)
+    size = draws * sum((m + n) * (n + 1) for m, n in shapes)
+    normals = _kept_normals(draws, shapes) if size <= _KEPT else _normals(draws, shapes)
     largest = [_largest(*pair) for pair in zip(some, normals, strict=True)]
     return float(np.quantile(np.max(largest, axis=0), 1 - level))
 
 
 class _Normals(NamedTuple):
-    """Standard normal draws for one member of m joints and n columns.
+    """Standard normal draws for one member of m joints and n columns, in blocks of d draws.
 
     Attributes:
-        shared: Of the columns, shape (n, draws, n + 1).
-        single: Of each joint alone, shape (m, draws, n + 1).
-        own: Of each joint's rounding, shape (m, draws).
-        turn: Of the common turn, shape (draws,).
+        shared: Of the columns, shape (n, d, n + 1) each.
+        single: Of each joint alone, shape (m, d, n + 1) each.
+        own: Of each joint's rounding, shape (m, d) each.
+        turn: Of the common turn, shape (1, d) each.
     """
 
-    shared: FloatArray
-    single: FloatArray
-    own: FloatArray
-    turn: FloatArray
+    shared: Iterable[FloatArray]
+    single: Iterable[FloatArray]
+    own: Iterable[FloatArray]
+    turn: Iterable[FloatArray]
+
+
+def _normals(draws: int, shapes: tuple[tuple[int, int], ...]) -> Iterator[_Normals]:
+    """Yield what a family of members needs, always the same; to be used up in this order."""
+    rng = np.random.default_rng(SEED)
+
+    def drawn(*shape: int) -> Iterator[FloatArray]:
+        most = max(1, _BLOCK // math.prod(shape))
+        for first in range(0, draws, most):
+            count = min(most, draws - first)
+            yield np.ascontiguousarray(rng.standard_normal((count, *shape)).swapaxes(0, 1))
+
+    for m, n in shapes:
+        yield _Normals(drawn(n, n + 1), drawn(m, n + 1), drawn(m), drawn(1))
 
 
 @lru_cache(maxsize=1)  # one session after the other has the same joints
-def _normals(draws: int, shapes: tuple[tuple[int, int], ...]) -> tuple[_Normals, ...]:
-    """Draw what a family of members with these joints and columns needs, always the same."""
-    rng = np.random.default_rng(SEED)
+def _kept_normals(draws: int, shapes: tuple[tuple[int, int], ...]) -> tuple[_Normals, ...]:
+    return tuple(_Normals(*(tuple(blocks) for blocks in one)) for one in _normals(draws, shapes))
 
-    def drawn(*shape: int) -> FloatArray:
-        found = np.ascontiguousarray(rng.standard_normal((draws, *shape)).swapaxes(0, 1))
-        found.setflags(write=False)
-        return found
 
-    return tuple(
-        _Normals(drawn(n, n + 1), drawn(m, n + 1), drawn(m), drawn(1)[0]) for m, n in shapes
-    )
+def _product(weights: FloatArray, normals: Iterable[FloatArray]) -> FloatArray:
+    """Return weighted sums over the first axis of all draws, shape (c, draws, ...)."""
+    parts = [(weights @ one.reshape(len(one), -1)).reshape(-1, *one.shape[1:]) for one in normals]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
 
 def _largest(member: Member, normals: _Normals) -> FloatArray:
     """Return the largest studentised contrast of each draw, shape (draws,)."""
     scatter, weights = member.scatter, member.weights
     columns = scatter.columns
-    joints, count = columns.shape
+    count = columns.shape[1]
     shrink = _shrinkage(columns)
     sigma = np.sqrt(np.mean(columns**2, axis=1))
     shared, single = ((1 - shrink) / count) ** 0.5, shrink**0.5
-    blocks = (shared * weights @ columns) @ normals.shared.reshape(count, -1)
-    blocks += (single * weights * sigma) @ normals.single.reshape(joints, -1)
-    blocks = blocks.reshape(len(weights), -1, count + 1)
-    error = blocks[..., -1] + (weights * np.sqrt(scatter.own)) @ normals.own
-    error += np.outer(weights @ scatter.turn, normals.turn)
+    blocks = _product(shared * weights @ columns, normals.shared)
+    blocks += _product(single * weights * sigma, normals.single)
+    error = blocks[..., -1] + _product(weights * np.sqrt(scatter.own), normals.own)
+    error += _product((weights @ scatter.turn)[:, np.newaxis], normals.turn)
     variance = np.mean(blocks[..., :-1] ** 2, axis=-1)
     variance += (weights**2 @ scatter.own + (weights @ scatter.turn) ** 2)[:, np.newaxis]
     return np.max(np.abs(error) / np.sqrt(np.maximum(variance, _TINY)), axis=0)
