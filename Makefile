@@ -46,8 +46,10 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 	  '$(BIN)/undulog sim list' 'what else can be simulated'
 
 # Two processes at once: tests that compute, and tests of processes, time and pictures.
-COMPUTING = tests/analysis tests/docs tests/zoo tests/replay/calibrate \
-  $(addprefix tests/sim/,batch control gait physics scenario sensing twin)
+COMPUTING = tests/analysis tests/docs \
+  $(addprefix tests/capture/,following robot) \
+  $(addprefix tests/replay/,calibrate draw sweep) \
+  $(addprefix tests/sim/,batch gait physics scenario sensing twin)
 define tests
 	@log=$$(mktemp); \
 	$(BIN)/python -m pytest -p no:cacheprovider -m $(1) $(COMPUTING) >$$log 2>&1 & first=$$!; \

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from study import chains, coupling, heterogeneity, statements
+from study import chains, coupling, heterogeneity, prediction, statements
 from study.conclusions import CONCLUSIONS, evaluate
 from study.results import results_of
 from study.rows import read_rows
@@ -36,6 +36,24 @@ def test_the_rows_in_the_tree_give_the_page_and_all_conclusions():
     results = results_of(LONG)
     assert [one for one in evaluate(results) if not one.holds] == []
     assert results.digest in (ROOT / "docs/study.md").read_text()
+
+
+def test_both_engines_give_the_same_couplings_and_predict_50_joints():
+    found = prediction.rows(ROOT / "docs/study/rows/prediction")
+    chain = ["n", "law", "stall", "amplitude"]
+    engines = [found[(found.kind == "P") & (found.engine == one)] for one in prediction.ENGINES]
+    pairs = engines[0].merge(engines[1], on=chain)
+    assert {5, 13, 50} <= {*pairs.n}
+    for first, other in zip(pairs.P_x, pairs.P_y, strict=True):
+        np.testing.assert_allclose(np.vstack(first), np.vstack(other), rtol=0, atol=1e-9)
+    longest = prediction.summary(found[(found.kind == "kick") & (found.n == 50)])
+    assert {*zip(longest.engine, longest.law, strict=True)} >= {
+        *((one, "ellipse") for one in prediction.ENGINES),
+        ("bullet", "transeth"),
+    }
+    assert (longest.error <= 0.15).all()
+    assert (longest["error/still"] <= 0.4).all()
+    assert (longest.below == f"{prediction.PATTERNS}/{prediction.PATTERNS}").all()
 
 
 @pytest.mark.parametrize(
