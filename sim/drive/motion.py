@@ -22,6 +22,7 @@ import numpy as np
 
 from undulog.capture import Session
 from undulog.capture.common.arrays import NS, FloatArray, IntArray
+from undulog.capture.common.console import complain
 from undulog.capture.common.errors import (
     DataError,
     JointSetError,
@@ -352,6 +353,8 @@ def _commands(
     facts = {"driven": "commands", "driven.by": path.name}
     with Session.open(path) as session:
         recorded = RecordedCommands.read(session, command_topic)
+        for warning in session.warnings:  # of a damaged log commands may be missing
+            complain(f"warning: {path}: {warning}")
         stored, meta = session.attachments, session.metadata
         settle_s, described = session.settle_s, session.robot
         if robot is None:

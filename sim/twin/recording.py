@@ -375,5 +375,5 @@ def open_twin(address: SourceAddress) -> TwinSource:
         given = ", ".join(address.options)
         raise UsageError(f"{address.text}: a twin takes no options; found {given}")
     scenario = load_scenario(address.rest)
-    engine_type(scenario.engine)  # is told before a recording is begun
+    engine_type(scenario.engine)  # a missing engine is an error before a recording is begun
     return TwinSource(address, scenario)

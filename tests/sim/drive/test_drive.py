@@ -153,6 +153,14 @@ def test_several_motions_are_driven_into_a_folder(plain, tmp_path, command, repo
     assert sorted(one.name for one in (tmp_path / "again").iterdir()) == ["bend.mcap", "plain.mcap"]
 
 
+def test_a_log_that_is_cut_short_is_driven_with_a_warning(plain, tmp_path, command):
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(plain.read_bytes()[:-100])
+    err = command("drive", cut, "--on", "twin", "-o", tmp_path / "again.mcap").err
+    assert f"warning: {cut}: " in err
+    assert "cut short" in err
+
+
 def test_several_motions_never_share_a_session(plain, tmp_path, command):
     copy = tmp_path / "copy" / "plain.mcap"
     copy.parent.mkdir()
