@@ -11,6 +11,7 @@ Format: https://mcap.dev/spec.
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -39,7 +40,8 @@ from .payloads import FetchedFile, McapPayloads
 _Record = TypeVar("_Record")
 
 
-_FOOTER_SIZE = 1 + 8 + 20
+_FOOTER = struct.Struct("<QQI")  # first byte of the summary and of its offsets, CRC
+_FOOTER_SIZE = PREFIX_SIZE + _FOOTER.size
 _CHUNK_INDEX = struct.Struct("<16xQQI")  # after the times: the chunk's place and length, offsets
 _INDEX_END = struct.Struct("<QI")  # behind the offsets: sizes of the indexes and of a name,
 _SIZES = struct.Struct("<QQ")  # the compression's; behind it: of the payload, stored and not
@@ -104,10 +106,13 @@ class _Summary:
         self._file.need(max(footer, 0), len(buffer))
         if footer < len(MAGIC) or buffer[-len(MAGIC) :] != MAGIC or buffer[footer] != Opcode.FOOTER:
             raise _NoSummaryError("the file is cut short (no footer)")
-        (summary_start,) = struct.unpack_from("<Q", buffer, footer + PREFIX_SIZE)
+        summary_start, _, crc = _FOOTER.unpack_from(buffer, footer + PREFIX_SIZE)
         if not len(MAGIC) <= summary_start < footer:
             raise _NoSummaryError("the file has no summary")
         self._file.need(summary_start, footer)
+        covered = footer + PREFIX_SIZE + _FOOTER.size - 4  # up to the CRC itself
+        if crc and zlib.crc32(buffer[summary_start:covered]) != crc:
+            raise _NoSummaryError("the summary is damaged (its CRC doesn't fit)")
         return summary_start, footer
 
     def _block(self, start: int, stop: int) -> Block:
@@ -315,8 +320,11 @@ class McapFile(McapPayloads):
         try:
             _Summary(self).read()
         except _NoSummaryError as why:
+            # What a damaged summary says of channels may be wrong as well.
+            for found in (self.schemas, self.channels, self.counts, self.metadata):
+                found.clear()
+            self.attachments.clear()
             self.blocks.clear()
-            self.counts.clear()
             self.appendices.clear()
             _Scan(self).read()
             self.cut = str(why)

@@ -1,9 +1,11 @@
 """What is no session, or only part of one: an error or a warning in words."""
 
+import random
+
 import numpy as np
 import pytest
 
-from support.read_back import summary_of
+from support.read_back import read, summary_of
 from support.written_sessions import write_session
 from undulog.capture import Session
 from undulog.capture.common.errors import LogError, MissingChannelError, NotALogError
@@ -67,3 +69,21 @@ def test_chunks_that_claim_to_have_no_bytes_are_reported_as_missing(tmp_path):
     with Session.open(path) as session:
         assert not session.joints("/joint_states").t_ns  # no message names a joint
         assert any("its messages are missing" in warning for warning in session.warnings)
+
+
+def test_no_bit_of_a_summary_is_read_wrong(tmp_path):
+    path = tmp_path / "s.mcap"
+    write_session(path, 50)
+    raw = path.read_bytes()
+    start = raw.rindex(bytes([0x0F]) + (4).to_bytes(8, "little")) + 9 + 4  # behind the data's end
+    truth, warnings = read(path)
+    assert len(truth) >= 50
+    assert not warnings
+    dice = random.Random(3)
+    for _ in range(300):
+        data = bytearray(raw)
+        data[dice.randrange(start, len(raw) - 8)] ^= 1 << dice.randrange(8)
+        path.write_bytes(data)
+        found, warnings = read(path)
+        assert found == truth
+        assert any("read record by record" in text for text in warnings)
