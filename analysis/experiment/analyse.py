@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,7 @@ from ..response.fitting import GaitFit
 from ..response.response import gain_estimate, lag_estimate
 from ..results.analysis import Analysis
 from ..results.body import BodyConnection
-from ..results.coupling import LocalCoupling
+from ..results.coupling import Coupling, LocalCoupling
 from ..results.estimate import Provenance
 from ..results.experiment import Experiment, Headings, PooledJoint, PooledRuns, Reversal, Run
 from ..session.analyse import measure_session
@@ -236,10 +236,20 @@ def _of_perturbed(
         ),
         heterogeneity=experiment_indices(none, none, None),
         reversal=None,
-        coupling=coupling_of_one_gait(0),
+        coupling=_coupling_of_perturbed(examined.gaits),
         body_connection=body,
         warnings=tuple(f"{runs[k].label} {why}; it is left out" for k, why in apart.items()),
         provenance=_provenance(analyses, options),
+    )
+
+
+def _coupling_of_perturbed(gaits: Iterable[GaitFit | None]) -> Coupling:
+    """Return that gaits whose whole wave is changed do not tell one joint from the others."""
+    known = [len(gait.all_answered) for gait in gaits if gait is not None]
+    return replace(
+        coupling_of_one_gait(min(known, default=0)),
+        why="gaits perturbed as a whole do not tell the effect of one joint's command from that of "
+        "the others",
     )
 
 

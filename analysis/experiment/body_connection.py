@@ -217,9 +217,9 @@ def connection_detail(found: BodyConnection) -> list[str]:
 
 
 CONNECTION_METHOD = (
-    "xi = A r' + B (r - r0) in the axes of the virtual chassis, A and B Fourier series in the "
-    "gait's phase, least squares over the mean cycles of all gaits; each session predicted from "
-    "its measured joint angles by a model of the others; intervals at 95 % from what the gaits "
-    "leave when left out (Student's t), none at another speed."
+    "velocity of the body xi = A r' + B (r - r0) in the axes of the virtual chassis, A and B "
+    "Fourier series in the gait's phase, least squares over the mean cycles of all gaits; each "
+    "session predicted from its measured joint angles by a model of the others; intervals at 95 % "
+    "from what the gaits leave when left out (Student's t), none at another speed."
 )
 """The method as one sentence, beginning in lower case."""

@@ -336,8 +336,8 @@ def travel_table(found: BodyConnection) -> Table[PredictedTravel]:
     def column(
         name: str, unit: str, of: Callable[[PredictedTravel], Estimate], spare: int = 0
     ) -> Column[PredictedTravel]:
-        digits = (typical(2), typical(3))
-        return Column(f"{name} {unit} (95 %)", f"{name} [{unit}]", of, digits, spare=spare)
+        shown = typical(1 if unit == "mm" else 2)  # what a camera tells apart
+        return Column(f"{name} {unit} (95 %)", f"{name} [{unit}]", of, (shown, shown), spare=spare)
 
     def mm(of: Callable[[PredictedTravel], Estimate]) -> Callable[[PredictedTravel], Estimate]:
         return lambda one: formats.scaled(of(one), 1000.0)

@@ -17,11 +17,11 @@ from ...experiment.answer import kick_checks, sweep_checks
 from ...experiment.body_connection import connection_detail
 from ...experiment.sweep.coupling import NONLINEAR
 from ...results import formats
+from ...results.body import BodyConnection
 from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
 from ...results.estimate import Estimate, leaves_out_zero
 from ...results.experiment import Experiment, Reversal
 from ...results.formats import degrees, estimate, relative, short
-from ...results.oscillators import BodyOscillators
 from ..text_experiment import (
     best_linear_table,
     by_sentence,
@@ -31,7 +31,8 @@ from ..text_experiment import (
     travel_table,
 )
 from .bode import best_linear_bode
-from .matrix import Entries, entries_of, matrix_picture
+from .matrix import entries_of, matrix_picture
+from .oscillators import body_facts, entrainment_entries, modes_drawing
 from .svg import (
     DASHED,
     INK,
@@ -142,6 +143,9 @@ def experiment_view(experiment: Experiment) -> dict[str, Any]:
         ],
         "checks": _checks(coupling),
         "travel": None if connection is None else travel_table(connection),
+        "travel_figure": None
+        if connection is None or all(one.why for one in connection.predicted)
+        else travel_drawing(connection),
         "travel_detail": [] if connection is None else connection_detail(connection),
         "travel_refusals": [] if connection is None else list(refusals(connection)),
         "modes": None if body is None else modes_drawing(body),
@@ -166,6 +170,9 @@ def _question(experiment: Experiment) -> str:
         return "Does the spread over the joints come from the modules or from the boundary?"
     if experiment.coupling.identifiable:
         return "How does the motion of one joint act on the others?"
+    body = experiment.body_connection
+    if body is not None and body.fitted:
+        return "How do changes of shape move the body?"
     return "What can these sessions separate: modules, boundary, coupling between joints?"
 
 
@@ -404,71 +411,40 @@ def _mirror_in_words(reversal: Reversal) -> str:
     )
 
 
-def body_facts(body: BodyOscillators) -> list[Fact]:
-    """Return the key figures of oscillators with feedback from their servos."""
-    bound = f"{body.strong_above:g} eps"
-    slowest = formats.estimate(body.slowest, " eps", most=4)
-    strong = f"{formats.number(body.strong.value, 0)} of {len(body.modes)}"
-    growth = formats.estimate(body.growth, " eps")
-    lifts = body.explicit_coupling
-    explicit = "none is enough" if lifts.value is None else formats.estimate(lifts, " eps")
-    return [
-        Fact("Slowest pattern", slowest, "negative: grows"),
-        Fact("Strong patterns", strong, f"relax faster than {bound}"),
-        Fact("Growth for a while", growth, "the fastest of a deviation; negative: none"),
-        Fact("Explicit coupling", explicit, f"between neighbours, lifts all to {bound}"),
-    ]
-
-
-def modes_drawing(body: BodyOscillators) -> Drawing:
-    """Draw the rates at which patterns of phases relax, and those of a homogeneous chain.
-
-    Args:
-        body: With at least one mode.
-    """
-    count = len(body.modes)
+def travel_drawing(found: BodyConnection) -> Drawing:
+    """Draw by how much the predicted travel of each session differs from the measured one."""
+    panels = (
+        ("forward", " mm", 1000.0, "forward_m"),
+        ("left", " mm", 1000.0, "left_m"),
+        ("turn", "°", math.degrees(1.0), "turn_rad"),
+    )
+    known = [one for one in found.predicted if one.why is None]
     tooltips: dict[str, str] = {}
-    hollow = {"markerfacecolor": "none", "linestyle": "none"}
-    with drawing(2.9) as figure:
-        axes = figure.subplots()
-        axes.axhline(0.0, color=REFERENCE, linewidth=0.8, zorder=1)
-        axes.axhline(body.strong_above, color=REFERENCE, linestyle=DASHED, zorder=1)
-        others = body.comparator.real
-        style = {"markersize": 6.0, "markeredgecolor": REFERENCE, **hollow}
-        axes.plot(range(1, len(others) + 1), others, marker="D", zorder=2, **style)
-        for k, mode in enumerate(body.modes, start=1):
-            style = {"markersize": 4.6, "markeredgewidth": 1.0, "gid": f"mode-{k}"}
-            plot_estimate(axes, k, mode.real, INK, bar=1.8, zorder=3, **style)
-            tooltips[f"mode-{k}"] = f"pattern {k}: {formats.estimate(mode.real, ' eps', most=4)}"
-        axes.set_xlim(0.4, count + 0.6)
-        axes.set_xticks(range(1, count + 1))
-        axes.set_xlabel("pattern of phases, the slowest first")
-        axes.set_ylabel("rate of relaxing [eps]")
-        legend(
-            figure,
-            key(color=INK, marker="o", markersize=4.6, label="this body, 95 %"),
-            key(color=REFERENCE, marker="D", label="a homogeneous chain as strong", **hollow),
-            key(color=REFERENCE, linestyle=DASHED, label=f"{body.strong_above:g} eps: strong"),
-        )
-        title = "Rates at which patterns of phases relax through the body"
-        description = f"{count} patterns; the table below holds every number."
-        svg = inline_svg(figure, "modes-figure", title, description, tooltips)
+    with drawing(2.7) as figure:
+        for axes, (name, unit, scale, field) in zip(figure.subplots(1, 3), panels, strict=True):
+            axes.axhline(0.0, color=REFERENCE, linestyle=DASHED, zorder=1)
+            for k, one in enumerate(known):
+                measured = formats.scaled(getattr(one, f"measured_{field}"), scale)
+                predicted = formats.scaled(getattr(one, field), scale)
+                if measured.value is None or predicted.value is None:
+                    continue
+                low, high = predicted.ci95 or (math.nan, math.nan)
+                seen = measured.value
+                off = Estimate(predicted.value - seen, (low - seen, high - seen))
+                plot_estimate(axes, seen, off, INK, gid=f"{name}-{k}")
+                shown = formats.number(seen, formats.decimals_for([predicted]))
+                tooltips[f"{name}-{k}"] = (
+                    f"{formats.filename(one.path)}: {name} predicted {estimate(predicted, unit)}, "
+                    f"measured {shown}{unit}"
+                )
+            axes.set_xlabel(f"measured {name} [{unit.strip()}]")
+            axes.set_ylabel(f"predicted \N{MINUS SIGN} measured [{unit.strip()}]")
+            axes.margins(0.12)
+        title = "Travel of a cycle, predicted from the other sessions, against the measured one"
+        described = f"{len(known)} sessions; the table below holds every number."
+        svg = inline_svg(figure, "travel-figure", title, described, tooltips)
     return Drawing(
         svg,
-        "What oscillators that feel their own servos would do without any other coupling, eps the "
-        "strength of that feeling: a pattern above zero relaxes, below zero it grows. All phases "
-        "together are left out: they neither relax nor grow.",
+        "Each dot is a session, predicted from its joint angles by a model of the others, with the "
+        "95 % interval of the prediction: on the dashed line it is exact.",
     )
-
-
-def entrainment_entries(body: BodyOscillators) -> Entries | None:
-    """Return P^-1 - I, the coupling relative to entrainment; None if P is singular."""
-    relative = body.entrainment
-    if relative.value is None:
-        return None
-    value = np.array(relative.value, dtype=np.float64)
-    half = None if relative.ci95_half is None else np.array(relative.ci95_half, dtype=np.float64)
-    symbol = "P\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT ONE} \N{MINUS SIGN} I"
-    meaning = "P read as entrainment by the commands: coupling relative to it [1]"
-    words = ("the joint that follows", "the joint that it follows")
-    return Entries(symbol, meaning, body.joints, body.joints, value, half, *words)

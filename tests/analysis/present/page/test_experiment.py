@@ -15,6 +15,8 @@ from undulog.analysis.present.page.page import render
 from undulog.analysis.present.page.session_view import artefact_rows, times_text
 from undulog.analysis.present.page.tables import experiment_trials, session_trials
 from undulog.analysis.results.answer import Artefact
+from undulog.analysis.results.body import BodyConnection, PredictedTravel
+from undulog.analysis.results.estimate import Estimate
 from undulog.analysis.results.formats import sentence
 
 
@@ -182,3 +184,31 @@ def test_artefacts_are_shown_with_their_times_once_for_all_joints(snake):
     # Ten of sixteen seconds into the session, two long.
     assert 'd="M62.50 0h12.50v10h-12.50z"' in str(first.line)
     assert render(known).count("10.00 to 12.00 s") == 1
+
+
+def test_the_travel_of_perturbed_gaits_is_drawn_and_every_number_is_in_the_table(both_ways):
+    def travel(path, forward, why=None):
+        near = [Estimate(v, (v - 0.001, v + 0.002)) for v in (forward, 0.002, 0.05)]
+        measured = [Estimate(v) for v in (0.5, 0.001, 0.04)]
+        predicted = [Estimate()] * 3 if why else near
+        return PredictedTravel(path, 0.5, *predicted, *measured, why=why)
+
+    body = BodyConnection(
+        True,
+        "8 gaits around one gait",
+        8,
+        12.0,
+        predicted=(travel("a.mcap", 0.498), travel("b.mcap", 0.5, "it is far away")),
+    )
+    apart = dataclasses.replace(both_ways, reversal=None, body_connection=body)
+    page = render(apart)
+    assert "How do changes of shape move the body?" in page
+    (first, second) = rows(page, "travels")
+    assert first[1] == pytest.approx([498.0, 497.0, 500.0])
+    assert first[2] == [500.0]
+    assert second[1] == []
+    tip = "a.mcap: forward predicted 498.0 mm [497.0, 500.0], measured 500.0 mm"
+    assert page.count(tip) == 1
+    assert "b.mcap: forward" not in page
+    none = dataclasses.replace(body, predicted=body.predicted[1:])
+    assert "travel-figure" not in render(dataclasses.replace(apart, body_connection=none))
