@@ -1,1 +1,1 @@
-"""Frequency, gain and lag of a gait, fitted to commands and positions."""
+"""Frequency, gain and lag of a gait, fitted to commands and positions; responses from any excitation."""

@@ -28,8 +28,8 @@ from scipy import stats
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 
-from ...frequency_response.estimate import Kind, joint_response, sound_lines
-from ...frequency_response.nonparametric import LineResponse, line_power, noise_power
+from ...response.frequency_response import Kind, joint_response, sound_lines
+from ...response.nonparametric import LineResponse, line_power, noise_power
 from ...results import formats
 from ...results.estimate import Estimate
 from ...results.frequency_response import BestLinearJoint, BestLinearResponses, CrossResponse

@@ -12,8 +12,8 @@ from support.paths import SHARED, TRACE
 from support.written_sessions import EPOCH_NS
 from undulog.analysis import analyse_session
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.frequency_response.estimate import estimate, excited_bins, find_excitation
-from undulog.analysis.frequency_response.nonparametric import resampled, window
+from undulog.analysis.response.frequency_response import estimate, excited_bins, find_excitation
+from undulog.analysis.response.nonparametric import resampled, window
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session, SessionWriter
 

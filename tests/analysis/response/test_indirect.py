@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.frequency_response.estimate import (
+from undulog.analysis.response.frequency_response import (
     estimate,
     find_excitation,
     frequency_responses,

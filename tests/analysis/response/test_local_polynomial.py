@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from undulog.analysis.frequency_response.nonparametric import local_response, window
+from undulog.analysis.response.nonparametric import local_response, window
 
 N = 2000
 BINS = np.arange(20, 300, 15)

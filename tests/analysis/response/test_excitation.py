@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.frequency_response.estimate import Kind, find_excitation
+from undulog.analysis.response.frequency_response import Kind, find_excitation
 
 T = np.arange(0.0, 60.0, 0.01)
 RNG = np.random.default_rng(0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from undulog.analysis.frequency_response.delay_model import fit_delay
+from undulog.analysis.response.delay_model import fit_delay
 
 F_HZ = np.geomspace(0.2, 8.0, 40)
 
