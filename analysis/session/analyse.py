@@ -15,7 +15,6 @@ from undulog.capture.log.health.rules import judge_made_times
 from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
-from ..artefacts.find import find_artefacts
 from ..body.free_motion import MotionFit, free_motion
 from ..body.ground_contact import ground_contact
 from ..body.motion import body_motion
@@ -50,6 +49,7 @@ from ..segments.session import (
     stopped,
     unrefuted,
 )
+from ..signals.artefacts import find_artefacts
 from ..signals.columns import drag_ratio, read_columns
 from ..signals.stretch import (
     Options,

@@ -1,5 +1,11 @@
 """All artefacts of a session: every detector on every joint that it applies to.
 
+A frozen encoder is not a weak servo: what is wrong with samples, or at a limit, is kept apart from
+mechanics. Each :class:`~.analysis.results.answer.Artefact` names a joint, a topic and the intervals
+in which it holds, and states what it is about: the ``sensor`` (the values are not what the joint
+did), the ``record`` (samples are missing) or a ``limit`` (the robot could not do more; the values
+are right).
+
 An encoder that wraps around, or loses its place: steps that no joint can make.
 
 Steps of one common size P, up and down, are the wrap of a counter: the position is right again
@@ -25,7 +31,7 @@ from undulog.capture.robot.model import Joint
 
 from ..estimators.series import Series, clean_together
 from ..results.answer import FALSIFYING, Artefact, Span
-from ..signals.columns import QUANTITIES, Columns
+from .columns import QUANTITIES, Columns
 from .holds import clipped, frozen, stale
 from .scales import (
     SAME_RATE,
