@@ -112,7 +112,7 @@ def coupling_of_result(file: Path) -> LocalCoupling:
     Raises:
         DataError: If the file holds none.
     """
-    from ..present.notebook.files import load
+    from ..present.result_files import load
     from ..results.coupling import Coupling
     from ..results.experiment import Experiment
 

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from undulog.analysis.present.notebook.files import load
+from undulog.analysis.present.result_files import load
 from undulog.analysis.results.analysis import Analysis
 from undulog.analysis.results.comparison import Comparison, ModelledAnalysis
 from undulog.analysis.results.experiment import Experiment

@@ -16,18 +16,18 @@ from undulog.capture.common.errors import DataError, MissingChannelError
 from undulog.capture.common.palette import joint_hex
 from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 
-from ...results import formats
-from ...results.analysis import Analysis, JointResult
-from ...results.answer import KINDS, Artefact, Span, Verdict
-from ...results.formats import degrees, estimate, short
-from ...results.oscillators import ChainCoupling
-from ...session.cycles import CycleMaps
-from ..text import chain_detail
+from ..results import formats
+from ..results.analysis import Analysis, JointResult
+from ..results.answer import KINDS, Artefact, Span, Verdict
+from ..results.formats import degrees, estimate, short
+from ..results.oscillators import ChainCoupling
+from ..session.cycles import CycleMaps
 from .bode import bode, cycle_drawings
 from .matrix import Entries, entries_of, matrix_picture
+from .page_tables import element, is_driven, joint_mark, key_figures, session_trials
 from .segments import body_motion, segments
 from .svg import COMMAND, Drawing, drawing, inline_svg, key, legend
-from .tables import element, is_driven, joint_mark, key_figures, session_trials
+from .text import chain_detail
 
 CYCLES = 2.5
 """Gait cycles shown."""

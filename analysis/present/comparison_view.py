@@ -15,14 +15,14 @@ import pandas as pd
 
 from undulog.capture.common.palette import joint_hex
 
-from ...catalog.fleet import QUANTITIES, Fleet, JointChange, RobotHistory
-from ...catalog.fleet import sentence as change_sentence
-from ...compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, margin_text, signed_difference
-from ...results import formats
-from ...results.comparison import BODY, Comparison, of_body
-from ...results.estimate import Estimate
-from ...results.formats import estimate, scaled, short
-from ..text_experiment import comparison_method
+from ..catalog.fleet import QUANTITIES, Fleet, JointChange, RobotHistory
+from ..catalog.fleet import sentence as change_sentence
+from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, margin_text, signed_difference
+from ..results import formats
+from ..results.comparison import BODY, Comparison, of_body
+from ..results.estimate import Estimate
+from ..results.formats import estimate, scaled, short
+from .page_tables import Fact, Trial, joint_mark
 from .svg import (
     COMMAND,
     DASHED,
@@ -38,7 +38,7 @@ from .svg import (
     legend,
     plot_estimate,
 )
-from .tables import Fact, Trial, joint_mark
+from .text_experiment import comparison_method
 
 
 class Panel(NamedTuple):

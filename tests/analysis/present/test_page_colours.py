@@ -7,11 +7,11 @@ import pytest
 
 from support.colour_vision import DEFICIENCIES, contrast, difference, seen
 from support.paths import ROOT
-from undulog.analysis.present.page.bode import JOINTS, MARKERS
-from undulog.analysis.present.page.svg import COMMAND
+from undulog.analysis.present.bode import JOINTS, MARKERS
+from undulog.analysis.present.svg import COMMAND
 from undulog.capture.common.palette import joint_hex
 
-STYLE = (ROOT / "analysis/present/page/templates/style.css").read_text(encoding="utf-8")
+STYLE = (ROOT / "analysis/present/templates/style.css").read_text(encoding="utf-8")
 SCHEMES = [
     dict(re.findall(r"--([a-z-]+): (#[0-9a-f]{6});", block))
     for block in re.findall(r":root \{(.*?)\}", STYLE, re.DOTALL)[:2]

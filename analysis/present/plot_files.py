@@ -22,8 +22,8 @@ from undulog.capture.common.console import refuse_existing
 from undulog.capture.common.errors import UsageError
 from undulog.capture.common.files import part_file, write_text
 
-from ..page.svg import CSS_VARIABLES, STYLE, Axes, Figure, drawing
-from .files import Picture, paper_colors
+from .result_files import Picture, paper_colors
+from .svg import CSS_VARIABLES, STYLE, Axes, Figure, drawing
 
 Format = Literal["svg", "png", "pdf"]
 

@@ -20,11 +20,11 @@ from undulog.capture.common.console import refuse_existing
 from undulog.capture.common.errors import OutputExistsError, UsageError
 from undulog.capture.common.files import as_text, csv_writer, number_cells, part_file
 
-from ...results.analysis import Analysis, GaitFacts, Index, JointResult
-from ...results.answer import Artefact, Span
-from ...results.body import BodyPoint, BodyTravel, PredictedTravel, Serpenoid
-from ...results.comparison import Change, Comparison, Difference, Equivalence, NamedJoint
-from ...results.coupling import (
+from ..results.analysis import Analysis, GaitFacts, Index, JointResult
+from ..results.answer import Artefact, Span
+from ..results.body import BodyPoint, BodyTravel, PredictedTravel, Serpenoid
+from ..results.comparison import Change, Comparison, Difference, Equivalence, NamedJoint
+from ..results.coupling import (
     Coupling,
     HeldOut,
     LinearCoupling,
@@ -33,9 +33,9 @@ from ...results.coupling import (
     RowCheck,
     ToneCoupling,
 )
-from ...results.estimate import Estimate
-from ...results.experiment import Experiment, MirrorJoint, OrderedPair, Reversal, Run
-from ...results.oscillators import ChainCoupling, Link, Mode, Rate
+from ..results.estimate import Estimate
+from ..results.experiment import Experiment, MirrorJoint, OrderedPair, Reversal, Run
+from ..results.oscillators import ChainCoupling, Link, Mode, Rate
 
 _UNITS = ("_rad", "_hz", "_m_s", "_m", "_j", "_s", "_deg")
 

@@ -17,10 +17,10 @@ from markupsafe import Markup
 
 from undulog.capture.common.arrays import FloatArray
 
-from ...results.coupling import ComplexMatrix, Coupling, LinearCoupling, LocalCoupling
-from ...results.formats import decimals_for_values, number, short
+from ..results.coupling import ComplexMatrix, Coupling, LinearCoupling, LocalCoupling
+from ..results.formats import decimals_for_values, number, short
+from .page_tables import color_bar, element, joined, svg_element
 from .svg import Drawing
-from .tables import color_bar, element, joined, svg_element
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,11 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_hex
 
-from ...results.analysis import JointResult
-from ...results.body import BodyPoint, BodyResult
-from ...results.estimate import Estimate
-from ...results.formats import degrees, estimate, number, scaled, short
+from ..results.analysis import JointResult
+from ..results.body import BodyPoint, BodyResult
+from ..results.estimate import Estimate
+from ..results.formats import degrees, estimate, number, scaled, short
+from .page_tables import is_driven
 from .svg import (
     ABOVE,
     DASHED,
@@ -34,7 +35,6 @@ from .svg import (
     marker,
     plot_estimate,
 )
-from .tables import is_driven
 
 _SOLID: dict[str, Any] = {"markersize": 5.2, "markeredgecolor": INK, "markeredgewidth": 0.5}
 _HOLLOW: dict[str, Any] = {"markersize": 5.2, "markeredgewidth": 1.2, "markerfacecolor": PAPER}

@@ -21,20 +21,20 @@ from undulog.capture.common.console import plain, refuse_existing
 from undulog.capture.common.errors import DataError, MissingExtraError, UsageError
 from undulog.capture.common.files import check_output, part_file, read_input, write_text
 
-from ...experiment.answer import kick_answer, kick_detail, pair_order, sweep_answer, sweep_detail
-from ...results import analysis, formats, oscillators
-from ...results.analysis import Analysis, interval_key
-from ...results.comparison import Comparison
-from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
-from ...results.estimate import Estimate, PresentedResult
-from ...results.experiment import Experiment, Reversal
-from ...results.formats import degrees, relative
-from ..text import render, unidentified
-from ..text_experiment import render_comparison, render_experiment, reversal_detail
-from .frames import frames_of as frames
+from ..experiment.answer import kick_answer, kick_detail, pair_order, sweep_answer, sweep_detail
+from ..results import analysis, formats, oscillators
+from ..results.analysis import Analysis, interval_key
+from ..results.comparison import Comparison
+from ..results.coupling import Coupling, LinearCoupling, LocalCoupling
+from ..results.estimate import Estimate, PresentedResult
+from ..results.experiment import Experiment, Reversal
+from ..results.formats import degrees, relative
+from .data_frames import frames_of as frames
+from .text import render, unidentified
+from .text_experiment import render_comparison, render_experiment, reversal_detail
 
 if TYPE_CHECKING:
-    from ..page.svg import Drawing
+    from .svg import Drawing
 
 __all__ = ["frames", "headline", "html", "load", "picture", "save", "save_tables", "text"]
 
@@ -312,7 +312,7 @@ def figure_rules() -> str:
 
 
 def _style() -> str:
-    folder = files("undulog.analysis.present.page")
+    folder = files("undulog.analysis.present")
     return folder.joinpath("templates", "style.css").read_text(encoding="utf-8")
 
 
@@ -366,7 +366,7 @@ def pictures_of(result: object) -> Pictures:
         case Coupling() if result.matrix is None:
             raise UsageError(f"{result!r}: there is no matrix to draw")
         case Coupling():
-            from ..page.matrix import entries_of, matrix_picture
+            from .matrix import entries_of, matrix_picture
 
             return {one.symbol: partial(matrix_picture, one) for one in entries_of(result, ())}
         case _:
@@ -374,14 +374,14 @@ def pictures_of(result: object) -> Pictures:
 
 
 def _of_analysis(result: Analysis) -> Pictures:
-    from ..page.segments import body_motion, segments
+    from .segments import body_motion, segments
 
     body = {} if result.body is None else {"body": partial(body_motion, result.body)}
     return {"segments": partial(segments, result.joints), **body}
 
 
 def _of_experiment(result: Experiment) -> Pictures:
-    from ..page.experiment_view import mirror_profile, profiles
+    from .experiment_view import mirror_profile, profiles
 
     reversal = result.reversal
     known: Pictures = {}
@@ -395,14 +395,14 @@ def _of_experiment(result: Experiment) -> Pictures:
 
 
 def _of_comparison(result: Comparison) -> Pictures:
-    from ..page.comparison_view import differences_of, waveforms_drawing
+    from .comparison_view import differences_of, waveforms_drawing
 
     waves = {"waveforms": partial(waveforms_drawing, result)} if result.waveforms else {}
     return {"differences": partial(differences_of, result), **waves}
 
 
 def _mirror_differences(result: Reversal, prefix: str) -> Drawing:
-    from ..page.comparison_view import Panel, differences_drawing
+    from .comparison_view import Panel, differences_drawing
 
     gains = [relative(one.log_gain_difference) for one in result.joints]
     lags = [degrees(one.lag_difference_rad) for one in result.joints]

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from undulog.analysis.present.page.page import render
+from undulog.analysis.present.page import render
 from undulog.analysis.results.coupling import Coupling
 
 PAGES = ["snake", "still", "single", "hostile", "both_ways", "kicked", "swept"]

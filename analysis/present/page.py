@@ -2,7 +2,15 @@
 
 No outside reference: style, figures and one script (values under the pointer, zoom) are inside, and
 a content security policy (W3C CSP3) makes the browser refuse anything else. Without the script the
-page is complete. Everything that comes from a log is escaped.
+page is complete. Everything that comes from a log is escaped. It needs the extra ``report``.
+
+::
+
+    from undulog.analysis.present.page import render
+    from undulog.capture import Session
+
+    with Session.open("run.mcap") as session:
+        page = render(analysis, session)  # one page; a sequence of both for several sessions
 """
 
 from __future__ import annotations
@@ -35,20 +43,18 @@ from undulog.capture.common.errors import UndulogError, UsageError
 from undulog.capture.common.files import part_file
 from undulog.capture.common.palette import joint_hex
 
-from ...catalog.fleet import Fleet
-from ...results import formats
-from ...results.analysis import Analysis
-from ...results.answer import beyond
-from ...results.comparison import Comparison
-from ...results.estimate import Provenance
-from ...results.experiment import Experiment
-from ...session.cycles import CycleMaps
-from .. import tables
-from ..text import contact_lines, shape_lines
+from ..catalog.fleet import Fleet
+from ..results import formats
+from ..results.analysis import Analysis
+from ..results.answer import beyond
+from ..results.comparison import Comparison
+from ..results.estimate import Provenance
+from ..results.experiment import Experiment
+from ..session.cycles import CycleMaps
+from . import tables
 from .comparison_view import change_text, comparison_view, fleet_view, spread_text
 from .experiment_view import experiment_view
-from .session_view import session_view
-from .tables import (
+from .page_tables import (
     LEVEL_NOTE,
     digits,
     estimate,
@@ -60,6 +66,8 @@ from .tables import (
     softer,
     typeset,
 )
+from .session_view import session_view
+from .text import contact_lines, shape_lines
 
 LARGEST_BYTES = 3_000_000
 """A page must open on a phone."""
@@ -144,7 +152,7 @@ def render_fleet(fleet: Fleet, joints: pd.DataFrame, where: str, page: Path) -> 
 
 
 def _template_text(name: str) -> str:
-    folder = files("undulog.analysis.present.page")
+    folder = files("undulog.analysis.present")
     return folder.joinpath("templates", name).read_text(encoding="utf-8")
 
 
@@ -176,7 +184,7 @@ def _without_control(value: object) -> object:
 def environment() -> Environment:
     """Return the templates, with their filters and what all pages share."""
     made: Any = Environment(
-        loader=PackageLoader("undulog.analysis.present.page"),
+        loader=PackageLoader("undulog.analysis.present"),
         autoescape=True,
         finalize=_without_control,
         undefined=StrictUndefined,

@@ -6,7 +6,7 @@ from xml.etree import ElementTree as ET
 import matplotlib as mpl
 import pytest
 
-from undulog.analysis.present.page import svg
+from undulog.analysis.present import svg
 
 
 def draw(prefix="p", text="lag [°]", **options):

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from undulog.analysis.present.page import session_view as signals
-from undulog.analysis.present.page.page import render
+from undulog.analysis.present import session_view as signals
+from undulog.analysis.present.page import render
 from undulog.capture import SessionWriter
 from undulog.capture.common.errors import UsageError
 
@@ -45,11 +45,11 @@ def test_a_page_that_grows_too_large_goes_without_signals(snake, recorded, monke
     size, left_out = len(full.encode()), "the cycles one by one, are not drawn"
     assert "Command and response of joint01, joint13, joint25" in full
     assert size < 300_000
-    monkeypatch.setattr("undulog.analysis.present.page.page.LARGEST_BYTES", size - 1)
+    monkeypatch.setattr("undulog.analysis.present.page.LARGEST_BYTES", size - 1)
     smaller = render(snake, session)
     assert left_out in smaller
     assert left_out not in full
-    monkeypatch.setattr("undulog.analysis.present.page.page.LARGEST_BYTES", 1000)
+    monkeypatch.setattr("undulog.analysis.present.page.LARGEST_BYTES", 1000)
     with pytest.raises(UsageError, match=f"would be {len(smaller.encode()) / 1e6:.3g} MB"):
         render(snake, session)
 

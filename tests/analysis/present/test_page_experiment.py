@@ -8,12 +8,12 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from undulog.analysis.present.page import tables as typeset
-from undulog.analysis.present.page.experiment_view import profiles
-from undulog.analysis.present.page.matrix import Entries, entries_of, matrix_picture
-from undulog.analysis.present.page.page import render
-from undulog.analysis.present.page.session_view import artefact_rows, times_text
-from undulog.analysis.present.page.tables import experiment_trials, session_trials
+from undulog.analysis.present import page_tables as typeset
+from undulog.analysis.present.experiment_view import profiles
+from undulog.analysis.present.matrix import Entries, entries_of, matrix_picture
+from undulog.analysis.present.page import render
+from undulog.analysis.present.page_tables import experiment_trials, session_trials
+from undulog.analysis.present.session_view import artefact_rows, times_text
 from undulog.analysis.results.answer import Artefact
 from undulog.analysis.results.formats import sentence
 
@@ -127,7 +127,7 @@ def test_what_was_not_recorded_is_named(both_ways):
 
 def test_a_page_that_grows_too_large_goes_without_every_run(both_ways, pages, monkeypatch):
     largest = len(pages["both_ways"].encode()) - 1
-    monkeypatch.setattr("undulog.analysis.present.page.page.LARGEST_BYTES", largest)
+    monkeypatch.setattr("undulog.analysis.present.page.LARGEST_BYTES", largest)
     assert "Gain and lag of every run are left out" in render(both_ways)
 
 

@@ -5,7 +5,7 @@ from functools import cache
 
 import pytest
 
-from undulog.analysis.present.page.page import render
+from undulog.analysis.present.page import render
 
 SCHEMES = [pytest.param(False, id="light"), pytest.param(True, id="dark")]
 

@@ -13,25 +13,18 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray, frozen
 from undulog.capture.common.palette import joint_hex
 
-from ...experiment.answer import kick_checks, sweep_checks
-from ...experiment.body_connection import connection_detail
-from ...experiment.sweep.coupling import NONLINEAR
-from ...results import formats
-from ...results.coupling import Coupling, LinearCoupling, LocalCoupling
-from ...results.estimate import Estimate, leaves_out_zero
-from ...results.experiment import Experiment, Reversal
-from ...results.formats import degrees, estimate, relative, short
-from ...results.oscillators import BodyOscillators
-from ..text_experiment import (
-    best_linear_table,
-    by_sentence,
-    method,
-    refusals,
-    reversal_detail,
-    travel_table,
-)
+from ..experiment.answer import kick_checks, sweep_checks
+from ..experiment.body_connection import connection_detail
+from ..experiment.sweep.coupling import NONLINEAR
+from ..results import formats
+from ..results.coupling import Coupling, LinearCoupling, LocalCoupling
+from ..results.estimate import Estimate, leaves_out_zero
+from ..results.experiment import Experiment, Reversal
+from ..results.formats import degrees, estimate, relative, short
+from ..results.oscillators import BodyOscillators
 from .bode import best_linear_bode
 from .matrix import Entries, entries_of, matrix_picture
+from .page_tables import Fact, Trial, digits, experiment_trials
 from .svg import (
     DASHED,
     INK,
@@ -46,7 +39,14 @@ from .svg import (
     legend,
     plot_estimate,
 )
-from .tables import Fact, Trial, digits, experiment_trials
+from .text_experiment import (
+    best_linear_table,
+    by_sentence,
+    method,
+    refusals,
+    reversal_detail,
+    travel_table,
+)
 
 AGREE = 0.1
 """Largest relative difference of Z from torques and Z from the described servos that agree."""

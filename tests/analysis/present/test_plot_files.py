@@ -9,10 +9,10 @@ from matplotlib import colors
 from PIL import Image
 
 from support.joint_runs import write_joints
-from undulog.analysis.present.notebook.files import paper_colors
-from undulog.analysis.present.notebook.plot_files import _mixed, figure_of, figures_of, save_plots
-from undulog.analysis.present.page.matrix import Entries, matrix_picture
-from undulog.analysis.present.page.svg import CSS_VARIABLES, drawing, inline_svg, kept_figures
+from undulog.analysis.present.matrix import Entries, matrix_picture
+from undulog.analysis.present.plot_files import _mixed, figure_of, figures_of, save_plots
+from undulog.analysis.present.result_files import paper_colors
+from undulog.analysis.present.svg import CSS_VARIABLES, drawing, inline_svg, kept_figures
 from undulog.capture.common.errors import OutputExistsError
 
 NAMES = ("j1", "j2", "j3")

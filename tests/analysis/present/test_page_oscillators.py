@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from undulog.analysis import Estimate
-from undulog.analysis.present.page.experiment_view import entrainment_entries
-from undulog.analysis.present.page.page import render
-from undulog.analysis.present.page.session_view import chain_view
+from undulog.analysis.present.experiment_view import entrainment_entries
+from undulog.analysis.present.page import render
+from undulog.analysis.present.session_view import chain_view
 from undulog.analysis.results.oscillators import ChainCoupling, Link, Rate
 
 LINKS = (

@@ -19,12 +19,12 @@ from markupsafe import Markup
 from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.common.palette import joint_hex
 
-from ...results.estimate import Estimate
-from ...results.formats import decimals_for_values, degrees, estimate, number, short
-from ...results.frequency_response import BestLinearJoint, JointFrequencyResponse
-from ...session.cycles import CycleMaps
+from ..results.estimate import Estimate
+from ..results.formats import decimals_for_values, degrees, estimate, number, short
+from ..results.frequency_response import BestLinearJoint, JointFrequencyResponse
+from ..session.cycles import CycleMaps
+from .page_tables import LEVELS, color_bar, element, hue, svg_element
 from .svg import Drawing, band, drawing, inline_svg, key, legend
-from .tables import LEVELS, color_bar, element, hue, svg_element
 
 MARKERS = ("o", "s", "^", "D", "v", "P")
 """Of the joints in one figure, since colours alone don't distinguish them for all readers."""

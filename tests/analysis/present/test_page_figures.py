@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from undulog.analysis.present.page.page import render
+from undulog.analysis.present.page import render
 from undulog.analysis.results.formats import degrees, estimate
 
 TIP = "(t => t.hidden ? null : t.textContent)(document.querySelector('.tip'))"

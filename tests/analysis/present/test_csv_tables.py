@@ -11,7 +11,7 @@ import pytest
 from support import built_results
 from support.joint_runs import write_joints
 from undulog.analysis import load
-from undulog.analysis.present.notebook.frames import write_csv
+from undulog.analysis.present.data_frames import write_csv
 from undulog.analysis.results.analysis import Window
 from undulog.capture.common.errors import OutputExistsError, UsageError
 

@@ -11,7 +11,7 @@ from itertools import pairwise
 import pytest
 
 from undulog.analysis import Estimate
-from undulog.analysis.present.page.page import render
+from undulog.analysis.present.page import render
 from undulog.analysis.results.coupling import Coupling
 
 VOID = {"meta", "link", "br", "hr", "img", "input"}

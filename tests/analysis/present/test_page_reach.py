@@ -2,7 +2,7 @@
 
 import pytest
 
-from undulog.analysis.present.page.page import render
+from undulog.analysis.present.page import render
 
 PAGE_PX = (297 - 2 * 14) * 96 / 25.4
 """Height of an A4 page within its margins, in CSS pixels."""
