@@ -21,7 +21,7 @@ from ..gate.gate import Gate
 from ..gate.limits import GateLimits
 from ..gate.outcome import GateEvent, GateInput, JointStatus, Phase
 from ..physics.ledger import JOINT_TERMS
-from ..sensing.contract import JointSample, SensorSample
+from ..physics.sensing import JointSample, SensorSample
 from ..twin.twin import Sample, Twin
 
 _ENERGIES = tuple(

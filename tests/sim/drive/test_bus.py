@@ -32,7 +32,7 @@ from undulog.sim.drive.motion import find_motion
 from undulog.sim.drive.over_bus import LISTEN_S, bus_plan, drive_bus
 from undulog.sim.drive.python_can_bus import open_link
 from undulog.sim.gate.outcome import DriveEnding
-from undulog.sim.sensing.contract import JointSample
+from undulog.sim.physics.sensing import JointSample
 from undulog.sim.serve.pacing import Pacer
 from undulog.sim.serve.robot import PERIOD_NS, VirtualRobot
 from undulog.sim.serve.socketcand_server import SocketcandServer, VirtualBus

@@ -13,8 +13,8 @@ from support.foreign_logs import foreign_log
 from support.read_back import summary_of
 from undulog.capture import Session, SessionWriter, load_robot
 from undulog.capture.common.errors import DataError, UsageError
-from undulog.capture.log.edit.cut import cut_log
-from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.cut import cut_log
+from undulog.capture.log.merge import merge_logs
 
 # -- merge -----------------------------------------------------------------------------------
 

@@ -39,11 +39,11 @@ from undulog.capture.common.arrays import FloatArray, IntArray, frozen
 from undulog.capture.robot.model import Robot, Sensor, SensorKind
 
 from ..gait.contract import CONTROL_RATE_HZ, Readings
-from ..physics.contact import cross, into_frames, out_of_frames
-from ..physics.steps import Steps
 from ..scenario.scenario import Scenario
 from ..scenario.sensors import AccelerometerModel, CompassModel, Noise, ServoPolling
-from .contract import (
+from .contact import cross, into_frames, out_of_frames
+from .ranging import Infrared, RayCaster, Sonar
+from .sensing import (
     JointSample,
     Mounts,
     RangeSample,
@@ -52,7 +52,7 @@ from .contract import (
     VectorSample,
     quantised,
 )
-from .ranging import Infrared, RayCaster, Sonar
+from .steps import Steps
 
 ACCELEROMETER_STREAM = 5
 """Number of the random stream that the sensors' noise is drawn from."""

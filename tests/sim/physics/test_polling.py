@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from undulog.sim.physics.sensors import JointPolling
 from undulog.sim.physics.steps import Steps
 from undulog.sim.scenario.sensors import Noise, ServoPolling
-from undulog.sim.sensing.sensors import JointPolling
 
 DT, N, JOINTS = 1e-3, 10, 4
 

@@ -13,7 +13,7 @@ from PIL import Image
 from support import golden_pictures
 from support.processes import UNDULOG, process, undulog, wait_for
 from undulog.capture.common.errors import UsageError
-from undulog.replay.feed.film import Shot, open_film
+from undulog.replay.film import Shot, open_film
 
 VERMILION = (255, 84, 48)
 GROUND = (16, 18, 22)

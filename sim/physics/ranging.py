@@ -35,11 +35,11 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray
 from undulog.capture.robot.model import Robot, Sensor
 
-from ..physics.contact import out_of_frames
-from ..physics.steps import Steps
 from ..scenario.obstacles import Boxes, Cylinders, Obstacle, columns, into_axes
 from ..scenario.sensors import InfraredModel, SonarModel
-from .contract import Mounts, RangeSample, Schedule, quantised
+from .contact import out_of_frames
+from .sensing import Mounts, RangeSample, Schedule, quantised
+from .steps import Steps
 
 
 class RayCaster:

@@ -6,7 +6,7 @@ from hostile_logs import EPOCH_NS, NS, HostileLog, joint_state
 from support.read_back import messages_of
 from undulog.capture import SessionWriter, load_robot
 from undulog.capture.common.errors import UsageError
-from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.merge import merge_logs
 
 DAY = 86400 * NS
 

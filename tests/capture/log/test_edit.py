@@ -12,8 +12,8 @@ from support.foreign_logs import foreign_log
 from support.processes import python, start
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.process import StopRequest
-from undulog.capture.log.edit.cut import cut_log
-from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.cut import cut_log
+from undulog.capture.log.merge import merge_logs
 
 # -- both ------------------------------------------------------------------------------------
 
@@ -66,7 +66,7 @@ def test_a_stop_leaves_nothing(tmp_path):
 
 SLOW = """
 import sys, time, undulog
-from undulog.capture.log.edit import edited_log as edit
+from undulog.capture.log import edited_log as edit
 write = edit.EditedLog.write
 def slowly(*arguments):
     print("writing", flush=True)

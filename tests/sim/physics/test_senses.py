@@ -11,7 +11,7 @@ from support.twin_runs import SNAKE25, check_keys, faults_of, sensed, simulate
 from undulog import sim
 from undulog.capture import Session
 from undulog.capture.robot.model import Plane
-from undulog.sim.sensing.contract import JointSample, RangeSample, VectorSample
+from undulog.sim.physics.sensing import JointSample, RangeSample, VectorSample
 
 SCENARIO = f"""{SNAKE25.replace("2.0", "0.6")}
 [world]

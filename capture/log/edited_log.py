@@ -21,16 +21,16 @@ from typing import Any, BinaryIO, NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata
 
-from ...common.arrays import NS
-from ...common.console import progress, refuse_existing
-from ...common.errors import DataError, LogError, UndulogError, UsageError
-from ...common.files import part_file
-from ...common.process import StopRequest
-from ...common.strict_table import read_toml
-from ..file.log_file import LogFile
-from ..mcap.chunk import PREFIX_SIZE, Block, Buffer, walk_records
-from ..mcap.writer import McapWriter
-from ..write.mcap_sink import chunk_group, library_name
+from ..common.arrays import NS
+from ..common.console import progress, refuse_existing
+from ..common.errors import DataError, LogError, UndulogError, UsageError
+from ..common.files import part_file
+from ..common.process import StopRequest
+from ..common.strict_table import read_toml
+from .file.log_file import LogFile
+from .mcap.chunk import PREFIX_SIZE, Block, Buffer, walk_records
+from .mcap.writer import McapWriter
+from .write.mcap_sink import chunk_group, library_name
 
 _LENGTH = struct.Struct("<Q")
 _FIXED = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time

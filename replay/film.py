@@ -27,9 +27,9 @@ from undulog.capture.common.errors import DataError, LogWriteError, UndulogError
 from undulog.capture.common.files import check_stop, part_file
 from undulog.capture.common.process import StopRequest
 
-from ..layout import build_views
-from ..samples.content import Content
-from ..viewer import HeadlessViewer
+from .layout import build_views
+from .samples.content import Content
+from .viewer import HeadlessViewer
 
 GIF_FPS = 50
 """More frames a second than this a browser slows down to ten."""

@@ -27,14 +27,16 @@ from undulog.capture.common.console import Progress
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.process import StopRequest
 
-from ..draw import mean_cycle
-from ..draw.drawing import Drawing, Sources, clock_of
-from ..draw.heat_maps import POWER
-from ..draw.lines import MODE
-from ..draw.motion import BODY_RATE_HZ
-from ..draw.steps import CYCLES
-from ..layout import build_blueprint, build_views
-from ..samples.content import (
+from .draw import mean_cycle
+from .draw.drawing import Drawing, Sources, clock_of
+from .draw.heat_maps import POWER
+from .draw.lines import MODE
+from .draw.motion import BODY_RATE_HZ
+from .draw.steps import CYCLES
+from .layout import build_blueprint, build_views
+from .numbers import Analysing
+from .recording import open_recording, recording_id, send_properties
+from .samples.content import (
     ENERGY,
     GAIN,
     LAG,
@@ -47,12 +49,10 @@ from ..samples.content import (
     Series,
     Tab,
 )
-from ..samples.quantities import GAIT, Survey, comes, survey
-from ..samples.timeline import STRETCH_NS, Rhythm, Span, Stretch, stretches
-from ..samples.tracks import wanted_fields
-from ..viewer import Viewer
-from .numbers import Analysing
-from .recording import open_recording, recording_id, send_properties
+from .samples.quantities import GAIT, Survey, comes, survey
+from .samples.timeline import STRETCH_NS, Rhythm, Span, Stretch, stretches
+from .samples.tracks import wanted_fields
+from .viewer import Viewer
 
 
 def predict_layout(content: Content, rhythm: Rhythm | None) -> Content:

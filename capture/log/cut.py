@@ -19,11 +19,8 @@ from typing import Any
 
 from mcap.records import Channel
 
-from ...common.errors import DataError, LogError, MissingChannelError, UsageError
-from ...common.process import StopRequest
-from ..file.parts import first_part
-from ..messages.definitions import adds_up, is_latched
-from ..wal.writer import wal_folder
+from ..common.errors import DataError, LogError, MissingChannelError, UsageError
+from ..common.process import StopRequest
 from .edited_log import (
     EDIT_RECORD,
     FOREVER_NS,
@@ -38,6 +35,9 @@ from .edited_log import (
     portable,
     refuse_output,
 )
+from .file.parts import first_part
+from .messages.definitions import adds_up, is_latched
+from .wal.writer import wal_folder
 
 
 def cut_log(

@@ -23,9 +23,9 @@ from support.processes import wait_for
 from support.read_back import read, rows_of, summary_of
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common import errors
-from undulog.capture.log.edit.cut import cut_log, recover_log, recovered_path
-from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.cut import cut_log, recover_log, recovered_path
 from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.merge import merge_logs
 
 
 def fingerprint(folder):

@@ -13,7 +13,7 @@ from support.edited_logs import EPOCH_NS, MAKES, MS, between, read, records, tex
 from support.foreign_logs import foreign_log
 from support.read_back import summary_of
 from undulog.capture import Session, SessionWriter, load_robot
-from undulog.capture.log.edit.cut import cut_log
+from undulog.capture.log.cut import cut_log
 from undulog.capture.log.messages.definitions import schema_text
 
 # -- cut -------------------------------------------------------------------------------------

@@ -12,10 +12,10 @@ from support import golden_pictures
 from undulog.capture import Session
 from undulog.capture.common.errors import UndulogError
 from undulog.capture.common.process import StopRequest
+from undulog.replay import progressive
 from undulog.replay.draw.drawing import clock_of
-from undulog.replay.feed import progressive
-from undulog.replay.feed.numbers import Analysing, computed
-from undulog.replay.feed.recording import recording_id, write_recording
+from undulog.replay.numbers import Analysing, computed
+from undulog.replay.recording import recording_id, write_recording
 from undulog.replay.samples.content import Layer
 from undulog.replay.viewer import Viewer
 

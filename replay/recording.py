@@ -27,10 +27,10 @@ from undulog.capture.common.errors import LogWriteError
 from undulog.capture.common.files import check_stop, part_file
 from undulog.capture.common.process import StopRequest
 
-from ..draw.drawing import Drawing, Sources, clock_of
-from ..layout import build_blueprint
-from ..samples.content import Content, Layer, Named
-from ..samples.timeline import stretches
+from .draw.drawing import Drawing, Sources, clock_of
+from .layout import build_blueprint
+from .samples.content import Content, Layer, Named
+from .samples.timeline import stretches
 
 APPLICATION = "undulog"
 

@@ -25,12 +25,10 @@ from typing import cast
 
 from mcap.records import Schema
 
-from ...common.errors import DataError, UsageError, some_names
-from ...common.process import StopRequest
-from ..columns.layouts import names_of
-from ..columns.topics import Topics
-from ..messages.cdr import layout_of
-from ..messages.definitions import JOINT_STATE, parse_message_type
+from ..common.errors import DataError, UsageError, some_names
+from ..common.process import StopRequest
+from .columns.layouts import names_of
+from .columns.topics import Topics
 from .edited_log import (
     EDIT_RECORD,
     HEALTH_RECORD,
@@ -45,6 +43,8 @@ from .edited_log import (
     portable,
     refuse_output,
 )
+from .messages.cdr import layout_of
+from .messages.definitions import JOINT_STATE, parse_message_type
 
 Record = tuple[str, dict[str, str]]
 

@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from undulog.capture.robot.model import Sensor, SensorKind
+from undulog.sim.physics.sensing import rotation_from_rpy
+from undulog.sim.physics.sensors import Accelerometer, Compass
 from undulog.sim.physics.steps import Steps
 from undulog.sim.scenario.sensors import AccelerometerModel, CompassModel
-from undulog.sim.sensing.contract import rotation_from_rpy
-from undulog.sim.sensing.sensors import Accelerometer, Compass
 
 DT, PERIOD, G = 1e-3, 10, 9.81
 GRAVITY = (0.0, 0.0, -G)

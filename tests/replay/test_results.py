@@ -24,7 +24,7 @@ from undulog.analysis.results.experiment import (
 )
 from undulog.capture.common.errors import DataError
 from undulog.capture.robot.kinematics import link_poses
-from undulog.replay.feed.numbers import saved
+from undulog.replay.numbers import saved
 
 PINK = 0xFF5FBEFF
 NO_COUPLING = Coupling(identifiable=False, why="one gait")

@@ -8,8 +8,8 @@ import pytest
 
 from undulog.capture.robot.model import Sensor, SensorKind
 from undulog.sim import Cylinder, InfraredModel, SonarModel, Wall
+from undulog.sim.physics.ranging import Infrared, RayCaster, Sonar, cone, decoded, voltage
 from undulog.sim.physics.steps import Steps
-from undulog.sim.sensing.ranging import Infrared, RayCaster, Sonar, cone, decoded, voltage
 
 DT, PERIOD = 1e-3, 10
 EXACT = InfraredModel(noise_v=0.0, adc_bits=24)

@@ -9,7 +9,7 @@ from undulog.capture import Session
 from undulog.capture.common.errors import DataError, LogWriteError
 from undulog.capture.common.palette import joint_colors
 from undulog.replay.draw.body import ROUNDING
-from undulog.replay.feed.recording import recording_id, write_recording
+from undulog.replay.recording import recording_id, write_recording
 
 
 def converted(file, path, **options):

@@ -30,7 +30,7 @@ from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session, SessionView
 from undulog.capture.common.errors import DataError, UndulogError
 
-from ..samples.content import Layer, Named
+from .samples.content import Layer, Named
 
 _NICENESS = 10
 

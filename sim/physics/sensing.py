@@ -16,8 +16,8 @@ import numpy as np
 from undulog.capture.common.arrays import FloatArray, IntArray, frozen
 from undulog.capture.robot.model import Robot, Sensor
 
-from ..physics.contact import out_of_frames
-from ..physics.engine import BodyState
+from .contact import out_of_frames
+from .engine import BodyState
 
 
 def quantised(values: FloatArray, step: float) -> FloatArray:

@@ -6,8 +6,8 @@ import numpy as np
 import pybullet
 import pytest
 
+from undulog.sim.physics.ranging import RayCaster
 from undulog.sim.scenario.obstacles import Box, Cylinder, Wall
-from undulog.sim.sensing.ranging import RayCaster
 
 INF = math.inf
 
