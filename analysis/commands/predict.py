@@ -73,7 +73,7 @@ def predict(
 
     from undulog.capture.common.files import write_text
 
-    from ..experiment.kicks.prediction import closed_loop
+    from ..experiment.kick_prediction import closed_loop
     from ..present.text import render_loop
 
     first, *others = files

@@ -24,7 +24,7 @@ import numpy as np
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import UsageError
 
-from ..experiment.sweep.multisine_runs import KIND, MOST_LINES, Inputs
+from ..experiment.multisine_runs import KIND, MOST_LINES, Inputs
 from .designs import RATE_HZ, PlannedRun, Tone, dft
 
 GROUP = 4

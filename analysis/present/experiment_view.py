@@ -15,7 +15,7 @@ from undulog.capture.common.palette import joint_hex
 
 from ..experiment.answer import kick_checks, sweep_checks
 from ..experiment.body_connection import connection_detail
-from ..experiment.sweep.coupling import NONLINEAR
+from ..experiment.sweep_coupling import NONLINEAR
 from ..results import formats
 from ..results.coupling import Coupling, LinearCoupling, LocalCoupling
 from ..results.estimate import Estimate, leaves_out_zero

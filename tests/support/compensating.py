@@ -13,8 +13,8 @@ import numpy as np
 
 from support import twin_chains
 from support.closed_loop import Sines
-from undulog.analysis.experiment.kicks.coupling import kick_coupling
-from undulog.analysis.experiment.kicks.runs import KickExperiment, sort_kicks
+from undulog.analysis.experiment.kick_coupling import kick_coupling
+from undulog.analysis.experiment.kick_runs import KickExperiment, sort_kicks
 from undulog.analysis.experiment.pooling import pool_runs
 from undulog.analysis.plan.compensate import KEEP, compensation
 from undulog.analysis.plan.gait_base import BaseGait

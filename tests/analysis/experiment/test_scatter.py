@@ -9,10 +9,10 @@ import pytest
 
 from support.kick_runs import kicked
 from undulog.analysis.experiment.answer import kick_answer
-from undulog.analysis.experiment.kicks.coupling import kick_coupling
-from undulog.analysis.experiment.kicks.local import local_matrices
-from undulog.analysis.experiment.kicks.runs import Kick, Kind, sort_kicks
-from undulog.analysis.experiment.kicks.scatter import run_errors
+from undulog.analysis.experiment.kick_coupling import kick_coupling
+from undulog.analysis.experiment.kick_runs import Kick, Kind, sort_kicks
+from undulog.analysis.experiment.local_coupling import local_matrices
+from undulog.analysis.experiment.run_scatter import run_errors
 
 H, C = kick_tables.chain(5)
 KICKS = kick_tables.plan(5)

@@ -8,7 +8,7 @@ import pytest
 from support.analysed import experiment
 from support.joint_runs import write_joints
 from support.linear_chain import within
-from undulog.analysis.experiment.sweep.coupling import servo_side
+from undulog.analysis.experiment.sweep_coupling import servo_side
 from undulog.analysis.plan.designs import tones
 from undulog.analysis.present.text_experiment import render_experiment
 from undulog.analysis.results.coupling import LinearCoupling, Route

@@ -21,14 +21,14 @@ from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 from undulog.capture.robot.run import Run
 
-from ...estimators.series import Series, clean
-from ...response.changes import DRIFT_PER_CYCLE
-from ...response.fitting import GaitFit
-from ...response.rhythm import DRIVEN_SHARE, NYQUIST_SHARE
-from ...results.answer import Remarks
-from ...session.runs import SAME_FREQUENCY
-from ...signals.columns import read_columns
-from ...signals.stretch import Options, choose_stretch
+from ..estimators.series import Series, clean
+from ..response.changes import DRIFT_PER_CYCLE
+from ..response.fitting import GaitFit
+from ..response.rhythm import DRIVEN_SHARE, NYQUIST_SHARE
+from ..results.answer import Remarks
+from ..session.runs import SAME_FREQUENCY
+from ..signals.columns import read_columns
+from ..signals.stretch import Options, choose_stretch
 from .tones import Beside, Phasors, ToneFit, common_step, find_tones, fit_tones
 
 MOST_CONDITION = 10.0

@@ -1,4 +1,4 @@
-"""From the runs of a kick experiment to its coupling: orchestration of :mod:`.local`.
+"""From the runs of a kick experiment to its coupling: orchestration of :mod:`.local_coupling`.
 
 Are the kicks too small for the noise, or too large for a derivative?
 
@@ -19,8 +19,8 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.console import Warn
 
-from ...estimators.intervals import CONFIDENCE
-from ...results.coupling import (
+from ..estimators.intervals import CONFIDENCE
+from ..results.coupling import (
     BaseResponse,
     Coupling,
     HeldOut,
@@ -31,8 +31,9 @@ from ...results.coupling import (
     RunScatter,
     rows_of,
 )
-from ...results.estimate import Estimate
-from .local import (
+from ..results.estimate import Estimate
+from .kick_runs import MOST_KICK, Kick, KickExperiment, Kind, missing_kicks
+from .local_coupling import (
     LocalMatrices,
     MeasuredDerivatives,
     ResponseMatrices,
@@ -40,8 +41,7 @@ from .local import (
     lti_reading,
     nonlinearity,
 )
-from .runs import MOST_KICK, Kick, KickExperiment, Kind, missing_kicks
-from .scatter import RunErrors, sides
+from .run_scatter import RunErrors, sides
 
 RESOLVED = 0.1
 """Coupling between joints that kicks should be able to show: what the robot's body brings back with

@@ -28,13 +28,13 @@ from scipy import stats
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
 
-from ...response.frequency_response import Kind, joint_response, sound_lines
-from ...response.nonparametric import LineResponse, line_power, noise_power
-from ...results import formats
-from ...results.estimate import Estimate
-from ...results.frequency_response import BestLinearJoint, BestLinearResponses, CrossResponse
+from ..response.frequency_response import Kind, joint_response, sound_lines
+from ..response.nonparametric import LineResponse, line_power, noise_power
+from ..results import formats
+from ..results.estimate import Estimate
+from ..results.frequency_response import BestLinearJoint, BestLinearResponses, CrossResponse
 from .multisine_runs import MultisineRun
-from .runs import MOST_CONDITION
+from .sweep_runs import MOST_CONDITION
 
 IMPURE = 0.01
 """Share of the commands at lines that the plan leaves out from which a warning is given."""

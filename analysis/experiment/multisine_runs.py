@@ -13,12 +13,12 @@ from undulog.capture import SessionView
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import DataError
 
-from ...estimators.series import Series
-from ...response.frequency_response import REPEATED, SAME_COMMAND, Kind, find_excitation
-from ...response.nonparametric import excited_lines, resampled
-from ...response.rhythm import DRIVEN_SHARE
-from ...signals.stretch import Options
-from .runs import read_signals
+from ..estimators.series import Series
+from ..response.frequency_response import REPEATED, SAME_COMMAND, Kind, find_excitation
+from ..response.nonparametric import excited_lines, resampled
+from ..response.rhythm import DRIVEN_SHARE
+from ..signals.stretch import Options
+from .sweep_runs import read_signals
 
 KIND = "odd-random-phase"
 """Value of ``kind`` in the record of each run."""

@@ -16,8 +16,8 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 
-from ...response.fitting import GaitFit
-from ...session.runs import SAME_FREQUENCY, GaitRun
+from ..response.fitting import GaitFit
+from ..session.runs import SAME_FREQUENCY, GaitRun
 
 SAME = 0.01
 """A command that deviates by less, in phase [rad] or log amplitude, is the base's still."""

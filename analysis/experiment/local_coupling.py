@@ -40,11 +40,11 @@ from scipy.special import stdtrit
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 from undulog.capture.common.errors import UsageError
 
-from ...estimators.intervals import CONFIDENCE, Noisy, noise_draws, norm_ratio, welch_satterthwaite
-from ...results.coupling import LTI_LABEL, Lti, rows_of
-from ...results.estimate import Estimate
-from .runs import Kick, Kind
-from .scatter import RunErrors, run_errors, sides
+from ..estimators.intervals import CONFIDENCE, Noisy, noise_draws, norm_ratio, welch_satterthwaite
+from ..results.coupling import LTI_LABEL, Lti, rows_of
+from ..results.estimate import Estimate
+from .kick_runs import Kick, Kind
+from .run_scatter import RunErrors, run_errors, sides
 
 
 @dataclass(frozen=True)

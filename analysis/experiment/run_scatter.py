@@ -27,7 +27,7 @@ import numpy as np
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
-from .runs import Kick, Kind
+from .kick_runs import Kick, Kind
 
 _ZERO = 1e-9
 """A combination of runs that is shorter, once those before it are taken off, is one of them."""

@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 
 from support.linear_chain import asymmetry, within
-from undulog.analysis.experiment.kicks.coupling import predict, valid_to
-from undulog.analysis.experiment.kicks.local import (
-    MeasuredDerivatives,
-    ResponseMatrices,
-    central_differences,
-    lti_reading,
-    nonlinearity,
-    row_sums,
-)
-from undulog.analysis.experiment.kicks.runs import (
+from undulog.analysis.experiment.kick_coupling import predict, valid_to
+from undulog.analysis.experiment.kick_runs import (
     Kick,
     Kind,
     deviation_of,
     kick_of,
     missing_kicks,
     sort_kicks,
+)
+from undulog.analysis.experiment.local_coupling import (
+    MeasuredDerivatives,
+    ResponseMatrices,
+    central_differences,
+    lti_reading,
+    nonlinearity,
+    row_sums,
 )
 from undulog.capture.common.errors import UsageError
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from undulog.analysis.experiment.sweep.best_linear import (
+from undulog.analysis.experiment.best_linear import (
     detection_lines,
     input_inverse,
     over_realisations,

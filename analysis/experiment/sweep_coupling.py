@@ -36,8 +36,8 @@ from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import DataError
 from undulog.capture.robot.model import Servo
 
-from ...estimators.intervals import CONFIDENCE, welch_satterthwaite
-from ...results.coupling import (
+from ..estimators.intervals import CONFIDENCE, welch_satterthwaite
+from ..results.coupling import (
     ComplexMatrix,
     Coupling,
     LinearCoupling,
@@ -45,10 +45,10 @@ from ...results.coupling import (
     ToneCoupling,
     rows_of,
 )
-from ...results.estimate import Estimate
-from ...signals.stretch import Options
-from ..kicks.local import SINGULAR, UNKNOWN_SHAPE, reciprocity
-from .runs import CommandTones, Sweep, SweepData, sweep_data
+from ..results.estimate import Estimate
+from ..signals.stretch import Options
+from .local_coupling import SINGULAR, UNKNOWN_SHAPE, reciprocity
+from .sweep_runs import CommandTones, Sweep, SweepData, sweep_data
 from .tones import Phasors, distortion, sideband_energy
 
 

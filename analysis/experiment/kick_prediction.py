@@ -16,14 +16,14 @@ from scipy.linalg import expm
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 from undulog.capture.common.errors import DataError, UsageError
 
-from ...estimators.intervals import CONFIDENCE, noise_draws
-from ...oscillators.laplacian import intervals_of, spectrum
-from ...oscillators.predictions import felt_response, measured, relaxation
-from ...results import formats
-from ...results.coupling import BaseResponse, LocalCoupling, rows_of
-from ...results.estimate import Estimate
-from ...results.oscillators import ClosedLoop, LoopMode, Relaxation
-from .local import MeasuredDerivatives, stacked
+from ..estimators.intervals import CONFIDENCE, noise_draws
+from ..oscillators.laplacian import intervals_of, spectrum
+from ..oscillators.predictions import felt_response, measured, relaxation
+from ..results import formats
+from ..results.coupling import BaseResponse, LocalCoupling, rows_of
+from ..results.estimate import Estimate
+from ..results.oscillators import ClosedLoop, LoopMode, Relaxation
+from .local_coupling import MeasuredDerivatives, stacked
 
 POINTS = 50
 """Times at which the rest of a kick is predicted."""

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.experiment.sweep.coupling import (
+from undulog.analysis.experiment.sweep_coupling import (
     impedance,
     impedance_behind_servos,
     servo_side,
     transfer,
 )
-from undulog.analysis.experiment.sweep.runs import CommandTones, find_sweep
-from undulog.analysis.experiment.sweep.tones import Phasors, common_step, find_tones, fit_tones
+from undulog.analysis.experiment.sweep_runs import CommandTones, find_sweep
+from undulog.analysis.experiment.tones import Phasors, common_step, find_tones, fit_tones
 from undulog.capture.robot.model import Servo
 
 LINEAR = dataclasses.replace(Servo(), coulomb_friction=0.0)
