@@ -1,8 +1,8 @@
 """Modes of I - P, the signed Laplacian of what the body couples.
 
-With P = d psi / d psi_c of open-loop kicks (:mod:`.analysis.experiment.local_coupling`) and generators
-with feedback from their own servos, eps P_ij is the embodied coupling, and deviations of the phases
-relax as
+With P = d psi / d psi_c of open-loop kicks (:mod:`.analysis.experiment.local_coupling`) and
+generators with feedback from their own servos, eps P_ij is the embodied coupling, and deviations of
+the phases relax as
 
     d phi' = -eps (I - P) d phi,
 

@@ -10,11 +10,10 @@ from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.log.messages.frames import DIR_TX, ERROR_FLAG, empty_frames
 from undulog.capture.robot.model import OnFault
 from undulog.capture.sources.events import BUS_OFF
-from undulog.sim.gait.contract import GaitTick, Readings
-from undulog.sim.gate.feedback import BusCheck
-from undulog.sim.gate.gate import HOLD_S, POSE_S, Gate
-from undulog.sim.gate.limits import gate_limits
-from undulog.sim.gate.outcome import (
+from undulog.sim.drive.feedback import BusCheck
+from undulog.sim.drive.gate import HOLD_S, POSE_S, Gate
+from undulog.sim.drive.limits import gate_limits
+from undulog.sim.drive.outcome import (
     DriveEnding,
     FaultKind,
     GateFault,
@@ -23,6 +22,7 @@ from undulog.sim.gate.outcome import (
     Phase,
     jitter,
 )
+from undulog.sim.gait.contract import GaitTick, Readings
 
 ROBOT = load_robot("snake25")
 LIMITS = gate_limits(ROBOT)

@@ -9,18 +9,6 @@ import pytest
 from undulog.capture.robot.description import load_robot
 from undulog.capture.robot.model import Plane, Robot, Sensor, SensorKind
 from undulog.sim import PlaneGait, Readings, Serpentine
-from undulog.sim.control.adaptive import (
-    AVOID,
-    HASTEN,
-    SHRINK,
-    TURN,
-    AdaptiveGait,
-    RandomHeadingPolicy,
-    StraightOn,
-    TargetHeadingPolicy,
-)
-from undulog.sim.control.filters import Pose, SlipOdometry
-from undulog.sim.control.reactions import ControlInput, Distances, ObstacleMonitor
 from undulog.sim.gait.contract import WALK
 from undulog.sim.scenario.motion import (
     Controller,
@@ -34,6 +22,18 @@ from undulog.sim.scenario.motion import (
 )
 from undulog.sim.scenario.motion import Lookout as LookoutParameters
 from undulog.sim.scenario.sensors import layout
+from undulog.sim.twin.adaptive import (
+    AVOID,
+    HASTEN,
+    SHRINK,
+    TURN,
+    AdaptiveGait,
+    RandomHeadingPolicy,
+    StraightOn,
+    TargetHeadingPolicy,
+)
+from undulog.sim.twin.filters import Pose, SlipOdometry
+from undulog.sim.twin.reactions import ControlInput, Distances, ObstacleMonitor
 
 SNAKE = load_robot("snake25")
 WAVE = Serpentine({Plane.HORIZONTAL: PlaneGait(0.3, 0.5, math.pi / 6)}, ramp_s=0.0)

@@ -15,10 +15,10 @@ from hypothesis.extra.numpy import arrays
 from support.decoded_commands import ROBOT, on_the_bus
 from undulog.capture.common.errors import SourceError, UsageError
 from undulog.capture.robot.model import OnFault
+from undulog.sim.drive.gate import Gate
+from undulog.sim.drive.limits import gate_limits
+from undulog.sim.drive.outcome import FaultKind, GateFault, GateInput, JointStatus, Phase
 from undulog.sim.gait.contract import GaitTick, Readings
-from undulog.sim.gate.gate import Gate
-from undulog.sim.gate.limits import gate_limits
-from undulog.sim.gate.outcome import FaultKind, GateFault, GateInput, JointStatus, Phase
 
 COUNT, RATE_HZ = len(ROBOT.joints), 100
 STEP = math.radians(0.01)  # of a command on the bus

@@ -9,8 +9,8 @@
 
 It decides once a control tick what is sent. Until the pose of every joint is known it sends
 nothing; then it ramps to the first pose, then lets the gait through, cut to what the robot may do
-(:mod:`.sim.gate.limits`). A fault or a request to stop leads to the ending that the robot's file
-names. While the bus is silent (:mod:`.sim.gate.feedback`) nothing is sent, and the servos hold; the
+(:mod:`.limits`). A fault or a request to stop leads to the ending that the robot's file
+names. While the bus is silent (:mod:`.feedback`) nothing is sent, and the servos hold; the
 ending begins when a joint is received again. It opens nothing and never blocks.
 """
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from undulog.sim.control import filters
-from undulog.sim.control.reactions import amplitude, bend, frequency
+from undulog.sim.twin import filters
+from undulog.sim.twin.reactions import amplitude, bend, frequency
 
 DISTANCES = np.linspace(0.0, 3.0, 31)
 

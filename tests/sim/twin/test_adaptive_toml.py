@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from support.twin_runs import SNAKE13, SNAKE25, check_keys, faults_of
 from undulog.sim import Readings, load_scenario, parse_scenario
-from undulog.sim.control.adaptive import build_gait
 from undulog.sim.scenario.motion import (
     Calibration,
     Controller,
@@ -22,6 +21,7 @@ from undulog.sim.scenario.motion import (
     TailHaste,
     TargetHeading,
 )
+from undulog.sim.twin.adaptive import build_gait
 
 TARGET = "[world.target]\nposition = [3.0, 1.0]\n"
 BASE = SNAKE25 + TARGET

@@ -12,9 +12,9 @@ from hypothesis.extra.numpy import arrays
 from support.decoded_commands import ROBOT, on_the_bus
 from undulog.capture.common.errors import UsageError
 from undulog.capture.robot.model import OnFault
-from undulog.sim.gate.feedback import CurrentLimiter
-from undulog.sim.gate.limits import Clamp, Ending, Ramp, Spacing, gate_limits
-from undulog.sim.gate.outcome import JointStatus
+from undulog.sim.drive.feedback import CurrentLimiter
+from undulog.sim.drive.limits import Clamp, Ending, Ramp, Spacing, gate_limits
+from undulog.sim.drive.outcome import JointStatus
 
 LIMITS = gate_limits(ROBOT)
 PERIOD_S = 0.01

@@ -254,7 +254,7 @@ class Clamp:
     It knows the command before, which the servos hold: a step is measured from there, and is at
     most what the greatest rate allows in one control period, also where ticks were left out. What
     was late is caught up step by step and never by a jump; that the steps are a period apart in
-    true time, too, is for :mod:`.sim.gate.limits`.
+    true time, too, is for :mod:`.sim.drive.limits`.
 
     Attributes:
         last: What was commanded last, at first the pose [rad], shape (m,).

@@ -12,8 +12,8 @@ import pytest
 
 from support.far_end import beyond_rate, largest_burst
 from undulog.capture import load_robot
-from undulog.sim.gate.feedback import Confirmation, Silence
-from undulog.sim.gate.limits import Clamp, gate_limits
+from undulog.sim.drive.feedback import Confirmation, Silence
+from undulog.sim.drive.limits import Clamp, gate_limits
 
 LIMITS = gate_limits(load_robot("snake25"))
 COUNT, PERIOD_S, STEP = 25, 0.01, 0.04
