@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from undulog.capture import SessionView
 
     from ..plan.compensate import Compensation
-    from ..plan.gait_base import BaseGait
+    from ..plan.runs import BaseGait
     from ..results.coupling import Coupling, LocalCoupling
     from ..session.runs import GaitRun
     from .plan import Planned
@@ -185,7 +185,7 @@ def compensate(
         from dataclasses import asdict
 
         from ..plan.compensate import compensation
-        from ..plan.designs import PlannedRun
+        from ..plan.runs import PlannedRun
 
         found, amplitude = compensation(
             coupling, base, session.robot, driven, target_gain=gain, keep=keep
