@@ -17,7 +17,7 @@ import numpy as np
 from markupsafe import Markup
 
 from undulog.capture.common.arrays import BoolArray, FloatArray
-from undulog.capture.common.palette import joint_hex
+from undulog.capture.common.palette import joint_hex, scale_ends
 
 from ..results.estimate import Estimate
 from ..results.formats import decimals_for_values, degrees, estimate, number, short
@@ -183,12 +183,7 @@ class Map:
     @property
     def limits(self) -> tuple[float, float]:
         """The values at the ends of the colours."""
-        low, high = float(np.nanmin(self.value)), float(np.nanmax(self.value))
-        if self.signed:
-            high = max(abs(low), abs(high), self.least / 2)
-            return -high, high
-        short_by = max(0.0, self.least - (high - low)) / 2
-        return low - short_by, high + short_by
+        return scale_ends(self.value, self.least, signed=self.signed)
 
 
 def cycle_drawings(cycles: CycleMaps, prefix: str) -> tuple[Drawing, ...]:
