@@ -14,10 +14,10 @@ from typing import TypeVar
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.commands.info import base_versions
 from undulog.capture.common.arrays import ComplexArray
 from undulog.capture.common.console import Warn, plain
 from undulog.capture.common.errors import DataError, UsageError
+from undulog.capture.common.extras import base_versions
 
 from ..estimators.intervals import CONFIDENCE, around, t_factor
 from ..results.answer import NotFollowing, StandOut

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.commands.info import base_versions
 from undulog.capture.common.arrays import ComplexArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import UsageError
+from undulog.capture.common.extras import base_versions
 from undulog.capture.robot.model import Robot
 
 from ..body.connection import MIN_GAITS

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 
 from undulog.capture import SessionView
-from undulog.capture.commands.info import base_versions
 from undulog.capture.common.console import Warn
+from undulog.capture.common.extras import base_versions
 from undulog.capture.following.find import times_made
 from undulog.capture.log.health.rules import judge_made_times
 from undulog.capture.log.read.sample_times import Signal
