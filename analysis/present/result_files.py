@@ -61,7 +61,7 @@ def save(result: PresentedResult, path: Path, *, force: bool) -> Path:
 
 
 def save_tables(result: PresentedResult, folder: Path, *, force: bool) -> list[Path]:
-    """Write the tables as Parquet; see :meth:`.results.estimate.PresentedResult.to_parquet`."""
+    """Write the tables as Parquet; see :meth:`.PresentedResult.to_parquet`."""
     frames = result.frames()
     folder.mkdir(parents=True, exist_ok=True)
     paths = {folder / f"{name}.parquet": frame for name, frame in frames.items()}
