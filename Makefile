@@ -49,7 +49,7 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 COMPUTING = tests/analysis tests/docs \
   $(addprefix tests/capture/,following robot) \
   $(addprefix tests/replay/,calibrate draw sweep) \
-  $(addprefix tests/sim/,batch gait physics scenario sensing twin)
+  $(addprefix tests/sim/,batch gait physics scenario twin)
 define tests
 	@log=$$(mktemp); \
 	$(BIN)/python -m pytest -p no:cacheprovider -m $(1) $(COMPUTING) >$$log 2>&1 & first=$$!; \

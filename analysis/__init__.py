@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from .compare.compare import compare_sessions as compare_sessions
     from .compare.decisions import Margins as Margins
     from .experiment.analyse import analyse_experiment as analyse_experiment
-    from .present.notebook.files import Picture as Picture
-    from .present.notebook.files import load as load
+    from .present.result_files import Picture as Picture
+    from .present.result_files import load as load
     from .present.text import render as render
     from .results.analysis import Analysis as Analysis
     from .results.analysis import Index as Index
@@ -47,9 +47,9 @@ if TYPE_CHECKING:
 
 
 def _presentation() -> Any:
-    from .present.notebook import files
+    from .present import result_files
 
-    return files
+    return result_files
 
 
 present_with(_presentation)
@@ -70,13 +70,13 @@ __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
         "LocalCoupling": "results.coupling",
         "Margins": "compare.decisions",
         "Options": "signals.stretch",
-        "Picture": "present.notebook.files",
+        "Picture": "present.result_files",
         "Reversal": "results.experiment",
         "analyse_experiment": "experiment.analyse",
         "analyse_fleet": "catalog.fleet",
         "analyse_session": "session.analyse",
         "compare_sessions": "compare.compare",
-        "load": "present.notebook.files",
+        "load": "present.result_files",
         "render": "present.text",
     },
 )

@@ -14,8 +14,12 @@ import sys
 
 import numpy as np
 
-from undulog.analysis.experiment.kicks.local import ResponseMatrices, local_matrices, nonlinearity
-from undulog.analysis.experiment.kicks.runs import Kick, Kind
+from undulog.analysis.experiment.kick_runs import Kick, Kind
+from undulog.analysis.experiment.local_coupling import (
+    ResponseMatrices,
+    local_matrices,
+    nonlinearity,
+)
 
 NOISE = np.radians(0.01)
 """Of one run's phase as its fit knows it [rad], and of its log amplitude."""

@@ -32,10 +32,10 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.palette import joint_hex
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.sim import load_scenario
-from undulog.sim.control.reactions import amplitude, bend, frequency
 from undulog.sim.scenario.obstacles import Cylinder, Wall
 from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.scenario.world import World
+from undulog.sim.twin.reactions import amplitude, bend, frequency
 from undulog.sim.twin.recording import record
 
 GREY = "#8c8c8c"

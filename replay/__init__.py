@@ -22,15 +22,15 @@ from typing import TYPE_CHECKING
 from undulog.capture.common.extras import attach
 
 if TYPE_CHECKING:
-    from .feed.recording import Recording as Recording
-    from .feed.recording import write_recording as write_recording
+    from .recording import Recording as Recording
+    from .recording import write_recording as write_recording
     from .samples.content import Content as Content
 
 __getattr__, __all__ = attach(  # pyright: ignore[reportUnsupportedDunderAll]
     __name__,
     {
         "Content": "samples.content",
-        "Recording": "feed.recording",
-        "write_recording": "feed.recording",
+        "Recording": "recording",
+        "write_recording": "recording",
     },
 )

@@ -21,7 +21,7 @@ from undulog.capture import Session, SessionView, load_robot
 from undulog.capture.common.console import echo, emit_json
 from undulog.capture.common.errors import DataError, MissingChannelError, UsageError
 from undulog.capture.common.process import StopRequest
-from undulog.capture.log.edit.edited_log import RawLog
+from undulog.capture.log.edited_log import RawLog
 from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from undulog.sim.commands.drive import drive_armed, dry_run_on_bus, early_end
 from undulog.sim.drive.in_process import drive_twin

@@ -4,8 +4,8 @@ Phases phi_k = arg a_k of the joints at places x_k are fitted by a line, phi = p
 weights |a_k|^2. Where all joints have the same white noise that is maximum likelihood and reaches
 the Cramer-Rao bound; and where the phases aren't on a line, the slope is the same whatever the
 noise. The slope kappa is a contrast of the phases, so its interval comes from the same bins of the
-residual as that of any other contrast (:mod:`.estimators.intervals`), whatever noise the joints
-share.
+residual as that of any other contrast (:mod:`.analysis.estimators.intervals`), whatever noise the
+joints share.
 """
 
 from __future__ import annotations

@@ -18,9 +18,8 @@ from undulog.capture.common.errors import InputFileError, UndulogError
 from undulog.capture.common.remote import ObjectStore, StoredFile
 from undulog.capture.log.file.bag import is_bag
 from undulog.capture.log.file.bag_metadata import METADATA, is_rosbag2
-from undulog.capture.log.file.log_paths import log_paths, walk
-from undulog.capture.log.read.bag_facts import read_bag_facts
-from undulog.capture.log.read.facts import LogFacts, read_facts
+from undulog.capture.log.file.parts import log_paths, walk
+from undulog.capture.log.read.facts import LogFacts, read_bag_facts, read_facts
 
 FOLDER = ".undulog-catalog"
 """Folder of the catalogue, beside the sessions."""

@@ -84,7 +84,7 @@ def analyse(
         check_output(output, (".json",), why, force=force)
     one_by_one = len(paths) > 1 and (each or not are_as_given(paths, files))
     if csv is not None:
-        from ..present.notebook.frames import check_csv
+        from ..present.data_frames import check_csv
 
         check_csv(csv, force=force, several=one_by_one)
     if one_by_one:
@@ -96,7 +96,7 @@ def analyse(
     if output is not None:
         result.save(output, force=True)  # refused before the work began, if it was there
     if csv is not None:
-        from ..present.notebook.frames import write_csv
+        from ..present.data_frames import write_csv
 
         write_csv([result], csv, force=force)
     if json:
@@ -158,7 +158,7 @@ def _table(
     work = partial(_line, options=options, robot=robot, found=None if csv is None else found)
     lines = each_session(paths, "analyse", work)
     if csv is not None:
-        from ..present.notebook.frames import write_csv
+        from ..present.data_frames import write_csv
 
         write_csv(found, csv, force=True)  # refused before the work began, if it was there
     if output is not None:

@@ -98,7 +98,7 @@ def _write(result: Comparison, output: Path) -> None:
     if output.suffix.lower() not in PAGES:
         result.save(output, force=True)
         return
-    from ..present.page.page import render
+    from ..present.page import render
 
     write_text(output, render(result))
 

@@ -17,8 +17,7 @@ from undulog.capture.common.errors import UsageError
 if TYPE_CHECKING:
     from undulog.capture import SessionView
 
-    from ..plan.designs import PlannedRun
-    from ..plan.gait_base import BaseGait
+    from ..plan.runs import BaseGait, PlannedRun
 
 
 LEAST, MOST = 0.01, 0.12
@@ -152,8 +151,7 @@ def write_sessions(
     """
     from undulog.capture import Session
 
-    from ..plan.designs import write_plan
-    from ..plan.gait_base import base_gait
+    from ..plan.runs import base_gait, write_plan
 
     with Session.open(like) as opened:
         session = topics.view(opened)
@@ -266,8 +264,8 @@ def settling(base: BaseGait, session: SessionView) -> tuple[float, dict[str, str
         The time [s], the commands' ramp included, and the slowest mode for the metadata; without
         a robot description the least time, and nothing.
     """
-    from ..plan.designs import RAMP_S
-    from ..plan.gait_base import TIME_CONSTANTS, slowest_mode
+    from ..plan.designs import TIME_CONSTANTS, slowest_mode
+    from ..plan.runs import RAMP_S
 
     robot = session.robot_as_run
     if robot is None:
@@ -426,7 +424,7 @@ def _write_band(
     as_json: bool,
 ) -> None:
     """Write odd random-phase multisines over a band."""
-    from ..plan.random_phase import odd_lines, random_phase_runs
+    from ..plan.designs import odd_lines, random_phase_runs
 
     amplitude, repeats, settle_s = numbers
     if options.periods < 1 or options.realisations < 1 or options.seed < 0:
@@ -439,7 +437,7 @@ def _write_band(
         raise UsageError("--settle is at least 0")
 
     def base_of(session: SessionView) -> BaseGait:
-        from ..plan.gait_base import base_pose
+        from ..plan.runs import base_pose
 
         return base_pose(session, options.joint or None, 2 * math.pi / options.period)
 

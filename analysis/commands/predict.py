@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from undulog.capture import SessionView
 
     from ..plan.compensate import Compensation
-    from ..plan.gait_base import BaseGait
+    from ..plan.runs import BaseGait
     from ..results.coupling import Coupling, LocalCoupling
     from ..session.runs import GaitRun
     from .plan import Planned
@@ -73,7 +73,7 @@ def predict(
 
     from undulog.capture.common.files import write_text
 
-    from ..experiment.kicks.prediction import closed_loop
+    from ..experiment.kick_prediction import closed_loop
     from ..present.text import render_loop
 
     first, *others = files
@@ -112,7 +112,7 @@ def coupling_of_result(file: Path) -> LocalCoupling:
     Raises:
         DataError: If the file holds none.
     """
-    from ..present.notebook.files import load
+    from ..present.result_files import load
     from ..results.coupling import Coupling
     from ..results.experiment import Experiment
 
@@ -185,7 +185,7 @@ def compensate(
         from dataclasses import asdict
 
         from ..plan.compensate import compensation
-        from ..plan.designs import PlannedRun
+        from ..plan.runs import PlannedRun
 
         found, amplitude = compensation(
             coupling, base, session.robot, driven, target_gain=gain, keep=keep

@@ -180,7 +180,7 @@ class _Outputs:
         self.first = self.paths[0]
         self._browser = ""
         if pdf is not None:
-            from ..present.page.page import find_browser
+            from ..present.page import find_browser
 
             self._browser = find_browser(browser)
 
@@ -188,7 +188,7 @@ class _Outputs:
         if self._page is not None:
             write_text(self._page, page)
         if self._pdf is not None:
-            from ..present.page.page import write_pdf
+            from ..present.page import write_pdf
 
             with progress("print", total=1) as bar:
                 bar.update(0, note=self._pdf.name)
@@ -204,7 +204,7 @@ def _keeping(figures: _Figures | None) -> AbstractContextManager[Mapping[str, An
     """Keep the figures that are drawn, if they are wanted."""
     if figures is None:
         return nullcontext({})
-    from ..present.page.svg import kept_figures
+    from ..present.svg import kept_figures
 
     return kept_figures()
 
@@ -213,7 +213,7 @@ class _Figures:
     """Where the figures of pages go, and as what."""
 
     def __init__(self, folder: Path, kind: _Format, *, force: bool) -> None:
-        from ..present.notebook.plot_files import check_plots
+        from ..present.plot_files import check_plots
 
         check_plots(folder, kind, force=force)
         self._folder, self._force = folder, force
@@ -221,7 +221,7 @@ class _Figures:
 
     def save(self, page: str, drawn: Mapping[str, Any], name: str | None = None) -> list[Path]:
         """Write the figures of a page, into a folder of a name in the folder if there is one."""
-        from ..present.notebook.plot_files import save_plots
+        from ..present.plot_files import save_plots
 
         folder = self._folder
         if name is not None:
@@ -245,7 +245,7 @@ def _page(
 ) -> tuple[str, Analysis]:
     from undulog.capture import Session
 
-    from ..present.page.page import render
+    from ..present.page import render
     from ..session.analyse import measure_session
     from ..session.cycles import cycle_maps
 
@@ -266,7 +266,7 @@ def _pages(
     as_json: bool,
 ) -> int:
     """Write a page for each session into a folder, and an index of them."""
-    from ..present.page.page import render_index
+    from ..present.page import render_index
 
     index = folder / "index.html"
     folder.mkdir(exist_ok=True)
@@ -314,7 +314,7 @@ def _fleet(where: str, find: str, output: Path) -> _Page:
     """Return the page on the sessions of a catalogue."""
     from ..catalog.catalog import Catalog
     from ..catalog.fleet import analyse_fleet
-    from ..present.page.page import render_fleet
+    from ..present.page import render_fleet
 
     found = Catalog(where)
     with progress("report", total=2) as bar:
@@ -336,7 +336,7 @@ def _one_by_one(files: Sequence[Path], options: Options, robot: str | None) -> _
     """Return one page on sessions by themselves."""
     from undulog.capture import Session
 
-    from ..present.page.page import SessionsPage
+    from ..present.page import SessionsPage
     from ..session.analyse import measure_session
     from ..session.cycles import cycle_maps
 
@@ -362,7 +362,7 @@ def _one_by_one(files: Sequence[Path], options: Options, robot: str | None) -> _
 
 def _several(files: Sequence[Path], options: Options, robot: str | None) -> _Page:
     """Return the page on an experiment."""
-    from ..present.page.page import render
+    from ..present.page import render
 
     experiment = experiment_of(files, options, "report", robot=robot)
     page = render(experiment)

@@ -14,19 +14,18 @@ from typing import TypeVar
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.commands.info import base_versions
 from undulog.capture.common.arrays import ComplexArray
 from undulog.capture.common.console import Warn, plain
 from undulog.capture.common.errors import DataError, UsageError
+from undulog.capture.common.extras import base_versions
 
 from ..estimators.intervals import CONFIDENCE, around, t_factor
-from ..results import formats
 from ..results.answer import NotFollowing, StandOut
 from ..results.comparison import BrokenJoint, Comparison, Waveform
 from ..results.estimate import Estimate, Provenance
 from ..segments.answer import deviation_in_words, fault_in_words
 from ..segments.examine import OFFSET_RAD
-from ..session.runs import SAME_COMMAND, GaitRun, command_change, other_frequency
+from ..session.runs import GaitRun, command_difference, other_frequency
 from ..signals.stretch import Options
 from .decisions import Margins, answer_of, decide, differ, estimates_of, family
 from .quantities import Motion, Quantities, common_motion, motion_estimates
@@ -155,16 +154,10 @@ def gait_fault(run: GaitRun, model: GaitRun, names: Sequence[str]) -> str | None
     groups, others = ([one.group[one.names.index(name)] for name in names] for one in (run, model))
     if groups != others:
         return f"{run.label} has other joints than {model.label} at one frequency"
-    change = np.ones_like(own)
-    for group in set(groups):
-        members = [k for k, one in enumerate(groups) if one == group]
-        change[members] = command_change(own[members], other[members])
-    deviation = np.abs(change - 1)
-    worst = int(np.argmax(deviation))
-    if deviation[worst] <= SAME_COMMAND:
+    members = [np.flatnonzero(np.array(groups) == group) for group in set(groups)]
+    if (off := command_difference(own, other, members)) is None:
         return None
-    percent = formats.number(100 * (float(np.abs(change[worst])) - 1), 1)
-    degrees = formats.number(float(np.degrees(np.angle(change[worst]))), 1)
+    worst, percent, degrees = off
     return (
         f"at {names[worst]} the command of {run.label} is {percent} % in amplitude and {degrees} "
         f"degrees in phase off that of {model.label}"

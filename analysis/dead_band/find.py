@@ -10,11 +10,11 @@ import numpy as np
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray
 
-from ..artefacts.scales import resolution_of, runs
 from ..estimators.series import Series, clean_together, shared_times
 from ..response.fitting import GaitFit
 from ..results.answer import EITHER, PLAY, STICK, DeadBand, Reversal
 from ..signals.columns import Columns
+from ..signals.scales import resolution_of, runs
 from .fit import Fitted, fit_dead_bands
 from .model import BOTTOM, DELAY, TOP, WIDTH, Cycles, whole_cycles
 

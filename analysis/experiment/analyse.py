@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from undulog.capture import SessionView
-from undulog.capture.commands.info import base_versions
 from undulog.capture.common.arrays import ComplexArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.errors import UsageError
+from undulog.capture.common.extras import base_versions
 from undulog.capture.robot.model import Robot
 
 from ..body.connection import MIN_GAITS
@@ -42,17 +42,17 @@ from ..session.runs import (
 )
 from ..signals.stretch import Options
 from .answer import broken_first, experiment_answer, kick_answer, sweep_answer
+from .best_linear import best_linear_responses, multisine_answer
 from .body_connection import MOST_DISTANCE, GaitSession, body_connection, connection_answer
-from .kicks.coupling import kick_coupling
-from .kicks.local import ROW_TOLERANCE
-from .kicks.runs import MOST_KICK, MOST_PATTERN, SAME, find_kicks
+from .kick_coupling import kick_coupling
+from .kick_runs import MOST_KICK, MOST_PATTERN, SAME, find_kicks
+from .local_coupling import ROW_TOLERANCE
 from .mirror import MIN_RUNS, MOST_LABELLINGS, RANDOM_LABELLINGS
+from .multisine_runs import MultisineRun, MultisineRuns, find_multisine, multisine_run
 from .pooling import PooledResponse, experiment_indices, pool_runs, pooled_answer
 from .reversal import RESAMPLES, SAME_HEADING_RAD, SIGNIFICANT, floor_lean, reversal_of
-from .sweep.best_linear import best_linear_responses, multisine_answer
-from .sweep.coupling import NONLINEAR, sweep_coupling
-from .sweep.multisine_runs import MultisineRun, MultisineRuns, find_multisine, multisine_run
-from .sweep.runs import MOST_CONDITION, CommandTones, Sweep, command_tones, find_sweep
+from .sweep_coupling import NONLINEAR, sweep_coupling
+from .sweep_runs import MOST_CONDITION, CommandTones, Sweep, command_tones, find_sweep
 
 _LOW_FLOOR = 0.01
 """A p-value that can't go below this leaves little room under the level."""

@@ -4,8 +4,8 @@ One direction recorded, and a model of identical modules: does any module deviat
 
 Let y = ln(response / command) of m joints have the covariance S, block-diagonal by joints, and let
 the model say f(x) for identical modules whose shared parameters are exp(x) times the assumed ones,
-x known beforehand up to a covariance P (:mod:`.robot.null_model`). Then, by generalised least
-squares::
+x known beforehand up to a covariance P (:mod:`.capture.robot.null_model`). Then, by generalised
+least squares::
 
     Q = min r' S^-1 r + x' P^-1 x,    r = y - f(x) - D z
 

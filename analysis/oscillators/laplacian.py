@@ -1,8 +1,8 @@
 """Modes of I - P, the signed Laplacian of what the body couples.
 
-With P = d psi / d psi_c of open-loop kicks (:mod:`.analysis.experiment.kicks.local`) and generators
-with feedback from their own servos, eps P_ij is the embodied coupling, and deviations of the phases
-relax as
+With P = d psi / d psi_c of open-loop kicks (:mod:`.analysis.experiment.local_coupling`) and
+generators with feedback from their own servos, eps P_ij is the embodied coupling, and deviations of
+the phases relax as
 
     d phi' = -eps (I - P) d phi,
 
@@ -26,7 +26,6 @@ in :mod:`.laplacian`.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -131,34 +130,6 @@ def growth(P: FloatArray) -> float:
     """
     rates = of_deviations(P)
     return -float(np.linalg.eigvalsh((rates + rates.T) / 2)[0])
-
-
-def henrici(P: FloatArray) -> float:
-    """Return how far I - P is from normal, 0 for a normal matrix and always below 1.
-
-    Args:
-        P: d psi / d psi_c, shape (m, m).
-
-    Returns:
-        sqrt(||A||^2 - sum |lambda|^2) / ||A||, Frobenius, A = I - P on deviations that sum to 0
-        (Henrici, Numerische Mathematik 4, 1962).
-    """
-    A = of_deviations(P)
-    total = float(np.sum(A**2))
-    inside = float(np.sum(np.abs(np.linalg.eigvals(A)) ** 2))
-    return math.sqrt(max(0.0, total - inside) / total) if total > 0.0 else 0.0
-
-
-def pattern_condition(P: FloatArray) -> float:
-    """Return the condition number of the patterns: 1 where I - P is normal.
-
-    A change of P by s moves no rate by more than this times s (Bauer & Fike, Numerische
-    Mathematik 2, 1960).
-
-    Args:
-        P: d psi / d psi_c, shape (m, m).
-    """
-    return float(np.linalg.cond(np.linalg.eig(of_deviations(P)).eigenvectors))
 
 
 def intervals_of(P: FloatArray, drawn: FloatArray) -> SpectrumIntervals:

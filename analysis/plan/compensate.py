@@ -45,7 +45,7 @@ from ..results.analysis import Index
 from ..results.coupling import LocalCoupling
 from ..session.heterogeneity import response_indices
 from ..session.runs import SAME_COMMAND, SAME_FREQUENCY, GaitRun, command_change
-from .gait_base import BaseGait
+from .runs import BaseGait
 
 RESERVE = 0.01
 """Share of a servo's limit that commands leave free."""

@@ -1,6 +1,8 @@
-"""Which runs an experiment needs, as deviations of the commands from a gait.
+"""Designs of experiments: which runs each needs, and how long a chain rings before it is measured.
 
-Runs that make the coupling of a chain without contact identifiable: lag sweep and multisine.
+Phase kicks and the reversal of a wave are deviations from a recorded gait. A lag sweep and a
+multisine make the coupling of a chain without contact identifiable, a band of odd random-phase
+multisines the best linear approximation.
 
 Without contact, at small amplitude, a = H c at every frequency. From r runs, Y = H C; H = Y C^-1 is
 best estimated when C is a DFT matrix, C_jk = A exp(j 2 pi j k / m): its condition number is 1. A
@@ -12,66 +14,35 @@ signals for MIMO frequency response function measurements", IEEE Trans. Instrum.
 from __future__ import annotations
 
 import math
-import re
-import time
-import uuid
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 
-from undulog.capture import SessionView, SessionWriter
-from undulog.capture.common.arrays import ComplexArray, FloatArray
-from undulog.capture.common.errors import LogWriteError, UsageError
-from undulog.capture.common.files import part_file
+from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
+from undulog.capture.common.errors import UsageError
+from undulog.capture.robot.model import Joint, Plane, Robot
 
+from ..experiment.multisine_runs import KIND, MOST_LINES, Inputs
 from ..session.runs import HEADING
-from .gait_base import BaseGait
+from .runs import RATE_HZ, PlannedRun, Tone
 
 HELD_OUT = (0.05, 0.1, 0.15)
 """Largest random phase of each held-out pattern [rad]."""
 
+TIME_CONSTANTS = 5.0
+"""So many of the slowest mode's time constants are waited for: 0.7 % of it is left."""
 
-@dataclass(frozen=True)
-class Tone:
-    """A sine at a frequency of its own, in all driven joints.
+GROUP = 4
+"""Consecutive odd lines of which one is left out."""
 
-    Attributes:
-        omega: Angular frequency [rad/s].
-        amplitude: Complex amplitudes of the driven joints' commands [rad], shape (m,).
-    """
+DRAWS = 64
+"""Draws of the phases of which the one with the least peak is taken."""
 
-    omega: float
-    amplitude: ComplexArray
-
-
-@dataclass(frozen=True)
-class PlannedRun:
-    """One run's commands.
-
-    Attributes:
-        amplitude: Complex amplitudes of the driven joints' commands at the gait's frequency [rad],
-            shape (m,).
-        facts: What it is, for its metadata record.
-    """
-
-    label: str
-    amplitude: ComplexArray
-    facts: dict[str, str] = field(default_factory=dict[str, str])
-    more: tuple[Tone, ...] = ()
-
-    def tones(self, omega: float) -> tuple[Tone, ...]:
-        """Return frequencies of which none is another plus a whole number of the gait's.
-
-        Args:
-            omega: The gait's angular frequency [rad/s].
-
-        Returns:
-            The tone at the gait's frequency, then the others.
-        """
-        return (Tone(omega, self.amplitude), *self.more)
+LEAST_LINES = 6
+HIGHEST_HZ = RATE_HZ / 8
+"""Highest excited frequency [Hz]: above it the samples of the plan hardly follow a sine."""
 
 
 def phase_kicks(
@@ -224,139 +195,242 @@ def dft(m: int) -> ComplexArray:
     return np.exp(2j * np.pi / m * place[:, None] * place[None, :]).astype(np.complex128)
 
 
-RATE_HZ = 100
-RAMP_S = 2.0
-"""Time over which the amplitude grows from zero, if the settling leaves as much."""
+@dataclass(frozen=True)
+class Multisine:
+    """What the realisations of one experiment share.
 
-_LONGEST_STEM = 80
-_TONES_AT_ONCE = 16
+    Attributes:
+        lines: Excited multiples of 1 / ``period_s``, odd, ascending, shape (k,).
+        period_s: After which the commands repeat [s].
+        amplitude: Of each excited line's sine [rad].
+        peak: Largest deviation from the offset in any run [rad].
+    """
+
+    lines: IntArray
+    period_s: float
+    amplitude: float
+    peak: float
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of each command about its offset [rad]."""
+        return self.amplitude * float(np.sqrt(self.lines.size / 2))
 
 
-def write_plan(
-    plan: str,
-    base: BaseGait,
-    runs: Sequence[PlannedRun],
-    like: SessionView,
-    folder: Path,
-    *,
-    settle_s: float,
-    measure_s: float,
-    facts: Mapping[str, str] | None = None,
-) -> tuple[Path, ...]:
-    """Write each run's commands to a session of its own.
+def odd_lines(band_hz: tuple[float, float], period_s: float, seed: int) -> IntArray:
+    """Draw the excited lines.
 
     Args:
-        like: The session the gait is of; its robot, and the twin's scenario and kernels, go along.
-        folder: Where to; made if it isn't there.
-        settle_s: Time before what is to be measured [s].
-        measure_s: Length of what is to be measured [s].
-        facts: More for the metadata record of every run.
+        band_hz: Lowest and highest frequency [Hz].
+        period_s: A whole number of samples of a plan [s].
 
     Raises:
-        UsageError: If a command would leave the robot's joint limits or is faster than its joint,
-            or a file is there already; nothing is written then.
-        LogWriteError: If the folder or a file can't be written.
+        UsageError: If the band or the period has no such lines.
     """
-    length_ns = round((settle_s + measure_s) * 1e9)
-    t_ns = np.arange(0, length_ns + 1, 1_000_000_000 // RATE_HZ, dtype=np.int64)
-    t_s: FloatArray = t_ns.astype(np.float64) * 1e-9
-    ramp_s = min(RAMP_S, settle_s)
-    _check_limits(base, runs, like, t_s, ramp_s)
-    files = [folder / f"run{k:03d}-{_file_stem(run.label)}.mcap" for k, run in enumerate(runs)]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        there = [file for file in files if file.exists()]
-    except OSError as error:
-        reason = error.strerror or error
-        raise LogWriteError(folder, f"no folder for the plan can be made: {reason}") from error
-    if there:
-        raise UsageError(f"{there[0]} exists already; name another folder")
-    plan_id, epoch_ns = uuid.uuid4().hex, time.time_ns()
-    twin = like.metadata.get("undulog", {})
-    metadata = {"settle_s": f"{settle_s:g}"} | {k: twin[k] for k in ("kernels",) if k in twin}
-    for k, (file, run) in enumerate(zip(files, runs, strict=True)):
-        start_ns = epoch_ns + k * length_ns
-        values = commands(base, run, t_s, ramp_s)
-        with (
-            part_file(file) as part,
-            SessionWriter(
-                part,
-                session_id=uuid.uuid4().hex,
-                epoch_ns=start_ns,
-                robot=like.robot,
-                metadata=metadata,
-                force=True,
-            ) as writer,
-        ):
-            record = {"plan": plan, "plan_id": plan_id, "run": str(k), "like": like.session_id}
-            record |= {"settle_s": f"{settle_s:g}", "measure_s": f"{measure_s:g}"}
-            writer.note("undulog.plan", record | dict(facts or {}) | run.facts)
-            if "scenario.toml" in like.attachments:
-                writer.attach(
-                    "scenario.toml", "application/toml", like.attachments["scenario.toml"]
-                )
-            channel = writer.joint_state("/joint_commands", base.names, unit="rad")
-            for at_ns, row in zip(t_ns.tolist(), values, strict=True):
-                channel.write(start_ns + at_ns, row)
-    return tuple(files)
+    low, high = band_hz
+    samples = period_s * RATE_HZ
+    if not 0 < low < high <= HIGHEST_HZ:
+        raise UsageError(
+            f"--band {low:g} {high:g} is not from a lower to a higher frequency above 0 and up to "
+            f"{HIGHEST_HZ:g} Hz"
+        )
+    if not (0 < samples < 1e6 and abs(samples - round(samples)) < 1e-6):
+        raise UsageError(f"--period {period_s:g} is not a multiple of {1 / RATE_HZ:g} s")
+    first, last = np.ceil(low * period_s - 1e-9), np.floor(high * period_s + 1e-9)
+    odd = np.arange(int(first) | 1, int(last) + 1, 2)
+    if odd.size - odd.size // GROUP < LEAST_LINES:
+        raise UsageError(
+            f"--band {low:g} {high:g} holds {odd.size} odd multiples of 1/{period_s:g} Hz, fewer "
+            f"than {LEAST_LINES} of them excited; take a longer --period or a wider --band"
+        )
+    random = np.random.default_rng([seed, 0])
+    left_out = np.arange(0, odd.size - GROUP + 1, GROUP)
+    left_out = left_out + random.integers(0, GROUP, left_out.size)
+    lines: IntArray = np.delete(odd, left_out).astype(np.int64)
+    if lines.size > MOST_LINES:
+        raise UsageError(
+            f"--band and --period give {lines.size} excited lines, at most {MOST_LINES} are "
+            "planned; take a shorter --period or a narrower --band"
+        )
+    return lines
 
 
-def _file_stem(label: str) -> str:
-    """Replace what has a meaning in paths, since joint names come from any log."""
-    return re.sub(r"[^\w.+-]", "_", label)[:_LONGEST_STEM]
+def random_phase_runs(
+    m: int,
+    lines: IntArray,
+    period_s: float,
+    amplitude: float,
+    *,
+    of_peak: bool,
+    realisations: int,
+    inputs: Inputs,
+    seed: int,
+) -> tuple[Multisine, tuple[PlannedRun, ...]]:
+    """Plan the runs of all realisations of an odd random-phase multisine.
 
+    A realisation is the sum of sines of equal amplitude and random phase at odd multiples (lines)
+    of the reciprocal period. In each group of :data:`GROUP` consecutive odd lines one, drawn at
+    random, is left out, and all even lines are: a nonlinearity of odd order responds at those odd
+    lines, one of even order at the even ones (detection lines). All realisations excite the same
+    lines with the same power, so that all of them have the same best linear approximation; their
+    phases differ. Of :data:`DRAWS` draws of the phases the one with the least peak is taken.
 
-def commands(base: BaseGait, run: PlannedRun, t_s: FloatArray, ramp_s: float) -> FloatArray:
-    """Return the commands of all joints.
+    With m joints and ``orthogonal`` inputs a realisation takes m runs: each joint has phases of its
+    own, which a DFT matrix over the runs multiplies, so that the commands are a regular matrix at
+    every line and the response of every joint to every command is identifiable.
+
+    Source: Pintelon & Schoukens, System Identification, 2nd ed. (Wiley 2012), sections 2.7 and 4.3;
+    Dobrowiecki, Schoukens & Guillaume, IEEE Trans. Instrum. Meas. 55 (2006) 1774-1780.
 
     Args:
-        t_s: Times [s], shape (k,).
-        ramp_s: Time over which the amplitude grows from zero without a corner [s].
+        m: Driven joints.
+        lines: Of :func:`odd_lines`.
+        amplitude: Root mean square of each command, or the largest peak of all [rad].
+        of_peak: Whether ``amplitude`` is the peak.
 
     Returns:
-        Angles [rad], shape (k, n).
+        What they share, and the runs: one a realisation, or m with orthogonal inputs.
     """
-    x = np.clip(t_s / ramp_s, 0.0, 1.0) if ramp_s > 0 else np.ones_like(t_s)
-    grown = x * x * (3 - 2 * x)
-    tones = run.tones(base.omega)
-    wave = np.zeros((t_s.size, len(base.driven)))
-    for k in range(0, len(tones), _TONES_AT_ONCE):
-        some = tones[k : k + _TONES_AT_ONCE]
-        turns = np.exp(1j * np.outer(t_s, [tone.omega for tone in some]))
-        wave += np.real(turns @ np.stack([tone.amplitude for tone in some]))
-    values = np.tile(base.offset, (t_s.size, 1))
-    values[:, list(base.driven)] += grown[:, None] * wave
-    return values
+    random = np.random.default_rng([seed, 1])
+    own = m if inputs == "orthogonal" else 1
+    drawn = [_phases(own, lines, random, rotated=own > 1) for _ in range(realisations)]
+    unit_rms = float(np.sqrt(lines.size / 2))
+    highest = max(float(peaks.max()) for _, peaks in drawn)
+    size = amplitude / (highest if of_peak else unit_rms)
+    shared = Multisine(lines, period_s, size, size * highest)
+    omega = 2 * np.pi * lines / period_s
+    turns = dft(own)
+    runs: list[PlannedRun] = []
+    for r, (phasors, peaks) in enumerate(drawn):
+        for e in range(own):
+            each = np.broadcast_to(size * phasors * turns[e][:, None], (m, lines.size))
+            facts = {
+                "kind": KIND,
+                "realisation": str(r),
+                "experiment": str(e),
+                "crest_factor": f"{float(peaks.max()) / unit_rms:.4g}",
+            }
+            label = f"realisation{r:02d}" + (f"-experiment{e:02d}" if own > 1 else "")
+            tones = tuple(
+                Tone(float(w), np.ascontiguousarray(each[:, k])) for k, w in enumerate(omega)
+            )
+            runs.append(PlannedRun(label, np.zeros(m, dtype=np.complex128), facts, tones))
+    return shared, tuple(runs)
 
 
-def _check_limits(
-    base: BaseGait, runs: Sequence[PlannedRun], like: SessionView, t_s: FloatArray, ramp_s: float
-) -> None:
-    """Refuse commands beyond the limits of position and rate of their joints."""
-    if like.robot is None:
-        return
-    joints = {joint.name: joint for joint in like.robot.joints}
-    highest = [joint.max_velocity for joint in like.robot.joints]
-    if like.robot.safety is not None:
-        highest = np.fmin(highest, like.robot.safety.values("max_rate", tuple(joints))).tolist()
-    fastest = dict(zip(joints, highest, strict=True))
-    known = [k for k in base.driven if base.names[k] in joints]
-    for run in runs:
-        values = commands(base, run, t_s, ramp_s)
-        rates = np.abs(np.diff(values, axis=0)).max(axis=0, initial=0.0) * RATE_HZ
-        for k in known:
-            joint = joints[base.names[k]]
-            low, high, rate = float(values[:, k].min()), float(values[:, k].max()), float(rates[k])
-            if low < joint.lower or high > joint.upper:
-                raise UsageError(
-                    f"{like.path}: {run.label} would command {joint.name} from {low:.3f} to "
-                    f"{high:.3f} rad, its limits are {joint.lower:.3f} and {joint.upper:.3f}; "
-                    "take a smaller amplitude, or record a session whose offsets are further "
-                    "from the limits"
-                )
-            if rate > fastest[joint.name]:
-                raise UsageError(
-                    f"{like.path}: {run.label} would command {joint.name} at up to {rate:.3g} "
-                    f"rad/s, its limit is {fastest[joint.name]:g} rad/s; take a smaller amplitude "
-                    "or a lower frequency"
-                )
+def _phases(
+    count: int, lines: IntArray, random: np.random.Generator, *, rotated: bool
+) -> tuple[ComplexArray, FloatArray]:
+    """Return phasors of modulus 1 of least peak, shape (count, k), and the peaks, shape (count,).
+
+    Args:
+        rotated: Whether runs multiply them by a constant phase: the peak is then that of the
+            envelope, which holds for all of them.
+    """
+    length = int(2 ** np.ceil(np.log2(16 * int(lines[-1]))))
+    best, peaks = np.zeros((count, lines.size), dtype=np.complex128), np.zeros(count)
+    for j in range(count):
+        phasors = np.exp(2j * np.pi * random.random((DRAWS, lines.size)))
+        spectrum = np.zeros((DRAWS, length), dtype=np.complex128)
+        spectrum[:, lines] = phasors * length
+        analytic = np.fft.ifft(spectrum)
+        peak = np.abs(analytic if rotated else analytic.real).max(axis=1)
+        least = int(np.argmin(peak))
+        best[j], peaks[j] = phasors[least], peak[least]
+    return best, peaks
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A decaying mode.
+
+    Attributes:
+        frequency_hz: Its natural frequency, |s| / 2 pi.
+        damping: Damping ratio, -Re s / |s|.
+        time_constant_s: -1 / Re s.
+    """
+
+    frequency_hz: float
+    damping: float
+    time_constant_s: float
+
+
+def slowest_mode(robot: Robot, driven: Sequence[str]) -> Mode:
+    """Find the mode of the driven planes that decays slowest: how long a straight chain rings.
+
+    What is measured without contact before the modes have died away is wrong. At small angles the
+    chain moves across itself by y_0 + theta_0 x + the joints' bends, so its mass matrix is
+    constant; with the servos linear (no Coulomb friction, no play, no saturation) the modes are the
+    eigenvalues of
+
+        M_eff q'' = k_g (th - q) + c_g (om - q')
+        Jm om' = -kappa q - (b + Kt^2/R) om - k_g (th - q) - c_g (om - q'),   kappa = Kt V Kp / R
+
+    with M_eff = M_qq - M_qb M_bb^-1 M_bq, the free body b eliminated. Ground and Coulomb friction
+    only add damping.
+
+    Args:
+        driven: Names of the driven joints, at least one.
+    """
+    poles = np.concatenate(
+        [
+            _poles(robot, plane)
+            for plane in Plane
+            if any(joint.plane is plane and joint.name in driven for joint in robot.joints)
+        ]
+    )
+    slowest = complex(poles[int(np.argmax(poles.real))])
+    size = abs(slowest)
+    return Mode(size / (2 * np.pi), -slowest.real / size, -1 / slowest.real)
+
+
+def transverse_mass(robot: Robot, plane: Plane) -> FloatArray:
+    """Return the mass matrix of the free straight chain bending in one plane.
+
+    Args:
+        plane: The plane; joints of the other one are rigid.
+
+    Returns:
+        Of the joints of that plane once the free body is eliminated, shape (m, m) [kg m^2].
+    """
+    length = np.array([link.length for link in robot.links])
+    mass = np.array([link.mass for link in robot.links])
+    axis = 2 if plane is Plane.HORIZONTAL else 1
+    inertia = np.array([link.inertia[axis] for link in robot.links])
+    back = np.cumsum(length)  # from the head's front; only differences count
+    centre = back - length / 2
+    joints: IntArray = robot.joint_indices(plane)
+    behind = (np.arange(len(length))[:, None] > joints[None, :]).astype(np.float64)
+    # Columns: shift, turn about the front, bends; each link's centre across, and its angle.
+    shift = np.column_stack(
+        [np.ones_like(centre), centre, behind * (centre[:, None] - back[joints])]
+    )
+    turn = np.column_stack([np.zeros_like(centre), np.ones_like(centre), behind])
+    whole = shift.T @ (mass[:, None] * shift) + turn.T @ (inertia[:, None] * turn)
+    free = np.linalg.solve(whole[:2, :2], whole[:2, 2:])
+    return whole[2:, 2:] - whole[2:, :2] @ free
+
+
+def _poles(robot: Robot, plane: Plane) -> ComplexArray:
+    """Return eigenvalues of (q, q', th, om), of the joints of one plane."""
+    joints: list[Joint] = [joint for joint in robot.joints if joint.plane is plane]
+    servos = [joint.servo for joint in joints]
+    winding = np.array([one.torque_constant / one.resistance_ohm for one in servos])
+    kappa = np.diag(winding * [one.supply_v * one.proportional_gain for one in servos])
+    drag = np.diag(
+        winding * [one.torque_constant for one in servos] + [one.viscous_friction for one in servos]
+    )
+    k = np.diag([one.gear_stiffness for one in servos])
+    c = np.diag([one.gear_damping for one in servos])
+    body = np.linalg.inv(transverse_mass(robot, plane))
+    rotor = np.diag([1 / one.rotor_inertia for one in servos])
+    none, unit = np.zeros_like(k), np.eye(len(k))
+    matrix = np.block(
+        [
+            [none, unit, none, none],
+            [-body @ k, -body @ c, body @ k, body @ c],
+            [none, none, none, unit],
+            [rotor @ (k - kappa), rotor @ c, -rotor @ k, -rotor @ (drag + c)],
+        ]
+    )
+    return np.linalg.eigvals(matrix).astype(np.complex128)

@@ -1,1 +1,1 @@
-"""Results for people: text, tables, pictures, pages."""
+"""Results for people: text, tables, pictures, pages, and files that can be read back."""

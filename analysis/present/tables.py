@@ -1,8 +1,8 @@
 """The tables of results, each described once: headings, values, digits, what is shown where.
 
-The terminal (:mod:`.text.table`) and the page (:mod:`.page.tables`) lay them out. JSON, pandas
+The terminal (:mod:`.text`) and the page (:mod:`.page_tables`) lay them out. JSON, pandas
 frames and Parquet hold every field of the same dataclasses in full and in SI units, so that their
-names and types follow from the fields (:mod:`.notebook.frames`).
+names and types follow from the fields (:mod:`.data_frames`).
 """
 
 from __future__ import annotations

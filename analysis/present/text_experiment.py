@@ -11,9 +11,9 @@ from undulog.capture.common.console import UNLIMITED, plain
 
 from ..compare.decisions import SIGNIFICANT_DIFFERENCE, WORDS, margin_text
 from ..experiment.answer import kick_detail, sweep_detail, sweep_method
+from ..experiment.best_linear import multisine_method
 from ..experiment.body_connection import CONNECTION_METHOD, connection_detail
 from ..experiment.reversal import SIGNIFICANT
-from ..experiment.sweep.best_linear import multisine_method
 from ..results import formats
 from ..results.body import BodyConnection, PredictedTravel
 from ..results.comparison import Change, Comparison

@@ -1,1 +1,1 @@
-"""Frequency, gain and lag of a gait, fitted to commands and positions."""
+"""Gain and lag of a gait, and frequency responses from any excitation."""

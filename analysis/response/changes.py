@@ -4,7 +4,8 @@ A gait whose amplitude moves has the same ratio of response and command in each 
 frequency moves slowly is analysed over its own phase instead of time: with the phase
 omega t + P(t) of the commands, P a polynomial, every channel is taken at the times t + P(t)/omega,
 at which the commands are periodic. Over that time each cycle has the ratio of response and command,
-and :mod:`.slow_changes` finds what of it is a trend, correlated variation, or noise.
+and :mod:`.analysis.estimators.slow_changes` finds what of it is a trend, correlated variation, or
+noise.
 
 A lightly damped bending mode rings for seconds after the start, and least squares over its tail
 gives a wrong gain with a small residual. A body mode shows in all joints, so one model is fitted to

@@ -8,14 +8,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 
 from undulog.capture import SessionView
-from undulog.capture.commands.info import base_versions
 from undulog.capture.common.console import Warn
+from undulog.capture.common.extras import base_versions
 from undulog.capture.following.find import times_made
 from undulog.capture.log.health.rules import judge_made_times
 from undulog.capture.log.read.sample_times import Signal
 from undulog.capture.robot.model import Robot
 
-from ..artefacts.find import find_artefacts
 from ..body.free_motion import MotionFit, free_motion
 from ..body.ground_contact import ground_contact
 from ..body.motion import body_motion
@@ -30,9 +29,9 @@ from ..energy import (
 from ..estimators.intervals import CONFIDENCE
 from ..estimators.series import Series, clean_together
 from ..estimators.spectrum import BINS_PER_SIDE
-from ..frequency_response.estimate import frequency_responses
 from ..oscillators.chain import closed_loop, session_couplings
 from ..response.fitting import GaitFit, fit_gait
+from ..response.frequency_response import frequency_responses
 from ..response.rhythm import HARMONICS, MIN_CYCLES, MIN_EXPLAINED
 from ..results.analysis import (
     Analysis,
@@ -50,6 +49,7 @@ from ..segments.session import (
     stopped,
     unrefuted,
 )
+from ..signals.artefacts import find_artefacts
 from ..signals.columns import drag_ratio, read_columns
 from ..signals.stretch import (
     Options,

@@ -347,6 +347,31 @@ def command_change(command: ComplexArray, model: ComplexArray) -> ComplexArray:
     return change
 
 
+def command_difference(
+    command: ComplexArray, model: ComplexArray, groups: Sequence[IntArray]
+) -> tuple[int, str, str] | None:
+    """Return where a command is farthest off another, each group of joints by itself.
+
+    Args:
+        command: Complex amplitudes [rad], shape (m,).
+        model: Those of the other run, shape (m,).
+        groups: Indices of the joints at each frequency.
+
+    Returns:
+        The joint's index, and its difference in percent of amplitude and degrees of phase; None
+        where no joint is farther off than :data:`SAME_COMMAND`.
+    """
+    change = np.ones_like(command)
+    for members in groups:
+        change[members] = command_change(command[members], model[members])
+    deviation = np.abs(change - 1)
+    worst = int(np.argmax(deviation))
+    if deviation[worst] <= SAME_COMMAND:
+        return None
+    percent = formats.number(100 * (float(np.abs(change[worst])) - 1), 1)
+    return worst, percent, formats.number(float(np.degrees(np.angle(change[worst]))), 1)
+
+
 def other_frequency(run: GaitRun, model: GaitRun) -> tuple[str, str] | None:
     """Find a group whose frequency is not the model's.
 
@@ -398,16 +423,10 @@ def _difference(run: GaitRun, model: GaitRun) -> str | None:
             "to head, come in another order"
         )
     command = run.command if all(same) else run.command[::-1]
-    change = np.ones_like(command)
-    for members in model.by_group:
-        change[members] = command_change(command[members], model.command[members])
-    deviation = np.abs(change - 1)
-    worst = int(np.argmax(deviation))
-    if deviation[worst] <= SAME_COMMAND:
+    if (off := command_difference(command, model.command, model.by_group)) is None:
         return None
+    worst, percent, degrees = off
     joint = run.names[worst if all(same) else -1 - worst]
-    percent = formats.number(100 * (float(np.abs(change[worst])) - 1), 1)
-    degrees = formats.number(float(np.degrees(np.angle(change[worst]))), 1)
     return (
         f"commands another gait than {model.label}: at {joint} the amplitude is {percent} % and "
         f"the phase {degrees} degrees off"

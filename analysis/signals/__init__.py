@@ -1,1 +1,1 @@
-"""The columns and the time window that an analysis uses."""
+"""The columns and the time window that an analysis uses, and the artefacts in them."""

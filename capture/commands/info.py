@@ -1,29 +1,17 @@
-"""What is installed: the command ``info``, and the versions that go into results."""
+"""Command ``info``: what is installed."""
 
 from __future__ import annotations
 
 import platform
 
 from ..common.console import emit
-from ..common.extras import EXTRAS, extra_packages, install_command
-
-_BASE = ("undulog", "numpy", "scipy", "pandas", "mcap", "python-can", "cantools")
-
-
-def package_version(name: str) -> str | None:
-    """Return the version of a package, None if it is not installed."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
-
-
-def base_versions() -> dict[str, str]:
-    """Return the versions of Python and the packages that every result depends on."""
-    found = {name: package_version(name) for name in _BASE}
-    return {"python": platform.python_version()} | {k: v for k, v in found.items() if v}
+from ..common.extras import (
+    EXTRAS,
+    base_versions,
+    extra_packages,
+    install_command,
+    package_version,
+)
 
 
 def info(*, json: bool = False) -> None:

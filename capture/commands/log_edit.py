@@ -12,8 +12,8 @@ from ..common.console import emit
 from ..common.process import interruptible
 
 if TYPE_CHECKING:
-    from ..log.edit.cut import RecoverReport
-    from ..log.edit.edited_log import EditReport
+    from ..log.cut import RecoverReport
+    from ..log.edited_log import EditReport
 
 
 def log_recover(
@@ -41,7 +41,7 @@ def log_recover(
         force: Replace an existing output.
         json: Report as one JSON object.
     """
-    from ..log.edit.cut import recover_log, recovered_path
+    from ..log.cut import recover_log, recovered_path
 
     with interruptible() as request:
         report = recover_log(file, output or recovered_path(file), force=force, stop=request)
@@ -97,7 +97,7 @@ def log_cut(
         force: Replace an existing output.
         json: Report as one JSON object.
     """
-    from ..log.edit.cut import cut_log
+    from ..log.cut import cut_log
 
     with interruptible() as request:
         report = cut_log(
@@ -141,7 +141,7 @@ def log_merge(
         force: Replace an existing output.
         json: Report as one JSON object.
     """
-    from ..log.edit.merge import merge_logs
+    from ..log.merge import merge_logs
 
     with interruptible() as request:
         report = merge_logs(files, output, robot=robot, apart=apart, force=force, stop=request)

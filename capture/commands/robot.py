@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from ..common.console import UNLIMITED, Column, echo, emit, emit_json, table
-from ..common.errors import RobotFileError
+from ..common.console import UNLIMITED, Column, echo, emit, emit_json, plain, table
+from ..common.errors import DataError, MissingChannelError, RobotFileError
 from ..common.files import check_output, write_text
+from ..log.messages.definitions import COMMAND_TOPIC, RESPONSE_TOPIC
 from .topic_options import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:
+    from ..common.arrays import FloatArray, IntArray
+    from ..log.read.sample_times import JointSignals
+    from ..log.read.session_view import SessionView
     from ..robot.model import Robot
 
+
+_SCALES = {"rad": 1.0, "deg": math.radians(1.0)}
+
+_MARGIN = 0.05
+"""Part of a seen range that the limits lie beyond it, at each end."""
 
 _JOINTS = (
     Column("joint", left=True),
@@ -118,7 +129,6 @@ def robot_new(
         force: Replace the file if it exists.
         json: Print one JSON object: the file and its joints.
     """
-    from ..exchange.robot_draft import draft, seen_joints
     from ..log.read.session import Session
 
     check_output(output, (".toml",), "a description is TOML; end its name in .toml", force=force)
@@ -193,4 +203,185 @@ def _bus(robot: Robot) -> Iterator[str]:
     yield (
         f"bus: {robot.bus.bitrate} bit/s, {', '.join(robot.bus.databases) or 'no database'}; "
         f"{', '.join(f'{count} {kind}' for kind, count in kinds.items())}"
+    )
+
+
+@dataclass(frozen=True)
+class SeenJoint:
+    """What a log shows of a joint.
+
+    Attributes:
+        lower: Least angle [rad].
+        upper: Greatest angle [rad].
+        rate: Greatest rate [rad/s].
+    """
+
+    name: str
+    lower: float
+    upper: float
+    rate: float
+
+
+def seen_joints(session: SessionView) -> list[SeenJoint]:
+    """Return the joints of a log with the ranges of their angles and their greatest rates.
+
+    Commands count too, if the log has some.
+
+    Returns:
+        In the order of the log. The rate is that of the measured velocities, or else between two
+        samples of an angle, which noise makes larger.
+
+    Raises:
+        MissingChannelError: If the log has no such responses.
+        DataError: If their angles are neither in rad nor in deg.
+    """
+    import numpy as np
+
+    measured = session.joints(RESPONSE_TOPIC)
+    scale = _scale(session, measured)
+    try:
+        rates = session.joints(RESPONSE_TOPIC, "velocity")
+    except MissingChannelError:
+        rates = None
+    commands: JointSignals | None = None
+    if COMMAND_TOPIC in session.channels:
+        commands = session.joints(COMMAND_TOPIC)
+    found: list[SeenJoint] = []
+    for name in measured.names:
+        angle = measured.signal(name)
+        values = [angle.values * scale]
+        if commands is not None and name in commands.names:
+            values.append(commands.signal(name).values * _scale(session, commands))
+        if rates is not None and name in rates.names:
+            rate = np.abs(rates.signal(name).values)
+        else:
+            rate = _rates(angle.t_ns, values[0])
+        known = np.concatenate(values)
+        known, rate = known[np.isfinite(known)], rate[np.isfinite(rate)]
+        if len(known):
+            fastest = float(rate.max(initial=0.0))
+            found.append(SeenJoint(name, float(known.min()), float(known.max()), fastest))
+    if not found:
+        raise DataError(f"{session.path}: {measured.topic} has no angle of any joint")
+    return found
+
+
+def _scale(session: SessionView, signals: JointSignals) -> float:
+    if signals.unit not in _SCALES:
+        raise DataError(
+            f"{session.path}: the angles of {signals.topic} are in {signals.unit!r}; a description "
+            "has rad"
+        )
+    return _SCALES[signals.unit]
+
+
+def _rates(t_ns: IntArray, values: FloatArray) -> FloatArray:
+    import numpy as np
+
+    from ..common.arrays import NS
+
+    steps = np.diff(t_ns) / NS
+    return np.abs(np.diff(values))[steps > 0] / steps[steps > 0]
+
+
+_TEMPLATE = """\
+# The description of a robot, to start from. All values in SI: m, kg, s, rad, N m, A, V.
+# `undulog robot check` holds it to the rules, the page "Robot descriptions" of the manual has them.
+
+name = {name}
+description = ""            # one sentence
+clock = "host"              # whose clock stamps the samples: host, device or simulated
+assumed = ["links", "joints", "servo"]   # take out of this list what you have filled in
+
+{origin}
+# plane: horizontal (turns about z, yaw) or vertical (about y, pitch).
+joints = [
+{joints}
+]
+
+[defaults.link]             # of every link, one more than joints; an entry of `links` may differ
+length = 0.06               # assumed: joint to joint
+radius = 0.025              # assumed
+mass = 0.1                  # assumed
+inertia = [4e-5, 5e-5, 5e-5]  # assumed: about the centre, along x (forward), y, z
+# mesh = "shell.stl"        # for the picture, a file beside this one
+# mesh_scale = 0.001        # metres in one unit of it
+
+[defaults.servo]            # of every joint, for the twin; assumed
+supply_v = 6.0
+stall_torque = 1.5          # at full voltage and standstill
+torque_constant = 1.0       # N m/A, at the joint
+proportional_gain = 8.0     # duty per rad of error
+viscous_friction = 0.005    # N m s/rad
+coulomb_friction = 0.03
+# Stiffer gears or lighter links need shorter steps than 1 ms: `physics_rate_hz` of a scenario.
+gear_stiffness = 20.0       # N m/rad
+gear_damping = 0.01         # N m s/rad
+
+# [safety]                  # limits of driving it over a bus; without them it is never driven
+# max_rate = 4.0            # rad/s, of commands
+# ramp_rate = 0.5           # rad/s, to the first pose and down again
+# max_tracking_error = 0.35 # between command and measured angle
+# max_current = 1.4
+# max_temperature = 70.0    # degC
+# reply_timeout_s = 0.25    # a joint that reports nothing for so long is lost
+# max_late_s = 0.2          # a control tick that is later stops the drive
+
+# [bus]                     # where each quantity is found on its CAN bus
+# databases = ["robot.dbc"] # beside this file
+# bitrate = 1_000_000
+# signals = [
+#   {{ message = "Command", signal = "Angle", direction = "tx",
+#      target = "{first}", quantity = "command", unit = "deg" }},
+#   {{ message = "State", signal = "Angle", direction = "rx",
+#      target = "{first}", quantity = "position", unit = "deg" }},
+# ]
+"""
+
+_NEW = "# From the head to the tail; these two are examples."
+_SEEN = """\
+# From {log}, in its order: put them in that of the chain, the head first. The limits are what the
+# log shows with a margin of 5 %, not those of the robot."""
+
+
+def draft(name: str, joints: Sequence[SeenJoint] | None = None, log: str = "") -> Robot:
+    """Return a description to start from, with its text.
+
+    Args:
+        joints: Those of a log; two examples if None.
+        log: Name of that log.
+
+    Raises:
+        RobotFileError: If a name can't be one in a description; lists all of them.
+    """
+    from ..robot.description import numbered, parse_robot
+
+    if joints is None:
+        names = numbered("joint", 2)
+        lines = [_line(one, -0.52, 0.52, 10.0, "assumed") for one in names]
+    else:
+        names = [joint.name for joint in joints]
+        lines = [_seen(joint) for joint in joints]
+    text = _TEMPLATE.format(
+        name=dumps(name),
+        origin=_NEW if joints is None else _SEEN.format(log=plain(log)),
+        joints="\n".join(lines),
+        first=plain(names[0]),
+    )
+    return parse_robot(text, name, {})
+
+
+def _seen(joint: SeenJoint) -> str:
+    beyond = max(_MARGIN * (joint.upper - joint.lower), 0.01)
+    lower = math.floor((joint.lower - beyond) * 1000) / 1000
+    upper = math.ceil((joint.upper + beyond) * 1000) / 1000
+    rate = max(math.ceil(joint.rate * (1 + _MARGIN) * 1000) / 1000, 0.001)
+    mark = f"seen: {joint.lower:.4g} to {joint.upper:.4g} rad, at most {joint.rate:.4g} rad/s"
+    return _line(joint.name, lower, upper, rate, mark)
+
+
+def _line(name: str, lower: float, upper: float, rate: float, mark: str) -> str:
+    return (
+        f'  {{ name = {dumps(name)}, plane = "horizontal", lower = {lower}, upper = {upper}, '
+        f"max_velocity = {rate} }},  # {mark}"
     )

@@ -97,7 +97,7 @@ def _matched(path: Path) -> list[Path]:
 
 def _in_folder(folder: Path) -> list[Path]:
     """Return the sessions in a folder and, behind them, in its folders."""
-    from ..log.file.log_paths import log_paths
+    from ..log.file.parts import log_paths
 
     return list(dict.fromkeys(map(_session_of, log_paths(folder))))
 

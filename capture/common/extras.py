@@ -74,6 +74,9 @@ def attach(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str], An
     return get, sorted(modules)
 
 
+_BASE = ("undulog", "numpy", "scipy", "pandas", "mcap", "python-can", "cantools")
+"""Packages whose versions go into results."""
+
 EXTRAS = (
     *("sim", "mujoco", "numba", "replay", "report", "parquet", "mf4", "bags", "serial"),
     *("remote", "cluster", "catalog"),
@@ -153,3 +156,21 @@ def install_command(extra: str, missing: str = "") -> str:
     """
     packages = extra_packages(extra).values() or [missing]
     return shlex.join(["pip", "install", *packages])
+
+
+def package_version(name: str) -> str | None:
+    """Return the version of a package, None if it is not installed."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def base_versions() -> dict[str, str]:
+    """Return the versions of Python and the packages that every result depends on."""
+    import platform
+
+    found = {name: package_version(name) for name in _BASE}
+    return {"python": platform.python_version()} | {k: v for k, v in found.items() if v}

@@ -3,7 +3,8 @@
 The map is a curve in OKLab (Ottosson 2020, https://bottosson.github.io/posts/oklab/) from blue
 at the head over green to amber at the tail, sampled at equal steps of arc length, so neighbours
 differ equally everywhere. Lightness rises all the way, so the order survives colour blindness
-and grey print, and stays between 0.53 and 0.77, so it reads on white and on black.
+and grey print, and stays between 0.53 and 0.77, so it reads on white and on black. Maps of values
+share the ends of their scale.
 """
 
 from __future__ import annotations
@@ -51,6 +52,22 @@ def joint_colors(count: int) -> NDArray[np.uint8]:
 def joint_hex(count: int) -> tuple[str, ...]:
     """Return the same colours as ``#rrggbb``, one a joint."""
     return tuple("#" + bytes(color[:3]).hex() for color in joint_colors(count))
+
+
+def scale_ends(values: FloatArray, least: float, *, signed: bool) -> tuple[float, float]:
+    """Return the values at the ends of a map's colours.
+
+    Args:
+        values: Those that are drawn, any shape; NaN counts as none.
+        least: Distance of the ends, at least.
+        signed: Whether the middle of the scale is 0.
+    """
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    if signed:
+        high = max(abs(low), abs(high), least / 2)
+        return -high, high
+    short_by = max(0.0, least - (high - low)) / 2
+    return low - short_by, high + short_by
 
 
 def _oklab(place: FloatArray) -> FloatArray:

@@ -22,8 +22,8 @@ from ..common.errors import DataError, ImportFormatError, MissingChannelError, s
 from ..common.files import check_stop
 from ..common.process import StopRequest
 from ..following.find import MOST_JOINTS
-from ..log.edit.cut import cut_log
-from ..log.edit.edited_log import RawLog
+from ..log.cut import cut_log
+from ..log.edited_log import RawLog
 from ..log.file.bag import check_room, is_bag
 from ..log.file.bag_metadata import is_rosbag2
 from ..log.mcap.chunk import LAST_NS

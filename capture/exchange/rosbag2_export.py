@@ -20,7 +20,7 @@ from mcap.records import Channel
 from ..common.errors import DataError, UsageError, some_names
 from ..common.files import part_folder
 from ..common.process import StopRequest
-from ..log.edit.edited_log import EditedLog, RawLog
+from ..log.edited_log import EditedLog, RawLog
 from ..log.file.bag_metadata import METADATA, is_rosbag2
 from ..log.messages.definitions import is_latched
 

@@ -41,9 +41,9 @@ import pandas as pd
 from scipy.linalg import expm
 
 from undulog.analysis.estimators.intervals import noise_draws
-from undulog.analysis.experiment.kicks.coupling import kick_coupling
-from undulog.analysis.experiment.kicks.local import MeasuredDerivatives
-from undulog.analysis.experiment.kicks.runs import KickExperiment, sort_kicks
+from undulog.analysis.experiment.kick_coupling import kick_coupling
+from undulog.analysis.experiment.kick_runs import KickExperiment, sort_kicks
+from undulog.analysis.experiment.local_coupling import MeasuredDerivatives
 from undulog.analysis.oscillators.laplacian import intervals_of, spectrum
 from undulog.analysis.oscillators.predictions import (
     explicit_coupling,

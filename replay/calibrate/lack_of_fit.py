@@ -13,7 +13,7 @@ Checks of the residual r = measured - twin at the fit:
 * **Data not fitted**. Each half of the session is fitted by itself (to first order, around the fit
   of all), and predicts the other: x_1 - x_2 against its covariance, chi^2 with K degrees of
   freedom, and the error on the half that was not used.
-* **Other laws** (:mod:`.alternatives`), each in its own direction.
+* **Other laws** (:mod:`.identifiability`), each in its own direction.
 
 Joints may share noise, so their p-values are multiplied by their number (Bonferroni).
 

@@ -21,8 +21,8 @@ from undulog.capture.common.process import interruptible
 from .view_options import ClipOptions, OverlayOptions, SingleOptions, given
 
 if TYPE_CHECKING:
-    from ..feed.recording import Recording
     from ..live.relay import RelayReport
+    from ..recording import Recording
     from ..viewer import Viewer
 
 _NICENESS, _LIVE_NICENESS = 5, 10
@@ -144,7 +144,7 @@ def _convert(
 ) -> tuple[Recording, float]:
     from undulog.analysis.signals.stretch import Options
 
-    from ..feed.numbers import saved
+    from ..numbers import saved
 
     command, response = topics.names
     options = Options(command_topic=command, response_topic=response)
@@ -157,8 +157,8 @@ def _convert(
         session.forget()
         bar.update(1, note="recording")
         # Here, not above: Rerun takes memory that the analysis can use before.
-        from ..feed.recording import write_recording
         from ..layout import build_blueprint
+        from ..recording import write_recording
 
         recording = write_recording(
             topics.view(session),
@@ -249,15 +249,15 @@ def _view_session(
         session = topics.view(stack.enter_context(capture.Session.open(file, robot=robot)))
         known = Layer(None)
         if single.result:
-            from ..feed.numbers import read_results
+            from ..numbers import read_results
 
             known = read_results(session, single.result)
         options = [viewer.WHOLE_IN_MEMORY] if web else []
         process = stack.enter_context(_open_viewer(*options, web=web))
         # Rerun would report a closed window as errors of its own, in colours.
         os.environ.setdefault("RUST_LOG", "off")
-        from ..feed.numbers import Analysing
-        from ..feed.progressive import NoLongerWantedError, Task, show_session, steps
+        from ..numbers import Analysing
+        from ..progressive import NoLongerWantedError, Task, show_session, steps
 
         analysing = stack.enter_context(Analysing(file, topics.names, robot))
         try:

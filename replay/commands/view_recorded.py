@@ -17,10 +17,10 @@ from undulog.capture.common.process import interruptible
 from .view_options import ClipOptions, OverlayOptions
 
 if TYPE_CHECKING:
-    from ..feed.film import Shot
-    from ..feed.recording import Recording
+    from ..film import Shot
     from ..overlay.sessions import Align
     from ..overlay.write import Overlay, Place
+    from ..recording import Recording
 
 
 def view_clip(
@@ -49,13 +49,13 @@ def view_clip(
         UndulogError: If the work fails.
     """
     try:
-        from ..feed.film import check_film, film, scene_only
+        from ..film import check_film, film, scene_only
     except ModuleNotFoundError as error:
         raise MissingExtraError("'undulog view --clip'", "replay", error.name or "av") from error
     from tempfile import TemporaryDirectory
 
     from ..draw.body import body_title
-    from ..feed.recording import write_recording
+    from ..recording import write_recording
 
     refuse_existing(clip, force=force)
     with (
@@ -81,7 +81,7 @@ def view_clip(
 
 
 def _shot(options: ClipOptions, duration_s: float, file: Path) -> Shot:
-    from ..feed.film import Shot
+    from ..film import Shot
 
     end_s = duration_s if options.end is None else options.end
     if end_s > duration_s:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from undulog.analysis.results.analysis import Analysis
 from undulog.analysis.results.formats import number
 from undulog.capture.common.arrays import FloatArray
-from undulog.capture.common.palette import joint_colors
+from undulog.capture.common.palette import joint_colors, scale_ends
 
 from ..samples.content import ENERGY, GAIN, LAG, NAMED, Color, CycleTable, HeatMap, Quantity
 from ..samples.timeline import Clock
@@ -71,7 +71,9 @@ def heat_maps(
         if quantity is ENERGY:
             milliwatt = 1e3 * table.value / (table.stop_s - table.start_s)
             table = replace(table, quantity=POWER, value=milliwatt)
-        low, high = _limits(table, _settled(analysis, table), signed=quantity is ENERGY)
+        low, high = scale_ends(
+            _settled(analysis, table), _LEAST[table.quantity.key], signed=quantity is ENERGY
+        )
         places = tuple(place.get(name, i + 1) for i, name in enumerate(table.names))
         found.append(HeatMap(table, places, low, high, quantity is ENERGY))
     return tuple(found)
@@ -143,16 +145,6 @@ def _settled(analysis: Analysis, table: CycleTable) -> FloatArray:
         inside |= (window.start_s <= middle) & (middle < window.stop_s)
     chosen = table.value[:, inside]
     return chosen if np.isfinite(chosen).any() else table.value
-
-
-def _limits(table: CycleTable, settled: FloatArray, *, signed: bool) -> tuple[float, float]:
-    least = _LEAST[table.quantity.key]
-    low, high = float(np.nanmin(settled)), float(np.nanmax(settled))
-    if signed:
-        high = max(abs(low), abs(high), least / 2)
-        return -high, high
-    short_by = max(0.0, least - (high - low)) / 2
-    return low - short_by, high + short_by
 
 
 def _log_axes(rec: rr.RecordingStream, shown: HeatMap, named: Collection[str]) -> None:

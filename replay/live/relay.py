@@ -36,7 +36,7 @@ from undulog.capture.recorder.live_wire import (
     read_records,
 )
 
-from ..feed.recording import open_recording, recording_id, require_whole, send_properties
+from ..recording import open_recording, recording_id, require_whole, send_properties
 from ..viewer import Viewer
 from .decode import LiveLog
 from .scene import LiveScene

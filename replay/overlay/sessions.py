@@ -34,7 +34,7 @@ from undulog.capture.robot.model import Robot
 from ..draw.drawing import palette_of
 from ..draw.lines import rhythm_of
 from ..draw.motion import HeadPath, read_head
-from ..feed.recording import Recording, write_recording
+from ..recording import Recording, write_recording
 from ..samples.content import Color
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME, Clock, Rhythm
 from ..samples.tracks import Track, gaps, interpolate, read_columns, resampled, wanted_fields

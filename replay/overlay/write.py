@@ -34,7 +34,7 @@ from undulog.capture.log.read.joint_topics import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..draw.body import body_title
 from ..draw.drawing import log_facts
 from ..draw.plots import Plot
-from ..feed.recording import Recording, recording_file, recording_id
+from ..recording import Recording, recording_file, recording_id
 from ..samples.content import Color
 from ..samples.timeline import GAIT_CYCLE, SESSION_TIME
 from ..samples.tracks import Track, decimate

@@ -236,7 +236,7 @@ def resampled(
         tracks: The tracks, in any order.
         names: Joint names, in the order of the result's columns.
         at_ns: The times [ns], shape (n,).
-        method: :func:`.sampling.interpolate` or :func:`.sampling.hold`.
+        method: :func:`interpolate` or :func:`hold`.
 
     Returns:
         Shape (n, number of names); NaN columns for joints without a track.

@@ -24,10 +24,10 @@ from ..gait.contract import CONTROL_RATE_HZ, Readings
 from ..gait.oscillators import OscillatorChains
 from ..gait.wave import SerpentineGait
 from ..physics.compiled_kernels import LAWS, ground_table
+from ..physics.sensing import quantised
 from ..physics.servo import Servos
 from ..scenario.motion import generator
 from ..scenario.scenario import Scenario
-from ..sensing.contract import quantised
 from ..twin.twin import MAX_ROTOR_SPEED, MAX_SPEED, failure, resting_height
 from .body import (
     ARM,

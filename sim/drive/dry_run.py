@@ -1,6 +1,6 @@
 """Dry run of a motion in the twin of its robot, through the gate of a bus.
 
-It is the same gate (:mod:`.sim.gate.gate`), state by state: it reads the pose of the twin's servos,
+It is the same gate (:mod:`.gate`), state by state: it reads the pose of the twin's servos,
 ramps to the first pose, clamps, watches and ends. What the twin does not have (temperatures, supply
 voltages, lost replies, a late process) is not tried.
 """
@@ -24,9 +24,6 @@ from undulog.capture.common.errors import SimulationError, some_names
 from undulog.capture.common.process import StopRequest
 from undulog.capture.robot.model import Robot, Safety
 
-from ..gate.gate import POSE_S, Gate
-from ..gate.limits import GateLimits, Ramp, gate_limits, missing_limits, safety_example
-from ..gate.outcome import DriveEnding, GateEvent, GateFault
 from ..scenario.scenario import LONGEST_S, Scenario
 from ..scenario.scenario_file import parse_scenario
 from ..twin.recording import Driver, open_session
@@ -34,7 +31,10 @@ from ..twin.session_log import SessionLog
 from ..twin.stability import warnings
 from ..twin.twin import Twin
 from .dry_run_gait import Demand, GatedGait, JointDemand, NotedGait
+from .gate import POSE_S, Gate
+from .limits import GateLimits, Ramp, gate_limits, missing_limits, safety_example
 from .motion import MotionSource
+from .outcome import DriveEnding, GateEvent, GateFault
 
 _NOMINAL = """
 description = "Flat ground, and servos as the description of the robot has them."

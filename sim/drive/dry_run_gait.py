@@ -17,12 +17,12 @@ from undulog.capture.common.arrays import BoolArray, FloatArray
 from undulog.capture.robot.model import Robot
 
 from ..gait.contract import CONTROL_RATE_HZ, Gait, GaitTick, Readings
-from ..gate.gate import Gate
-from ..gate.limits import GateLimits
-from ..gate.outcome import GateEvent, GateInput, JointStatus, Phase
 from ..physics.ledger import JOINT_TERMS
-from ..sensing.contract import JointSample, SensorSample
+from ..physics.sensing import JointSample, SensorSample
 from ..twin.twin import Sample, Twin
+from .gate import Gate
+from .limits import GateLimits
+from .outcome import GateEvent, GateInput, JointStatus, Phase
 
 _ENERGIES = tuple(
     JOINT_TERMS.index(term) for term in ("mechanical_net", "mechanical_abs", "electrical_net")

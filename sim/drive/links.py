@@ -41,7 +41,7 @@ from undulog.capture.sources.socketcand import (
 )
 
 from ..gait.contract import Readings
-from ..gate.outcome import JointStatus
+from .outcome import JointStatus
 
 OLDEST_S = 0.5
 """A value older than this counts as unknown [s]; the slowest sensors come several times in it."""

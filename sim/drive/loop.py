@@ -20,11 +20,11 @@ from undulog.capture.log.messages.frames import FrameArray, empty_frames
 from undulog.capture.robot.model import Direction, Quantity, Robot
 
 from ..gait.contract import CONTROL_RATE_HZ
-from ..gate.feedback import BusCheck, Confirmation
-from ..gate.gate import Gate
-from ..gate.limits import Spacing
-from ..gate.outcome import FaultKind, GateFault, GateInput, GateStep, Phase
+from .feedback import BusCheck, Confirmation
+from .gate import Gate
+from .limits import Spacing
 from .links import BusReadings, Link, VirtualRobotLink
+from .outcome import FaultKind, GateFault, GateInput, GateStep, Phase
 
 _STREAMS = (0, 1, 2)
 

@@ -34,10 +34,10 @@ from undulog.capture.common.files import Shelf
 from undulog.capture.log.read.sample_times import JointSignals
 from undulog.capture.robot.model import Plane, Robot
 
-from ..control.adaptive import build_gait
 from ..gait.contract import CONTROL_RATE_HZ, Gait, GaitTick, Readings
 from ..scenario.scenario import Kernels, Scenario
 from ..scenario.scenario_file import load_scenario, parse_scenario, scenario_names
+from ..twin.adaptive import build_gait
 from .plan import PlanGait, is_plan, parse_plan
 
 COMMANDS = "/joint_commands"

@@ -17,15 +17,15 @@ from undulog.capture.sources.contract import SourceAddress, SourceCounts, parse_
 from undulog.capture.sources.events import Tally
 
 from ..gait.contract import CONTROL_RATE_HZ
-from ..gate.feedback import Confirmation
-from ..gate.gate import Gate
-from ..gate.limits import Spacing, gate_limits
-from ..gate.outcome import DriveEnding, FaultKind, GateFault, Outcome, jitter
 from ..scenario.scenario import LONGEST_S, Scenario
 from ..twin.recording import quick_collections
+from .feedback import Confirmation
+from .gate import Gate
+from .limits import Spacing, gate_limits
 from .links import Link, VirtualRobotLink
 from .loop import BusTick, ConsoleWatch, ControlLoop, LockstepPace, LoopTally, WallPace
 from .motion import MotionSource
+from .outcome import DriveEnding, FaultKind, GateFault, Outcome, jitter
 from .python_can_bus import open_link
 from .report import UNASKED, BusPlan, BusReport, Feedback
 from .session import BusSession, GaitPublisher, stamped

@@ -9,10 +9,10 @@ from typing import Any
 from undulog.capture.robot.model import Robot
 from undulog.capture.sources.contract import SourceAddress
 
-from ..gate.limits import GateLimits
-from ..gate.outcome import DriveEnding, GateEvent, Jitter, Outcome
+from .limits import GateLimits
 from .loop import LoopTally
 from .motion import MotionSource
+from .outcome import DriveEnding, GateEvent, Jitter, Outcome
 
 UNASKED = "joints were received more often than requested: commands are not confirmed by replies"
 

@@ -30,10 +30,10 @@ from undulog.capture.robot.model import ClockDomain, Robot
 from undulog.capture.sources.contract import DEVICE_TIMES_END_NS, SourceAddress
 
 from ..gait.contract import GaitTick
-from ..gate.outcome import DriveEnding, GateEvent, Outcome
 from ..twin.session_log import GAIT_UNIT
 from .loop import BusTick
 from .motion import MotionSource
+from .outcome import DriveEnding, GateEvent, Outcome
 
 _MOST_HELD = 1000
 _AT_ONCE = 64

@@ -406,13 +406,7 @@ class CompiledLaws:
     def __init__(
         self, steps: Steps, robot: Robot, ground: Ground | None, servos: Servos, dt: float
     ) -> None:
-        """Get ready for one body.
-
-        Args:
-            steps: The table that is filled in.
-            ground: What carries it, if anything does.
-            dt: Step [s].
-        """
+        """Get ready for one body, with the arguments of :class:`.sim.physics.steps.NumpyLaws`."""
         self._rows = tuple(steps.table)
         self._sizes = steps.link_count, steps.joint_count
         self._radius = np.array([link.radius for link in robot.links])

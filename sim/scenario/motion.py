@@ -1,7 +1,7 @@
 """What moves the robot in a scenario: its tables ``[gait]`` and ``[controller]``.
 
 The keys of a gait: ``docs/reference/gaits.md``. Of a controller all distances are in m, offsets in
-rad; what it computes: :mod:`.sim.control`.
+rad; what it computes: :mod:`.sim.twin.adaptive`.
 """
 
 from __future__ import annotations
@@ -182,8 +182,8 @@ class Calibration:
     """Calibration of a robot's gait on free ground.
 
     Attributes:
-        slip_ratio: K of :class:`.sim.control.filters.SlipOdometry`.
-        turn_gain: c of :class:`.sim.control.filters.PathHeading`.
+        slip_ratio: K of :class:`.sim.twin.filters.SlipOdometry`.
+        turn_gain: c of :class:`.sim.twin.filters.PathHeading`.
         turn_radius_m: Of the turn with the course's largest offset [m].
     """
 

@@ -138,7 +138,7 @@ class ServoPolling:
 
 @dataclass(frozen=True)
 class InfraredModel:
-    """Infrared distance sensors, :mod:`.sim.sensing.ranging`.
+    """Infrared distance sensors, :mod:`.sim.physics.ranging`.
 
     Attributes:
         hold_s: From one measurement of a sensor to its next [s].
@@ -157,7 +157,7 @@ class InfraredModel:
 
 @dataclass(frozen=True)
 class SonarModel:
-    """Ultrasonic range finders, :mod:`.sim.sensing.ranging`.
+    """Ultrasonic range finders, :mod:`.sim.physics.ranging`.
 
     Attributes:
         rate_hz: Measurements a second.
@@ -174,7 +174,7 @@ class SonarModel:
 
 @dataclass(frozen=True)
 class AccelerometerModel:
-    """Accelerometers, :mod:`.sim.sensing.sensors`.
+    """Accelerometers, :mod:`.sim.physics.sensors`.
 
     Attributes:
         rate_hz: Measurements a second, each a mean over its period.
@@ -189,7 +189,7 @@ class AccelerometerModel:
 
 @dataclass(frozen=True)
 class CompassModel:
-    """Magnetometers, :mod:`.sim.sensing.sensors`.
+    """Magnetometers, :mod:`.sim.physics.sensors`.
 
     Attributes:
         rate_hz: Measurements a second.

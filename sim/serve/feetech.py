@@ -37,8 +37,8 @@ from undulog.capture.robot.serial_servos import (
 )
 
 from ..gait.contract import CONTROL_RATE_HZ, GaitTick, Readings
+from ..physics.sensing import JointSample, SensorSample
 from ..scenario.scenario import Scenario
-from ..sensing.contract import JointSample, SensorSample
 from ..twin.recording import quick_collections
 from ..twin.twin import Twin
 from .pacing import Pacer, PaceTally

@@ -15,8 +15,8 @@ from undulog.capture.robot.model import Direction, Quantity, Robot, SensorKind
 from undulog.capture.sources.events import BUS_OFF, RESTARTED
 
 from ..gait.contract import CONTROL_RATE_HZ
+from ..physics.sensing import JointSample, RangeSample, SensorSample
 from ..scenario.bus_faults import BusFault, FaultKind
-from ..sensing.contract import JointSample, RangeSample, SensorSample
 
 _OF_JOINT = (
     Quantity.POSITION,

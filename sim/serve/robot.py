@@ -24,9 +24,9 @@ from undulog.capture.robot.model import Direction, Quantity, Robot
 from undulog.capture.sources.contract import records
 
 from ..gait.contract import CONTROL_RATE_HZ, GaitTick, Readings
+from ..physics.sensing import SensorSample
 from ..scenario.bus_faults import BusFault
 from ..scenario.scenario import Scenario
-from ..sensing.contract import SensorSample
 from ..twin.recording import quick_collections
 from ..twin.twin import Twin
 from .pacing import Pacer, PaceTally

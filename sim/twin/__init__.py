@@ -1,1 +1,1 @@
-"""The twin: stepped, recorded, or as a source of the recorder."""
+"""The twin: stepped, recorded, or as a source of the recorder; adaptive control of its gait."""

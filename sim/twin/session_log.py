@@ -3,7 +3,7 @@
 Sensor samples are written when they arrive at the robot's computer: ``header.stamp`` is the
 sampling time (of joints the start of the polling cycle, and ``/joint_sample_offset`` has each
 joint's own turn after it), the log time is that of the arrival. Effort, current and voltage are
-means over one control period (:mod:`.sim.sensing.sensors`). Their products miss what happens within
+means over one control period (:mod:`.sim.physics.sensors`). Their products miss what happens within
 a period, so each joint's powers are logged besides, accumulated at the physics rate. Commands,
 gait, odometry, powers and ledger are the twin's own; powers carry the middle of their period, the
 others the tick. Time is simulated: nothing of the machine's clock enters the file, and the same
@@ -38,8 +38,8 @@ from undulog.capture.robot.run import RUN_RECORD, Run, drag_ratio
 
 from ..gait.contract import CONTROL_RATE_HZ
 from ..physics.ledger import JOINT_TERMS, TERMS
+from ..physics.sensing import JointSample, RangeSample, SensorSample
 from ..scenario.scenario import Kernels, Scenario
-from ..sensing.contract import JointSample, RangeSample, SensorSample
 from .stability import warnings
 from .twin import Sample, Twin
 

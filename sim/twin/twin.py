@@ -16,17 +16,17 @@ from undulog.capture.common.arrays import FloatArray
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.model import Joint, Link, Robot
 
-from ..control.adaptive import build_gait
 from ..gait.contract import CONTROL_RATE_HZ, Gait, GaitTick
 from ..physics.engine import BodyStart, engine_type
 from ..physics.ledger import Ledger
 from ..physics.obstacle_contact import obstacle_law
+from ..physics.sensing import SensorSample, quantised
+from ..physics.sensors import Senses
 from ..physics.servo import Servos
 from ..physics.steps import Laws, NumpyLaws, Step, Steps
 from ..scenario.scenario import Kernels, Scenario
 from ..scenario.world import Ground, pushes_during
-from ..sensing.contract import SensorSample, quantised
-from ..sensing.sensors import Senses
+from .adaptive import build_gait
 from .stability import likely_cause
 
 MAX_SPEED = 10.0

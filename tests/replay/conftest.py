@@ -234,7 +234,7 @@ def read_back():
 @pytest.fixture(scope="session")
 def recording(session_file, analysis, tmp_path_factory):
     """The whole session as a recording: (what was reported, what is in the file)."""
-    from undulog.replay.feed.recording import write_recording
+    from undulog.replay.recording import write_recording
 
     path = tmp_path_factory.mktemp("recording") / "made.rrd"
     with Session.open(session_file) as session:

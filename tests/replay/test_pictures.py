@@ -7,8 +7,8 @@ import rerun.blueprint as rrb
 from support.golden_pictures import marked
 from undulog.capture import Session
 from undulog.capture.common.palette import joint_colors
-from undulog.replay.feed.recording import write_recording
 from undulog.replay.layout import build_views
+from undulog.replay.recording import write_recording
 
 pytestmark = pytest.mark.slow
 

@@ -26,8 +26,8 @@ from rerun.chunk import RrdReader
 
 from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
-from undulog.replay.feed.recording import APPLICATION, write_recording
 from undulog.replay.layout import build_views
+from undulog.replay.recording import APPLICATION, write_recording
 from undulog.replay.viewer import HeadlessViewer
 
 FOLDER = Path(__file__).parents[1] / "replay" / "golden"

@@ -5,7 +5,7 @@ import math
 import kick_tables
 import numpy as np
 
-from undulog.analysis.experiment.kicks.runs import KickExperiment, Kind, sort_kicks
+from undulog.analysis.experiment.kick_runs import KickExperiment, Kind, sort_kicks
 
 
 def kicked(random, H, c, kicks, scatter, *, bend=0.0, size=1.0, late=0.0, noise=None):

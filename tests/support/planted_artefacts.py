@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from undulog.analysis.artefacts.find import find_artefacts
+from undulog.analysis.signals.artefacts import find_artefacts
 from undulog.analysis.signals.columns import read_columns
 from undulog.capture import Session, SessionWriter, load_robot
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from undulog.capture.log.edit.edited_log import RawLog
+from undulog.capture.log.edited_log import RawLog
 
 
 def read(path):

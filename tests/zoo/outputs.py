@@ -8,7 +8,7 @@ from html import unescape
 import numpy as np
 
 from undulog.analysis.compare.compare import Choices, compare_sessions
-from undulog.analysis.present.page.page import render
+from undulog.analysis.present.page import render
 from undulog.analysis.session.analyse import analyse_session
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session

@@ -1,4 +1,4 @@
-"""The files of a session, from any of its parts or their folder.
+"""The files of a session, from any of its parts or their folder, and the logs in a folder.
 
 The parts of a split session are ``run.mcap``, ``run_0002.mcap``, ``run_0003.mcap``, ... The first
 part has the requested name, whether the session will be split or not.
@@ -6,16 +6,18 @@ part has the requested name, whether the session will be split or not.
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import count, takewhile
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from ...common.errors import InputFileError, LogError, NotALogError, some_names
 from ...common.remote import RemoteFile, RemotePath
 from ..mcap.file import McapFile
 from ..wal.writer import wal_folder
-from .bag_metadata import is_rosbag2
+from .bag_metadata import METADATA, is_rosbag2
 
 PART_RECORD = "undulog.part"
 """Metadata record of a part: ``part`` (its number), ``previous`` and ``previous_sha256`` (file
@@ -23,6 +25,8 @@ name and hash of the one before), ``next`` (file name of the one after) or, in t
 ``parts`` (their number). A session that was never split has none."""
 
 _NUMBERED = re.compile(r"(.+)_(\d{4,})")
+_FILES = (".mcap", ".db3", ".bag")
+_WAL = ".mcap.wal"
 
 
 def part_path(first: Path, number: int) -> Path:
@@ -306,3 +310,58 @@ def _session_in(folder: Path) -> Path:
         what = "files of a rosbag2 folder" if bag else "sessions"
         raise LogError(folder, f"{len(heads)} {what} are in this folder; {fix}: {listed}")
     return next(iter(heads))
+
+
+def walk(folder: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
+    """Yield folders with the names of their folders and files, as ``os.walk``, in order of name.
+
+    Links are followed, and a folder that several lead to is visited once. What is removed from a
+    list of folders is not entered.
+
+    Raises:
+        OSError: If a folder can't be listed.
+    """
+    left, visited = [folder], set[tuple[int, int]]()
+    while left:
+        here = left.pop()
+        facts = here.stat()
+        if (facts.st_dev, facts.st_ino) in visited:
+            continue
+        visited.add((facts.st_dev, facts.st_ino))
+        with os.scandir(here) as listed:
+            entries = sorted(listed, key=lambda entry: entry.name)
+        folders: list[str] = []
+        files: list[str] = []
+        for entry in entries:
+            # pathlib takes a link to itself as broken, where a DirEntry raises an error.
+            kind = Path(entry) if entry.is_symlink() else entry
+            if kind.is_dir():
+                folders.append(entry.name)
+            elif kind.is_file():
+                files.append(entry.name)
+        yield here, folders, files
+        left += [here / name for name in reversed(folders)]
+
+
+def log_paths(folder: Path, is_recording: Callable[[Path], bool] = is_rosbag2) -> Iterator[Path]:
+    """Yield the logs in a folder and, behind them, in its folders, each in order of name.
+
+    A log is a file ``.mcap``, ``.bag`` or ``.db3``, a rosbag2 folder, whose files are not yielded,
+    or the file that a write-ahead log belongs to, which need not exist and may be yielded twice.
+    Hidden folders are left out.
+
+    Args:
+        is_recording: Whether a folder with a metadata.yaml is one of rosbag2.
+
+    Raises:
+        OSError: If a folder can't be listed.
+    """
+    for here, folders, files in walk(folder):
+        if METADATA in files and is_recording(here):
+            folders.clear()
+            yield here
+            continue
+        logs = [name for name in files if PurePath(name).suffix in _FILES]
+        logs += [name.removesuffix(".wal") for name in folders if name.endswith(_WAL)]
+        yield from (here / name for name in sorted(logs))
+        folders[:] = [n for n in folders if not n.startswith(".") and not n.endswith(".wal")]

@@ -1,6 +1,6 @@
 """Rules for the health of a session: findings and a verdict from the measures.
 
-The measures come from :mod:`.health.tallies`, so the same rules apply to a file and to a live
+The measures come from :mod:`.tallies`, so the same rules apply to a file and to a live
 recording. Every threshold has a name and a reason.
 """
 

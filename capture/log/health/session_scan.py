@@ -1,6 +1,6 @@
 """The health of a session from its messages, of a file or of a running recording.
 
-Chunks of a file (:mod:`.health.session_check`) and messages of a recording get the same verdict.
+Chunks of a file (:mod:`.session_check`) and messages of a recording get the same verdict.
 """
 
 from __future__ import annotations

@@ -4,6 +4,9 @@ A file that lies in an object store costs at most :data:`MOST_REQUESTS` requests
 bytes, whatever its size: the header and the first metadata, the footer and the summary behind it,
 and metadata between them.
 
+Of the recordings of ROS that are no plain MCAP, a rosbag2 folder states them in its metadata.yaml,
+a .bag of ROS 1 at its end; of a .db3 file the topics and the index of times are read.
+
 Format: https://mcap.dev/spec.
 """
 
@@ -13,6 +16,7 @@ import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 from mcap.data_stream import ReadDataStream
@@ -20,7 +24,9 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Footer, Metadata, MetadataIndex, Statistics
 
-from ...common.errors import NotALogError
+from ...common.errors import MissingExtraError, NotALogError, UndulogError
+from ..file.bag_metadata import Stated, read_stated
+from ..file.bag_parts import Allowance, read_database_facts
 from ..mcap.chunk import MAGIC, walk_records
 
 MOST_REQUESTS = 5
@@ -166,3 +172,46 @@ def _add_metadata(metadata: dict[str, dict[str, str]], records: list[tuple[int, 
 
 def _parse(kind: Any, body: bytes) -> Any:
     return kind.read(ReadDataStream(BytesIO(body)))
+
+
+def read_bag_facts(path: Path) -> LogFacts:
+    """Read the facts of a rosbag2 folder, a .db3 file or a .bag file.
+
+    Raises:
+        NotALogError: If it is damaged.
+        OSError: If it can't be read.
+        MissingExtraError: If ``rosbags`` or the YAML parser is not installed and needed.
+    """
+    try:
+        if path.is_dir():
+            stated = read_stated(path)
+        else:
+            stated = _of_ros1(path) if path.suffix == ".bag" else read_database_facts(path)
+    except ImportError as error:
+        raise MissingExtraError("reading a recording of ROS", "bags", "rosbags") from error
+    facts = LogFacts(messages=stated.messages, topics=tuple(sorted({*stated.topics})))
+    if not stated.messages or stated.start_ns is None or stated.duration_ns is None:
+        return facts
+    return LogFacts(
+        start_ns=stated.start_ns,
+        end_ns=stated.start_ns + stated.duration_ns,
+        messages=facts.messages,
+        topics=facts.topics,
+    )
+
+
+def _of_ros1(path: Path) -> Stated:
+    from ..file.bag_ros1 import SummaryReader
+
+    try:
+        with SummaryReader(path, Allowance(path, 0)) as bag:
+            topics = tuple(connection.topic for connection in bag.connections)
+            count = sum(sum(chunk.connection_counts.values()) for chunk in bag.chunk_infos)
+            start, stop = bag.start_time, bag.end_time
+    except (MemoryError, OSError, UndulogError):
+        raise
+    except Exception as error:  # rosbags lets errors of struct and dictionaries through
+        why = " ".join(str(error).split()) or type(error).__name__
+        fix = "run 'rosbag reindex' or 'rosbag fix'"
+        raise NotALogError(path, f"can't be read as a bag of ROS 1: {why}; {fix}") from error
+    return Stated([path], "", start, stop - 1 - start, count, topics)

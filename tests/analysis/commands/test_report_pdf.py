@@ -107,7 +107,7 @@ def test_a_browser_that_fails_leaves_nothing(text, expected, tmp_path, command):
 
 
 def test_a_browser_that_hangs_is_ended_with_its_children(tmp_path):
-    from undulog.analysis.present.page.page import write_pdf
+    from undulog.analysis.present.page import write_pdf
     from undulog.capture.common.errors import UndulogError
 
     out = tmp_path / "out"

@@ -110,7 +110,7 @@ def test_named_files_are_one_page_by_themselves_only_if_asked(folder, tmp_path, 
 def test_a_page_of_many_sessions_leaves_out_samples_then_refuses(
     folder, tmp_path, command, monkeypatch
 ):
-    page, limit = tmp_path / "all.html", "undulog.analysis.present.page.page.LARGEST_BYTES"
+    page, limit = tmp_path / "all.html", "undulog.analysis.present.page.LARGEST_BYTES"
     command("report", folder, "-o", page, code=1)
     full = page.read_text()
     monkeypatch.setattr(limit, len(full.encode()) * 0.7)

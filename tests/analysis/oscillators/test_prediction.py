@@ -14,8 +14,8 @@ import undulog
 from support import linear_chain
 from support.kick_runs import kicked
 from support.linear_chain import CHAIN, WAVE
-from undulog.analysis.experiment.kicks.coupling import kick_coupling
-from undulog.analysis.experiment.kicks.prediction import closed_loop
+from undulog.analysis.experiment.kick_coupling import kick_coupling
+from undulog.analysis.experiment.kick_prediction import closed_loop
 from undulog.analysis.oscillators.laplacian import of_deviations
 from undulog.analysis.oscillators.predictions import path_laplacian
 from undulog.analysis.results.coupling import BaseResponse, LocalCoupling, Matrix, rows_of

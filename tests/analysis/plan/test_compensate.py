@@ -12,9 +12,9 @@ import undulog
 from support import linear_chain
 from support.compensating import Wave, gait_run
 from support.kick_runs import kicked
-from undulog.analysis.experiment.kicks.coupling import kick_coupling
+from undulog.analysis.experiment.kick_coupling import kick_coupling
 from undulog.analysis.plan.compensate import RESERVE, compensation
-from undulog.analysis.plan.gait_base import BaseGait
+from undulog.analysis.plan.runs import BaseGait
 from undulog.analysis.response.response import Response
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import DataError, UsageError

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from support.joint_runs import turns, write_joints
-from undulog.analysis.experiment.kicks.runs import Kind, missing_kicks, sort_kicks
-from undulog.analysis.plan.designs import reversal, tones
-from undulog.analysis.plan.gait_base import slowest_mode, transverse_mass
+from undulog.analysis.experiment.kick_runs import Kind, missing_kicks, sort_kicks
+from undulog.analysis.plan.designs import reversal, slowest_mode, tones, transverse_mass
 from undulog.capture import Session, load_robot
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Plane

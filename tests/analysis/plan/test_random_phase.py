@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from support.joint_runs import turns, write_joints
-from undulog.analysis.plan.random_phase import GROUP, odd_lines, random_phase_runs
+from undulog.analysis.plan.designs import GROUP, odd_lines, random_phase_runs
 from undulog.capture import Session, load_robot
 from undulog.capture.common.errors import UsageError
 

@@ -32,16 +32,20 @@ def profile(rng, values, margin=0.0, shared=0.0):
     return Profile(place, joints, values + noise, scatter(rng, joints, shared), margin)
 
 
-def test_one_contrast_of_known_error_has_student_s_quantile():
-    many = Scatter(np.random.default_rng(1).standard_normal((1, COLUMNS)), np.zeros(1), np.zeros(1))
-    found = critical_value([Member(np.ones((1, 1)), many)], draws=40_000)
-    assert found == pytest.approx(2.064, abs=0.05)  # t with 24 degrees of freedom
-
-
-def test_many_independent_contrasts_have_the_quantile_of_their_largest():
-    many = Scatter(np.random.default_rng(2).standard_normal((10, 100)), np.zeros(10), np.zeros(10))
-    found = critical_value([Member(np.eye(10), many)], draws=2000)
-    assert found == pytest.approx(2.87, abs=0.12)  # Student's t with 100 at 1 - 0.05 / 20
+@pytest.mark.parametrize(
+    ("count", "columns", "draws", "expected", "within"),
+    [
+        (1, COLUMNS, 40_000, 2.064, 0.05),  # t with 24 degrees of freedom
+        (10, 100, 2000, 2.87, 0.12),  # Student's t with 100 at 1 - 0.05 / 20
+    ],
+)
+def test_the_critical_value_of_contrasts_is_the_quantile_of_the_largest(
+    count, columns, draws, expected, within
+):
+    noise = np.random.default_rng(count).standard_normal((count, columns))
+    many = Scatter(noise, np.zeros(count), np.zeros(count))
+    found = critical_value([Member(np.eye(count), many)], draws=draws)
+    assert found == pytest.approx(expected, abs=within)
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.8])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from support.analysed import analysed, experiment
-from undulog.analysis.present.notebook.files import load
+from undulog.analysis.present.result_files import load
 from undulog.capture import SessionWriter
 
 EPOCH_NS = 1_735_689_600_000_000_000

@@ -17,7 +17,7 @@ def std_string(store, serialize):
     return bytes(serialize(store.types["std_msgs/msg/String"](data="walk"), "std_msgs/msg/String"))
 
 
-ROS1_TEXT, ROS1_SUM = NOETIC.generate_msgdef("std_msgs/msg/String")
+ROS1_TEXT, _ = NOETIC.generate_msgdef("std_msgs/msg/String")
 ROS2_TEXT, _ = HUMBLE.generate_msgdef("std_msgs/msg/String", ros_version=2)
 
 # topic, encoding of its messages, its schema (name, encoding, data) or None, one message or None

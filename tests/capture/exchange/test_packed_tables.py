@@ -135,13 +135,6 @@ def test_a_mat_element_that_expands(tmp_path):
         open_table(path)
 
 
-def test_joints_that_never_share_a_time(tmp_path):
-    rows = (f"{k / 100},j{k % 3000},0.5" for k in range(60_000))
-    path = of_bytes(tmp_path / "x.csv", "\n".join(["time,joint,angle", *rows]).encode())
-    with pytest.raises(ImportFormatError, match="seldom share a time"):
-        import_tables(open_tables(path), tmp_path / "x.mcap")
-
-
 def test_a_long_table_in_any_order(tmp_path):
     """Rows of three joints, shuffled, are the samples that they are in order."""
     rng = np.random.default_rng(1)
@@ -177,27 +170,44 @@ def test_frames_numbered_by_what_is_no_number(tmp_path, column, cells):
         import_lerobot(dataset(tmp_path, **{column: cells}), tmp_path / "out")
 
 
-@pytest.mark.parametrize("t", ["1e999999999", "1e308", "-1e308", "nan", "inf", "1e18", "-5e9"])
-def test_a_time_that_no_stamp_holds(tmp_path, t):
+def with_one(name, t=None, value=None):
+    """A table of one joint in which one row has another time or value."""
     rows = [f"{k / 100},{k % 7}" for k in range(100)]
-    rows[50] = f"{t},1"
-    path = of_bytes(tmp_path / "x.csv", "\n".join(["time,joint1_pos", *rows]).encode())
-    with pytest.raises(ImportFormatError, match="time"):
-        import_tables(open_tables(path), tmp_path / "x.mcap")
+    rows[50] = f"{t or 0.5},{value or 1}"
+    return [f"time,{name}", *rows]
 
 
-def test_times_before_1970(tmp_path):
-    rows = [f"{k - 2e8:.2f},{k % 7}" for k in range(100)]
-    path = of_bytes(tmp_path / "x.csv", "\n".join(["time,joint1_pos", *rows]).encode())
-    with pytest.raises(ImportFormatError, match="not all times are from 1970"):
-        import_tables(open_tables(path), tmp_path / "x.mcap", units={"time": "s"})
+BEYOND = (0, 1, 4294967296)  # as many joints were named
+REFUSED = [
+    *(
+        (with_one("joint1_pos", t=t), "time")
+        for t in ("1e999999999", "1e308", "-1e308", "nan", "inf", "1e18", "-5e9")
+    ),
+    *(
+        (with_one("joint1_pos_deg", value=value), "joint1_pos_deg")
+        for value in ("1e308", "inf", "-1e250")
+    ),
+    (
+        ["time [s],joint1_pos", *(f"{k - 2e8:.2f},{k % 7}" for k in range(100))],
+        "not all times are from 1970",
+    ),
+    (
+        ["time,joint,angle", *(f"{k / 100},j{k % 3000},0.5" for k in range(60_000))],
+        "seldom share a time",
+    ),
+    (
+        ["time,joint,angle", *(f"{k},{j},0.5" for k in range(100) for j in BEYOND)],
+        "number 4294967296",
+    ),
+]
 
 
-@pytest.mark.parametrize("value", ["1e308", "inf", "-1e250"])
-def test_a_value_beyond_any_joint(tmp_path, value):
-    rows = [f"{k / 100},{value if k == 50 else k % 7}" for k in range(100)]
-    path = of_bytes(tmp_path / "x.csv", "\n".join(["time,joint1_pos_deg", *rows]).encode())
-    with pytest.raises(ImportFormatError, match="joint1_pos_deg"):
+@pytest.mark.parametrize(
+    ("rows", "why"), REFUSED, ids=[f"{why}-{k}" for k, (_, why) in enumerate(REFUSED)]
+)
+def test_times_values_and_joints_that_no_log_holds(tmp_path, rows, why):
+    path = of_bytes(tmp_path / "x.csv", "\n".join(rows).encode())
+    with pytest.raises(ImportFormatError, match=why):
         import_tables(open_tables(path), tmp_path / "x.mcap")
 
 
@@ -217,11 +227,3 @@ def test_one_joint_has_no_vectors(tmp_path):
     import_lerobot(dataset(tmp_path, width=1, action=cells), tmp_path / "x.mcap")
     found = decoded_of(tmp_path / "x.mcap", ["/joint_commands"])
     assert [message.position for *_, message in found] == [[cell] for cell in cells]
-
-
-def test_a_joint_of_a_number_beyond_any_robot(tmp_path):
-    """As many joints were named."""
-    rows = [f"{k},{j},0.5" for k in range(100) for j in (0, 1, 4294967296)]
-    path = of_bytes(tmp_path / "x.csv", "\n".join(["time,joint,angle", *rows]).encode())
-    with pytest.raises(ImportFormatError, match="number 4294967296"):
-        import_tables(open_tables(path), tmp_path / "x.mcap")

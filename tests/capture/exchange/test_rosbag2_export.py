@@ -14,7 +14,7 @@ from support.written_sessions import EPOCH_NS, NAMES, samples, write_session
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError
 from undulog.capture.exchange.rosbag2_export import export_rosbag2
-from undulog.capture.log.edit.edited_log import EDIT_RECORD, RawLog
+from undulog.capture.log.edited_log import EDIT_RECORD, RawLog
 from undulog.capture.log.health.contract import check_contract
 
 

@@ -11,7 +11,7 @@ from undulog.capture import load_robot, robot_names
 from undulog.capture.common.errors import RobotFileError, UsageError
 from undulog.capture.robot import model
 from undulog.capture.robot.description import parse_robot
-from undulog.sim.gate.limits import missing_limits, safety_example
+from undulog.sim.drive.limits import missing_limits, safety_example
 
 MINIMAL = f"""
 name = "worm"

@@ -8,9 +8,9 @@ import pytest
 import undulog
 from undulog.capture import Session
 from undulog.capture.common.palette import joint_colors
-from undulog.replay.feed.numbers import computed
-from undulog.replay.feed.recording import write_recording
 from undulog.replay.layout import build_blueprint
+from undulog.replay.numbers import computed
+from undulog.replay.recording import write_recording
 
 pytestmark = pytest.mark.slow
 

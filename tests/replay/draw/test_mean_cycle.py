@@ -14,8 +14,8 @@ from undulog.analysis.session.analyse import measure_session
 from undulog.analysis.session.cycles import cycle_maps
 from undulog.capture import Session
 from undulog.replay.draw.steps import cycle_tables
-from undulog.replay.feed.numbers import computed
-from undulog.replay.feed.recording import write_recording
+from undulog.replay.numbers import computed
+from undulog.replay.recording import write_recording
 from undulog.replay.samples.timeline import ENSEMBLE_CYCLE
 
 

@@ -50,7 +50,7 @@ def angles():
 @pytest.fixture(scope="module")
 def file(robot, angles, tmp_path_factory):
     """That robot, recorded and converted."""
-    from undulog.replay.feed.recording import write_recording
+    from undulog.replay.recording import write_recording
 
     folder = tmp_path_factory.mktemp("meshes")
     path = folder / "boxes.mcap"

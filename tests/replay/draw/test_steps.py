@@ -20,7 +20,7 @@ from undulog.capture.common.palette import joint_colors
 from undulog.replay.draw.body import power_colors
 from undulog.replay.draw.heat_maps import cell_colors, heat_maps
 from undulog.replay.draw.steps import charts, cycle_tables, together
-from undulog.replay.feed.recording import write_recording
+from undulog.replay.recording import write_recording
 from undulog.replay.samples.content import ENERGY, GAIN, LAG, CycleTable
 
 STARTS = (0.0, 1.0, 2.0)

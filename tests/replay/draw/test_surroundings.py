@@ -5,7 +5,7 @@ import pytest
 
 from support.written_topics import EPOCH_NS, write_topics
 from undulog.capture import Session
-from undulog.replay.feed.recording import write_recording
+from undulog.replay.recording import write_recording
 from undulog.sim import Cylinder, Wall, load_scenario
 
 

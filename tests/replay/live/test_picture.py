@@ -6,7 +6,7 @@ import pytest
 from support.live_stage import EPOCH_NS, seen_live
 from support.written_topics import write_topics
 from undulog.capture import Session
-from undulog.replay.feed.recording import write_recording
+from undulog.replay.recording import write_recording
 
 
 @pytest.fixture(scope="module")

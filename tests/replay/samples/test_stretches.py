@@ -5,7 +5,7 @@ import pytest
 
 from undulog.capture import Session, SessionWriter
 from undulog.capture.robot.model import Plane
-from undulog.replay.feed.recording import write_recording
+from undulog.replay.recording import write_recording
 from undulog.replay.samples import timeline as stretches
 from undulog.replay.samples.quantities import survey
 from undulog.replay.samples.timeline import Span

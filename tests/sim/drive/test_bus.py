@@ -25,17 +25,17 @@ from undulog.capture.robot.model import Direction, OnFault, Quantity
 from undulog.capture.sources.contract import parse_address
 from undulog.capture.sources.events import Tally
 from undulog.sim import load_scenario
-from undulog.sim.control.adaptive import build_gait
 from undulog.sim.drive.links import find_virtual_robot, sent_text
 from undulog.sim.drive.loop import CommandEncoder, WallPace
 from undulog.sim.drive.motion import find_motion
+from undulog.sim.drive.outcome import DriveEnding
 from undulog.sim.drive.over_bus import LISTEN_S, bus_plan, drive_bus
 from undulog.sim.drive.python_can_bus import open_link
-from undulog.sim.gate.outcome import DriveEnding
-from undulog.sim.sensing.contract import JointSample
+from undulog.sim.physics.sensing import JointSample
 from undulog.sim.serve.pacing import Pacer
 from undulog.sim.serve.robot import PERIOD_NS, VirtualRobot
 from undulog.sim.serve.socketcand_server import SocketcandServer, VirtualBus
+from undulog.sim.twin.adaptive import build_gait
 
 STEP = np.radians(0.01)  # of a command on the bus of snake25
 

@@ -16,8 +16,8 @@ from undulog.capture.bus.encoding import poll_frames
 from undulog.capture.common.process import StopRequest
 from undulog.capture.log.messages.frames import DIR_RX, DIR_TX
 from undulog.sim.drive.motion import find_motion
+from undulog.sim.drive.outcome import DriveEnding
 from undulog.sim.drive.over_bus import bus_plan, drive_bus
-from undulog.sim.gate.outcome import DriveEnding
 
 SHIPPED = load_robot("arcsnake-joint")
 ADDRESS = 0x14B

@@ -13,7 +13,7 @@ from undulog.capture.common.errors import DataError
 from undulog.capture.log.messages.frames import DIR_RX, DIR_TX, EXTENDED_FLAG, empty_frames
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Direction, Quantity
-from undulog.sim.sensing.contract import JointSample, RangeSample, VectorSample
+from undulog.sim.physics.sensing import JointSample, RangeSample, VectorSample
 from undulog.sim.serve.reply_frames import ReplyEncoder
 from undulog.sim.serve.robot import CommandLatch
 

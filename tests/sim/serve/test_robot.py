@@ -20,9 +20,9 @@ from undulog.capture.log.messages.frames import ERROR_FLAG
 from undulog.capture.robot.description import parse_robot
 from undulog.capture.robot.model import Direction, Quantity
 from undulog.sim.gait.contract import CONTROL_RATE_HZ, GaitTick
+from undulog.sim.physics.sensing import JointSample
 from undulog.sim.scenario.bus_faults import parse_faults
 from undulog.sim.scenario.sensors import Noise, SensorModels, ServoPolling
-from undulog.sim.sensing.contract import JointSample
 from undulog.sim.serve.pacing import PATIENCE_NS, Pacer
 from undulog.sim.serve.reply_frames import FaultLine, ReplyEncoder
 from undulog.sim.serve.robot import PERIOD_NS, VirtualRobot

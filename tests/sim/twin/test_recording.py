@@ -17,7 +17,7 @@ from undulog.capture.common.errors import OutputExistsError
 from undulog.capture.common.process import StopRequest
 from undulog.capture.robot.kinematics import link_poses, rotation_from_quaternion
 from undulog.sim.physics.ledger import JOINT_TERMS, TERMS
-from undulog.sim.sensing.contract import JointSample
+from undulog.sim.physics.sensing import JointSample
 from undulog.sim.twin.session_log import urdf
 
 HUNDREDTH_NS = 10_000_000

@@ -7,8 +7,8 @@ import pytest
 
 from support.twin_runs import simulate
 from undulog import sim
+from undulog.capture.commands.robot import SeenJoint, draft
 from undulog.capture.common.errors import SimulationError
-from undulog.capture.exchange.robot_draft import SeenJoint, draft
 from undulog.capture.robot.model import Plane
 from undulog.sim.twin.stability import likely_cause, stability, warnings
 

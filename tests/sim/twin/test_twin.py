@@ -9,7 +9,7 @@ from support.twin_runs import energies, simulate
 from undulog.capture.common.errors import SimulationError
 from undulog.capture.robot.model import Plane
 from undulog.sim import FrictionLaw, Ground, PlaneGait, Serpentine, Twin, World
-from undulog.sim.sensing.contract import JointSample
+from undulog.sim.physics.sensing import JointSample
 
 
 def centre_of_mass(samples):

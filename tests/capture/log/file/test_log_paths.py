@@ -2,7 +2,7 @@
 
 import pytest
 
-from undulog.capture.log.file.log_paths import log_paths
+from undulog.capture.log.file.parts import log_paths
 
 
 def names(folder):

@@ -12,10 +12,10 @@ from support import durable_child as recorder
 from support.read_back import messages_of, metadata_of, read, rows_of
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import LogError, LogWriteError, NotALogError, OutputExistsError
-from undulog.capture.log.edit.cut import cut_log
-from undulog.capture.log.edit.merge import merge_logs
+from undulog.capture.log.cut import cut_log
 from undulog.capture.log.file.parts import later_parts, part_path, split_part_path
 from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.merge import merge_logs
 from undulog.capture.log.write.durable_sink import DurableSink
 
 EPOCH_NS = recorder.EPOCH_NS

@@ -209,23 +209,20 @@ def test_a_server_that_is_gone_is_an_error():
         Session.open(url)
 
 
-def test_an_object_that_changes_meanwhile_is_an_error_not_a_mixture(session):
+@pytest.mark.parametrize(
+    ("attribute", "value", "why"),
+    [
+        ("etag", '"second"', "has changed since it was opened"),
+        ("refuse", True, "refuses access"),
+    ],
+)
+def test_an_object_that_changes_or_stops_midway_is_an_error(session, attribute, value, why):
     with (
         web_server(files={"run.mcap": session.read_bytes()}) as server,
         Session.open(server.url("run.mcap")) as far,
     ):
-        server.etag = '"second"'
-        with pytest.raises(InputFileError, match="has changed since it was opened"):
-            far.joints("/joint_states")
-
-
-def test_a_server_that_stops_midway_is_an_error_not_missing_messages(session):
-    with (
-        web_server(files={"run.mcap": session.read_bytes()}) as server,
-        Session.open(server.url("run.mcap")) as far,
-    ):
-        server.refuse = True
-        with pytest.raises(InputFileError, match="refuses access"):
+        setattr(server, attribute, value)
+        with pytest.raises(InputFileError, match=why):
             far.joints("/joint_states")
 
 

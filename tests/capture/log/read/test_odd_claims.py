@@ -10,8 +10,8 @@ from hostile_logs import EPOCH_NS, NS, HostileLog, gait, joint_state
 import undulog
 from undulog.capture import Session
 from undulog.capture.common.errors import DataError
-from undulog.capture.log.edit.merge import merge_logs
 from undulog.capture.log.health.session_check import check_session
+from undulog.capture.log.merge import merge_logs
 from undulog.capture.log.messages.definitions import parse_message_type
 from undulog.replay.samples.tracks import drawn_topics
 

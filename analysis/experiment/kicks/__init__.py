@@ -1,1 +1,0 @@
-"""Coupling around one gait, from kicks of single joints."""

@@ -1,1 +1,0 @@
-"""Frequency responses from any excitation."""

@@ -1,0 +1,473 @@
+"""All artefacts of a session: every detector on every joint that it applies to.
+
+A frozen encoder is not a weak servo: what is wrong with samples, or at a limit, is kept apart from
+mechanics. Each :class:`~.analysis.results.answer.Artefact` names a joint, a topic and the intervals
+in which it holds, and states what it is about: the ``sensor`` (the values are not what the joint
+did), the ``record`` (samples are missing) or a ``limit`` (the robot could not do more; the values
+are right).
+
+An encoder that wraps around, or loses its place: steps that no joint can make.
+
+Steps of one common size P, up and down, are the wrap of a counter: the position is right again
+but for whole turns of P. Any other such step is a jump: from then on the position is another one,
+or one sample was wrong. A joint at the limits of its robot is saturated or stalled, which is
+neither sensor nor spread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+
+from undulog.capture import SessionView
+from undulog.capture.common.arrays import BoolArray, FloatArray
+from undulog.capture.common.process import in_threads
+from undulog.capture.following.motion import JointMotion, Samples, linearised
+from undulog.capture.log.read.sample_times import LARGEST, Signal
+from undulog.capture.robot.model import Joint
+
+from ..estimators.series import Series, clean_together
+from ..results.answer import FALSIFYING, Artefact, Span
+from .columns import QUANTITIES, Columns
+from .holds import clipped, frozen, stale
+from .scales import (
+    SAME_RATE,
+    SAME_SCALE,
+    against_command,
+    against_witness,
+    compare,
+    inside,
+    integral,
+    spans_of,
+    turns,
+)
+
+ABOVE_NEIGHBOURS = 8.0
+"""A step this many times those beside it stands alone."""
+
+ABOVE_USUAL = 20.0
+"""A step this many times the median one is unlike any other."""
+
+SAME_SIZE = 0.02
+"""Relative spread of the sizes of one counter's wraps."""
+
+_BESIDE = 3
+_TURNS = (np.pi, 2 * np.pi, 4 * np.pi)
+"""Sizes [rad] by which a single step is known as a wrap."""
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """What a position does that no joint can do.
+
+    Attributes:
+        wrapped: Stretches in which it is off by whole turns of the counter.
+        turn_rad: Size of that turn [rad]; 0 where there is none.
+        jumped: Instants of other steps, from the sample before to the sample after.
+    """
+
+    wrapped: tuple[Span, ...]
+    turn_rad: float
+    jumped: tuple[Span, ...]
+
+
+def find_jumps(position: Series, most_rate: float, released: tuple[Span, ...] = ()) -> Jumps:
+    """Look for wraps and jumps.
+
+    Args:
+        most_rate: Rate that the joint can't exceed [rad/s].
+        released: Stretches in which the position was frozen: the step at the end of one is the
+            way that the joint has gone meanwhile.
+    """
+    t_s, value = position.t_s, position.values
+    nothing = Jumps((), 0.0, ())
+    if value.size < 16:
+        return nothing
+    step, dt = np.diff(value), np.diff(t_s)
+    at = np.flatnonzero(_alone(step, dt, most_rate))
+    if released:
+        held = inside(t_s, released)
+        near = np.minimum(at[:, None] + np.arange(-1, 3), value.size - 1)
+        at = at[~held[near].any(axis=1)]
+    if at.size == 0:
+        return nothing
+    before, after = np.maximum(at - 1, 0), np.minimum(at + 1, step.size - 1)
+    own = step[at] - (step[before] + step[after]) / 2  # without what the joint itself did meanwhile
+    turn = float(np.median(np.abs(own)))
+    spread = SAME_SIZE * turn + 2 * float(np.median(np.abs(step)))
+    alike = bool(np.all(np.abs(np.abs(own) - turn) < spread))
+    # Lone steps of any size may be a jump; a counter's single wrap is known by its size.
+    known = any(abs(turn - one) < spread for one in _TURNS)
+    if not alike or not (known or (at.size > 2 and np.ptp(value) < 2 * turn)):
+        return Jumps((), 0.0, tuple((float(t_s[k]), float(t_s[k + 1])) for k in at))
+    turns = np.zeros(value.size)
+    turns[at + 1] = np.rint(own / turn)
+    count = np.cumsum(turns)
+    levels, index = np.unique(count, return_inverse=True)
+    return Jumps(spans_of(t_s, count != levels[np.argmax(np.bincount(index))]), turn, ())
+
+
+def _alone(step: FloatArray, dt: FloatArray, most_rate: float) -> BoolArray:
+    size = np.abs(step)
+    possible = most_rate * dt
+    alone = size > possible
+    if not np.any(alone):
+        return alone
+    # Over a gap a joint goes further; the usual step grows with it.
+    alone &= size > ABOVE_USUAL * np.median(size[size > 0]) * np.maximum(dt / np.median(dt), 1.0)
+    for k in np.flatnonzero(alone):
+        near = np.concatenate((size[max(k - _BESIDE, 0) : k], size[k + 1 : k + 1 + _BESIDE]))
+        calm = near[near <= possible[k]]
+        alone[k] = calm.size > 1 and size[k] > ABOVE_NEIGHBOURS * float(calm.max())
+    return alone
+
+
+AT_LIMIT_RAD = 1e-4
+"""A position this close to its limit, or beyond it, is at the limit."""
+
+AT_LIMIT = 0.995
+"""So large a part of any other limit is at the limit."""
+
+AT_LIMIT_SHARE = 0.01
+"""Less of the time at a limit is touching it."""
+
+STALL_SHARE = 0.9
+"""Part of the stall torque that a stalled joint gives at least."""
+
+STALL_S = 0.2
+DWELL = 3.0
+"""Times the turning point of a sine that a joint of unknown stall torque stands still."""
+
+CONSTANT = 0.05
+"""Standard deviation over mean below which an effort is constant."""
+
+STANDING = 0.05
+"""Standing still: slower than this part of what the joint does at most."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one joint can do, from the robot's description.
+
+    Attributes:
+        lower: Angle [rad].
+        upper: Angle [rad].
+        rate: [rad/s].
+        torque: At standstill and full voltage [N m].
+        current: At standstill and full voltage [A].
+        voltage: Of the supply [V].
+        known: Whether the servo's values are known rather than assumed.
+    """
+
+    lower: float
+    upper: float
+    rate: float
+    torque: float
+    current: float
+    voltage: float
+    known: bool
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """All of them, both signs: values at which a channel may stay by itself."""
+        sizes = (self.rate, self.torque, self.current, self.voltage)
+        return (self.lower, self.upper, *sizes, *(-one for one in sizes))
+
+
+def limits_of(session: SessionView) -> dict[str, Limits]:
+    """Return the limits of the session's joints.
+
+    Args:
+        session: An open session; a twin may have run other servos than the robot's own.
+
+    Returns:
+        By joint name; empty without a robot description.
+    """
+    robot = session.robot_as_run
+    if robot is None:
+        return {}
+    # A twin's servos are as they are stated, whatever the robot's may be.
+    known = session.run is not None or not {"servo", "joints"} & set(robot.assumed)
+    return {joint.name: _limits(joint, known) for joint in robot.joints}
+
+
+def _limits(joint: Joint, known: bool) -> Limits:
+    servo = joint.servo
+    return Limits(
+        joint.lower,
+        joint.upper,
+        joint.max_velocity,
+        servo.stall_torque,
+        servo.supply_v / servo.resistance_ohm,
+        servo.supply_v,
+        known,
+    )
+
+
+def saturated(one: Series, lower: float, upper: float, slack: float) -> tuple[Span, ...]:
+    """Return the stretches in which a channel is at a limit.
+
+    Args:
+        slack: This close to a limit is at it.
+
+    Returns:
+        The stretches; none if they are less than ``AT_LIMIT_SHARE`` of the samples.
+    """
+    at = (one.values <= lower + slack) | (one.values >= upper - slack)
+    if np.count_nonzero(at) <= AT_LIMIT_SHARE * one.count:
+        return ()
+    return spans_of(one.t_s, at, join=2)
+
+
+def stalled(
+    effort: Series, position: Series, most: float | None, asked: Series
+) -> tuple[Span, ...]:
+    """Return the stretches in which a joint pushes with all it has, and stands still.
+
+    Without a known stall torque, a joint has stalled where its effort stays constant at its
+    largest value for far longer than a sine at its turning point stands still.
+
+    Args:
+        effort: Torque, or motor current.
+        most: Torque or current at standstill and full voltage; None where it is not known.
+        asked: Its command, or else its position: what it does at most, 95 % of the time less,
+            shows what standing still is.
+
+    Returns:
+        Stretches of ``STALL_S`` or more.
+    """
+    largest = float(np.percentile(np.abs(effort.values), 99.5)) if effort.count else 0.0
+    pushing = np.abs(effort.values) >= STALL_SHARE * (largest if most is None else most)
+    pushing &= largest > 0
+    if position.count < 2 or asked.count < 2 or not np.any(pushing):
+        return ()
+    usual_rate = float(np.percentile(np.abs(np.diff(asked.values)) / np.diff(asked.t_s), 95))
+    if usual_rate <= 0:
+        return ()
+    # Speed over a tenth of a second, so that an encoder's steps and noise are none.
+    half = STALL_S / 4
+    at = np.flatnonzero(pushing)
+    ends = position.at(effort.t_s[at] + half), position.at(effort.t_s[at] - half)
+    rate = (ends[0] - ends[1]) / (2 * half)
+    pushing[at[np.abs(rate) >= STANDING * usual_rate]] = False
+    found = spans_of(effort.t_s, pushing, join=2)
+    long = STALL_S
+    if most is None:
+        edges = turns(asked)
+        if edges.size < 2:
+            return ()
+        # A sine is slower than the share s of its peak speed for 2 arcsin(s) / omega.
+        omega = 2 * np.pi / float(np.median(np.diff(edges)))
+        long = max(STALL_S, DWELL * 2 * float(np.arcsin(STANDING)) / omega)
+        found = tuple(span for span in found if _constant(effort, span))
+    return tuple(span for span in found if span[1] - span[0] >= long)
+
+
+def _constant(effort: Series, span: Span) -> bool:
+    """Return whether an effort keeps one value over a span."""
+    i, j = np.searchsorted(effort.t_s, span)
+    inside = effort.values[i : j + 1]
+    return bool(np.std(inside) < CONSTANT * abs(float(np.mean(inside))))
+
+
+GAP_SHARE = 1e-3
+"""Less of a session without samples is no gap worth a word."""
+
+MOST_RATE = 50.0
+"""Rate that no joint of a robot without description exceeds [rad/s]."""
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """One joint's channels over the whole session, as recorded and cleaned."""
+
+    name: str
+    raw: Mapping[str, Signal]
+    series: Mapping[str, Series]
+    limits: Limits | None
+    driven: bool
+
+
+def find_artefacts(session: SessionView, columns: Columns) -> tuple[Artefact, ...]:
+    """Look at the whole session, joint by joint.
+
+    Returns:
+        What was found, in chain order.
+    """
+    limits = limits_of(session)
+    commanded = columns.commanded()
+    origin_ns = session.start_ns
+
+    def of_joint(name: str) -> list[Artefact]:
+        own = {key: columns.of(key).get(name) for key in QUANTITIES}
+        raw = {key: one for key, one in own.items() if one is not None and one.t_ns.size}
+        series = {key: one for key, one in clean_together(raw, origin_ns).items() if one.count}
+        joint = _Joint(name, raw, series, limits.get(name), name in commanded)
+        return [
+            Artefact(name, columns.topics.get(quantity, ""), quantity, flag, spans, note)
+            for quantity, flag, spans, note in _of_joint(joint, origin_ns)
+        ]
+
+    samples = sum(one.t_ns.size for key in QUANTITIES for one in columns.of(key).values())
+    return tuple(chain.from_iterable(in_threads(of_joint, columns.names, samples, session.forget)))
+
+
+_Found = Iterator[tuple[str, str, tuple[Span, ...], str]]
+
+
+def _of_joint(joint: _Joint, origin_ns: int) -> _Found:
+    """Quantity, flag, stretches and note of whatever one joint shows."""
+    found = [*_of_sensors(joint)]
+    yield from found
+    # What a sensor falsifies says nothing about a limit.
+    false = {quantity for quantity, flag, _, _ in found if flag in FALSIFYING}
+    yield from (one for one in _at_limits(joint) if one[0] not in false)
+    for quantity in ("command", "position"):
+        if quantity in joint.series:
+            yield from _of_record(quantity, joint, origin_ns)
+
+
+def _of_sensors(joint: _Joint) -> _Found:
+    levels = () if joint.limits is None else joint.limits.values
+    command = joint.series.get("command") if joint.driven else None
+    sensed = {key: one for key, one in joint.series.items() if key != "command"}
+    against = {"position": command}
+    tops = {key: clipped(one, levels, against.get(key)) for key, one in sensed.items()}
+    if "position" not in joint.series:
+        yield "position", "not_recorded", (), ""
+    else:
+        yield from _of_position(joint, joint.series["position"], tops["position"])
+    for quantity, spans in tops.items():
+        if spans:
+            yield quantity, "clipped", spans, ""
+
+
+def _of_position(joint: _Joint, position: Series, tops: tuple[Span, ...]) -> _Found:
+    command, velocity = joint.series.get("command"), joint.series.get("velocity")
+    way = None if velocity is None or velocity.count < 2 else integral(velocity)
+    # Without a command the velocity says that a joint moves; one that is held still may stand.
+    motion = way if command is None else command if joint.driven else None
+    if stopped := _stalled(joint):
+        yield "effort", "stalled", stopped, ""
+    held: tuple[Span, ...] = ()
+    if motion is not None:
+        held = _apart(frozen(position, motion, way), [*stopped, *tops])
+        if held:
+            yield "position", "frozen", held, ""
+        if old := stale(position):
+            yield "position", "stale", old, ""
+    rate = MOST_RATE if joint.limits is None else joint.limits.rate
+    jumps = find_jumps(position, rate, (*held, *stopped))
+    if jumps.wrapped:
+        yield "position", "wrapped", jumps.wrapped, f"turn of {jumps.turn_rad:.4g} rad"
+        return
+    scales = [*_of_scale(joint, position, command if joint.driven else None, way)]
+    yield from scales
+    # A sign or unit that changes makes a step, somewhere in the cycles around.
+    if jumps.jumped:
+        edges = np.zeros(0) if motion is None else turns(motion)
+        cycle = float(np.median(np.diff(edges))) if edges.size > 1 else 0.0
+        own = chain.from_iterable(spans for q, _, spans, _ in scales if q == "position")
+        other = [(a - cycle, b + cycle) for a, b in own]
+        if left := _apart(jumps.jumped, other):
+            yield "position", "jump", left, ""
+
+
+def _linear(position: Series, command: Series) -> Series:
+    """Return what a joint makes of a command that is no rhythm; a rhythm as it is."""
+    asked, moved = (Samples(one.t_s, one.values) for one in (command, position))
+    own = linearised(JointMotion(command.name, asked, moved)).command
+    return command if own.t_s is command.t_s else Series(command.name, own.t_s, own.values)
+
+
+def _of_scale(
+    joint: _Joint, position: Series, command: Series | None, way: Series | None
+) -> _Found:
+    """Sign, unit and scale against the command, a second sensor and the velocity's integral."""
+    found: set[str] = set()
+    command, second, way = (
+        one if one is not None and np.ptp(one.values) > 0 else None
+        for one in (command, joint.series.get("reference"), way)
+    )
+    leader = command or second or way
+    if leader is None:
+        return
+    edges = turns(leader)
+    if command is not None:
+        leading = _linear(position, command)
+        for flag, spans in against_command(compare(position, leading, edges)).items():
+            found.add(flag)
+            yield "position", flag, spans, ""
+    if second is not None:
+        by_second = compare(position, second, edges, noisy=True)
+        for flag, spans in against_witness(by_second, SAME_SCALE).items():
+            found.add(flag)
+            scale = float(np.nanmedian(by_second.ratio))
+            yield "position", flag, spans, f"{scale:.3g} of the second sensor's"
+    if way is not None:
+        by_rate = compare(position, way, edges, noisy=True)
+        # What the position is blamed for already is no fault of the velocity.
+        for flag, spans in against_witness(by_rate, SAME_RATE).items():
+            if flag not in found:
+                scale = 1 / float(np.nanmedian(by_rate.ratio))
+                note = f"{scale:.3g} times the derivative of the position"
+                yield "velocity", flag, spans, note if flag == "scale_mismatch" else ""
+
+
+def _stalled(joint: _Joint) -> tuple[Span, ...]:
+    position = joint.series["position"]
+    limits = joint.limits if joint.limits is not None and joint.limits.known else None
+    for quantity, most in (
+        ("effort", limits and limits.torque),
+        ("current", limits and limits.current),
+    ):
+        if quantity in joint.series:
+            asked = joint.series.get("command", position)
+            return stalled(joint.series[quantity], position, most, asked)
+    return ()
+
+
+def _at_limits(joint: _Joint) -> _Found:
+    limits = joint.limits
+    if limits is None:
+        return
+    for quantity in ("command", "position"):
+        if quantity in joint.series:
+            one = joint.series[quantity]
+            if spans := saturated(one, limits.lower, limits.upper, AT_LIMIT_RAD):
+                yield quantity, "saturated", spans, "angle"
+    sizes = [("velocity", limits.rate, "rate")]
+    if limits.known:
+        sizes += [
+            ("effort", limits.torque, "torque"),
+            ("current", limits.current, "current"),
+            ("voltage", limits.voltage, "voltage"),
+        ]
+    for quantity, most, note in sizes:
+        slack = (1 - AT_LIMIT) * most
+        one = joint.series.get(quantity)
+        if one is not None and (spans := saturated(one, -most, most, slack)):
+            yield quantity, "saturated", spans, note
+
+
+def _of_record(quantity: str, joint: _Joint, origin_ns: int) -> _Found:
+    raw, one = joint.raw[quantity], joint.series[quantity]
+    seconds = (raw.t_ns - origin_ns).astype(np.float64) * 1e-9
+    if one.dropped_nan:
+        yield quantity, "nan", spans_of(seconds, ~(np.abs(raw.values) <= LARGEST)), ""
+    if one.dropped_duplicates:
+        again = np.concatenate((np.diff(raw.t_ns) == 0, [False]))
+        yield quantity, "duplicate_stamps", tuple((t, t) for t in np.unique(seconds[again])), ""
+    if one.count < 2:
+        return
+    begin, end = one.t_s[one.gaps], one.t_s[one.gaps + 1]
+    if float(np.sum(end - begin)) > GAP_SHARE * (one.t_s[-1] - one.t_s[0]):
+        yield quantity, "gaps", tuple(zip(begin.tolist(), end.tolist(), strict=True)), ""
+
+
+def _apart(spans: Sequence[Span], others: Sequence[Span]) -> tuple[Span, ...]:
+    """Return the stretches that meet none of some others."""
+    return tuple(s for s in spans if not any(s[0] < end and s[1] > start for start, end in others))

@@ -1,1 +1,0 @@
-"""Logs cut, merged and recovered."""

@@ -1,1 +1,0 @@
-"""Adaptive control: how distances and the compass change a gait."""

@@ -1,1 +1,0 @@
-"""The safety gate: what stands between whoever drives and a robot's bus."""

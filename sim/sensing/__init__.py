@@ -1,1 +1,0 @@
-"""The robot's sensors: what they measure, when, and how wrongly."""

@@ -1,0 +1,46 @@
+"""Commands of each kind."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from undulog.analysis.estimators.series import Series
+from undulog.analysis.response.frequency_response import Kind, find_excitation
+
+T = np.arange(0.0, 60.0, 0.01)
+RNG = np.random.default_rng(0)
+
+
+def sines(*frequencies):
+    return sum(np.sin(2 * np.pi * f * T + k) for k, f in enumerate(frequencies))
+
+
+def multisine(period):
+    lines = np.arange(1, 60, 2)
+    phases = 2 * np.pi * RNG.random(lines.size)
+    angle = 2 * np.pi * np.outer(T, lines) / period
+    return np.cos(angle + phases).sum(axis=1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        (Kind.TONES, sines(0.25, 0.4, 0.613)),
+        (Kind.TONES, sines(0.25)),
+        (Kind.PERIODIC, multisine(12.0)),
+        (Kind.CHIRP, signal.chirp(T, 0.2, 60.0, 6.0)),
+        (Kind.CHIRP, signal.chirp(T, 6.0, 60.0, 0.2, method="logarithmic")),
+        (Kind.STEPS, np.sign(RNG.normal(size=120)).repeat(50)),
+        (Kind.NOISE, signal.lfilter(*signal.butter(2, 0.1), RNG.normal(size=T.size))),
+    ],
+)
+def test_each_kind_is_found(kind, values):
+    found = find_excitation(Series("u", T, values))
+    assert found.kind is kind
+    if kind is Kind.PERIODIC:
+        assert found.period_s == pytest.approx(12.0, abs=0.005)
+
+
+def test_what_never_moves_excites_nothing():
+    assert find_excitation(Series("u", T, np.ones(T.size))) is None
+    assert find_excitation(Series("u", T[:50], np.sin(T[:50]))) is None
