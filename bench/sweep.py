@@ -1,9 +1,10 @@
-"""A sweep on two processes, and on a Dask cluster of two, against one process.
+"""A sweep on two processes against one, and on a Dask cluster of two workers against one.
 
 Runs: a chain of five yaw joints on the ground, 2 s each, a random design over the servos' strength.
-The baseline is a tenth of the runs on one worker. Overhead is the part of the workers' time, wall
-clock times workers, that was not spent in runs, without the start of the workers. The scheduler and
-its worker processes run on loopback; their rows are those of the local processes, bit for bit.
+A baseline is a tenth of the runs, on one local process or on one Dask worker. Overhead is the part
+of the workers' time, wall clock times workers, that was not spent in runs, without the start of the
+workers. The scheduler and its worker processes run on loopback; their rows are those of the local
+processes, bit for bit.
 
 Run: python bench/sweep.py [--runs 2000]
 """
@@ -63,7 +64,7 @@ def measure(
 
 
 def _rows(folder: Path, processes: int, cluster: str | None) -> str:
-    return str(folder / (f"rows{processes}" if cluster is None else "cluster"))
+    return str(folder / f"{'rows' if cluster is None else 'cluster'}{processes}")
 
 
 def main() -> None:
@@ -71,26 +72,35 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--runs", type=int, default=2000)
     runs: int = parser.parse_args().runs
+    few = max(20, runs // 10)
     with TemporaryDirectory() as name:
         folder = Path(name)
         write_plan(folder, joints=5)  # its robot and scenario serve here
-        one, _ = measure(folder, max(20, runs // 10), 1)
+        one, _ = measure(folder, few, 1)
         two, overhead = measure(folder, runs, 2)
         port = free_port()
         address = f"tcp://127.0.0.1:{port}"
-        with scheduler(port), workers(port, folder / "dask"):
-            dask, dask_overhead = measure(folder, runs, 2, address)
+        with scheduler(port):
+            with workers(port, folder / "dask1", 1):
+                dask_one, _ = measure(folder, few, 1, address)
+            with workers(port, folder / "dask2", 2):
+                dask_two, dask_overhead = measure(folder, runs, 2, address)
         local = comparable(RowStore(_rows(folder, 2, None)).rows())
         same = comparable(RowStore(_rows(folder, 2, address)).rows()) == local
-    print(f"1 worker:  {one:.2f} runs/s ({max(20, runs // 10)} runs)")
-    print(f"2 workers: {two:.2f} runs/s ({runs} runs), {two / one:.2f} times one worker")
-    print(f"overhead:  {100 * overhead:.1f} % of the workers' time")
-    print(f"Dask, 2:   {dask:.2f} runs/s, {dask / one:.2f} times one worker")
-    print(f"overhead:  {100 * dask_overhead:.1f} % of the workers' time")
+    print(f"1 process:      {one:.2f} runs/s ({few} runs)")
+    print(f"2 processes:    {two:.2f} runs/s ({runs} runs), {two / one:.2f} times one process")
+    print(f"overhead:       {100 * overhead:.1f} % of the workers' time")
+    print(f"1 Dask worker:  {dask_one:.2f} runs/s, {dask_one / one:.2f} times one process")
+    print(
+        f"2 Dask workers: {dask_two:.2f} runs/s, {dask_two / dask_one:.2f} times one Dask worker, "
+        f"{dask_two / one:.2f} times one process"
+    )
+    print(f"overhead:       {100 * dask_overhead:.1f} % of the workers' time")
     verdict("sweep, 2 workers, 5 joints: runs/s to one worker", two / one, None, "times")
     verdict("sweep, 2 workers: overhead", 100 * overhead, None, "% of the workers' time")
-    what = "the same on a Dask cluster of 2: runs/s to one worker"
-    verdict(what, dask / one, None, "times")
+    what = "the same on a Dask cluster of 2: runs/s to one"
+    verdict(f"{what} local process", dask_two / one, None, "times")
+    verdict(f"{what} Dask worker", dask_two / dask_one, None, "times")
     verdict("sweep, rows of both equal", float(same), 1, "", most=False)
     print(f"same rows: {'yes' if same else 'NO'}")
 

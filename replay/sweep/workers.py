@@ -7,23 +7,20 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
-import threading
 import time
 from collections import Counter
 from collections.abc import Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
-from multiprocessing import connection, get_context, parent_process
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from typing import Any, Self
 
 from undulog.capture.common.console import complain
-from undulog.capture.common.errors import MissingExtraError, SourceError, UndulogError
+from undulog.capture.common.errors import MissingExtraError, SourceError
 from undulog.capture.common.process import StopRequest
 
+from .processes import RunProcesses, request_of, row_in, run_beside
 from .rows import Row
-from .run import Job, Setting, row_of, run_job
+from .run import Job, Setting, row_of
 
 _AHEAD = 2
 """Runs that are handed out at a time, for each worker."""
@@ -34,39 +31,11 @@ PATIENCE_S = 300.0
 
 _ATTEMPTS = 3
 """A run whose worker ends so often is a failed one."""
-_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 def processors() -> int:
     """Return how many processors this process may use."""
     return len(os.sched_getaffinity(0))
-
-
-@contextmanager
-def _one_thread_each() -> Generator[None]:
-    """Processes that begin within have one thread each for linear algebra."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name in _THREADS:
-            del os.environ[name]
-        os.environ.update((name, value) for name, value in before.items() if value is not None)
-
-
-def _begin_worker() -> None:
-    """Leave Ctrl-C to the coordinator, and end with it, however it ends."""
-    for number in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
 
 
 class _Queue:
@@ -107,7 +76,8 @@ class LocalWorkers:
     def __init__(self, count: int) -> None:
         """Begin none yet: they begin with the first runs."""
         self.count = count
-        self._pool: ProcessPoolExecutor | None = None
+        self._processes = RunProcesses()
+        self._threads = ThreadPoolExecutor(count)
 
     def __enter__(self) -> Self:
         """Enter the block that owns the processes."""
@@ -119,16 +89,13 @@ class LocalWorkers:
 
     def end(self) -> None:
         """End the processes; others begin with the next run."""
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-        self._pool = None
+        self._threads.shutdown(cancel_futures=True)
+        self._processes.end()
+        self._threads = ThreadPoolExecutor(self.count)
 
-    def submit(self, setting: Setting, job: Job) -> Future[Row]:
+    def submit(self, setting: Setting, job: Job) -> Future[bytes]:
         """Hand out a run."""
-        if self._pool is None:
-            self._pool = ProcessPoolExecutor(self.count, get_context("spawn"), _begin_worker)
-        with _one_thread_each():  # the pool starts its processes when it gets work
-            return self._pool.submit(run_job, setting, job)
+        return self._threads.submit(self._processes.run, request_of(setting, job))
 
 
 def run_local(
@@ -140,36 +107,29 @@ def run_local(
         Rows as they are done; none is begun any more once an end is requested.
     """
     queue = _Queue(jobs)
-    lost: list[Job] | None = None
-    while lost is None or lost:
-        lost = []
-        running: dict[Future[Row], Job] = {}
-        try:
-            while not lost:
-                if stop.requested:
-                    running = {one: job for one, job in running.items() if not one.cancel()}
-                while len(running) < _AHEAD * workers.count and not stop.requested:
-                    if (job := queue.next()) is None:
-                        break
-                    try:
-                        running[workers.submit(setting, job)] = job
-                    except BrokenProcessPool:  # since the sweep before
-                        lost.append(job)
-                        break
-                if not running and not lost:
-                    return
-                done, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
-                for future in done:
-                    job = running.pop(future)
-                    try:
-                        yield future.result()
-                    except BrokenProcessPool:
-                        lost.append(job)
-        finally:
-            if lost or running:  # they were lost, or nobody waits for what they run
-                workers.end()
-        lost += running.values()
-        yield from queue.put_back(lost)
+    running: dict[Future[bytes], Job] = {}
+    try:
+        while True:
+            if stop.requested:
+                running = {one: job for one, job in running.items() if not one.cancel()}
+            while len(running) < _AHEAD * workers.count and not stop.requested:
+                if (job := queue.next()) is None:
+                    break
+                running[workers.submit(setting, job)] = job
+            if not running:
+                return
+            done, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
+            for future in done:
+                job = running.pop(future)
+                try:
+                    answer = future.result()
+                except ChildProcessError:
+                    yield from queue.put_back([job])
+                else:
+                    yield row_in(answer)
+    finally:
+        if running:  # nobody waits for them
+            workers.end()
 
 
 def failed(job: Job, why: str) -> Row:
@@ -214,7 +174,7 @@ def run_on_cluster(
                 if (job := queue.next()) is None:
                     break
                 name = f"{job.key}-{queue.attempt(job)}"
-                running[client.submit(run_job, setting, job, key=name)] = job
+                running[client.submit(run_beside, request_of(setting, job), key=name)] = job
             if not running:
                 return
             done = [future for future in running if future.status != "pending"]
@@ -233,15 +193,17 @@ def _outcome(future: Any, job: Job) -> Row | None:
     """Return the row of a future that ended, or None if the cluster lost it."""
     try:
         if future.status == "finished":
-            return future.result(timeout=10)
-        if future.status != "error":
+            answer = future.result(timeout=10)
+        elif future.status == "error":
+            error = future.exception(timeout=10)
+            if isinstance(error, ChildProcessError):
+                return None
+            return failed(job, f"its worker ended: {type(error).__name__}: {error}")
+        else:
             return None
-        error = future.exception(timeout=10)
     except (OSError, TimeoutError, CancelledError):
         return None  # the scheduler ended meanwhile
-    if isinstance(error, UndulogError):
-        raise error
-    return failed(job, f"its worker ended: {type(error).__name__}: {error}")
+    return row_in(answer)
 
 
 def workers_of(address: str) -> int:

@@ -20,9 +20,9 @@ def scheduler(port):
         yield running
 
 
-def workers(port, folder):
-    """Two worker processes of one thread, restarted if they are killed."""
+def workers(port, folder, count=2):
+    """Worker processes of one thread, restarted if they are killed."""
     words = (sys.executable, "-m", "distributed.cli.dask_worker", f"tcp://127.0.0.1:{port}")
-    options = ("--nthreads", "1", "--nworkers", "2", "--no-dashboard")
+    options = ("--nthreads", "1", "--nworkers", count, "--no-dashboard")
     place = ("--host", "127.0.0.1", "--local-directory", folder)
     return process(*words, *options, *place)

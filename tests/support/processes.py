@@ -76,6 +76,18 @@ def wait_for(condition, what="", seconds=90.0, *, each=lambda: None, alive=()):
     return found
 
 
+def alive(pid):
+    """Return whether a process runs; one that has ended and was not waited for does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def parent_of(pid):
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
 def freeze(pid):
     """Stop a process, and wait until all its threads are stopped."""
     os.kill(pid, signal.SIGSTOP)

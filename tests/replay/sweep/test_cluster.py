@@ -8,7 +8,7 @@ from contextlib import ExitStack
 import pytest
 
 from support.dask_cluster import free_port, scheduler, workers
-from support.processes import UNDULOG, process, undulog, wait_for
+from support.processes import UNDULOG, alive, parent_of, process, undulog, wait_for
 from support.sweep_plans import comparable, write_plan
 from undulog.replay.sweep.rows import RowStore
 
@@ -31,20 +31,31 @@ def local(tmp_path_factory):
     return rows_of(folder / "rows")
 
 
+def pids(output):
+    """Processes that made the rows that are there, by id, the latest first."""
+    files = sorted(output.glob("pending/*.json"), key=lambda one: -one.stat().st_mtime_ns)
+    names = [json.loads(one.read_text())["worker"] for one in files]
+    return list(dict.fromkeys(int(name.rpartition(":")[2]) for name in names))
+
+
 @pytest.mark.slow
-def test_rows_are_the_same_though_worker_and_scheduler_are_killed(local, tmp_path):
+def test_rows_are_the_same_though_run_worker_and_scheduler_are_killed(local, tmp_path):
     plan, output, port = write_plan(tmp_path, STRENGTHS), tmp_path / "rows", free_port()
     address = f"tcp://127.0.0.1:{port}"
     words = (*UNDULOG, "sweep", plan, "-o", output, "--cluster", address, "--json")
+    seen = set()
     with ExitStack() as stack:
         first = stack.enter_context(scheduler(port))
         stack.enter_context(workers(port, tmp_path / "dask1"))
         sweep = stack.enter_context(process(*words))
         wait_for_rows(output, 2)
-        names = [json.loads(p.read_text())["worker"] for p in output.glob("pending/*.json")]
-
-        os.kill(int(names[0].rpartition(":")[2]), signal.SIGKILL)
-        wait_for_rows(output, 6)
+        os.kill(pids(output)[0], signal.SIGKILL)
+        wait_for_rows(output, 4)
+        latest = pids(output)[0]
+        os.kill(parent_of(latest), signal.SIGKILL)
+        wait_for(lambda: not alive(latest), "a run ends with its worker", 20)
+        wait_for_rows(output, 8)
+        seen.update(pids(output))
         first.kill()
         first.wait()
         stack.enter_context(scheduler(port))
@@ -55,6 +66,9 @@ def test_rows_are_the_same_though_worker_and_scheduler_are_killed(local, tmp_pat
     assert (report["run"], report["failed"], report["complete"]) == (20, 0, True)
     assert err == f"{address}: the scheduler ended; waiting 300 s for another\n"
     assert rows_of(output) == local
+    made = {int(row["worker"].rpartition(":")[2]) for row in RowStore(str(output)).rows()}
+    assert len(made) > len(seen)
+    wait_for(lambda: not any(map(alive, seen | made)), "processes end with their workers", 20)
 
 
 @pytest.mark.slow

@@ -3,12 +3,11 @@
 import json
 import os
 import signal
-from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from support.processes import UNDULOG, process, run, undulog, wait_for
+from support.processes import UNDULOG, alive, process, run, undulog, wait_for
 from support.sweep_plans import comparable, write_plan
 from undulog.analysis.session.analyse import analyse_session
 from undulog.capture import Session
@@ -138,15 +137,8 @@ def _begun(output):
 
 
 def _workers(parent):
-    """Processes that work for a sweep, by id; the tracker of resources is none."""
-    return [int(word) for word in run("pgrep", "-P", parent, "-f", "spawn_main").stdout.split()]
-
-
-def _alive(worker):
-    try:
-        return Path(f"/proc/{worker}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+    """Processes that work for a sweep, by id."""
+    return [int(word) for word in run("pgrep", "-P", parent, "-f", "processes").stdout.split()]
 
 
 @pytest.mark.slow
@@ -165,7 +157,7 @@ def test_an_interrupted_sweep_goes_on_where_it_stopped(number, reference, tmp_pa
     if number != signal.SIGKILL:
         report = json.loads(out)
         assert (report["run"], report["complete"], sweep.returncode) == (there, False, 1)
-    wait_for(lambda: not any(map(_alive, workers)), "workers end with their coordinator", 20)
+    wait_for(lambda: not any(map(alive, workers)), "workers end with their coordinator", 20)
     rest, code = swept(plan, tmp_path / "rows")
     assert (rest["there_before"], rest["run"], code) == (there, 10 - there, 0)
     assert rows_of(tmp_path / "rows") == rows_of(reference / "rows")
