@@ -21,7 +21,7 @@ from ..common.arrays import NS, IntArray
 from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError
 from ..common.files import part_file
-from ..common.process import StopRequest
+from ..common.process import StopRequest, helpers, threads_or_default
 from ..log.health.bus_tally import undecoded
 from ..log.mcap.writer import Compression
 from ..log.messages.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd
@@ -148,6 +148,7 @@ def imported_session(
     digest = digest or file_digest(source)
     with (
         part_file(output) as part,
+        helpers(threads_or_default(None)) as pool,
         SessionWriter(
             part,
             session_id=f"import-{digest[:16]}",
@@ -155,7 +156,7 @@ def imported_session(
             robot=robot,
             clock={"log": str(robot.clock)} if robot else {},
             metadata={"source": source.name, "source.sha256": digest, **facts},
-            sink=McapSink(part, force=True, compression=compression),
+            sink=McapSink(part, force=True, compression=compression, helpers=pool),
         ) as writer,
     ):
         yield writer
