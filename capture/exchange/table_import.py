@@ -26,6 +26,7 @@ from ..log.write.writer import SessionWriter
 from ..robot.bus_map import TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
 from .can_import import LEVEL, ImportReport, digest_of, imported_session
+from .column_blocks import Block
 from .column_map import COMMANDS, STATES, Column, ColumnMap, JointTopic, topics_of
 from .frame_log import EARLIEST_NS, LATEST_NS, RELATIVE_EPOCH_NS
 from .marker_tracks import as_joints, with_fps
@@ -319,18 +320,17 @@ class _Source:
     ) -> Iterator[_Messages]:
         """Yield the messages of each block, in order of time."""
         found = {(column.joint, column.quantity): column for column in self.columns}
+        columns: dict[Quantity, list[Column]] = {}
+        for (_, quantity), column in found.items():
+            columns.setdefault(quantity, []).append(column)
         topics = [
-            JointTopic(writer, list(found), quantities)
-            for quantities in topics_of({quantity for _, quantity in found})
+            JointTopic(writer, list(found), quantities) for quantities in topics_of(set(columns))
         ]
         for block in self._blocks:
             if not len(block[self._time]):
                 continue
             t_ns = self._checked(self._times(block[self._time]), offset)
-            values = {
-                (column.joint, column.quantity): self._converted(column, block[column.column])
-                for column in self.columns
-            }
+            values = {quantity: self._converted(own, block) for quantity, own in columns.items()}
             yield _Messages(
                 (int(t_ns[0]), self._order),
                 int(t_ns[-1]),
@@ -339,7 +339,8 @@ class _Source:
 
     def missing(self) -> list[str]:
         """Return how many cells of each column had no value."""
-        return [f"column {n!r}: {c} cells without a value" for n, c in self._missing.items() if c]
+        names = [column.column for column in self.columns if self._missing.get(column.column)]
+        return [f"column {name!r}: {self._missing[name]} cells without a value" for name in names]
 
     def _times(self, cells: NDArray[Any]) -> IntArray:
         unit, path = self._unit_ns, self.table.path
@@ -378,30 +379,53 @@ class _Source:
             )
         return stamps
 
-    def _converted(self, column: Column, cells: NDArray[Any]) -> FloatArray:
-        """Convert cells to the session's unit: unwrapped over blocks, scaled and offset."""
-        path, name = self.table.path, column.column
+    def _converted(self, columns: Sequence[Column], block: Block) -> FloatArray:
+        """Return the cells of some columns in the session's unit, shape (n, m).
+
+        They have single precision if all of them had it and none is converted.
+        """
+        cells = [self._numbers(column, block[column.column]) for column in columns]
+        changed = [k for k, column in enumerate(columns) if not column.is_plain]
+        single = not changed and all(each.dtype == np.float32 for each in cells)
+        kind: Any = np.float32 if single else np.float64
+        values: FloatArray = np.empty((len(cells[0]), len(cells)), kind)
+        for k, each in enumerate(cells):
+            values[:, k] = each
+        if not -_MOST < float(values.min()) <= float(values.max()) < _MOST:
+            known = ~np.isnan(values)
+            for column, own, there in zip(columns, values.T, known.T, strict=True):
+                if not np.all(np.abs(own[there]) < _MOST):
+                    raise ImportFormatError(
+                        self.table.path,
+                        f"column {column.column!r} has a number that is not finite or beyond "
+                        f"{_MOST:g}",
+                    )
+                missing = self._missing.get(column.column, 0) + int(len(own) - there.sum())
+                self._missing[column.column] = missing
+        for k in changed:
+            values[:, k] = self._in_unit(columns[k], values[:, k])
+        return values
+
+    def _numbers(self, column: Column, cells: NDArray[Any]) -> NDArray[Any]:
+        if cells.dtype.kind in "fiu":
+            return cells
         try:
-            values = cells.astype(np.float64)
+            return cells.astype(np.float64)
         except (ValueError, TypeError) as error:
             bad = next((str(cell)[:40] for cell in cells if not _is_number(cell)), "")
-            raise ImportFormatError(path, f"column {name!r}: {bad!r} is not a number") from error
-        known = np.abs(values) < _MOST
-        missing = 0
-        if not known.all():
-            known = ~np.isnan(values)
-            if not np.all(np.abs(values[known]) < _MOST):
-                raise ImportFormatError(
-                    path, f"column {name!r} has a number that is not finite or beyond {_MOST:g}"
-                )
-            missing = int(len(values) - known.sum())
-        self._missing[name] = self._missing.get(name, 0) + missing
+            raise ImportFormatError(
+                self.table.path, f"column {column.column!r}: {bad!r} is not a number"
+            ) from error
+
+    def _in_unit(self, column: Column, values: FloatArray) -> FloatArray:
+        """Convert numbers to the session's unit: unwrapped over blocks, scaled and offset."""
+        known = ~np.isnan(values)
         if column.wrap and known.any():
             raw = values[known]
-            before = self._unwrapped.get(name, (raw[0], raw[0]))
+            before = self._unwrapped.get(column.column, (raw[0], raw[0]))
             turns = np.unwrap(np.concatenate([[before[0]], raw]), period=column.wrap)
             values[known] = turns[1:] + (before[1] - before[0])
-            self._unwrapped[name] = (raw[-1], values[known][-1])
+            self._unwrapped[column.column] = (raw[-1], values[known][-1])
         scaled = values if column.scale == 1.0 else column.scale * values
         unit = unit_for(column.unit, column.quantity)
         return unit.convert(scaled + column.offset if column.offset else scaled)  # keeps -0.0
@@ -430,7 +454,7 @@ def _is_number(cell: object) -> bool:
 def _write_block(
     topics: Sequence[JointTopic],
     t_ns: IntArray,
-    values: Mapping[tuple[str, Quantity], FloatArray],
+    values: Mapping[Quantity, FloatArray],
     report: ImportReport,
 ) -> None:
     for topic in topics:
