@@ -125,7 +125,7 @@ def imported_session(
     epoch_ns: int,
     facts: Mapping[str, str],
     force: bool,
-    digest: str | None = None,
+    digest: Callable[[], str] | None = None,
     compression: Compression = LEVEL,
 ) -> Generator[SessionWriter]:
     """Write an imported session, which appears under its name only when it is whole.
@@ -137,7 +137,7 @@ def imported_session(
         robot: The robot that made the log, if it is known.
         epoch_ns: Time of its first sample [Unix ns].
         facts: For the session's metadata.
-        digest: Of the log, where that is more than the file ``source``.
+        digest: Returns that of the log, where that is more than the file ``source``.
         compression: Of the messages.
 
     Raises:
@@ -145,17 +145,17 @@ def imported_session(
         LogWriteError: If it can't be written; nothing is left behind then.
     """
     refuse_existing(output, force=force)
-    digest = digest or file_digest(source)
+    of_log = file_digest(source) if digest is None else digest()
     with (
         part_file(output) as part,
         helpers(threads_or_default(None)) as pool,
         SessionWriter(
             part,
-            session_id=f"import-{digest[:16]}",
+            session_id=f"import-{of_log[:16]}",
             epoch_ns=epoch_ns,
             robot=robot,
             clock={"log": str(robot.clock)} if robot else {},
-            metadata={"source": source.name, "source.sha256": digest, **facts},
+            metadata={"source": source.name, "source.sha256": of_log, **facts},
             sink=McapSink(part, force=True, compression=compression, helpers=pool),
         ) as writer,
     ):

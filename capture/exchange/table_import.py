@@ -26,7 +26,7 @@ from ..log.write.writer import SessionWriter
 from ..robot.bus_map import TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
 from .can_import import LEVEL, ImportReport, digest_of, imported_session
-from .column_blocks import Block
+from .column_blocks import Block, joined
 from .column_map import COMMANDS, STATES, Column, ColumnMap, JointTopic, topics_of
 from .frame_log import EARLIEST_NS, LATEST_NS, RELATIVE_EPOCH_NS
 from .marker_tracks import as_joints, with_fps
@@ -59,9 +59,10 @@ class TableSet:
 
     Attributes:
         tables: ``states``, ``commands`` or both.
+        digest: Returns that of all files' bytes; called once reading has begun, which other threads
+            go on with.
         joints: Names in the order of vectors, if a file lists them.
         events: A table of times and texts, if there is one.
-        digest: Of all files' bytes.
         left_out: Names of files that were not read.
         facts: For the session's metadata, beside those of any import.
         compression: Of the session.
@@ -69,9 +70,9 @@ class TableSet:
 
     source: Path
     tables: dict[str, TableFile]
+    digest: Callable[[], str]
     joints: tuple[str, ...] = ()
     events: Path | None = None
-    digest: str = ""
     left_out: tuple[str, ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict[str, str])
     compression: Compression = LEVEL
@@ -99,7 +100,7 @@ def open_tables(source: Path, commands: Path | None = None, fps: float | None = 
         if commands is not None:
             tables[COMMANDS] = open_table(commands)
         files = [source, *([commands] if commands is not None else [])]
-        found = TableSet(source, tables, digest=digest_of(files))
+        found = TableSet(source, tables, partial(digest_of, files))
     joints = {role: as_joints(table) or table for role, table in found.tables.items()}
     if fps is None:
         return replace(found, tables=joints)
@@ -121,7 +122,7 @@ def open_mapped(source: Path, column_map: ColumnMap) -> TableSet:
     """
     columns = [column.column for column in column_map.columns]
     table = open_csv(source, column_map.time_column, columns, column_map.delimiter)
-    return TableSet(source, {STATES: table}, digest=digest_of([source]))
+    return TableSet(source, {STATES: table}, partial(digest_of, [source]))
 
 
 def _open_folder(folder: Path) -> TableSet:
@@ -157,7 +158,7 @@ def _open_folder(folder: Path) -> TableSet:
     events = found["events"][0] if found["events"] else None
     files = [path for paths in found.values() for path in paths]
     joints = _names(found["names"][0]) if found["names"] else ()
-    return TableSet(folder, tables, joints, events, digest_of(files), tuple(others))
+    return TableSet(folder, tables, partial(digest_of, files), joints, events, tuple(others))
 
 
 def _names(path: Path) -> tuple[str, ...]:
@@ -386,11 +387,7 @@ class _Source:
         """
         cells = [self._numbers(column, block[column.column]) for column in columns]
         changed = [k for k, column in enumerate(columns) if not column.is_plain]
-        single = not changed and all(each.dtype == np.float32 for each in cells)
-        kind: Any = np.float32 if single else np.float64
-        values: FloatArray = np.empty((len(cells[0]), len(cells)), kind)
-        for k, each in enumerate(cells):
-            values[:, k] = each
+        values: FloatArray = joined(cells)
         if not -_MOST < float(values.min()) <= float(values.max()) < _MOST:
             known = ~np.isnan(values)
             for column, own, there in zip(columns, values.T, known.T, strict=True):
@@ -402,6 +399,8 @@ class _Source:
                     )
                 missing = self._missing.get(column.column, 0) + int(len(own) - there.sum())
                 self._missing[column.column] = missing
+        if changed:
+            values = values.astype(np.float64)
         for k in changed:
             values[:, k] = self._in_unit(columns[k], values[:, k])
         return values

@@ -8,6 +8,7 @@ The other topics are small and share chunks.
 from __future__ import annotations
 
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol, TypeAlias
@@ -157,9 +158,15 @@ class McapSink:
         self._stream.close()
 
 
+@cache
+def own_version() -> str:
+    """Return the version of this library."""
+    return version("undulog")
+
+
 def library_name() -> str:
     """Return the name and version of this library, for the header of a file."""
-    return f"undulog/{version('undulog')}"
+    return f"undulog/{own_version()}"
 
 
 def write_description(writer: McapWriter, record: Description) -> None:
