@@ -22,6 +22,7 @@ from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError
 from ..common.files import part_file
 from ..common.process import StopRequest, helpers, threads_or_default
+from ..log.file.log_file import keep_freed
 from ..log.health.bus_tally import undecoded
 from ..log.mcap.writer import Compression
 from ..log.messages.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd
@@ -116,6 +117,11 @@ table of matches in the nearest cache finds as many. A quarter to a third less t
 for 2 % fewer to 5 % more bytes; rounded decimals take up to twice as many."""
 
 
+_REUSED = 1 << 24
+"""Bytes of freed memory that are used again: blocks of rows and chunks are allocated anew, and a new
+page from the system costs more than to fill it."""
+
+
 @contextmanager
 def imported_session(
     source: Path,
@@ -145,6 +151,7 @@ def imported_session(
         LogWriteError: If it can't be written; nothing is left behind then.
     """
     refuse_existing(output, force=force)
+    keep_freed(_REUSED)
     of_log = file_digest(source) if digest is None else digest()
     with (
         part_file(output) as part,
