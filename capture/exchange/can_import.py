@@ -118,8 +118,8 @@ for 2 % fewer to 5 % more bytes; rounded decimals take up to twice as many."""
 
 
 _REUSED = 1 << 24
-"""Bytes of freed memory that are used again: blocks of rows and chunks are allocated anew, and a new
-page from the system costs more than to fill it."""
+"""Bytes of freed memory that are used again: blocks of rows and chunks are allocated anew, and
+getting a new page from the system takes longer than filling it."""
 
 
 @contextmanager
