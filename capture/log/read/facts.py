@@ -28,7 +28,9 @@ MOST_REQUESTS = 5
 
 _EDGE = 64 * 1024
 _MOST_SUMMARY = 64 << 20
-_METADATA = ("undulog", "undulog.health", "undulog.part")
+RECORDS = ("undulog", "undulog.health", "undulog.part")
+"""Metadata records that are facts of a log."""
+
 _FOOTER = 1 + 8 + 20 + len(MAGIC)
 
 
@@ -129,7 +131,7 @@ def _from_summary(summary: bytes, ranges: _Ranges, metadata: dict[str, dict[str,
             statistics = _parse(Statistics, body)
         elif opcode == Opcode.METADATA_INDEX:
             index = _parse(MetadataIndex, body)
-            if index.name in _METADATA:
+            if index.name in RECORDS:
                 record = ranges.get(index.offset, index.offset + index.length, _EDGE)
                 if record is not None:
                     _add_metadata(metadata, _records(record, 0))
@@ -160,7 +162,7 @@ def _add_metadata(metadata: dict[str, dict[str, str]], records: list[tuple[int, 
     for opcode, body in records:
         if opcode == Opcode.METADATA:
             record = _parse(Metadata, body)
-            if record.name in _METADATA:
+            if record.name in RECORDS:
                 metadata.setdefault(record.name, {}).update(record.metadata)
 
 

@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import shutil
 import sqlite3
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from support import durable_child as recorder
 from support.analysed import analysed as analysed_session
 from support.bucket import s3_bucket
+from support.kills import killed_after
 from support.linear_chain import CHAIN, WAVE, write_run
 from support.processes import undulog
 from support.ros_bags import Filler, ticks, write_bag
@@ -183,6 +185,32 @@ def test_a_damaged_copy_has_none_of_the_results_of_the_whole_session(lab):
     (lab / "day1" / "gait.mcap").unlink()  # alone, it is the session that the result names
     catalog.scan()
     assert catalog.find("path = 'copy.mcap'").status.to_list() == ["analysed"]
+
+
+@pytest.mark.parametrize("left", [None, b""], ids=["missing", "empty"])
+def test_a_session_that_has_only_its_write_ahead_log(tmp_path, left):
+    path = tmp_path / "run.mcap"
+    killed_after([sys.executable, recorder.__file__, str(path), "{}"], 0.3)
+    path.unlink(missing_ok=True)  # what a power failure can leave of a file that is not synced
+    if left is not None:
+        path.write_bytes(left)
+    catalog = Catalog(str(tmp_path))
+    assert (catalog.scan().damaged, Catalog(str(tmp_path)).scan().read) == (1, 0)
+    (row,) = catalog.find().itertuples()
+    assert (row.path, row.session_id, row.status) == ("run.mcap", "killed", "not analysed")
+    assert row.damage.endswith("undulog log recover run.mcap")
+    assert [*row.topics] == sorted(recorder.TOPICS)
+    with Session.open(path) as session:
+        assert session.session_id == row.session_id
+    (tmp_path / "run.mcap.wal" / "def-000001.seg").write_bytes(b"no segment")
+    for segment in (tmp_path / "run.mcap.wal").glob("0*.seg"):
+        segment.unlink()
+    assert catalog.scan().damaged == 1
+    assert "no readable header" in catalog.find().damage[0]
+    shutil.rmtree(tmp_path / "run.mcap.wal")
+    path.unlink(missing_ok=True)
+    assert catalog.scan().removed == 1
+    assert not len(catalog.find())
 
 
 def test_parts_of_a_session_are_one_row(tmp_path):
