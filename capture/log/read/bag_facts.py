@@ -6,11 +6,13 @@ topics and the index of times are read.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from ...common.errors import MissingExtraError, NotALogError, UndulogError
 from ..file.bag_metadata import Stated, read_stated
 from ..file.bag_parts import Allowance, read_database_facts
+from ..file.content import content_id_of
 from .facts import LogFacts
 
 
@@ -29,15 +31,15 @@ def read_bag_facts(path: Path) -> LogFacts:
             stated = _of_ros1(path) if path.suffix == ".bag" else read_database_facts(path)
     except ImportError as error:
         raise MissingExtraError("reading a recording of ROS", "bags", "rosbags") from error
-    facts = LogFacts(messages=stated.messages, topics=tuple(sorted({*stated.topics})))
+    facts = LogFacts(
+        messages=stated.messages,
+        topics=tuple(sorted({*stated.topics})),
+        content=content_id_of(stated.files),
+    )
     if not stated.messages or stated.start_ns is None or stated.duration_ns is None:
         return facts
-    return LogFacts(
-        start_ns=stated.start_ns,
-        end_ns=stated.start_ns + stated.duration_ns,
-        messages=facts.messages,
-        topics=facts.topics,
-    )
+    end_ns = stated.start_ns + stated.duration_ns
+    return replace(facts, start_ns=stated.start_ns, end_ns=end_ns)
 
 
 def _of_ros1(path: Path) -> Stated:

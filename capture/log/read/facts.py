@@ -2,7 +2,7 @@
 
 A file that lies in an object store costs at most :data:`MOST_REQUESTS` requests for ranges of
 bytes, whatever its size: the header and the first metadata, the footer and the summary behind it,
-and metadata between them.
+metadata between them, and pieces that an id is made from where the log has none.
 
 Format: https://mcap.dev/spec.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from typing import Any
 
@@ -21,12 +21,12 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Footer, Metadata, MetadataIndex, Statistics
 
 from ...common.errors import NotALogError
+from ..file.content import BETWEEN, EDGE, content_id
 from ..mcap.chunk import MAGIC, walk_records
 
-MOST_REQUESTS = 5
+MOST_REQUESTS = 5 + BETWEEN
 """Ranges that are read of one file."""
 
-_EDGE = 64 * 1024
 _MOST_SUMMARY = 64 << 20
 RECORDS = ("undulog", "undulog.health", "undulog.part")
 """Metadata records that are facts of a log."""
@@ -49,6 +49,7 @@ class LogFacts:
         topics: In order of name.
         metadata: Of the log contract: ``undulog``, ``undulog.health`` and ``undulog.part``.
         damage: Why there is no summary; empty where there is one.
+        content: Id from its content; empty where the metadata has one.
     """
 
     start_ns: int | None = None
@@ -57,6 +58,12 @@ class LogFacts:
     topics: tuple[str, ...] = ()
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
     damage: str = ""
+    content: str = ""
+
+    @property
+    def session_id(self) -> str:
+        """Its own id, or the one from its content; empty if there is neither."""
+        return self.metadata.get("undulog", {}).get("session_id") or self.content
 
 
 class _Ranges:
@@ -65,7 +72,7 @@ class _Ranges:
     def __init__(self, read: Callable[[int, int], bytes], size: int) -> None:
         self._read, self._size = read, size
         self._parts: list[tuple[int, bytes]] = []
-        self.left = MOST_REQUESTS
+        self.left = MOST_REQUESTS - BETWEEN
 
     def get(self, start: int, stop: int, ahead: int = 0) -> bytes | None:
         """Return bytes of the file; None where they take one request too many."""
@@ -98,12 +105,27 @@ def read_facts(name: str, size: int, read: Callable[[int, int], bytes]) -> LogFa
         OSError: As ``read`` raises it.
     """
     ranges = _Ranges(read, size)
-    head = ranges.get(0, min(size, _EDGE)) or b""
+    head = ranges.get(0, min(size, EDGE)) or b""
     if not head.startswith(MAGIC):
         raise NotALogError(name, "no MCAP file: it doesn't start as one")
     metadata: dict[str, dict[str, str]] = {}
     _add_metadata(metadata, _records(head, len(MAGIC)))
-    tail = ranges.get(max(0, size - _EDGE), size) or b""
+    tail = ranges.get(max(0, size - EDGE), size) or b""
+    found = _found(ranges, size, tail, metadata)
+    if found.session_id:
+        return found
+
+    def piece(start: int, stop: int) -> bytes:
+        if start == 0:
+            return head
+        return tail if stop == size else read(start, stop)
+
+    return replace(found, content=content_id([(size, piece)]))
+
+
+def _found(
+    ranges: _Ranges, size: int, tail: bytes, metadata: dict[str, dict[str, str]]
+) -> LogFacts:
     if size < 2 * len(MAGIC) + 29 or not tail.endswith(MAGIC):
         return LogFacts(metadata=metadata, damage="it has no end: undulog log recover")
     try:
@@ -132,7 +154,7 @@ def _from_summary(summary: bytes, ranges: _Ranges, metadata: dict[str, dict[str,
         elif opcode == Opcode.METADATA_INDEX:
             index = _parse(MetadataIndex, body)
             if index.name in RECORDS:
-                record = ranges.get(index.offset, index.offset + index.length, _EDGE)
+                record = ranges.get(index.offset, index.offset + index.length, EDGE)
                 if record is not None:
                     _add_metadata(metadata, _records(record, 0))
     if statistics is None or not statistics.message_count:
