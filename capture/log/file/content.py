@@ -19,6 +19,8 @@ EDGE = 64 << 10
 BETWEEN = 2
 """Pieces between the first and the last one."""
 
+_PREFIX = "log-"
+
 Read: TypeAlias = Callable[[int, int], bytes]
 """Returns the bytes of a file from a first offset up to a second one."""
 
@@ -35,7 +37,7 @@ def content_id(files: Sequence[tuple[int, Read]]) -> str:
         last = max(0, size - EDGE)
         for at in dict.fromkeys(last * k // (BETWEEN + 1) for k in range(BETWEEN + 2)):
             digest.update(read(at, min(at + EDGE, size)))
-    return f"log-{digest.hexdigest()[:16]}"
+    return f"{_PREFIX}{digest.hexdigest()[:16]}"
 
 
 def content_id_of(paths: Sequence[Path]) -> str:
@@ -51,6 +53,11 @@ def content_id_of(paths: Sequence[Path]) -> str:
             stack.callback(os.close, own)
             files.append((os.fstat(own).st_size, partial(_read, own)))
         return content_id(files)
+
+
+def session_label(session_id: str, path: Path | str) -> str:
+    """Return how text names a session: by its own id, or else by its file."""
+    return Path(path).stem if session_id.startswith(_PREFIX) else session_id
 
 
 def _read(descriptor: int, start: int, stop: int) -> bytes:
