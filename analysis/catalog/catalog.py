@@ -62,6 +62,7 @@ _MOST_ROWS = 50_000
 
 _MOST_RESULT = 256 << 20
 _REMOTE_THREADS = 16
+_VERSION = 2  # of what is read of a file; those that an earlier one read are read again
 _UNREAD = -1  # a size that no file has
 _ANALYSED = "analysis of "
 
@@ -177,14 +178,15 @@ class Catalog:
             LogWriteError: If the catalogue can't be written.
         """
         begun, stop = time.monotonic(), stop or StopRequest()
-        known = self._known()
+        known, outdated = self._known()
         listed = {file.name: file for file in list_sources(self._store, known)}
         # Later than all scans before, whatever the clocks of others say.
         scanned_ns = max([time.time_ns(), *(scanned + 1 for _, _, scanned in known.values())])
         facts = {name: (file.size, file.modified_ns) for name, file in listed.items()}
-        fresh = [one for one in listed.values() if known.get(one.name, (0,))[:2] != facts[one.name]]
+        other = {name for name in listed if known.get(name, (0,))[:2] != facts[name]}
+        fresh = [one for one in listed.values() if one.name in other | outdated]
         gone = [name for name in known if name not in listed and not name.startswith(_ANALYSED)]
-        changed = [file.name for file in fresh if file.is_log and file.name in known]
+        changed = [name for name in sorted(other) if listed[name].is_log and name in known]
         self._remove([*gone, *(_ANALYSED + name for name in (*gone, *changed))], scanned_ns)
         read = damaged = 0
         for start in range(0, len(fresh), _BATCH):
@@ -200,7 +202,8 @@ class Catalog:
                 common = {"source": file.name, "removed": False}
                 for kind, own in found.items():
                     rows[kind] += [common | row | stamp for row in own]
-                sources.append(common | {"size": file.size, "fault": fault or None} | stamp)
+                own = {"size": file.size, "fault": fault or None, "version": _VERSION}
+                sources.append(common | own | stamp)
             for kind, own in rows.items():
                 self._write(kind, table_of(kind, own))
             self._write("sources", _ARROW.Table.from_pylist(sources, _SOURCES))
@@ -262,16 +265,19 @@ class Catalog:
 
     # -- inside ----------------------------------------------------------------------------------
 
-    def _known(self) -> dict[str, Scanned]:
-        """Name of each file that was read and is there to its size, modification and scan."""
-        latest: dict[str, tuple[int, int, int, bool]] = {}
+    def _known(self) -> tuple[dict[str, Scanned], set[str]]:
+        """Return the files that were read and are there, and those of an earlier version."""
+        latest: dict[str, tuple[int, int, int, bool, int | None]] = {}
         for name in self._files("sources"):
-            columns = self._store.read_table(name).to_pydict()
-            rows = zip(*(columns[key] for key in _SCANNED), strict=True)
-            for source, size, modified, scanned, removed in rows:
+            table = self._store.read_table(name).to_pydict()
+            columns = [table[key] for key in _SCANNED]
+            columns.append(table.get("version", [None] * len(columns[0])))
+            for source, size, modified, scanned, removed, version in zip(*columns, strict=True):
                 if source not in latest or latest[source][2] < scanned:
-                    latest[source] = size, modified, scanned, removed
-        return {name: facts[:3] for name, facts in latest.items() if not facts[3]}
+                    latest[source] = size, modified, scanned, removed, version
+        there = {name: facts for name, facts in latest.items() if not facts[3]}
+        outdated = {name for name, facts in there.items() if facts[4] != _VERSION}
+        return {name: facts[:3] for name, facts in there.items()}, outdated
 
     def _read_files(
         self, files: Sequence[Source]
@@ -301,7 +307,7 @@ class Catalog:
         row = session_row(facts)
         head = split_part_path(Path(file.name))[0].as_posix() if row["part"] > 1 else file.name
         name = PurePosixPath(self._store.path(head)).stem  # as a session without an id calls itself
-        return {**row, "session_id": row["session_id"] or name, "path": file.name, "head": head} | {
+        return {**row, "session_id": facts.session_id or name, "path": file.name, "head": head} | {
             "size": file.size
         }
 
@@ -379,7 +385,9 @@ class Catalog:
             for kind in kinds:
                 names = self._files(kind)
                 if kind == "sources":
-                    table = _ARROW.concat_tables([self._store.read_table(name) for name in names])
+                    table = _ARROW.concat_tables(
+                        [self._store.read_table(name) for name in names], promote_options="default"
+                    )
                 else:
                     with self._database() as database:
                         table = put_together(database, kind)
@@ -409,6 +417,7 @@ _SOURCES: Any = _ARROW.schema(
         ("scanned_ns", _ARROW.int64()),
         ("removed", _ARROW.bool_()),
         ("fault", _ARROW.string()),
+        ("version", _ARROW.int64()),
     ]
 )
 

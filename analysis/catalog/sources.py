@@ -1,8 +1,9 @@
 """Files that a catalogue reads: logs, and files that may hold results.
 
-The logs of a folder are those that commands find in it. Of a rosbag2 folder size and time are those
-of its files, so that it is opened again only when one of them has changed; and of a folder whose
-metadata.yaml is of another tool that file is kept in mind as one without rows.
+The logs of a folder are those that commands find in it, also those of which only the write-ahead
+log is left. Of a rosbag2 folder size and time are those of its files, so that it is opened again
+only when one of them has changed; and of a folder whose metadata.yaml is of another tool that file
+is kept in mind as one without rows.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from undulog.capture.log.file.bag import is_bag
 from undulog.capture.log.file.bag_metadata import METADATA, is_rosbag2
 from undulog.capture.log.file.parts import log_paths, walk
 from undulog.capture.log.read.facts import LogFacts, read_bag_facts, read_facts
+from undulog.capture.log.read.wal_facts import is_wal_alone, read_wal_facts
+from undulog.capture.log.wal.writer import wal_folder
 
 FOLDER = ".undulog-catalog"
 """Folder of the catalogue, beside the sessions."""
@@ -76,6 +79,8 @@ def source_facts(store: ObjectStore, source: Source) -> LogFacts:
         with store.filesystem.open_input_file(path) as stream:
             return read_facts(path, source.size, lambda a, b: stream.read_at(b - a, a))
     plain = Path(path)
+    if is_wal_alone(plain):
+        return read_wal_facts(plain)
     if is_bag(plain):
         return read_bag_facts(plain)
     if plain.is_dir():
@@ -126,9 +131,9 @@ def _is_known(source: Source, known: Mapping[str, Scanned]) -> bool:
 
 
 def _source(base: Path, path: Path, *, is_log: bool = False) -> Source | None:
-    """Return a file or folder; None where it isn't there.
+    """Return a file or folder; None if it was removed meanwhile.
 
-    That is the file of a write-ahead log alone, or one that was removed meanwhile.
+    A session whose file is missing or empty has the size and time of its write-ahead log.
 
     Raises:
         InputFileError: If its name is not UTF-8.
@@ -137,10 +142,11 @@ def _source(base: Path, path: Path, *, is_log: bool = False) -> Source | None:
     if not name.isprintable() and name != name.encode(errors="replace").decode():
         raise InputFileError(path, "its name is not UTF-8, which a catalogue needs; rename it")
     try:
-        facts = path.stat()
+        at = wal_folder(path) if is_log and is_wal_alone(path) else path
+        facts = at.stat()
         own = [facts]
         if S_ISDIR(facts.st_mode):
-            with os.scandir(path) as entries:
+            with os.scandir(at) as entries:
                 own = [each.stat() for each in entries if each.is_file()] or own
     except FileNotFoundError:
         return None

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from ..common.console import emit
 from ..common.process import interruptible
+from ..log.file.content import session_label
 
 if TYPE_CHECKING:
     from ..log.cut import RecoverReport
@@ -150,7 +151,8 @@ def log_merge(
 
 def _lines(report: EditReport) -> Iterator[str]:
     messages = sum(report.messages.values())
-    origin = ", ".join(dict.fromkeys(source["session_id"] for source in report.sources))
+    names = (session_label(source["session_id"], source["path"]) for source in report.sources)
+    origin = ", ".join(dict.fromkeys(names))
     size = f"{report.output.stat().st_size / 1e6:.1f} MB"
     yield f"{report.output}: {report.duration_s:.2f} s of {origin}, {messages} messages, {size}"
     yield from _remarks(report)

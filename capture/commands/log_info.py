@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..common.console import emit, progress
 from ..common.errors import DataError, UsageError
+from ..log.file.content import session_label
 from ..log.messages.definitions import CONTRACT_VERSION
 from .sessions import Line, each, sessions_of, show, stated_gait
 from .topic_options import CONTRACT, JointTopicOptions
@@ -122,9 +123,13 @@ def _info_line(path: Path) -> Line:
 
     with Session.open(path) as session:
         facts, gait = describe(session), stated_gait(session.metadata)
-    first = next(_info_lines(facts)).removeprefix(f"{facts['session']['id']}: ")
+    first = next(_info_lines(facts)).removeprefix(f"{_label(facts['session'])}: ")
     robot, verdict = facts["session"]["robot"] or "", facts["session"]["verdict"] or ""
     return Line(robot, gait, verdict, first, facts)
+
+
+def _label(session: dict[str, Any]) -> str:
+    return session_label(session["id"], session["path"])
 
 
 def _info_lines(facts: dict[str, Any]) -> Iterator[str]:
@@ -137,7 +142,7 @@ def _info_lines(facts: dict[str, Any]) -> Iterator[str]:
         if session["start_utc"]
         else "no messages"
     )
-    yield f"{session['id']}: {robot}, {held}, {_size(session['size_bytes'])}{parts}"
+    yield f"{_label(session)}: {robot}, {held}, {_size(session['size_bytes'])}{parts}"
     yield from (f"warning: {warning}" for warning in facts["warnings"])
     foreign = Counter(t["encoding"] or "no encoding" for t in facts["topics"] if not t["read"])
     if foreign:
@@ -318,7 +323,8 @@ def _check_lines(health: SessionHealth) -> Iterator[str]:
     robot = f"{health.robot}, " if health.robot else ""
     count = len(health.reasons)
     why = f", for {count} reason{'s' if count != 1 else ''}" if count else ""
-    yield f"{health.verdict}: {health.session_id}, {robot}{health.duration_s:.2f} s{why}"
+    name = session_label(health.session_id, health.path)
+    yield f"{health.verdict}: {name}, {robot}{health.duration_s:.2f} s{why}"
     yield from (f"  {sentence}" for sentence in health.reasons)
     yield from (f"  note: {sentence}" for sentence in health.notes)
     yield _stored_line(health)

@@ -21,9 +21,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from .errors import UsageError
+
+if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
 
 _NICE = -10  # requested where real-time priority is refused
 _REAL_TIME = os.sched_param(1)
@@ -158,6 +161,49 @@ def in_threads(
     shares = [items[first : first + size] for first in range(0, len(items), size)]
     with ThreadPoolExecutor(threads) as pool:
         return [result for share in pool.map(work, shares) for result in share]
+
+
+class Piece(Generic[_Result]):
+    """A piece of work that is done by a helper thread, or by the caller if none has begun it."""
+
+    def __init__(self, work: Callable[[], _Result], helpers: ThreadPoolExecutor | None) -> None:
+        """Submit it to the helper threads, if any."""
+        self._work = work
+        self._taken = None if helpers is None else helpers.submit(work)
+        self._done: list[_Result] = []
+
+    def hurry(self) -> None:
+        """Do the work now unless a helper has begun it."""
+        if not self._done and (self._taken is None or self._taken.cancel()):
+            self._taken = None
+            self._done.append(self._work())
+
+    def result(self) -> _Result:
+        """Return the result, or raise the error of the work; waits for it."""
+        self.hurry()
+        return self._done[0] if self._taken is None else self._taken.result()
+
+
+@contextmanager
+def helpers(threads: int) -> Generator[ThreadPoolExecutor | None]:
+    """Start helper threads, which end with the block.
+
+    Args:
+        threads: Number of threads, with the caller's own.
+
+    Yields:
+        The other threads; None if there are none.
+    """
+    if threads == 1:
+        yield None
+        return
+    from concurrent.futures import ThreadPoolExecutor
+
+    pool = ThreadPoolExecutor(threads - 1, thread_name_prefix="undulog-helper")
+    try:
+        yield pool
+    finally:  # also when the caller stops early: pending work is cancelled
+        pool.shutdown(cancel_futures=True)
 
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +111,7 @@ def import_bag(
         writer = stack.enter_context(
             imported_session(
                 source, output, session.robot, epoch_ns=report.start_ns, facts=facts, force=force,
-                digest=digest_of(files),
+                digest=partial(digest_of, files),
             )
         )  # fmt: skip
         joints = _Joints(session, writer, found, report)

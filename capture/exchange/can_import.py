@@ -21,7 +21,8 @@ from ..common.arrays import NS, IntArray
 from ..common.console import progress, refuse_existing
 from ..common.errors import ImportFormatError
 from ..common.files import part_file
-from ..common.process import StopRequest
+from ..common.process import StopRequest, helpers, threads_or_default
+from ..log.file.log_file import keep_freed
 from ..log.health.bus_tally import undecoded
 from ..log.mcap.writer import Compression
 from ..log.messages.frames import FD_TOPIC_PREFIX, FRAME_TOPIC_PREFIX, FrameArray, holds_fd
@@ -116,6 +117,11 @@ table of matches in the nearest cache finds as many. A quarter to a third less t
 for 2 % fewer to 5 % more bytes; rounded decimals take up to twice as many."""
 
 
+_REUSED = 1 << 24
+"""Bytes of freed memory that are used again: blocks of rows and chunks are allocated anew, and
+getting a new page from the system takes longer than filling it."""
+
+
 @contextmanager
 def imported_session(
     source: Path,
@@ -125,7 +131,7 @@ def imported_session(
     epoch_ns: int,
     facts: Mapping[str, str],
     force: bool,
-    digest: str | None = None,
+    digest: Callable[[], str] | None = None,
     compression: Compression = LEVEL,
 ) -> Generator[SessionWriter]:
     """Write an imported session, which appears under its name only when it is whole.
@@ -137,7 +143,7 @@ def imported_session(
         robot: The robot that made the log, if it is known.
         epoch_ns: Time of its first sample [Unix ns].
         facts: For the session's metadata.
-        digest: Of the log, where that is more than the file ``source``.
+        digest: Returns that of the log, where that is more than the file ``source``.
         compression: Of the messages.
 
     Raises:
@@ -145,17 +151,19 @@ def imported_session(
         LogWriteError: If it can't be written; nothing is left behind then.
     """
     refuse_existing(output, force=force)
-    digest = digest or file_digest(source)
+    keep_freed(_REUSED)
+    of_log = file_digest(source) if digest is None else digest()
     with (
         part_file(output) as part,
+        helpers(threads_or_default(None)) as pool,
         SessionWriter(
             part,
-            session_id=f"import-{digest[:16]}",
+            session_id=f"import-{of_log[:16]}",
             epoch_ns=epoch_ns,
             robot=robot,
             clock={"log": str(robot.clock)} if robot else {},
-            metadata={"source": source.name, "source.sha256": digest, **facts},
-            sink=McapSink(part, force=True, compression=compression),
+            metadata={"source": source.name, "source.sha256": of_log, **facts},
+            sink=McapSink(part, force=True, compression=compression, helpers=pool),
         ) as writer,
     ):
         yield writer

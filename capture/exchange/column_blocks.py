@@ -41,6 +41,30 @@ def spread(name: str, vectors: NDArray[Any]) -> Block:
     return {f"{name}[{i}]": vectors[:, i] for i in range(vectors.shape[1])}
 
 
+def joined(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Return columns of numbers, (n,) each, as one array, (n, m), of single or double precision.
+
+    Columns that :func:`spread` made of one array are not copied; the result is not to be written.
+    """
+    first, many = columns[0], len(columns)
+    step, begin = first.itemsize, _address(first)
+    if str(first.dtype) in {"float32", "float64"} and all(
+        each.base is first.base is not None
+        and (each.dtype, each.strides) == (first.dtype, (many * step,))
+        and _address(each) == begin + k * step
+        for k, each in enumerate(columns)
+    ):
+        return np.lib.stride_tricks.as_strided(
+            first, (len(first), many), (many * step, step), writeable=False
+        )
+    single = all(each.dtype == np.float32 for each in columns)
+    return np.stack(columns, axis=1, dtype=np.float32 if single else np.float64)
+
+
+def _address(array: NDArray[Any]) -> int:
+    return array.__array_interface__["data"][0]
+
+
 def refuse(path: Path, why: str) -> NoReturn:
     """Raise ImportFormatError."""
     raise ImportFormatError(path, why)

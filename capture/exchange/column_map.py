@@ -74,6 +74,13 @@ class Column:
     offset: float = 0.0
     table: str = STATES
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether its cells are values in the session's unit."""
+        unit = unit_for(self.unit, self.quantity)
+        own = (self.wrap, self.scale, self.offset, unit.factor, unit.offset)
+        return own == (0.0, 1.0, 0.0, 1.0, 0.0)
+
 
 @dataclass(frozen=True)
 class ColumnMap:
@@ -267,11 +274,16 @@ class JointTopic:
         """Open the topic.
 
         Args:
-            columns: Joint and quantity of each column, the joints in their order in a message.
+            columns: Joint and quantity of each column, no two the same; the joints in their order
+                in a message.
             quantities: One of :func:`topics_of`.
         """
         self._joints = list(dict.fromkeys(joint for joint, each in columns if each in quantities))
         self._fields = (quantities[0], *(q for q in _WITH_POSITION if q in quantities[1:]))
+        self._places = [
+            [self._joints.index(joint) for joint, each in columns if each is quantity]
+            for quantity in self._fields
+        ]
         self._rest = [q in quantities[1:] for q in _WITH_POSITION]
         self.name = JOINT_TOPIC[quantities[0]]
         velocity, effort = self._rest
@@ -281,25 +293,24 @@ class JointTopic:
         )  # fmt: skip
         self._parts: dict[bytes, JointStateChannel] = {}
 
-    def write(self, t_ns: IntArray, values: Mapping[tuple[str, Quantity], FloatArray]) -> int:
+    def write(self, t_ns: IntArray, values: Mapping[Quantity, FloatArray]) -> int:
         """Write the rows that have any value; a joint without any value in a row has no sample.
 
         Args:
-            t_ns: Times of the rows [Unix ns], shape (n,).
-            values: Joint and quantity to cells, (n,).
+            t_ns: Times of the rows [Unix ns], shape (n,), n > 0.
+            values: Quantity to the cells of its columns, in their order, (n, m).
 
         Returns:
             Number of rows written.
         """
-        fields = np.full((len(self._fields), len(t_ns), len(self._joints)), np.nan)
-        for field, quantity in zip(fields, self._fields, strict=True):
-            for k, joint in enumerate(self._joints):
-                if (cells := values.get((joint, quantity))) is not None:
-                    field[:, k] = cells
-        absent = np.isnan(fields)
-        if not absent.any():
-            self._write_part(t_ns, fields, np.ones(len(self._joints), dtype=bool))
+        found = [
+            self._spread(values[q], at) for q, at in zip(self._fields, self._places, strict=True)
+        ]
+        if not any(np.isnan(field.min()) for field in found):
+            self._write_part(t_ns, found, np.ones(len(self._joints), dtype=bool))
             return len(t_ns)
+        fields = np.stack(found)
+        absent = np.isnan(fields)
         sampled: BoolArray = ~np.all(absent, axis=0)
         filled = np.any(sampled, axis=1)
         if not filled.all():
@@ -312,10 +323,18 @@ class JointTopic:
             self._write_part(t_ns[start:stop], fields[:, start:stop], sampled[start])
         return len(t_ns)
 
-    def _write_part(self, t_ns: IntArray, fields: FloatArray, sampled: BoolArray) -> None:
-        """Write rows, of shape (fields, n, joints), that all have samples of the same joints."""
+    def _spread(self, cells: FloatArray, places: Sequence[int]) -> FloatArray:
+        """Return the cells of all joints, NaN for those without a column."""
+        if list(places) == list(range(len(self._joints))):
+            return cells
+        field = np.full((len(cells), len(self._joints)), np.nan)
+        field[:, places] = cells
+        return field
+
+    def _write_part(self, t_ns: IntArray, fields: Iterable[FloatArray], sampled: BoolArray) -> None:
+        """Write rows, (n, joints) of each field, that all have samples of the same joints."""
         channel, which = self._part(sampled)
-        rows = iter(fields if which.all() else fields[:, :, which])
+        rows = iter(fields if which.all() else [field[:, which] for field in fields])
         none = np.empty((len(t_ns), 0))
         position = next(rows)
         velocity, effort = (next(rows) if present else none for present in self._rest)

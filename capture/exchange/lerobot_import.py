@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -30,7 +30,7 @@ from ..robot.bus_map import SESSION_UNIT
 from ..robot.description import numbered
 from ..robot.model import Quantity, Robot
 from .can_import import FLOAT32, ImportReport, file_digest
-from .column_blocks import Block, read_parquet, refuse, rows_of_block, vectors_of
+from .column_blocks import Block, read_parquet, refuse, rows_of_block, spread, vectors_of
 from .column_map import STATES, Column, ColumnMap
 from .table_import import TableSet, import_tables
 from .tables import TableFile
@@ -183,7 +183,7 @@ def import_lerobot(
     digest = cache(file_digest)  # a file may hold many episodes
     for number in chosen:
         path = output if single else output / f"episode_{number:06d}.mcap"
-        source = _episode(dataset, number, present[number], digest(present[number][0]))
+        source = _episode(dataset, number, present[number], digest)
         column_map, notes = _map(dataset, units or {})
         report = import_tables(
             source, path, robot=robot, column_map=column_map, said=notes, force=force, stop=stop
@@ -212,7 +212,12 @@ def _map(dataset: LeRobotDataset, units: Mapping[str, str]) -> tuple[ColumnMap, 
     return ColumnMap("time", "ns", tuple(columns)), notes
 
 
-def _episode(dataset: LeRobotDataset, number: int, paths: Sequence[Path], of_file: str) -> TableSet:
+def _episode(
+    dataset: LeRobotDataset,
+    number: int,
+    paths: Sequence[Path],
+    digest_of_file: Callable[[Path], str],
+) -> TableSet:
     columns = tuple(f"{name}[{i}]" for name, n in dataset.names.items() for i in range(len(n)))
 
     def read(names: Sequence[str], time: str) -> Iterator[Block]:  # noqa: ARG001
@@ -230,11 +235,12 @@ def _episode(dataset: LeRobotDataset, number: int, paths: Sequence[Path], of_fil
         "import.robot_type": dataset.robot_type,
         **({"import.task": task} if task else {}),
     }
-    # A file may hold several episodes, and each is a session of its own.
-    digest = hashlib.sha256(f"{of_file} {number}".encode()).hexdigest()
-    return TableSet(
-        dataset.folder, {STATES: table}, digest=digest, facts=facts, compression=FLOAT32
-    )
+
+    def digest() -> str:
+        """A file may hold several episodes, and each is a session of its own."""
+        return hashlib.sha256(f"{digest_of_file(paths[0])} {number}".encode()).hexdigest()
+
+    return TableSet(dataset.folder, {STATES: table}, digest, facts=facts, compression=FLOAT32)
 
 
 def _of_episode(path: Path, number: int, columns: Sequence[str], rows: int) -> Iterator[Any]:
@@ -251,7 +257,7 @@ def _frames(path: Path, dataset: LeRobotDataset, number: int, rows: int) -> Iter
             vectors = vectors_of(batch.column(name))
             if vectors.shape != (len(frame), len(names)):
                 refuse(path, f"{name} has not {len(names)} elements in each frame, as in info.json")
-            block |= {f"{name}[{i}]": vectors[:, i] for i in range(len(names))}
+            block |= spread(name, vectors)
         yield block
 
 

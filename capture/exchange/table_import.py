@@ -26,6 +26,7 @@ from ..log.write.writer import SessionWriter
 from ..robot.bus_map import TIME_UNITS, unit_for
 from ..robot.model import Quantity, Robot
 from .can_import import LEVEL, ImportReport, digest_of, imported_session
+from .column_blocks import Block, joined
 from .column_map import COMMANDS, STATES, Column, ColumnMap, JointTopic, topics_of
 from .frame_log import EARLIEST_NS, LATEST_NS, RELATIVE_EPOCH_NS
 from .marker_tracks import as_joints, with_fps
@@ -58,9 +59,10 @@ class TableSet:
 
     Attributes:
         tables: ``states``, ``commands`` or both.
+        digest: Returns that of all files' bytes; called once reading has begun, which other threads
+            go on with.
         joints: Names in the order of vectors, if a file lists them.
         events: A table of times and texts, if there is one.
-        digest: Of all files' bytes.
         left_out: Names of files that were not read.
         facts: For the session's metadata, beside those of any import.
         compression: Of the session.
@@ -68,9 +70,9 @@ class TableSet:
 
     source: Path
     tables: dict[str, TableFile]
+    digest: Callable[[], str]
     joints: tuple[str, ...] = ()
     events: Path | None = None
-    digest: str = ""
     left_out: tuple[str, ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict[str, str])
     compression: Compression = LEVEL
@@ -98,7 +100,7 @@ def open_tables(source: Path, commands: Path | None = None, fps: float | None = 
         if commands is not None:
             tables[COMMANDS] = open_table(commands)
         files = [source, *([commands] if commands is not None else [])]
-        found = TableSet(source, tables, digest=digest_of(files))
+        found = TableSet(source, tables, partial(digest_of, files))
     joints = {role: as_joints(table) or table for role, table in found.tables.items()}
     if fps is None:
         return replace(found, tables=joints)
@@ -120,7 +122,7 @@ def open_mapped(source: Path, column_map: ColumnMap) -> TableSet:
     """
     columns = [column.column for column in column_map.columns]
     table = open_csv(source, column_map.time_column, columns, column_map.delimiter)
-    return TableSet(source, {STATES: table}, digest=digest_of([source]))
+    return TableSet(source, {STATES: table}, partial(digest_of, [source]))
 
 
 def _open_folder(folder: Path) -> TableSet:
@@ -156,7 +158,7 @@ def _open_folder(folder: Path) -> TableSet:
     events = found["events"][0] if found["events"] else None
     files = [path for paths in found.values() for path in paths]
     joints = _names(found["names"][0]) if found["names"] else ()
-    return TableSet(folder, tables, joints, events, digest_of(files), tuple(others))
+    return TableSet(folder, tables, partial(digest_of, files), joints, events, tuple(others))
 
 
 def _names(path: Path) -> tuple[str, ...]:
@@ -319,18 +321,17 @@ class _Source:
     ) -> Iterator[_Messages]:
         """Yield the messages of each block, in order of time."""
         found = {(column.joint, column.quantity): column for column in self.columns}
+        columns: dict[Quantity, list[Column]] = {}
+        for (_, quantity), column in found.items():
+            columns.setdefault(quantity, []).append(column)
         topics = [
-            JointTopic(writer, list(found), quantities)
-            for quantities in topics_of({quantity for _, quantity in found})
+            JointTopic(writer, list(found), quantities) for quantities in topics_of(set(columns))
         ]
         for block in self._blocks:
             if not len(block[self._time]):
                 continue
             t_ns = self._checked(self._times(block[self._time]), offset)
-            values = {
-                (column.joint, column.quantity): self._converted(column, block[column.column])
-                for column in self.columns
-            }
+            values = {quantity: self._converted(own, block) for quantity, own in columns.items()}
             yield _Messages(
                 (int(t_ns[0]), self._order),
                 int(t_ns[-1]),
@@ -339,7 +340,8 @@ class _Source:
 
     def missing(self) -> list[str]:
         """Return how many cells of each column had no value."""
-        return [f"column {n!r}: {c} cells without a value" for n, c in self._missing.items() if c]
+        names = [column.column for column in self.columns if self._missing.get(column.column)]
+        return [f"column {name!r}: {self._missing[name]} cells without a value" for name in names]
 
     def _times(self, cells: NDArray[Any]) -> IntArray:
         unit, path = self._unit_ns, self.table.path
@@ -378,30 +380,51 @@ class _Source:
             )
         return stamps
 
-    def _converted(self, column: Column, cells: NDArray[Any]) -> FloatArray:
-        """Convert cells to the session's unit: unwrapped over blocks, scaled and offset."""
-        path, name = self.table.path, column.column
+    def _converted(self, columns: Sequence[Column], block: Block) -> FloatArray:
+        """Return the cells of some columns in the session's unit, shape (n, m).
+
+        They have single precision if all of them had it and none is converted.
+        """
+        cells = [self._numbers(column, block[column.column]) for column in columns]
+        changed = [k for k, column in enumerate(columns) if not column.is_plain]
+        values: FloatArray = joined(cells)
+        if not -_MOST < float(values.min()) <= float(values.max()) < _MOST:
+            known = ~np.isnan(values)
+            for column, own, there in zip(columns, values.T, known.T, strict=True):
+                if not np.all(np.abs(own[there]) < _MOST):
+                    raise ImportFormatError(
+                        self.table.path,
+                        f"column {column.column!r} has a number that is not finite or beyond "
+                        f"{_MOST:g}",
+                    )
+                missing = self._missing.get(column.column, 0) + int(len(own) - there.sum())
+                self._missing[column.column] = missing
+        if changed:
+            values = values.astype(np.float64)
+        for k in changed:
+            values[:, k] = self._in_unit(columns[k], values[:, k])
+        return values
+
+    def _numbers(self, column: Column, cells: NDArray[Any]) -> NDArray[Any]:
+        if cells.dtype.kind in "fiu":
+            return cells
         try:
-            values = cells.astype(np.float64)
+            return cells.astype(np.float64)
         except (ValueError, TypeError) as error:
             bad = next((str(cell)[:40] for cell in cells if not _is_number(cell)), "")
-            raise ImportFormatError(path, f"column {name!r}: {bad!r} is not a number") from error
-        known = np.abs(values) < _MOST
-        missing = 0
-        if not known.all():
-            known = ~np.isnan(values)
-            if not np.all(np.abs(values[known]) < _MOST):
-                raise ImportFormatError(
-                    path, f"column {name!r} has a number that is not finite or beyond {_MOST:g}"
-                )
-            missing = int(len(values) - known.sum())
-        self._missing[name] = self._missing.get(name, 0) + missing
+            raise ImportFormatError(
+                self.table.path, f"column {column.column!r}: {bad!r} is not a number"
+            ) from error
+
+    def _in_unit(self, column: Column, values: FloatArray) -> FloatArray:
+        """Convert numbers to the session's unit: unwrapped over blocks, scaled and offset."""
+        known = ~np.isnan(values)
         if column.wrap and known.any():
             raw = values[known]
-            before = self._unwrapped.get(name, (raw[0], raw[0]))
+            before = self._unwrapped.get(column.column, (raw[0], raw[0]))
             turns = np.unwrap(np.concatenate([[before[0]], raw]), period=column.wrap)
             values[known] = turns[1:] + (before[1] - before[0])
-            self._unwrapped[name] = (raw[-1], values[known][-1])
+            self._unwrapped[column.column] = (raw[-1], values[known][-1])
         scaled = values if column.scale == 1.0 else column.scale * values
         unit = unit_for(column.unit, column.quantity)
         return unit.convert(scaled + column.offset if column.offset else scaled)  # keeps -0.0
@@ -430,7 +453,7 @@ def _is_number(cell: object) -> bool:
 def _write_block(
     topics: Sequence[JointTopic],
     t_ns: IntArray,
-    values: Mapping[tuple[str, Quantity], FloatArray],
+    values: Mapping[Quantity, FloatArray],
     report: ImportReport,
 ) -> None:
     for topic in topics:

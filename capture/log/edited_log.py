@@ -75,7 +75,7 @@ class RawLog:
         filled = [block for block in self.file.blocks if block.end_ns]
         self.start_ns = min((block.start_ns for block in filled), default=0)
         self.end_ns = max((block.end_ns for block in filled), default=0)
-        self.session_id = self.file.metadata.get("undulog", {}).get("session_id") or path.stem
+        self.session_id = self.file.session_id
         self.robot = _robot_name(self.file)
 
     def __enter__(self) -> RawLog:

@@ -100,6 +100,7 @@ SESSION_UNIT: dict[Quantity, str] = {
 """The unit in which a session holds each quantity."""
 
 
+@lru_cache
 def valid_units(quantity: Quantity) -> tuple[str, ...]:
     """Return the names of the units that fit a quantity, that of sessions first."""
     dimension = SESSION_UNIT[quantity]

@@ -12,18 +12,18 @@ import itertools
 import mmap
 import struct
 from collections import deque
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
-from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
 from mcap.opcode import Opcode
 
 from ...common.arrays import IntArray
 from ...common.errors import LogError
+from ...common.process import Piece, helpers
 from ..file.log_file import LogFile, keep_freed, new_pages
 from ..mcap.chunk import (
     BODY_AT,
@@ -41,49 +41,6 @@ if TYPE_CHECKING:
     from concurrent.futures import ThreadPoolExecutor
 
 _T = TypeVar("_T")
-
-
-class Piece(Generic[_T]):
-    """A piece of work that is done by a helper thread, or by the caller if none has begun it."""
-
-    def __init__(self, work: Callable[[], _T], helpers: ThreadPoolExecutor | None) -> None:
-        """Submit it to the helper threads, if any."""
-        self._work = work
-        self._taken = None if helpers is None else helpers.submit(work)
-        self._done: list[_T] = []
-
-    def hurry(self) -> None:
-        """Do the work now unless a helper has begun it."""
-        if not self._done and (self._taken is None or self._taken.cancel()):
-            self._taken = None
-            self._done.append(self._work())
-
-    def result(self) -> _T:
-        """Return the result, or raise the error of the work; waits for it."""
-        self.hurry()
-        return self._done[0] if self._taken is None else self._taken.result()
-
-
-@contextmanager
-def helpers(threads: int) -> Generator[ThreadPoolExecutor | None]:
-    """Start helper threads, which end with the block.
-
-    Args:
-        threads: Number of threads, with the caller's own.
-
-    Yields:
-        The other threads; None if there are none.
-    """
-    if threads == 1:
-        yield None
-        return
-    from concurrent.futures import ThreadPoolExecutor
-
-    pool = ThreadPoolExecutor(threads - 1, thread_name_prefix="undulog-read")
-    try:
-        yield pool
-    finally:  # also when the caller stops early: pending work is cancelled
-        pool.shutdown(cancel_futures=True)
 
 
 def ahead(items: Iterable[_T], count: int) -> Iterator[_T]:

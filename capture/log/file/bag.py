@@ -21,6 +21,7 @@ from ...common.errors import LogError, MissingExtraError, NotALogError, UndulogE
 from ..messages.definitions import CONTROLLER_STATE, DYNAMIC_STATE
 from .bag_metadata import METADATA, Stated, is_rosbag2, metadata_text, read_stated
 from .bag_parts import Allowance, opened
+from .content import content_id_of
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -170,6 +171,7 @@ class BagCopy:
 
     Attributes:
         warnings: What was left out, one sentence each.
+        content: Id from the content of the bag.
     """
 
     def __init__(
@@ -214,6 +216,7 @@ class BagCopy:
                 else:
                     copy.rosbag2(Path(self._folder.name, "part"), Allowance(path, size))
                 copy.finish()
+            self.content = content_id_of(copy.files)
         except (MemoryError, UndulogError):
             self.close()
             raise
@@ -268,6 +271,7 @@ class _Copy:
     Attributes:
         damaged: Number of messages that can't be read, by topic.
         warnings: Parts that can't be read.
+        files: Of the recording.
     """
 
     def __init__(
@@ -283,6 +287,7 @@ class _Copy:
         self._begun, self._share = 0.0, 1.0
         self.damaged: Counter[str] = Counter()
         self.warnings: list[str] = []
+        self.files = [path]
 
     def rosbag2(self, scratch: Path, allowance: Allowance) -> None:
         """Copy all files of a recording of ROS 2.
@@ -293,8 +298,9 @@ class _Copy:
         """
         path = self._path
         stated = read_stated(path) if path.is_dir() else Stated([path], "")
-        self._share = 1 / len(stated.files)
-        for file in stated.files:
+        self.files = stated.files
+        self._share = 1 / len(self.files)
+        for file in self.files:
             with opened(file, stated.mode, scratch, allowance) as part:
                 self.add(part.connections, part.count, part.messages(), None)
                 self.warnings += [text.replace(str(scratch), str(file)) for text in part.warnings]

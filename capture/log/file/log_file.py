@@ -27,6 +27,7 @@ from ..mcap.chunk import LAST_NS, Block, read_message_heads
 from ..mcap.file import McapFile
 from ..wal.reader import MessageKey, WalContents, WalTail, beyond, read_wal
 from .bag import BagCopy, is_bag
+from .content import content_id
 from .parts import PART_RECORD, PartFiles, first_part, open_parts
 
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
@@ -266,6 +267,23 @@ class LogFile:
         for part, file in enumerate(self.files):
             if file.remote is not None:
                 file.remote.expect([block for block in blocks if block.part == part])
+
+    @cached_property
+    def session_id(self) -> str:
+        """The session's id; one from the content if it has none, or else the file's name."""
+        if own := self.metadata.get("undulog", {}).get("session_id"):
+            return own
+        if self._bag is not None:
+            return self._bag.content
+        if not self.files:
+            return self.path.stem
+        file = self.files[0]
+
+        def read(start: int, stop: int) -> bytes:
+            file.need(start, stop)
+            return bytes(file.buffer[start:stop])
+
+        return content_id([(len(file.buffer), read)])
 
     @property
     def size(self) -> int:

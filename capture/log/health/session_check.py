@@ -125,7 +125,7 @@ class SessionHealth(SessionMeasures):
     """The health of a session in a file.
 
     Attributes:
-        session_id: Its id, or the file's name.
+        session_id: Its id; one from the content if it has none.
         stored: The verdict stored in the file, or None.
         stored_reasons: The reasons stored with it.
         following: Joints that do not follow their command. Only the whole file shows them, so the
@@ -204,8 +204,7 @@ class _Check:
         return SessionHealth(
             **{each.name: getattr(found, each.name) for each in fields(found)},
             path=self._file.path,
-            session_id=self._file.metadata.get("undulog", {}).get("session_id")
-            or self._file.path.stem,
+            session_id=self._file.session_id,
             stored=stored.get("verdict"),
             stored_reasons=_reasons(stored.get("reasons", "[]")),
             file=file,

@@ -12,11 +12,14 @@ Format: https://mcap.dev/spec.
 from __future__ import annotations
 
 import struct
+import threading
 import zlib
 from array import array
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias
+from functools import partial
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 import zstandard
@@ -40,7 +43,11 @@ from mcap.records import (
 from numpy.typing import NDArray
 
 from ...common.arrays import IntArray
+from ...common.process import Piece
 from .chunk import BODY_AT, FIXED_SIZE, HEAD, MAGIC, MESSAGE, PREFIX_SIZE
+
+if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
 
 CHUNK_SIZE = 1 << 20
 """Bytes of messages after which a chunk is written."""
@@ -49,6 +56,7 @@ Compression: TypeAlias = int | zstandard.ZstdCompressionParameters
 """Level of zstd, or its parameters, ``write_checksum`` among them."""
 
 _LONGEST_WAIT_NS = 10 * 10**9  # of log time, once a chunk of other channels is full
+_MOST_WAITING = 8 << 20  # bytes of messages in full chunks that helper threads compress
 _COMPRESSION = "zstd"
 _CHUNK = struct.Struct("<BQQQQII4sQ")
 _INDEX = struct.Struct("<BQHI")
@@ -82,6 +90,31 @@ class _OpenChunk:
     schemas: set[int] = field(default_factory=set[int])  # that a chunk of this group has
 
 
+class _Compressor(threading.local):
+    """The zstd compressor of each thread."""
+
+    def __init__(self, compression: Compression) -> None:
+        self._zstd = (
+            zstandard.ZstdCompressor(compression, write_checksum=True)
+            if isinstance(compression, int)
+            else zstandard.ZstdCompressor(compression_params=compression)
+        )
+
+    def pack(self, data: bytearray) -> tuple[bytes, int]:
+        """Return the compressed content of a chunk, and the CRC-32 of the content."""
+        return self._zstd.compress(data), zlib.crc32(data)
+
+
+@dataclass(frozen=True, slots=True)
+class _FullChunk:
+    """A chunk that is compressed and not yet written."""
+
+    began: int
+    index: dict[int, array[int]]
+    size: int
+    packed: Piece[tuple[bytes, int]]
+
+
 class McapWriter:
     """Writes one MCAP file of zstd chunks with all indexes.
 
@@ -94,6 +127,7 @@ class McapWriter:
         chunk_size: int = CHUNK_SIZE,
         group_of: Callable[[str, str], str] | None = None,
         compression: Compression = 3,
+        helpers: ThreadPoolExecutor | None = None,
     ) -> None:
         """Write to a stream; :meth:`start` begins.
 
@@ -102,13 +136,14 @@ class McapWriter:
             group_of: Topic and type name to the group of a channel; channels of one group share
                 chunks. None for one group, named "".
             compression: Level or parameters of zstd.
+            helpers: Threads that compress chunks while the next ones are filled; the caller does it
+                if None. The file is the same.
         """
         self._stream, self._chunk_size = stream, chunk_size
-        self._zstd = (
-            zstandard.ZstdCompressor(compression, write_checksum=True)
-            if isinstance(compression, int)
-            else zstandard.ZstdCompressor(compression_params=compression)
-        )
+        self._compressor, self._helpers = _Compressor(compression), helpers
+        self._full: deque[_FullChunk] = deque()
+        self._waiting = 0  # bytes of messages in these
+        self._most_waiting = 0 if helpers is None else _MOST_WAITING
         self._group_of = group_of
         self._shared = _OpenChunk("")
         self._open = {"": self._shared}
@@ -127,7 +162,8 @@ class McapWriter:
     @property
     def settled(self) -> int:
         """Number of first messages that are all in written chunks."""
-        return next((chunk.began for chunk in self._begun.values()), self.messages)
+        chunks = (*self._full, *self._begun.values())
+        return min((chunk.began for chunk in chunks), default=self.messages)
 
     def start(self, profile: str, library: str) -> None:
         """Write the beginning of the file.
@@ -280,6 +316,7 @@ class McapWriter:
         Raises:
             OSError: If the stream can't take it.
         """
+        self._write_full()
         offset = self._stream.tell()
         length = self._put(Attachment(create_time, log_time, name, media_type, data))
         self._attachments.append(
@@ -303,6 +340,7 @@ class McapWriter:
         Raises:
             OSError: If the stream can't take it.
         """
+        self._write_full()
         offset = self._stream.tell()
         length = self._put(Metadata(name, dict(data)))
         self._metadata.append(MetadataIndex(offset=offset, length=length, name=name))
@@ -328,6 +366,7 @@ class McapWriter:
         for chunk in list(self._begun.values()):
             if chunk.began < count:
                 self._finish_chunk(chunk)
+        self._write_full()
 
     def finish(self) -> None:
         """Write the chunks and the summary; the stream stays open.
@@ -382,18 +421,35 @@ class McapWriter:
                 self._finish_chunk(other)
 
     def _finish_chunk(self, chunk: _OpenChunk) -> None:
-        """Write a chunk that has messages."""
+        """Compress a chunk that has messages, and write the earlier ones that would be too many."""
+        size, pack = len(chunk.data), partial(self._compressor.pack, chunk.data)
+        self._full.append(_FullChunk(chunk.began, chunk.index, size, Piece(pack, self._helpers)))
+        self._waiting += size
+        chunk.data, chunk.index = bytearray(), {}
+        del self._begun[chunk.group]
+        if self._waiting > self._most_waiting:
+            self._full[-1].packed.hurry()  # the helpers are at the earlier ones
+            self._write_full(self._most_waiting)
+
+    def _write_full(self, most_waiting: int = 0) -> None:
+        """Write full chunks, in order, until so many bytes of messages wait."""
+        while self._full and self._waiting > most_waiting:
+            chunk = self._full.popleft()
+            self._waiting -= chunk.size
+            self._write_chunk(chunk)
+
+    def _write_chunk(self, chunk: _FullChunk) -> None:
         indexes = {key: np.frombuffer(index, np.uint64)[::2] for key, index in chunk.index.items()}
         begin = int(min(times.min() for times in indexes.values()))
         end = int(max(times.max() for times in indexes.values()))
-        data = self._zstd.compress(chunk.data)
+        data, crc = chunk.packed.result()
         body = _CHUNK.size - 9 + len(data)
         at = self._stream.tell()
-        size, crc = len(chunk.data), zlib.crc32(chunk.data)
         head = _CHUNK.pack(
-            Opcode.CHUNK, body, begin, end, size, crc, 4, _COMPRESSION.encode(), len(data)
+            Opcode.CHUNK, body, begin, end, chunk.size, crc, 4, _COMPRESSION.encode(), len(data)
         )
-        self._stream.write(head + data)
+        self._stream.write(head)
+        self._stream.write(data)
         written = ChunkIndex(
             message_start_time=begin,
             message_end_time=end,
@@ -403,9 +459,9 @@ class McapWriter:
             message_index_length=0,
             compression=_COMPRESSION,
             compressed_size=len(data),
-            uncompressed_size=size,
+            uncompressed_size=chunk.size,
         )
-        index_at = self._stream.tell()
+        index_at = at + written.chunk_length
         records = bytearray()
         for key, index in chunk.index.items():
             written.message_index_offsets[key] = index_at + len(records)
@@ -418,8 +474,6 @@ class McapWriter:
         self._chunks.append(written)
         low, high = self._times or (begin, end)
         self._times = min(low, begin), max(high, end)
-        chunk.data, chunk.index = bytearray(), {}
-        del self._begun[chunk.group]
 
     def _statistics(self) -> Statistics:
         begin, end = self._times or (0, 0)

@@ -2,7 +2,8 @@
 
 A file that lies in an object store costs at most :data:`MOST_REQUESTS` requests for ranges of
 bytes, whatever its size: the header and the first metadata, the footer and the summary behind it,
-and metadata between them.
+and metadata between them. A log without an id has no such metadata; two pieces between, which its
+id is made from, take their place.
 
 Of the recordings of ROS that are no plain MCAP, a rosbag2 folder states them in its metadata.yaml,
 a .bag of ROS 1 at its end; of a .db3 file the topics and the index of times are read.
@@ -14,7 +15,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -27,14 +28,16 @@ from mcap.records import Channel, Footer, Metadata, MetadataIndex, Statistics
 from ...common.errors import MissingExtraError, NotALogError, UndulogError
 from ..file.bag_metadata import Stated, read_stated
 from ..file.bag_parts import Allowance, read_database_facts
+from ..file.content import EDGE, content_id, content_id_of
 from ..mcap.chunk import MAGIC, walk_records
 
 MOST_REQUESTS = 5
 """Ranges that are read of one file."""
 
-_EDGE = 64 * 1024
 _MOST_SUMMARY = 64 << 20
-_METADATA = ("undulog", "undulog.health", "undulog.part")
+RECORDS = ("undulog", "undulog.health", "undulog.part")
+"""Metadata records that are facts of a log."""
+
 _FOOTER = 1 + 8 + 20 + len(MAGIC)
 
 
@@ -53,6 +56,7 @@ class LogFacts:
         topics: In order of name.
         metadata: Of the log contract: ``undulog``, ``undulog.health`` and ``undulog.part``.
         damage: Why there is no summary; empty where there is one.
+        content: Id from its content; empty where the metadata has one.
     """
 
     start_ns: int | None = None
@@ -61,6 +65,12 @@ class LogFacts:
     topics: tuple[str, ...] = ()
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
     damage: str = ""
+    content: str = ""
+
+    @property
+    def session_id(self) -> str:
+        """Its own id, or the one from its content; empty if there is neither."""
+        return self.metadata.get("undulog", {}).get("session_id") or self.content
 
 
 class _Ranges:
@@ -102,12 +112,27 @@ def read_facts(name: str, size: int, read: Callable[[int, int], bytes]) -> LogFa
         OSError: As ``read`` raises it.
     """
     ranges = _Ranges(read, size)
-    head = ranges.get(0, min(size, _EDGE)) or b""
+    head = ranges.get(0, min(size, EDGE)) or b""
     if not head.startswith(MAGIC):
         raise NotALogError(name, "no MCAP file: it doesn't start as one")
     metadata: dict[str, dict[str, str]] = {}
     _add_metadata(metadata, _records(head, len(MAGIC)))
-    tail = ranges.get(max(0, size - _EDGE), size) or b""
+    tail = ranges.get(max(0, size - EDGE), size) or b""
+    found = _found(ranges, size, tail, metadata)
+    if found.session_id:
+        return found
+
+    def piece(start: int, stop: int) -> bytes:
+        if start == 0:
+            return head
+        return tail if stop == size else read(start, stop)
+
+    return replace(found, content=content_id([(size, piece)]))
+
+
+def _found(
+    ranges: _Ranges, size: int, tail: bytes, metadata: dict[str, dict[str, str]]
+) -> LogFacts:
     if size < 2 * len(MAGIC) + 29 or not tail.endswith(MAGIC):
         return LogFacts(metadata=metadata, damage="it has no end: undulog log recover")
     try:
@@ -135,8 +160,8 @@ def _from_summary(summary: bytes, ranges: _Ranges, metadata: dict[str, dict[str,
             statistics = _parse(Statistics, body)
         elif opcode == Opcode.METADATA_INDEX:
             index = _parse(MetadataIndex, body)
-            if index.name in _METADATA:
-                record = ranges.get(index.offset, index.offset + index.length, _EDGE)
+            if index.name in RECORDS:
+                record = ranges.get(index.offset, index.offset + index.length, EDGE)
                 if record is not None:
                     _add_metadata(metadata, _records(record, 0))
     if statistics is None or not statistics.message_count:
@@ -166,7 +191,7 @@ def _add_metadata(metadata: dict[str, dict[str, str]], records: list[tuple[int, 
     for opcode, body in records:
         if opcode == Opcode.METADATA:
             record = _parse(Metadata, body)
-            if record.name in _METADATA:
+            if record.name in RECORDS:
                 metadata.setdefault(record.name, {}).update(record.metadata)
 
 
@@ -189,15 +214,15 @@ def read_bag_facts(path: Path) -> LogFacts:
             stated = _of_ros1(path) if path.suffix == ".bag" else read_database_facts(path)
     except ImportError as error:
         raise MissingExtraError("reading a recording of ROS", "bags", "rosbags") from error
-    facts = LogFacts(messages=stated.messages, topics=tuple(sorted({*stated.topics})))
+    facts = LogFacts(
+        messages=stated.messages,
+        topics=tuple(sorted({*stated.topics})),
+        content=content_id_of(stated.files),
+    )
     if not stated.messages or stated.start_ns is None or stated.duration_ns is None:
         return facts
-    return LogFacts(
-        start_ns=stated.start_ns,
-        end_ns=stated.start_ns + stated.duration_ns,
-        messages=facts.messages,
-        topics=facts.topics,
-    )
+    end_ns = stated.start_ns + stated.duration_ns
+    return replace(facts, start_ns=stated.start_ns, end_ns=end_ns)
 
 
 def _of_ros1(path: Path) -> Stated:

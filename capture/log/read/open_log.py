@@ -285,8 +285,8 @@ class SessionFacts:
 
     @property
     def session_id(self) -> str:
-        """The session's id; the file's name if it has none."""
-        return self._log.file.metadata.get("undulog", {}).get("session_id") or self.path.stem
+        """The session's id; one from the content if it has none, the same for every copy."""
+        return self._log.file.session_id
 
     @property
     def settle_s(self) -> float | None:

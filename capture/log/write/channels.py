@@ -41,7 +41,7 @@ SendRows = Callable[[IntArray, NDArray[np.uint8]], None]
 
 _TIME = struct.Struct("<iI")
 _END_NS = 2**31 * NS
-_AT_ONCE = 1 << 18  # bytes of messages, which a processor's cache holds
+_AT_ONCE = 1 << 20  # bytes of messages: a chunk
 _POSE_STEP = 2.0**-14  # transforms are a view aid: rounded, they compress
 
 _LEVELS = {"debug": 10, "info": 20, "warn": 30, "error": 40, "fatal": 50}

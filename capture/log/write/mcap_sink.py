@@ -8,9 +8,10 @@ The other topics are small and share chunks.
 from __future__ import annotations
 
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import BinaryIO, Protocol, TypeAlias
+from typing import TYPE_CHECKING, BinaryIO, Protocol, TypeAlias
 
 import numpy as np
 from mcap.records import Attachment, Channel, Metadata, Schema
@@ -19,6 +20,9 @@ from numpy.typing import NDArray
 from ...common.arrays import IntArray
 from ...common.errors import DataError, LogWriteError, OutputExistsError
 from ..mcap.writer import Compression, McapWriter
+
+if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
 
 _BULKY = frozenset(
     {"sensor_msgs/msg/JointState", "std_msgs/msg/UInt8MultiArray", "tf2_msgs/msg/TFMessage"}
@@ -87,12 +91,18 @@ class McapSink:
     """Writes one MCAP file; it is finalised by :meth:`close`."""
 
     def __init__(
-        self, path: Path | str, *, force: bool = False, compression: Compression = 3
+        self,
+        path: Path | str,
+        *,
+        force: bool = False,
+        compression: Compression = 3,
+        helpers: ThreadPoolExecutor | None = None,
     ) -> None:
         """Create the file.
 
         Args:
             compression: Level or parameters of zstd.
+            helpers: Threads that compress, which outlive the sink; the caller's own if None.
 
         Raises:
             OutputExistsError: If the file exists and ``force`` is not given.
@@ -102,7 +112,9 @@ class McapSink:
         self._open = True
         self._stream = create_file(self.path, force=force)
         guarded = _Guarded(self._stream, self.path)
-        self._writer = McapWriter(guarded, group_of=chunk_group, compression=compression)
+        self._writer = McapWriter(
+            guarded, group_of=chunk_group, compression=compression, helpers=helpers
+        )
         self._writer.start(profile=PROFILE, library=library_name())
 
     def define(self, record: Description) -> None:
@@ -146,9 +158,15 @@ class McapSink:
         self._stream.close()
 
 
+@cache
+def own_version() -> str:
+    """Return the version of this library."""
+    return version("undulog")
+
+
 def library_name() -> str:
     """Return the name and version of this library, for the header of a file."""
-    return f"undulog/{version('undulog')}"
+    return f"undulog/{own_version()}"
 
 
 def write_description(writer: McapWriter, record: Description) -> None:

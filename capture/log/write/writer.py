@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
@@ -39,7 +38,7 @@ from .channels import (
     TimeReferenceChannel,
     TransformChannel,
 )
-from .mcap_sink import McapSink, MessageSink
+from .mcap_sink import McapSink, MessageSink, own_version
 
 
 class SessionWriter:
@@ -89,7 +88,7 @@ class SessionWriter:
             "contract": str(CONTRACT_VERSION),
             "epoch_ns": str(epoch_ns),
             "robot": robot.name if robot is not None else "",
-            "undulog": version("undulog"),
+            "undulog": own_version(),
         }
         facts |= {f"clock.{source}": domain for source, domain in (clock or {}).items()}
         facts |= dict(metadata or {})

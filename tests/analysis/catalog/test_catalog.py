@@ -5,10 +5,12 @@ import multiprocessing
 import os
 import shutil
 import sqlite3
+import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
@@ -16,10 +18,11 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from support import durable_child as recorder
 from support.analysed import analysed as analysed_session
 from support.bucket import s3_bucket
+from support.kills import killed_after
 from support.linear_chain import CHAIN, WAVE, write_run
 from support.processes import undulog
 from support.ros_bags import Filler, ticks, write_bag
-from support.written_sessions import write_foreign, write_session
+from support.written_sessions import joint_state, write_foreign, write_session
 from undulog.analysis.catalog.catalog import FOLDER, Catalog
 from undulog.capture import Session
 from undulog.capture.common.errors import InputFileError, NotALogError, UsageError
@@ -185,6 +188,32 @@ def test_a_damaged_copy_has_none_of_the_results_of_the_whole_session(lab):
     assert catalog.find("path = 'copy.mcap'").status.to_list() == ["analysed"]
 
 
+@pytest.mark.parametrize("left", [None, b""], ids=["missing", "empty"])
+def test_a_session_that_has_only_its_write_ahead_log(tmp_path, left):
+    path = tmp_path / "run.mcap"
+    killed_after([sys.executable, recorder.__file__, str(path), "{}"], 0.3)
+    path.unlink(missing_ok=True)  # what a power failure can leave of a file that is not synced
+    if left is not None:
+        path.write_bytes(left)
+    catalog = Catalog(str(tmp_path))
+    assert (catalog.scan().damaged, Catalog(str(tmp_path)).scan().read) == (1, 0)
+    (row,) = catalog.find().itertuples()
+    assert (row.path, row.session_id, row.status) == ("run.mcap", "killed", "not analysed")
+    assert row.damage.endswith("undulog log recover run.mcap")
+    assert [*row.topics] == sorted(recorder.TOPICS)
+    with Session.open(path) as session:
+        assert session.session_id == row.session_id
+    (tmp_path / "run.mcap.wal" / "def-000001.seg").write_bytes(b"no segment")
+    for segment in (tmp_path / "run.mcap.wal").glob("0*.seg"):
+        segment.unlink()
+    assert catalog.scan().damaged == 1
+    assert "no readable header" in catalog.find().damage[0]
+    shutil.rmtree(tmp_path / "run.mcap.wal")
+    path.unlink(missing_ok=True)
+    assert catalog.scan().removed == 1
+    assert not len(catalog.find())
+
+
 def test_parts_of_a_session_are_one_row(tmp_path):
     sink = recorder.open_sink(tmp_path / "run.mcap")
     for number in range(900):
@@ -274,7 +303,8 @@ def test_a_bag_alone_and_damaged_ones(bags):
     catalog = Catalog(str(bags / "day/plain"))
     catalog.scan()
     assert catalog.find().path.to_list() == ["."]
-    assert catalog.find().session_id.to_list() == ["plain"]
+    with Session.open(bags / "day/plain") as session:
+        assert catalog.find().session_id.to_list() == [session.session_id]
     (bags / "day/sql/sql.db3").unlink()
     for name in ("alone.db3", "day/one.bag"):
         os.truncate(bags / name, 3000)
@@ -332,6 +362,73 @@ def test_analyses_of_bags_are_made_on_request(bags):
     assert catalog.analyse(["day/one.bag", "day/messages"]) == {}
     rows = catalog.find("status = 'analysed'")
     assert rows.path.to_list() == ["day/messages", "day/one.bag"]
+
+
+KINDS = {
+    "walk.bag": {},
+    "walk": {},
+    "messages": {"compression": MESSAGES},
+    "sql": {"storage": StoragePlugin.SQLITE3},
+    "files": {"storage": StoragePlugin.SQLITE3, "compression": FILES},
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_id_of_a_bag_is_of_its_content(tmp_path, name):
+    """Same name, times, topics and sizes of all messages, and the same begin and end."""
+
+    def fill(bag, day):
+        first, then = Filler(bag), Filler(bag, seed=day)
+        for number, tick in enumerate(ticks(20.0)):
+            (then if 300 < number < 1700 else first).state(*tick)
+
+    for day in range(2):
+        (tmp_path / f"{day}").mkdir()
+        write_bag(tmp_path / f"{day}" / name, lambda bag, day=day: fill(bag, day), **KINDS[name])
+    copy = shutil.copytree if (tmp_path / "0" / name).is_dir() else shutil.copy
+    (tmp_path / "copy").mkdir()
+    copy(tmp_path / "0" / name, tmp_path / "copy" / f"other_{name}")
+    catalog = Catalog(str(tmp_path))
+    assert catalog.scan().damaged == 0
+    first, second, copied = catalog.find().session_id
+    assert first == copied != second
+    for path, row in catalog.find().set_index("path").iterrows():
+        with Session.open(tmp_path / path) as session:
+            assert session.session_id == row.session_id
+    assert catalog.analyse([f"1/{name}"]).keys() <= {f"1/{name}"}
+    analysed = catalog.find("status = 'analysed'").path.to_list()
+    assert analysed in ([], [f"1/{name}"])
+
+
+def test_the_id_of_a_foreign_log_is_of_its_content(tmp_path):
+    logs = [
+        [
+            ("/joint_states", 10**18 + k * 10**7, joint_state(0, ["a"], [k * step]))
+            for k in range(99)
+        ]
+        for step in (1.0, 2.0)
+    ]
+    for place, messages in zip(("0", "1", "2"), (*logs, logs[0]), strict=True):
+        (tmp_path / place).mkdir()
+        write_foreign(tmp_path / place / f"run{place if place == '2' else ''}.mcap", messages)
+    catalog = Catalog(str(tmp_path))
+    catalog.scan()
+    ids = catalog.find().set_index("path").session_id
+    assert ids["0/run.mcap"] == ids["2/run2.mcap"] != ids["1/run.mcap"]
+    with Session.open(tmp_path / "2/run2.mcap") as session:
+        assert session.session_id == ids["2/run2.mcap"]
+
+
+def test_a_catalogue_of_an_earlier_version_is_read_anew_and_keeps_its_results(lab):
+    catalog = Catalog(str(lab))
+    catalog.scan()
+    for path in (lab / FOLDER / "sources").iterdir():
+        table = pq.read_table(path).drop_columns("version")
+        pq.write_table(table, path)
+    before = catalog.find()
+    assert catalog.scan().read == 4
+    pd.testing.assert_frame_equal(catalog.find(), before)
+    assert catalog.scan().read == 0
 
 
 def _write_many(arguments):
@@ -416,3 +513,18 @@ def test_a_bucket_has_the_catalogue_of_a_folder(lab, monkeypatch):
         pd.testing.assert_frame_equal(catalog.find(), local.find(), check_dtype=False)
         assert (catalog.scan().read, catalog.analyse()) == (0, {})
         assert (catalog.find().status == "analysed").all()
+
+
+@pytest.mark.slow
+def test_a_foreign_log_has_the_same_id_on_a_server(tmp_path, monkeypatch):
+    messages = [("/a", 10**18 + k, joint_state(k, ["a"], [k * 0.1])) for k in range(30_000)]
+    path = write_foreign(tmp_path / "run.mcap", messages)
+    local = Catalog(str(tmp_path))
+    local.scan()
+    with s3_bucket(monkeypatch) as client:
+        client.upload_file(os.fspath(path), "robots", "other.mcap")
+        catalog = Catalog("s3://robots")
+        catalog.scan()
+        assert catalog.find().session_id[0] == local.find().session_id[0]
+        with Session.open("s3://robots/other.mcap") as session:
+            assert session.session_id == local.find().session_id[0]

@@ -12,8 +12,9 @@ from support.foreign_logs import rewrite
 from support.processes import python
 from undulog.capture import Session, SessionWriter
 from undulog.capture.common.errors import UsageError
+from undulog.capture.common.process import Piece, helpers
 from undulog.capture.log.columns import blocks as arenas
-from undulog.capture.log.columns.blocks import Piece, ahead, helpers
+from undulog.capture.log.columns.blocks import ahead
 from undulog.capture.log.file.log_file import LogFile
 from undulog.capture.log.write.durable_sink import DurableSink
 
@@ -52,7 +53,7 @@ def small_arenas(monkeypatch):
 
 
 def helpers_alive():
-    return [each for each in threading.enumerate() if each.name.startswith("undulog-read")]
+    return [each for each in threading.enumerate() if each.name.startswith("undulog-helper")]
 
 
 def signals(path, threads, **window):
