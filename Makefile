@@ -9,6 +9,8 @@ DEMO   := out/demo
 
 # The matrices are small: more threads of linear algebra only get in each other's way.
 export OPENBLAS_NUM_THREADS ?= 1
+# Every command is a process of its own: it shall load compiled modules, not compile them again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test slow zoo campaign study check format bench docs schemas pictures golden lock \

@@ -15,7 +15,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.errors import MissingExtraError
@@ -312,6 +311,8 @@ def _date(start: Any) -> str:
 
 def _trends(sessions: _Frame) -> list[Trend]:
     """Kendall's tau of each result against the date and each number that a sweep varied."""
+    from scipy import stats  # takes half a second
+
     found: list[Trend] = []
     for against, x in _covariates(sessions).items():
         for name in _TRENDS:
@@ -394,6 +395,8 @@ def _outliers(
     conditions: IntArray,
 ) -> list[Outlier]:
     """Single values far from those of their joint, which are taken apart where it changes."""
+    from scipy import stats
+
     found: list[Outlier] = []
     total = sum(values.size for values in relative.values())
     positions = {str(path): k for k, path in enumerate(sessions.index)}

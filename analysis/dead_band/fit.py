@@ -29,6 +29,9 @@ _LAGS = (0.2, 0.8)
 
 _FACTORS = np.array([0.03, 1.0, 30.0])
 _ITERATIONS = 15
+_IDLE = 2
+"""Iterations without gain after which a row is done."""
+
 _SAME = 1e-3
 _SEGMENTS = 16
 """Parts of a cycle whose repeated residuals are taken as independent."""
@@ -233,12 +236,18 @@ def _levenberg(
     rows, n = values.shape
     lower = scales.lower[:n]
     damping, idle = np.full(rows, 1e-3), np.zeros(rows, dtype=np.int64)
-    here = np.arange(rows, dtype=np.int64)
     values = np.maximum(values, lower)
+    left = misfit(cycles, joint, np.einsum("rpn,rn->rp", ties, values)).residual
+    slopes = np.empty((rows, n, *left.shape[1:]))
+    tried = np.empty((rows, _FACTORS.size, n))
+    moved = np.arange(rows, dtype=np.int64)
     for _ in range(_ITERATIONS):
-        left, slopes = _slopes(cycles, joint, values, ties, scales)
-        tried = np.repeat(values[:, np.newaxis], _FACTORS.size, axis=1)
-        for r in range(rows):
+        if moved.size:
+            slopes[moved] = _slopes(
+                cycles, joint[moved], values[moved], ties[moved], scales, left=left[moved]
+            )
+        active = np.flatnonzero(idle < _IDLE)
+        for r in active:
             unit, slope = scales.unit[joint[r], :n], slopes[r].reshape(n, -1)
             normal, pull = slope @ slope.T, slope @ left[r].ravel()
             free = ~((values[r] <= lower + 1e-12) & (pull > 0))
@@ -251,32 +260,46 @@ def _levenberg(
                 most = np.maximum(0.4 * np.abs(values[r]), scales.least_move[joint[r], :n])
                 step /= max(1.0, float(np.max(np.abs(step) / most)))
                 tried[r, m] = np.maximum(values[r] + step, lower)
-        full = np.einsum("rpn,rmn->rmp", ties, tried).reshape(-1, PARAMETERS)
-        costs = misfit(cycles, np.repeat(joint, _FACTORS.size), full).cost.reshape(rows, -1)
+        full = np.einsum("rpn,rmn->rmp", ties[active], tried[active]).reshape(-1, PARAMETERS)
+        each = misfit(cycles, np.repeat(joint[active], _FACTORS.size), full)
+        costs = each.cost.reshape(active.size, -1)
         best = costs.argmin(axis=1)
-        better = costs[here, best] < np.square(left).sum(axis=(1, 2)) * (1 - _SAME)
-        values[better] = tried[here, best][better]
-        damping = np.where(better, np.clip(damping * _FACTORS[best], 1e-6, 1e4), 100 * damping)
-        idle = np.where(better, 0, idle + 1)
-        if np.all(idle >= 2):
+        here = np.arange(active.size, dtype=np.int64)
+        before = np.square(left[active]).sum(axis=(1, 2))
+        better = costs[here, best] < before * (1 - _SAME)
+        damping[active] = np.where(
+            better, np.clip(damping[active] * _FACTORS[best], 1e-6, 1e4), 100 * damping[active]
+        )
+        idle[active] = np.where(better, 0, idle[active] + 1)
+        if np.all(idle >= _IDLE):
             break
+        moved = active[better]
+        values[moved] = tried[moved, best[better]]
+        left[moved] = each.residual[(_FACTORS.size * here + best)[better]]
     return values
 
 
 def _slopes(
-    cycles: Cycles, joint: IntArray, values: FloatArray, ties: FloatArray, scales: _Scales
-) -> tuple[FloatArray, FloatArray]:
-    """Return the residuals, shape (r, k, n), and their derivatives a unit, shape (r, m, k, n)."""
+    cycles: Cycles,
+    joint: IntArray,
+    values: FloatArray,
+    ties: FloatArray,
+    scales: _Scales,
+    *,
+    left: FloatArray,
+) -> FloatArray:
+    """Return the derivatives of the residuals a unit, shape (r, m, k, n).
+
+    Args:
+        left: The residuals, shape (r, k, n).
+    """
     rows, n = values.shape
     nudge = scales.nudge[joint, :n]
-    sets = np.repeat(values[:, np.newaxis], n + 1, axis=1)
-    for m in range(n):
-        sets[:, m + 1, m] += nudge[:, m]
+    sets = values[:, np.newaxis] + nudge[:, :, np.newaxis] * np.eye(n)
     full = np.einsum("rpn,rmn->rmp", ties, sets).reshape(-1, PARAMETERS)
-    left = misfit(cycles, np.repeat(joint, n + 1), full).residual
-    left = left.reshape(rows, n + 1, *left.shape[1:])
+    nudged = misfit(cycles, np.repeat(joint, n), full).residual.reshape(rows, n, *left.shape[1:])
     share = nudge / scales.unit[joint, :n]
-    return left[:, 0], (left[:, 1:] - left[:, :1]) / share[:, :, np.newaxis, np.newaxis]
+    return (nudged - left[:, np.newaxis]) / share[:, :, np.newaxis, np.newaxis]
 
 
 def _independent(residual: FloatArray) -> float:

@@ -46,36 +46,74 @@ def follow(
 
     Args:
         command: u, r rows of k stretches of n samples [rad], shape (r, k, n).
-        step_s: Time since the sample before [s], same shape.
+        step_s: Time since the sample before, the same for all rows [s], shape (k, n).
         parameters: As :data:`PARAMETERS` (the delay is in u already), shape (r, 5).
 
     Returns:
         z [rad], and where it rests, each of shape (r, k, n).
     """
-    lag, width, top, bottom = parameters.T[1:, :, np.newaxis]
+    rows, stretches, samples = command.shape
+    lag, width, top, bottom = np.repeat(parameters[:, 1:].T, stretches, axis=1)
     half = width / 2
-    up, down = half + bottom, half + top
-    u = np.ascontiguousarray(np.moveaxis(command, 2, 0))
-    dt = np.ascontiguousarray(np.moveaxis(step_s, 2, 0))
-    found, rests = np.empty_like(u), np.ones(u.shape, dtype=np.bool_)
-    z: FloatArray = u[0].copy()
-    mode: FloatArray = np.zeros(u.shape[1:])
-    before: FloatArray = u[0]
-    found[0] = z
-    for k in range(1, len(u)):
-        now: FloatArray = u[k]
-        error, slope = now - z, (now - before) / dt[k]
-        starts_up, starts_down = (error > up) & (mode <= 0), (error < -down) & (mode >= 0)
-        mode = np.where(starts_up, 1.0, np.where(starts_down, -1.0, mode))
-        past = np.where(starts_up, error - up, np.where(starts_down, -error - down, np.inf))
-        moves_s = np.minimum(past / np.maximum(np.abs(slope), _TINY), dt[k])
-        behind = slope * lag
-        off = z - (now - slope * moves_s - mode * half)
-        after = now - mode * half - behind + (off + behind) * np.exp(-moves_s / lag)
-        stops = mode * (after - z) <= 0
-        z, mode = np.where(stops, z, after), np.where(stops, 0.0, mode)
-        found[k], rests[k], before = z, stops, now
-    return np.moveaxis(found, 0, 2), np.moveaxis(rests, 0, 2)
+    limits = np.stack((half + top, half + bottom))  # of the error, downwards and upwards
+    u = np.ascontiguousarray(command.reshape(-1, samples).T)
+    dt = np.tile(step_s.T, rows)
+    keeps, adds = _low_pass(u, step_s, parameters[:, LAG])
+    # In motion v = z + pull is a low pass of u, pull = mode w/2; at rest v is z. A joint starts
+    # where u - v is below the least or above the most that its mode bears.
+    none, never = np.zeros_like(half), np.full_like(half, np.inf)
+    down, rest = (-half, -never, half + limits[1]), (none, -limits[0], limits[1])
+    modes = np.stack((down, rest, (half, -half - limits[0], never)))
+    present = modes[1].copy()
+    pull, least, most = present
+    found, moves = np.empty_like(u), np.zeros(u.shape, dtype=np.bool_)
+    found[0] = v = u[0].copy()
+    mode, after, change = np.zeros_like(half), np.empty_like(half), np.empty_like(half)
+    above, goes = np.empty_like(moves[0]), np.zeros_like(moves[0])
+    for k in range(1, samples):
+        now, moved = u[k], moves[k]
+        np.subtract(now, v, out=change)
+        np.greater(change, most, out=above)
+        np.less(change, least, out=moved)
+        moved |= above
+        np.multiply(v, keeps[k], out=after)
+        after += adds[k]
+        if np.count_nonzero(moved):  # some start
+            i = moved.nonzero()[0]
+            way = above[i].astype(np.int64)
+            sign, z, to, step = 2.0 * way - 1.0, found[k - 1][i], now[i], dt[k][i]
+            mode[i], goes[i], present[:, i] = sign, True, modes[2 * way, :, i].T
+            slope, past = (to - u[k - 1][i]) / step, sign * (to - z) - limits[way, i]
+            moves_s = np.minimum(past / np.maximum(np.abs(slope), _TINY), step)
+            behind, v[i] = slope * lag[i], z + pull[i]
+            off = v[i] - (to - slope * moves_s) + behind
+            after[i] = to - behind + off * np.exp(-moves_s / lag[i])
+        np.subtract(after, v, out=change)
+        change *= mode
+        np.greater(change, 0.0, out=moved)
+        np.copyto(v, after, where=moved)
+        if np.count_nonzero(moved) < np.count_nonzero(goes):  # some stop
+            i = np.greater(goes, moved).nonzero()[0]
+            v[i], mode[i], goes[i], present[:, i] = found[k - 1][i], 0.0, False, modes[1][:, i]
+        np.subtract(v, pull, out=found[k])
+    shape = (samples, rows, stretches)
+    return np.moveaxis(found.reshape(shape), 0, 2), np.moveaxis(~moves.reshape(shape), 0, 2)
+
+
+def _low_pass(u: FloatArray, step_s: FloatArray, lag: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a and b of ``v[k] = a v[k - 1] + b``, T v' = u - v, each of shape (n, r k).
+
+    Args:
+        u: Linear between samples, shape (n, r k).
+        step_s: As in :func:`follow`.
+        lag: T of the rows [s], shape (r,).
+    """
+    known, row = np.unique(lag, return_inverse=True)  # many rows share it
+    ratio = known[:, np.newaxis] / step_s.T[:, np.newaxis]
+    keeps = np.exp(-1 / ratio)
+    a, behind = (x[:, row].reshape(u.shape) for x in (keeps, ratio * (1 - keeps)))
+    before = np.concatenate((u[:1], u[:-1]))
+    return a, u - a * before - behind * (u - before)
 
 
 @dataclass(frozen=True)
@@ -185,8 +223,10 @@ def misfit(cycles: Cycles, joint: IntArray, parameters: FloatArray) -> Misfit:
     Returns:
         One row a set of parameters.
     """
-    u = np.stack([cycles.commanded(j, d) for j, d in zip(joint, parameters[:, DELAY], strict=True)])
-    z, rests = follow(u, np.broadcast_to(cycles.step_s, u.shape), parameters)
+    pairs, row = np.unique(np.stack((joint, parameters[:, DELAY])), axis=1, return_inverse=True)
+    known = np.stack([cycles.commanded(int(j), float(d)) for j, d in pairs.T])
+    u = known[row]
+    z, rests = follow(u, cycles.step_s, parameters)
     fitted, measured = z[:, :, cycles.first :], cycles.measured[joint, :, cycles.first :]
     own = fitted - fitted.mean(axis=(1, 2), keepdims=True)
     seen = measured - measured.mean(axis=(1, 2), keepdims=True)

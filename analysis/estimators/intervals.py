@@ -34,9 +34,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.special import chdtri, stdtr, stdtrit
+from scipy.special import chdtri, gammaln, stdtr, stdtrit
 
-from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 
 from ..results.estimate import Estimate, Interval
 from .spectrum import ResidualBins
@@ -234,22 +234,40 @@ def _norm(
     return max(0.0, squared) ** 0.5, float(np.quantile(sizes, 1 - (1 - CONFIDENCE) / 2))
 
 
+_MOST_STEPS = 60
+_EXACT = 1e-12
+_TINY = 1e-300
+
+
 def mixture_interval(
     share: FloatArray, mean: FloatArray, scale: FloatArray, dof: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the mean and the half width of a mixture of Student's t, each of shape (k,)."""
+    """Return the mean and the half width of a mixture of Student's t, each of shape (k,).
+
+    Args:
+        share: Of each part, shape (p, 1).
+        mean: Shape (p, k).
+        scale: Shape (p, k).
+        dof: Degrees of freedom of all parts.
+    """
     centre = (share * mean).sum(axis=0)
-    reach = 12.0 * (scale.max(axis=0) + np.ptp(mean, axis=0))
-    ends: list[FloatArray] = []
-    for quantile in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2):
-        low: FloatArray = centre - reach
-        high: FloatArray = centre + reach
-        for _ in range(40):
-            middle: FloatArray = (low + high) / 2
-            chance: FloatArray = stdtr(dof, (middle - mean) / scale)
-            below: BoolArray = np.sum(share * chance, axis=0) < quantile
-            low, high = np.where(below, middle, low), np.where(below, high, middle)
-        ends.append((low + high) / 2)
+    quantile = np.array([[(1 - CONFIDENCE) / 2], [(1 + CONFIDENCE) / 2]])
+    peak = float(np.exp(gammaln((dof + 1) / 2) - gammaln(dof / 2))) / (np.pi * dof) ** 0.5
+    # Newton's steps from where all parts have their own quantile, within what brackets it.
+    own = mean[:, np.newaxis] + stdtrit(dof, quantile) * scale[:, np.newaxis]
+    low, high = own.min(axis=0), own.max(axis=0)
+    ends: FloatArray = (share[:, np.newaxis] * own).sum(axis=0)
+    for _ in range(_MOST_STEPS):
+        t = (ends - mean[:, np.newaxis]) / scale[:, np.newaxis]
+        excess: FloatArray = np.sum(share[:, np.newaxis] * stdtr(dof, t), axis=0) - quantile
+        density = share[:, np.newaxis] * peak * (1 + t**2 / dof) ** (-(dof + 1) / 2)
+        low, high = np.where(excess < 0, ends, low), np.where(excess < 0, high, ends)
+        slope = np.maximum(np.sum(density / scale[:, np.newaxis], axis=0), _TINY)
+        step = ends - excess / slope
+        inside = (step >= low) & (step <= high)
+        before, ends = ends, np.where(inside, step, (low + high) / 2)
+        if np.all(np.abs(ends - before) <= _EXACT * (np.abs(ends - centre) + scale.min(axis=0))):
+            break
     return centre, np.maximum(ends[1] - centre, centre - ends[0])
 
 

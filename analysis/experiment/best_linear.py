@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
@@ -359,7 +359,7 @@ def root_of_mean(squares: FloatArray, least_sd: float = 0.0) -> Estimate:
         return Estimate()
     if squares.size < 2:
         return Estimate(max(mean, 0.0) ** 0.5)
-    reach = float(stats.t.ppf(0.975, squares.size - 1) * np.std(squares, ddof=1))
+    reach = float(stdtrit(squares.size - 1, 0.975) * np.std(squares, ddof=1))
     reach = max(reach / squares.size**0.5, 1.96 * least_sd)
     low, high = (max(end, 0.0) ** 0.5 for end in (mean - reach, mean + reach))
     return Estimate(max(mean, 0.0) ** 0.5, (low, high))

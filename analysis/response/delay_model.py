@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import optimize, stats
+from scipy.special import fdtrc
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray
 
@@ -117,7 +117,7 @@ def fit_delay(
             continue
         # The variances are estimates: a ratio of chi-squares rather than a chi-square.
         ratio = 2 * found.cost / left
-        p = float(stats.f.sf(float(ratio), left, 2 * freedom * omega.size))
+        p = float(fdtrc(left, 2 * freedom * omega.size, float(ratio)))
         best = max(best, p)
         sd = _delay_sd(found.jac)
         if sd is None or sd * abs(lines.s[-1]) > np.pi:  # not determined
@@ -164,6 +164,8 @@ def _delay_sd(jacobian: Any) -> float | None:
 def _fit(lines: _Lines, top: int, bottom: int) -> Any:
     """Fit one pair of orders from the best start over a grid of delays; None if none may pass."""
     highest = np.abs(lines.s[-1])
+    from scipy.optimize import least_squares
+
     best = None
     for tau in np.linspace(0.0, 2 * np.pi, _DELAYS) / highest:
         start = _linear(lines, tau, top, bottom)
@@ -172,9 +174,7 @@ def _fit(lines: _Lines, top: int, bottom: int) -> Any:
             best = cost, start
     if best is None or best[0] > _HOPELESS * 2 * lines.s.size:
         return None
-    found: Any = optimize.least_squares(
-        lines.residual, best[1], args=(top,), method="lm", max_nfev=400
-    )
+    found: Any = least_squares(lines.residual, best[1], args=(top,), method="lm", max_nfev=400)
     poles = np.roots(np.append(found.x[: top + 1 : -1], 1.0))
     return found if (poles.real < 0).all() else None
 

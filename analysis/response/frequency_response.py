@@ -11,7 +11,7 @@ from enum import StrEnum
 from itertools import islice
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtri, stdtrit
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
@@ -316,7 +316,7 @@ def joint_response(
     """
     gain = np.abs(lines.value)
     sd = np.sqrt(lines.variance / 2)
-    reach = stats.t.ppf(0.975, 2 * lines.freedom) * sd
+    reach: FloatArray = np.asarray(stdtrit(2 * lines.freedom, 0.975) * sd, dtype=np.float64)
     known = gain > lines.radius()
     model = fit_delay(
         lines.frequency_hz, lines.value, lines.variance, float(np.median(lines.freedom))
@@ -414,6 +414,6 @@ def _halves(series: Sequence[Series], excitation: Excitation) -> tuple[int, int]
     if first.frequency_hz.size != second.frequency_hz.size:
         return None
     differ = np.abs(first.value - second.value) ** 2
-    quantile = stats.f.ppf(0.95, 2, 2 * (first.freedom + second.freedom))
+    quantile = fdtri(2, 2 * (first.freedom + second.freedom), 0.95)
     agree = differ <= (first.variance + second.variance) * quantile
     return int(agree.sum()), int(agree.size)

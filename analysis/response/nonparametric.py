@@ -40,7 +40,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import signal, stats
+from scipy.special import fdtri
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -73,7 +73,7 @@ def _float(values: object) -> FloatArray:
 
 def _radius(variance: FloatArray, freedom: FloatArray | int, level: float) -> FloatArray:
     """|e|^2 / variance is distributed as F with 2 and 2 q degrees of freedom."""
-    return _float(np.sqrt(variance * stats.f.ppf(level, 2, 2 * freedom)))
+    return _float(np.sqrt(variance * fdtri(2, 2 * freedom, level)))
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,8 @@ def find_tones(command: Series) -> FloatArray | None:
     Args:
         command: At least 32 samples.
     """
+    from scipy import signal  # takes a quarter of a second
+
     t_s = np.arange(command.t_s[0], command.t_s[-1], command.period_s)
     values = signal.detrend(resampled(command, t_s))
     if not values.any():

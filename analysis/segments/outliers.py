@@ -16,7 +16,7 @@ from itertools import combinations
 from math import comb
 
 import numpy as np
-from scipy.stats import t
+from scipy.special import stdtrit
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
@@ -283,7 +283,7 @@ def _scatter(residual: FloatArray, rows: FloatArray, others: IntArray, spare: in
 
 def _limit(profile: Profile, spare: int) -> float:
     """Standard deviations that few of equally scattered joints exceed, by Student's t."""
-    return float(t.isf(CHANCE / (2 * profile.values.size), spare))
+    return -float(stdtrit(spare, CHANCE / (2 * profile.values.size)))
 
 
 def _out_of_profile(

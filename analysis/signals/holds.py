@@ -8,7 +8,7 @@ command. What makes it an artefact is evidence of motion.
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from undulog.capture.common.arrays import BoolArray, FloatArray, IntArray
 
@@ -124,7 +124,7 @@ def stale(position: Series) -> tuple[Span, ...]:
         seen = slice(max(known[k] - _BOX // 2, 0), known[stop - 1] + _BOX // 2 + 1)
         again, quick = int((fast & repeats)[seen].sum()), int(fast[seen].sum())
         # A few of the many windows of a noisy coarse encoder exceed the share by chance.
-        if binom.sf(again - 1, quick, _BY_CHANCE) < _RARE:
+        if bdtrc(again - 1, quick, _BY_CHANCE) < _RARE:
             marked[known[k] + 2 : known[stop - 1] + 3] = True
     return spans_of(position.t_s, marked)
 
