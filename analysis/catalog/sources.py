@@ -20,8 +20,13 @@ from undulog.capture.common.remote import ObjectStore, StoredFile
 from undulog.capture.log.file.bag import is_bag
 from undulog.capture.log.file.bag_metadata import METADATA, is_rosbag2
 from undulog.capture.log.file.parts import log_paths, walk
-from undulog.capture.log.read.facts import LogFacts, read_bag_facts, read_facts
-from undulog.capture.log.read.wal_facts import is_wal_alone, read_wal_facts
+from undulog.capture.log.read.facts import (
+    LogFacts,
+    is_wal_alone,
+    read_bag_facts,
+    read_facts,
+    read_wal_facts,
+)
 from undulog.capture.log.wal.writer import wal_folder
 
 FOLDER = ".undulog-catalog"
