@@ -105,24 +105,27 @@ _LEAST_SAMPLES = 6
 """Samples that a cycle's amplitude needs."""
 
 
-def amplitudes(series: Series, starts: IntArray, omega: float) -> ComplexArray:
+def amplitudes(t_s: FloatArray, values: FloatArray, starts: IntArray, omega: float) -> ComplexArray:
     """Complex amplitude of each cycle, from its samples alone.
 
     Args:
+        t_s: Times [s], shape (n,).
+        values: Of channels that share them, shape (..., n).
         starts: Where c cycles begin among them and the last one ends, shape (c + 1,).
         omega: Angular frequency [rad/s].
 
     Returns:
-        Amplitudes at t = 0, shape (c,); NaN where a cycle has too few samples.
+        Amplitudes at t = 0, shape (..., c); NaN where a cycle has too few samples.
     """
-    cosine, sine = cos_sin(omega * series.t_s)
-    basis = np.stack([np.ones(series.count), cosine, -sine])
+    cosine, sine = cos_sin(omega * t_s)
+    basis = np.stack([np.ones_like(cosine), cosine, -sine])
     gram = np.stack([cycle_sums(basis * row, starts) for row in basis])
-    right = cycle_sums(basis * series.values, starts)
+    right = np.stack([cycle_sums(values * row, starts) for row in basis])
     known: BoolArray = np.diff(starts) >= _LEAST_SAMPLES
-    result = np.full(known.size, np.nan, dtype=np.complex128)
-    solved = np.linalg.solve(gram.T[known], right.T[known, :, None])[..., 0]
-    result[known] = solved[:, 1] + 1j * solved[:, 2]
+    result = np.full(right.shape[1:], np.nan, dtype=np.complex128)
+    each = right[..., known].reshape(3, -1, np.count_nonzero(known))
+    solved = np.linalg.solve(gram.T[known], each.transpose(2, 0, 1))
+    result[..., known] = (solved[:, 1] + 1j * solved[:, 2]).T.reshape(result[..., known].shape)
     return result
 
 

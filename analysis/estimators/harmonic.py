@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undulog.capture.common.arrays import ComplexArray, FloatArray
+from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.errors import DataError
 from undulog.capture.common.process import in_threads
 
@@ -329,23 +329,26 @@ class HarmonicFit:
         harmonic = np.stack([parts.real, parts.imag], axis=-1).reshape(index.size, -1)
         return np.concatenate([trend, harmonic], axis=1)
 
-    def predict(self, channel: int, t_s: FloatArray) -> FloatArray:
-        """Return the fitted model of one channel.
+    def predict(self, channel: int | IntArray, t_s: FloatArray) -> FloatArray:
+        """Return the fitted model of one channel, or of some.
 
         Args:
+            channel: Index, or indices of shape (m,).
             t_s: Times [s], any shape.
 
         Returns:
-            Values in the channel's unit, shape of ``t_s``.
+            Values in the channel's unit, shape of ``t_s``, after m where there are indices.
         """
-        value = np.zeros_like(t_s)
-        for coefficient in self.trend[channel][::-1]:
-            value = value * t_s + coefficient
-        for h, amplitude in enumerate(self.amplitudes[channel], start=1):
-            value = value + np.real(amplitude * np.exp(1j * h * self.omega * t_s))
-        for line, amplitude in zip(self.model.lines, self.lines[channel], strict=True):
-            value = value + np.real(amplitude * np.exp(1j * line * t_s))
-        return value
+        index = np.atleast_1d(channel)
+        value = np.zeros((index.size, *t_s.shape))
+        across = (-1, *(1 for _ in t_s.shape))
+        for coefficient in self.trend[index].T[::-1]:
+            value = value * t_s + coefficient.reshape(across)
+        turns = [h * self.omega for h in range(1, self.amplitudes.shape[1] + 1)]
+        parts = np.concatenate([self.amplitudes[index], self.lines[index]], axis=1)
+        for turn, part in zip([*turns, *self.model.lines], parts.T, strict=True):
+            value += np.real(part.reshape(across) * np.exp(1j * turn * t_s))
+        return value if np.ndim(channel) else value[0]
 
 
 def fit_shared(

@@ -14,8 +14,8 @@ all of them; no single joint has cycles enough.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import fdtrc
@@ -25,7 +25,7 @@ from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, I
 from ..estimators.demodulation import amplitudes, cycle_sums, starts_of
 from ..estimators.harmonic import HarmonicFit, cos_sin
 from ..estimators.intervals import ResponseErrors, around, t_factor
-from ..estimators.series import Series
+from ..estimators.series import Series, shared_times
 from ..estimators.slow_changes import (
     EXCESS,
     MOST_CYCLES,
@@ -54,6 +54,7 @@ _SIGNIFICANT = 1e-3
 _CLEAR_EXCESS = 1e-3
 _ROUNDING = 1e-9  # of an amplitude
 _DEGREES = (2, 3, 4)
+_BLOCK = 1 << 20  # samples that are looked at together
 
 
 @dataclass(frozen=True)
@@ -233,74 +234,99 @@ def _cycles(
     several = -(-count // MOST_CYCLES)
     count //= several
     edges = stop - turn_s * several * np.arange(count, -1.0, -1.0)
-    found: list[ComplexArray] = []
-    noise: list[float] = []
-    for one, channel in zip(every, channels.ravel().tolist(), strict=True):
-        amplitude = complex(fit.amplitudes[channel, 0])
-        if amplitude == 0:
-            return None
-        rest = replace(one, values=one.values - fit.predict(channel, one.t_s))
-        starts = starts_of(one.t_s, edges - 1e-6 * turn_s)
-        own = amplitudes(rest, starts, fit.omega)
-        found.append(_without_image(1 + own / amplitude, amplitude, edges, fit.omega))
-        noise.append(_noise_within(rest, starts, fit.omega, own) / abs(amplitude) ** 2)
-    whole = np.array(found).reshape(2, len(commands), count)
+    whole = np.empty((len(every), count), dtype=np.complex128)
+    noise = np.empty(len(every))
+    at = channels.ravel()
+    if not fit.amplitudes[at, 0].all():
+        return None
+    for block in _blocks(every):
+        t_s, own = every[block[0]].t_s, at[block]
+        amplitude = fit.amplitudes[own, :1]
+        rest = np.stack([every[k].values for k in block]) - fit.predict(own, t_s)
+        starts = starts_of(t_s, edges - 1e-6 * turn_s)
+        found = amplitudes(t_s, rest, starts, fit.omega)
+        whole[block] = _without_image(1 + found / amplitude, amplitude, edges, fit.omega)
+        noise[block] = _noise_within(t_s, rest, starts, fit.omega, found)
+    noise /= np.abs(fit.amplitudes[at, 0]) ** 2
+    whole = whole.reshape(2, len(commands), count)
     usable: BoolArray = np.all(np.isfinite(whole), axis=(0, 1)).reshape(count)
     usable &= np.all(np.abs(whole[0]) > _ROUNDING, axis=0)
     if np.count_nonzero(usable) < MIN_CYCLES:
         return None
     whole = whole[:, :, usable]
     mean = fit.fundamental[channels[1]] / fit.fundamental[channels[0]]
-    variances = np.array(noise).reshape(2, -1).sum(axis=0)
+    variances = noise.reshape(2, -1).sum(axis=0)
     number = several * np.flatnonzero(usable).astype(np.float64)
     return Cycles(number, whole[0], whole[1] / whole[0] * mean[:, None], variances)
 
 
+def _blocks(series: Sequence[Series]) -> Iterator[list[int]]:
+    """Yield the indices of channels that share their times, few where they are long."""
+    for group in shared_times(series):
+        most = max(1, _BLOCK // max(series[group[0]].count, 1))
+        for first in range(0, len(group), most):
+            yield group[first : first + most]
+
+
 def _without_image(
-    relative: ComplexArray, amplitude: complex, edges: FloatArray, omega: float
+    relative: ComplexArray, amplitude: ComplexArray, edges: FloatArray, omega: float
 ) -> ComplexArray:
     """Take off what a change within each cycle makes at minus the gait frequency.
 
     Of Re (a + a' s) exp(j omega t), s from the middle of whole cycles, least squares find
     a + j conj(a') exp(-2 j omega t_edge) / (2 omega).
+
+    Args:
+        relative: Shape (m, c).
+        amplitude: Shape (m, 1).
     """
-    if relative.size < 2:
+    if relative.shape[1] < 2:
         return relative
-    rate = np.gradient(relative, (edges[:-1] + edges[1:]) / 2)
+    rate = np.gradient(relative, (edges[:-1] + edges[1:]) / 2, axis=1)
     turned = np.conj(amplitude) / amplitude * np.exp(-2j * omega * edges[:-1])
     return np.asarray(relative - 1j * np.conj(rate) * turned / (2 * omega))
 
 
-def _noise_within(one: Series, starts: IntArray, omega: float, amplitude: ComplexArray) -> float:
-    """Return the variance that noise gives each part of a cycle's amplitude.
+def _noise_within(
+    t_s: FloatArray, values: FloatArray, starts: IntArray, omega: float, amplitude: ComplexArray
+) -> FloatArray:
+    """Return the variance that noise gives each part of a cycle's amplitude, shape (m,).
 
     Its level is read at 1.5 and 2.5 times the gait frequency, from what is left in each cycle
     without a constant and that cycle's own amplitude, and extrapolated to the gait frequency as a
     power of the frequency, if it rises towards it; what the fit takes of it there is added.
+
+    Args:
+        t_s: Shape (n,).
+        values: Shape (m, n).
+        starts: Shape (c + 1,).
+        amplitude: Shape (m, c).
     """
-    cosine, sine = cos_sin(omega * one.t_s)
+    inside = slice(int(starts[0]), int(starts[-1]))
+    cosine, sine = cos_sin(omega * t_s[inside])
     filled = np.diff(starts)
     known: ComplexArray = np.where(np.isfinite(amplitude), amplitude, 0.0).astype(np.complex128)
-    known = np.repeat(known, filled)
-    inside = slice(int(starts[0]), int(starts[-1]))
-    rest: FloatArray = one.values[inside] - (
-        known.real * cosine[inside] - known.imag * sine[inside]
-    )
+    known = np.repeat(known, filled, axis=1)
+    rest: FloatArray = values[:, inside] - (known.real * cosine - known.imag * sine)
     starts = starts - starts[0]
-    rest = rest - np.repeat(cycle_sums(rest, starts) / np.maximum(filled, 1), filled)
+    rest = rest - np.repeat(cycle_sums(rest, starts) / np.maximum(filled, 1), filled, axis=1)
     usable = filled > 0
-    levels: list[float] = []
+    period_s = float(np.median(np.diff(t_s)))
+    levels: list[FloatArray] = []
     for beside, kept in zip(_BESIDE, _KEPT, strict=True):
-        if beside * omega * one.period_s > 2 * np.pi * NYQUIST_SHARE:
+        if beside * omega * period_s > 2 * np.pi * NYQUIST_SHARE:
             break
-        waves = np.stack(cos_sin(beside * omega * one.t_s[inside]))
-        power: FloatArray = np.sum(cycle_sums(waves * rest, starts) ** 2, axis=0)
-        level: FloatArray = power[usable] / filled[usable]
-        levels.append(float(np.mean(level)) / kept)
-    if not levels or min(levels) <= 0:
-        return 0.0
-    rise = max(levels[0] / levels[-1], 1.0) ** _POWER
-    return 2 * rise * levels[0] * float(np.mean(1 / filled[usable]))
+        waves = cos_sin(beside * omega * t_s[inside])
+        one, other = (cycle_sums(wave * rest, starts) for wave in waves)
+        power: FloatArray = one**2 + other**2
+        levels.append(np.mean(power[:, usable] / filled[usable], axis=1) / kept)
+    if not levels:
+        return np.zeros(len(values))
+    least = np.min(levels, axis=0)
+    ratio = np.divide(levels[0], levels[-1], out=np.ones_like(least), where=least > 0)
+    rise = np.maximum(ratio, 1.0) ** _POWER
+    variance = 2 * rise * levels[0] * float(np.mean(1 / filled[usable]))
+    return np.where(least > 0, variance, 0.0)
 
 
 def _kept(beside: float) -> float:
@@ -390,14 +416,14 @@ def moving_pace(
     edges = start + turn_s * several * np.arange(whole // several + 1.0)
     phases: list[FloatArray] = []
     weights: list[float] = []
-    for k, one in enumerate(own):
-        amplitude = complex(fit.amplitudes[k, 0])
-        rest = replace(one, values=one.values - fit.predict(k, one.t_s))
-        found = 1 + amplitudes(rest, starts_of(one.t_s, edges), fit.omega) / amplitude
+    for block in _blocks(own):
+        t_s, amplitude = own[block[0]].t_s, fit.amplitudes[block, :1]
+        rest = np.stack([own[k].values for k in block]) - fit.predict(np.array(block), t_s)
+        found = 1 + amplitudes(t_s, rest, starts_of(t_s, edges), fit.omega) / amplitude
         found = _without_image(found, amplitude, edges, fit.omega)
-        if np.isfinite(found).all():
-            phases.append(np.unwrap(np.angle(found)))
-            weights.append(float(fit.weight[k]) * abs(amplitude) ** 2)
+        known = np.isfinite(found).all(axis=1)
+        phases.extend(np.unwrap(np.angle(found[known])))
+        weights.extend((fit.weight[block] * np.abs(amplitude[:, 0]) ** 2)[known].tolist())
     if not phases:
         return None
     middle: FloatArray = (edges[:-1] + edges[1:]) / 2

@@ -416,7 +416,8 @@ def _periodogram(series: Sequence[Series], fit: HarmonicFit, omegas: FloatArray)
         t_s = series[members[0]].t_s
         total = np.zeros((len(members), omegas.size), dtype=np.complex128)
         for part in chunks(t_s.size):
-            rest = np.stack([series[k].values[part] - fit.predict(k, t_s[part]) for k in members])
+            rest = np.stack([series[k].values[part] for k in members])
+            rest -= fit.predict(np.array(members), t_s[part])
             total += rest @ np.exp(-1j * np.outer(t_s[part], omegas))
         power[members] = np.abs(total) ** 2 / t_s.size
     return power

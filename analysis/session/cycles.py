@@ -302,7 +302,9 @@ def cycle_maps(measured: SessionMeasurement) -> CycleMaps | None:
     for name in gait.driven:
         command = gait.fit.fundamental[gait.driven.index(name)]
         if name in whole and name in gait.answered and abs(command) > 0:
-            amplitude = amplitudes(parts[name], starts[name], gait.fit.omega)
+            amplitude = amplitudes(
+                parts[name].t_s, parts[name].values, starts[name], gait.fit.omega
+            )
             ratio.append(np.where(whole[name], amplitude / command, nothing))
         else:
             ratio.append(nothing)
