@@ -5,8 +5,10 @@ the same.
 """
 
 import contextlib
+import errno
 import io
 import struct
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,6 +22,7 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
+from undulog.capture.common.process import helpers
 from undulog.capture.log.mcap.chunk import BODY_AT
 from undulog.capture.log.mcap.writer import McapWriter
 
@@ -100,6 +103,60 @@ def written(kind, calls, chunk_size):
 def test_the_bytes_are_those_of_the_library(calls, chunk_size):
     ours, theirs = (written(kind, calls, chunk_size) for kind in (McapWriter, Writer))
     assert ours == theirs
+
+
+@settings(max_examples=150, deadline=None)
+@given(calls=CALLS, chunk_size=st.integers(1, 400), waiting=st.integers(0, 1500))
+def test_helper_threads_change_no_byte(calls, chunk_size, waiting):
+    with helpers(3) as pool, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("undulog.capture.log.mcap.writer._MOST_WAITING", waiting)
+        threaded = written(partial(McapWriter, helpers=pool), calls, chunk_size)
+    assert threaded == written(McapWriter, calls, chunk_size)
+
+
+@settings(max_examples=50, deadline=None)
+@given(sizes=st.lists(st.integers(0, 300), max_size=60), waiting=st.integers(0, 1500))
+def test_what_is_settled_with_helpers_is_in_the_file(sizes, waiting):
+    stream = io.BytesIO()
+    with helpers(2) as pool, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("undulog.capture.log.mcap.writer._MOST_WAITING", waiting)
+        writer = McapWriter(stream, 400, helpers=pool)
+        writer.start("", "")
+        channel = writer.register_channel("/a", "cdr", 0)
+        for number, size in enumerate(sizes):
+            writer.add_message(channel, number, bytes(size), number, number)
+            records = StreamReader(io.BytesIO(stream.getvalue()), record_size_limit=None).records
+            found = []
+            with contextlib.suppress(EndOfFile):
+                found.extend(one.sequence for one in records if isinstance(one, Message))
+            assert found == [*range(writer.settled)]
+        writer.settle(writer.messages)
+        assert writer.settled == len(sizes)
+        writer.finish()
+    stream.seek(0)
+    assert sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages()) == len(sizes)
+
+
+def test_a_full_disk_is_reported_with_helpers():
+    class Full(io.BytesIO):
+        def write(self, data):
+            if self.tell() + len(data) > 2000:
+                raise OSError(errno.ENOSPC, "no space")
+            return super().write(data)
+
+    with helpers(2) as pool:
+        writer = McapWriter(Full(), 400, helpers=pool)
+        writer.start("", "")
+        channel = writer.register_channel("/a", "cdr", 0)
+        random = np.random.default_rng(1)
+
+        def write():
+            for number in range(50):
+                writer.add_message(channel, number, random.bytes(200), number, number)
+            writer.finish()
+
+        with pytest.raises(OSError, match="no space"):  # at once or at the end, never swallowed
+            write()
 
 
 def test_a_long_file_of_many_channels():
