@@ -1,8 +1,8 @@
 """Import of tables, against the readers of the same files: pandas.read_csv, and pyarrow.
 
-Each pair reads the same file in the same run, in turn; the ratio of wall time counts, that of
-processor time is printed beside it. The peer only reads; the import also writes a new session, one
-message a row. Both use the threads that they like.
+Each pair reads the same file in the same run, in turn; the ratio of processor time counts, that of
+wall time, where both use the threads that they like, is printed beside it. The peer only reads; the
+import also writes a new session, one message a row.
 
 Run: python bench/table_import.py [--rows 60000] [--runs 3]
 """
@@ -108,8 +108,8 @@ def main() -> int:
             ),
         ):
             wall, processor = turns(ours, peer, out, options.runs).tolist()
-            good &= compared(what, *wall, name, bar=BAR)
-            compared(f"{what}, processor time", *processor, name)
+            good &= compared(what, *processor, name, bar=BAR)
+            compared(f"{what}, wall time", *wall, name)
     return 0 if good else 1
 
 
