@@ -14,10 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
-EDGE = 64 << 10
-"""Size of a piece [byte]."""
-BETWEEN = 2
-"""Pieces between the first and the last one."""
+_PIECE = 4 << 10  # few bytes, because a server has to be asked for them
+_PIECES = 4
 
 _PREFIX = "log-"
 
@@ -34,9 +32,9 @@ def content_id(files: Sequence[tuple[int, Read]]) -> str:
     digest = hashlib.sha256()
     for size, read in files:
         digest.update(size.to_bytes(8, "little"))
-        last = max(0, size - EDGE)
-        for at in dict.fromkeys(last * k // (BETWEEN + 1) for k in range(BETWEEN + 2)):
-            digest.update(read(at, min(at + EDGE, size)))
+        last = max(0, size - _PIECE)
+        for at in dict.fromkeys(last * k // (_PIECES - 1) for k in range(_PIECES)):
+            digest.update(read(at, min(at + _PIECE, size)))
     return f"{_PREFIX}{digest.hexdigest()[:16]}"
 
 

@@ -280,7 +280,8 @@ class LogFile:
         file = self.files[0]
 
         def read(start: int, stop: int) -> bytes:
-            file.need(start, stop)
+            if file.remote is not None:
+                return file.remote.read(start, stop)
             return bytes(file.buffer[start:stop])
 
         return content_id([(len(file.buffer), read)])

@@ -143,6 +143,18 @@ class FetchedFile:
                 self._write(at, data)
             self._whole = self._whole or (start == 0 and stop == self._file.size)
 
+    def read(self, start: int, stop: int) -> bytes:
+        """Return the bytes [start, stop), fetched alone if they are not here.
+
+        Raises:
+            InputFileError: If they can't be fetched.
+        """
+        with self._lock:
+            if self._pages.issuperset(range(start // _PAGE, -(-stop // _PAGE))):
+                return self._buffer[start:stop]
+        (data,) = self._file.read_many([(start, stop)])
+        return data
+
     def add(self, block: Block, end: int) -> None:
         """Add a block that only its index describes; its message indexes end at ``end``."""
         self._ends[block.record_at] = end

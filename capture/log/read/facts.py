@@ -28,7 +28,7 @@ from mcap.records import Channel, Footer, Metadata, MetadataIndex, Statistics
 from ...common.errors import MissingExtraError, NotALogError, UndulogError
 from ..file.bag_metadata import Stated, read_stated
 from ..file.bag_parts import Allowance, read_database_facts
-from ..file.content import EDGE, content_id, content_id_of
+from ..file.content import content_id, content_id_of
 from ..mcap.chunk import MAGIC, walk_records
 from ..wal.reader import Recovery
 from ..wal.writer import wal_folder
@@ -36,6 +36,7 @@ from ..wal.writer import wal_folder
 MOST_REQUESTS = 5
 """Ranges that are read of one file."""
 
+_EDGE = 64 * 1024
 _MOST_SUMMARY = 64 << 20
 RECORDS = ("undulog", "undulog.health", "undulog.part")
 """Metadata records that are facts of a log."""
@@ -114,20 +115,21 @@ def read_facts(name: str, size: int, read: Callable[[int, int], bytes]) -> LogFa
         OSError: As ``read`` raises it.
     """
     ranges = _Ranges(read, size)
-    head = ranges.get(0, min(size, EDGE)) or b""
+    head = ranges.get(0, min(size, _EDGE)) or b""
     if not head.startswith(MAGIC):
         raise NotALogError(name, "no MCAP file: it doesn't start as one")
     metadata: dict[str, dict[str, str]] = {}
     _add_metadata(metadata, _records(head, len(MAGIC)))
-    tail = ranges.get(max(0, size - EDGE), size) or b""
+    tail = ranges.get(max(0, size - _EDGE), size) or b""
     found = _found(ranges, size, tail, metadata)
     if found.session_id:
         return found
 
     def piece(start: int, stop: int) -> bytes:
-        if start == 0:
-            return head
-        return tail if stop == size else read(start, stop)
+        if stop <= len(head):
+            return head[start:stop]
+        ahead = size - len(tail)
+        return tail[start - ahead : stop - ahead] if start >= ahead else read(start, stop)
 
     return replace(found, content=content_id([(size, piece)]))
 
@@ -163,7 +165,7 @@ def _from_summary(summary: bytes, ranges: _Ranges, metadata: dict[str, dict[str,
         elif opcode == Opcode.METADATA_INDEX:
             index = _parse(MetadataIndex, body)
             if index.name in RECORDS:
-                record = ranges.get(index.offset, index.offset + index.length, EDGE)
+                record = ranges.get(index.offset, index.offset + index.length, _EDGE)
                 if record is not None:
                     _add_metadata(metadata, _records(record, 0))
     if statistics is None or not statistics.message_count:
