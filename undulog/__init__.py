@@ -16,6 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cyclopts import App
+    from cyclopts.help import HelpPanel
+    from rich.console import Console, ConsoleOptions
+    from rich.text import Text
 
     from undulog.analysis import Analysis as Analysis
     from undulog.analysis import Catalog as Catalog
@@ -167,8 +170,6 @@ def build(arguments: Sequence[str] = ()) -> App:
     """
     from cyclopts import App, Parameter
 
-    from .help_layout import HelpLayout
-
     completion = list(arguments[:1]) == [_COMPLETION]
     app = App(
         name="undulog",
@@ -177,7 +178,7 @@ def build(arguments: Sequence[str] = ()) -> App:
         "Every command takes `--max-chunk-mib N`: larger chunks (256 MiB by default) are not read.",
         version=_version,
         help_format="markdown" if completion else "plaintext",
-        help_formatter=HelpLayout(),
+        help_formatter=_HelpLayout(),
         help_epilogue="Example: undulog sim run flat -o run.mcap && undulog analyse run.mcap",
         default_parameter=Parameter(negative=()),
         result_action="return_value",
@@ -200,6 +201,50 @@ def build(arguments: Sequence[str] = ()) -> App:
             _in_commands(target), name=name, help=None if asked else summary, help_epilogue=""
         )
     return app
+
+
+class _HelpLayout:
+    """Layout of help for cyclopts; as for Markdown whose only marks are backticks and empty lines.
+
+    Importing the parser of Markdown takes longer than all else of a help.
+    """
+
+    def __call__(self, console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:
+        """Print a panel of commands or parameters."""
+        from cyclopts.help import DefaultFormatter
+
+        for entry in panel.entries:
+            _fill(entry.description)
+        DefaultFormatter()(console, options, panel)
+
+    def render_usage(self, console: Console, options: ConsoleOptions, usage: Any) -> None:
+        """Print the line of the usage."""
+        from cyclopts.help import DefaultFormatter
+
+        DefaultFormatter().render_usage(console, options, usage)
+
+    def render_description(self, console: Console, _: ConsoleOptions, description: Any) -> None:
+        """Print the description of a command."""
+        _fill(description)
+        console.print(description)
+
+
+def _fill(description: Any) -> None:
+    """Lay out the plain text that an ``InlineText`` of cyclopts holds."""
+    plain = getattr(getattr(description, "primary_renderable", None), "plain", None)
+    if plain is not None:
+        description.primary_renderable = _filled(plain)
+
+
+def _filled(text: str) -> Text:
+    """Return a text with a line for each paragraph and a style for code."""
+    from rich.text import Text
+
+    paragraphs = (" ".join(paragraph.split()) for paragraph in text.strip().split("\n\n"))
+    styled = Text()
+    for k, part in enumerate("\n\n".join(paragraphs).split("`")):
+        styled.append(part, "markdown.code" if k % 2 else "")
+    return styled
 
 
 def _version() -> str:

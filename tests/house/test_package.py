@@ -72,7 +72,7 @@ def test_the_source_archive_holds_each_file_once_and_builds_the_same_wheel(tree,
 
 def test_the_wheel_holds_every_file_of_the_packages(wheel):
     expected = {f"undulog/{path.relative_to(ROOT)}" for path in tracked(*FOLDERS)}
-    own = ("__init__.py", "__main__.py", "help_layout.py", "notebook.py", "py.typed")
+    own = ("__init__.py", "__main__.py", "notebook.py", "py.typed")
     expected |= {f"undulog/{name}" for name in own}
     assert {name for name in record(wheel) if not name.startswith("undulog-")} == expected
 
