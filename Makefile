@@ -49,8 +49,8 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 
 # Two processes at once: tests that compute, and tests of processes, time and pictures.
 COMPUTING = tests/analysis tests/docs \
-  $(addprefix tests/capture/,following robot) \
-  tests/replay/sweep \
+  $(addprefix tests/capture/,exchange following robot) \
+  $(addprefix tests/replay/,calibrate draw sweep) \
   $(addprefix tests/sim/,batch gait physics scenario twin)
 define tests
 	@log=$$(mktemp); \
@@ -63,6 +63,7 @@ endef
 test: $(READY)  ## all tests but the slow ones
 	$(call tests,"not slow")
 
+slow: COMPUTING := $(filter-out tests/replay/sweep tests/sim/twin,$(COMPUTING))
 slow: $(READY)  ## the slow tests
 	$(call tests,slow)
 
