@@ -49,7 +49,7 @@ demo: $(READY)  ## record 20 s of the 25-joint snake, analyse it, write page and
 
 # Two processes at once: tests that compute, and tests of processes, time and pictures.
 COMPUTING = tests/analysis tests/docs \
-  $(addprefix tests/capture/,exchange following robot) \
+  $(addprefix tests/capture/,following robot) \
   $(addprefix tests/replay/,calibrate draw sweep) \
   $(addprefix tests/sim/,batch gait physics scenario twin)
 define tests
