@@ -1,8 +1,6 @@
 """Chunks of an MCAP file: decompression, the walk over records, and messages many at a time.
 
 Format: https://mcap.dev/spec.
-
-Format: https://mcap.dev/spec#message-op0x05.
 """
 
 from __future__ import annotations
@@ -13,6 +11,7 @@ import os
 import re
 import struct
 import threading
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -43,6 +42,8 @@ _LEAST_WINDOW = 1 << 23
 
 _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, size, CRC, length of the compression's name
 _NAME_AT = PREFIX_SIZE + 8 + 8 + 8 + 4  # of the compression's name in a chunk's record
+
+_CRC = struct.Struct("<I")
 
 _COMPRESSION_NAME = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
 
@@ -199,6 +200,18 @@ def checks_itself(raw: memoryview) -> bool:
         return zstandard.get_frame_parameters(raw).has_checksum
     except zstandard.ZstdError:
         return False
+
+
+def summary_fits(data: Buffer, start: int = 0) -> bool:
+    """Return whether a summary fits its CRC; True without one.
+
+    Args:
+        data: Ends as the file ends.
+        start: First byte of the summary.
+    """
+    covered = len(data) - len(MAGIC) - _CRC.size
+    (crc,) = _CRC.unpack_from(data, covered)
+    return not crc or zlib.crc32(data[start:covered]) == crc
 
 
 def walk_records(data: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]]:

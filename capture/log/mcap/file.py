@@ -11,7 +11,6 @@ Format: https://mcap.dev/spec.
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -34,7 +33,16 @@ from mcap.records import (
 
 from ...common.arrays import IntArray, frozen
 from ...common.errors import LogError, NotALogError
-from .chunk import MAGIC, PREFIX_SIZE, Block, Buffer, chunk_at, next_chunk, walk_records
+from .chunk import (
+    MAGIC,
+    PREFIX_SIZE,
+    Block,
+    Buffer,
+    chunk_at,
+    next_chunk,
+    summary_fits,
+    walk_records,
+)
 from .payloads import FetchedFile, McapPayloads
 
 _Record = TypeVar("_Record")
@@ -106,12 +114,11 @@ class _Summary:
         self._file.need(max(footer, 0), len(buffer))
         if footer < len(MAGIC) or buffer[-len(MAGIC) :] != MAGIC or buffer[footer] != Opcode.FOOTER:
             raise _NoSummaryError("the file is cut short (no footer)")
-        summary_start, _, crc = _FOOTER.unpack_from(buffer, footer + PREFIX_SIZE)
+        summary_start, _, _ = _FOOTER.unpack_from(buffer, footer + PREFIX_SIZE)
         if not len(MAGIC) <= summary_start < footer:
             raise _NoSummaryError("the file has no summary")
         self._file.need(summary_start, footer)
-        covered = footer + PREFIX_SIZE + _FOOTER.size - 4  # up to the CRC itself
-        if crc and zlib.crc32(buffer[summary_start:covered]) != crc:
+        if not summary_fits(buffer, summary_start):
             raise _NoSummaryError("the summary is damaged (its CRC doesn't fit)")
         return summary_start, footer
 

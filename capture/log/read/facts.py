@@ -29,7 +29,7 @@ from ...common.errors import MissingExtraError, NotALogError, UndulogError
 from ..file.bag_metadata import Stated, read_stated
 from ..file.bag_parts import Allowance, read_database_facts
 from ..file.content import content_id, content_id_of
-from ..mcap.chunk import MAGIC, walk_records
+from ..mcap.chunk import MAGIC, summary_fits, walk_records
 from ..wal.reader import Recovery
 from ..wal.writer import wal_folder
 
@@ -144,11 +144,13 @@ def _found(
         start, stop = footer.summary_start, footer.summary_offset_start or size - _FOOTER
         if not start:
             return LogFacts(metadata=metadata, damage="it has no summary")
-        summary = ranges.get(start, stop) if stop - start <= _MOST_SUMMARY else None
-        if summary is None:
+        rest = ranges.get(start, size) if start < stop <= start + _MOST_SUMMARY else None
+        if rest is None:
             damage = f"its summary claims the bytes {start:,} to {stop:,}"
             return LogFacts(metadata=metadata, damage=damage)
-        return _from_summary(summary, ranges, metadata)
+        if not summary_fits(rest):
+            return LogFacts(metadata=metadata, damage="its summary is damaged: its CRC doesn't fit")
+        return _from_summary(rest[: stop - start], ranges, metadata)
     except (McapError, struct.error, ValueError, OverflowError) as error:
         return LogFacts(metadata=metadata, damage=f"its summary is damaged: {error}")
 

@@ -9,6 +9,7 @@ from support.read_back import read, summary_of
 from support.written_sessions import write_session
 from undulog.capture import Session
 from undulog.capture.common.errors import LogError, MissingChannelError, NotALogError
+from undulog.capture.log.read.facts import read_facts
 
 # -- bad input ---------------------------------------------------------------------------------
 
@@ -84,6 +85,7 @@ def test_no_bit_of_a_summary_is_read_wrong(tmp_path):
         data = bytearray(raw)
         data[dice.randrange(start, len(raw) - 8)] ^= 1 << dice.randrange(8)
         path.write_bytes(data)
+        assert read_facts("s.mcap", len(raw), lambda start, stop: data[start:stop]).damage  # noqa: B023
         found, warnings = read(path)
         assert found == truth
         assert any("read record by record" in text for text in warnings)
