@@ -455,7 +455,7 @@ def test_many_writers_at_once_lose_no_row(lab):
     count = catalog.sql("select count(*) as n from all_joints where source not like '%.json'").n[0]
     assert count == 320 * catalog.sql("select max(joints) as n from analyses").n[0]
     catalog.scan()  # puts the files together
-    assert len(list((lab / FOLDER / "analyses").iterdir())) < 64
+    assert len(list((lab / FOLDER / "analyses").iterdir())) <= 64  # one put together, and 63
     assert len(catalog.sql("select * from analyses")) == 321
 
 
