@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import os
 import pickle
+import shutil
 import subprocess
 import sys
+import tempfile
 from contextlib import suppress
 from multiprocessing.connection import Connection, Pipe
 from queue import SimpleQueue
@@ -83,11 +85,12 @@ class RunProcesses:
 class _RunProcess:
     def __init__(self) -> None:
         self._connection, other = Pipe()
-        environment = os.environ | dict.fromkeys(_OF_THREADS, "1")
+        self._folder = tempfile.mkdtemp(prefix="undulog-sweep-")  # one that is killed leaves files
+        environment = os.environ | dict.fromkeys(_OF_THREADS, "1") | {"TMPDIR": self._folder}
         environment.pop("MALLOC_TRIM_THRESHOLD_", None)
         with other:
             self._process = subprocess.Popen(  # noqa: S603  our own arguments
-                [sys.executable, "-P", "-m", __name__, str(other.fileno())],
+                [sys.executable, "-P", "-m", __name__, str(other.fileno()), self._folder],
                 stdin=subprocess.DEVNULL,
                 pass_fds=[other.fileno()],
                 env=environment,
@@ -105,6 +108,7 @@ class _RunProcess:
     def end(self) -> None:
         self._connection.close()
         self._process.wait()
+        shutil.rmtree(self._folder, ignore_errors=True)
 
 
 def request_of(setting: Setting, job: Job) -> bytes:
@@ -132,12 +136,12 @@ def run_beside(request: bytes) -> bytes:
     return _OF_THIS_PROCESS.run(request)
 
 
-def main(handle: int) -> None:
-    """Make the runs that are asked for over a connection, until it ends."""
+def main(handle: int, folder: str) -> None:
+    """Make the runs that are asked for over a connection, until it ends; then remove a folder."""
     from .run import run_job
 
     connection, requests = Connection(handle), SimpleQueue[bytes]()
-    Thread(target=_receive, args=(connection, requests), daemon=True).start()
+    Thread(target=_receive, args=(connection, requests, folder), daemon=True).start()
     while True:
         setting, job = pickle.loads(requests.get())  # noqa: S301  of our own process
         try:
@@ -147,13 +151,14 @@ def main(handle: int) -> None:
         connection.send_bytes(pickle.dumps(answer))
 
 
-def _receive(connection: Connection, requests: SimpleQueue[bytes]) -> None:
+def _receive(connection: Connection, requests: SimpleQueue[bytes], folder: str) -> None:
     try:
         while True:
             requests.put(connection.recv_bytes())
-    except (EOFError, OSError):
-        os._exit(0)  # the process that asks has ended, however it did
+    except (EOFError, OSError):  # the process that asks has ended, however it did
+        shutil.rmtree(folder, ignore_errors=True)
+        os._exit(0)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(int(sys.argv[1]), sys.argv[2])

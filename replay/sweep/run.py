@@ -220,7 +220,7 @@ def run_job(setting: Setting, job: Job) -> Row:
         raise UsageError(f"worker {_worker()} has other software: {', '.join(other)}")
     start = time.perf_counter()
     row = row_of(job)
-    with tempfile.TemporaryDirectory(prefix="undulog-sweep-") as folder:
+    with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{job.key}.mcap"
         try:
             row |= _results(setting, job, path)

@@ -131,9 +131,9 @@ def test_a_key_that_is_none_is_refused_before_anything_runs(change, message, tmp
     assert not (tmp_path / "rows").exists()
 
 
-def _begun(output):
-    """Wait until a row is there."""
-    wait_for(lambda: list(output.glob("pending/*.json")), "a row", 120)
+def _begun(output, rows=1):
+    """Wait until rows are there."""
+    wait_for(lambda: len(rows_of(output)) >= rows, "rows", 120)
 
 
 def _workers(parent):
@@ -141,29 +141,45 @@ def _workers(parent):
     return [int(word) for word in run("pgrep", "-P", parent, "-f", "processes").stdout.split()]
 
 
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """A folder for temporary files, of which none may be left."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
+    yield folder
+    wait_for(lambda: not list(folder.iterdir()), "temporary files are removed", 20)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_an_interrupted_sweep_goes_on_where_it_stopped(number, reference, tmp_path):
+@pytest.mark.usefixtures("temporary")
+@pytest.mark.parametrize("signals", [("SIGINT", "SIGKILL"), ("SIGTERM", "SIGINT")])
+def test_a_sweep_that_was_interrupted_twice_goes_on_where_it_stopped(signals, reference, tmp_path):
     plan = write_plan(tmp_path, STRENGTHS, seeds=2, top="sessions = true")
     words = (*UNDULOG, "sweep", plan, "-o", tmp_path / "rows", "--workers", "2", "--json")
-    with process(*words) as sweep:
-        _begun(tmp_path / "rows")
-        workers = _workers(sweep.pid)
-        assert len(workers) == 2
-        sweep.send_signal(number)
-        out, _ = sweep.communicate(timeout=60)
-    there = len(rows_of(tmp_path / "rows"))
-    assert 1 <= there < 10
-    if number != signal.SIGKILL:
-        report = json.loads(out)
-        assert (report["run"], report["complete"], sweep.returncode) == (there, False, 1)
-    wait_for(lambda: not any(map(alive, workers)), "workers end with their coordinator", 20)
+    before = 0
+    for name in signals:
+        with process(*words) as sweep:
+            _begun(tmp_path / "rows", before + 1)
+            workers = _workers(sweep.pid)
+            assert len(workers) == 2
+            sweep.send_signal(signal.Signals[name])
+            out, _ = sweep.communicate(timeout=60)
+        there = len(rows_of(tmp_path / "rows"))
+        assert before < there < 10
+        if name != "SIGKILL":
+            report = json.loads(out)
+            assert (report["run"], report["there_before"]) == (there - before, before)
+            assert (report["complete"], sweep.returncode) == (False, 1)
+        wait_for(lambda: not any(map(alive, workers)), "workers end", 20)  # noqa: B023
+        before = there
     rest, code = swept(plan, tmp_path / "rows")
     assert (rest["there_before"], rest["run"], code) == (there, 10 - there, 0)
     assert rows_of(tmp_path / "rows") == rows_of(reference / "rows")
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("temporary")
 def test_a_worker_that_is_killed_takes_no_row_with_it(reference, tmp_path):
     plan = write_plan(tmp_path, STRENGTHS, seeds=2, top="sessions = true")
     words = (*UNDULOG, "sweep", plan, "-o", tmp_path / "rows", "--workers", "2", "--json")
