@@ -41,6 +41,7 @@ from .scales import (
     compare,
     inside,
     integral,
+    rate_of,
     spans_of,
     turns,
 )
@@ -398,7 +399,8 @@ def _of_scale(
     edges = turns(leader)
     if command is not None:
         leading = _linear(position, command)
-        for flag, spans in against_command(compare(position, leading, edges)).items():
+        both = (compare(position, one, edges) for one in (leading, rate_of(leading)))
+        for flag, spans in against_command(*both).items():
             found.add(flag)
             yield "position", flag, spans, ""
     if second is not None:

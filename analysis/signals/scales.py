@@ -85,6 +85,11 @@ OPPOSITE = -0.7
 """Correlation of a response with its command at full size, below which its sign is wrong: 45
 degrees from opposite phase."""
 
+EARLY = -0.26
+"""Correlation of a response with the rate of its command, below which its sign is right: beyond a
+resonance of the body a sound joint lags by nearly half a cycle, and one of the wrong sign by half a
+cycle or more. This is 15 degrees less, for clocks that differ."""
+
 EITHER_WAY = 0.75
 """Share of the cycles that must follow the command, upright or not, for a sign to be decided:
 of a multisine near a resonance every cycle has another phase."""
@@ -191,8 +196,12 @@ def compare(first: Series, second: Series, edges_s: FloatArray, *, noisy: bool =
     return Compared(first.t_s[starts], stops, ratio, correlation, error)
 
 
-def against_command(one: Compared) -> dict[str, tuple[Span, ...]]:
+def against_command(one: Compared, rate: Compared) -> dict[str, tuple[Span, ...]]:
     """Wrong sign and unit of a position, from its command.
+
+    Args:
+        one: Position against its command.
+        rate: Position against the rate of its command.
 
     Returns:
         ``wrong_sign`` and ``wrong_unit`` to stretches, those that were found.
@@ -201,7 +210,7 @@ def against_command(one: Compared) -> dict[str, tuple[Span, ...]]:
     # A joint that hardly moves may be stuck: only one that follows closely is in another unit.
     radians = _near(one.ratio, 1 / DEGREE) & (one.correlation > MIN_CORRELATION)
     full = (one.ratio > FULL_SIZE[0]) & (one.ratio < FULL_SIZE[1])
-    opposite = (one.correlation < OPPOSITE) & (full | degrees)
+    opposite = (one.correlation < OPPOSITE) & (full | degrees) & (rate.correlation > EARLY)
     # A sign changes no more than the sign: near a resonance the phase is anything, cycle by cycle.
     along = np.abs(one.correlation[np.isfinite(one.correlation)]) > -OPPOSITE
     opposite &= np.count_nonzero(along) >= EITHER_WAY * along.size
@@ -227,6 +236,11 @@ def against_witness(one: Compared, same: float) -> dict[str, tuple[Span, ...]]:
     off = np.abs(np.log(ratio)) > np.log(same) + SURE * one.error
     signs = {"wrong_sign": clear & (one.correlation < 0), "wrong_unit": unit}
     return _found(one, signs | {"scale_mismatch": clear & off & ~unit})
+
+
+def rate_of(one: Series) -> Series:
+    """Return the time derivative of a signal with two samples or more, by central differences."""
+    return Series(one.name, one.t_s, np.gradient(one.values, one.t_s))
 
 
 def integral(velocity: Series) -> Series:

@@ -53,3 +53,32 @@ def test_a_joint_that_answers_upside_down_at_all_tones_is_reported(seed, tmp_pat
     (found,) = planted_artefacts.artefacts(snake.write(tmp_path / "run.mcap"))
     assert (found.joint, found.quantity) == (snake.robot.joint_names[j], "position")
     assert (found.flag, found.spans_s) == ("wrong_sign", (pytest.approx((0.0, snake.t[-1])),))
+
+
+def wave(lags_deg, upside_down=()):
+    """A gait of one frequency; some joints answer upside down."""
+    snake = planted_artefacts.Snake(1, (2 * np.pi / 4096, 0.005))
+    for j, lag in zip(DRIVEN, np.radians(lags_deg), strict=True):
+        sign = -1 if j in upside_down else 1
+        phase = OMEGA * snake.t - j
+        snake.command[:, j] = 0.3 * np.sin(phase)
+        snake.position[:, j] = sign * 0.35 * np.sin(phase - lag)
+        snake.velocity[:, j] = sign * 0.35 * OMEGA * np.cos(phase - lag)
+    snake.velocity += snake.rng.normal(0, 0.002, snake.velocity.shape)
+    snake.position = snake.told(snake.position + snake.rng.normal(0, 1e-4, snake.position.shape))
+    return snake
+
+
+def test_joints_that_lag_by_nearly_half_a_cycle_near_a_resonance_are_sound(tmp_path):
+    bend = np.sin(np.pi * np.arange(len(DRIVEN)) / (len(DRIVEN) - 1))
+    snake = wave(20 + 140 * bend)
+    assert planted_artefacts.artefacts(snake.write(tmp_path / "run.mcap")) == ()
+
+
+@pytest.mark.parametrize("lag_deg", [-10, 0, 40])
+@pytest.mark.parametrize("upside_down", [DRIVEN[3:4], DRIVEN])
+def test_joints_that_answer_upside_down_are_reported(upside_down, lag_deg, tmp_path):
+    snake = wave(np.full(len(DRIVEN), lag_deg), upside_down)
+    found = planted_artefacts.artefacts(snake.write(tmp_path / "run.mcap"))
+    assert {one.flag for one in found} == {"wrong_sign"}
+    assert {one.joint for one in found} == {snake.robot.joint_names[j] for j in upside_down}
