@@ -31,6 +31,8 @@ MIB = 1 << 20
 ANALYSE, REPORT = 0.25, 0.5
 """The bars, shares of the peer's processor time."""
 ANALYSE_MIB, PAGE_MIB = 1.5e9 / MIB, 3e6 / MIB
+OF_READING = 6.0
+"""The bar of ``analyse`` to reading the columns of joints, times, power and sensors."""
 PEER_S = 120.0
 """What the peer decodes at most; its time is scaled to the whole session [s]."""
 
@@ -41,6 +43,14 @@ from hour_session import EPOCH_NS, JOINT_TOPICS
 from one_hour import OWN_TIMES, decode
 window = EPOCH_NS, EPOCH_NS + round(float(sys.argv[2]) * 1e9)
 decode(Path(sys.argv[1]), [*JOINT_TOPICS, *OWN_TIMES], window)
+"""
+
+
+READ = """
+import sys
+from pathlib import Path
+from one_hour import load
+load(Path(sys.argv[1]), 1)
 """
 
 
@@ -70,9 +80,9 @@ def cost(*words: str) -> Cost:
     return Cost(took, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / MIB)
 
 
-def decode_s(path: Path, seconds: float) -> float:
-    """Return the processor time of decoding the JointStates of so much of a session [s]."""
-    child = subprocess.Popen([sys.executable, "-c", DECODE, str(path), str(seconds)], cwd=HERE)
+def spent_s(program: str, *words: str) -> float:
+    """Return the processor time of a Python program [s]."""
+    child = subprocess.Popen([sys.executable, "-c", program, *words], cwd=HERE)
     _, status, usage = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:
@@ -97,11 +107,12 @@ def measure(path: Path, part: float, runs: int, *, adaptive: bool = False) -> bo
         (
             cost("analyse", str(path)),
             cost("report", str(path), "-o", str(page), "--force"),
-            decode_s(path, peer_s),
+            spent_s(DECODE, str(path), str(peer_s)),
+            spent_s(READ, str(path)),
         )
         for _ in range(runs)
     ]
-    analysed, reported, theirs = zip(*turns, strict=True)
+    analysed, reported, theirs, read = zip(*turns, strict=True)
     peer = f"{versions('mcap', 'mcap-ros2-support')} decoding the JointStates"
     if peer_s < seconds:
         peer += f" (scaled from {peer_s:g} s)"
@@ -114,6 +125,8 @@ def measure(path: Path, part: float, runs: int, *, adaptive: bool = False) -> bo
         peak = max(one.peak_mib for one in costs)
         bar_mib = round(ANALYSE_MIB) if verb == "analyse" else None
         good.append(verdict(f"{what}, peak memory", peak, bar_mib, "MiB"))
+    what, ours = f"undulog analyse, {length}", [one.processor_s for one in analysed]
+    good.append(compared(what, ours, read, "undulog reading its columns", bar=OF_READING))
     size = page.stat().st_size / MIB
     good.append(verdict(f"undulog report, {length}, page", size, round(PAGE_MIB, 2), "MiB"))
     return all(good)

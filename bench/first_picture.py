@@ -30,7 +30,7 @@ from undulog.capture import Session
 from undulog.replay import write_recording
 from undulog.replay.viewer import client_of
 
-BAR = 1.0
+BAR = 0.5
 """To Rerun's viewer on the MCAP file itself."""
 
 REST_S = 5.0

@@ -230,7 +230,7 @@ def measure(path: Path, without: Path, seconds: int, runs: int) -> bool:
     reference, loaded, frames = zip(*took, strict=True)
     peer = f"{versions('zstandard')}, decompressing the same chunks"
     what = "load joint, time, power and sensor columns, 1 thread"
-    good.append(compared(what, loaded, reference, peer, bar=2.0))
+    good.append(compared(what, loaded, reference, peer, bar=1.6))
     compared("load the raw frames, 1 thread", frames, reference, peer)
     threads = threads_or_default(None)
     command = [sys.executable, __file__, "--memory", str(path)]

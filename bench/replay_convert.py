@@ -41,6 +41,7 @@ from undulog.replay.samples.tracks import read_columns, wanted_fields
 from undulog.replay.viewer import viewer_binary
 
 COST, SIZE, PEAK_MB = 0.1, 0.5, 500.0
+WITH_ANALYSIS = 1.4
 """The bars; memory is not to grow with the session."""
 
 CONVERT = """
@@ -175,6 +176,9 @@ def measure(path: Path, minutes: float, runs: int, rows_s: float) -> bool:
         compared(what, cpu, itself, own)
         peak_mb = max(one.peak_mb for one in costs)
         good.append(verdict(f"{what}, peak memory", peak_mb, PEAK_MB, "MB"))
+    alone = "the conversion alone"
+    spent = ([one.processor_s for one in costs] for costs in (commands, ours))
+    good.append(compared("view --save, which analyses", *spent, alone, bar=WITH_ANALYSIS))
     verdict("MCAP to .rrd, wall-clock time", min(one.wall_s for one in ours), None, "s")
     sizes = [ours[0].size_mb], [rows[0].size_mb]
     good.append(compared(".rrd, size", *sizes, by_row, bar=SIZE, unit="MB", scale=scale))

@@ -34,7 +34,7 @@ def positions(path):
 
 def test_each_is_listed_in_the_readme():
     text = (EARLIER / "README.md").read_text()
-    assert len(FILES) == 6
+    assert len(FILES) == 7
     assert [p.name for p in EARLIER.iterdir() if p.stem != "README" and p.name not in text] == []
 
 
@@ -81,6 +81,18 @@ def test_can_frames_of_both_kinds_are_kept():
             "aabbccddeeff0011"
         ] * 3
         assert len(session.frames("/can/can0")) == 100
+
+
+def test_packets_of_a_line_of_serial_servos_are_kept():
+    with Session.open(EARLIER / "2026-11-26-serial.mcap") as session:
+        packets = session.fd_frames("/serial/sts")
+        commands = session.joints("/joint_commands", "position")
+    assert len(packets) == 1400
+    writes = packets[(packets["id_flags"] == 0xFE) & (packets["data"][:, 4] == 0x83)]
+    low, high = writes["data"][:, 8:10].astype(int).T  # of the first servo's goal
+    rad = (low + 256 * high - 2048) * 2 * np.pi / 4096
+    assert commands.names[0] == "joint01"
+    np.testing.assert_allclose(commands.values[0], rad, atol=1e-9)
 
 
 def test_a_killed_recording_is_put_together_and_recovered(tmp_path, command):
