@@ -68,6 +68,9 @@ SPIKE = 8.0  # robust standard deviations of the noise about the running median 
 # A spike is also larger than so many of the command's largest steps: the median may be late.
 SPIKE_STEPS = 3.0
 SPIKE_SHARE = 0.1  # a spike is also larger than this share of the command's range
+# A spike misses the cubic through those around it by this share of what it misses their median: one
+# of two in a row by a third, the turning point of a vibration by a sixth.
+SPIKE_ALONE = 0.3
 SPIKES = 0.003  # share of the samples that may be spikes beyond what the joints have in common
 
 
@@ -149,16 +152,23 @@ def _spikes(each: JointMotion) -> float:
     if values.size < 4 * AROUND:
         return 0.0
     away = np.abs(values - _median_of_five(values))
+    a, b, _, d, e = _fives(values)
+    alone = np.abs(values - (4 * (b + d) - a - e) / 6) > SPIKE_ALONE * away
     noise = robust_deviation(np.diff(values, 2), 0.0) / 6**0.5
     far = away > max(
         SPIKE * noise, SPIKE_STEPS * each.largest_step, SPIKE_SHARE * each.command.range
     )
-    return float(np.count_nonzero(far)) / values.size
+    return float(np.count_nonzero(far & alone)) / values.size
+
+
+def _fives(values: FloatArray) -> FloatArray:
+    """Return each value with two before and two behind it, shape (5, n); the ends are held."""
+    return np.lib.stride_tricks.sliding_window_view(np.pad(values, 2, mode="edge"), 5).T
 
 
 def _median_of_five(values: FloatArray) -> FloatArray:
     """Return the running median; the ends are held. SciPy's would take longer to import."""
-    a, b, c, d, e = np.lib.stride_tricks.sliding_window_view(np.pad(values, 2, mode="edge"), 5).T
+    a, b, c, d, e = _fives(values)
     low = np.maximum(np.minimum(a, b), np.minimum(d, e))
     high = np.minimum(np.maximum(a, b), np.maximum(d, e))  # of four without least and greatest
     return np.maximum(np.minimum(c, low), np.minimum(np.maximum(c, low), high))

@@ -76,6 +76,13 @@ def coarse(seed, encoder=2 * np.pi / 4096):
     return chain
 
 
+def test_a_vibration_near_the_limit_of_the_sampling_is_no_noise(chain):
+    """Its turning points lie far from the running median of a few samples."""
+    burst = np.exp(-(((chain.t[:, None] - [3.0, 6.0, 9.0, 12.0]) / 0.15) ** 2)).sum(1)
+    chain.position[BROKEN] += 0.6 * burst * np.sin(2 * np.pi * 9.3 * chain.t)
+    assert "noisy_sensor" not in {kind for one in chain.judged().values() for kind in one.kinds}
+
+
 def test_a_noisy_coarse_encoder_repeats_values_by_chance():
     for seed in range(20):
         assert coarse(seed).judged() == {}
