@@ -72,7 +72,7 @@ BENCHES = {
     "target-following": Bench("target_following", "", TARGET),
     "converting": Bench("replay_convert", "--minutes 5", "--minutes 1 --runs 2 --rows 5"),
     "merging": Bench("replay_merge", "", "1"),
-    "first-picture": Bench("first_picture", "5", "1"),
+    "first-picture": Bench("first_picture", "", "1"),
 }  # fmt: skip
 
 PEERS = (

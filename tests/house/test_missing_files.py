@@ -8,6 +8,7 @@ import pytest
 
 import undulog
 from undulog.sim import load_scenario
+from undulog.sim.scenario.scenario import Kernels
 from undulog.sim.twin.recording import record
 
 # What isn't there is {no} with a suffix, what is there {run}; outputs go to {out}.
@@ -110,12 +111,18 @@ OF_ONE = [
 ]
 
 
+@pytest.fixture(scope="module")
+def of_one(tmp_path_factory):
+    """A folder with one session."""
+    folder = tmp_path_factory.mktemp("one")
+    scenario = load_scenario("flat").changed(duration_s=12.0)
+    record(scenario, folder / "run.mcap", kernels=Kernels.NUMBA)
+    return folder
+
+
 @pytest.mark.parametrize("line", OF_ONE)
-def test_a_folder_of_one_session_is_that_session(line, tmp_path, capsys):
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    record(load_scenario("flat").changed(duration_s=12.0), folder / "run.mcap")
-    words = {"folder": folder, "out": tmp_path / "out", "run": folder / "run.mcap"}
+def test_a_folder_of_one_session_is_that_session(line, of_one, tmp_path, capsys):
+    words = {"folder": of_one, "out": tmp_path / "out", "run": of_one / "run.mcap"}
     assert undulog.run(shlex.split(line.format_map(words))) == 0, capsys.readouterr().err
 
 

@@ -15,7 +15,7 @@ import pytest
 from mcap.writer import Writer
 from rerun.chunk import RrdReader
 
-from support import processes
+import undulog
 from support.paths import ROOT
 from support.processes import UNDULOG
 from support.written_sessions import joint_state
@@ -115,15 +115,20 @@ def folder(tmp_path_factory):
 def words(command):
     named = {"A": "a.mcap", "B": "b.mcap"}
     evil = f"n\x1b[2J\r{FORGED}\n{FORGED}"
-    return [*UNDULOG, *(named.get(word, word.replace("N", evil)) for word in command.split())]
+    return [named.get(word, word.replace("N", evil)) for word in command.split()]
 
 
-def run(folder, command, *more):
-    """Run a command; return its output and its errors."""
-    done = processes.run(*words(command), *more, cwd=folder, text=False, env=environment())
-    out, err = done.stdout.decode(), done.stderr.decode()
-    assert "Traceback" not in err
-    return out, err
+@pytest.fixture
+def run(folder, capsys, monkeypatch):
+    """Runs a command in this process, in the folder; returns its output and its errors."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("TERM", "xterm")
+
+    def run(command, *more):
+        undulog.run([*words(command), *more])
+        return capsys.readouterr()
+
+    return run
 
 
 def forced(command):
@@ -139,15 +144,15 @@ def raw(text):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_no_command_prints_a_control_character_or_a_forged_line(folder, command):
-    for text in run(folder, command, *(() if "N" in command else forced(command))):
+def test_no_command_prints_a_control_character_or_a_forged_line(run, command):
+    for text in run(command, *(() if "N" in command else forced(command))):
         assert raw(text) == set()
         assert not re.search(rf"(?m)^(# )?{FORGED[:6]}", text)
 
 
 @pytest.mark.parametrize("command", [x for x in COMMANDS if "N" not in x and "frames" not in x])
-def test_json_is_one_value_and_keeps_the_names(folder, command):
-    out, _ = run(folder, command, "--json", *forced(command))
+def test_json_is_one_value_and_keeps_the_names(run, command):
+    out, _ = run(command, "--json", *forced(command))
     assert raw(out) == set()
     value = json.loads(out)
     if command == "analyse A":
@@ -161,7 +166,8 @@ def test_a_terminal_gets_styles_and_progress_only(folder, command):
     (folder / "pty.csv").unlink(missing_ok=True)
     ours, theirs = pty.openpty()
     streams = dict.fromkeys(("stdin", "stdout", "stderr"), theirs)
-    with subprocess.Popen(words(command), cwd=folder, env=environment(), **streams) as process:
+    line = (*UNDULOG, *words(command))
+    with subprocess.Popen(line, cwd=folder, env=environment(), **streams) as process:
         os.close(theirs)
         shown = b""
         with contextlib.suppress(OSError):  # Linux: the last one to hold the other end has left
@@ -177,8 +183,8 @@ def test_a_terminal_gets_styles_and_progress_only(folder, command):
     assert b"\x1b]" not in shown
 
 
-def test_spreadsheets_find_no_formula_and_names_come_back(folder):
-    run(folder, "log export A -o names.csv")
+def test_spreadsheets_find_no_formula_and_names_come_back(folder, run):
+    run("log export A -o names.csv")
     with (folder / "names.csv").open(newline="", encoding="utf-8") as stream:
         head, *rows = list(csv.reader(stream))
     texts = [*head, *(row[1] for row in rows), *(row[2] for row in rows)]
@@ -187,8 +193,8 @@ def test_spreadsheets_find_no_formula_and_names_come_back(folder):
     assert all(abs(float(row[3] or row[4])) <= 0.4 for row in rows)
 
 
-def test_entities_and_documents_of_rerun_are_as_meant(folder):
-    run(folder, "view A --save c.rrd")
+def test_entities_and_documents_of_rerun_are_as_meant(folder, run):
+    run("view A --save c.rrd")
     paths = {chunk.entity_path for chunk in RrdReader(folder / "c.rrd").stream().to_chunks()}
     assert not [path for path in paths if raw(path)]
     assert not {path.split("/")[1] for path in paths} & {"j10", "t1", ".."}
@@ -206,8 +212,8 @@ class _Tags(HTMLParser):
 @pytest.mark.parametrize(
     "command", ["report A -o p.html", "report A B -o q.html", "compare A B -o r.html"]
 )
-def test_pages_have_no_markup_from_names(folder, command):
-    run(folder, command)
+def test_pages_have_no_markup_from_names(folder, run, command):
+    run(command)
     text = (folder / command.split()[-1]).read_text()
     tags = _Tags()
     tags.feed(text)

@@ -20,8 +20,8 @@ STRENGTHS = (0.1, 0.15, 0.2, 0.25, 0.3)
 
 
 def swept(plan, output, *words):
-    """Run a sweep; return its report."""
-    done = undulog("sweep", plan, "-o", output, "--json", *words)
+    """Run a sweep by one worker, whose start takes as long as a few runs; return its report."""
+    done = undulog("sweep", plan, "-o", output, "--json", "--workers", "1", *words)
     assert done.stdout, done.stderr
     return json.loads(done.stdout), done.returncode
 
@@ -35,7 +35,7 @@ def reference(tmp_path_factory):
     """A sweep of ten runs by one worker, sessions kept: its plan's folder and its rows."""
     folder = tmp_path_factory.mktemp("reference")
     plan = write_plan(folder, STRENGTHS, seeds=2, top="sessions = true")
-    report, code = swept(plan, folder / "rows", "--workers", "1")
+    report, code = swept(plan, folder / "rows")
     assert code == 0
     assert report["run"] == report["planned"] == 10
     return folder
@@ -61,7 +61,7 @@ def test_a_row_is_what_the_commands_give_one_by_one(reference, tmp_path):
 
 def test_what_is_there_is_not_run_again_and_what_is_new_is(reference, tmp_path):
     plan = write_plan(tmp_path, (0.1, 0.2), seeds=2)
-    first, _ = swept(plan, tmp_path / "rows", "--workers", "2")
+    first, _ = swept(plan, tmp_path / "rows")
     assert (first["run"], first["there_before"]) == (4, 0)
     again, _ = swept(plan, tmp_path / "rows")
     assert (again["run"], again["there_before"], again["complete"]) == (0, 4, True)
