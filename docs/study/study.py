@@ -66,7 +66,8 @@ def main() -> int:
         return 0
     from study.page import write_page
 
-    gather(folder, rows)
+    if not chosen.no_runs or folder.exists():
+        gather(folder, rows)
     page = folder / "study.md" if chosen.quick else DOCS / "study.md"
     write_page(rows, page, quick=chosen.quick)
     print(page)
