@@ -293,7 +293,12 @@ def run(arguments: Sequence[str]) -> int:
         if "" in arguments:  # as a path it would be this folder
             raise UsageError("an argument is empty; is it a variable of the shell that isn't set?")
         arguments = _without_chunk_limit(arguments)
-        result = build(arguments)(arguments, exit_on_error=False, print_error=False)
+        app, result = build(arguments), None
+        *command, last = arguments or [""]
+        if last == "--help" and " ".join(command) in ("", *VERBS, *_GROUPS):
+            app.help_print(command)  # reads the options once, which takes a tenth less time
+        else:
+            result = app(arguments, exit_on_error=False, print_error=False)
     except UnknownCommandError:  # its own text would import every command
         return _complain(_unknown(arguments), 2)
     except CycloptsError as error:

@@ -15,7 +15,6 @@ from undulog import capture
 from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import complain, echo, emit_json, progress
 from undulog.capture.common.errors import UsageError
-from undulog.capture.common.files import check_output
 from undulog.capture.common.process import interruptible
 
 from .view_options import ClipOptions, OverlayOptions, SingleOptions, given
@@ -95,6 +94,8 @@ def view(
         view_clip(files[0], clip, filmed, topics=topics, robot=robot, force=force, json=json)
         return
     if save is not None:
+        from undulog.capture.common.files import check_output
+
         check_output(save, [".rrd"], "a Rerun recording; end its name in .rrd", force=force)
     if live is not None:
         _view_live(live, save=save, web=web, connect=connect, json=json)
