@@ -15,7 +15,7 @@ from cyclopts import Parameter
 from ..common.console import UNLIMITED, Column, echo, emit, emit_json, plain, table
 from ..common.errors import DataError, MissingChannelError, RobotFileError
 from ..common.files import check_output, write_text
-from ..log.messages.definitions import COMMAND_TOPIC, RESPONSE_TOPIC
+from ..log.messages import COMMAND_TOPIC, RESPONSE_TOPIC
 from .topic_options import CONTRACT, JointTopicOptions
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from ..log.messages.definitions import COMMAND_TOPIC, RESPONSE_TOPIC
+from ..log.messages import COMMAND_TOPIC, RESPONSE_TOPIC
 
 if TYPE_CHECKING:
     from ..log.read.session_view import SessionView

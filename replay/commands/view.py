@@ -15,7 +15,6 @@ from undulog import capture
 from undulog.capture.commands.topic_options import CONTRACT, JointTopicOptions
 from undulog.capture.common.console import complain, echo, emit_json, progress
 from undulog.capture.common.errors import UsageError
-from undulog.capture.common.process import interruptible
 
 from .view_options import ClipOptions, OverlayOptions, SingleOptions, given
 
@@ -240,6 +239,8 @@ def _view_session(
     file: Path, single: SingleOptions, topics: JointTopicOptions, robot: str | None, *, web: bool
 ) -> None:
     """Show a session until the viewer is closed or a stop is requested."""
+    from undulog.capture.common.process import interruptible
+
     from .. import viewer
     from ..samples.content import Layer
 

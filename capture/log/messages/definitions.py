@@ -23,9 +23,6 @@ from ...common.errors import DataError
 if TYPE_CHECKING:
     from mcap.records import Channel
 
-COMMAND_TOPIC, RESPONSE_TOPIC = "/joint_commands", "/joint_states"
-"""Topics of the log contract for commanded and measured joints."""
-
 CONTRACT_VERSION = 1
 """Version that sessions are written by.
 

@@ -15,14 +15,13 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from ...common.errors import DataError, JointSetError, MissingChannelError, some_names
+from ..messages import COMMAND_TOPIC, RESPONSE_TOPIC
 from ..messages.cdr import Layout, layout_of
 from ..messages.definitions import (
-    COMMAND_TOPIC,
     CONTROLLER_STATE,
     DYNAMIC_STATE,
     FLOAT_ARRAY,
     JOINT_STATE,
-    RESPONSE_TOPIC,
     TRAJECTORY,
     PowerTopic,
 )
