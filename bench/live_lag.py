@@ -6,9 +6,9 @@ draws off screen. The viewer is asked, some sixty times a second, how far its da
 its time cursor stands; what that is behind the clock is the lag, the asking included (about 13 ms,
 printed). The first quarter is left out: the viewer builds its views then.
 
-One bar is held to nine of ten lags: beyond, one sees when the machine's scheduler let the three
-processes wait, of which the load average printed tells. The other is held to the median, less that
-of a viewer fed directly: this process logs the joints' positions alone, straight to a viewer. On a
+One bar applies to nine of ten lags: the others show when the machine's scheduler let the three
+processes wait, so the load average is printed. The second bar applies to the median, less that of a
+viewer fed directly: this process logs only the joints' positions, straight to a viewer. On a
 machine without a graphics card the viewer draws in software and takes a core of its own.
 
 Run: python bench/live_lag.py [--scenario weak-servo-pi3] [--size 1440x900]

@@ -85,7 +85,7 @@ class RunProcesses:
 class _RunProcess:
     def __init__(self) -> None:
         self._connection, other = Pipe()
-        self._folder = tempfile.mkdtemp(prefix="undulog-sweep-")  # one that is killed leaves files
+        self._folder = tempfile.mkdtemp(prefix="undulog-sweep-")  # a killed process leaves files
         environment = os.environ | dict.fromkeys(_OF_THREADS, "1") | {"TMPDIR": self._folder}
         environment.pop("MALLOC_TRIM_THRESHOLD_", None)
         with other:
