@@ -16,6 +16,7 @@ import sys
 import tempfile
 from contextlib import suppress
 from multiprocessing.connection import Connection, Pipe
+from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread, Timer
 from typing import TYPE_CHECKING
@@ -88,14 +89,18 @@ class _RunProcess:
         self._folder = tempfile.mkdtemp(prefix="undulog-sweep-")  # a killed process leaves files
         environment = os.environ | dict.fromkeys(_OF_THREADS, "1") | {"TMPDIR": self._folder}
         environment.pop("MALLOC_TRIM_THRESHOLD_", None)
-        with other:
-            self._process = subprocess.Popen(  # noqa: S603  our own arguments
-                [sys.executable, "-P", "-m", __name__, str(other.fileno()), self._folder],
-                stdin=subprocess.DEVNULL,
-                pass_fds=[other.fileno()],
-                env=environment,
-                process_group=0,  # a Ctrl-C ends it through us
-            )
+        try:
+            with other:
+                self._process = subprocess.Popen(  # noqa: S603  our own arguments
+                    [sys.executable, "-P", "-m", __name__, str(other.fileno()), self._folder],
+                    stdin=subprocess.DEVNULL,
+                    pass_fds=[other.fileno()],
+                    env=environment,
+                    process_group=0,  # a Ctrl-C ends it through us
+                )
+        except BaseException:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise
 
     @property
     def runs(self) -> bool:
@@ -141,14 +146,18 @@ def main(handle: int, folder: str) -> None:
     from .run import run_job
 
     connection, requests = Connection(handle), SimpleQueue[bytes]()
-    Thread(target=_receive, args=(connection, requests, folder), daemon=True).start()
+    receiver = Thread(target=_receive, args=(connection, requests, folder), daemon=True)
+    receiver.start()
     while True:
         setting, job = pickle.loads(requests.get())  # noqa: S301  of our own process
         try:
             answer = run_job(setting, job)
         except UndulogError as error:
             answer = error
-        connection.send_bytes(pickle.dumps(answer))
+        try:
+            connection.send_bytes(pickle.dumps(answer))
+        except OSError:  # nobody waits for it: the receiver ends this process
+            receiver.join()
 
 
 def _receive(connection: Connection, requests: SimpleQueue[bytes], folder: str) -> None:
@@ -156,7 +165,10 @@ def _receive(connection: Connection, requests: SimpleQueue[bytes], folder: str) 
         while True:
             requests.put(connection.recv_bytes())
     except (EOFError, OSError):  # the process that asks has ended, however it did
-        shutil.rmtree(folder, ignore_errors=True)
+        for _ in range(100):  # a run that goes on may write there meanwhile
+            shutil.rmtree(folder, ignore_errors=True)
+            if not Path(folder).exists():
+                break
         os._exit(0)
 
 

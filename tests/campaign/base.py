@@ -12,6 +12,7 @@ from mcap.writer import CompressionType, IndexType
 from mcap_ros2.writer import Writer as RosWriter
 
 from support.foreign_logs import rewrite
+from support.processes import wait_for
 from support.twin_chains import snake4
 from support.written_frames import log_messages
 from support.written_sessions import joint_state
@@ -274,8 +275,9 @@ def of_recorder(folder):
                     channel.write(EPOCH_NS + tick * PERIOD_NS, angles)
                 at(tick, sink)
 
-    def copy(tick, _sink):
+    def copy(tick, sink):
         if tick == 100:
+            wait_for(lambda: not sink.backlog, "what was written is on the disk")
             shutil.copytree(work, folder / "unfinished")
 
     def divide(tick, sink):

@@ -115,8 +115,8 @@ def _mutated(data, suffix, rng, scratch, part):
         return mutate_text(data, rng)
     if suffix == ".db" and rng.random() < 0.7:
         return remake_database(data, rng, scratch)
-    # What a kill left has no end; it may be as short as the magic at its beginning.
-    if suffix == ".mcap" and rng.random() < 0.6 and data[8:].endswith(data[:8]):
+    # What a kill left has no end; it may be empty, or as short as the magic at its beginning.
+    if suffix == ".mcap" and rng.random() < 0.6 and data and data[8:].endswith(data[:8]):
         return remake_log(data, rng, scratch)
     return mutate_bytes(data, rng)
 
