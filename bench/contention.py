@@ -115,11 +115,12 @@ def sources_at(kind: str, places: Sequence[object]) -> list[str]:
 
 
 def start_undulog(
-    stack: ExitStack, folder: Path, sources: Sequence[str], *before: str
+    stack: ExitStack, folder: Path, sources: Sequence[str], *before: str, decode: bool = True
 ) -> subprocess.Popen[str]:
-    """Start the recorder as a user does, to ``run.mcap``."""
-    command = [*before, sys.executable, "-m", "undulog", "record", *sources, "--robot", "snake25"]
-    command += ["--bus", "front", "-o", folder / "run.mcap", "--floor", 0, "--json", "--quiet"]
+    """Start the recorder as a user does, to ``run.mcap``; the first bus is decoded, or none."""
+    command = [*before, sys.executable, "-m", "undulog", "record", *sources]
+    command += ["--robot", "snake25", "--bus", "front"] if decode else []
+    command += ["-o", folder / "run.mcap", "--floor", 0, "--json", "--quiet"]
     return start(stack, *command, "--socket", folder / "control.sock")
 
 

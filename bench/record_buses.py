@@ -1,9 +1,10 @@
 """Recording two saturated 1 Mbit/s buses: what is lost, what it costs, what others take for it.
 
 ``python bench/record_buses.py [SECONDS]``: 2 x 9,000 frames/s from two other processes, into
-``undulog record`` over AF_UNIX and over loopback socketcand; the same socketcand buses into
-python-can's Logger (BLF and candump) and into mcap-ros2-support; a burst of 500,000 frames/s; and
-a live view that is frozen all the time. Senders are paced by the clock and wait for nobody: what
+``undulog record`` over AF_UNIX and over loopback socketcand, one bus decoded; the latter also with
+frames alone, as the others write them; the same socketcand buses into python-can's Logger (BLF and
+candump) and into mcap-ros2-support; a burst of 500,000 frames/s; and a live view that is frozen all
+the time. Senders are paced by the clock and wait for nobody: what
 the socket refuses and what is sent more than 20 ms late counts as lost. In the end the same beside
 busy loops and a busy disk (``bench/contention.py``).
 """
@@ -20,6 +21,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import contention
@@ -55,7 +57,6 @@ class Outcome:
     size: int = 0
     tick_p99_ms: float | None = None
     worst_behind_ms: float = 0.0
-    used_s: float = 0.0
     packages: tuple[str, ...] = ()
 
     @property
@@ -65,8 +66,8 @@ class Outcome:
 
     @property
     def frame_us(self) -> float:
-        """Processor time of a frame in the file [us]."""
-        return 1e6 * self.used_s / max(self.in_file, 1)
+        """Processor time of a frame while the senders send [us]."""
+        return 1e6 * self.cpu / (2 * RATE)
 
     def line(self) -> str:
         """Return one line of the table."""
@@ -91,7 +92,6 @@ def rss_mb(pid: int) -> float:
 
 def watch(outcome: Outcome, pid: int, seconds: float, senders: list[subprocess.Popen[str]]) -> None:
     """Measure the recorder while the senders send; then take what these say."""
-    at_first = cpu_s(pid)
     time.sleep(SETTLE_S)
     begun, used = time.monotonic(), cpu_s(pid)
     while time.monotonic() < begun + seconds - SETTLE_S - 2:
@@ -105,7 +105,6 @@ def watch(outcome: Outcome, pid: int, seconds: float, senders: list[subprocess.P
         outcome.lost_by_sender += said["late"]
         outcome.worst_behind_ms = max(outcome.worst_behind_ms, said["worst_behind_ms"])
     time.sleep(1.0)  # what is buffered is taken
-    outcome.used_s = cpu_s(pid) - at_first
 
 
 def start_senders(
@@ -141,12 +140,13 @@ def over_unix(
         return finish(outcome, recorder, folder)
 
 
-def over_socketcand(folder: Path, seconds: float) -> Outcome:
+def over_socketcand(folder: Path, seconds: float, *, decode: bool = True) -> Outcome:
     """Measure our recorder, frames as text over TCP."""
-    outcome = Outcome("undulog, socketcand")
+    outcome = Outcome("undulog, socketcand" if decode else "undulog, socketcand, not decoded")
     with ExitStack() as stack:
         senders = start_senders(stack, "socketcand", (0, 0), seconds)
-        recorder = start_undulog(stack, folder, sources_at("socketcand", served(senders)))
+        sources = sources_at("socketcand", served(senders))
+        recorder = start_undulog(stack, folder, sources, decode=decode)
         time.sleep(1.0)
         watch(outcome, recorder.pid, seconds, senders)
         return finish(outcome, recorder, folder)
@@ -197,6 +197,7 @@ def main() -> None:
     runs = [
         (over_unix, seconds),
         (over_socketcand, seconds),
+        (partial(over_socketcand, decode=False), seconds),
         (frozen_viewer, seconds),
         (over_unix, 2.0 + SETTLE_S, 250_000.0, "undulog, burst 500k frames/s"),
         (peer, seconds, "blf", "python-can Logger, BLF"),
@@ -208,11 +209,11 @@ def main() -> None:
         with tempfile.TemporaryDirectory(prefix="undulog-bench-") as folder:
             outcomes.append(run(Path(folder), *how))
         print(outcomes[-1].line(), flush=True)
-    ours, text, frozen, _, *peers = outcomes
+    ours, text, alone, frozen, _, *peers = outcomes
     growth = ours.rss_mb[-1] - ours.rss_mb[len(ours.rss_mb) // 3]
     more_ms = (frozen.tick_p99_ms or 0) - (ours.tick_p99_ms or 0)
     good = [
-        *(verdict(f"{one.name}: frames lost", one.lost, 0, "frames") for one in outcomes[:4]),
+        *(verdict(f"{one.name}: frames lost", one.lost, 0, "frames") for one in outcomes[:5]),
         verdict(f"{ours.name}: memory growth in the last two thirds", growth, 5, "MB"),
         verdict("frozen viewer: more at the 99th percentile of the tick", more_ms, 0.5, "ms"),
         *(
@@ -220,9 +221,9 @@ def main() -> None:
                 f"record two buses, {mine.name.removeprefix('undulog, ')}: time a frame",
                 [mine.frame_us], [other.frame_us],
                 f"{other.name} ({versions(*other.packages)})",
-                bar=0.7 if (mine, other.name) == (text, CANDUMP) else 1.0, unit="us",
+                bar=0.7 if mine is not ours and other.name == CANDUMP else 1.0, unit="us",
             )
-            for mine in (text, ours)
+            for mine in (text, alone, ours)
             for other in peers
         ),
     ]  # fmt: skip

@@ -9,6 +9,7 @@ the messages that the socket doesn't accept.
 from __future__ import annotations
 
 import os
+import select
 import socket
 import threading
 import time
@@ -41,7 +42,7 @@ from ..viewer import Viewer
 from .decode import LiveLog
 from .scene import LiveScene
 
-_INBOX_LOOK_S = 0.01
+_INBOX_LOOK_S = 0.1
 
 
 class Datagram(NamedTuple):
@@ -105,7 +106,7 @@ class Inbox(AbstractContextManager["Inbox"]):
             try:
                 data = self._socket.recv(MAX_DATAGRAM)
             except BlockingIOError:
-                self._ending.wait(_INBOX_LOOK_S)
+                select.select([self._socket], [], [], _INBOX_LOOK_S)
                 continue
             try:
                 head = read_head(data)
@@ -168,11 +169,12 @@ def _answers(path: Path) -> bool:
     return True
 
 
-BATCH_S = 0.03
+BATCH_S = 0.025
 """How often what has come is drawn [s]."""
 SILENCE_S = 10.0
 """A feed that is silent for so long has ended; a live one repeats its definitions [s]."""
 
+_REST_S = 0.01  # between two drawings, for the thread that reads
 _LAGS_KEPT = 100_000
 _FLUSH_S = 1.0
 _GRACE_S = 3.0
@@ -453,7 +455,9 @@ class _Painter(threading.Thread):
 
     def run(self) -> None:
         try:
-            while not self.stop.wait(BATCH_S):
+            due_s = time.monotonic() + BATCH_S
+            while not self.stop.wait(max(due_s - time.monotonic(), _REST_S)):
+                due_s = max(due_s, time.monotonic() - BATCH_S) + BATCH_S
                 self.relay.step()
             self.relay.step()
             self.relay.close()
