@@ -24,7 +24,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from measuring import HERE, HOUR_S, add_place, arguments, write_hour
+from measuring import HERE, HOUR_S, PEAK_MIB, add_place, arguments, write_hour
 from records import compared, verdict, versions
 
 MIB = 1 << 20
@@ -54,6 +54,16 @@ load(Path(sys.argv[1]), 1)
 """
 
 
+COMMAND = f"""
+import atexit, sys
+from pathlib import Path
+peak = Path(sys.argv.pop(1))
+atexit.register(lambda: peak.write_text(str({PEAK_MIB})))
+import undulog
+undulog.main()
+"""
+
+
 class Cost(NamedTuple):
     """Cost of a command.
 
@@ -71,13 +81,16 @@ class Cost(NamedTuple):
 def cost(*words: str) -> Cost:
     """Run ``undulog WORDS...`` and return its cost."""
     start = time.perf_counter()
-    child = subprocess.Popen([sys.executable, "-m", "undulog", *words], stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(child.pid, 0)
-    took = time.perf_counter() - start
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
-        raise SystemExit(f"undulog {' '.join(words)} failed with exit code {child.returncode}")
-    return Cost(took, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / MIB)
+    with tempfile.NamedTemporaryFile() as peak:
+        command = [sys.executable, "-c", COMMAND, peak.name, *words]
+        child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        _, status, usage = os.wait4(child.pid, 0)
+        took = time.perf_counter() - start
+        child.returncode = os.waitstatus_to_exitcode(status)
+        if child.returncode:
+            raise SystemExit(f"undulog {' '.join(words)} failed with exit code {child.returncode}")
+        peak_mib = float(Path(peak.name).read_text())
+    return Cost(took, usage.ru_utime + usage.ru_stime, peak_mib)
 
 
 def spent_s(program: str, *words: str) -> float:

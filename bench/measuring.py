@@ -16,6 +16,11 @@ from undulog.capture.robot.model import Robot
 
 HERE = Path(__file__).parent
 HOUR_S = 3600
+PEAK_MIB = 'int(open("/proc/self/status").read().partition("VmHWM:")[2].split()[0]) / 1024'
+"""Expression for a process's largest resident memory [MiB].
+
+Not ``ru_maxrss``, which in a child is at least what its parent had when it was started.
+"""
 TICKS_S = os.sysconf("SC_CLK_TCK")
 
 
