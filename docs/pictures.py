@@ -1,16 +1,20 @@
 """The pictures of README and manual, from what ``make demo`` left.
 
 ``python docs/pictures.py out/demo docs/images``: the replay's tabs as Rerun's viewer draws them off
-screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), the body's motion, and the
-report's first figure as a picture of its own that follows the reader's light or dark scheme. With
-``--quick`` one tab and a small clip, only to see that it runs.
+screen (needs a Vulkan driver; Debian: mesa-vulkan-drivers libvulkan1), the view of a recording that
+runs, the body's motion, and the report's first figure as a picture of its own that follows the
+reader's light or dark scheme. With ``--quick`` one tab and a small clip, only to see that it runs.
 """
 
 import argparse
 import io
 import re
+import signal
+import subprocess
 import sys
 import tempfile
+import time
+from contextlib import ExitStack
 from pathlib import Path
 
 from PIL import Image
@@ -19,6 +23,8 @@ import undulog
 from undulog.replay.viewer import HeadlessViewer
 
 SECONDS = 12.3
+SCENARIO = "weak-servo-pi3"
+LIVE_S = 13.0
 DEGREES = 90
 TITLE_BAR = 36
 """Height of the viewer's own title bar [pixels]; it warns of the software driver."""
@@ -63,6 +69,31 @@ def replay_picture(demo: Path, images: Path, tab: str) -> None:
         window_picture(recording, images / f"{TABS[tab]}.png", SECONDS, degrees=degrees)
 
 
+def _started(stack: ExitStack, *command: str | Path) -> subprocess.Popen[bytes]:
+    """Start a process that is ended with the stack."""
+    process = subprocess.Popen(command)  # noqa: S603  our own arguments
+    stack.callback(process.wait)
+    stack.callback(process.terminate)
+    stack.callback(process.send_signal, signal.SIGCONT)
+    return process
+
+
+def live_picture(target: Path) -> None:
+    """Draw the viewer beside a recorder of the twin that runs."""
+    with tempfile.TemporaryDirectory() as name, HeadlessViewer(SIZE) as viewer:
+        folder, command = Path(name), [sys.executable, "-m", "undulog"]
+        record = ["record", f"twin:{SCENARIO}", "-o", folder / "run.mcap", "--duration", "60s"]
+        record += ["--socket", folder / "run.sock", "--quiet"]
+        view = ["view", "--live", folder / "run.live", "--connect", viewer.address]
+        with ExitStack() as stack:
+            relay, _ = (_started(stack, *command, *words) for words in (view, record))
+            time.sleep(LIVE_S + 4.0)  # with its start
+            viewer.seek(LIVE_S)
+            relay.send_signal(signal.SIGSTOP)  # a picture is taken when nothing moves
+            picture = Image.open(io.BytesIO(viewer.picture())).convert("RGB")
+    picture.crop((0, TITLE_BAR, *picture.size)).save(target, optimize=True)
+
+
 def clip(demo: Path, target: Path, *size: str) -> None:
     """Write the body's motion over one period."""
     words = [demo / "session.mcap", "--clip", target, *CLIP, *size, "--force"]
@@ -100,6 +131,8 @@ def main() -> None:
     images.mkdir(parents=True, exist_ok=True)
     for tab in list(TABS)[-1:] if options.quick else TABS:
         replay_picture(options.demo, images, tab)
+    if not options.quick:
+        live_picture(images / "live.png")
     clip(options.demo, images / "clip.gif", *(QUICK if options.quick else SMALL))
     response_picture(options.demo / "report.html", images / "response.svg")
     for path in sorted(images.iterdir()):

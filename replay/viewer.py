@@ -277,6 +277,11 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         """End it; safe to call twice."""
         self._viewer.close()
 
+    @property
+    def address(self) -> str:
+        """Where recordings can be sent to."""
+        return self._viewer.address
+
     def open(self, recording: Path, seconds: float) -> None:
         """Show a recording in its own layout, standing still, instead of what was shown before.
 

@@ -1,10 +1,10 @@
 """The one colour map along the body: a joint keeps its colour in report, docs and Rerun.
 
 The map is a curve in OKLab (Ottosson 2020, https://bottosson.github.io/posts/oklab/) from blue
-at the head over green to amber at the tail, sampled at equal steps of arc length, so neighbours
+at the head over green to orange at the tail, sampled at equal steps of arc length, so neighbours
 differ equally everywhere. Lightness rises all the way, so the order survives colour blindness
-and grey print, and stays between 0.53 and 0.77, so it reads on white and on black. Maps of values
-share the ends of their scale.
+and grey print, and stays between 0.48 and 0.67, so that each colour has a contrast of 3 to white
+and to black (WCAG 2.2, success criterion 1.4.11). Maps of values share the ends of their scale.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from .arrays import FloatArray, frozen
 
-# Control points of a quadratic Bezier curve in OKLab (lightness, a, b): blue, green, amber.
-_CURVE = np.array([[0.53, -0.02, -0.18], [0.64, -0.20, 0.02], [0.77, 0.07, 0.16]])
+# Control points of a quadratic Bezier curve in OKLab (lightness, a, b): blue, green, orange.
+_CURVE = np.array([[0.483, 0.02, -0.15], [0.603, -0.217, -0.01], [0.671, 0.09, 0.136]])
 
 # OKLab -> cube roots of cone responses -> linear sRGB (Ottosson 2020).
 _LAB_TO_CONE = np.array(

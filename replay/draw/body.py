@@ -290,7 +290,7 @@ def rounded_to(values: FloatArray, step: float) -> NDArray[np.float32]:
 def body_title(content: Content) -> str:
     """Return the name of the body's view, which is also the legend of its colours."""
     if content.power_limit_w is None:
-        return "Body, blue head to amber tail"
+        return "Body, blue head to orange tail"
     if content.live:  # the scale may still grow
         return "Body: vermilion drives, cyan is driven"
     limit = content.power_limit_w

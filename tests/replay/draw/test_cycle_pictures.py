@@ -45,16 +45,16 @@ def test_the_mean_cycle_moves_on_its_own_timeline_only(tabs, show, rgb):
     viewer = show(tabs["mean-cycle"], 12.3)
     color = joint_colors(25)[24, :3].astype(int)
 
-    def amber():
+    def of_the_tail():
         picture = rgb(viewer.picture("Mean angle [°]"))[:, 160:]  # beside the legend
         return int((np.abs(picture - color).max(axis=-1) <= 26).sum())
 
-    assert amber() == 0
+    assert of_the_tail() == 0
     pictures = []
     for degrees in (0, 180, 360):
         viewer.seek_phase(degrees)
         pictures.append(rgb(viewer.picture("Mean cycle: body")))
-    assert amber() > 300
+    assert of_the_tail() > 300
     still, half, again = pictures
     assert (np.abs(still - half).max(axis=-1) > 40).sum() > 3000
     assert (np.abs(still - again).max(axis=-1) > 40).sum() == 0
