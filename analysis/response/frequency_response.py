@@ -15,6 +15,7 @@ from scipy.special import fdtri, stdtrit
 
 from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
 from undulog.capture.common.console import Warn
+from undulog.capture.common.process import in_threads
 
 from ..estimators.series import Series
 from ..results.estimate import Estimate, Interval
@@ -108,9 +109,11 @@ def excited_bins(spectrum: FloatArray) -> IntArray:
 
 def _period(values: FloatArray) -> int | None:
     """Return the period in samples, where the command repeats at least twice."""
+    from scipy.fft import next_fast_len
+
     n = values.size
-    padded = np.fft.rfft(values, 2 * n)
-    correlation = np.fft.irfft(np.abs(padded) ** 2)[:n]
+    size = next_fast_len(2 * n, real=True)
+    correlation = np.fft.irfft(np.abs(np.fft.rfft(values, size)) ** 2, size)[:n]
     energy = np.concatenate([[0.0], np.cumsum(values**2)])
     lags = np.arange(1, n // 2 + 1)
     # sum (u(t + L) - u(t))^2 over its mean square, by lag L.
@@ -177,8 +180,8 @@ def frequency_responses(
     if next(answered, None) is not None:
         warn(f"frequency responses are those of the first {MOST_JOINTS} joints that are driven")
     sharing = _same_commands({name: commands[name] for name in known})
-    results = list[JointFrequencyResponse]()
-    for name in known:
+
+    def of_joint(name: str) -> JointFrequencyResponse | None:
         external = (references or {}).get(name)
         if external is not None and not (external.count and np.ptp(external.values) > 0):
             external = None
@@ -186,10 +189,12 @@ def frequency_responses(
         command, response, *reference = _unbroken(known_series)
         excitation = find_excitation((reference or [command])[0])
         lines = None if excitation is None else estimate(command, response, excitation, *reference)
-        if excitation is not None and lines is not None and lines.frequency_hz.size:
-            result = _result(excitation, sharing[name], lines, [command, response, *reference])
-            results.append(result)
-    return tuple(results)
+        if excitation is None or lines is None or not lines.frequency_hz.size:
+            return None
+        return _result(excitation, sharing[name], lines, [command, response, *reference])
+
+    samples = sum(commands[name].count + responses[name].count for name in known)
+    return tuple(one for one in in_threads(of_joint, known, samples) if one is not None)
 
 
 def estimate(

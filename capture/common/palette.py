@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .arrays import FloatArray, frozen
 
 # Control points of a quadratic Bezier curve in OKLab (lightness, a, b): blue, green, orange.
-_CURVE = np.array([[0.483, 0.02, -0.15], [0.603, -0.217, -0.01], [0.671, 0.09, 0.136]])
+_CURVE = np.array([[0.483, 0.022, -0.15], [0.603, -0.218, -0.009], [0.671, 0.089, 0.139]])
 
 # OKLab -> cube roots of cone responses -> linear sRGB (Ottosson 2020).
 _LAB_TO_CONE = np.array(

@@ -9,7 +9,6 @@ the messages that the socket doesn't accept.
 from __future__ import annotations
 
 import os
-import select
 import socket
 import threading
 import time
@@ -42,7 +41,7 @@ from ..viewer import Viewer
 from .decode import LiveLog
 from .scene import LiveScene
 
-_INBOX_LOOK_S = 0.1
+_INBOX_LOOK_S = 0.005
 
 
 class Datagram(NamedTuple):
@@ -106,7 +105,7 @@ class Inbox(AbstractContextManager["Inbox"]):
             try:
                 data = self._socket.recv(MAX_DATAGRAM)
             except BlockingIOError:
-                select.select([self._socket], [], [], _INBOX_LOOK_S)
+                self._ending.wait(_INBOX_LOOK_S)  # to wake who waits costs the one who sends
                 continue
             try:
                 head = read_head(data)
