@@ -156,7 +156,7 @@ def main(handle: int, folder: str) -> None:
             answer = error
         try:
             connection.send_bytes(pickle.dumps(answer))
-        except OSError:  # nobody waits for it: the receiver ends this process
+        except ConnectionError:  # nobody waits for it: the receiver ends this process
             receiver.join()
 
 
