@@ -4,9 +4,9 @@
 ``undulog record`` over AF_UNIX and over loopback socketcand, one bus decoded; the latter also with
 frames alone, as the others write them; the same socketcand buses into python-can's Logger (BLF and
 candump) and into mcap-ros2-support; a burst of 500,000 frames/s; and a live view that is frozen all
-the time. Senders are paced by the clock and wait for nobody: what
-the socket refuses and what is sent more than 20 ms late counts as lost. In the end the same beside
-busy loops and a busy disk (``bench/contention.py``).
+the time. Senders are paced by the clock and wait for nobody: what the socket refuses and what is
+sent more than 20 ms late counts as lost. In the end the same beside busy loops and a busy disk
+(``bench/contention.py``).
 """
 
 from __future__ import annotations

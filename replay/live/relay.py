@@ -454,9 +454,9 @@ class _Painter(threading.Thread):
 
     def run(self) -> None:
         try:
-            due_s = time.monotonic() + BATCH_S
+            due_s = time.monotonic()
             while not self.stop.wait(max(due_s - time.monotonic(), _REST_S)):
-                due_s = max(due_s, time.monotonic() - BATCH_S) + BATCH_S
+                due_s = time.monotonic() + BATCH_S
                 self.relay.step()
             self.relay.step()
             self.relay.close()
