@@ -5,7 +5,7 @@ A command is one of sines, a periodic multisine, a sweep, steps, or a band of no
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import islice
@@ -13,7 +13,7 @@ from itertools import islice
 import numpy as np
 from scipy.special import fdtri, stdtrit
 
-from undulog.capture.common.arrays import ComplexArray, FloatArray, IntArray
+from undulog.capture.common.arrays import FloatArray, IntArray
 from undulog.capture.common.console import Warn
 from undulog.capture.common.process import in_threads
 
@@ -23,7 +23,9 @@ from ..results.frequency_response import DIRECT, INDIRECT, JointFrequencyRespons
 from .delay_model import DelayModel, fit_delay
 from .nonparametric import (
     LineResponse,
+    even_samples,
     excited_lines,
+    fast_length,
     find_tones,
     indirect_response,
     line_power,
@@ -80,9 +82,9 @@ def find_excitation(command: Series) -> Excitation | None:
     """
     if command.count < LEAST_SAMPLES or np.ptp(command.values) == 0:
         return None
-    t_s = np.arange(command.t_s[0], command.t_s[-1], command.period_s)
-    values = resampled(command, t_s) - np.mean(command.values)
-    tones = find_tones(command)
+    even = even_samples(command)
+    values = even - np.mean(command.values)
+    tones = find_tones(command, even)
     repeated = _period(values) if tones is None or tones.size > 1 else None
     period_s = float("nan") if repeated is None else repeated * command.period_s
     if repeated is not None:
@@ -154,6 +156,7 @@ _HIGHEST = 0.25  # of the sampling rate: beyond it splines are not exact
 _HALF_POWER = 1 / np.sqrt(2)
 _ROUNDING = 1e-9  # of a gain
 _LONG_GAP = 0.01  # of the record
+_SPARE = 16  # samples beyond the parameters of the tones
 _COMPARED = 4096  # samples by which commands are compared
 
 
@@ -188,10 +191,19 @@ def frequency_responses(
         known_series = [commands[name], responses[name], *([] if external is None else [external])]
         command, response, *reference = _unbroken(known_series)
         excitation = find_excitation((reference or [command])[0])
-        lines = None if excitation is None else estimate(command, response, excitation, *reference)
-        if excitation is None or lines is None or not lines.frequency_hz.size:
+        if excitation is None:
             return None
-        return _result(excitation, sharing[name], lines, [command, response, *reference])
+        estimates = _estimates([command, response, *reference], excitation)
+        lines = next(estimates)
+        if lines is None or not lines.frequency_hz.size:
+            return None
+        return replace(
+            joint_response(response.name, str(excitation.kind), sharing[name], lines),
+            distortion=None if reference else _distortion(command, response, excitation),
+            # The halves of a chirp excite different bands.
+            halves_agree=None if excitation.kind is Kind.CHIRP else _agreement(*estimates),
+            method=INDIRECT if reference else DIRECT,
+        )
 
     samples = sum(commands[name].count + responses[name].count for name in known)
     return tuple(one for one in in_threads(of_joint, known, samples) if one is not None)
@@ -210,29 +222,65 @@ def estimate(
         At the tones, or at up to :data:`LINES` frequencies of the excited band; None where the
         record is too short.
     """
-    if response.count <= 2 * excitation.tones_hz.size + 16:
+    known = [command, response, *([] if reference is None else [reference])]
+    return next(_estimates(known, excitation))
+
+
+def _estimates(series: Sequence[Series], excitation: Excitation) -> Iterator[LineResponse | None]:
+    """Estimate the response of the whole record, of its first and of its second half.
+
+    Args:
+        series: Command, response and, if any, external reference.
+    """
+    start, stop = series[0].t_s[0], series[0].t_s[-1]
+    tones = excitation.tones_hz
+    if tones.size:
+        middle = (start + stop) / 2
+        for limits in (start, stop), (start, middle), (middle, stop):
+            command, response, *reference = (one.between(*limits) for one in series)
+            enough = response.count > 2 * tones.size + _SPARE
+            yield (
+                sound_lines(tone_response(command, response, tones, looped=bool(reference)))
+                if enough
+                else None
+            )
+        return
+    if min(one.count for one in series) <= _SPARE:
+        yield from (None, None, None)
+        return
+    step = max(one.period_s for one in series)
+    t_s = np.arange(start, stop, step)
+    even = [resampled(one, t_s) for one in series]
+    half = t_s.size // 2
+    for part in slice(None), slice(half), slice(half, None):
+        yield _of_band([one[part] for one in even], step)
+
+
+def _of_band(even: Sequence[FloatArray], step: float) -> LineResponse | None:
+    """Estimate a response at up to :data:`LINES` frequencies of the excited band.
+
+    Args:
+        even: Command, response and, if any, external reference, each of shape (n,).
+        step: Their sampling interval [s].
+    """
+    if even[0].size <= _SPARE:
         return None
-    if excitation.tones_hz.size:
-        tones = excitation.tones_hz
-        return sound_lines(tone_response(command, response, tones, looped=reference is not None))
-    driving = command if reference is None else reference
-    step = max(command.period_s, response.period_s, driving.period_s)
-    t_s = np.arange(command.t_s[0], command.t_s[-1], step)
-    u, y = (_spectrum(resampled(one, t_s)) for one in (command, response))
-    r = u if reference is None else _spectrum(resampled(reference, t_s))
+    size = fast_length(even[0].size)
+    # Without the mean; a straight line taken off would leak unlike the rest.
+    u, y, *reference = (np.fft.rfft(one[:size] - one[:size].mean()) for one in even)
     half = window(1, freedom=_FREEDOM)
-    bins = excited_bins(np.abs(r) ** 2)
+    bins = excited_bins(np.abs((reference or [u])[0]) ** 2)
     bins = bins[(bins > half // 2) & (bins < 2 * _HIGHEST * u.size)]
     if u.size <= 4 * half or not bins.size:
         return None
     wanted = _log_spaced(float(bins[0]), float(bins[-1]), LINES)
     chosen = np.array(sorted({int(bins[np.abs(bins - each).argmin()]) for each in wanted}))
-    if reference is None:
+    if reference:
+        value, variance, freedom = indirect_response(y, u, reference[0], chosen, half)
+    else:
         found = local_response(y, u[None], chosen, half)
         value, variance, freedom = found.value[:, 0], found.variance[:, 0], found.freedom
-    else:
-        value, variance, freedom = indirect_response(y, u, r, chosen, half)
-    frequency = chosen / (t_s.size * step)
+    frequency = chosen / (size * step)
     return sound_lines(
         LineResponse(frequency, value, variance, np.full(chosen.size, float(freedom)))
     )
@@ -250,11 +298,6 @@ def sound_lines(lines: LineResponse) -> LineResponse:
 
 def _log_spaced(low: float, high: float, count: int) -> FloatArray:
     return np.asarray(np.geomspace(low, high, count), dtype=np.float64)
-
-
-def _spectrum(values: FloatArray) -> ComplexArray:
-    """Return the DFT without the mean; a straight line taken off would leak unlike the rest."""
-    return np.fft.rfft(values - values.mean())
 
 
 def _unbroken(series: Sequence[Series]) -> list[Series]:
@@ -291,22 +334,6 @@ def _same_commands(commands: Mapping[str, Series]) -> dict[str, tuple[str, ...]]
         )
         for i, name in enumerate(names)
     }
-
-
-def _result(
-    excitation: Excitation,
-    sharing: tuple[str, ...],
-    lines: LineResponse,
-    series: Sequence[Series],
-) -> JointFrequencyResponse:
-    """Return the result of one joint from command, response and, if any, external reference."""
-    command, response, *reference = series
-    return replace(
-        joint_response(response.name, str(excitation.kind), sharing, lines),
-        distortion=None if reference else _distortion(command, response, excitation),
-        halves_agree=_halves(series, excitation),
-        method=INDIRECT if reference else DIRECT,
-    )
 
 
 def joint_response(
@@ -386,7 +413,8 @@ def _distortion(command: Series, response: Series, excitation: Excitation) -> fl
     """
     if not excitation.period_s > 0:
         return None
-    length = round(excitation.period_s / max(command.period_s, response.period_s))
+    samples = round(excitation.period_s / max(command.period_s, response.period_s))
+    length = fast_length(samples)
     step = excitation.period_s / length
     periods = int((command.t_s[-1] - command.t_s[0]) / excitation.period_s)
     if periods < LEAST_PERIODS:
@@ -404,16 +432,8 @@ def _distortion(command: Series, response: Series, excitation: Excitation) -> fl
     return max(share, 0.0) ** 0.5
 
 
-def _halves(series: Sequence[Series], excitation: Excitation) -> tuple[int, int] | None:
+def _agreement(first: LineResponse | None, second: LineResponse | None) -> tuple[int, int] | None:
     """Compare the two halves of a record, at the lines that both have."""
-    if excitation.kind is Kind.CHIRP:
-        return None  # the halves excite different bands
-    start, stop = series[0].t_s[0], series[0].t_s[-1]
-    halves: list[LineResponse | None] = []
-    for limits in (start, (start + stop) / 2), ((start + stop) / 2, stop):
-        command, response, *reference = [one.between(*limits) for one in series]
-        halves.append(estimate(command, response, excitation, *reference))
-    first, second = halves
     if first is None or second is None:
         return None
     if first.frequency_hz.size != second.frequency_hz.size:

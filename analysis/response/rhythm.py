@@ -172,7 +172,9 @@ def _refined(scouts: Sequence[Series], series: Sequence[Series], omega: float) -
     if any(one.count <= model.size + 1 for one in series):
         return None
     try:
-        fit = fit_at(series, fit_shared(scouts, omega, model).omega, model)
+        fit = fit_shared(scouts, omega, model)
+        if len(series) > 1:
+            fit = fit_at(series, fit.omega, model)
     except DataError:
         return None
     return Rhythm(tuple(one.name for one in series), fit)
@@ -184,6 +186,8 @@ def _periodogram_peak(scouts: Sequence[Series], duration_s: float) -> float | No
     Only a starting point: the channels are interpolated to an even grid and tapered, and the
     Gauss-Newton fit does the rest on the true times.
     """
+    from scipy.fft import next_fast_len
+
     step = max(one.period_s for one in scouts)
     start = max(one.t_s[0] for one in scouts)
     stop = min(one.t_s[-1] for one in scouts)
@@ -191,7 +195,7 @@ def _periodogram_peak(scouts: Sequence[Series], duration_s: float) -> float | No
     if not 16 <= count <= _SPARSEST * max(one.count for one in scouts):
         return None
     grid = start + step * np.arange(count)
-    length = 1 << int(np.ceil(np.log2(_PADDING * count)))
+    length = next_fast_len(_PADDING * count, real=True)
     power = np.zeros(length // 2 + 1)
     taper = np.hanning(count)
     for one in scouts:
