@@ -11,6 +11,7 @@ from enum import StrEnum
 from itertools import islice
 
 import numpy as np
+from scipy.fft import next_fast_len
 from scipy.special import fdtri, stdtrit
 
 from undulog.capture.common.arrays import FloatArray, IntArray
@@ -23,9 +24,8 @@ from ..results.frequency_response import DIRECT, INDIRECT, JointFrequencyRespons
 from .delay_model import DelayModel, fit_delay
 from .nonparametric import (
     LineResponse,
-    even_samples,
+    even_times,
     excited_lines,
-    fast_length,
     find_tones,
     indirect_response,
     line_power,
@@ -38,6 +38,9 @@ from .nonparametric import (
 LEAST_SAMPLES = 128
 REPEATED = 1e-3
 """Two periods are one if they differ by less than this share of the variance."""
+
+_LIKELY = 10 * REPEATED  # by the parabola
+_MOST_TRIED = 16
 
 LEVELS = 8
 """A command with at most so many values is one of steps."""
@@ -82,11 +85,12 @@ def find_excitation(command: Series) -> Excitation | None:
     """
     if command.count < LEAST_SAMPLES or np.ptp(command.values) == 0:
         return None
-    even = even_samples(command)
+    t_s, step = even_times(command.t_s[0], command.t_s[-1], command.period_s)
+    even = resampled(command, t_s)
     values = even - np.mean(command.values)
     tones = find_tones(command, even)
     repeated = _period(values) if tones is None or tones.size > 1 else None
-    period_s = float("nan") if repeated is None else repeated * command.period_s
+    period_s = float("nan") if repeated is None else repeated * step
     if repeated is not None:
         kind = Kind.PERIODIC
     elif tones is not None:
@@ -109,25 +113,44 @@ def excited_bins(spectrum: FloatArray) -> IntArray:
     return np.flatnonzero(smooth > _POWER * smooth.max())
 
 
-def _period(values: FloatArray) -> int | None:
+def _period(values: FloatArray) -> float | None:
     """Return the period in samples, where the command repeats at least twice."""
-    from scipy.fft import next_fast_len
-
     n = values.size
     size = next_fast_len(2 * n, real=True)
     correlation = np.fft.irfft(np.abs(np.fft.rfft(values, size)) ** 2, size)[:n]
     energy = np.concatenate([[0.0], np.cumsum(values**2)])
-    lags = np.arange(1, n // 2 + 1)
+    lags = np.arange(1, n // 2 + 2)
     # sum (u(t + L) - u(t))^2 over its mean square, by lag L.
     both = energy[n] - energy[lags] + energy[n - lags]
     differ = (both - 2 * correlation[lags]) / np.maximum(both, np.finfo(float).tiny)
-    good = np.flatnonzero(differ < REPEATED)
-    # The first run of small lags is smoothness, not repetition.
-    far = good[good > np.argmax(differ > 0.5)] if (differ > 0.5).any() else good[:0]
-    if not far.size:
+    if not (differ > 0.5).any():
         return None
-    run = far[: np.argmax(np.diff(far, append=far[-1] + 2) > 1) + 1]
-    return int(lags[run[np.argmin(differ[run])]])
+    # The first small lags are smoothness, not repetition.
+    least = _minima(differ, int(np.argmax(differ > 0.5)))
+    before, at, after = differ[least - 1], differ[least], differ[least + 1]
+    # Near the period the difference is a parabola: its vertex lies between two samples.
+    bend = np.maximum(before - 2 * at + after, np.finfo(float).tiny)
+    beside = np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+    likely = np.flatnonzero(at - 0.25 * (before - after) * beside < _LIKELY)[:_MOST_TRIED]
+    for lag, known in zip((lags[least] + beside)[likely], at[likely], strict=True):
+        if known < REPEATED or _differ(values, lag) < REPEATED:
+            return float(lag)
+    return None
+
+
+def _minima(values: FloatArray, first: int) -> IntArray:
+    """Return the local minima behind an index, without both ends."""
+    inner = values[1:-1]
+    found = 1 + np.flatnonzero((inner <= values[:-2]) & (inner <= values[2:]))
+    return found[found > first]
+
+
+def _differ(values: FloatArray, lag: float) -> float:
+    """Return sum (u(t + L) - u(t))^2 over its mean square, for a lag between two samples."""
+    at = np.arange(values.size, dtype=np.float64)
+    shared = int(values.size - 1 - lag)
+    later, now = resampled(Series("u", at, values), at[:shared] + lag), values[:shared]
+    return float(np.sum((later - now) ** 2) / np.sum(later**2 + now**2))
 
 
 def _is_chirp(values: FloatArray) -> bool:
@@ -248,8 +271,7 @@ def _estimates(series: Sequence[Series], excitation: Excitation) -> Iterator[Lin
     if min(one.count for one in series) <= _SPARE:
         yield from (None, None, None)
         return
-    step = max(one.period_s for one in series)
-    t_s = np.arange(start, stop, step)
+    t_s, step = even_times(start, stop, max(one.period_s for one in series))
     even = [resampled(one, t_s) for one in series]
     half = t_s.size // 2
     for part in slice(None), slice(half), slice(half, None):
@@ -265,9 +287,8 @@ def _of_band(even: Sequence[FloatArray], step: float) -> LineResponse | None:
     """
     if even[0].size <= _SPARE:
         return None
-    size = fast_length(even[0].size)
     # Without the mean; a straight line taken off would leak unlike the rest.
-    u, y, *reference = (np.fft.rfft(one[:size] - one[:size].mean()) for one in even)
+    u, y, *reference = (np.fft.rfft(one - one.mean()) for one in even)
     half = window(1, freedom=_FREEDOM)
     bins = excited_bins(np.abs((reference or [u])[0]) ** 2)
     bins = bins[(bins > half // 2) & (bins < 2 * _HIGHEST * u.size)]
@@ -280,7 +301,7 @@ def _of_band(even: Sequence[FloatArray], step: float) -> LineResponse | None:
     else:
         found = local_response(y, u[None], chosen, half)
         value, variance, freedom = found.value[:, 0], found.variance[:, 0], found.freedom
-    frequency = chosen / (size * step)
+    frequency = chosen / (even[0].size * step)
     return sound_lines(
         LineResponse(frequency, value, variance, np.full(chosen.size, float(freedom)))
     )
@@ -413,8 +434,7 @@ def _distortion(command: Series, response: Series, excitation: Excitation) -> fl
     """
     if not excitation.period_s > 0:
         return None
-    samples = round(excitation.period_s / max(command.period_s, response.period_s))
-    length = fast_length(samples)
+    length = round(excitation.period_s / max(command.period_s, response.period_s))
     step = excitation.period_s / length
     periods = int((command.t_s[-1] - command.t_s[0]) / excitation.period_s)
     if periods < LEAST_PERIODS:

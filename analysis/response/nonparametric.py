@@ -37,9 +37,11 @@ ed. 2012, 2.6.4). With the errors e of both, that of G is (e_y - G e_u) / G_ur t
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.fft import next_fast_len
 from scipy.special import fdtri
 
 from undulog.capture.common.arrays import BoolArray, ComplexArray, FloatArray, IntArray
@@ -110,19 +112,22 @@ def resampled(series: Series, t_s: FloatArray) -> FloatArray:
     return np.asarray(CubicSpline(series.t_s, series.values)(t_s), dtype=np.float64)
 
 
-def fast_length(count: int) -> int:
-    """Return the largest length up to ``count`` that a fast Fourier transform takes whole.
+def even_times(start: float, stop: float, step: float) -> tuple[FloatArray, float]:
+    """Return even times over a stretch, whose fast Fourier transforms take little time.
 
-    A length with a large prime factor takes ten times as long.
+    A number of samples with a large prime factor takes ten times as long. Cutting the stretch
+    instead would add leakage to a command that begins and ends at rest.
+
+    Args:
+        step: Longest distance [s].
+
+    Returns:
+        Times [s] from ``start`` on, shape (n,), n even; their distance [s], the stretch's length
+        over n.
     """
-    from scipy.fft import prev_fast_len
-
-    return prev_fast_len(count)
-
-
-def even_samples(series: Series) -> FloatArray:
-    """Return a series at even steps of its sampling interval, shape (n,)."""
-    return resampled(series, np.arange(series.t_s[0], series.t_s[-1], series.period_s))
+    count = 2 * next_fast_len(math.ceil((stop - start) / step / 2))
+    distance = (stop - start) / count
+    return _float(start + distance * np.arange(count)), distance
 
 
 def find_tones(command: Series, even: FloatArray) -> FloatArray | None:
@@ -130,11 +135,10 @@ def find_tones(command: Series, even: FloatArray) -> FloatArray | None:
 
     Args:
         command: At least 32 samples.
-        even: The same, from :func:`even_samples`.
+        even: The same at :func:`even_times` of all its stretch.
     """
-    values = even[: fast_length(even.size)]
-    place = np.linspace(-1.0, 1.0, values.size)
-    values = values - values.mean()
+    place = np.linspace(-1.0, 1.0, even.size)
+    values = even - even.mean()
     values -= place * (place @ values) / (place @ place)
     if not values.any():
         return None
@@ -147,7 +151,7 @@ def find_tones(command: Series, even: FloatArray) -> FloatArray | None:
         return None
     if not 0 < peaks.size <= MOST_TONES or (np.diff(peaks) < SEPARATION).any():
         return None
-    found = peaks / (values.size * command.period_s)
+    found = peaks / (command.t_s[-1] - command.t_s[0])
     for _ in range(_STEPS):
         found = found + _step(command, found)
     residual = command.values - _fitted(command, found)

@@ -186,8 +186,6 @@ def _periodogram_peak(scouts: Sequence[Series], duration_s: float) -> float | No
     Only a starting point: the channels are interpolated to an even grid and tapered, and the
     Gauss-Newton fit does the rest on the true times.
     """
-    from scipy.fft import next_fast_len
-
     step = max(one.period_s for one in scouts)
     start = max(one.t_s[0] for one in scouts)
     stop = min(one.t_s[-1] for one in scouts)
@@ -195,7 +193,7 @@ def _periodogram_peak(scouts: Sequence[Series], duration_s: float) -> float | No
     if not 16 <= count <= _SPARSEST * max(one.count for one in scouts):
         return None
     grid = start + step * np.arange(count)
-    length = next_fast_len(_PADDING * count, real=True)
+    length = 1 << int(np.ceil(np.log2(_PADDING * count)))
     power = np.zeros(length // 2 + 1)
     taper = np.hanning(count)
     for one in scouts:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
 from undulog.capture import SessionView
 from undulog.capture.common.console import Warn
@@ -18,7 +18,7 @@ from undulog.capture.robot.model import Robot
 from ..body.free_motion import MotionFit, free_motion
 from ..body.ground_contact import ground_contact
 from ..body.motion import body_motion
-from ..body.shape import body_shape
+from ..body.shape import MeasuredShape, body_shape
 from ..dead_band.find import dead_bands
 from ..energy import (
     check_ledger,
@@ -39,6 +39,7 @@ from ..results.analysis import (
     SessionFacts,
 )
 from ..results.answer import KINDS, Artefact, Note, Remarks, flags_by_joint
+from ..results.body import BodyResult, GroundContact
 from ..results.estimate import Provenance
 from ..results.frequency_response import FreeMotion
 from ..segments.answer import Facts, compose
@@ -50,7 +51,7 @@ from ..segments.session import (
     unrefuted,
 )
 from ..signals.artefacts import find_artefacts
-from ..signals.columns import drag_ratio, read_columns
+from ..signals.columns import Columns, drag_ratio, read_columns
 from ..signals.stretch import (
     Options,
     SharedTimes,
@@ -131,13 +132,19 @@ def analyse_session(session: SessionView, options: Options | None = None) -> Ana
 
 
 def measure_session(
-    session: SessionView, options: Options | None = None, *, with_dead_bands: bool = True
+    session: SessionView,
+    options: Options | None = None,
+    *,
+    with_dead_bands: bool = True,
+    with_body: bool = True,
 ) -> SessionMeasurement:
     """Analyse one session, and keep the intermediate data.
 
     Args:
         with_dead_bands: Whether to fit them, which takes a third of the time of a short session
             and changes nothing else.
+        with_body: Whether to measure the body's motion, shape and ground contact, which takes two
+            fifths of the time of a long session and changes nothing else.
 
     Raises:
         MissingChannelError: If the session has neither commands nor responses.
@@ -218,7 +225,11 @@ def measure_session(
     )
     session.forget()
     over_time = response_over_time(session, columns, artefacts, warn)
-    body = body_motion(session, sound, gait, span, warn)
+    body = (
+        _body(session, columns, responses, sound, gait, span=span, warn=warn)
+        if with_body or not columns.command  # a motion without commands is known by the body's
+        else _NO_BODY
+    )
     heterogeneity = heterogeneity_indices(session.robot, gait, joints, energies, warn)
     commanded = columns.commanded()
     findings = compare_joints(
@@ -229,7 +240,6 @@ def measure_session(
         commanded=commanded,
         offsets=follows.offsets,
     )
-    shape = body_shape(session, responses, sound, gait, span=span, warn=warn)
     analysis = Analysis(
         session=SessionFacts(
             id=session.session_id,
@@ -241,12 +251,14 @@ def measure_session(
         ),
         gait=gait_facts(session, gait, span, stretch),
         joints=joints,
-        body=body,
-        body_shape=shape.shape,
-        ground_contact=ground_contact(session, columns, sound, span=span, warn=warn),
+        body=body.motion,
+        body_shape=body.measured.shape,
+        ground_contact=body.contact,
         heterogeneity=heterogeneity,
         coupling=coupling_of_one_gait(0 if gait is None else len(gait.all_answered)),
-        free_motion=None if columns.command else _free_motion(session.robot, shape.motion, warn),
+        free_motion=None
+        if columns.command
+        else _free_motion(session.robot, body.measured.motion, warn),
         closed_loop=closed_loop(session, options, swept, warn),
         warnings=warn.warnings(session.warnings),
         provenance=_provenance(session, options),
@@ -271,8 +283,37 @@ def measure_session(
     analysis = dataclasses.replace(analysis, answer=compose(facts))
     return SessionMeasurement(
         *(analysis, gait, sound, energies, span, follows.offsets),
-        motion=None if columns.command else shape.motion,
-        cycle=shape.cycle,
+        motion=None if columns.command else body.measured.motion,
+        cycle=body.measured.cycle,
+    )
+
+
+@dataclass(frozen=True)
+class _Body:
+    """What is measured of the whole body."""
+
+    motion: BodyResult | None
+    measured: MeasuredShape
+    contact: GroundContact | None
+
+
+_NO_BODY = _Body(None, MeasuredShape(), None)
+
+
+def _body(
+    session: SessionView,
+    columns: Columns,
+    responses: Mapping[str, Series],
+    sound: Mapping[str, Series],
+    gait: GaitFit | None,
+    *,
+    span: Span,
+    warn: Warn,
+) -> _Body:
+    return _Body(
+        motion=body_motion(session, sound, gait, span, warn),
+        measured=body_shape(session, responses, sound, gait, span=span, warn=warn),
+        contact=ground_contact(session, columns, sound, span=span, warn=warn),
     )
 
 

@@ -142,15 +142,16 @@ def _convert(
     topics: JointTopicOptions,
     robot: str | None,
 ) -> tuple[Recording, float]:
-    from undulog.analysis.signals.stretch import Options
-
-    from ..numbers import saved
-
-    command, response = topics.names
-    options = Options(command_topic=command, response_topic=response)
     folder = output.parent  # on a disk, so that an hour's columns need not be in memory
     with ExitStack() as stack:
         session = stack.enter_context(capture.Session.open(file, column_folder=folder, robot=robot))
+        # Here, not above: a file that can't be opened is reported at once.
+        from undulog.analysis.signals.stretch import Options
+
+        from ..numbers import saved
+
+        command, response = topics.names
+        options = Options(command_topic=command, response_topic=response)
         bar = stack.enter_context(progress("view", total=2))
         bar.update(0, note="results" if single.result else "analysis")
         layer = saved(session, single.result or (), options)

@@ -12,7 +12,12 @@ from support.paths import SHARED, TRACE
 from support.written_sessions import EPOCH_NS
 from undulog.analysis import analyse_session
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.response.frequency_response import estimate, excited_bins, find_excitation
+from undulog.analysis.response.frequency_response import (
+    estimate,
+    excited_bins,
+    find_excitation,
+    frequency_responses,
+)
 from undulog.analysis.response.nonparametric import resampled, window
 from undulog.analysis.signals.stretch import Options
 from undulog.capture import Session, SessionWriter
@@ -231,3 +236,21 @@ def test_a_servo_of_a_snake_follows_with_the_lag_of_its_ramp(tmp_path, command):
     # Fitted in the time domain: position = 1.000 command(t - 7.4 ms) + offset.
     assert found.gain_ci95[0][0] <= 1.0 <= found.gain_ci95[0][1]
     assert found.delay_s.ci95[0] <= 7.4e-3 <= found.delay_s.ci95[1]
+
+
+@pytest.mark.parametrize("planted", [0.0, 0.01])
+def test_distortion_of_a_period_between_two_samples_is_that_which_was_planted(planted):
+    """Odd lines are excited; one even line [rad] holds all that is nonlinear."""
+    rng, period_s = np.random.default_rng(5), 7.8937
+    t = np.arange(0.0, 5.4 * period_s, 0.02)
+    lines, free = np.arange(1, 40, 2), np.arange(2, 40, 2)
+    phase = 2 * np.pi * rng.random(lines.size)
+    gain = 1 / (1 + 1j * lines / 15)
+    turns = np.exp(2j * np.pi * np.outer(t, lines) / period_s + 1j * phase)
+    u, y = 0.05 * turns.real.sum(axis=1), 0.05 * (turns @ gain).real
+    y += planted * np.cos(2 * np.pi * 6 * t / period_s)
+    (found,) = frequency_responses({"a": Series("a", t, u)}, {"a": Series("a", t, y)}, pytest.fail)
+    power = np.mean(0.05**2 * np.abs(gain) ** 2)
+    truth = np.sqrt(planted**2 / free.size / power)
+    assert found.excitation == "periodic multisine"
+    assert found.distortion == pytest.approx(truth, rel=0.02, abs=2e-3)

@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 from undulog.analysis.estimators.series import Series
-from undulog.analysis.response.nonparametric import even_samples, find_tones, tone_response
+from undulog.analysis.response.nonparametric import even_times, find_tones, resampled, tone_response
 
 TONES = np.array([0.31, 0.5, 0.83, 1.4, 2.3])
 RESPONSE = np.array([0.99, 0.9, 0.7, 0.4, 0.2]) * np.exp(-1j * np.array([0.1, 0.3, 0.8, 1.5, 2.2]))
@@ -26,11 +26,16 @@ def record(rng, *, noise=0.02, length_s=60.0):
     return Series("u", t_u, u), Series("y", t_y, y)
 
 
+def tones_of(command):
+    t_s, _ = even_times(command.t_s[0], command.t_s[-1], command.period_s)
+    return find_tones(command, resampled(command, t_s))
+
+
 def test_intervals_hold_the_chosen_responses():
     rng, inside = np.random.default_rng(0), []
     for _ in range(100):
         command, response = record(rng)
-        tones = find_tones(command, even_samples(command))
+        tones = tones_of(command)
         assert tones == pytest.approx(TONES, abs=1e-6)
         found = tone_response(command, response, tones)
         inside.append(np.abs(found.value - RESPONSE) <= found.radius())
@@ -46,5 +51,4 @@ def test_what_is_no_sum_of_sines_has_no_tones():
         np.sign(rng.normal(size=60)).repeat(50),
         np.zeros(t.size),
     ):
-        one = Series("u", t, values)
-        assert find_tones(one, even_samples(one)) is None
+        assert tones_of(Series("u", t, values)) is None
