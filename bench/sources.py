@@ -228,11 +228,7 @@ def virtual(count: int, context: SourceContext) -> tuple[float, float]:
 
 def main() -> None:
     """Measure and print a table."""
-    parser = arguments(__doc__)
-    parser.add_argument("--frames", type=int, default=20_000)
-    parser.add_argument("--runs", type=int, default=2)
-    parser.add_argument("--rate", type=float, default=8000.0)
-    given = parser.parse_args()
+    given = arguments(__doc__, frames=20_000, runs=2, rate=8000.0).parse_args()
     count, rate = given.frames, given.rate
     can.set_logging_level("error")  # it warns of each message that two reads share
     rows: dict[str, list[tuple[float, float | None]]] = defaultdict(list)
